@@ -1,0 +1,165 @@
+// Covariances: from scale and rotation to 3D, from 3D to the image plane, each backward under its forward.
+#pragma once
+
+#include "dsmoe/camera.h"
+#include "dsmoe/constants.h"
+#include "dsmoe/vec.h"
+
+namespace dsmoe {
+
+// Rotation matrix of a quaternion (w, x, y, z), used as given: callers normalise.
+template <class S> DSMOE_HD Mat3<S> quaternion_to_rotation(Vec4<S> q) {
+  const S r = q.x, x = q.y, y = q.z, z = q.w;
+  return {{S(1) - S(2) * (y * y + z * z), S(2) * (x * y - r * z), S(2) * (x * z + r * y)},
+          {S(2) * (x * y + r * z), S(1) - S(2) * (x * x + z * z), S(2) * (y * z - r * x)},
+          {S(2) * (x * z - r * y), S(2) * (y * z + r * x), S(1) - S(2) * (x * x + y * y)}};
+}
+
+template <class S> DSMOE_HD Vec4<S> quaternion_to_rotation_backward(Vec4<S> q, const Mat3<S>& g) {
+  const S r = q.x, x = q.y, y = q.z, z = q.w;
+  return {S(2) * (x * (g.r2.y - g.r1.z) + y * (g.r0.z - g.r2.x) + z * (g.r1.x - g.r0.y)),
+          S(2) * (r * (g.r2.y - g.r1.z) + y * (g.r0.y + g.r1.x) + z * (g.r0.z + g.r2.x) - S(2) * x * (g.r1.y + g.r2.z)),
+          S(2) * (r * (g.r0.z - g.r2.x) + x * (g.r0.y + g.r1.x) + z * (g.r1.z + g.r2.y) - S(2) * y * (g.r0.x + g.r2.z)),
+          S(2) * (r * (g.r1.x - g.r0.y) + x * (g.r0.z + g.r2.x) + y * (g.r1.z + g.r2.y) - S(2) * z * (g.r0.x + g.r1.y))};
+}
+
+// Sigma = R S S^T R^T (3DGS Eq. 6); scale already holds the scale modifier.
+template <class S> DSMOE_HD Sym3<S> covariance_3d(Vec3<S> scale, const Mat3<S>& rotation) {
+  const Vec3<S> variance = {scale.x * scale.x, scale.y * scale.y, scale.z * scale.z};
+  auto entry = [&](Vec3<S> a, Vec3<S> b) { return variance.x * a.x * b.x + variance.y * a.y * b.y + variance.z * a.z * b.z; };
+  const auto& [a, b, c] = rotation;
+  return {entry(a, a), entry(a, b), entry(a, c), entry(b, b), entry(b, c), entry(c, c)};
+}
+
+// dL_dcov holds the derivative by each of the six stored numbers: an off-diagonal one stands for two matrix entries.
+template <class S>
+DSMOE_HD void covariance_3d_backward(Vec3<S> scale, const Mat3<S>& rotation, const Sym3<S>& dL_dcov, Vec3<S>& dL_dscale,
+                                     Mat3<S>& dL_drotation) {
+  const S half = S(0.5);
+  const Sym3<S> g = {dL_dcov.xx, half * dL_dcov.xy, half * dL_dcov.xz, dL_dcov.yy, half * dL_dcov.yz, dL_dcov.zz};
+  // Column k of R contributes scale_k^2 r_k r_k^T; g r_k serves both derivatives.
+  const Vec3<S> rx = {rotation.r0.x, rotation.r1.x, rotation.r2.x};
+  const Vec3<S> ry = {rotation.r0.y, rotation.r1.y, rotation.r2.y};
+  const Vec3<S> rz = {rotation.r0.z, rotation.r1.z, rotation.r2.z};
+  const Vec3<S> gx = g * rx, gy = g * ry, gz = g * rz;
+  dL_dscale = {S(2) * scale.x * dot(rx, gx), S(2) * scale.y * dot(ry, gy), S(2) * scale.z * dot(rz, gz)};
+  const S vx = S(2) * scale.x * scale.x, vy = S(2) * scale.y * scale.y, vz = S(2) * scale.z * scale.z;
+  dL_drotation = {{vx * gx.x, vy * gy.x, vz * gz.x}, {vx * gx.y, vy * gy.y, vz * gz.y}, {vx * gx.z, vy * gy.z, vz * gz.z}};
+}
+
+// The local affine approximation of the perspective projection (EWA splatting): J W, 2x3. The slopes x/z and y/z are
+// clamped a little outside the frustum, where the approximation would explode.
+template <class S> struct ProjectionJacobian {
+  Vec2<S> focal;          // pixels
+  Vec2<S> slope;          // clamped x/z, y/z
+  bool clamped_x, clamped_y;
+  S inverse_z;
+  Mat23<S> jacobian;      // J
+};
+
+template <class S> DSMOE_HD ProjectionJacobian<S> projection_jacobian(const Camera<S>& camera, Vec3<S> view) {
+  ProjectionJacobian<S> out;
+  out.focal = {S(camera.width) / (S(2) * camera.tan_fov_x), S(camera.height) / (S(2) * camera.tan_fov_y)};
+  const S limit_x = S(kFrustumMargin) * camera.tan_fov_x, limit_y = S(kFrustumMargin) * camera.tan_fov_y;
+  out.inverse_z = S(1) / view.z;
+  const Vec2<S> slope = {view.x * out.inverse_z, view.y * out.inverse_z};
+  out.slope = {clamp(slope.x, -limit_x, limit_x), clamp(slope.y, -limit_y, limit_y)};
+  out.clamped_x = out.slope.x != slope.x;
+  out.clamped_y = out.slope.y != slope.y;
+  const S fx = out.focal.x * out.inverse_z, fy = out.focal.y * out.inverse_z;
+  out.jacobian = {{fx, S(0), -fx * out.slope.x}, {S(0), fy, -fy * out.slope.y}};
+  return out;
+}
+
+template <class S> DSMOE_HD Vec3<S> projection_jacobian_backward(const ProjectionJacobian<S>& f, const Mat23<S>& dL_dJ) {
+  const S fx = f.focal.x * f.inverse_z, fy = f.focal.y * f.inverse_z;
+  const S dL_dslope_x = -fx * dL_dJ.r0.z, dL_dslope_y = -fy * dL_dJ.r1.z;
+  const S dL_dfx = dL_dJ.r0.x - f.slope.x * dL_dJ.r0.z, dL_dfy = dL_dJ.r1.y - f.slope.y * dL_dJ.r1.z;
+  Vec3<S> dL_dview = {S(0), S(0), -f.inverse_z * (fx * dL_dfx + fy * dL_dfy)};
+  if (!f.clamped_x) {
+    dL_dview.x += dL_dslope_x * f.inverse_z;
+    dL_dview.z -= dL_dslope_x * f.slope.x * f.inverse_z;
+  }
+  if (!f.clamped_y) {
+    dL_dview.y += dL_dslope_y * f.inverse_z;
+    dL_dview.z -= dL_dslope_y * f.slope.y * f.inverse_z;
+  }
+  return dL_dview;
+}
+
+// M = J W, the rows that take world vectors to the image plane.
+template <class S> DSMOE_HD Mat23<S> image_axes(const Mat23<S>& jacobian, const Mat3<S>& rotation) {
+  return {transposed_times(rotation, jacobian.r0), transposed_times(rotation, jacobian.r1)};
+}
+
+// Sigma2D = M Sigma M^T, before the low-pass filter.
+template <class S> DSMOE_HD Sym2<S> covariance_2d(const Mat23<S>& axes, const Sym3<S>& cov) {
+  const Vec3<S> u = cov * axes.r0, v = cov * axes.r1;
+  return {dot(axes.r0, u), dot(axes.r0, v), dot(axes.r1, v)};
+}
+
+template <class S>
+DSMOE_HD void covariance_2d_backward(const Mat23<S>& axes, const Sym3<S>& cov, const Sym2<S>& g, Sym3<S>& dL_dcov,
+                                     Mat23<S>& dL_daxes) {
+  const Vec3<S> a = axes.r0, b = axes.r1;
+  dL_dcov = {g.xx * a.x * a.x + g.xy * a.x * b.x + g.yy * b.x * b.x,
+             S(2) * g.xx * a.x * a.y + g.xy * (a.x * b.y + a.y * b.x) + S(2) * g.yy * b.x * b.y,
+             S(2) * g.xx * a.x * a.z + g.xy * (a.x * b.z + a.z * b.x) + S(2) * g.yy * b.x * b.z,
+             g.xx * a.y * a.y + g.xy * a.y * b.y + g.yy * b.y * b.y,
+             S(2) * g.xx * a.y * a.z + g.xy * (a.y * b.z + a.z * b.y) + S(2) * g.yy * b.y * b.z,
+             g.xx * a.z * a.z + g.xy * a.z * b.z + g.yy * b.z * b.z};
+  const Vec3<S> u = cov * a, v = cov * b;
+  dL_daxes = {S(2) * g.xx * u + g.xy * v, g.xy * u + S(2) * g.yy * v};
+}
+
+// The conic, the inverse of Sigma2D + low-pass, with what the radius and antialiasing need.
+template <class S> struct Conic {
+  Sym2<S> inverse;        // per px^2
+  Sym2<S> filtered;       // Sigma2D + low-pass, px^2
+  S determinant;          // of filtered; not above 0: no footprint
+};
+
+template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& cov2d) {
+  Conic<S> out;
+  out.filtered = {cov2d.xx + S(kLowPass), cov2d.xy, cov2d.yy + S(kLowPass)};
+  const auto& c = out.filtered;
+  out.determinant = difference_of_products(c.xx, c.yy, c.xy, c.xy);
+  const S scale = S(1) / out.determinant;
+  out.inverse = {c.yy * scale, -c.xy * scale, c.xx * scale};
+  return out;
+}
+
+// d(C^-1) = -C^-1 dC C^-1; g.xy is the derivative by the one stored off-diagonal number.
+template <class S> DSMOE_HD Sym2<S> make_conic_backward(const Conic<S>& conic, const Sym2<S>& g) {
+  const auto& k = conic.inverse;
+  return {-(g.xx * k.xx * k.xx + g.xy * k.xx * k.xy + g.yy * k.xy * k.xy),
+          -(S(2) * g.xx * k.xx * k.xy + g.xy * (k.xx * k.yy + k.xy * k.xy) + S(2) * g.yy * k.xy * k.yy),
+          -(g.xx * k.xy * k.xy + g.xy * k.xy * k.yy + g.yy * k.yy * k.yy)};
+}
+
+// Antialiasing: the factor on the opacity that keeps a Gaussian's total weight when the low-pass filter widens it.
+template <class S> DSMOE_HD S opacity_compensation(const Sym2<S>& cov2d, const Conic<S>& conic) {
+  const S before = difference_of_products(cov2d.xx, cov2d.yy, cov2d.xy, cov2d.xy);
+  return sqrt(max(S(kCompensationFloor), before / conic.determinant));
+}
+
+template <class S>
+DSMOE_HD Sym2<S> opacity_compensation_backward(const Sym2<S>& cov2d, const Conic<S>& conic, S dL_dfactor) {
+  const S before = difference_of_products(cov2d.xx, cov2d.yy, cov2d.xy, cov2d.xy);
+  const S ratio = before / conic.determinant;
+  if (!(ratio > S(kCompensationFloor))) return {S(0), S(0), S(0)};
+  const S dL_dratio = dL_dfactor * S(0.5) / sqrt(ratio);
+  const S dL_dbefore = dL_dratio / conic.determinant, dL_dafter = -dL_dratio * ratio / conic.determinant;
+  const auto& c = conic.filtered;
+  return {dL_dbefore * cov2d.yy + dL_dafter * c.yy, S(-2) * (dL_dbefore + dL_dafter) * cov2d.xy,
+          dL_dbefore * cov2d.xx + dL_dafter * c.xx};
+}
+
+// The 3-sigma radius in pixels that the trainers prune and count by, whatever the blend mode.
+template <class S> DSMOE_HD S screen_radius(const Conic<S>& conic) {
+  const S mid = S(0.5) * (conic.filtered.xx + conic.filtered.yy);
+  const S root = sqrt(max(S(kRadiusRootFloor), mid * mid - conic.determinant));
+  return ceil(S(3) * sqrt(mid + root));
+}
+
+}  // namespace dsmoe

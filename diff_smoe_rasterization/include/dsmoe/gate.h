@@ -1,0 +1,84 @@
+// One (Gaussian, pixel) pair: the projected kernel G (Eq. 1, 2), the gate logit alpha = min(0.99, o G), which pairs
+// count, and the derivative by everything the pair came from.
+#pragma once
+
+#include "dsmoe/constants.h"
+#include "dsmoe/vec.h"
+
+namespace dsmoe {
+
+enum class BlendMode : int {
+  kAlpha = 0,    // Eq. 3, 3DGS
+  kSmoe = 1,     // Eq. 7, the method
+  kSmoeTn = 2,   // Eq. 8, ablation "-T_d"
+  kSmoeStd = 3,  // Eq. 6, ablation "-T_n,d", classic SMoE
+};
+constexpr int kNumBlendModes = 4;
+
+DSMOE_HD constexpr bool is_smoe(BlendMode mode) { return mode != BlendMode::kAlpha; }
+
+// The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels: d = pixel - mean, d.x fixed, d.y free.
+template <class Real, class S> struct ColumnExponent {
+  Real constant, linear;
+  S quadratic;
+
+  DSMOE_HD ColumnExponent(const Sym2<S>& conic, Real dx)
+      : constant(S(-0.5) * conic.xx * dx * dx), linear(-conic.xy * dx), quadratic(S(-0.5) * conic.yy) {}
+
+  DSMOE_HD Real at(S dy) const { return fma(fma(Real(quadratic), Real(dy), linear), Real(dy), constant); }
+};
+
+// The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. Negative: none does.
+template <class S> DSMOE_HD S squared_reach(BlendMode mode, S opacity, S alpha_min) {
+  if (!(opacity > S(0))) return S(-1);
+  const S by_alpha = S(2) * log(opacity / (is_smoe(mode) ? alpha_min : S(kAlphaCut)));
+  if (!is_smoe(mode)) return by_alpha;
+  const S by_gate = S(-2) * log(S(kGateCut));
+  return alpha_min > S(0) ? min(by_gate, by_alpha) : by_gate;
+}
+
+template <class Real> struct Gate {
+  Real logit;         // o G, before the clamp
+  Real alpha;         // min(0.99, o G)
+  Mask<Real> counts;  // the pair takes part
+};
+
+template <BlendMode kMode, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S alpha_min) {
+  const Real kernel = exp(power);
+  Gate<Real> gate;
+  gate.logit = Real(opacity) * kernel;
+  gate.alpha = min(gate.logit, Real(S(kAlphaMax)));
+  if constexpr (is_smoe(kMode)) {
+    gate.counts = (power <= Real(S(0))) & (kernel >= Real(S(kGateCut))) & (gate.alpha >= Real(alpha_min));
+  } else {
+    gate.counts = (power <= Real(S(0))) & (gate.alpha >= Real(S(kAlphaCut)));
+  }
+  return gate;
+}
+
+// dL/dpower from gamma = alpha dL/dalpha. The clamp passes the gradient straight through, as Inria's rasterizer does
+// and a drop-in must: dL/dpower = o G dL/dalpha.
+template <class Real> DSMOE_HD Real gate_backward(const Gate<Real>& gate, Real gamma) {
+  return gamma * max(Real(Scalar<Real>(1)), gate.logit * Real(Scalar<Real>(1.0 / kAlphaMax)));
+}
+
+// Sums over pixels of dL/dpower times 1, d.x, d.y, d.x^2, d.x d.y, d.y^2: all that a Gaussian's shape needs to know.
+template <class S> struct GateMoments {
+  S one, x, y, xx, xy, yy;
+};
+constexpr int kNumGateMoments = 6;
+
+template <class S> struct GateGradient {
+  Vec2<S> mean;   // by the pixel position of the centre
+  Sym2<S> conic;  // by the three stored numbers
+  S opacity;
+};
+
+// power = -1/2 (xx dx^2 + yy dy^2) - xy dx dy, and o dL/do = dL/dpower.
+template <class S> DSMOE_HD GateGradient<S> moments_backward(const Sym2<S>& conic, S opacity, const GateMoments<S>& m) {
+  return {{conic.xx * m.x + conic.xy * m.y, conic.xy * m.x + conic.yy * m.y},
+          {S(-0.5) * m.xx, -m.xy, S(-0.5) * m.yy},
+          opacity > S(0) ? m.one / opacity : S(0)};
+}
+
+}  // namespace dsmoe

@@ -1,0 +1,58 @@
+// One qualifier for functions that run on host and device, and the scalar functions that the math needs.
+#pragma once
+
+#include <cmath>
+
+#if defined(__CUDACC__)
+#define DSMOE_HD __host__ __device__ __forceinline__
+#else
+#define DSMOE_HD inline __attribute__((always_inline))
+#endif
+
+namespace dsmoe {
+
+// The math headers call these unqualified, so that a SIMD pack brings its own by argument-dependent lookup.
+// A pack of pixels has a mask type and a scalar type; for a single pixel they are bool and the type itself.
+template <class Real> struct RealTraits;
+template <> struct RealTraits<float> {
+  using Scalar = float;
+  using Mask = bool;
+};
+template <> struct RealTraits<double> {
+  using Scalar = double;
+  using Mask = bool;
+};
+template <class Real> using Mask = typename RealTraits<Real>::Mask;
+template <class Real> using Scalar = typename RealTraits<Real>::Scalar;
+
+DSMOE_HD float exp(float x) { return ::expf(x); }
+DSMOE_HD double exp(double x) { return ::exp(x); }
+DSMOE_HD float log(float x) { return ::logf(x); }
+DSMOE_HD double log(double x) { return ::log(x); }
+DSMOE_HD float sqrt(float x) { return ::sqrtf(x); }
+DSMOE_HD double sqrt(double x) { return ::sqrt(x); }
+DSMOE_HD float ceil(float x) { return ::ceilf(x); }
+DSMOE_HD double ceil(double x) { return ::ceil(x); }
+DSMOE_HD float floor(float x) { return ::floorf(x); }
+DSMOE_HD double floor(double x) { return ::floor(x); }
+DSMOE_HD float abs(float x) { return ::fabsf(x); }
+DSMOE_HD double abs(double x) { return ::fabs(x); }
+DSMOE_HD float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
+DSMOE_HD double fma(double a, double b, double c) { return ::fma(a, b, c); }
+DSMOE_HD float reciprocal(float x) { return 1.0f / x; }
+DSMOE_HD double reciprocal(double x) { return 1.0 / x; }
+
+template <class S> DSMOE_HD S min(S a, S b) { return a < b ? a : b; }
+template <class S> DSMOE_HD S max(S a, S b) { return a > b ? a : b; }
+template <class S> DSMOE_HD S clamp(S x, S low, S high) { return min(max(x, low), high); }
+template <class S> DSMOE_HD S select(bool mask, S a, S b) { return mask ? a : b; }
+
+// a b - c d with one rounding error of the result instead of the products' (Kahan): determinants of long, thin
+// Gaussians cancel almost completely.
+template <class S> DSMOE_HD S difference_of_products(S a, S b, S c, S d) {
+  const S cd = c * d;
+  const S error = fma(-c, d, cd);
+  return fma(a, b, -cd) + error;
+}
+
+}  // namespace dsmoe

@@ -1,0 +1,98 @@
+// What goes in and out of the rasterizer, as plain structs of pointers. Every array is dense and row-major; N is the
+// number of Gaussians, F the number of features (colour channels, then z and 1/z on request), I of tile instances.
+#pragma once
+
+#include <cstdint>
+
+#include "dsmoe/camera.h"
+#include "dsmoe/gate.h"
+
+namespace dsmoe {
+
+template <class S> struct GaussianInputs {
+  int64_t num_gaussians = 0;
+  const S* means3D = nullptr;         // [N, 3] world
+  const S* opacities = nullptr;       // [N] may exceed 1
+  const S* scales = nullptr;          // [N, 3] with rotations, or null
+  const S* rotations = nullptr;       // [N, 4] (w, x, y, z), used as given
+  const S* cov3D_precomp = nullptr;   // [N, 6] (xx, xy, xz, yy, yz, zz), or null
+  const S* colors_precomp = nullptr;  // [N, C], or null
+  const S* dc = nullptr;              // [N, 3] degree 0, or null where shs holds it
+  const S* shs = nullptr;             // [N, K, 3], or null
+  int num_sh = 0;                     // K
+  int sh_degree = 0;                  // active degree
+};
+
+template <class S> struct RasterConfig {
+  BlendMode mode = BlendMode::kAlpha;
+  int num_channels = 3;               // C
+  const S* background = nullptr;      // [C]
+  S scale_modifier = 1;
+  S alpha_min = 0;                    // SMoE modes: also skip alpha below this
+  bool antialiasing = false;
+  bool depth = false;                 // the expected depth is asked for
+  bool inverse_depth = false;
+  int num_threads = 1;                // CPU backend
+
+  DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
+};
+
+// One Gaussian on the image plane: all that the blend reads of it besides its features.
+template <class S> struct ProjectedGaussian {
+  Vec2<S> mean;      // pixels
+  Sym2<S> conic;     // per px^2
+  S opacity;         // after antialiasing
+  S squared_reach;   // k^2 of the footprint
+  S depth;           // view z
+};
+constexpr int kProjectedGaussianSize = 8;
+
+// One (Gaussian, tile) pair, in a tile's list from front to back.
+struct TileInstance {
+  int32_t gaussian;
+  uint32_t slot;     // where its gradient goes: the Gaussian's instances lie side by side
+};
+
+// What the forward pass leaves for the backward pass.
+template <class S> struct SavedForward {
+  ProjectedGaussian<S>* projected = nullptr;  // [N]
+  S* features = nullptr;                      // [N, F]
+  int64_t* instance_offsets = nullptr;        // [N + 1] first slot of each Gaussian; the last entry is I
+  int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
+  TileInstance* instances = nullptr;          // [I]
+  S* final_transmittance = nullptr;           // [H, W] T_{N+1}
+  S* gate_sum = nullptr;                      // [H, W] the denominator
+  int32_t* last_contributor = nullptr;        // [H, W] how many entries of the tile's list the numerator has seen
+};
+
+template <class S> struct ImageOutputs {
+  S* color = nullptr;          // [C, H, W]
+  S* depth = nullptr;          // [H, W], or null
+  S* inverse_depth = nullptr;  // [H, W], or null
+  int32_t* radii = nullptr;    // [N] pixels
+};
+
+// Any of these may be null: that output was not used.
+template <class S> struct ImageGradients {
+  const S* color = nullptr;          // [C, H, W]
+  const S* gate_sum = nullptr;       // [H, W]; gradient on the alpha image
+  const S* depth = nullptr;          // [H, W]
+  const S* inverse_depth = nullptr;  // [H, W]
+};
+
+// Any of these may be null: that gradient is not wanted. The others are written whole.
+template <class S> struct GaussianGradients {
+  S* means3D = nullptr;         // [N, 3]
+  S* means2D = nullptr;         // [N, 3] dL/dpixel times (W/2, H/2), z = 0: what densification reads
+  S* opacities = nullptr;       // [N]
+  S* scales = nullptr;          // [N, 3]
+  S* rotations = nullptr;       // [N, 4]
+  S* cov3D_precomp = nullptr;   // [N, 6]
+  S* colors_precomp = nullptr;  // [N, C]
+  S* dc = nullptr;              // [N, 3]
+  S* shs = nullptr;             // [N, K, 3]
+  S* background = nullptr;      // [C]
+  CameraGradient<S>* camera = nullptr;
+};
+
+}  // namespace dsmoe

@@ -1,0 +1,100 @@
+// Which tiles, and which rows of a tile, a footprint meets: exact ellipse against axis-aligned band, and Inria's
+// tile rectangle. All tests are bounds, widened by kFootprintSlack: every pixel that counts passes them.
+#pragma once
+
+#include "dsmoe/constants.h"
+#include "dsmoe/vec.h"
+
+namespace dsmoe {
+
+// Half-open rectangle of tiles.
+struct TileRect {
+  int x0, y0, x1, y1;
+  DSMOE_HD bool empty() const { return x0 >= x1 || y0 >= y1; }
+};
+
+struct TileGrid {
+  int columns, rows;
+  DSMOE_HD TileGrid(int width, int height)
+      : columns((width + kTileSize - 1) / kTileSize), rows((height + kTileSize - 1) / kTileSize) {}
+};
+
+// The integer nearest to x that lies in [low, high]; also defined where x is beyond every integer.
+template <class S> DSMOE_HD int clamp_to_int(S x, int low, int high) { return static_cast<int>(clamp(x, S(low), S(high))); }
+
+// The tiles that Inria's rasterizer gives to a Gaussian: the square of its radius, in whole tiles. In `alpha` mode a
+// pair counts only inside, although for opacity above 0.353 the 1/255 ellipse leaves it.
+template <class S> DSMOE_HD TileRect radius_rect(Vec2<S> mean, S radius, TileGrid grid) {
+  const S size = S(kTileSize);
+  return {clamp_to_int(floor((mean.x - radius) / size), 0, grid.columns),
+          clamp_to_int(floor((mean.y - radius) / size), 0, grid.rows),
+          clamp_to_int(floor((mean.x + radius + size - S(1)) / size), 0, grid.columns),
+          clamp_to_int(floor((mean.y + radius + size - S(1)) / size), 0, grid.rows)};
+}
+
+template <class S> struct Interval {
+  S low, high;
+  DSMOE_HD bool empty() const { return !(low <= high); }
+};
+
+// The ellipse conic.xx u^2 + 2 conic.xy u v + conic.yy v^2 <= reach, centred at 0: its extent in u over a band of v.
+template <class S> class EllipseBand {
+ public:
+  DSMOE_HD EllipseBand(const Sym2<S>& conic, S squared_reach) : conic_(conic) {
+    reach_ = squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack);
+    determinant_ = difference_of_products(conic.xx, conic.yy, conic.xy, conic.xy);
+    v_extent_ = sqrt(max(S(0), reach_ * conic.xx / determinant_));
+    // v where u is largest: on the line conic.xy u + conic.yy v = 0.
+    v_at_u_extent_ = -conic.xy / conic.yy * sqrt(max(S(0), reach_ * conic.yy / determinant_));
+  }
+
+  DSMOE_HD S v_extent() const { return v_extent_; }
+
+  // u over v in [band.low, band.high]; empty where the band misses the ellipse.
+  DSMOE_HD Interval<S> over(Interval<S> band) const {
+    const S low = max(band.low, -v_extent_), high = min(band.high, v_extent_);
+    if (!(low <= high)) return {S(1), S(0)};
+    const S v_right = clamp(v_at_u_extent_, low, high), v_left = clamp(-v_at_u_extent_, low, high);
+    return {centre(v_left) - half_width(v_left), centre(v_right) + half_width(v_right)};
+  }
+
+ private:
+  DSMOE_HD S centre(S v) const { return -conic_.xy * v / conic_.xx; }
+  DSMOE_HD S half_width(S v) const { return sqrt(max(S(0), conic_.xx * reach_ - determinant_ * v * v)) / conic_.xx; }
+
+  Sym2<S> conic_;
+  S reach_, determinant_, v_extent_, v_at_u_extent_;
+};
+
+// Calls visit(tile_x0, tile_x1, tile_y) for each tile row that the footprint meets, inside bounds.
+template <class S, class Visit>
+DSMOE_HD void for_each_tile_row(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, TileRect bounds, Visit visit) {
+  if (!(squared_reach >= S(0)) || bounds.empty()) return;
+  const EllipseBand<S> ellipse(conic, squared_reach);
+  const S size = S(kTileSize), last = S(kTileSize - 1);
+  const int y0 = clamp_to_int(floor((mean.y - ellipse.v_extent()) / size), bounds.y0, bounds.y1);
+  const int y1 = clamp_to_int(floor((mean.y + ellipse.v_extent()) / size) + S(1), bounds.y0, bounds.y1);
+  for (int y = y0; y < y1; ++y) {
+    const S top = S(y) * size - mean.y;
+    const Interval<S> u = ellipse.over({top, top + last});
+    if (u.empty()) continue;
+    // The first tile whose last pixel is not left of u.low, and the tile after the last whose first pixel is in.
+    const int x0 = clamp_to_int(ceil((mean.x + u.low - last) / size), bounds.x0, bounds.x1);
+    const int x1 = clamp_to_int(floor((mean.x + u.high) / size) + S(1), bounds.x0, bounds.x1);
+    if (x0 < x1) visit(x0, x1, y);
+  }
+}
+
+// Whether the ellipse meets a rectangle of pixel centres, borders included: the gated modes' rule for radius > 0.
+template <class S> DSMOE_HD bool meets_image(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, int width, int height) {
+  // Exact, without the bounds' slack: the least value of the quadratic form over the rectangle.
+  const S x0 = -mean.x, x1 = S(width - 1) - mean.x, y0 = -mean.y, y1 = S(height - 1) - mean.y;
+  if (x0 <= S(0) && S(0) <= x1 && y0 <= S(0) && S(0) <= y1) return true;
+  auto value = [&](S x, S y) { return conic.xx * x * x + S(2) * conic.xy * x * y + conic.yy * y * y; };
+  auto on_column = [&](S x) { return value(x, clamp(-conic.xy * x / conic.yy, y0, y1)); };
+  auto on_row = [&](S y) { return value(clamp(-conic.xy * y / conic.xx, x0, x1), y); };
+  const S least = min(min(on_column(x0), on_column(x1)), min(on_row(y0), on_row(y1)));
+  return least <= squared_reach;
+}
+
+}  // namespace dsmoe

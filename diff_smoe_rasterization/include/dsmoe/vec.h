@@ -1,0 +1,67 @@
+// Small fixed-size algebra: only what the projection needs.
+#pragma once
+
+#include "dsmoe/hd.h"
+
+namespace dsmoe {
+
+template <class S> struct Vec2 {
+  S x, y;
+};
+
+template <class S> struct Vec3 {
+  S x, y, z;
+};
+
+template <class S> struct Vec4 {
+  S x, y, z, w;
+};
+
+// Symmetric matrices, upper triangle.
+template <class S> struct Sym2 {
+  S xx, xy, yy;
+};
+
+template <class S> struct Sym3 {
+  S xx, xy, xz, yy, yz, zz;
+};
+
+// Rows of a 3x3 matrix.
+template <class S> struct Mat3 {
+  Vec3<S> r0, r1, r2;
+};
+
+// Rows of a 2x3 matrix.
+template <class S> struct Mat23 {
+  Vec3<S> r0, r1;
+};
+
+template <class S> DSMOE_HD Vec3<S> operator+(Vec3<S> a, Vec3<S> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class S> DSMOE_HD Vec3<S> operator-(Vec3<S> a, Vec3<S> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class S> DSMOE_HD Vec3<S> operator*(S s, Vec3<S> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class S> DSMOE_HD S dot(Vec3<S> a, Vec3<S> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+template <class S> DSMOE_HD Vec3<S> operator*(const Sym3<S>& m, Vec3<S> v) {
+  return {m.xx * v.x + m.xy * v.y + m.xz * v.z, m.xy * v.x + m.yy * v.y + m.yz * v.z,
+          m.xz * v.x + m.yz * v.y + m.zz * v.z};
+}
+
+template <class S> DSMOE_HD Vec3<S> operator*(const Mat3<S>& m, Vec3<S> v) {
+  return {dot(m.r0, v), dot(m.r1, v), dot(m.r2, v)};
+}
+
+template <class S> DSMOE_HD Vec3<S> transposed_times(const Mat3<S>& m, Vec3<S> v) {
+  return v.x * m.r0 + v.y * m.r1 + v.z * m.r2;
+}
+
+template <class S> DSMOE_HD bool is_finite(S x) { return x - x == S(0); }
+template <class S> DSMOE_HD bool is_finite(Vec3<S> v) { return is_finite(v.x) && is_finite(v.y) && is_finite(v.z); }
+
+// NaN and infinity survive this sum whatever the other terms are.
+template <class S> DSMOE_HD bool all_finite(const S* values, int count) {
+  S poison = S(0);
+  for (int i = 0; i < count; ++i) poison += values[i] - values[i];
+  return poison == S(0);
+}
+
+}  // namespace dsmoe

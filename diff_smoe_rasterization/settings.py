@@ -1,0 +1,77 @@
+"""What a caller says about one rendering: camera, image, blend mode and options."""
+from __future__ import annotations
+
+import os
+from typing import NamedTuple, Optional
+
+import torch
+
+BLEND_MODES = ("alpha", "smoe", "smoe_tn", "smoe_std")
+"""The blend modes, by number in the C++ core.
+
+========== ====================== =========================================== ==========
+name       paper                  colour of a pixel                           background
+========== ====================== =========================================== ==========
+alpha      Eq. 3 (3DGS)           sum c_i alpha_i T_i + T bg                  blended
+smoe       Eq. 7 (the method)     sum c_i alpha_i T_i / sum alpha_i T_i       where no gate
+smoe_tn    Eq. 8 (ablation)       sum c_i alpha_i T_i / sum alpha_i           where no gate
+smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               where no gate
+========== ====================== =========================================== ==========
+"""
+
+BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """Camera and options of one rendering; the first twelve fields are Inria's, in Inria's order.
+
+    Matrices are transposed, as every 3DGS trainer passes them: a row vector times the matrix.
+    """
+
+    image_height: int  # pixels
+    image_width: int  # pixels
+    tanfovx: float  # tan of half the horizontal field of view
+    tanfovy: float
+    bg: torch.Tensor  # [C] background colour, C = 3 unless colors_precomp has other channels
+    scale_modifier: float  # multiplies every scale; 1 for training
+    viewmatrix: torch.Tensor  # [4, 4] world to view, transposed
+    projmatrix: torch.Tensor  # [4, 4] world to clip (view and projection), transposed; carries the principal point
+    sh_degree: int  # active degree, 0 to 3; shs may hold more
+    campos: torch.Tensor  # [3] camera centre, world
+    prefiltered: bool = False  # the caller asserts that every point lies in front of the near plane
+    debug: bool = False  # check inputs and results for NaN; slower
+    antialiasing: bool = False  # scale opacity by sqrt(det(cov2D) / det(cov2D + 0.3 I))
+    near: float = 0.2  # Gaussians with view depth <= near are culled
+    alpha_min: float = 0.0  # SMoE modes: also skip alpha below this; 0 is the paper's rule
+    strict: bool = False  # raise where an attribute is NaN or infinite, instead of culling that Gaussian
+    blend_mode: Optional[str] = None  # one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha"
+
+
+class Rendering(NamedTuple):
+    """What `rasterize` returns; an output that was not asked for is None."""
+
+    color: torch.Tensor  # [C, H, W]
+    radii: torch.Tensor  # [P] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
+    alpha: Optional[torch.Tensor] = None  # [1, H, W]; alpha: 1 - T, SMoE modes: the denominator (gate sum)
+    depth: Optional[torch.Tensor] = None  # [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
+    inverse_depth: Optional[torch.Tensor] = None  # [1, H, W]; alpha: sum(w / z), SMoE modes: divided by the gate sum
+
+
+OUTPUTS = ("alpha", "depth", "inverse_depth")
+"""The optional outputs of `rasterize`."""
+
+
+def resolve_blend_mode(blend_mode: Optional[str]) -> str:
+    """Returns the blend mode that a rendering uses.
+
+    An explicit name wins; None means the environment variable DSMOE_BLEND_MODE, for callers that
+    cannot be edited, and "alpha" where that is unset.
+    Raises ValueError for a name that is not in BLEND_MODES.
+    """
+    source = "blend_mode"
+    if blend_mode is None:
+        blend_mode = os.environ.get(BLEND_MODE_VARIABLE) or "alpha"
+        source = BLEND_MODE_VARIABLE
+    if blend_mode not in BLEND_MODES:
+        raise ValueError(f"{source} is {blend_mode!r}; it must be one of {', '.join(BLEND_MODES)}")
+    return blend_mode
