@@ -1,0 +1,118 @@
+"""Builds the torch extension. Metadata: pyproject.toml; files and compiler flags: sources.txt.
+
+Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA), TORCH_CUDA_ARCH_LIST, MAX_JOBS.
+"""
+import os
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import setuptools
+
+ROOT = Path(__file__).resolve().parent
+PACKAGE = "diff_smoe_rasterization"
+FOLDERS_INSTALLED_INSIDE = ("integrations", "patches", "benchmarks")
+COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
+
+
+def read_sources():
+    """Returns {group: [word, ...]} of sources.txt."""
+    groups = defaultdict(list)
+    for line in (ROOT / "sources.txt").read_text().splitlines():
+        words = line.partition("#")[0].split()
+        if words:
+            groups[words[0]] += words[1:]
+    return groups
+
+
+def import_build_tools():
+    """Returns torch and torch.utils.cpp_extension, or stops with what the user has to type."""
+    try:
+        import torch
+    except ImportError as error:
+        sys.exit(
+            f"{PACKAGE} compiles against PyTorch, which this Python ({sys.executable}) cannot import: {error}\n"
+            "Install it first, then build against it:\n"
+            "    pip install torch setuptools wheel ninja\n"
+            "    pip install --no-build-isolation ."
+        )
+    try:
+        from torch.utils import cpp_extension
+    except ImportError as error:
+        if error.name != "pkg_resources":
+            raise
+        sys.exit(
+            f"torch {torch.__version__} builds extensions with pkg_resources, which setuptools "
+            f"{setuptools.__version__} no longer has. Take an older one, then build again:\n"
+            "    pip install 'setuptools<82'\n"
+            "    pip install --no-build-isolation ."
+        )
+    return torch, cpp_extension
+
+
+def reasons_against_cuda(cuda_sources, torch, cuda_home):
+    """Returns why the CUDA backend is not built, as a list; empty where it is."""
+    wish = os.environ.get("DSMOE_BUILD_CUDA", "auto")
+    if wish not in ("auto", "0", "1"):
+        sys.exit(f"DSMOE_BUILD_CUDA is {wish!r}; it must be auto, 0 or 1")
+    if wish == "0":
+        return ["it was built with DSMOE_BUILD_CUDA=0"]
+    reasons = []
+    if not cuda_sources:
+        reasons.append("this version has no CUDA backend")
+    if torch.version.cuda is None:
+        reasons.append(f"torch {torch.__version__} is a build without CUDA")
+    if cuda_home is None:
+        reasons.append("no CUDA toolkit was found (nvcc; CUDA_HOME names its folder)")
+    if wish == "1" and reasons:
+        sys.exit("DSMOE_BUILD_CUDA=1, but " + "; ".join(reasons))
+    return reasons
+
+
+def extension():
+    """Returns the arguments of setup() that build `diff_smoe_rasterization._C`."""
+    torch, cpp_extension = import_build_tools()
+    sources = read_sources()
+    without_cuda = reasons_against_cuda(sources["cuda"], torch, cpp_extension.CUDA_HOME)
+    groups = ["core", "io", "torch"] + ([] if without_cuda else ["cuda"])
+    flags = sources["flags"] + ["-g0", "-fvisibility=hidden", "-pthread"]
+    if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
+        flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
+    folders = [str(ROOT / PACKAGE / folder) for folder in ("include", "csrc")]
+    make = cpp_extension.CppExtension if without_cuda else cpp_extension.CUDAExtension
+    module = make(
+        f"{PACKAGE}._C",
+        [f"{PACKAGE}/{path}" for group in groups for path in sources[group]],
+        include_dirs=folders,
+        define_macros=[] if without_cuda else [("DSMOE_WITH_CUDA", None)],
+        extra_compile_args={"cxx": flags, "nvcc": ["-O3"]},
+        extra_link_args=["-pthread"],
+    )
+    built_against = {
+        "TORCH_VERSION": torch.__version__,
+        "CUDA_VERSION": None if without_cuda else torch.version.cuda,
+        "WITHOUT_CUDA_BECAUSE": "; ".join(without_cuda),
+    }
+
+    class BuildExtension(cpp_extension.BuildExtension):
+        def run(self):
+            super().run()
+            lines = [f"{name} = {value!r}\n" for name, value in built_against.items()]
+            text = '"""What the extension was built against; readable even where it cannot be loaded."""\n' + "".join(lines)
+            Path(self.get_ext_fullpath(module.name)).with_name("_build_info.py").write_text(text)
+
+    return {"ext_modules": [module], "cmdclass": {"build_ext": BuildExtension}}
+
+
+def packages():
+    """Returns the arguments of setup() that say which folder is which package."""
+    folders = {PACKAGE: PACKAGE}
+    folders.update({f"{PACKAGE}.{name}": name for name in FOLDERS_INSTALLED_INSIDE if (ROOT / name).is_dir()})
+    names = list(folders)
+    for name, folder in folders.items():
+        names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
+    return {"packages": names, "package_dir": folders, "package_data": {PACKAGE: ["include/dsmoe/*.h"]}}
+
+
+if __name__ == "__main__":
+    setuptools.setup(**packages(), **(extension() if COMMANDS_THAT_COMPILE & set(sys.argv) else {}))
