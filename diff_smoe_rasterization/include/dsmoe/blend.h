@@ -32,8 +32,8 @@ template <class Real> struct PixelState {
 };
 
 template <class Real> struct PairWeight {
-  Real weight;               // of the expert in the numerator
-  Mask<Real> contributes;    // to the numerator
+  Real weight;             // of the expert in the numerator
+  Mask<Real> contributes;  // to the numerator
 };
 
 // What the backward pass knows of a pixel; g' itself is one number a channel and stays with the caller.
@@ -98,7 +98,8 @@ template <> struct Blend<BlendMode::kAlpha> {
   }
 };
 
-// What the three gated modes share: the numerator divided by the gate sum, no epsilon; background where no gate is open.
+// What the three gated modes share: the numerator divided by the gate sum, no epsilon; background where no gate is
+// open.
 struct GatedBlend {
   template <class Real> static DSMOE_HD Real finalize(const PixelState<Real>& state, Real sum, Real background) {
     const Mask<Real> gated = state.gate_sum >= Real(Scalar<Real>(kGateSumCut));

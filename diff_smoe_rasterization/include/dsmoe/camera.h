@@ -9,12 +9,12 @@ namespace dsmoe {
 // Matrices as the trainers pass them: element [4 * row + column] of the transposed matrix, so that a point is a row
 // vector to its left. view: world to view; projection: world to clip, principal point included.
 template <class S> struct Camera {
-  int width = 0, height = 0;          // pixels
-  S tan_fov_x = 0, tan_fov_y = 0;     // tan of half the field of view
-  S view[16] = {};                    // [4, 4]
-  S projection[16] = {};              // [4, 4]
-  S position[3] = {};                 // world
-  S near = S(0.2);                    // view depth; nearer Gaussians are culled
+  int width = 0, height = 0;       // pixels
+  S tan_fov_x = 0, tan_fov_y = 0;  // tan of half the field of view
+  S view[16] = {};                 // [4, 4]
+  S projection[16] = {};           // [4, 4]
+  S position[3] = {};              // world
+  S near = S(0.2);                 // view depth; nearer Gaussians are culled
 };
 
 template <class S> struct CameraGradient {
@@ -38,7 +38,8 @@ template <class S> DSMOE_HD Vec3<S> transform_point_backward(const S* m, Vec3<S>
       dL_dm[4 * i + 2] += point[i] * dL_dout.z;
     }
   }
-  return {m[0] * dL_dout.x + m[1] * dL_dout.y + m[2] * dL_dout.z, m[4] * dL_dout.x + m[5] * dL_dout.y + m[6] * dL_dout.z,
+  return {m[0] * dL_dout.x + m[1] * dL_dout.y + m[2] * dL_dout.z,
+          m[4] * dL_dout.x + m[5] * dL_dout.y + m[6] * dL_dout.z,
           m[8] * dL_dout.x + m[9] * dL_dout.y + m[10] * dL_dout.z};
 }
 

@@ -4,19 +4,19 @@
 
 namespace dsmoe {
 
-constexpr float kAlphaMax = 0.99f;           // alpha never reaches 1, so that transmittance can be divided back
-constexpr float kAlphaCut = 1.0f / 255.0f;   // `alpha` mode skips fainter pairs: invisible in 8 bits
-constexpr float kGateCut = 1e-5f;            // SMoE modes skip smaller kernels (the paper's rule; on G, not alpha)
-constexpr float kTransmittanceCut = 1e-4f;   // a pixel is full where the next pair would leave less
-constexpr float kGateSumCut = 1e-30f;        // below it no gate is open: the pixel takes the background
-constexpr float kRadiusRootFloor = 0.1f;     // keeps the larger eigenvalue's root real for round Gaussians
+constexpr float kAlphaMax = 0.99f;             // alpha never reaches 1, so that transmittance can be divided back
+constexpr float kAlphaCut = 1.0f / 255.0f;     // `alpha` mode skips fainter pairs: invisible in 8 bits
+constexpr float kGateCut = 1e-5f;              // SMoE modes skip smaller kernels (the paper's rule; on G, not alpha)
+constexpr float kTransmittanceCut = 1e-4f;     // a pixel is full where the next pair would leave less
+constexpr float kGateSumCut = 1e-30f;          // below it no gate is open: the pixel takes the background
+constexpr float kRadiusRootFloor = 0.1f;       // keeps the larger eigenvalue's root real for round Gaussians
 constexpr float kCompensationFloor = 2.5e-5f;  // antialiasing: the determinant ratio is not taken below this
 
-constexpr double kLowPass = 0.3;             // px^2 added to the projected covariance: no splat thinner than a pixel
-constexpr double kFrustumMargin = 1.3;       // the Jacobian is taken at most this many tan(fov / 2) off the axis
+constexpr double kLowPass = 0.3;              // px^2 added to the projected covariance: no splat thinner than a pixel
+constexpr double kFrustumMargin = 1.3;        // the Jacobian is taken at most this many tan(fov / 2) off the axis
 constexpr double kHomogeneousEpsilon = 1e-7;  // added to w before the perspective division
 
-constexpr int kTileSize = 16;                // pixels; also the grid of Inria's tile rectangle
+constexpr int kTileSize = 16;  // pixels; also the grid of Inria's tile rectangle
 
 // Tile and row tests are bounds: every pixel that counts must pass. This is far above their rounding errors, and
 // widens a footprint by less than a hundredth of a pixel at sigma = 1.

@@ -17,16 +17,19 @@ template <class S> DSMOE_HD Mat3<S> quaternion_to_rotation(Vec4<S> q) {
 
 template <class S> DSMOE_HD Vec4<S> quaternion_to_rotation_backward(Vec4<S> q, const Mat3<S>& g) {
   const S r = q.x, x = q.y, y = q.z, z = q.w;
-  return {S(2) * (x * (g.r2.y - g.r1.z) + y * (g.r0.z - g.r2.x) + z * (g.r1.x - g.r0.y)),
-          S(2) * (r * (g.r2.y - g.r1.z) + y * (g.r0.y + g.r1.x) + z * (g.r0.z + g.r2.x) - S(2) * x * (g.r1.y + g.r2.z)),
-          S(2) * (r * (g.r0.z - g.r2.x) + x * (g.r0.y + g.r1.x) + z * (g.r1.z + g.r2.y) - S(2) * y * (g.r0.x + g.r2.z)),
-          S(2) * (r * (g.r1.x - g.r0.y) + x * (g.r0.z + g.r2.x) + y * (g.r1.z + g.r2.y) - S(2) * z * (g.r0.x + g.r1.y))};
+  return {
+      S(2) * (x * (g.r2.y - g.r1.z) + y * (g.r0.z - g.r2.x) + z * (g.r1.x - g.r0.y)),
+      S(2) * (r * (g.r2.y - g.r1.z) + y * (g.r0.y + g.r1.x) + z * (g.r0.z + g.r2.x) - S(2) * x * (g.r1.y + g.r2.z)),
+      S(2) * (r * (g.r0.z - g.r2.x) + x * (g.r0.y + g.r1.x) + z * (g.r1.z + g.r2.y) - S(2) * y * (g.r0.x + g.r2.z)),
+      S(2) * (r * (g.r1.x - g.r0.y) + x * (g.r0.z + g.r2.x) + y * (g.r1.z + g.r2.y) - S(2) * z * (g.r0.x + g.r1.y))};
 }
 
 // Sigma = R S S^T R^T (3DGS Eq. 6); scale already holds the scale modifier.
 template <class S> DSMOE_HD Sym3<S> covariance_3d(Vec3<S> scale, const Mat3<S>& rotation) {
   const Vec3<S> variance = {scale.x * scale.x, scale.y * scale.y, scale.z * scale.z};
-  auto entry = [&](Vec3<S> a, Vec3<S> b) { return variance.x * a.x * b.x + variance.y * a.y * b.y + variance.z * a.z * b.z; };
+  auto entry = [&](Vec3<S> a, Vec3<S> b) {
+    return variance.x * a.x * b.x + variance.y * a.y * b.y + variance.z * a.z * b.z;
+  };
   const auto& [a, b, c] = rotation;
   return {entry(a, a), entry(a, b), entry(a, c), entry(b, b), entry(b, c), entry(c, c)};
 }
@@ -44,17 +47,18 @@ DSMOE_HD void covariance_3d_backward(Vec3<S> scale, const Mat3<S>& rotation, con
   const Vec3<S> gx = g * rx, gy = g * ry, gz = g * rz;
   dL_dscale = {S(2) * scale.x * dot(rx, gx), S(2) * scale.y * dot(ry, gy), S(2) * scale.z * dot(rz, gz)};
   const S vx = S(2) * scale.x * scale.x, vy = S(2) * scale.y * scale.y, vz = S(2) * scale.z * scale.z;
-  dL_drotation = {{vx * gx.x, vy * gy.x, vz * gz.x}, {vx * gx.y, vy * gy.y, vz * gz.y}, {vx * gx.z, vy * gy.z, vz * gz.z}};
+  dL_drotation = {
+      {vx * gx.x, vy * gy.x, vz * gz.x}, {vx * gx.y, vy * gy.y, vz * gz.y}, {vx * gx.z, vy * gy.z, vz * gz.z}};
 }
 
 // The local affine approximation of the perspective projection (EWA splatting): J W, 2x3. The slopes x/z and y/z are
 // clamped a little outside the frustum, where the approximation would explode.
 template <class S> struct ProjectionJacobian {
-  Vec2<S> focal;          // pixels
-  Vec2<S> slope;          // clamped x/z, y/z
+  Vec2<S> focal;  // pixels
+  Vec2<S> slope;  // clamped x/z, y/z
   bool clamped_x, clamped_y;
   S inverse_z;
-  Mat23<S> jacobian;      // J
+  Mat23<S> jacobian;  // J
 };
 
 template <class S> DSMOE_HD ProjectionJacobian<S> projection_jacobian(const Camera<S>& camera, Vec3<S> view) {
@@ -71,7 +75,8 @@ template <class S> DSMOE_HD ProjectionJacobian<S> projection_jacobian(const Came
   return out;
 }
 
-template <class S> DSMOE_HD Vec3<S> projection_jacobian_backward(const ProjectionJacobian<S>& f, const Mat23<S>& dL_dJ) {
+template <class S>
+DSMOE_HD Vec3<S> projection_jacobian_backward(const ProjectionJacobian<S>& f, const Mat23<S>& dL_dJ) {
   const S fx = f.focal.x * f.inverse_z, fy = f.focal.y * f.inverse_z;
   const S dL_dslope_x = -fx * dL_dJ.r0.z, dL_dslope_y = -fy * dL_dJ.r1.z;
   const S dL_dfx = dL_dJ.r0.x - f.slope.x * dL_dJ.r0.z, dL_dfy = dL_dJ.r1.y - f.slope.y * dL_dJ.r1.z;
@@ -114,9 +119,9 @@ DSMOE_HD void covariance_2d_backward(const Mat23<S>& axes, const Sym3<S>& cov, c
 
 // The conic, the inverse of Sigma2D + low-pass, with what the radius and antialiasing need.
 template <class S> struct Conic {
-  Sym2<S> inverse;        // per px^2
-  Sym2<S> filtered;       // Sigma2D + low-pass, px^2
-  S determinant;          // of filtered; not above 0: no footprint
+  Sym2<S> inverse;   // per px^2
+  Sym2<S> filtered;  // Sigma2D + low-pass, px^2
+  S determinant;     // of filtered; not above 0: no footprint
 };
 
 template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& cov2d) {

@@ -63,9 +63,7 @@ template <class Real> DSMOE_HD Real gate_backward(const Gate<Real>& gate, Real g
 }
 
 // Sums over pixels of dL/dpower times 1, d.x, d.y, d.x^2, d.x d.y, d.y^2: all that a Gaussian's shape needs to know.
-template <class S> struct GateMoments {
-  S one, x, y, xx, xy, yy;
-};
+template <class S> struct GateMoments { S one, x, y, xx, xy, yy; };
 constexpr int kNumGateMoments = 6;
 
 template <class S> struct GateGradient {

@@ -25,32 +25,32 @@ template <class S> struct GaussianInputs {
 
 template <class S> struct RasterConfig {
   BlendMode mode = BlendMode::kAlpha;
-  int num_channels = 3;               // C
-  const S* background = nullptr;      // [C]
+  int num_channels = 3;           // C
+  const S* background = nullptr;  // [C]
   S scale_modifier = 1;
-  S alpha_min = 0;                    // SMoE modes: also skip alpha below this
+  S alpha_min = 0;  // SMoE modes: also skip alpha below this
   bool antialiasing = false;
-  bool depth = false;                 // the expected depth is asked for
+  bool depth = false;  // the expected depth is asked for
   bool inverse_depth = false;
-  int num_threads = 1;                // CPU backend
+  int num_threads = 1;  // CPU backend
 
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
 };
 
 // One Gaussian on the image plane: all that the blend reads of it besides its features.
 template <class S> struct ProjectedGaussian {
-  Vec2<S> mean;      // pixels
-  Sym2<S> conic;     // per px^2
-  S opacity;         // after antialiasing
-  S squared_reach;   // k^2 of the footprint
-  S depth;           // view z
+  Vec2<S> mean;     // pixels
+  Sym2<S> conic;    // per px^2
+  S opacity;        // after antialiasing
+  S squared_reach;  // k^2 of the footprint
+  S depth;          // view z
 };
 constexpr int kProjectedGaussianSize = 8;
 
 // One (Gaussian, tile) pair, in a tile's list from front to back.
 struct TileInstance {
   int32_t gaussian;
-  uint32_t slot;     // where its gradient goes: the Gaussian's instances lie side by side
+  uint32_t slot;  // where its gradient goes: the Gaussian's instances lie side by side
 };
 
 // What the forward pass leaves for the backward pass.

@@ -19,7 +19,8 @@ template <class S> struct WorldCovariance {
   Sym3<S> cov;
 };
 
-template <class S> DSMOE_HD WorldCovariance<S> world_covariance(const GaussianInputs<S>& in, S scale_modifier, int64_t i) {
+template <class S>
+DSMOE_HD WorldCovariance<S> world_covariance(const GaussianInputs<S>& in, S scale_modifier, int64_t i) {
   WorldCovariance<S> out = {};
   if (in.cov3D_precomp != nullptr) {
     const S* c = in.cov3D_precomp + 6 * i;
@@ -52,8 +53,7 @@ template <class S> DSMOE_HD bool attributes_finite(const GaussianInputs<S>& in, 
 }
 
 // The tiles that may hold pairs of a Gaussian.
-template <class S>
-DSMOE_HD TileRect tile_bounds(BlendMode mode, const Camera<S>& camera, Vec2<S> mean, S radius) {
+template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, const Camera<S>& camera, Vec2<S> mean, S radius) {
   const TileGrid grid(camera.width, camera.height);
   if (is_smoe(mode)) return {0, 0, grid.columns, grid.rows};
   return radius_rect(mean, radius, grid);
@@ -101,9 +101,10 @@ template <class S> struct ProjectedGradient {
 
 // Writes the gradients of Gaussian i, and adds its share of the camera's where that is wanted.
 template <class S>
-DSMOE_HD void project_gaussian_backward(const GaussianInputs<S>& in, const Camera<S>& camera, const RasterConfig<S>& config,
-                                        int64_t i, const S* features, const ProjectedGradient<S>& g,
-                                        const GaussianGradients<S>& out, CameraGradient<S>* dL_dcamera) {
+DSMOE_HD void project_gaussian_backward(const GaussianInputs<S>& in, const Camera<S>& camera,
+                                        const RasterConfig<S>& config, int64_t i, const S* features,
+                                        const ProjectedGradient<S>& g, const GaussianGradients<S>& out,
+                                        CameraGradient<S>* dL_dcamera) {
   const Vec3<S> mean = load3(in.means3D + 3 * i);
   const Vec3<S> view = transform_point(camera.view, mean);
   const auto jacobian = projection_jacobian(camera, view);

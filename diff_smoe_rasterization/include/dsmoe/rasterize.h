@@ -29,7 +29,7 @@ namespace cpu {
 // Seconds of each stage, and the work the blend did, of the calls that were given this struct.
 struct StageTimes {
   double project = 0, sort = 0, bin = 0, blend = 0;
-  double blend_backward = 0, reduce_backward = 0, project_backward = 0;
+  double blend_backward = 0, project_backward = 0;
   int64_t forward_pairs = 0, backward_pairs = 0;  // (Gaussian, pixel) pairs whose exponent was evaluated
 };
 

@@ -15,8 +15,8 @@ constexpr double kSh0 = 0.28209479177387814;
 constexpr double kSh1 = 0.4886025119029199;
 constexpr double kSh2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792,
                             0.5462742152960396};
-constexpr double kSh3[7] = {-0.5900435899266435, 2.890611442640554,   -0.4570457994644658, 0.3731763325901154,
-                            -0.4570457994644658, 1.445305721320277,   -0.5900435899266435};
+constexpr double kSh3[7] = {-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
+                            -0.4570457994644658, 1.445305721320277, -0.5900435899266435};
 
 template <class S> DSMOE_HD void sh_basis(int degree, Vec3<S> d, S* basis) {
   basis[0] = S(kSh0);
@@ -67,10 +67,11 @@ template <class S> DSMOE_HD Vec3<S> sh_basis_backward(int degree, Vec3<S> d, con
   return out;
 }
 
-// Where a Gaussian's coefficients lie: degree 0 apart from the rest, or all in one array (then dc == rest - 3 in effect).
+// Where a Gaussian's coefficients lie: degree 0 apart from the rest, or all in one array (then dc == rest - 3 in
+// effect).
 template <class S> struct ShCoefficients {
-  S* dc;      // [3]
-  S* rest;    // [coefficients - 1, 3]
+  S* dc;    // [3]
+  S* rest;  // [coefficients - 1, 3]
 };
 
 // The viewing direction; a Gaussian at the camera centre has none and is seen as degree 0 sees it.
@@ -82,7 +83,8 @@ template <class S> DSMOE_HD Vec3<S> view_direction(Vec3<S> mean, const S* positi
 }
 
 // colour = max(0, 1/2 + sum_k basis_k sh_k)
-template <class S> DSMOE_HD void sh_color(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh, S* color) {
+template <class S>
+DSMOE_HD void sh_color(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh, S* color) {
   S inverse_length, basis[kMaxShCoefficients];
   sh_basis(degree, view_direction(mean, position, inverse_length), basis);
   for (int c = 0; c < 3; ++c) color[c] = S(0.5) + basis[0] * sh.dc[c];
@@ -95,8 +97,8 @@ template <class S> DSMOE_HD void sh_color(int degree, Vec3<S> mean, const S* pos
 // Writes dL/dsh for the active degree, where the outputs are given; returns dL/dmean (dL/dposition is its negative).
 // color is the forward's result: 0 means clamped, and a clamped channel passes no gradient.
 template <class S>
-DSMOE_HD Vec3<S> sh_color_backward(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh, const S* color,
-                                   const S* dL_dcolor, ShCoefficients<S> dL_dsh) {
+DSMOE_HD Vec3<S> sh_color_backward(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh,
+                                   const S* color, const S* dL_dcolor, ShCoefficients<S> dL_dsh) {
   S inverse_length, basis[kMaxShCoefficients], dL_dbasis[kMaxShCoefficients];
   const Vec3<S> direction = view_direction(mean, position, inverse_length);
   sh_basis(degree, direction, basis);

@@ -20,7 +20,9 @@ struct TileGrid {
 };
 
 // The integer nearest to x that lies in [low, high]; also defined where x is beyond every integer.
-template <class S> DSMOE_HD int clamp_to_int(S x, int low, int high) { return static_cast<int>(clamp(x, S(low), S(high))); }
+template <class S> DSMOE_HD int clamp_to_int(S x, int low, int high) {
+  return static_cast<int>(clamp(x, S(low), S(high)));
+}
 
 // The tiles that Inria's rasterizer gives to a Gaussian: the square of its radius, in whole tiles. In `alpha` mode a
 // pair counts only inside, although for opacity above 0.353 the 1/255 ellipse leaves it.
@@ -86,7 +88,8 @@ DSMOE_HD void for_each_tile_row(const Sym2<S>& conic, Vec2<S> mean, S squared_re
 }
 
 // Whether the ellipse meets a rectangle of pixel centres, borders included: the gated modes' rule for radius > 0.
-template <class S> DSMOE_HD bool meets_image(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, int width, int height) {
+template <class S>
+DSMOE_HD bool meets_image(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, int width, int height) {
   // Exact, without the bounds' slack: the least value of the quadratic form over the rectangle.
   const S x0 = -mean.x, x1 = S(width - 1) - mean.x, y0 = -mean.y, y1 = S(height - 1) - mean.y;
   if (x0 <= S(0) && S(0) <= x1 && y0 <= S(0) && S(0) <= y1) return true;

@@ -5,36 +5,22 @@
 
 namespace dsmoe {
 
-template <class S> struct Vec2 {
-  S x, y;
-};
+template <class S> struct Vec2 { S x, y; };
 
-template <class S> struct Vec3 {
-  S x, y, z;
-};
+template <class S> struct Vec3 { S x, y, z; };
 
-template <class S> struct Vec4 {
-  S x, y, z, w;
-};
+template <class S> struct Vec4 { S x, y, z, w; };
 
 // Symmetric matrices, upper triangle.
-template <class S> struct Sym2 {
-  S xx, xy, yy;
-};
+template <class S> struct Sym2 { S xx, xy, yy; };
 
-template <class S> struct Sym3 {
-  S xx, xy, xz, yy, yz, zz;
-};
+template <class S> struct Sym3 { S xx, xy, xz, yy, yz, zz; };
 
 // Rows of a 3x3 matrix.
-template <class S> struct Mat3 {
-  Vec3<S> r0, r1, r2;
-};
+template <class S> struct Mat3 { Vec3<S> r0, r1, r2; };
 
 // Rows of a 2x3 matrix.
-template <class S> struct Mat23 {
-  Vec3<S> r0, r1;
-};
+template <class S> struct Mat23 { Vec3<S> r0, r1; };
 
 template <class S> DSMOE_HD Vec3<S> operator+(Vec3<S> a, Vec3<S> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 template <class S> DSMOE_HD Vec3<S> operator-(Vec3<S> a, Vec3<S> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }

@@ -1,0 +1,118 @@
+// From image gradients to the gradients of every input: tiles write one record per instance, then each Gaussian sums
+// its own, which lie side by side. No atomics, so the result does not depend on the threads.
+#include <memory>
+#include <vector>
+
+#include "dsmoe/project.h"
+#include "dsmoe/rasterize.h"
+#include "parallel.h"
+#include "stopwatch.h"
+#include "tile_kernels.h"
+#include "tile_loop.h"
+
+namespace dsmoe {
+namespace cpu {
+namespace {
+
+constexpr int64_t kChunk = 512;  // Gaussians; also fixes the order in which the camera's gradient is summed
+
+template <class S> void set_zero(S* values, int64_t stride, int64_t i) {
+  if (values == nullptr) return;
+  for (int64_t k = 0; k < stride; ++k) values[i * stride + k] = S(0);
+}
+
+template <class S>
+void set_zero(const GaussianInputs<S>& inputs, const RasterConfig<S>& config, const GaussianGradients<S>& g,
+              int64_t i) {
+  set_zero(g.means3D, 3, i);
+  set_zero(g.means2D, 3, i);
+  set_zero(g.opacities, 1, i);
+  set_zero(g.scales, 3, i);
+  set_zero(g.rotations, 4, i);
+  set_zero(g.cov3D_precomp, 6, i);
+  set_zero(g.colors_precomp, config.num_channels, i);
+  set_zero(g.dc, 3, i);
+  set_zero(g.shs, 3 * inputs.num_sh, i);
+}
+
+// Sums the records of one Gaussian in double: a large Gaussian has thousands.
+template <class S> void sum_records(const S* records, int64_t count, int size, double* wide, S* sum) {
+  for (int k = 0; k < size; ++k) wide[k] = 0;
+  for (int64_t n = 0; n < count; ++n) {
+    for (int k = 0; k < size; ++k) wide[k] += records[n * size + k];
+  }
+  for (int k = 0; k < size; ++k) sum[k] = static_cast<S>(wide[k]);
+}
+
+template <class S> void add(const S* from, S* to, int count) {
+  for (int k = 0; k < count; ++k) to[k] += from[k];
+}
+
+}  // namespace
+
+template <class S>
+void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
+              const SavedForward<S>& saved, const ImageOutputs<S>& images, const ImageGradients<S>& image_gradients,
+              const GaussianGradients<S>& gradients, StageTimes* times) {
+  const int record = kNumGateMoments + config.num_features();
+  const int64_t num_instances = saved.instance_offsets[inputs.num_gaussians];
+  const std::unique_ptr<S[]> dL_dinstances(new S[num_instances * record]);
+  {
+    const Stopwatch stopwatch(times, &StageTimes::blend_backward);
+    const auto& kernels = tile_kernels<S>();
+    const int64_t tiles = num_tiles(camera.width, camera.height);
+    std::vector<S> dL_dbackground(gradients.background != nullptr ? tiles * config.num_channels : 0);
+    const int64_t pairs = for_each_tile<S>(
+        config.num_threads, camera.width, camera.height, config.num_features(),
+        [&](int64_t tile, int x, int y, S* scratch) {
+          S* tile_background = dL_dbackground.empty() ? nullptr : dL_dbackground.data() + tile * config.num_channels;
+          return kernels.backward(
+              {config, saved, images, image_gradients, camera.width, camera.height, x, y, saved.tile_offsets[tile],
+               saved.tile_offsets[tile + 1], dL_dinstances.get(), tile_background},
+              scratch);
+        });
+    if (times != nullptr) times->backward_pairs += pairs;
+    if (gradients.background != nullptr) {
+      std::vector<double> wide(config.num_channels);
+      sum_records(dL_dbackground.data(), tiles, config.num_channels, wide.data(), gradients.background);
+    }
+  }
+
+  const Stopwatch stopwatch(times, &StageTimes::project_backward);
+  const int64_t num_chunks = (inputs.num_gaussians + kChunk - 1) / kChunk;
+  std::vector<CameraGradient<S>> camera_shares(gradients.camera != nullptr ? num_chunks : 0);
+  parallel_for(config.num_threads, inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
+    std::vector<S> sum(record);
+    std::vector<double> wide(record);
+    CameraGradient<S>* share = camera_shares.empty() ? nullptr : &camera_shares[begin / kChunk];
+    for (int64_t i = begin; i < end; ++i) {
+      set_zero(inputs, config, gradients, i);
+      const int64_t first = saved.instance_offsets[i], count = saved.instance_offsets[i + 1] - first;
+      if (count == 0) continue;
+      sum_records(dL_dinstances.get() + first * record, count, record, wide.data(), sum.data());
+      const ProjectedGaussian<S>& gaussian = saved.projected[i];
+      const GateMoments<S> moments = {sum[0], sum[1], sum[2], sum[3], sum[4], sum[5]};
+      project_gaussian_backward(
+          inputs, camera, config, i, saved.features + i * config.num_features(),
+          {moments_backward(gaussian.conic, gaussian.opacity, moments), sum.data() + kNumGateMoments}, gradients,
+          share);
+    }
+  });
+  if (gradients.camera == nullptr) return;
+  *gradients.camera = {};
+  for (const auto& share : camera_shares) {
+    add(share.view, gradients.camera->view, 16);
+    add(share.projection, gradients.camera->projection, 16);
+    add(share.position, gradients.camera->position, 3);
+  }
+}
+
+#define DSMOE_INSTANTIATE(S)                                                                                         \
+  template void backward(const GaussianInputs<S>&, const Camera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
+                         const ImageOutputs<S>&, const ImageGradients<S>&, const GaussianGradients<S>&, StageTimes*);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cpu
+}  // namespace dsmoe

@@ -1,0 +1,100 @@
+// Stage 2: one depth sort of the visible Gaussians, then their tile instances into per-tile lists, front to back.
+#include <algorithm>
+#include <limits>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "../dispatch.h"
+#include "dsmoe/blend.h"
+#include "dsmoe/project.h"
+#include "dsmoe/rasterize.h"
+#include "parallel.h"
+#include "radix_sort.h"
+#include "stopwatch.h"
+
+namespace dsmoe {
+namespace cpu {
+namespace {
+
+// The Gaussians that have instances, nearest first where the mode needs it, else in the order of their indices.
+template <class S>
+std::vector<KeyedIndex<DepthBits<S>>> depth_order(int64_t num_gaussians, const RasterConfig<S>& config,
+                                                  const SavedForward<S>& saved) {
+  std::vector<KeyedIndex<DepthBits<S>>> order;
+  order.reserve(num_gaussians);
+  for (int64_t i = 0; i < num_gaussians; ++i) {
+    if (saved.instance_offsets[i + 1] == saved.instance_offsets[i]) continue;
+    order.push_back({depth_bits(saved.projected[i].depth), static_cast<int32_t>(i)});
+  }
+  dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
+    if (Blend<decltype(mode)::value>::kNeedsDepthOrder) radix_sort(order);
+  });
+  return order;
+}
+
+}  // namespace
+
+template <class S>
+void bin(int64_t num_gaussians, const Camera<S>& camera, const RasterConfig<S>& config, const SavedForward<S>& saved,
+         const int32_t* radii, StageTimes* times) {
+  std::vector<KeyedIndex<DepthBits<S>>> order;
+  {
+    const Stopwatch stopwatch(times, &StageTimes::sort);
+    order = depth_order(num_gaussians, config, saved);
+  }
+  const Stopwatch stopwatch(times, &StageTimes::bin);
+  const TileGrid grid(camera.width, camera.height);
+  const int64_t tiles = num_tiles(camera.width, camera.height);
+  const int64_t num_visible = static_cast<int64_t>(order.size());
+
+  // A counting sort by tile. Each thread owns a run of the depth order, and its own counters, so that the lists come
+  // out in depth order whatever the number of threads.
+  const int num_runs = static_cast<int>(std::clamp<int64_t>(num_visible / 256, 1, config.num_threads));
+  std::vector<std::vector<int64_t>> cursors(num_runs, std::vector<int64_t>(tiles));
+  auto for_each_instance = [&](int run, auto visit) {
+    for (int64_t k = num_visible * run / num_runs; k < num_visible * (run + 1) / num_runs; ++k) {
+      const int32_t i = order[k].index;
+      const ProjectedGaussian<S>& gaussian = saved.projected[i];
+      const TileRect bounds = tile_bounds(config.mode, camera, gaussian.mean, S(radii[i]));
+      for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds, [&](int x0, int x1, int y) {
+        for (int x = x0; x < x1; ++x) visit(i, static_cast<int64_t>(y) * grid.columns + x);
+      });
+    }
+  };
+  run_threads(num_runs, [&](int run) { for_each_instance(run, [&](int32_t, int64_t tile) { ++cursors[run][tile]; }); });
+  int64_t total = 0;
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+    saved.tile_offsets[tile] = total;
+    for (auto& cursor : cursors) {
+      const int64_t count = cursor[tile];
+      cursor[tile] = total;
+      total += count;
+    }
+    // Positions in a list are kept in the scalar type: they must be exact there.
+    if (total - saved.tile_offsets[tile] >= int64_t(1) << std::numeric_limits<S>::digits) {
+      throw std::overflow_error("rasterize: one tile holds " + std::to_string(total - saved.tile_offsets[tile]) +
+                                " Gaussians, more than this scalar type can count");
+    }
+  }
+  saved.tile_offsets[tiles] = total;
+  run_threads(num_runs, [&](int run) {
+    int32_t previous = -1;
+    int64_t slot = 0;
+    for_each_instance(run, [&](int32_t i, int64_t tile) {
+      if (i != previous) slot = saved.instance_offsets[i];
+      previous = i;
+      saved.instances[cursors[run][tile]++] = {i, static_cast<uint32_t>(slot++)};
+    });
+  });
+}
+
+#define DSMOE_INSTANTIATE(S)                                                                                   \
+  template void bin(int64_t, const Camera<S>&, const RasterConfig<S>&, const SavedForward<S>&, const int32_t*, \
+                    StageTimes*);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cpu
+}  // namespace dsmoe

@@ -1,0 +1,72 @@
+// Stage 1: every Gaussian to the image plane, and how many tiles each meets.
+#include "dsmoe/project.h"
+
+#include <limits>
+#include <stdexcept>
+#include <string>
+
+#include "dsmoe/rasterize.h"
+#include "parallel.h"
+#include "stopwatch.h"
+
+namespace dsmoe {
+namespace cpu {
+namespace {
+
+constexpr int64_t kChunk = 1024;  // Gaussians: enough to hide the hand-out, few enough to balance
+
+}  // namespace
+
+template <class S>
+int64_t project(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
+                const SavedForward<S>& saved, const ImageOutputs<S>& images, StageTimes* times) {
+  const Stopwatch stopwatch(times, &StageTimes::project);
+  const int num_features = config.num_features();
+  int64_t* counts = saved.instance_offsets + 1;
+  parallel_for(config.num_threads, inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      ProjectedGaussian<S>& gaussian = saved.projected[i];
+      const int32_t radius = project_gaussian(inputs, camera, config, i, gaussian, saved.features + i * num_features);
+      images.radii[i] = radius;
+      counts[i] = 0;
+      if (radius == 0) continue;
+      const TileRect bounds = tile_bounds(config.mode, camera, gaussian.mean, S(radius));
+      for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds,
+                        [&](int x0, int x1, int) { counts[i] += x1 - x0; });
+    }
+  });
+  saved.instance_offsets[0] = 0;
+  for (int64_t i = 0; i < inputs.num_gaussians; ++i) counts[i] += saved.instance_offsets[i];
+  const int64_t num_instances = saved.instance_offsets[inputs.num_gaussians];
+  if (num_instances > std::numeric_limits<int32_t>::max()) {
+    throw std::overflow_error("rasterize: " + std::to_string(num_instances) + " tile instances need " +
+                              std::to_string(num_instances * sizeof(TileInstance)) +
+                              " bytes; the CPU backend takes at most 2147483647 instances. Are the scales right?");
+  }
+  return num_instances;
+}
+
+template <class S> void mark_visible(int64_t num_gaussians, const S* means3D, const Camera<S>& camera, bool* visible) {
+  for (int64_t i = 0; i < num_gaussians; ++i) {
+    visible[i] = transform_point(camera.view, load3(means3D + 3 * i)).z > camera.near;
+  }
+}
+
+template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int num_channels) {
+  for (int64_t i = 0; i < inputs.num_gaussians; ++i) {
+    if (!attributes_finite(inputs, num_channels, i)) return i;
+  }
+  return -1;
+}
+
+#define DSMOE_INSTANTIATE(S)                                                                                           \
+  template int64_t project(const GaussianInputs<S>&, const Camera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
+                           const ImageOutputs<S>&, StageTimes*);                                                       \
+  template void mark_visible(int64_t, const S*, const Camera<S>&, bool*);                                              \
+  template int64_t first_non_finite(const GaussianInputs<S>&, int);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cpu
+}  // namespace dsmoe

@@ -1,0 +1,28 @@
+// Adds the seconds of its own life to a stage, where somebody wants to know.
+#pragma once
+
+#include <chrono>
+
+#include "dsmoe/rasterize.h"
+
+namespace dsmoe {
+namespace cpu {
+
+class Stopwatch {
+ public:
+  Stopwatch(StageTimes* times, double StageTimes::*stage)
+      : seconds_(times != nullptr ? &(times->*stage) : nullptr), start_(Clock::now()) {}
+  ~Stopwatch() {
+    if (seconds_ != nullptr) *seconds_ += std::chrono::duration<double>(Clock::now() - start_).count();
+  }
+  Stopwatch(const Stopwatch&) = delete;
+  Stopwatch& operator=(const Stopwatch&) = delete;
+
+ private:
+  using Clock = std::chrono::steady_clock;
+  double* seconds_;
+  Clock::time_point start_;
+};
+
+}  // namespace cpu
+}  // namespace dsmoe

@@ -1,0 +1,64 @@
+// The blend of one tile, forward and backward: compiled once per instruction set, chosen at run time.
+#pragma once
+
+#include <cstdint>
+
+#include "dsmoe/params.h"
+
+namespace dsmoe {
+namespace cpu {
+
+constexpr int kTilePixels = kTileSize * kTileSize;
+
+template <class S> struct ForwardTile {
+  const RasterConfig<S>& config;
+  const SavedForward<S>& saved;
+  const ImageOutputs<S>& images;
+  int width, height;
+  int tile_x, tile_y;
+  int64_t begin, end;  // the tile's instances
+};
+
+template <class S> struct BackwardTile {
+  const RasterConfig<S>& config;
+  const SavedForward<S>& saved;
+  const ImageOutputs<S>& images;
+  const ImageGradients<S>& dL_dimages;
+  int width, height;
+  int tile_x, tile_y;
+  int64_t begin, end;
+  S* dL_dinstances;   // [I, kNumGateMoments + F] by slot; the tile's are written whole
+  S* dL_dbackground;  // [C] the tile's share, or null
+};
+
+// Numbers of scratch memory that one tile needs, for either direction.
+inline int64_t tile_scratch_size(int num_features) {
+  return static_cast<int64_t>(kTilePixels) * (num_features + 5) + 16 * num_features;
+}
+
+// Both return the number of (Gaussian, pixel) pairs whose exponent they evaluated. scratch: 64-byte aligned.
+template <class S> struct TileKernels {
+  int64_t (*forward)(const ForwardTile<S>& tile, S* scratch);
+  int64_t (*backward)(const BackwardTile<S>& tile, S* scratch);
+};
+
+// One of these per instruction set that the compiler can build for.
+struct SimdLevel {
+  const char* name;
+  TileKernels<float> float_kernels;
+  TileKernels<double> double_kernels;
+};
+extern const SimdLevel kBaselineLevel;
+#if defined(__x86_64__)
+extern const SimdLevel kAvx2Level, kAvx512Level;
+#endif
+
+// The best level that this processor has, or the lower one that DSMOE_SIMD names; decided once.
+const SimdLevel& current_simd_level();
+
+template <class S> const TileKernels<S>& tile_kernels();
+template <> inline const TileKernels<float>& tile_kernels() { return current_simd_level().float_kernels; }
+template <> inline const TileKernels<double>& tile_kernels() { return current_simd_level().double_kernels; }
+
+}  // namespace cpu
+}  // namespace dsmoe

@@ -1,0 +1,35 @@
+// The tile kernels for AVX-512: 64-byte packs. Empty where the target is not x86-64.
+#if defined(__x86_64__)
+
+// Everything below is compiled for this instruction set, so nothing here may define code that other files share:
+// the math headers are always inlined, and the standard headers come first.
+#include <cmath>
+#include <cstdint>
+#include <type_traits>
+
+#if defined(__clang__)
+#pragma clang attribute push(__attribute__((target("avx512f,avx512vl,avx512bw,avx512dq,avx2,fma"))), \
+                             apply_to = function)
+#else
+#pragma GCC push_options
+#pragma GCC target("avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")
+#endif
+
+#define DSMOE_SIMD avx512
+#define DSMOE_SIMD_BYTES 64
+#include "tile_kernels_impl.h"
+
+namespace dsmoe {
+namespace cpu {
+const SimdLevel kAvx512Level = {
+    "avx512", {avx512::forward<float>, avx512::backward<float>}, {avx512::forward<double>, avx512::backward<double>}};
+}  // namespace cpu
+}  // namespace dsmoe
+
+#if defined(__clang__)
+#pragma clang attribute pop
+#else
+#pragma GCC pop_options
+#endif
+
+#endif  // __x86_64__
