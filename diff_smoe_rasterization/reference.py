@@ -1,0 +1,380 @@
+"""The rasterizer written as its own specification: plain torch, formula after formula, gradients by autograd.
+
+It is slow, runs in float32 and float64, imports no extension and shares no constant with the C++ core, so that the
+core can be tested against it. Equation numbers are those of "3D SMoE Splatting for Edge-aware Realtime Radiance Field
+Rendering". Read it in this order: `rasterize`, `project`, `pair_counts`, `pair_alphas`, `blend`.
+
+What the paper leaves open is decided here:
+
+- Gaussians are sorted by view depth; equal depths keep the order of the input.
+- A Gaussian is culled (radius 0, gradients exactly 0) where any value of its attributes, used or not, is NaN or
+  infinite, its view depth is not beyond `near`, its projected covariance is not positive definite, its pixel position,
+  conic or colour is not finite (a Gaussian at `campos` has no view direction), or its footprint misses the image.
+- Opacity plays no part in culling or in the radius; pairs with opacity <= 0 do not count.
+- Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
+- The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
+- The value of `means2D` is ignored; it only receives a gradient.
+"""
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Optional
+
+import torch
+from torch.utils.checkpoint import checkpoint
+
+from .settings import OUTPUTS, Rendering, resolve_blend_mode
+
+
+def _float32(value):
+    return torch.tensor(value, dtype=torch.float32).item()
+
+
+LOW_PASS = 0.3  # px^2 on the diagonal of cov2D: a splat is never narrower than about a pixel (3DGS)
+COMPENSATION_MIN = _float32(2.5e-5)  # least square of the antialiasing factor (3DGS of 2024)
+FRUSTUM_MARGIN = 1.3  # the Jacobian is taken at most this many tan(fov) off axis, where it still fits (3DGS)
+W_EPSILON = 1e-7  # added to the clip w before dividing (3DGS)
+EIGENVALUE_SPREAD_MIN = _float32(0.1)  # px^4 under the root of the radius rule (3DGS)
+TILE = 16  # px; the tiles of 3DGS, whose rectangle is part of its image
+ALPHA_MAX = _float32(0.99)  # no Gaussian is opaque, else T would reach 0 (3DGS)
+ALPHA_MIN = _float32(1 / 255)  # less changes no 8-bit image (3DGS)
+KERNEL_MIN = _float32(1e-5)  # SMoE modes cut on G, not on alpha: faint tails decide where gates are weak (paper)
+TRANSMITTANCE_MIN = _float32(1e-4)  # a pixel this dark behind what it has is finished (3DGS)
+GATE_SUM_MIN = _float32(1e-30)  # under this, and only then, a pixel has no gate; far above float32's smallest number
+BLOCK = 32  # px; pixels are processed in squares of this side, for speed alone
+
+
+class Gaussians(NamedTuple):
+    """The inputs, one row a Gaussian; an input that was not given is None."""
+
+    means3D: torch.Tensor  # [N, 3] world
+    means2D: torch.Tensor  # [N, 3] zeros that receive the gradient in normalised device coordinates
+    opacities: torch.Tensor  # [N]
+    shs: Optional[torch.Tensor]  # [N, K, 3]
+    colors_precomp: Optional[torch.Tensor]  # [N, C]
+    scales: Optional[torch.Tensor]  # [N, 3] standard deviations, world
+    rotations: Optional[torch.Tensor]  # [N, 4] quaternions w, x, y, z
+    cov3D_precomp: Optional[torch.Tensor]  # [N, 6] xx, xy, xz, yy, yz, zz
+
+
+class Splats(NamedTuple):
+    """Projected Gaussians, one row each."""
+
+    position: torch.Tensor  # [n, 2] px; the centre of pixel (0, 0) is at (0, 0)
+    depth: torch.Tensor  # [n] view z
+    covariance: torch.Tensor  # [n, 3] px^2: xx, xy, yy, low-pass included
+    conic: torch.Tensor  # [n, 3] 1/px^2: the inverse of it
+    opacity: torch.Tensor  # [n] compensated if antialiasing
+    color: torch.Tensor  # [n, C]
+
+
+def _rows(table, index):
+    return type(table)(*(None if column is None else column[index] for column in table))
+
+
+def rasterize(means3D, opacities, settings, means2D=None, dc=None, shs=None, colors_precomp=None, scales=None,
+              rotations=None, cov3D_precomp=None, outputs=()):
+    """Renders Gaussians; the arguments, shapes and results of `diff_smoe_rasterization.rasterize`.
+
+    Args:
+        means3D: [N, 3] centres, world.
+        opacities: [N, 1] or [N]; may exceed 1.
+        settings: GaussianRasterizationSettings; viewmatrix, projmatrix, campos and bg are differentiable.
+        means2D: [N, 3]; its gradient is dL/d(pixel) times (0.5 width, 0.5 height), z = 0.
+        dc, shs: [N, 1, 3] and [N, K - 1, 3], or shs alone [N, K, 3]; K >= (sh_degree + 1)^2.
+        colors_precomp: [N, C] instead of dc and shs.
+        scales, rotations: [N, 3] and [N, 4]; quaternions w, x, y, z are used as given.
+        cov3D_precomp: [N, 6] xx, xy, xz, yy, yz, zz, instead of scales and rotations.
+        outputs: names from OUTPUTS, the optional images to return.
+    All tensors have the type of means3D, float32 or float64. None or a tensor of shape [0] is an absent input.
+
+    Returns: Rendering.
+    Raises ValueError for both or neither of shs and colors_precomp, of scales with rotations and cov3D_precomp; for an
+    unknown output or blend mode; under `strict` for a value that is not finite; under `prefiltered` for a Gaussian
+    that is not beyond `near`.
+    """
+    mode = resolve_blend_mode(settings.blend_mode)
+    if not set(outputs) <= set(OUTPUTS):
+        raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
+    gaussians = _gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
+    with torch.no_grad():
+        radii, order = visible(gaussians, settings, mode)
+    splats = project(_rows(gaussians, order), settings)
+    image = _render_blocks(splats, settings, mode)
+    channels = settings.bg.shape[0]
+    images = dict(zip(OUTPUTS, image[channels:].split(1)))
+    return Rendering(image[:channels], radii, **{name: images[name] for name in outputs})
+
+
+def _gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp):
+    def given(tensor):
+        return None if tensor is None or tensor.shape == (0,) else tensor
+
+    means2D, dc, shs, colors_precomp = given(means2D), given(dc), given(shs), given(colors_precomp)
+    scales, rotations, cov3D_precomp = given(scales), given(rotations), given(cov3D_precomp)
+    if dc is not None:
+        shs = dc if shs is None else torch.cat([dc, shs], 1)
+    if (shs is None) == (colors_precomp is None):
+        raise ValueError("rasterize: give either shs or colors_precomp, and not both")
+    if (scales is None) != (rotations is None) or (scales is None) == (cov3D_precomp is None):
+        raise ValueError("rasterize: give either scales with rotations or cov3D_precomp, and not both")
+    means2D = torch.zeros_like(means3D) if means2D is None else means2D - means2D.detach()
+    return Gaussians(means3D, means2D, opacities.reshape(-1), shs, colors_precomp, scales, rotations, cov3D_precomp)
+
+
+def visible(gaussians, settings, mode):
+    """Returns radii [N] int32 and the rows of the visible Gaussians, nearest first [n]."""
+    finite = torch.ones_like(gaussians.opacities, dtype=torch.bool)
+    for name, column in zip(gaussians._fields, gaussians):
+        if column is None or name == "means2D":
+            continue
+        column_finite = torch.isfinite(column).flatten(1).all(1) if column.dim() > 1 else torch.isfinite(column)
+        if settings.strict and not column_finite.all():
+            index = (~column_finite).nonzero()[0].item()
+            raise ValueError(f"rasterize: {name}[{index}] is not finite")
+        finite &= column_finite
+    finite = finite.nonzero()[:, 0]
+
+    splats = project(_rows(gaussians, finite), settings)
+    in_front = splats.depth > _float32(settings.near)
+    if settings.prefiltered and not in_front.all():
+        index = finite[~in_front][0].item()
+        raise ValueError(f"rasterize: prefiltered is set, but means3D[{index}] is not beyond the near plane")
+    xx, xy, yy = splats.covariance.unbind(1)
+    det = xx * yy - xy * xy
+    kept = in_front & (xx > 0) & (det > 0) & torch.isfinite(det)
+    for column in splats:
+        kept &= torch.isfinite(column).reshape(len(column), -1).all(1)
+    kept &= footprint_meets(splats, 0, 0, settings.image_width - 1, settings.image_height - 1, settings, mode)
+    kept = kept.nonzero()[:, 0]
+
+    radii = torch.zeros(len(gaussians.means3D), dtype=torch.int32, device=finite.device)
+    largest = torch.iinfo(torch.int32).max
+    radii[finite[kept]] = radius(splats.covariance[kept]).double().clamp(max=largest).to(torch.int32)
+    nearest_first = torch.sort(splats.depth[kept], stable=True)[1]
+    return radii, finite[kept][nearest_first]
+
+
+def project(gaussians, settings):
+    """Projects Gaussians to the image plane (Eq. 1, 2; EWA splatting as in 3DGS)."""
+    width, height = settings.image_width, settings.image_height
+    view, clip = _transform(gaussians.means3D, settings.viewmatrix), _transform(gaussians.means3D, settings.projmatrix)
+    ndc = clip[:, :2] / (clip[:, 3:] + W_EPSILON) + gaussians.means2D[:, :2]
+    size = ndc.new_tensor([width, height])
+    position = ((ndc + 1) * size - 1) / 2
+
+    x, y, z = view[:, :3].unbind(1)
+    limit_x, limit_y = FRUSTUM_MARGIN * settings.tanfovx, FRUSTUM_MARGIN * settings.tanfovy
+    slope_x, slope_y = (x / z).clamp(-limit_x, limit_x), (y / z).clamp(-limit_y, limit_y)
+    focal_x, focal_y = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([torch.stack([focal_x / z, zero, -focal_x * slope_x / z], 1),
+                            torch.stack([zero, focal_y / z, -focal_y * slope_y / z], 1)], 1)
+    to_image = jacobian @ settings.viewmatrix[:3, :3].T
+    raw = to_image @ covariance3D(gaussians, settings.scale_modifier) @ to_image.transpose(1, 2)
+    raw_xx, xy, raw_yy = raw[:, 0, 0], raw[:, 0, 1], raw[:, 1, 1]
+    xx, yy = raw_xx + LOW_PASS, raw_yy + LOW_PASS
+    det = xx * yy - xy * xy
+    opacity = gaussians.opacities
+    if settings.antialiasing:
+        opacity = opacity * ((raw_xx * raw_yy - xy * xy) / det).clamp(min=COMPENSATION_MIN).sqrt()
+    return Splats(position, z, torch.stack([xx, xy, yy], 1), torch.stack([yy, -xy, xx], 1) / det[:, None], opacity,
+                  color(gaussians, settings))
+
+
+def _transform(points, matrix):
+    return torch.cat([points, torch.ones_like(points[:, :1])], 1) @ matrix
+
+
+def covariance3D(gaussians, scale_modifier):
+    """Returns R S S^T R^T [n, 3, 3], or the given covariance, which scale_modifier does not touch."""
+    if gaussians.cov3D_precomp is not None:
+        xx, xy, xz, yy, yz, zz = gaussians.cov3D_precomp.unbind(1)
+        return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], 1).reshape(-1, 3, 3)
+    w, x, y, z = gaussians.rotations.unbind(1)
+    rotation = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+                            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1).reshape(-1, 3, 3)
+    axes = rotation * (scale_modifier * gaussians.scales)[:, None, :]
+    return axes @ axes.transpose(1, 2)
+
+
+def color(gaussians, settings):
+    """Returns the experts [n, C]: the given colours, or spherical harmonics plus 0.5, at least 0."""
+    if gaussians.colors_precomp is not None:
+        return gaussians.colors_precomp
+    basis = sh_basis(settings.sh_degree, gaussians.means3D - settings.campos)
+    return (0.5 + torch.einsum("nk,nkc->nc", basis, gaussians.shs[:, :basis.shape[1]])).clamp(min=0)
+
+
+def sh_basis(degree, offset):
+    """Returns the real spherical harmonics of degree 0 to 3 [n, (degree + 1)^2] in the direction of offset [n, 3].
+
+    The signs are those of 3DGS, with the Condon-Shortley phase.
+    """
+    constant = torch.ones_like(offset[:, 0])
+    bands = [math.sqrt(1 / (4 * math.pi)) * constant]
+    if degree > 0:
+        x, y, z = (offset / offset.norm(dim=1, keepdim=True)).unbind(1)
+        factor = math.sqrt(3 / (4 * math.pi))
+        bands += [-factor * y, factor * z, -factor * x]
+    if degree > 1:
+        factor = math.sqrt(15 / (4 * math.pi))
+        bands += [factor * x * y, -factor * y * z, math.sqrt(5 / (16 * math.pi)) * (2 * z * z - x * x - y * y),
+                  -factor * x * z, factor / 2 * (x * x - y * y)]
+    if degree > 2:
+        outer, inner = math.sqrt(35 / (32 * math.pi)), math.sqrt(21 / (32 * math.pi))
+        factor = math.sqrt(105 / (4 * math.pi))
+        bands += [-outer * y * (3 * x * x - y * y), factor * x * y * z, -inner * y * (4 * z * z - x * x - y * y),
+                  math.sqrt(7 / (16 * math.pi)) * z * (2 * z * z - 3 * x * x - 3 * y * y),
+                  -inner * x * (4 * z * z - x * x - y * y), factor / 2 * z * (x * x - y * y),
+                  -outer * x * (x * x - 3 * y * y)]
+    return torch.stack(bands, 1)
+
+
+def radius(covariance):
+    """Returns the 3-sigma radius of the longer axis in whole pixels [n], as a floating-point number (3DGS)."""
+    xx, xy, yy = covariance.unbind(1)
+    mid = (xx + yy) / 2
+    det = xx * yy - xy * xy
+    return torch.ceil(3 * torch.sqrt(mid + torch.sqrt((mid * mid - det).clamp(min=EIGENVALUE_SPREAD_MIN))))
+
+
+def tile_rectangle(splats, settings):
+    """Returns the first tile and the tile past the last [n, 2] each, in x and y, that 3DGS bins a splat into.
+
+    3DGS truncates toward zero; after the clamp to the grid that equals the floor.
+    """
+    grid = splats.position.new_tensor([-(-settings.image_width // TILE), -(-settings.image_height // TILE)])
+    reach = radius(splats.covariance)[:, None]
+    first = torch.floor((splats.position - reach) / TILE)
+    past = torch.floor((splats.position + reach + (TILE - 1)) / TILE)
+    zero = torch.zeros_like(grid)
+    return first.clamp(zero, grid), past.clamp(zero, grid)
+
+
+def footprint_meets(splats, left, top, right, bottom, settings, mode, slack=0.0):
+    """Returns whether each footprint meets a rectangle of pixel centres, edges included [n].
+
+    The footprint is the tile rectangle of 3DGS in "alpha" and the ellipse G >= 1e-5 in the SMoE modes, where slack is
+    added to d^T Sigma^-1 d.
+    """
+    low, high = splats.position.new_tensor([left, top]), splats.position.new_tensor([right, bottom])
+    if mode == "alpha":
+        first, past = tile_rectangle(splats, settings)
+        return ((past > first) & (first * TILE <= high) & (past * TILE > low)).all(1)
+    return _closest_squared(splats, left, top, right, bottom) <= -2 * math.log(KERNEL_MIN) + slack
+
+
+def _closest_squared(splats, left, top, right, bottom):
+    """Returns the smallest d^T Sigma^-1 d [n] over a rectangle: 0 inside, else on one of its edges, as it is convex."""
+    x, y = splats.position.unbind(1)
+    a, b, c = splats.conic.unbind(1)
+    candidates = []
+    for edge in (left, right):
+        dx = edge - x
+        candidates.append((dx, (y - b / c * dx).clamp(top, bottom) - y))
+    for edge in (top, bottom):
+        dy = edge - y
+        candidates.append(((x - b / a * dy).clamp(left, right) - x, dy))
+    on_edges = torch.stack([a * dx * dx + 2 * b * dx * dy + c * dy * dy for dx, dy in candidates]).min(0)[0]
+    inside = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+    return on_edges.masked_fill(inside, 0)
+
+
+class _PassThroughClamp(torch.autograd.Function):
+    """min(ALPHA_MAX, x) whose gradient is passed straight through, as in 3DGS."""
+
+    @staticmethod
+    def forward(ctx, raw):
+        return raw.clamp(max=ALPHA_MAX)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return gradient
+
+
+def pair_counts(splats, x, y, settings, mode):
+    """Returns which pairs of Gaussian and pixel count [n, pixels]; x, y [pixels] are pixel coordinates.
+
+    A pair counts where o > 0, power <= 0 and, in "alpha", alpha >= 1/255 within the tile rectangle of 3DGS; in the
+    SMoE modes G >= 1e-5 and alpha >= alpha_min.
+    """
+    opacity = splats.opacity[:, None]
+    power = _power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y)
+    kernel = torch.exp(power)
+    alpha = (opacity * kernel).clamp(max=ALPHA_MAX)
+    counts = (opacity > 0) & (power <= 0)
+    if mode != "alpha":
+        return counts & (kernel >= KERNEL_MIN) & (alpha >= _float32(settings.alpha_min))
+    (first_x, first_y), (past_x, past_y) = (edge.T[:, :, None] for edge in tile_rectangle(splats, settings))
+    tile_x, tile_y = torch.floor(x / TILE), torch.floor(y / TILE)
+    counts &= (tile_x >= first_x) & (tile_x < past_x) & (tile_y >= first_y) & (tile_y < past_y)
+    return counts & (alpha >= ALPHA_MIN)
+
+
+def pair_alphas(splats, x, y, counts):
+    """Returns the gate logits alpha_i = min(0.99, o_i G_i) (Eq. 1) [n, pixels], 0 for pairs that do not count.
+
+    Those pairs are moved to the centre first: far away their derivatives overflow, and 0 times infinity is NaN.
+    """
+    dx = (splats.position[:, :1] - x).masked_fill(~counts, 0)
+    dy = (splats.position[:, 1:] - y).masked_fill(~counts, 0)
+    kernel = torch.exp(_power(splats.conic, dx, dy))
+    return _PassThroughClamp.apply(splats.opacity[:, None] * kernel).masked_fill(~counts, 0)
+
+
+def _power(conic, dx, dy):
+    a, b, c = conic.T[:, :, None]
+    return -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+
+
+def blend(alpha, color, depth, bg, mode):
+    """Blends the Gaussians of every pixel, front to back.
+
+    alpha: [n, pixels]; color: [n, C]; depth: [n]; bg: [C].
+    Returns [C + 3, pixels]: colour, alpha, depth, inverse depth.
+    """
+    transmittance_behind = torch.cumprod(1 - alpha, 0)
+    transmittance = torch.cat([torch.ones_like(alpha[:1]), transmittance_behind])[:len(alpha)]  # T_i, Eq. 4
+    stopped = transmittance_behind < TRANSMITTANCE_MIN  # from the Gaussian on that would saturate the pixel
+    weight = alpha if mode == "smoe_std" else (alpha * transmittance).masked_fill(stopped, 0)
+    gate_sum = weight.sum(0) if mode in ("alpha", "smoe") else alpha.sum(0)
+    has_gate = gate_sum >= GATE_SUM_MIN
+    safe_sum = gate_sum.masked_fill(~has_gate, 1)
+
+    blended = color.T @ weight
+    if mode == "alpha":  # Eq. 3
+        final_transmittance = (1 - alpha).masked_fill(stopped, 1).prod(0)
+        image = blended + final_transmittance * bg[:, None]
+    else:  # Eq. 7 (smoe), 8 (smoe_tn), 6 (smoe_std), which differ in weight and gate_sum
+        image = torch.where(has_gate, blended / safe_sum, bg[:, None])
+
+    expected_depth = (depth @ weight).masked_fill(~has_gate, 0) / safe_sum
+    inverse_depth = (1 / depth) @ weight
+    if mode != "alpha":
+        inverse_depth = inverse_depth.masked_fill(~has_gate, 0) / safe_sum
+    return torch.cat([image, torch.stack([gate_sum, expected_depth, inverse_depth])])
+
+
+def _render_blocks(splats, settings, mode):
+    """Returns [C + 3, height, width]; each block keeps only its inputs for the backward and is computed again there."""
+    def block(left, top, right, bottom, *columns):
+        splats = Splats(*columns)
+        x = torch.arange(left, right).to(splats.depth).repeat(bottom - top)
+        y = torch.arange(top, bottom).to(splats.depth).repeat_interleave(right - left)
+        with torch.no_grad():
+            # The slack keeps rounding in this shortcut from losing a pair; `pair_counts` alone decides.
+            near = footprint_meets(splats, left, top, right - 1, bottom - 1, settings, mode, slack=1.0)
+            counts = pair_counts(_rows(splats, near), x, y, settings, mode)
+        alpha = pair_alphas(_rows(splats, near), x, y, counts)
+        image = blend(alpha, splats.color[near], splats.depth[near], settings.bg, mode)
+        return image.reshape(-1, bottom - top, right - left)
+
+    bands = []
+    for top in range(0, settings.image_height, BLOCK):
+        bottom = min(top + BLOCK, settings.image_height)
+        bands.append(torch.cat([
+            checkpoint(block, left, top, min(left + BLOCK, settings.image_width), bottom, *splats, use_reentrant=False)
+            for left in range(0, settings.image_width, BLOCK)], 2))
+    return torch.cat(bands, 1)

@@ -1,0 +1,145 @@
+"""Random scenes for the tests: a camera that looks at a cloud of Gaussians, some behind it, some out of its sight."""
+from __future__ import annotations
+
+import math
+from typing import Dict, NamedTuple
+
+import torch
+
+from diff_smoe_rasterization.settings import GaussianRasterizationSettings
+
+CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
+
+
+class Scene(NamedTuple):
+    """Arguments of one call of `rasterize`."""
+
+    inputs: Dict[str, torch.Tensor]
+    settings: GaussianRasterizationSettings
+
+    def to(self, dtype):
+        """Returns the scene with every tensor of the given type."""
+        camera = {name: getattr(self.settings, name).detach().to(dtype) for name in CAMERA_FIELDS}
+        inputs = {name: tensor.detach().to(dtype) for name, tensor in self.inputs.items()}
+        return Scene(inputs, self.settings._replace(**camera))
+
+    def with_settings(self, **fields):
+        return self._replace(settings=self.settings._replace(**fields))
+
+    def with_inputs(self, **tensors):
+        return self._replace(inputs={**self.inputs, **tensors})
+
+    def rows(self, index):
+        """Returns the scene with a selection of its Gaussians."""
+        return self._replace(inputs={name: tensor[index] for name, tensor in self.inputs.items()})
+
+    def requiring_grad(self, camera=True):
+        """Returns the scene with every tensor a fresh leaf that requires its gradient."""
+        inputs = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in self.inputs.items()}
+        if not camera:
+            return self._replace(inputs=inputs)
+        fields = {name: getattr(self.settings, name).detach().clone().requires_grad_(True) for name in CAMERA_FIELDS}
+        return Scene(inputs, self.settings._replace(**fields))
+
+    def leaves(self):
+        """Returns the tensors that require their gradient, by name."""
+        tensors = dict(self.inputs, **{name: getattr(self.settings, name) for name in CAMERA_FIELDS})
+        return {name: tensor for name, tensor in tensors.items() if tensor.requires_grad}
+
+
+def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, principal_point=(0.0, 0.0), degree=0, bg=None,
+                    dtype=torch.float64, **fields):
+    """Returns settings of a camera that looks from position to the origin, matrices transposed as trainers pass them.
+
+    principal_point: offset from the image centre in pixels.
+    """
+    position = torch.tensor(position, dtype=torch.float64)
+    forward = -position / position.norm()
+    right = torch.linalg.cross(torch.tensor([0.1, 1.0, 0.0], dtype=torch.float64), forward)
+    right = right / right.norm()
+    down = torch.linalg.cross(forward, right)
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3] = torch.stack([right, down, forward], 1)
+    view[3, :3] = -position @ view[:3, :3]
+
+    tanfovx = math.tan(fov_x / 2)
+    tanfovy = tanfovx * height / width
+    near, far = 0.01, 100.0
+    projection = torch.zeros(4, 4, dtype=torch.float64)
+    projection[0, 0], projection[1, 1] = 1 / tanfovx, 1 / tanfovy
+    projection[2, 0], projection[2, 1] = 2 * principal_point[0] / width, 2 * principal_point[1] / height
+    projection[2, 2], projection[2, 3], projection[3, 2] = far / (far - near), 1, -far * near / (far - near)
+
+    bg = torch.tensor([0.2, 0.5, 0.8]) if bg is None else bg
+    return GaussianRasterizationSettings(
+        image_height=height, image_width=width, tanfovx=tanfovx, tanfovy=tanfovy, bg=bg.to(dtype), scale_modifier=1.0,
+        viewmatrix=view.to(dtype), projmatrix=(view @ projection).to(dtype), sh_degree=degree,
+        campos=position.to(dtype), prefiltered=False, debug=False, **fields)
+
+
+def random_scene(mode, num_gaussians=120, width=50, height=37, seed=0, degree=2, channels=None, covariance="scales",
+                 split_dc=False, scale=0.12, opacity=(0.02, 1.2), dtype=torch.float64, **camera):
+    """Returns a scene of a random cloud in a box that is larger than the view, so that about a third is out of sight.
+
+    channels: number of channels of colors_precomp; None for spherical harmonics.
+    covariance: "scales" for scales and rotations, "cov3D" for cov3D_precomp.
+    scale: median standard deviation, world; axes vary by a factor of 3 up and down.
+    Every value is a float32 number, so that the same scene exists in both types.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=generator)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    means3D = uniform(-2.2, 2.2, num_gaussians, 3)
+    means3D[: num_gaussians // 12] -= torch.tensor([0.0, 0.0, 6.0])
+    inputs = {"means3D": means3D, "means2D": torch.zeros(num_gaussians, 3),
+              "opacities": uniform(opacity[0], opacity[1], num_gaussians, 1)}
+    if channels is not None:
+        inputs["colors_precomp"] = uniform(0.0, 1.0, num_gaussians, channels)
+        camera.setdefault("bg", uniform(0.0, 1.0, channels))
+    else:
+        shs = 0.4 * normal(num_gaussians, (degree + 1) ** 2, 3)
+        if split_dc:
+            inputs["dc"], inputs["shs"] = shs[:, :1].contiguous(), shs[:, 1:].contiguous()
+        else:
+            inputs["shs"] = shs
+    scales = scale * torch.exp(uniform(-1.1, 1.1, num_gaussians, 3))
+    rotations = normal(num_gaussians, 4)
+    rotations = uniform(0.95, 1.05, num_gaussians, 1) * rotations / rotations.norm(dim=1, keepdim=True)
+    if covariance == "scales":
+        inputs["scales"], inputs["rotations"] = scales, rotations
+    else:
+        axes = torch.linalg.qr(normal(num_gaussians, 3, 3))[0] * scales[:, None, :]
+        full = axes @ axes.transpose(1, 2)
+        inputs["cov3D_precomp"] = torch.stack([full[:, i, j] for i in range(3) for j in range(i, 3)], 1)
+    settings = camera_settings(width, height, degree=degree, dtype=torch.float32, blend_mode=mode, **camera)
+    return Scene(inputs, settings).to(dtype)
+
+
+def assert_not_empty(rendering, settings):
+    """Fails for a scene that tests nothing: nothing visible, nothing culled, or an image that is all background."""
+    assert (rendering.radii > 0).sum() >= 5
+    background = settings.bg.detach()[:, None, None]
+    covered = ((rendering.color.detach() - background).abs() > 1e-3).any(0).double().mean()
+    assert covered > 0.3, f"only {covered:.0%} of the pixels differ from the background"
+
+
+def random_weights(rendering, outputs=(), seed=1):
+    """Returns fixed random gradients [C, H, W], ... for the colour and the optional outputs of a rendering."""
+    generator = torch.Generator().manual_seed(seed)
+    images = [rendering.color] + [getattr(rendering, name) for name in outputs]
+    return images, [torch.randn(image.shape, generator=generator, dtype=torch.float64).to(image) for image in images]
+
+
+def gradients(function, scene, outputs=(), camera=True):
+    """Renders with `function` and returns (rendering, gradients by name) for fixed random image gradients."""
+    scene = scene.requiring_grad(camera)
+    rendering = function(settings=scene.settings, outputs=outputs, **scene.inputs)
+    images, weights = random_weights(rendering, outputs)
+    leaves = scene.leaves()
+    values = torch.autograd.grad(images, list(leaves.values()), weights)
+    return rendering, dict(zip(leaves, values))
