@@ -1,0 +1,199 @@
+"""Every option of a training run in one dataclass; the command line, OUT/config.json and resume all read it."""
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+from dataclasses import dataclass, field
+from typing import Any, Dict, List, Optional
+
+from ..settings import BLEND_MODES, resolve_blend_mode
+from .files import write_text_atomically
+
+CONFIG_NAME = "config.json"
+SCHEDULES = ("3dgs", "steady")
+PRINCIPAL_POINTS = ("scene", "centre")
+
+
+def _option(default: Any, text: str, **extra: Any) -> Any:
+    """A dataclass field whose metadata is what argparse needs to offer it."""
+    return field(default=default, metadata={"help": text, **extra})
+
+
+@dataclass
+class TrainConfig:
+    """Options of one training run; defaults are those of 3D Gaussian Splatting (the 2023 release).
+
+    Raises ValueError from `validate` with the option's name, its value and what it must be.
+    """
+
+    scene: str = _option("", "folder of a COLMAP or NeRF-synthetic scene", positional=True)
+    output: str = _option("", "folder to write", flags=("-o", "--output"), required=True)
+    blend_mode: Optional[str] = _option(
+        None, "how Gaussians make a pixel (default: $DSMOE_BLEND_MODE, else alpha)", choices=BLEND_MODES)
+    iterations: int = _option(30_000, "optimisation steps")
+    resolution: int = _option(
+        -1, "1, 2, 4, 8: divide the image size by it; -1: cap the width at 1600; else the width in pixels")
+    images: str = _option("images", "image folder inside a COLMAP scene")
+    principal_point: str = _option(
+        "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
+        choices=PRINCIPAL_POINTS)
+    white_background: bool = _option(False, "white background instead of black")
+    init_points: int = _option(
+        0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
+           "0: all points, respectively 100,000")
+    schedule: str = _option(
+        "3dgs", "3dgs: the original recipe; steady: no opacity reset and no size prune", choices=SCHEDULES)
+    seed: int = _option(0, "seed of every random choice")
+    device: str = _option("cpu", "where tensors live", choices=("cpu", "cuda"))
+    sh_degree: int = _option(3, "highest spherical-harmonics degree, 0 to 3")
+    sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
+    antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
+
+    lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
+    position_lr_init: float = _option(0.00016, "first learning rate of positions, times the scene extent")
+    position_lr_final: float = _option(0.0000016, "last learning rate of positions, times the scene extent")
+    position_lr_max_steps: int = _option(30_000, "step at which the last position learning rate is reached")
+    feature_lr: float = _option(0.0025, "learning rate of base colours; higher SH bands take a 20th of it")
+    opacity_lr: float = _option(0.05, "learning rate of opacity logits")
+    scaling_lr: float = _option(0.005, "learning rate of log scales")
+    rotation_lr: float = _option(0.001, "learning rate of quaternions")
+
+    densify_grad_threshold: float = _option(
+        0.0002, "mean screen-space gradient (NDC units) from which a Gaussian is cloned or split")
+    percent_dense: float = _option(
+        0.01, "largest scale, as a part of the scene extent, that is cloned; larger ones are split")
+    densify_from_iter: int = _option(500, "densification starts after this step")
+    densify_until_iter: int = _option(15_000, "densification stops before this step")
+    densification_interval: int = _option(100, "steps between two densifications")
+    opacity_reset_interval: int = _option(3000, "steps between two opacity resets")
+
+    eval_every: int = _option(0, "evaluate the test views every so many steps; 0: only at the end")
+    checkpoint_every: int = _option(1000, "write a checkpoint every so many steps; 0: only at the end")
+
+    def __post_init__(self) -> None:
+        self.blend_mode = resolve_blend_mode(self.blend_mode)
+
+    def validate(self) -> "TrainConfig":
+        """Checks every option that needs no file; returns self."""
+        for option in dataclasses.fields(self):
+            value, choices = getattr(self, option.name), option.metadata.get("choices")
+            if choices and value not in choices:
+                raise ValueError(f"{_flag(option)} is {value!r}; it must be one of {', '.join(choices)}")
+        self._require("iterations", self.iterations >= 1, "at least 1")
+        self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
+        self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
+        self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
+        self._require("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "between 0 and 1")
+        self._require("seed", 0 <= self.seed < 2**32, "between 0 and 2^32 - 1")
+        for name in ("sh_degree_interval", "position_lr_max_steps", "densification_interval", "opacity_reset_interval"):
+            self._require(name, getattr(self, name) >= 1, "at least 1")
+        for name in ("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr",
+                     "densify_grad_threshold", "percent_dense"):
+            self._require(name, 0.0 < getattr(self, name) < float("inf"), "a positive number")
+        for name in ("densify_from_iter", "densify_until_iter", "eval_every", "checkpoint_every"):
+            self._require(name, getattr(self, name) >= 0, "at least 0")
+        return self
+
+    def _require(self, name: str, holds: bool, requirement: str) -> None:
+        if not holds:
+            flag = "--" + name.replace("_", "-")
+            raise ValueError(f"{flag} is {getattr(self, name)!r}; it must be {requirement}")
+
+    def shortened(self) -> "TrainConfig":
+        """The same recipe squeezed into `iterations` steps: every milestone keeps its share of 30,000.
+
+        Only the densification interval stays, as far as at least ten densifications fit.
+        """
+        share = self.iterations / 30_000
+        until = max(1, round(15_000 * share))
+        return dataclasses.replace(
+            self,
+            position_lr_max_steps=self.iterations,
+            sh_degree_interval=max(1, round(1000 * share)),
+            densify_from_iter=round(500 * share),
+            densify_until_iter=until,
+            densification_interval=max(1, min(100, until // 10)),
+            opacity_reset_interval=max(1, round(3000 * share)),
+        )
+
+    def save(self, folder: str) -> None:
+        """Writes OUT/config.json."""
+        text = json.dumps(dataclasses.asdict(self), indent=2) + "\n"
+        write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
+
+    @classmethod
+    def load(cls, folder: str) -> "TrainConfig":
+        """Reads OUT/config.json. Raises ValueError where the file is absent or wrong, naming file and reason."""
+        path = os.path.join(folder, CONFIG_NAME)
+        if not os.path.isfile(path):
+            raise ValueError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`")
+        try:
+            with open(path, encoding="utf-8") as file:
+                values = json.load(file)
+        except ValueError as error:
+            raise ValueError(f"{path}: not valid json ({error})") from error
+        if not isinstance(values, dict):
+            raise ValueError(f"{path}: expected a json object of options")
+        known = {option.name for option in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise ValueError(f"{path}: unknown option {', '.join(unknown)} (written by another version?)")
+        # Rendering must use the mode of the training, so an absent mode is never replaced by a default.
+        if values.get("blend_mode") not in BLEND_MODES:
+            raise ValueError(f"{path}: blend_mode is {values.get('blend_mode')!r}; "
+                             f"it must be one of {', '.join(BLEND_MODES)}")
+        try:
+            return cls(**values).validate()
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    def differences(self, other: "TrainConfig") -> List[str]:
+        """Options that would change the result and differ from those of `other`, one text each."""
+        # These alter when something is written or where, never the trained Gaussians.
+        harmless = {"scene", "output", "eval_every", "checkpoint_every"}
+        texts = []
+        for option in dataclasses.fields(self):
+            mine, theirs = getattr(self, option.name), getattr(other, option.name)
+            if option.name not in harmless and mine != theirs:
+                texts.append(f"{_flag(option)} is {mine!r} here and {theirs!r} there")
+        return texts
+
+
+def _flag(option: "dataclasses.Field[Any]") -> str:
+    return "--" + option.name.replace("_", "-")
+
+
+_TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str}
+
+
+def add_arguments(parser: argparse.ArgumentParser, skip: tuple = ()) -> None:
+    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser."""
+    for option in dataclasses.fields(TrainConfig):
+        if option.name in skip:
+            continue
+        text = option.metadata["help"].replace("%", "%%")
+        if option.metadata.get("positional"):
+            parser.add_argument(option.name, metavar=option.name.upper(), help=text)
+            continue
+        flags = option.metadata.get("flags", (_flag(option),))
+        if option.type == "bool":
+            parser.add_argument(*flags, action="store_true", help=text)
+            continue
+        keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": option.default}
+        if option.metadata.get("required"):
+            keywords["required"] = True
+        elif option.default is not None:
+            text += f" (default: {option.default})"
+        if option.metadata.get("choices"):
+            keywords["choices"] = option.metadata["choices"]
+        else:
+            keywords["metavar"] = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
+        parser.add_argument(*flags, help=text, dest=option.name, **keywords)
+
+
+def config_from_arguments(arguments: argparse.Namespace) -> TrainConfig:
+    """Builds a validated TrainConfig from parsed arguments; options not offered keep their defaults."""
+    names = {option.name for option in dataclasses.fields(TrainConfig)}
+    return TrainConfig(**{name: value for name, value in vars(arguments).items() if name in names}).validate()

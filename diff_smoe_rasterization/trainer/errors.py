@@ -1,0 +1,10 @@
+"""The errors a user can cause; the command prints their text and no traceback."""
+from __future__ import annotations
+
+
+class TrainerError(ValueError):
+    """Something asked of the trainer cannot be done; the text says what and why."""
+
+
+class SceneError(TrainerError):
+    """A scene folder cannot be used; the text names the file and the reason."""

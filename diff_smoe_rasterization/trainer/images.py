@@ -1,0 +1,95 @@
+"""Ground-truth images: read in parallel, composited, downscaled as 3DGS does."""
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import List, Sequence, Tuple
+
+import numpy as np
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from .cameras import Camera
+from .config import TrainConfig
+from .errors import SceneError
+from .layout import PosedImage
+
+MAX_WIDTH = 1600  # of images at resolution -1
+# An image may have another size than its camera (images_4 beside a full-size model) but not another shape.
+MAX_ASPECT_ERROR = 0.02
+DOWNSCALER = "pillow bicubic"
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and its ground truth."""
+
+    camera: Camera
+    image: torch.Tensor  # [3, H, W] uint8
+
+    def image_float(self) -> torch.Tensor:
+        """[3, H, W] in [0, 1]"""
+        return self.image.float() / 255
+
+
+def target_size(width: int, height: int, resolution: int) -> Tuple[int, int]:
+    """Image size (width, height) for a --resolution, by the rule of 3DGS.
+
+    1, 2, 4, 8 divide and round (half to even); -1 caps the width at 1600; any other value is the width. The latter
+    two truncate.
+    """
+    if resolution in (1, 2, 4, 8):
+        return max(1, round(width / resolution)), max(1, round(height / resolution))
+    if resolution == -1:
+        factor = width / MAX_WIDTH if width > MAX_WIDTH else 1.0
+    else:
+        factor = width / resolution
+    return max(1, int(width / factor)), max(1, int(height / factor))
+
+
+def load_views(images: Sequence[PosedImage], config: TrainConfig, progress: bool) -> List[View]:
+    """Reads images in parallel threads, in order, with a progress bar."""
+    with ThreadPoolExecutor(min(16, 2 * (os.cpu_count() or 1))) as pool:
+        loading = pool.map(lambda image: load_view(image, config), images)
+        return list(tqdm(loading, total=len(images), desc="images", unit="image", disable=not progress, leave=False))
+
+
+def load_view(posed: PosedImage, config: TrainConfig) -> View:
+    """Reads one image: transparency composited, then resized; the camera follows the size."""
+    try:
+        with Image.open(posed.path) as file:
+            image = composited(file, config.white_background)
+    except (OSError, ValueError, SyntaxError) as error:  # Pillow raises all three for damaged files
+        raise SceneError(f"{posed.path}: not a readable image ({error})") from error
+    camera = posed.camera
+    if camera.width and abs(image.width * camera.height / (image.height * camera.width) - 1) > MAX_ASPECT_ERROR:
+        raise SceneError(f"{posed.path}: the image is {image.width}x{image.height}, "
+                         f"its camera {camera.width}x{camera.height}: another shape")
+    size = target_size(image.width, image.height, config.resolution)
+    if size != image.size:
+        image = image.resize(size, Image.BICUBIC)
+    camera = camera.resized(*size)
+    if config.principal_point == "centre":
+        camera = camera.centred()
+    return View(camera, torch.from_numpy(np.array(image)).permute(2, 0, 1).contiguous())
+
+
+def composited(image: Image.Image, white: bool) -> Image.Image:
+    """The image as RGB; where it has transparency, over white or black."""
+    if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
+        return image.convert("RGB")
+    rgba = np.asarray(image.convert("RGBA"), np.float32) / 255
+    color, alpha = rgba[..., :3], rgba[..., 3:]
+    blended = color * alpha + (1.0 if white else 0.0) * (1 - alpha)
+    return Image.fromarray((blended * 255).round().astype(np.uint8))
+
+
+def image_size(path: str) -> Tuple[int, int]:
+    """(width, height) from an image's header. Raises SceneError."""
+    try:
+        with Image.open(path) as file:
+            return file.size
+    except (OSError, ValueError, SyntaxError) as error:
+        raise SceneError(f"{path}: not a readable image ({error})") from error

@@ -1,0 +1,45 @@
+"""What a scene folder says before any image is read, and the train/test split."""
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import List, Sequence, Tuple
+
+from .cameras import Camera
+from .errors import SceneError
+from .pointcloud import PointCloud
+
+HOLD_OUT = 8  # every 8th image of a COLMAP scene, by sorted name, is a test image
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """A camera and the file of its image, not yet read; the camera's size may differ from the file's."""
+
+    camera: Camera
+    path: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a scene folder says, images unread."""
+
+    kind: str  # "colmap" or "nerf-synthetic"
+    train: Sequence[PosedImage]
+    test: Sequence[PosedImage]
+    points: PointCloud
+    split: str  # how test images are chosen, for the protocol
+
+
+def hold_out(images: Sequence[PosedImage]) -> Tuple[List[PosedImage], List[PosedImage]]:
+    """Training and test images: sorted by name, every 8th from the first on is a test image."""
+    ordered = sorted(images, key=lambda image: image.camera.name)
+    train = [image for index, image in enumerate(ordered) if index % HOLD_OUT != 0]
+    return train, ordered[::HOLD_OUT]
+
+
+def check_files(paths: Sequence[str]) -> None:
+    """Raises SceneError naming the first missing image and how many are missing."""
+    missing = [path for path in paths if not os.path.isfile(path)]
+    if missing:
+        raise SceneError(f"{missing[0]}: no such image ({len(missing)} of {len(paths)} images are missing)")

@@ -1,0 +1,36 @@
+"""Image metrics as 3DGS papers report them: on images as an 8-bit PNG would hold them, one value per image."""
+from __future__ import annotations
+
+import math
+from typing import Dict
+
+import torch
+
+from .losses import ssim, target_moments
+
+
+def quantised(image: torch.Tensor) -> torch.Tensor:
+    """The image after a trip through an 8-bit file: clamped to [0, 1] and rounded to multiples of 1/255."""
+    return (image.clamp(0, 1) * 255).add(0.5).floor().clamp(max=255) / 255
+
+
+def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
+    """Peak signal-to-noise ratio in dB of one image [3, H, W], the squared error averaged over pixels and channels.
+
+    Infinite for equal images.
+    """
+    mean_squared_error = float((image - target).double().pow(2).mean())
+    return -10 * math.log10(mean_squared_error) if mean_squared_error > 0 else math.inf
+
+
+def image_metrics(image: torch.Tensor, target: torch.Tensor) -> Dict[str, float]:
+    """Metrics of one rendering [3, H, W] against its ground truth in [0, 1].
+
+    psnr, ssim: on 8-bit values (the headline). psnr_float: on floats clamped to [0, 1].
+    """
+    png = quantised(image)
+    return {
+        "psnr": psnr(png, target),
+        "ssim": float(ssim(png, target_moments(target))),
+        "psnr_float": psnr(image.clamp(0, 1), target),
+    }

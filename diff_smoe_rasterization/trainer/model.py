@@ -1,0 +1,211 @@
+"""The trainable Gaussians: raw parameters, their activations, Adam, and the Inria-format .ply."""
+from __future__ import annotations
+
+from typing import Callable, Dict, List
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from .config import TrainConfig
+from .pointcloud import PointCloud
+
+SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi))
+INITIAL_OPACITY = 0.1
+MIN_SQUARED_DISTANCE = 1e-7  # of coinciding points, so that log scales stay finite
+ADAM_EPSILON = 1e-15
+
+PARAMETERS = ("means3D", "dc", "shs", "opacities", "scales", "rotations")
+"""The raw parameters: shapes [N, 3], [N, 1, 3], [N, K-1, 3], [N, 1] logits, [N, 3] logs, [N, 4] unnormalised."""
+
+
+def inverse_sigmoid(x: torch.Tensor) -> torch.Tensor:
+    """log(x / (1 - x))"""
+    return torch.log(x / (1 - x))
+
+
+def quaternion_to_matrix(rotations: torch.Tensor) -> torch.Tensor:
+    """[N, 4] quaternions (w, x, y, z), normalised here -> [N, 3, 3]."""
+    w, x, y, z = torch.nn.functional.normalize(rotations).unbind(1)
+    return torch.stack([
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ], dim=1).view(-1, 3, 3)
+
+
+def mean_squared_neighbour_distance(positions: np.ndarray) -> np.ndarray:
+    """[N] mean squared distance to the three nearest other points. positions: [N, 3], N >= 4."""
+    distances, _ = cKDTree(positions).query(positions, k=4, workers=-1)
+    return (distances[:, 1:] ** 2).mean(axis=1)
+
+
+class GaussianModel:
+    """N Gaussians as leaf tensors under an Adam optimizer with the learning rates of 3DGS.
+
+    Rows can be appended and removed in training; the optimizer's moments follow.
+    """
+
+    def __init__(self, raw: Dict[str, torch.Tensor], sh_degree: int) -> None:
+        """raw: tensors named in PARAMETERS. sh_degree: highest degree that `shs` holds."""
+        self.sh_degree = sh_degree
+        self.active_sh_degree = 0
+        self.raw = {name: raw[name].detach().clone().contiguous().requires_grad_() for name in PARAMETERS}
+
+    @classmethod
+    def from_points(cls, points: PointCloud, sh_degree: int, device: str) -> "GaussianModel":
+        """Initialises as 3DGS: round Gaussians as wide as the distance to their neighbours, opacity 0.1."""
+        count = len(points.positions)
+        squared = np.maximum(mean_squared_neighbour_distance(points.positions), MIN_SQUARED_DISTANCE)
+        log_scales = np.repeat(np.log(np.sqrt(squared))[:, None], 3, axis=1)
+
+        def tensor(array: np.ndarray) -> torch.Tensor:
+            return torch.tensor(array, dtype=torch.float32, device=device)
+
+        rotations = torch.zeros(count, 4, device=device)
+        rotations[:, 0] = 1
+        return cls({
+            "means3D": tensor(points.positions),
+            "dc": tensor((points.colors - 0.5) / SH_C0).unsqueeze(1),
+            "shs": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device=device),
+            "opacities": inverse_sigmoid(torch.full((count, 1), INITIAL_OPACITY, device=device)),
+            "scales": tensor(log_scales),
+            "rotations": rotations,
+        }, sh_degree)
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.raw["means3D"].shape[0]
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """[N, 1] in (0, 1)"""
+        return torch.sigmoid(self.raw["opacities"])
+
+    @property
+    def scales(self) -> torch.Tensor:
+        """[N, 3] world units"""
+        return torch.exp(self.raw["scales"])
+
+    @property
+    def rotations(self) -> torch.Tensor:
+        """[N, 4] unit quaternions"""
+        return torch.nn.functional.normalize(self.raw["rotations"])
+
+    def color_arguments(self) -> Dict[str, torch.Tensor]:
+        """The colour arguments of `rasterize`; while degree 0 is active the higher bands are left out."""
+        if self.active_sh_degree == 0:
+            return {"shs": self.raw["dc"]}
+        return {"dc": self.raw["dc"], "shs": self.raw["shs"]}
+
+    def raise_sh_degree(self) -> None:
+        """Activates one more SH degree, up to the highest."""
+        self.active_sh_degree = min(self.active_sh_degree + 1, self.sh_degree)
+
+
+class GaussianOptimizer:
+    """Adam over a GaussianModel, one group per parameter, with the exponential schedule of positions."""
+
+    def __init__(self, model: GaussianModel, config: TrainConfig, extent: float) -> None:
+        """extent: the scene's scale, which multiplies the learning rate of positions."""
+        self.model = model
+        self.config = config
+        self.extent = extent
+        rates = {
+            "means3D": config.position_lr_init * extent,
+            "dc": config.feature_lr,
+            "shs": config.feature_lr / 20,
+            "opacities": config.opacity_lr,
+            "scales": config.scaling_lr,
+            "rotations": config.rotation_lr,
+        }
+        self.adam = _make_adam([{"params": [model.raw[name]], "lr": rates[name], "name": name} for name in PARAMETERS])
+
+    def set_position_rate(self, iteration: int) -> None:
+        """Sets the positions' learning rate for this step."""
+        config = self.config
+        rate = exponential_rate(iteration, config.position_lr_init, config.position_lr_final,
+                                config.position_lr_max_steps)
+        self._group("means3D")["lr"] = rate * self.extent
+
+    def step(self) -> None:
+        """Steps every parameter that has a gradient, then drops the gradients."""
+        self._start_higher_bands()
+        self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
+
+    def append(self, rows: Dict[str, torch.Tensor]) -> None:
+        """Adds Gaussians, raw parameters as in PARAMETERS; their moments start at zero."""
+        for name in PARAMETERS:
+            self._replace(name, lambda tensor, new: torch.cat([tensor, new]), rows[name])
+
+    def keep(self, mask: torch.Tensor) -> None:
+        """Removes the Gaussians where mask [N] (bool) is False."""
+        for name in PARAMETERS:
+            self._replace(name, lambda tensor, _: tensor[mask], self.model.raw[name].new_zeros(0))
+
+    def set_opacity_logits(self, logits: torch.Tensor) -> None:
+        """Sets all opacity logits [N, 1] and forgets their moments."""
+        self._replace("opacities", lambda tensor, new: new.clone(), logits)
+
+    def _replace(self, name: str, edit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
+                 rows: torch.Tensor) -> None:
+        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros like rows) in place of its moments.
+
+        The new leaf has no gradient, so the current step leaves it alone: as in 3DGS, where an iteration that
+        densifies steps nothing and one that resets opacities steps all but them.
+        """
+        old = self.model.raw[name]
+        new = edit(old.detach(), rows.detach()).contiguous().requires_grad_()
+        state = self.adam.state.pop(old, None)
+        if state is not None:
+            zeros = torch.zeros_like(rows)
+            for key in ("exp_avg", "exp_avg_sq"):
+                state[key] = edit(state[key], zeros).contiguous()
+            self.adam.state[new] = state
+        self._group(name)["params"][0] = new
+        self.model.raw[name] = new
+
+    def _group(self, name: str) -> Dict:
+        return self.adam.param_groups[PARAMETERS.index(name)]
+
+    def _start_higher_bands(self) -> None:
+        """Gives `shs` its Adam state when it first has a gradient, as old as that of `dc`.
+
+        While degree 0 is active its gradient would be zero: Adam would leave it where it is and only count the
+        step. Skipping that, and taking over the count, gives the same numbers and saves most of the step's time.
+        """
+        bands, base = self.model.raw["shs"], self.model.raw["dc"]
+        if bands.grad is None or bands in self.adam.state or base not in self.adam.state:
+            return
+        step = self.adam.state[base]["step"]
+        self.adam.state[bands] = {
+            "step": step.clone() if isinstance(step, torch.Tensor) else step,
+            "exp_avg": torch.zeros_like(bands),
+            "exp_avg_sq": torch.zeros_like(bands),
+        }
+
+    def state_dict(self) -> Dict[str, Dict]:
+        """Adam's state by parameter name."""
+        return {name: dict(self.adam.state[self.model.raw[name]]) for name in PARAMETERS
+                if self.model.raw[name] in self.adam.state}
+
+    def load_state_dict(self, states: Dict[str, Dict]) -> None:
+        """Takes what `state_dict` gave."""
+        self.adam.state.clear()
+        for name, state in states.items():
+            self.adam.state[self.model.raw[name]] = dict(state)
+
+
+def _make_adam(groups: List[Dict]) -> torch.optim.Adam:
+    """Adam, fused where this torch has a fused kernel for the device (one pass over memory instead of ten)."""
+    try:
+        return torch.optim.Adam([dict(group) for group in groups], lr=0.0, eps=ADAM_EPSILON, fused=True)
+    except (TypeError, RuntimeError):
+        return torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPSILON)
+
+
+def exponential_rate(step: int, first: float, last: float, max_steps: int) -> float:
+    """Log-linear interpolation from `first` at step 0 to `last` at max_steps, constant from there on."""
+    share = min(max(step / max_steps, 0.0), 1.0)
+    return float(np.exp((1 - share) * np.log(first) + share * np.log(last)))

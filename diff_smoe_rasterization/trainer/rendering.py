@@ -1,0 +1,46 @@
+"""One image of a GaussianModel through the package's public rasterizer."""
+from __future__ import annotations
+
+from typing import Any, Callable, Optional
+
+import torch
+
+from ..settings import Rendering
+from .cameras import Camera
+from .model import GaussianModel
+
+Rasterize = Callable[..., Rendering]
+
+
+def package_rasterizer() -> Rasterize:
+    """The compiled `rasterize`; imported late, so that scenes and configs work without the extension."""
+    from .. import rasterize
+
+    return rasterize
+
+
+class Renderer:
+    """Renders a model with one blend mode and background; the only place where the trainer calls `rasterize`."""
+
+    def __init__(self, model: GaussianModel, blend_mode: str, background: torch.Tensor,
+                 antialiasing: bool = False, rasterize: Optional[Rasterize] = None) -> None:
+        """background: [3] on the model's device. rasterize: by default the package's."""
+        self.model = model
+        self.blend_mode = blend_mode
+        self.background = background
+        self.antialiasing = antialiasing
+        self.rasterize = rasterize or package_rasterizer()
+
+    def __call__(self, camera: Camera, **arguments: Any) -> Rendering:
+        """arguments: further ones of `rasterize`, means2D or outputs, or colors_precomp in place of the SH colours."""
+        model = self.model
+        if "colors_precomp" not in arguments:
+            arguments.update(model.color_arguments())
+        settings = camera.settings(self.background, model.active_sh_degree, self.blend_mode, self.antialiasing)
+        return self.rasterize(model.raw["means3D"], model.opacities, settings, scales=model.scales,
+                              rotations=model.rotations, **arguments)
+
+
+def background_color(white: bool, device: str) -> torch.Tensor:
+    """[3] white or black."""
+    return torch.full((3,), 1.0 if white else 0.0, device=device)

@@ -1,0 +1,72 @@
+"""Loads a scene folder: cameras, images, the train/test split and the points to start from.
+
+Two kinds are known: COLMAP (a sparse model beside a folder of images) and NeRF-synthetic (transforms_*.json).
+Everything that can be wrong with a folder is a SceneError here, before training starts.
+"""
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import List, Sequence
+
+import numpy as np
+
+from .cameras import scene_extent
+from .config import TrainConfig
+from .errors import SceneError
+from .images import View, load_views
+from .layout import Layout, check_files
+from .pointcloud import PointCloud
+from .scene_colmap import read_colmap_layout
+from .scene_nerf import read_nerf_layout
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A loaded scene."""
+
+    kind: str
+    train: Sequence[View]
+    test: Sequence[View]
+    points: PointCloud
+    extent: float  # world units
+    split: str
+
+    def to(self, device: str) -> "Scene":
+        """The same scene with its images on `device`."""
+
+        def moved(views: Sequence[View]) -> List[View]:
+            return [View(view.camera, view.image.to(device)) for view in views]
+
+        return Scene(self.kind, moved(self.train), moved(self.test), self.points, self.extent, self.split)
+
+
+def load_scene(config: TrainConfig, progress: bool = True) -> Scene:
+    """Reads the folder config.scene with the config's resolution, background, principal point and initial points.
+
+    Raises SceneError naming the file and the reason.
+    """
+    layout = read_layout(config)
+    images = load_views(list(layout.train) + list(layout.test), config, progress)
+    train, test = images[:len(layout.train)], images[len(layout.train):]
+    points = layout.points.subset(config.init_points, config.seed)
+    extent = scene_extent(np.stack([view.camera.center for view in train]))
+    return Scene(layout.kind, train, test, points, extent, layout.split)
+
+
+def read_layout(config: TrainConfig) -> Layout:
+    """Reads everything of a scene folder but its images, whose presence it checks."""
+    folder = config.scene
+    if not os.path.isdir(folder):
+        raise SceneError(f"scene {folder}: no such folder")
+    if os.path.isfile(os.path.join(folder, "transforms_train.json")):
+        layout = read_nerf_layout(folder, config)
+    elif os.path.isdir(os.path.join(folder, "sparse")):
+        layout = read_colmap_layout(folder, config)
+    else:
+        raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor transforms_train.json "
+                         "(NeRF-synthetic) is in it")
+    if not layout.train:
+        raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
+    check_files([image.path for image in list(layout.train) + list(layout.test)])
+    return layout
