@@ -1,0 +1,46 @@
+// Gaussian models and point clouds in PLY files.
+#pragma once
+
+#include <cstddef>
+#include <string>
+#include <vector>
+
+#include "io/point_cloud.h"
+
+namespace dsmoe::io {
+
+/// A trained model as Inria's 3DGS stores it: raw parameters, before sigmoid, exp and normalisation.
+/// Values may be NaN or infinite; the rasterizer culls such Gaussians.
+struct GaussianModel {
+  std::size_t count = 0;
+  int sh_degree = 0;                       // 0 to 3; K = (sh_degree + 1)^2 coefficients per channel
+  std::vector<float> means3D;              // [N, 3] world
+  std::vector<float> dc;                   // [N, 1, 3] SH coefficient 0
+  std::vector<float> shs;                  // [N, K-1, 3] SH coefficients 1 to K-1
+  std::vector<float> opacity_logits;       // [N, 1]
+  std::vector<float> log_scales;           // [N, 3]
+  std::vector<float> rotations;            // [N, 4] (w, x, y, z), not normalised
+  std::string blend_mode;                  // what "comment blend_mode NAME" records; empty: the file does not say
+  std::vector<std::string> comments = {};  // all comment lines, that one included
+};
+
+/// Reads a model; columns are found by name, in any order and scalar type, and others are ignored.
+/// The degree follows from the number of f_rest columns: 0, 9, 24 or 45. Throws FileError, FormatError.
+GaussianModel read_gaussians(const std::string& path);
+
+/// The same from the bytes of a file, which `file` names in errors.
+GaussianModel parse_gaussians(std::string bytes, const std::string& file);
+
+/// Writes binary little endian float32 columns in Inria's order, normals zero. A blend mode becomes a comment line.
+/// Throws FileError; FormatError where a vector has not the size that count and sh_degree ask for.
+void write_gaussians(const std::string& path, const GaussianModel& model);
+
+/// Reads x y z and, where present, red green blue (whole numbers 0 to 255) and nx ny nz.
+/// Throws FileError; FormatError, also for a position that is NaN or infinite.
+PointCloud read_points(const std::string& path);
+PointCloud parse_points(std::string bytes, const std::string& file);
+
+/// Writes x y z (float32), nx ny nz (float32) and red green blue (uchar) where the cloud has them.
+void write_points(const std::string& path, const PointCloud& points);
+
+}  // namespace dsmoe::io
