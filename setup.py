@@ -114,5 +114,8 @@ def packages():
     return {"packages": names, "package_dir": folders, "package_data": {PACKAGE: ["include/dsmoe/*.h"]}}
 
 
+if int(setuptools.__version__.split(".")[0]) < 61:  # it would ignore pyproject.toml and install "UNKNOWN 0.0.0"
+    sys.exit(f"setuptools {setuptools.__version__} is too old; type: pip install 'setuptools>=61,<82' and build again")
+
 if __name__ == "__main__":
     setuptools.setup(**packages(), **(extension() if COMMANDS_THAT_COMPILE & set(sys.argv) else {}))
