@@ -22,7 +22,7 @@ std::string binary_cameras() {
   file.put<std::uint64_t>(2);
   file.put<std::uint32_t>(1).put<std::int32_t>(1).put<std::uint64_t>(640).put<std::uint64_t>(480);
   file.put(500.5).put(501.5).put(320.0).put(240.25);
-  file.put<std::uint32_t>(9).put<std::int32_t>(2).put<std::uint64_t>(5000000000 % 4000).put<std::uint64_t>(7);
+  file.put<std::uint32_t>(9).put<std::int32_t>(2).put<std::uint64_t>(1000).put<std::uint64_t>(7);
   file.put(30.0).put(2.0).put(3.5).put(-0.125);
   return file.str();
 }
