@@ -136,10 +136,11 @@ def random_weights(rendering, outputs=(), seed=1):
 
 
 def gradients(function, scene, outputs=(), camera=True):
-    """Renders with `function` and returns (rendering, gradients by name) for fixed random image gradients."""
+    """Renders with `function`, returns (rendering, gradients by name) for fixed random image gradients; None is 0."""
     scene = scene.requiring_grad(camera)
     rendering = function(settings=scene.settings, outputs=outputs, **scene.inputs)
     images, weights = random_weights(rendering, outputs)
     leaves = scene.leaves()
-    values = torch.autograd.grad(images, list(leaves.values()), weights)
-    return rendering, dict(zip(leaves, values))
+    values = torch.autograd.grad(images, list(leaves.values()), weights, allow_unused=True)
+    return rendering, {name: torch.zeros_like(leaf) if value is None else value
+                       for (name, leaf), value in zip(leaves.items(), values)}

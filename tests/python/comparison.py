@@ -1,0 +1,64 @@
+"""How the tests compare tensors, and where a comparison in float32 makes sense."""
+from __future__ import annotations
+
+import math
+
+import torch
+
+from diff_smoe_rasterization import reference
+
+
+def relative_error(actual, expected):
+    """Returns |actual - expected| / |expected| in the 2-norm, computed in float64."""
+    actual, expected = actual.detach().double(), expected.detach().double()
+    return ((actual - expected).norm() / expected.norm()).item()
+
+
+def assert_close(actual, expected, tolerance, name):
+    """Compares by the norm of the difference relative to the norm; what must be zero must be exactly zero."""
+    assert actual.shape == expected.shape, f"{name}: shape {tuple(actual.shape)}, not {tuple(expected.shape)}"
+    assert torch.isfinite(actual).all(), f"{name} is not finite"
+    if not expected.any():
+        assert not actual.any(), f"{name} must be exactly zero, its largest value is {actual.abs().max():.3g}"
+        return
+    error = relative_error(actual, expected)
+    assert error <= tolerance, f"{name}: relative error {error:.3g}, allowed {tolerance:.3g}"
+
+
+def assert_all_close(actual, expected, tolerance):
+    """Compares two dictionaries of tensors."""
+    assert actual.keys() == expected.keys()
+    for name in expected:
+        assert_close(actual[name], expected[name], tolerance, name)
+
+
+def threshold_margin(scene):
+    """Returns how near each pixel is to another outcome [H, W]: the least |ln(value / threshold)| over its pairs.
+
+    Thresholds are the cut-off on G or on alpha and the early stop. In float32, and under finite differences, a pixel
+    with a margin within the error of its values may fall on the other side. For small scenes: it is dense.
+    """
+    scene = scene.to(torch.float64)
+    settings, mode = scene.settings, reference.resolve_blend_mode(scene.settings.blend_mode)
+    with torch.no_grad():
+        gaussians = reference._gather(*(scene.inputs.get(name) for name in (
+            "means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")))
+        order = reference.visible(gaussians, settings, mode)[1]
+        splats = reference.project(reference._rows(gaussians, order), settings)
+        y, x = (axis.reshape(-1).double() for axis in torch.meshgrid(
+            torch.arange(settings.image_height), torch.arange(settings.image_width), indexing="ij"))
+        power = reference._power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y)
+        log_alpha = power + splats.opacity.clamp(min=1e-300).log()[:, None]
+        if mode == "alpha":
+            distances = [log_alpha - math.log(reference.ALPHA_MIN)]
+        else:
+            distances = [power - math.log(reference.KERNEL_MIN)]
+            if settings.alpha_min > 0:
+                distances.append(log_alpha - math.log(settings.alpha_min))
+        if mode != "smoe_std":
+            counts = reference.pair_counts(splats, x, y, settings, mode)
+            alpha = reference.pair_alphas(splats, x, y, counts)
+            distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
+        nearest = torch.cat([torch.full_like(x, math.inf)[None]] + [distance.abs() for distance in distances]).min(0)[0]
+    return nearest.reshape(settings.image_height, settings.image_width)
+
