@@ -1,12 +1,13 @@
 // A pack of pixels that behaves like one number: the SIMD scalar of the math headers.
 //
 // Included once per instruction set, by a file that has set DSMOE_SIMD (the namespace, so that each set's code has
-// its own symbols) and DSMOE_SIMD_BYTES (the register). Built on the compilers' vector types; where those make
-// poor masks (AVX, AVX-512) intrinsics take over.
+// its own symbols) and DSMOE_SIMD_BYTES (the register: 64 is AVX-512, 32 is AVX2 with FMA, 16 any machine). Built on
+// the compilers' vector types; where those make poor masks or no FMA, intrinsics take over. The compilers' own macros
+// (__AVX2__ ...) would not do: GCC expands them before it sees the target pragma.
 #pragma once
 
 #include <cstdint>
-#if defined(__AVX2__)
+#if DSMOE_SIMD_BYTES >= 32
 #include <immintrin.h>
 #endif
 
@@ -27,7 +28,7 @@ template <> struct Register<double> {
 
 template <class T> struct Pack;
 
-#if defined(__AVX512F__)
+#if DSMOE_SIMD_BYTES == 64
 template <class T> struct LaneBits;
 template <> struct LaneBits<float> { using Type = __mmask16; };
 template <> struct LaneBits<double> { using Type = __mmask8; };
@@ -46,7 +47,7 @@ template <class T> struct PackMask {
 
   friend DSMOE_HD PackMask operator&(PackMask a, PackMask b) { return {a.bits & b.bits}; }
   friend DSMOE_HD bool any(PackMask m) {
-#if defined(__AVX2__)
+#if DSMOE_SIMD_BYTES == 32
     return !_mm256_testz_si256(reinterpret_cast<__m256i>(m.bits), reinterpret_cast<__m256i>(m.bits));
 #else
     int64_t all = 0;
@@ -89,7 +90,7 @@ template <class T> struct Pack {
   friend DSMOE_HD PackMask<T> operator>=(Pack a, Pack b) { return b <= a; }
   friend DSMOE_HD Pack abs(Pack a) { return max(a, -a); }
 
-#if defined(__AVX512F__)
+#if DSMOE_SIMD_BYTES == 64
   friend DSMOE_HD PackMask<T> operator<(Pack a, Pack b) { return {compare_less(a.v, b.v)}; }
   friend DSMOE_HD PackMask<T> operator<=(Pack a, Pack b) { return {compare_less_equal(a.v, b.v)}; }
   friend DSMOE_HD Pack select(PackMask<T> m, Pack a, Pack b) { return blend(m.bits, a.v, b.v); }
@@ -132,7 +133,7 @@ template <class T> struct Pack {
     for (int i = 1; i < kLanes; ++i) largest = largest < a.v[i] ? a.v[i] : largest;
     return largest;
   }
-#if defined(__FMA__)
+#if DSMOE_SIMD_BYTES == 32
   friend DSMOE_HD Pack fma(Pack a, Pack b, Pack c) { return fused(a.v, b.v, c.v); }
 
  private:
