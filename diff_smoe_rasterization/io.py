@@ -1,7 +1,7 @@
 """Files of Gaussian models, point clouds and COLMAP scenes, as numpy arrays.
 
-The formats are read and written by the C++ core (csrc/io). A missing file raises FileNotFoundError (or another OSError),
-malformed content ValueError; both name the file, and the place in it where there is one.
+The formats are read and written by the C++ core (csrc/io). A missing file raises FileNotFoundError (another OSError
+where it is there and cannot be read), malformed content ValueError; both name the file, ValueError also byte or line.
 """
 from __future__ import annotations
 
