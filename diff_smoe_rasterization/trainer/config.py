@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional
 
 from ..settings import BLEND_MODES, resolve_blend_mode
+from .errors import ConfigError
 from .files import write_text_atomically
 
 CONFIG_NAME = "config.json"
@@ -25,7 +26,7 @@ def _option(default: Any, text: str, **extra: Any) -> Any:
 class TrainConfig:
     """Options of one training run; defaults are those of 3D Gaussian Splatting (the 2023 release).
 
-    Raises ValueError from `validate` with the option's name, its value and what it must be.
+    Raises ConfigError from `validate` with the option's name, its value and what it must be.
     """
 
     scene: str = _option("", "folder of a COLMAP or NeRF-synthetic scene", positional=True)
@@ -73,14 +74,17 @@ class TrainConfig:
     checkpoint_every: int = _option(1000, "write a checkpoint every so many steps; 0: only at the end")
 
     def __post_init__(self) -> None:
-        self.blend_mode = resolve_blend_mode(self.blend_mode)
+        try:
+            self.blend_mode = resolve_blend_mode(self.blend_mode)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
 
     def validate(self) -> "TrainConfig":
         """Checks every option that needs no file; returns self."""
         for option in dataclasses.fields(self):
             value, choices = getattr(self, option.name), option.metadata.get("choices")
             if choices and value not in choices:
-                raise ValueError(f"{_flag(option)} is {value!r}; it must be one of {', '.join(choices)}")
+                raise ConfigError(f"{_flag(option)} is {value!r}; it must be one of {', '.join(choices)}")
         self._require("iterations", self.iterations >= 1, "at least 1")
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
@@ -99,7 +103,11 @@ class TrainConfig:
     def _require(self, name: str, holds: bool, requirement: str) -> None:
         if not holds:
             flag = "--" + name.replace("_", "-")
-            raise ValueError(f"{flag} is {getattr(self, name)!r}; it must be {requirement}")
+            raise ConfigError(f"{flag} is {getattr(self, name)!r}; it must be {requirement}")
+
+    def changed(self, **options: Any) -> "TrainConfig":
+        """A validated copy with some options set."""
+        return dataclasses.replace(self, **options).validate()
 
     def shortened(self) -> "TrainConfig":
         """The same recipe squeezed into `iterations` steps: every milestone keeps its share of 30,000.
@@ -125,29 +133,30 @@ class TrainConfig:
 
     @classmethod
     def load(cls, folder: str) -> "TrainConfig":
-        """Reads OUT/config.json. Raises ValueError where the file is absent or wrong, naming file and reason."""
+        """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
         if not os.path.isfile(path):
-            raise ValueError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`")
+            raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`")
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)
         except ValueError as error:
-            raise ValueError(f"{path}: not valid json ({error})") from error
+            raise ConfigError(f"{path}: not valid json ({error})") from error
         if not isinstance(values, dict):
-            raise ValueError(f"{path}: expected a json object of options")
+            raise ConfigError(f"{path}: expected a json object of options")
         known = {option.name for option in dataclasses.fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:
-            raise ValueError(f"{path}: unknown option {', '.join(unknown)} (written by another version?)")
+            raise ConfigError(f"{path}: unknown option {', '.join(unknown)} (written by another version?)")
         # Rendering must use the mode of the training, so an absent mode is never replaced by a default.
         if values.get("blend_mode") not in BLEND_MODES:
-            raise ValueError(f"{path}: blend_mode is {values.get('blend_mode')!r}; "
+            raise ConfigError(f"{path}: blend_mode is {values.get('blend_mode')!r}; "
                              f"it must be one of {', '.join(BLEND_MODES)}")
+        values["output"] = folder  # the folder may have been moved
         try:
             return cls(**values).validate()
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{path}: {error}") from error
+        except (TypeError, ConfigError) as error:
+            raise ConfigError(f"{path}: {error}") from error
 
     def differences(self, other: "TrainConfig") -> List[str]:
         """Options that would change the result and differ from those of `other`, one text each."""

@@ -8,3 +8,7 @@ class TrainerError(ValueError):
 
 class SceneError(TrainerError):
     """A scene folder cannot be used; the text names the file and the reason."""
+
+
+class ConfigError(TrainerError):
+    """An option, or a file of options, has a value that it must not have."""

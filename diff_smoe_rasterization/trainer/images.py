@@ -19,6 +19,7 @@ from .layout import PosedImage
 MAX_WIDTH = 1600  # of images at resolution -1
 # An image may have another size than its camera (images_4 beside a full-size model) but not another shape.
 MAX_ASPECT_ERROR = 0.02
+UNREADABLE = (OSError, ValueError, SyntaxError)  # what Pillow raises for damaged files
 DOWNSCALER = "pillow bicubic"
 
 
@@ -61,19 +62,23 @@ def load_view(posed: PosedImage, config: TrainConfig) -> View:
     try:
         with Image.open(posed.path) as file:
             image = composited(file, config.white_background)
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow raises all three for damaged files
+    except UNREADABLE as error:
         raise SceneError(f"{posed.path}: not a readable image ({error})") from error
-    camera = posed.camera
-    if camera.width and abs(image.width * camera.height / (image.height * camera.width) - 1) > MAX_ASPECT_ERROR:
-        raise SceneError(f"{posed.path}: the image is {image.width}x{image.height}, "
-                         f"its camera {camera.width}x{camera.height}: another shape")
-    size = target_size(image.width, image.height, config.resolution)
-    if size != image.size:
-        image = image.resize(size, Image.BICUBIC)
-    camera = camera.resized(*size)
-    if config.principal_point == "centre":
-        camera = camera.centred()
+    camera = fitted_camera(posed, image.size, config)
+    if (camera.width, camera.height) != image.size:
+        image = image.resize((camera.width, camera.height), Image.BICUBIC)
     return View(camera, torch.from_numpy(np.array(image)).permute(2, 0, 1).contiguous())
+
+
+def fitted_camera(posed: PosedImage, size: Tuple[int, int], config: TrainConfig) -> Camera:
+    """The camera of an image file of that size (width, height) after --resolution and --principal-point."""
+    width, height = size
+    camera = posed.camera
+    if abs(width * camera.height / (height * camera.width) - 1) > MAX_ASPECT_ERROR:
+        raise SceneError(f"{posed.path}: the image is {width}x{height}, "
+                         f"its camera {camera.width}x{camera.height}: another shape")
+    camera = camera.resized(*target_size(width, height, config.resolution))
+    return camera.centred() if config.principal_point == "centre" else camera
 
 
 def composited(image: Image.Image, white: bool) -> Image.Image:
@@ -91,5 +96,5 @@ def image_size(path: str) -> Tuple[int, int]:
     try:
         with Image.open(path) as file:
             return file.size
-    except (OSError, ValueError, SyntaxError) as error:
+    except UNREADABLE as error:
         raise SceneError(f"{path}: not a readable image ({error})") from error

@@ -148,6 +148,12 @@ class GaussianOptimizer:
         """Sets all opacity logits [N, 1] and forgets their moments."""
         self._replace("opacities", lambda tensor, new: new.clone(), logits)
 
+    def replace_all(self, raw: Dict[str, torch.Tensor]) -> None:
+        """Sets every parameter, any number of rows, and forgets all moments."""
+        self.adam.state.clear()
+        for name in PARAMETERS:
+            self._replace(name, lambda _, new: new.clone(), raw[name])
+
     def _replace(self, name: str, edit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
                  rows: torch.Tensor) -> None:
         """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros like rows) in place of its moments.

@@ -11,10 +11,10 @@ from typing import List, Sequence
 
 import numpy as np
 
-from .cameras import scene_extent
+from .cameras import Camera, scene_extent
 from .config import TrainConfig
 from .errors import SceneError
-from .images import View, load_views
+from .images import View, fitted_camera, image_size, load_views
 from .layout import Layout, check_files
 from .pointcloud import PointCloud
 from .scene_colmap import read_colmap_layout
@@ -70,3 +70,10 @@ def read_layout(config: TrainConfig) -> Layout:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
     check_files([image.path for image in list(layout.train) + list(layout.test)])
     return layout
+
+
+def load_cameras(config: TrainConfig, split: str) -> List[Camera]:
+    """The cameras of "train", "test" or "all" images at the config's resolution; images are not decoded."""
+    layout = read_layout(config)
+    posed = {"train": layout.train, "test": layout.test, "all": list(layout.train) + list(layout.test)}[split]
+    return [fitted_camera(image, image_size(image.path), config) for image in posed]

@@ -1,0 +1,118 @@
+"""The `dsmoe` command: train, eval, render, info. Each is a few lines over the trainer library."""
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from typing import List, Optional
+
+from .settings import BLEND_MODES
+from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments
+from .trainer.errors import TrainerError
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    parser = argparse.ArgumentParser(prog="dsmoe", description="Gaussian splatting with alpha and SMoE blending.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    train = commands.add_parser("train", help="train Gaussians on a scene",
+                                description="Trains Gaussians on a COLMAP or NeRF-synthetic scene.")
+    add_arguments(train)
+    train.add_argument("--resume", action="store_true", help="continue the run in OUT from its last checkpoint")
+    train.add_argument("--overwrite", action="store_true", help="replace a run that is in OUT")
+    train.add_argument("--quiet", action="store_true", help="no progress bars")
+    train.set_defaults(run=_train)
+
+    evaluate = commands.add_parser("eval", help="measure a trained run again",
+                                   description="Measures PSNR, SSIM and FPS of a finished run.")
+    evaluate.add_argument("output", metavar="OUT", help="output folder of `dsmoe train`")
+    evaluate.add_argument("--split", choices=("test", "train"), default="test", help="which views (default: test)")
+    evaluate.add_argument("--scene", help="where the scene lies now, if it has moved")
+    _add_device(evaluate)
+    evaluate.set_defaults(run=_eval)
+
+    render = commands.add_parser("render", help="write images of a trained run or a .ply",
+                                 description="Writes one PNG for every camera of a scene.")
+    render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
+    render.add_argument("-o", "--output", metavar="DIR", required=True, help="folder for the images")
+    render.add_argument("--scene", help="folder whose cameras are rendered (default: the run's; needed for a .ply)")
+    render.add_argument("--split", choices=("test", "train", "all"), default="test",
+                        help="which cameras (default: test)")
+    render.add_argument("--blend-mode", choices=BLEND_MODES,
+                        help="needed for a .ply that does not record it; must agree where it does")
+    render.add_argument("--resolution", type=int, metavar="N",
+                        help="as in train (default: the run's, for a .ply -1)")
+    render.add_argument("--principal-point", choices=PRINCIPAL_POINTS,
+                        help="as in train (default: the run's, for a .ply scene)")
+    render.add_argument("--white-background", action="store_true", default=None,
+                        help="white background (default: the run's, for a .ply black)")
+    _add_device(render)
+    render.set_defaults(run=_render)
+
+    info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
+    info.set_defaults(run=_info)
+    return parser
+
+
+def main(argv: Optional[List[str]] = None) -> int:
+    """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 when interrupted."""
+    arguments = build_parser().parse_args(argv)
+    try:
+        return arguments.run(arguments) or 0
+    except (TrainerError, ImportError) as error:
+        print(f"dsmoe {arguments.command}: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        hint = "; the last checkpoint can be continued with --resume" if arguments.command == "train" else ""
+        print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
+        return 130
+
+
+def _add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to render (default: cpu)")
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from .trainer.loop import train
+    from .trainer.results import results_table
+
+    config = config_from_arguments(arguments)
+    print(f"{config.scene} -> {config.output}: blend mode {config.blend_mode}, schedule {config.schedule}, "
+          f"{config.iterations} iterations, seed {config.seed}")
+    row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)
+    print(results_table([row]))
+    if row["psnr"] is None:
+        print("the scene has no test images: nothing was measured")
+
+
+def _eval(arguments: argparse.Namespace) -> None:
+    from .trainer.inspection import evaluate_run
+    from .trainer.results import results_table
+
+    row = evaluate_run(arguments.output, arguments.device, arguments.split, arguments.scene)
+    print(f"{arguments.split} views")
+    print(results_table([row]))
+
+
+def _render(arguments: argparse.Namespace) -> None:
+    from .trainer.inspection import render_images
+
+    overrides = {name: getattr(arguments, name) for name in ("scene", "resolution", "principal_point",
+                                                             "white_background")
+                 if getattr(arguments, name) is not None}
+    if os.path.isdir(arguments.source):
+        config, ply = TrainConfig.load(arguments.source), None
+        config = config.changed(**overrides)
+    else:
+        if not arguments.scene:
+            raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
+        config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
+    paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device)
+    print(f"{len(paths)} images in {arguments.output}")
+
+
+def _info(arguments: argparse.Namespace) -> None:
+    from .trainer.environment import describe
+
+    print(describe())

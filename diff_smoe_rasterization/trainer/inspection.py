@@ -1,0 +1,85 @@
+"""What is done with a trained model: measure it again, write its images."""
+from __future__ import annotations
+
+import os
+from typing import Any, Dict, List, Optional
+
+import numpy as np
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from .config import TrainConfig
+from .errors import TrainerError
+from .evaluation import evaluate
+from .files import write_json_atomically
+from .loop import check_device
+from .metrics import quantised
+from .modelfile import agreed_blend_mode, load_model, trained_model_path
+from .rendering import Rasterize, Renderer, background_color
+from .results import read_results, result_row, write_results
+from .scene import load_cameras, load_scene
+
+
+def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_folder: Optional[str] = None,
+                 progress: bool = True, rasterize: Optional[Rasterize] = None) -> Dict[str, Any]:
+    """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
+
+    scene_folder: where the scene lies, if not where it was trained. Raises TrainerError.
+    """
+    config = TrainConfig.load(output).changed(device=device, **({"scene": scene_folder} if scene_folder else {}))
+    check_device(device)
+    ply = trained_model_path(output, config.iterations)
+    scene = load_scene(config, progress).to(device)
+    renderer = open_renderer(config, ply, config.blend_mode, device, rasterize)
+    views = {"test": scene.test, "train": scene.train}[split]
+    if not views:
+        raise TrainerError(f"scene {config.scene} has no {split} views")
+    evaluation = evaluate(renderer, views, device, progress)
+    earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
+    seconds = earlier[0].get("train_seconds") if earlier else None
+    row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation)
+    if split == "test":
+        write_results(output, [row])
+        write_json_atomically(os.path.join(output, "per_view.json"), evaluation.per_view)
+    return row
+
+
+def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str], device: str,
+                  rasterize: Optional[Rasterize] = None) -> Renderer:
+    """A renderer for a .ply with the blend mode that it records; config gives background and antialiasing."""
+    model, recorded = load_model(ply, device)
+    mode = agreed_blend_mode(ply, recorded, asked_blend_mode)
+    return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize)
+
+
+def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
+                  blend_mode: Optional[str] = None, device: str = "cpu",
+                  rasterize: Optional[Rasterize] = None) -> List[str]:
+    """Writes a PNG per camera of config.scene into `folder`; returns the paths.
+
+    ply: a file whose comment, else `blend_mode`, gives the blend mode; None: the model of the run that config is of,
+    whose recorded mode `blend_mode` must not contradict. Raises TrainerError.
+    """
+    check_device(device)
+    if ply is None:
+        ply = trained_model_path(config.output, config.iterations)
+        blend_mode = agreed_blend_mode(config.output, config.blend_mode, blend_mode)
+    renderer = open_renderer(config, ply, blend_mode, device, rasterize)
+    cameras = load_cameras(config, split)
+    if not cameras:
+        raise TrainerError(f"scene {config.scene} has no {split} views")
+    os.makedirs(folder, exist_ok=True)
+    paths = []
+    with torch.no_grad():
+        for camera in tqdm(cameras, desc="images", unit="image", leave=False):
+            name = os.path.splitext(camera.name)[0].replace("/", "_").replace(os.sep, "_") + ".png"
+            paths.append(os.path.join(folder, name))
+            to_image(renderer(camera).color).save(paths[-1])
+    return paths
+
+
+def to_image(color: torch.Tensor) -> Image.Image:
+    """A rendering [3, H, W] as an 8-bit image, rounded as the metrics round."""
+    values = (quantised(color.detach()) * 255).round().to(torch.uint8)
+    return Image.fromarray(np.ascontiguousarray(values.permute(1, 2, 0).cpu().numpy()))

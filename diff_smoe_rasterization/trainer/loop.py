@@ -1,0 +1,234 @@
+"""The training loop: one step, a run of them with progress, and the whole of `dsmoe train`."""
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from typing import Any, Dict, List, Optional
+
+import torch
+from tqdm import tqdm
+
+from .checkpoint import CHECKPOINT_NAME, load_checkpoint, save_checkpoint
+from .config import CONFIG_NAME, TrainConfig
+from .environment import extension_info
+from .errors import TrainerError
+from .evaluation import Evaluation, evaluate
+from .files import write_json_atomically
+from .losses import training_loss
+from .metrics import psnr
+from .model import GaussianModel, GaussianOptimizer
+from .modelfile import model_path, save_model
+from .order import ViewOrder
+from .randomness import random_state, restore_random_state, seed_everything
+from .rendering import Rasterize, Renderer, background_color
+from .results import result_row, write_results
+from .scene import Scene, load_scene
+from .stopwatch import Stopwatch
+from .strategy import STRATEGIES, Step, StrategyContext
+from .targets import Targets
+
+HISTORY_NAME = "history.json"  # the evaluations during a run
+PROGRESS_EVERY = 10  # steps between two updates of the progress bar
+
+
+def check_device(device: str) -> None:
+    """Raises TrainerError where this machine or this build cannot train on the device."""
+    if device == "cpu":
+        return
+    if not torch.cuda.is_available():
+        raise TrainerError("--device cuda: torch finds no CUDA device on this machine; use --device cpu")
+    if not extension_info().get("cuda_built"):
+        raise TrainerError("--device cuda: this build of diff_smoe_rasterization has no CUDA backend; "
+                           "use --device cpu or build it with CUDA")
+
+
+class Trainer:
+    """A training run over a loaded scene; `step` is one iteration of 3DGS."""
+
+    def __init__(self, config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None) -> None:
+        """rasterize: a function with the signature of the package's `rasterize`, which is the default."""
+        seed_everything(config.seed)
+        self.config = config
+        self.scene = scene.to(config.device)
+        self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
+        self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
+        background = background_color(config.white_background, config.device)
+        self.renderer = Renderer(self.model, str(config.blend_mode), background, config.antialiasing, rasterize)
+        self.strategy = STRATEGIES[config.schedule](StrategyContext(
+            config, self.model, self.optimizer, scene.extent, [view.camera for view in scene.train], self.renderer))
+        self.targets = Targets(self.scene.train)
+        self.order = ViewOrder(len(scene.train), config.seed)
+        self.watch = Stopwatch(config.device)
+        self.iteration = 0
+
+    def step(self) -> Step:
+        """One iteration, in the order of 3DGS: densification comes between the gradients and the optimizer's step.
+
+        As there, the last iteration does not step: nothing would be rendered after it.
+        """
+        config, model = self.config, self.model
+        if model.num_gaussians == 0:
+            raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
+                               "try another --densify-grad-threshold or --schedule steady")
+        self.iteration += 1
+        self.optimizer.set_position_rate(self.iteration)
+        if self.iteration % config.sh_degree_interval == 0:
+            model.raise_sh_degree()
+        index = self.order.next()
+        camera = self.scene.train[index].camera
+        means2D = torch.zeros_like(model.raw["means3D"], requires_grad=True)
+        rendering = self.renderer(camera, means2D=means2D)
+        loss = training_loss(rendering.color, self.targets[index], config.lambda_dssim)
+        step = Step(self.iteration, camera, rendering, means2D, loss)
+        self.strategy.before_backward(step)
+        loss.backward()
+        with torch.no_grad():
+            self.strategy.after_backward(step)
+            if self.iteration < config.iterations:
+                self.optimizer.step()
+            self.strategy.after_step(step)
+        self._report = (index, rendering.color.detach())
+        return step
+
+    def training_psnr(self) -> float:
+        """PSNR of the last step's rendering against its training image."""
+        index, color = self._report
+        return psnr(color.clamp(0, 1), self.targets[index].image)
+
+    def evaluate(self, progress: bool = False) -> Evaluation:
+        """Renders the test views."""
+        return evaluate(self.renderer, self.scene.test, self.config.device, progress)
+
+    def state_dict(self) -> Dict[str, Any]:
+        """Everything the rest of the run depends on, as tensors and plain values."""
+        return {
+            "config": dataclasses.asdict(self.config),
+            "iteration": self.iteration,
+            "train_seconds": self.watch.seconds,
+            "raw": {name: tensor.detach() for name, tensor in self.model.raw.items()},
+            "active_sh_degree": self.model.active_sh_degree,
+            "optimizer": self.optimizer.state_dict(),
+            "strategy": self.strategy.state_dict(),
+            "order": self.order.state_dict(),
+            "random": random_state(),
+        }
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        """Takes what `state_dict` gave. Raises TrainerError where it was another run's."""
+        differences = TrainConfig(**state["config"]).differences(self.config)
+        if differences:
+            raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
+        self.iteration = state["iteration"]
+        self.watch.seconds = state["train_seconds"]
+        self.optimizer.replace_all(state["raw"])
+        self.model.active_sh_degree = state["active_sh_degree"]
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.strategy.load_state_dict(state["strategy"])
+        self.order.load_state_dict(state["order"])
+        restore_random_state(state["random"])
+
+
+class Run:
+    """A Trainer with an output folder: progress, evaluations on the way, checkpoints."""
+
+    def __init__(self, trainer: Trainer, progress: bool = True) -> None:
+        self.trainer = trainer
+        self.progress = progress
+        self.history: List[Dict[str, Any]] = []
+
+    def resume(self) -> bool:
+        """Continues from the folder's checkpoint; False where there is none yet."""
+        path = self._path(CHECKPOINT_NAME)
+        if not os.path.isfile(path):
+            return False
+        state = load_checkpoint(path, self.trainer.config.device)
+        self.trainer.load_state_dict(state)
+        self.history = list(state["history"])
+        return True
+
+    def train(self) -> Dict[str, Any]:
+        """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
+        trainer, config = self.trainer, self.trainer.config
+        with tqdm(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
+                  disable=not self.progress, dynamic_ncols=True) as bar:
+            trainer.watch.start()
+            while trainer.iteration < config.iterations:
+                step = trainer.step()
+                bar.update()
+                if trainer.iteration % PROGRESS_EVERY == 0:
+                    self._show(bar, float(step.loss.detach()))
+                ends = trainer.iteration == config.iterations
+                evaluates = not ends and _is_due(trainer.iteration, config.eval_every)
+                saves = ends or _is_due(trainer.iteration, config.checkpoint_every)
+                if evaluates or saves:
+                    trainer.watch.stop()
+                    if evaluates:
+                        self._record(trainer.evaluate(), bar)
+                    if saves:
+                        self.save_checkpoint()
+                    trainer.watch.start()
+            trainer.watch.stop()
+        save_model(model_path(config.output, trainer.iteration), trainer.model, str(config.blend_mode))
+        evaluation = trainer.evaluate(self.progress)
+        row = result_row(config, trainer.scene, trainer.model.num_gaussians, trainer.watch.seconds, evaluation)
+        write_results(config.output, [row])
+        write_json_atomically(self._path("per_view.json"), evaluation.per_view)
+        return row
+
+    def save_checkpoint(self) -> None:
+        """Writes the state of trainer and history."""
+        save_checkpoint(self._path(CHECKPOINT_NAME), {**self.trainer.state_dict(), "history": self.history})
+
+    def _show(self, bar: Any, loss: float) -> None:
+        if not math.isfinite(loss):
+            raise TrainerError(f"iteration {self.trainer.iteration}: the loss is {loss}; lower the learning rates")
+        if self.progress:
+            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{self.trainer.training_psnr():.2f}",
+                            gaussians=self.trainer.model.num_gaussians, refresh=False)
+
+    def _record(self, evaluation: Evaluation, bar: Any) -> None:
+        trainer = self.trainer
+        self.history.append({"iteration": trainer.iteration, **evaluation.metrics,
+                             "num_gaussians": trainer.model.num_gaussians, "train_seconds": trainer.watch.seconds})
+        write_json_atomically(self._path(HISTORY_NAME), self.history)
+        if self.progress and evaluation.metrics["psnr"] is not None:
+            bar.write(f"iteration {trainer.iteration}: test PSNR {evaluation.metrics['psnr']:.2f} dB, "
+                      f"SSIM {evaluation.metrics['ssim']:.4f}, {trainer.model.num_gaussians} Gaussians")
+
+    def _path(self, name: str) -> str:
+        return os.path.join(self.trainer.config.output, name)
+
+
+def _is_due(iteration: int, interval: int) -> bool:
+    return interval > 0 and iteration % interval == 0
+
+
+def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
+          scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None) -> Dict[str, Any]:
+    """Trains a scene into config.output; returns the row of results.json.
+
+    resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
+    of threads); start it where it has no checkpoint yet. overwrite: replace a run that is there. scene: a loaded
+    scene, where one is at hand. Raises TrainerError before training starts where anything does not fit.
+    """
+    config.validate()
+    check_device(config.device)
+    if os.path.isfile(os.path.join(config.output, CONFIG_NAME)):
+        if resume:
+            differences = TrainConfig.load(config.output).differences(config)
+            if differences:
+                raise TrainerError(f"{config.output} holds a run with other options: " + "; ".join(differences))
+        elif not overwrite:
+            raise TrainerError(f"{config.output} already holds a training run; continue it with --resume, "
+                               "replace it with --overwrite, or choose another folder")
+    scene = scene or load_scene(config, progress)
+    os.makedirs(config.output, exist_ok=True)
+    run = Run(Trainer(config, scene, rasterize), progress)
+    config.save(config.output)
+    if resume:
+        resumed = run.resume()
+        print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
+    elif os.path.isfile(os.path.join(config.output, CHECKPOINT_NAME)):
+        os.remove(os.path.join(config.output, CHECKPOINT_NAME))
+    return run.train()

@@ -1,0 +1,79 @@
+"""OUT/results.json: rows that say what was measured, how and on what."""
+from __future__ import annotations
+
+import json
+import os
+from typing import Any, Dict, List, Optional
+
+from .config import TrainConfig
+from .environment import machine, versions
+from .evaluation import Evaluation
+from .files import write_json_atomically
+from .images import DOWNSCALER
+from .scene import Scene
+
+RESULTS_NAME = "results.json"
+
+
+def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seconds: Optional[float],
+               evaluation: Evaluation) -> Dict[str, Any]:
+    """One row: the figures first, then the protocol that makes them comparable."""
+    first = (list(scene.test) or list(scene.train))[0].camera
+    return {
+        "scene": os.path.basename(os.path.normpath(config.scene)),
+        "blend_mode": config.blend_mode,
+        **evaluation.metrics,
+        "num_gaussians": num_gaussians,
+        "train_seconds": train_seconds,  # the loop alone: without loading, evaluation and checkpoints
+        "fps": evaluation.fps,
+        "protocol": {
+            "scene_kind": scene.kind,
+            "split": scene.split,
+            "train_views": len(scene.train),
+            "test_views": len(scene.test),
+            "resolution": config.resolution,
+            "image_size": [first.width, first.height],
+            "downscaler": DOWNSCALER,
+            "background": "white" if config.white_background else "black",
+            "principal_point": config.principal_point,
+            "schedule": config.schedule,
+            "densify_grad_threshold": config.densify_grad_threshold,
+            "init_points": len(scene.points.positions),
+            "iterations": config.iterations,
+            "seed": config.seed,
+            "psnr": "8-bit images, mean over test views; psnr_float: floats clamped to [0, 1]",
+            "ssim": "8-bit images, 11x11 window, sigma 1.5, zero padding, mean over test views",
+            "device": config.device,
+            "machine": machine(config.device),
+            "versions": versions(),
+        },
+    }
+
+
+def write_results(folder: str, rows: List[Dict[str, Any]]) -> None:
+    """Writes OUT/results.json."""
+    write_json_atomically(os.path.join(folder, RESULTS_NAME), rows)
+
+
+def read_results(folder: str) -> List[Dict[str, Any]]:
+    """The rows of OUT/results.json; none where the file is absent."""
+    path = os.path.join(folder, RESULTS_NAME)
+    if not os.path.isfile(path):
+        return []
+    with open(path, encoding="utf-8") as file:
+        return json.load(file)
+
+
+def results_table(rows: List[Dict[str, Any]]) -> str:
+    """Rows as a text table: blend mode, PSNR, SSIM, #Gaussians, training seconds, frames per second."""
+    header = ("blend mode", "PSNR [dB]", "SSIM", "#Gaussians", "train [s]", "FPS")
+    body = [(row["blend_mode"], _number(row["psnr"], 2), _number(row["ssim"], 4), f"{row['num_gaussians']:,}",
+             _number(row["train_seconds"], 1), _number(row["fps"], 1)) for row in rows]
+    widths = [max(len(line[column]) for line in [header, *body]) for column in range(len(header))]
+    lines = ["  ".join(cell.ljust(width) if column == 0 else cell.rjust(width)
+                       for column, (cell, width) in enumerate(zip(line, widths))) for line in [header, *body]]
+    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+
+
+def _number(value: Optional[float], digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
