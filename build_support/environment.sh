@@ -1,0 +1,102 @@
+# shellcheck shell=bash
+# Sourced by ./quickstart and ./check: a virtual environment that holds torch and this package.
+#
+#   DSMOE_VENV    the environment's folder           (.venv in the repository)
+#   DSMOE_PYTHON  the Python that it is made of      (python3)
+#   DSMOE_TORCH   what pip is asked to install       (torch)
+
+unset PYTHONPATH PYTHONHOME
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+
+fail() {
+  printf 'error: %s\n' "$@" >&2
+  exit 1
+}
+
+# step WHAT COMMAND...: runs the command quietly; where it fails, shows the end of what it said.
+step() {
+  local what=$1 begin=$SECONDS
+  shift
+  printf '  %s ... ' "$what"
+  if "$@" >>"$log" 2>&1; then
+    printf 'done (%d s)\n' $((SECONDS - begin))
+  else
+    printf 'failed\n\n'
+    tail -n 30 "$log" >&2
+    fail "\"$what\" failed; the lines above are the end of $log"
+  fi
+}
+
+processors() { getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1; }
+
+check_prerequisites() {  # PYTHON
+  local python=$1 debian="on Debian or Ubuntu: apt-get install"
+  command -v "$python" >/dev/null || fail "there is no $python ($debian python3; DSMOE_PYTHON names another)"
+  "$python" -c 'import sys; sys.exit(sys.version_info < (3, 8))' ||
+    fail "$("$python" --version) is too old: 3.8 or newer is needed (DSMOE_PYTHON names another)"
+  "$python" -c 'import venv, ensurepip' 2>/dev/null ||
+    fail "$python cannot make virtual environments ($debian python3-venv)"
+  "$python" -c 'import os, sysconfig as s; open(os.path.join(s.get_paths()["include"], "Python.h"))' 2>/dev/null ||
+    fail "the headers of $python (Python.h) are missing ($debian python3-dev)"
+  command -v "${CXX:-c++}" >/dev/null || command -v g++ >/dev/null ||
+    fail "there is no C++ compiler ($debian g++)"
+}
+
+pip_install() { "$venv/bin/python" -m pip install --disable-pip-version-check "$@"; }
+
+# A checksum of all that decides what gets installed.
+fingerprint() {
+  (
+    cd "$root" || exit
+    find setup.py pyproject.toml sources.txt build_support diff_smoe_rasterization integrations patches benchmarks \
+      -type f ! -name '*.py[co]' ! -name '*.so' ! -name _build_info.py -exec cksum {} + 2>/dev/null | LC_ALL=C sort
+    cat "$venv"/lib/python*/site-packages/torch/version.py 2>/dev/null
+    echo "${torch_request[@]}" "${DSMOE_BUILD_CUDA-}" "${TORCH_CUDA_ARCH_LIST-}"
+  ) | cksum
+}
+
+install_package() {
+  local numpy=numpy
+  # PyTorch before 2.3 was built against NumPy 1 and cannot exchange arrays with NumPy 2.
+  "$venv/bin/python" -I -W ignore -c 'import sys, torch
+sys.exit(tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 3))' && numpy='numpy<2'
+  # Objects stay for the next build; assembled packages do not, or deleted modules would live on in them.
+  rm -rf "$venv"/build/lib* "$venv"/build/bdist*
+  printf '[build]\nbuild_base = %s\n' "$venv/build" >"$venv/build.cfg"
+  DIST_EXTRA_CONFIG=$venv/build.cfg pip_install --no-build-isolation "$root" "$numpy"
+}
+
+# prepare_environment FOLDER [WORD...]: makes, updates or reuses the environment in FOLDER; sets `venv` to its path.
+# The words ask pip for PyTorch; without any, the environment uses the packages of DSMOE_PYTHON, torch included.
+prepare_environment() {
+  venv=$1
+  shift
+  torch_request=("$@")
+  case "$venv" in /*) ;; *) venv=$PWD/$venv ;; esac
+  log=$venv/install.log
+  local stamp=$venv/dsmoe.stamp python=${DSMOE_PYTHON:-python3} over_system=()
+  if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$(fingerprint)" ]; then
+    echo "Reusing the environment $venv: nothing has changed since it was built."
+    return
+  fi
+  [ $# -gt 0 ] || over_system=(--system-site-packages)
+  if [ -x "$venv/bin/pip" ]; then
+    if [ -n "${DSMOE_PYTHON-}" ] && [ "$("$python" --version)" != "$("$venv/bin/python" --version)" ]; then
+      fail "$venv holds $("$venv/bin/python" --version), but DSMOE_PYTHON is $("$python" --version):" \
+        "remove that folder, or name another one in DSMOE_VENV"
+    fi
+    echo "Reusing the environment $venv and bringing it up to date (log: $log)"
+  else
+    check_prerequisites "$python"
+    echo "Making the environment $venv with $("$python" --version) (log: $log)"
+    mkdir -p "$venv"
+    step "Creating it" "$python" -m venv "${over_system[@]}" "$venv"
+  fi
+  rm -f "$stamp"
+  if [ $# -gt 0 ]; then
+    step "Installing PyTorch and build tools" pip_install "$@" "setuptools>=61,<82" wheel ninja
+  fi
+  step "Compiling and installing diff_smoe_rasterization" install_package
+  step "Loading it" "$venv/bin/python" -I -c 'import diff_smoe_rasterization.rasterizer'
+  fingerprint >"$stamp"
+}
