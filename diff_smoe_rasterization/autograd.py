@@ -1,0 +1,100 @@
+"""Gradients of the op `rasterize`, and what torch.compile must know of the ops.
+
+Torch 2.4 and later get a registered formula and fake kernels, so that torch.compile sees through the ops; older
+releases an autograd.Function around the same two functions, `_keep` and `_backward`.
+"""
+from __future__ import annotations
+
+import torch
+
+from .extension import _C  # noqa: F401  (loading it registers the ops)
+
+_OPS = torch.ops.diff_smoe_rasterization
+_NUM_INPUTS = 13  # tensors before the options
+_NUM_OPTIONS = 13  # options that the backward op takes too
+_NUM_CHECKS = 2  # strict, prefiltered
+_NUM_IMAGES = 5  # results that are the caller's: color, radii, gate_sum, depth, inverse_depth
+_RADII = 1
+
+
+def _keep(ctx, inputs, output):
+    """Keeps what the backward pass needs. The images are the caller's to edit in place, so they are copied."""
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(output[_RADII], *output[_NUM_IMAGES:])
+    ctx.options = inputs[_NUM_INPUTS:_NUM_INPUTS + _NUM_OPTIONS]
+    ctx.present = [tensor is not None for tensor in inputs[:_NUM_INPUTS]]
+    tensors = [tensor for tensor in inputs[:_NUM_INPUTS] if tensor is not None]
+    images = [image if i == _RADII else image.clone() for i, image in enumerate(output[:_NUM_IMAGES])]
+    ctx.save_for_backward(*tensors, *images, *output[_NUM_IMAGES:])
+
+
+def _backward(ctx, *gradients):
+    saved = iter(ctx.saved_tensors)
+    inputs = [next(saved) if present else None for present in ctx.present]
+    image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
+    wanted = list(ctx.needs_input_grad[:_NUM_INPUTS])
+    results = iter(_OPS.rasterize_backward(image_gradients, inputs, list(saved), *ctx.options, wanted))
+    return tuple(next(results) if want else None for want in wanted) + (None,) * (_NUM_OPTIONS + _NUM_CHECKS)
+
+
+def _refuse_second_derivative(ctx, *gradients):
+    raise RuntimeError("rasterize: second derivatives are not implemented; its gradients cannot be differentiated again")
+
+
+class _Rasterize(torch.autograd.Function):
+    """For torch without torch.library.register_autograd."""
+
+    @staticmethod
+    def forward(ctx, *inputs):
+        output = _OPS.rasterize(*inputs)
+        _keep(ctx, inputs, output)
+        return output
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *gradients):
+        return _backward(ctx, *gradients)
+
+
+def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
+                    viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier, near,
+                    alpha_min, sh_degree, blend_mode, antialiasing, depth, inverse_depth, debug, strict, prefiltered):
+    """The results' shapes and types, as csrc/torch/tensors.cpp allocates them."""
+    count = means3D.shape[0]
+    channels = 3 if colors_precomp is None else colors_precomp.shape[1]
+    tile = _C.constants["tile_size"]
+    tiles = ((image_width + tile - 1) // tile) * ((image_height + tile - 1) // tile)
+    num_instances = torch.library.get_ctx().new_dynamic_size()
+
+    def image(wanted=True):
+        return means3D.new_empty((1, image_height, image_width) if wanted else (0,))
+
+    return (means3D.new_empty((channels, image_height, image_width)), means3D.new_empty((count,), dtype=torch.int32),
+            image(), image(depth), image(inverse_depth), means3D.new_empty((count, 8)),
+            means3D.new_empty((count, channels + depth + inverse_depth)),
+            means3D.new_empty((count + 1,), dtype=torch.int64), means3D.new_empty((tiles + 1,), dtype=torch.int64),
+            means3D.new_empty((num_instances, 2), dtype=torch.int32), means3D.new_empty((image_height, image_width)),
+            means3D.new_empty((image_height, image_width), dtype=torch.int32))
+
+
+def _fake_rasterize_backward(image_gradients, inputs, outputs, *options_and_wanted):
+    wanted = options_and_wanted[-1]
+    return [tensor.new_empty(tensor.shape) for tensor, want in zip(inputs, wanted) if want]
+
+
+def _fake_mark_visible(positions, viewmatrix, near):
+    return positions.new_empty((positions.shape[0],), dtype=torch.bool)
+
+
+if hasattr(torch.library, "register_autograd"):
+    _NAME = "diff_smoe_rasterization::"
+    torch.library.register_fake(_NAME + "rasterize", _fake_rasterize)
+    torch.library.register_fake(_NAME + "rasterize_backward", _fake_rasterize_backward)
+    torch.library.register_fake(_NAME + "mark_visible", _fake_mark_visible)
+    torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)
+    torch.library.register_autograd(_NAME + "rasterize_backward", _refuse_second_derivative)
+    rasterize_op = _OPS.rasterize
+else:
+    def rasterize_op(*inputs):
+        needed = torch.is_grad_enabled() and any(isinstance(x, torch.Tensor) and x.requires_grad for x in inputs)
+        return _Rasterize.apply(*inputs) if needed else _OPS.rasterize(*inputs)

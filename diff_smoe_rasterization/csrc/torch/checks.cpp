@@ -1,0 +1,231 @@
+#include "checks.h"
+
+#include <climits>
+#include <cmath>
+#include <sstream>
+#include <string>
+#include <vector>
+
+namespace dsmoe {
+namespace binding {
+namespace {
+
+constexpr int kMaxShDegree = 3;
+
+std::string dtype_name(at::ScalarType type) {
+  switch (type) {
+    case at::kHalf:
+      return "float16";
+    case at::kBFloat16:
+      return "bfloat16";
+    case at::kFloat:
+      return "float32";
+    case at::kDouble:
+      return "float64";
+    case at::kInt:
+      return "int32";
+    case at::kLong:
+      return "int64";
+    default:
+      return c10::toString(type);
+  }
+}
+
+// One size of an expected shape: a number, or a letter (or -1) for any.
+struct Size {
+  Size(int64_t size) : size(size), letter(size < 0 ? "any" : nullptr) {}
+  Size(const char* letter) : letter(letter) {}
+  int64_t size = -1;
+  const char* letter;
+};
+using Shape = std::vector<Size>;
+
+std::string to_string(const Shape& shape) {
+  std::ostringstream out;
+  for (size_t i = 0; i < shape.size(); ++i) {
+    out << (i == 0 ? "[" : ", ");
+    if (shape[i].letter != nullptr) {
+      out << shape[i].letter;
+    } else {
+      out << shape[i].size;
+    }
+  }
+  out << "]";
+  return out.str();
+}
+
+bool matches(const at::Tensor& tensor, const Shape& shape) {
+  if (tensor.dim() != static_cast<int64_t>(shape.size())) return false;
+  for (size_t i = 0; i < shape.size(); ++i) {
+    if (shape[i].letter == nullptr && tensor.size(i) != shape[i].size) return false;
+  }
+  return true;
+}
+
+void check_shape(const char* function, const char* name, const at::Tensor& tensor, const Shape& shape) {
+  TORCH_CHECK_VALUE(matches(tensor, shape), function, ": ", name, " has shape ", tensor.sizes(), "; it must be ",
+                    to_string(shape));
+}
+
+void check_shape(Input input, const Inputs& inputs, const Shape& shape) {
+  if (inputs[input].defined()) check_shape("rasterize", kInputNames[input], inputs[input], shape);
+}
+
+void check_real(const char* function, const char* name, const at::Tensor& tensor) {
+  const at::ScalarType type = tensor.scalar_type();
+  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, function, ": ", name, " is ", dtype_name(type),
+                   "; it must be float32 or float64: cast it, for instance with ", name, ".float()");
+}
+
+void check_like(const char* function, const char* name, const at::Tensor& tensor, const char* other_name,
+                const at::Tensor& other) {
+  TORCH_CHECK_TYPE(tensor.scalar_type() == other.scalar_type(), function, ": ", name, " is ",
+                   dtype_name(tensor.scalar_type()), "; it must be ", dtype_name(other.scalar_type()), ", as ",
+                   other_name, " is");
+  TORCH_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
+                   "; it must be on ", other.device(), ", as ", other_name, " is");
+}
+
+void check_either(bool first, bool second, const char* names) {
+  TORCH_CHECK_VALUE(first != second, "rasterize: ", first ? "both" : "neither", " of ", names, first ? " are" : " is",
+                    " given; exactly one of the two must be");
+}
+
+void check_present(const Inputs& inputs) {
+  check_either(inputs[kShs].defined() || inputs[kDc].defined(), inputs[kColorsPrecomp].defined(),
+               "shs (or dc) and colors_precomp");
+  const bool scales = inputs[kScales].defined(), rotations = inputs[kRotations].defined();
+  check_either(scales || rotations, inputs[kCov3DPrecomp].defined(), "scales with rotations, and cov3D_precomp,");
+  TORCH_CHECK_VALUE(scales == rotations,
+                    "rasterize: ", scales ? "scales is given without rotations" : "rotations is given without scales",
+                    "; the covariance needs both");
+}
+
+void check_shapes(const Inputs& inputs) {
+  check_shape(kMeans3D, inputs, {"N", 3});
+  const int64_t count = num_gaussians(inputs);
+  const at::Tensor& opacities = inputs[kOpacities];
+  TORCH_CHECK_VALUE(matches(opacities, {count}) || matches(opacities, {count, 1}), "rasterize: opacities has shape ",
+                    opacities.sizes(), "; it must be [", count, ", 1] or [", count, "]");
+  check_shape(kMeans2D, inputs, {count, 3});
+  check_shape(kDc, inputs, {count, 1, 3});
+  check_shape(kShs, inputs, {count, "K", 3});
+  check_shape(kColorsPrecomp, inputs, {count, "C"});
+  check_shape(kScales, inputs, {count, 3});
+  check_shape(kRotations, inputs, {count, 4});
+  check_shape(kCov3DPrecomp, inputs, {count, 6});
+  check_shape(kBackground, inputs, {num_channels(inputs)});
+  check_shape(kViewMatrix, inputs, {4, 4});
+  check_shape(kProjMatrix, inputs, {4, 4});
+  check_shape(kCampos, inputs, {3});
+  TORCH_CHECK_VALUE(count <= INT_MAX, "rasterize: means3D has ", count, " Gaussians; the most is ", INT_MAX);
+}
+
+void check_sh_degree(const Inputs& inputs, int64_t degree) {
+  if (inputs[kColorsPrecomp].defined()) return;
+  TORCH_CHECK_VALUE(0 <= degree && degree <= kMaxShDegree, "rasterize: sh_degree is ", degree, "; it must be 0 to ",
+                    kMaxShDegree);
+  const int64_t held = (inputs[kShs].defined() ? inputs[kShs].size(1) : 0) + (inputs[kDc].defined() ? 1 : 0);
+  const int64_t needed = (degree + 1) * (degree + 1);
+  const Input last = inputs[kShs].defined() ? kShs : kDc;
+  TORCH_CHECK_VALUE(held >= needed, "rasterize: ", kInputNames[last], " has shape ", inputs[last].sizes(),
+                    inputs[kShs].defined() && inputs[kDc].defined() ? " besides dc" : "", "; sh_degree ", degree,
+                    " needs ", needed, " coefficients a Gaussian, not ", held);
+}
+
+void check_options(const Options& options) {
+  const int64_t height = options.image_height, width = options.image_width;
+  TORCH_CHECK_VALUE(height > 0 && width > 0, "rasterize: image_height x image_width is ", height, " x ", width,
+                    "; both must be positive");
+  TORCH_CHECK_VALUE(height <= INT_MAX / width, "rasterize: image_height x image_width is ", height, " x ", width,
+                    "; an image may have ", INT_MAX, " pixels");
+  const auto check_positive = [](const char* name, double value) {
+    TORCH_CHECK_VALUE(std::isfinite(value) && value > 0, "rasterize: ", name, " is ", value,
+                      "; it must be positive and finite");
+  };
+  const auto check_not_negative = [](const char* name, double value) {
+    TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0, "rasterize: ", name, " is ", value,
+                      "; it must be 0 or more and finite");
+  };
+  check_positive("tanfovx", options.tanfovx);
+  check_positive("tanfovy", options.tanfovy);
+  check_not_negative("scale_modifier", options.scale_modifier);
+  check_not_negative("near", options.near);
+  check_not_negative("alpha_min", options.alpha_min);
+  TORCH_CHECK_VALUE(0 <= options.blend_mode && options.blend_mode < kNumBlendModes, "rasterize: blend_mode is ",
+                    options.blend_mode, "; it must be 0 to ", kNumBlendModes - 1);
+}
+
+}  // namespace
+
+void check_arguments(const Inputs& inputs, const Options& options) {
+  check_real("rasterize", "means3D", inputs[kMeans3D]);
+  for (int i = 0; i < kNumInputs; ++i) {
+    if (inputs[i].defined()) check_like("rasterize", kInputNames[i], inputs[i], "means3D", inputs[kMeans3D]);
+  }
+  check_options(options);
+  check_present(inputs);
+  check_shapes(inputs);
+  check_sh_degree(inputs, options.sh_degree);
+}
+
+void check_backward_arguments(const Inputs& inputs, const Options& options, const Outputs& outputs,
+                              const ImageGradientTensors& image_gradients, const Wanted& wanted) {
+  const char* function = "rasterize_backward";
+  check_arguments(inputs, options);
+  const auto specs = output_specs(inputs, options);
+  for (int i = 0; i < kNumOutputs; ++i) {
+    check_shape(function, kOutputNames[i], outputs[i], {specs[i].shape.begin(), specs[i].shape.end()});
+    TORCH_CHECK_TYPE(outputs[i].scalar_type() == specs[i].type && outputs[i].is_contiguous() &&
+                         outputs[i].device() == inputs[kMeans3D].device(),
+                     function, ": ", kOutputNames[i], " must be as rasterize returned it: dense ",
+                     dtype_name(specs[i].type), " on ", inputs[kMeans3D].device());
+  }
+  for (int i = 0; i < kNumImageGradients; ++i) {
+    if (!image_gradients[i].defined()) continue;
+    const Output image = kImageOfGradient[i];
+    check_like(function, kImageGradientNames[i], image_gradients[i], "means3D", inputs[kMeans3D]);
+    check_shape(function, kImageGradientNames[i], image_gradients[i],
+                {specs[image].shape.begin(), specs[image].shape.end()});
+  }
+  for (int i = 0; i < kNumInputs; ++i) {
+    TORCH_CHECK_VALUE(!wanted[i] || inputs[i].defined(), function, ": the gradient of ", kInputNames[i],
+                      " is wanted, but that input is absent");
+  }
+}
+
+void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix) {
+  check_real("markVisible", "positions", positions);
+  check_shape("markVisible", "positions", positions, {"N", 3});
+  check_like("markVisible", "viewmatrix", viewmatrix, "positions", positions);
+  check_shape("markVisible", "viewmatrix", viewmatrix, {4, 4});
+}
+
+void refuse_non_finite(const Inputs& inputs, int64_t index) {
+  if (index < 0) return;
+  for (int i = kMeans3D; i <= kCov3DPrecomp; ++i) {
+    if (i == kMeans2D || !inputs[i].defined()) continue;
+    TORCH_CHECK_VALUE(at::isfinite(inputs[i][index]).all().item<bool>(), "rasterize: ", kInputNames[i], "[", index,
+                      "] is not finite (strict=True)");
+  }
+}
+
+void refuse_culled(const Inputs& inputs, const at::Tensor& visible) {
+  const at::Tensor culled = at::logical_not(visible).logical_and(at::isfinite(inputs[kMeans3D]).all(1)).nonzero();
+  if (culled.numel() == 0) return;
+  const int64_t index = culled[0][0].item<int64_t>();
+  TORCH_CHECK_VALUE(false, "rasterize: prefiltered is set, but means3D[", index, "] is not beyond the near plane");
+}
+
+void refuse_nan(const char* function, const char* what, const at::Tensor& result) {
+  if (!result.defined() || result.numel() == 0) return;
+  const at::Tensor indices = at::isnan(result).nonzero();
+  if (indices.size(0) == 0) return;
+  std::ostringstream index;
+  for (int64_t i = 0; i < indices.size(1); ++i) index << (i == 0 ? "" : ", ") << indices[0][i].item<int64_t>();
+  TORCH_CHECK(false, function, ": ", what, "[", index.str(), "] is NaN, as are ", indices.size(0), " of ",
+              result.numel(), " values (debug=True)");
+}
+
+}  // namespace binding
+}  // namespace dsmoe

@@ -1,0 +1,29 @@
+// What the ops refuse. Errors name the function, the argument, what it is and what it must be: ValueError for shapes
+// and values, TypeError for types and devices. This is the only place that checks; Python adds none of these.
+#pragma once
+
+#include "tensors.h"
+
+namespace dsmoe {
+namespace binding {
+
+// Tensors and numbers of one rendering, before any memory is read.
+void check_arguments(const Inputs& inputs, const Options& options);
+
+// The backward op's own arguments; for a caller that is not our autograd formula.
+void check_backward_arguments(const Inputs& inputs, const Options& options, const Outputs& outputs,
+                              const ImageGradientTensors& image_gradients, const Wanted& wanted);
+
+void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix);
+
+// Under `strict`: raises for Gaussian `index`, which has an attribute that is not finite; -1 is none.
+void refuse_non_finite(const Inputs& inputs, int64_t index);
+
+// Under `prefiltered`: raises for a Gaussian that is not visible [N], unless its position is not finite.
+void refuse_culled(const Inputs& inputs, const at::Tensor& visible);
+
+// Under `debug`: raises where a result holds NaN, naming it, the index, and the op.
+void refuse_nan(const char* function, const char* what, const at::Tensor& result);
+
+}  // namespace binding
+}  // namespace dsmoe

@@ -1,0 +1,62 @@
+// The Python module: what is no tensor op. Importing it registers the ops (schema.cpp).
+#include <ATen/Parallel.h>
+#include <pybind11/pybind11.h>
+#include <torch/version.h>
+
+#include "dsmoe/constants.h"
+#include "dsmoe/gate.h"
+#include "io/python_bindings.h"
+#include "profiling.h"
+
+namespace py = pybind11;
+
+namespace {
+
+// For the test that compares them with the oracle's own.
+py::dict constants() {
+  using namespace py::literals;
+  return py::dict("alpha_max"_a = dsmoe::kAlphaMax, "alpha_cut"_a = dsmoe::kAlphaCut, "gate_cut"_a = dsmoe::kGateCut,
+                  "transmittance_cut"_a = dsmoe::kTransmittanceCut, "gate_sum_cut"_a = dsmoe::kGateSumCut,
+                  "radius_root_floor"_a = dsmoe::kRadiusRootFloor, "compensation_floor"_a = dsmoe::kCompensationFloor,
+                  "low_pass"_a = dsmoe::kLowPass, "frustum_margin"_a = dsmoe::kFrustumMargin,
+                  "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon, "tile_size"_a = dsmoe::kTileSize);
+}
+
+py::dict blend_modes() {
+  using dsmoe::BlendMode;
+  using namespace py::literals;
+  return py::dict("alpha"_a = static_cast<int>(BlendMode::kAlpha), "smoe"_a = static_cast<int>(BlendMode::kSmoe),
+                  "smoe_tn"_a = static_cast<int>(BlendMode::kSmoeTn),
+                  "smoe_std"_a = static_cast<int>(BlendMode::kSmoeStd));
+}
+
+py::dict build_info() {
+  using namespace py::literals;
+#ifdef DSMOE_WITH_CUDA
+  constexpr bool kCudaBuilt = true;
+#else
+  constexpr bool kCudaBuilt = false;
+#endif
+  return py::dict("torch_built_with"_a = TORCH_VERSION, "compiler"_a = __VERSION__, "cuda_built"_a = kCudaBuilt,
+                  "simd_level"_a = dsmoe::cpu::simd_level(), "num_threads"_a = at::get_num_threads());
+}
+
+py::dict stage_times() {
+  using namespace py::literals;
+  const dsmoe::cpu::StageTimes times = dsmoe::binding::stage_times();
+  return py::dict("project"_a = times.project, "sort"_a = times.sort, "bin"_a = times.bin, "blend"_a = times.blend,
+                  "blend_backward"_a = times.blend_backward, "project_backward"_a = times.project_backward,
+                  "forward_pairs"_a = times.forward_pairs, "backward_pairs"_a = times.backward_pairs);
+}
+
+}  // namespace
+
+PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
+  m.attr("constants") = constants();
+  m.attr("blend_modes") = blend_modes();
+  m.def("build_info", &build_info);
+  m.def("set_profiling", &dsmoe::binding::set_profiling);
+  m.def("stage_times", &stage_times);
+  py::module_ io = m.def_submodule("io");
+  dsmoe::io::bind_io(io);
+}

@@ -1,0 +1,96 @@
+// The signatures of the ops, once for all backends: schema.cpp says them to torch; a backend registers
+// `rasterize<&forward>` and its like under its dispatch key.
+#pragma once
+
+#include <tuple>
+
+#include "checks.h"
+#include "tensors.h"
+
+namespace dsmoe {
+namespace binding {
+
+// What happens besides the rendering itself.
+struct ForwardChecks {
+  bool strict, prefiltered;
+};
+
+using ForwardFunction = Outputs (*)(const Inputs&, const Options&, ForwardChecks);
+using BackwardFunction = void (*)(const Inputs&, const Options&, const Outputs&, const ImageGradientTensors&,
+                                  const Inputs& gradients);
+
+template <ForwardFunction kForward>
+auto rasterize(const at::Tensor& means3D, const OptionalTensor& means2D, const at::Tensor& opacities,
+               const OptionalTensor& dc, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
+               const OptionalTensor& scales, const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp,
+               const at::Tensor& bg, const at::Tensor& viewmatrix, const at::Tensor& projmatrix,
+               const at::Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
+               double scale_modifier, double near, double alpha_min, int64_t sh_degree, int64_t blend_mode,
+               bool antialiasing, bool depth, bool inverse_depth, bool debug, bool strict, bool prefiltered) {
+  const auto given = [](const OptionalTensor& tensor) { return tensor.has_value() ? *tensor : at::Tensor(); };
+  const Inputs inputs = {means3D,
+                         given(means2D),
+                         opacities,
+                         given(dc),
+                         given(shs),
+                         given(colors_precomp),
+                         given(scales),
+                         given(rotations),
+                         given(cov3D_precomp),
+                         bg,
+                         viewmatrix,
+                         projmatrix,
+                         campos};
+  const Options options = {image_height, image_width, tanfovx,      tanfovy, scale_modifier, near, alpha_min,
+                           sh_degree,    blend_mode,  antialiasing, depth,   inverse_depth,  debug};
+  check_arguments(inputs, options);
+  const Outputs outputs = kForward(contiguous(inputs), options, {strict, prefiltered});
+  if (debug) {
+    for (Output image : kImageOfGradient) refuse_nan("rasterize", kOutputNames[image], outputs[image]);
+  }
+  return std::tuple_cat(outputs);
+}
+
+template <BackwardFunction kBackward>
+std::vector<at::Tensor> rasterize_backward(const c10::List<OptionalTensor>& image_gradient_list,
+                                           const c10::List<OptionalTensor>& input_list, at::TensorList output_list,
+                                           int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
+                                           double scale_modifier, double near, double alpha_min, int64_t sh_degree,
+                                           int64_t blend_mode, bool antialiasing, bool depth, bool inverse_depth,
+                                           bool debug, Wanted wanted) {
+  const char* function = "rasterize_backward";
+  ImageGradientTensors image_gradients;
+  Inputs inputs;
+  Outputs outputs;
+  const auto check_length = [&](const char* name, size_t length, size_t expected) {
+    TORCH_CHECK_VALUE(length == expected, function, ": ", name, " has length ", length, "; it must be ", expected);
+  };
+  check_length("image_gradients", image_gradient_list.size(), image_gradients.size());
+  check_length("inputs", input_list.size(), inputs.size());
+  check_length("outputs", output_list.size(), outputs.size());
+  for (size_t i = 0; i < image_gradients.size(); ++i) {
+    const OptionalTensor tensor = image_gradient_list[i];
+    if (tensor.has_value()) image_gradients[i] = tensor->contiguous();
+  }
+  for (size_t i = 0; i < inputs.size(); ++i) {
+    const OptionalTensor tensor = input_list[i];
+    if (tensor.has_value()) inputs[i] = *tensor;
+  }
+  std::copy(output_list.begin(), output_list.end(), outputs.begin());
+  const Options options = {image_height, image_width, tanfovx,      tanfovy, scale_modifier, near, alpha_min,
+                           sh_degree,    blend_mode,  antialiasing, depth,   inverse_depth,  debug};
+  check_backward_arguments(inputs, options, outputs, image_gradients, wanted);
+  inputs = contiguous(inputs);
+  const Inputs gradients = allocate_gradients(inputs, wanted);
+  kBackward(inputs, options, outputs, image_gradients, gradients);
+
+  std::vector<at::Tensor> result;
+  for (int i = 0; i < kNumInputs; ++i) {
+    if (debug) refuse_nan("rasterize_backward: gradient", kInputNames[i], gradients[i]);
+    if (wanted[i]) result.push_back(gradients[i]);
+  }
+  return result;
+}
+
+}  // namespace binding
+}  // namespace dsmoe

@@ -1,0 +1,35 @@
+// What torch knows of the ops. `alpha` and every other image but the colour is optional; what is made for the backward
+// pass are ordinary typed tensors among the results, so that torch accounts for their memory.
+#include <torch/library.h>
+
+#include <string>
+
+namespace {
+
+const std::string kOptions =
+    "int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, float near, "
+    "float alpha_min, int sh_degree, int blend_mode, bool antialiasing, bool depth, bool inverse_depth, bool debug";
+
+const std::string kRasterize =
+    "rasterize(Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? dc, Tensor? shs, Tensor? colors_precomp, "
+    "Tensor? scales, Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, "
+    "Tensor campos, " +
+    kOptions +
+    ", bool strict, bool prefiltered) -> "
+    "(Tensor color, Tensor radii, Tensor gate_sum, Tensor depth, Tensor inverse_depth, Tensor projected, "
+    "Tensor features, Tensor instance_offsets, Tensor tile_offsets, Tensor instances, Tensor final_transmittance, "
+    "Tensor last_contributor)";
+
+// image_gradients: of color, gate_sum, depth, inverse_depth; inputs: the 13 tensors of rasterize; outputs: its results;
+// wanted: the inputs whose gradients are returned, in that order.
+const std::string kRasterizeBackward =
+    "rasterize_backward(Tensor?[] image_gradients, Tensor?[] inputs, Tensor[] outputs, " + kOptions +
+    ", bool[13] wanted) -> Tensor[]";
+
+}  // namespace
+
+TORCH_LIBRARY(diff_smoe_rasterization, m) {
+  m.def(kRasterize.c_str());
+  m.def(kRasterizeBackward.c_str());
+  m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near) -> Tensor");
+}

@@ -1,0 +1,56 @@
+#include "tensors.h"
+
+#include <utility>
+
+namespace dsmoe {
+namespace binding {
+
+Inputs contiguous(Inputs inputs) {
+  for (at::Tensor& tensor : inputs) {
+    if (tensor.defined()) tensor = tensor.contiguous();
+  }
+  return inputs;
+}
+
+std::array<OutputSpec, kNumOutputs> output_specs(const Inputs& inputs, const Options& options) {
+  const int64_t count = num_gaussians(inputs), channels = num_channels(inputs);
+  const int64_t height = options.image_height, width = options.image_width;
+  const int64_t tiles = num_tiles(static_cast<int>(width), static_cast<int>(height));
+  const at::ScalarType real = inputs[kMeans3D].scalar_type();
+  const std::vector<int64_t> image = {1, height, width}, absent = {0};
+
+  std::array<OutputSpec, kNumOutputs> specs;
+  specs[kColor] = {{channels, height, width}, real};
+  specs[kRadii] = {{count}, at::kInt};
+  specs[kGateSum] = {image, real};
+  specs[kDepth] = {options.depth ? image : absent, real};
+  specs[kInverseDepth] = {options.inverse_depth ? image : absent, real};
+  specs[kProjected] = {{count, kProjectedGaussianSize}, real};
+  specs[kFeatures] = {{count, channels + options.depth + options.inverse_depth}, real};
+  specs[kInstanceOffsets] = {{count + 1}, at::kLong};
+  specs[kTileOffsets] = {{tiles + 1}, at::kLong};
+  specs[kInstances] = {{-1, 2}, at::kInt};
+  specs[kFinalTransmittance] = {{height, width}, real};
+  specs[kLastContributor] = {{height, width}, at::kInt};
+  return specs;
+}
+
+Outputs allocate_outputs(const Inputs& inputs, const Options& options) {
+  const auto specs = output_specs(inputs, options);
+  Outputs outputs;
+  for (int i = 0; i < kNumOutputs; ++i) {
+    if (i != kInstances) outputs[i] = at::empty(specs[i].shape, inputs[kMeans3D].options().dtype(specs[i].type));
+  }
+  return outputs;
+}
+
+Inputs allocate_gradients(const Inputs& inputs, const Wanted& wanted) {
+  Inputs gradients;
+  for (int i = 0; i < kNumInputs; ++i) {
+    if (wanted[i]) gradients[i] = at::empty(inputs[i].sizes(), inputs[i].options());
+  }
+  return gradients;
+}
+
+}  // namespace binding
+}  // namespace dsmoe

@@ -1,0 +1,76 @@
+"""The compiled extension: loading it, or saying in plain words why it does not load, and what it was built with."""
+from __future__ import annotations
+
+import importlib
+from typing import Any, Dict, NoReturn, Optional
+
+import torch
+
+from ._version import __version__
+
+_BUILD_AGAIN = "build it again against this torch:\n    pip install --no-build-isolation --no-deps --force-reinstall ."
+
+
+def _recorded(name: str) -> Optional[str]:
+    """Returns what the build wrote down under this name, readable even where the extension cannot be loaded."""
+    try:
+        return getattr(importlib.import_module("._build_info", __package__), name, None)
+    except ImportError:
+        return None
+
+
+def _release(version: str) -> str:
+    return ".".join(version.split(".")[:2])
+
+
+def _fail(reason: str, cause: Optional[BaseException] = None) -> NoReturn:
+    raise ImportError(f"diff_smoe_rasterization: {reason}") from cause
+
+
+def _load() -> Any:
+    built_against = _recorded("TORCH_VERSION")
+    mismatch = f"its extension was built against torch {built_against}, but torch {torch.__version__} is running; "
+    if built_against is not None and _release(built_against) != _release(torch.__version__):
+        _fail(mismatch + _BUILD_AGAIN)
+    try:
+        return importlib.import_module("._C", __package__)
+    except ModuleNotFoundError as error:
+        if error.name != f"{__package__}._C":
+            raise
+        _fail("its extension _C is not built for this Python; in the source folder type\n"
+              "    pip install --no-build-isolation .", error)
+    except ImportError as error:
+        _fail((f"its extension does not load ({error}); it was built against torch {built_against or 'of another build'}"
+               f", and torch {torch.__version__} is running; ") + _BUILD_AGAIN, error)
+
+
+_C = _load()
+
+BACKENDS = ("cpu", "cuda") if _C.build_info()["cuda_built"] else ("cpu",)
+"""The device types that this build renders on."""
+
+
+def build_info() -> Dict[str, Any]:
+    """Returns what this build is and what it runs on.
+
+    Keys: version, torch (running), torch_built_with, compiler, cuda_built, without_cuda_because (None where it is built
+    or the build left no word), simd_level ("avx512", "avx2" or "baseline"), num_threads (torch's, which the CPU backend
+    uses).
+    """
+    return {"version": __version__, "torch": torch.__version__, **_C.build_info(),
+            "without_cuda_because": _recorded("WITHOUT_CUDA_BECAUSE") or None}
+
+
+def set_profiling(enabled: bool) -> None:
+    """Turns the clock of `stage_times` on or off; it is off at first. It covers the whole process."""
+    _C.set_profiling(enabled)
+
+
+def stage_times() -> Dict[str, float]:
+    """Returns the seconds of each stage of the CPU backend's last rendering and of its last backward pass.
+
+    Keys: project, sort, bin, blend, blend_backward, project_backward in seconds; forward_pairs and backward_pairs count
+    the (Gaussian, pixel) pairs that the blend evaluated. All are 0 until something was rendered under
+    `set_profiling(True)`.
+    """
+    return _C.stage_times()

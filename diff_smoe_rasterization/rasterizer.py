@@ -1,0 +1,119 @@
+"""The rasterizer as a function, and as the function and the module that 3D Gaussian Splatting trainers call."""
+from __future__ import annotations
+
+from typing import Optional, Sequence
+
+import torch
+
+from .autograd import rasterize_op
+from .extension import BACKENDS, build_info
+from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend_mode
+
+
+def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
+              means2D: Optional[torch.Tensor] = None, dc: Optional[torch.Tensor] = None,
+              shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
+              scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
+              cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> Rendering:
+    """Renders N Gaussians; `settings.blend_mode` says by which equation, see BLEND_MODES.
+
+    Args:
+        means3D: [N, 3] centres, world.
+        opacities: [N, 1] or [N]; may exceed 1.
+        settings: camera and options; its viewmatrix, projmatrix, campos and bg are differentiable too, each on its own.
+        means2D: [N, 3]; its value is ignored, its gradient is dL/d(pixel) times (width / 2, height / 2), z = 0: what
+            densification reads.
+        shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.
+        dc: [N, 1, 3], the first coefficient where shs [N, K - 1, 3] holds only the others.
+        colors_precomp: [N, C] instead of shs; C is free and settings.bg has as many.
+        scales, rotations: [N, 3] standard deviations, world, and [N, 4] quaternions (w, x, y, z), used as given.
+        cov3D_precomp: [N, 6] (xx, xy, xz, yy, yz, zz) instead of scales and rotations.
+        outputs: names out of OUTPUTS, images to return beside the colour.
+    All tensors have one type, float32 or float64, and one device. Absent is None, or any tensor without elements.
+
+    Returns: Rendering. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
+    Raises:
+        ValueError: a shape or a value does not fit; both or neither of shs and colors_precomp, or of scales with
+            rotations and cov3D_precomp, are given; under `settings.strict` an attribute is not finite; under
+            `settings.prefiltered` a Gaussian is not beyond the near plane.
+        TypeError: a type or a device does not fit.
+        RuntimeError: the Gaussians cover more tiles than fit; under `settings.debug` a result or gradient is NaN.
+    """
+    _check_backend("means3D", means3D)
+    if not set(outputs) <= set(OUTPUTS):
+        raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
+    rows = means3D.shape[0] if means3D.dim() > 0 else 0
+    color, radii, gate_sum, depth, inverse_depth = rasterize_op(
+        means3D, _given("means2D", means2D, rows), _tensor("opacities", opacities), _given("dc", dc, rows),
+        _given("shs", shs, rows), _given("colors_precomp", colors_precomp, rows), _given("scales", scales, rows),
+        _given("rotations", rotations, rows), _given("cov3D_precomp", cov3D_precomp, rows),
+        _tensor("bg", settings.bg), _without_batch("viewmatrix", settings.viewmatrix, 2),
+        _without_batch("projmatrix", settings.projmatrix, 2), _without_batch("campos", settings.campos, 1),
+        int(settings.image_height), int(settings.image_width), float(settings.tanfovx), float(settings.tanfovy),
+        float(settings.scale_modifier), float(settings.near), float(settings.alpha_min), int(settings.sh_degree),
+        BLEND_MODES.index(resolve_blend_mode(settings.blend_mode)), bool(settings.antialiasing), "depth" in outputs,
+        "inverse_depth" in outputs, bool(settings.debug), bool(settings.strict), bool(settings.prefiltered))[:5]
+    return Rendering(color, radii, alpha=gate_sum if "alpha" in outputs else None,
+                     depth=depth if "depth" in outputs else None,
+                     inverse_depth=inverse_depth if "inverse_depth" in outputs else None)
+
+
+def _tensor(name, value):
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"rasterize: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
+    return value
+
+
+def _given(name, value, rows):
+    """Returns an optional tensor, None for one without elements: Inria's callers pass `torch.Tensor([])`."""
+    if value is None:
+        return None
+    absent = _tensor(name, value).numel() == 0 and (rows > 0 or value.dim() == 1)
+    return None if absent else value
+
+
+def _without_batch(name, value, dim):
+    """Returns a camera tensor without the batch axis of size 1 that some trainers leave in front."""
+    return value[0] if _tensor(name, value).dim() == dim + 1 and value.shape[0] == 1 else value
+
+
+def _check_backend(name, value):
+    device = _tensor(name, value).device
+    if device.type not in BACKENDS:
+        reason = build_info()["without_cuda_because"] if device.type == "cuda" else None
+        raise TypeError(f"rasterize: {name} is on {device}; this build renders on {' and '.join(BACKENDS)}"
+                        + (f": {reason}" if reason else ""))
+
+
+def rasterize_gaussians(means3D, means2D, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp,
+                        raster_settings):
+    """Renders as `rasterize`, with the arguments of Inria's function of 2023 in its order.
+
+    Returns: color [C, H, W], radii [N] int32.
+    """
+    rendering = rasterize(means3D, opacities, raster_settings, means2D=means2D, shs=sh, colors_precomp=colors_precomp,
+                          scales=scales, rotations=rotations, cov3D_precomp=cov3Ds_precomp)
+    return rendering.color, rendering.radii
+
+
+class GaussianRasterizer(torch.nn.Module):
+    """Renders as `rasterize`, as Inria's module of 2023 does. raster_settings: GaussianRasterizationSettings."""
+
+    def __init__(self, raster_settings: GaussianRasterizationSettings):
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    @torch.no_grad()
+    def markVisible(self, positions: torch.Tensor) -> torch.Tensor:
+        """Returns which positions [N, 3] lie beyond the near plane, [N] bool."""
+        _check_backend("positions", positions)
+        viewmatrix = _without_batch("viewmatrix", self.raster_settings.viewmatrix, 2)
+        return torch.ops.diff_smoe_rasterization.mark_visible(positions, viewmatrix, float(self.raster_settings.near))
+
+    def forward(self, means3D, means2D, opacities, shs=None, colors_precomp=None, scales=None, rotations=None,
+                cov3D_precomp=None, dc=None):
+        """Returns color [C, H, W], radii [N] int32. Arguments and errors are those of `rasterize`."""
+        rendering = rasterize(means3D, opacities, self.raster_settings, means2D=means2D, dc=dc, shs=shs,
+                              colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+                              cov3D_precomp=cov3D_precomp)
+        return rendering.color, rendering.radii
