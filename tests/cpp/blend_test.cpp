@@ -1,0 +1,366 @@
+// The blend modes against the paper's sums, written out, and against finite differences of those sums.
+#include "dsmoe/blend.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <vector>
+
+#include "all_modes.h"
+#include "finite_difference.h"
+
+namespace dsmoe {
+namespace {
+
+using Vector = std::vector<double>;
+
+// What one pixel blends: pairs front to back, each with an alpha and the features colour, z and 1 / z.
+struct Pixel {
+  std::vector<bool> counts;
+  Vector alpha;
+  Vector color, depth, inverse_depth;
+  double background = 0.35;
+  int size() const { return static_cast<int>(alpha.size()); }
+};
+
+struct Finished {
+  double color = 0, depth = 0, inverse_depth = 0, gate_sum = 0;
+  double transmittance = 1;
+  int last = 0;  // one past the last pair of the numerator
+};
+
+// Equations 3, 6, 7 and 8 with the sums as the paper writes them. stop: the pair before which the numerator ends.
+Finished paper(BlendMode mode, const Pixel& pixel, int stop) {
+  Finished out;
+  double sum_color = 0, sum_z = 0, sum_inverse_z = 0, sum_alpha_t = 0, sum_alpha = 0;
+  for (int i = 0; i < pixel.size(); ++i) {
+    if (!pixel.counts[i]) continue;
+    sum_alpha += pixel.alpha[i];
+    if (i >= stop && mode != BlendMode::kSmoeStd) continue;
+    double t = 1;
+    for (int j = 0; j < i; ++j) t *= pixel.counts[j] ? 1 - pixel.alpha[j] : 1;
+    const double w = mode == BlendMode::kSmoeStd ? pixel.alpha[i] : pixel.alpha[i] * t;
+    sum_alpha_t += pixel.alpha[i] * t;
+    sum_color += w * pixel.color[i];
+    sum_z += w * pixel.depth[i];
+    sum_inverse_z += w * pixel.inverse_depth[i];
+    out.transmittance = t * (1 - pixel.alpha[i]);
+    out.last = i + 1;
+  }
+  const bool divide_by_alpha_t = mode == BlendMode::kAlpha || mode == BlendMode::kSmoe;
+  out.gate_sum = divide_by_alpha_t ? sum_alpha_t : sum_alpha;
+  const bool gated = out.gate_sum >= static_cast<double>(1e-30f);
+  out.depth = gated ? sum_z / out.gate_sum : 0;
+  if (mode == BlendMode::kAlpha) {
+    out.color = sum_color + out.transmittance * pixel.background;
+    out.inverse_depth = sum_inverse_z;
+  } else {
+    out.color = gated ? sum_color / out.gate_sum : pixel.background;
+    out.inverse_depth = gated ? sum_inverse_z / out.gate_sum : 0;
+  }
+  return out;
+}
+
+// The first pair that would leave less than 1e-4 of the light, in the arithmetic of Real.
+template <class Real> int paper_stop(const Pixel& pixel) {
+  Real t = 1;
+  for (int i = 0; i < pixel.size(); ++i) {
+    if (!pixel.counts[i]) continue;
+    t *= Real(1) - Real(pixel.alpha[i]);
+    if (t < Real(1e-4f)) return i;
+  }
+  return pixel.size();
+}
+
+template <class Real> Gate<Real> gate_of(const Pixel& pixel, int i) {
+  return {Real(pixel.alpha[i]), Real(pixel.alpha[i]), pixel.counts[i]};
+}
+
+template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
+  auto state = PixelState<Real>::open();
+  Real color = 0, depth = 0, inverse_depth = 0;
+  Finished out;
+  for (int i = 0; i < pixel.size(); ++i) {
+    const auto pair = Blend<kMode>::accumulate(state, gate_of<Real>(pixel, i));
+    color += pair.weight * Real(pixel.color[i]);
+    depth += pair.weight * Real(pixel.depth[i]);
+    inverse_depth += pair.weight * Real(pixel.inverse_depth[i]);
+    if (pair.contributes) out.last = i + 1;
+  }
+  out.color = finish_feature<kMode>(FeatureRule::kBlended, state, color, Real(pixel.background));
+  out.depth = finish_feature<kMode>(FeatureRule::kAveraged, state, depth, Real(0));
+  out.inverse_depth = finish_feature<kMode>(FeatureRule::kBlended, state, inverse_depth, Real(0));
+  out.gate_sum = state.gate_sum;
+  out.transmittance = abs(state.transmittance);
+  return out;
+}
+
+Pixel random_pixel(Random& random, int count, double largest_alpha) {
+  Pixel pixel;
+  for (int i = 0; i < count; ++i) {
+    const double z = random.uniform(1, 4);
+    pixel.counts.push_back(random.uniform(0, 1) < 0.8);
+    pixel.alpha.push_back(random.log_uniform(1e-5, largest_alpha));
+    pixel.color.push_back(random.uniform(0, 1));
+    pixel.depth.push_back(z);
+    pixel.inverse_depth.push_back(1 / z);
+  }
+  return pixel;
+}
+
+// Fills a pixel after a few pairs, and goes on.
+Pixel saturated_pixel() {
+  Pixel pixel;
+  pixel.counts = {true, true, false, true, true, true, true};
+  pixel.alpha = {0.3, 0.9, 0.5, 0.98, 0.97, 0.2, 0.6};  // T: 0.7, 0.07, 0.0014; the fifth would leave 4.2e-5
+  pixel.color = {0.1, 0.9, 0.4, 0.6, 0.2, 0.8, 0.3};
+  pixel.depth = {1, 1.5, 2, 2.5, 3, 3.5, 4};
+  for (const double z : pixel.depth) pixel.inverse_depth.push_back(1 / z);
+  return pixel;
+}
+
+void expect_near(const Finished& actual, const Finished& expected, double tolerance) {
+  EXPECT_NEAR(actual.color, expected.color, tolerance);
+  EXPECT_NEAR(actual.depth, expected.depth, 4 * tolerance);  // depths reach 4
+  EXPECT_NEAR(actual.inverse_depth, expected.inverse_depth, tolerance);
+  EXPECT_NEAR(actual.gate_sum, expected.gate_sum, tolerance * std::max(1.0, expected.gate_sum));
+  EXPECT_EQ(actual.last, expected.last);
+}
+
+template <class Mode> struct BlendOf : testing::Test {};
+TYPED_TEST_SUITE(BlendOf, AllModes);
+template <class Mode> struct GatedBlendOf : testing::Test {};
+TYPED_TEST_SUITE(GatedBlendOf, GatedModes);
+
+template <BlendMode kMode, class Real> void expect_the_papers_sums(const Pixel& pixel, double tolerance) {
+  const Finished expected = paper(kMode, pixel, paper_stop<Real>(pixel));
+  const Finished actual = blended<kMode, Real>(pixel);
+  expect_near(actual, expected, tolerance);
+  if (Blend<kMode>::kNeedsDepthOrder) {
+    EXPECT_NEAR(actual.transmittance, expected.transmittance, tolerance);
+  }
+}
+
+// Sums of 40 positive terms: 40 roundings at most, in weighted means of numbers near 1.
+TYPED_TEST(BlendOf, EqualsThePapersSums) {
+  Random random(1);
+  for (int i = 0; i < 50; ++i) {
+    const Pixel pixel = random_pixel(random, 40, i % 2 ? 0.05 : 0.9);  // half of them fill up
+    expect_the_papers_sums<TypeParam::value, double>(pixel, 40 * 1.2e-16);
+    expect_the_papers_sums<TypeParam::value, float>(pixel, 40 * 6e-8);
+  }
+}
+
+TYPED_TEST(BlendOf, LeavesOutThePairThatWouldFillThePixelAndAllBehindIt) {
+  const Pixel pixel = saturated_pixel();
+  ASSERT_EQ(paper_stop<double>(pixel), 4);
+  const Finished actual = blended<TypeParam::value, double>(pixel);
+  expect_near(actual, paper(TypeParam::value, pixel, 4), 1e-14);
+  EXPECT_EQ(actual.last, TypeParam::value == BlendMode::kSmoeStd ? 7 : 4);
+}
+
+TYPED_TEST(BlendOf, StopsAtTheSamePairInEveryScalarType) {
+  Pixel pixel;  // (1 - 0.99f)^2 < 1e-4f, though (1 - 0.99)^2 is not below 1e-4 in double
+  pixel.alpha.assign(3, static_cast<double>(kAlphaMax));
+  pixel.counts.assign(3, true);
+  pixel.color = pixel.depth = pixel.inverse_depth = {1, 1, 1};
+  const int expected = TypeParam::value == BlendMode::kSmoeStd ? 3 : 1;
+  EXPECT_EQ((blended<TypeParam::value, float>(pixel).last), expected);
+  EXPECT_EQ((blended<TypeParam::value, double>(pixel).last), expected);
+}
+
+TYPED_TEST(BlendOf, KeepsASmallGateSumToSixDigits) {
+  // As 1 - T, a sum of 2.6e-6 would be off by 1.5 %.
+  Pixel pixel;
+  pixel.alpha = {1.1e-6, 0.9e-6, 0.6e-6};
+  pixel.counts = {true, true, true};
+  pixel.color = {0.2, 0.7, 0.9};
+  pixel.depth = {1, 2, 3};
+  pixel.inverse_depth = {1, 0.5, 1.0 / 3};
+  const Finished actual = blended<TypeParam::value, float>(pixel);
+  const Finished expected = paper(TypeParam::value, pixel, 3);
+  EXPECT_NEAR(actual.gate_sum, expected.gate_sum, 1e-6 * expected.gate_sum);
+  EXPECT_NEAR(actual.depth, expected.depth, 1e-6 * expected.depth);
+  EXPECT_NEAR(actual.color, expected.color, 1e-6);
+}
+
+TYPED_TEST(GatedBlendOf, OpensNoGateBelow1e30AndOneAt1e30) {
+  Pixel pixel;
+  pixel.counts = {true};
+  pixel.color = {0.8};
+  pixel.depth = {2};
+  pixel.inverse_depth = {0.5};
+  pixel.alpha = {0.9e-30};
+  const Finished closed = blended<TypeParam::value, double>(pixel);
+  EXPECT_EQ(closed.color, pixel.background);
+  EXPECT_EQ(closed.depth, 0);
+  EXPECT_EQ(closed.inverse_depth, 0);
+  pixel.alpha = {static_cast<double>(1e-30f)};
+  EXPECT_DOUBLE_EQ((blended<TypeParam::value, double>(pixel).color), 0.8);
+}
+
+TYPED_TEST(BlendOf, AnEmptyPixelIsBackground) {
+  const Finished empty = blended<TypeParam::value, float>(Pixel{});
+  EXPECT_EQ(empty.color, 0.35f);
+  EXPECT_EQ(empty.depth, 0);
+  EXPECT_EQ(empty.inverse_depth, 0);
+  EXPECT_EQ(empty.gate_sum, 0);
+}
+
+// The loss is a weighted sum of the pixel's outputs.
+struct Weights {
+  double color = 0.7, depth = -0.4, inverse_depth = 0.9, gate_sum = 0.3;
+};
+
+struct PixelGradient {
+  Vector gamma;  // alpha dL/dalpha
+  Vector color, depth, inverse_depth;
+  double background = 0;
+};
+
+template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel, const Weights& g) {
+  const Finished forward = blended<kMode, Real>(pixel);
+  const Real gate_sum = Real(forward.gate_sum), transmittance = Real(forward.transmittance);
+  const Real background = Real(pixel.background);
+  auto constants = begin_backward<kMode>(transmittance, Real(g.gate_sum));
+  const Real color = add_feature<kMode>(FeatureRule::kBlended, constants, gate_sum, Real(g.color),
+                                        Real(forward.color), background);
+  const Real depth = add_feature<kMode>(FeatureRule::kAveraged, constants, gate_sum, Real(g.depth),
+                                        Real(forward.depth), Real(0));
+  const Real inverse_depth = add_feature<kMode>(FeatureRule::kBlended, constants, gate_sum, Real(g.inverse_depth),
+                                                Real(forward.inverse_depth), Real(0));
+  PixelGradient out;
+  out.background = background_backward<kMode>(transmittance, gate_sum, Real(g.color));
+  out.gamma = out.color = out.depth = out.inverse_depth = Vector(pixel.size());
+  for (int i = pixel.size() - 1; i >= 0; --i) {
+    const Real value = color * Real(pixel.color[i]) + depth * Real(pixel.depth[i]) +
+                       inverse_depth * Real(pixel.inverse_depth[i]);
+    const auto gate = gate_of<Real>(pixel, i);
+    const auto pair = Blend<kMode>::backward(constants, gate, value, gate.counts & (i < forward.last));
+    out.gamma[i] = pair.gamma;
+    out.color[i] = pair.weight * color;
+    out.depth[i] = pair.weight * depth;
+    out.inverse_depth[i] = pair.weight * inverse_depth;
+  }
+  // Back to front, the transmittance arrives where it began: one rounding for each of at most 300 pairs.
+  if (Blend<kMode>::kNeedsDepthOrder) {
+    EXPECT_NEAR(constants.transmittance, 1, sizeof(Real) == 4 ? 300 * 6e-8 : 300 * 1.2e-16);
+  }
+  return out;
+}
+
+Vector flat(const Pixel& pixel, const PixelGradient& g) {
+  Vector out;
+  for (int i = 0; i < pixel.size(); ++i) out.push_back(g.gamma[i] / pixel.alpha[i]);
+  for (const Vector* part : {&g.color, &g.depth, &g.inverse_depth}) out.insert(out.end(), part->begin(), part->end());
+  out.push_back(g.background);
+  return out;
+}
+
+// Finite differences of the paper's sums by alpha, colour, depth, inverse depth and background, in that order.
+Vector paper_gradient(BlendMode mode, const Pixel& pixel, const Weights& g, double step) {
+  const int n = pixel.size(), stop = paper_stop<double>(pixel);
+  Vector x = pixel.alpha;
+  for (const Vector* part : {&pixel.color, &pixel.depth, &pixel.inverse_depth}) {
+    x.insert(x.end(), part->begin(), part->end());
+  }
+  x.push_back(pixel.background);
+  auto loss = [&](const Vector& v) {
+    Pixel moved = pixel;
+    moved.alpha.assign(v.begin(), v.begin() + n);
+    moved.color.assign(v.begin() + n, v.begin() + 2 * n);
+    moved.depth.assign(v.begin() + 2 * n, v.begin() + 3 * n);
+    moved.inverse_depth.assign(v.begin() + 3 * n, v.begin() + 4 * n);
+    moved.background = v.back();
+    const Finished f = paper(mode, moved, stop);
+    return g.color * f.color + g.depth * f.depth + g.inverse_depth * f.inverse_depth + g.gate_sum * f.gate_sum;
+  };
+  return finite_differences(loss, x, step);
+}
+
+// Alphas well above the step, so that the differences judge dL/dalpha itself.
+Pixel differentiable_pixel(Random& random, double largest_alpha) {
+  Pixel pixel = random_pixel(random, 12, largest_alpha);
+  for (double& alpha : pixel.alpha) alpha = random.uniform(0.02, largest_alpha);
+  return pixel;
+}
+
+TYPED_TEST(BlendOf, BackwardIsTheDerivativeOfThePapersSums) {
+  Random random(2);
+  for (int i = 0; i < 10; ++i) {
+    const Pixel pixel = differentiable_pixel(random, i % 2 ? 0.3 : 0.8);
+    const Weights g = {random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1)};
+    // 1 / gate sum to the fifth power enters the truncation error: a step of 1e-4.
+    expect_near_all(flat(pixel, backward<TypeParam::value, double>(pixel, g)),
+                    paper_gradient(TypeParam::value, pixel, g, 1e-4), kGradientTolerance);
+  }
+}
+
+TYPED_TEST(BlendOf, BackwardIsTheDerivativeBehindAFullPixel) {
+  const Pixel pixel = saturated_pixel();
+  const PixelGradient g = backward<TypeParam::value, double>(pixel, {});
+  expect_near_all(flat(pixel, g), paper_gradient(TypeParam::value, pixel, {}, 1e-4), kGradientTolerance);
+  // Hidden pairs move the denominator of smoe_tn and nothing else.
+  for (const int hidden : {4, 5, 6}) {
+    const bool moves = TypeParam::value == BlendMode::kSmoeTn || TypeParam::value == BlendMode::kSmoeStd;
+    EXPECT_EQ(g.gamma[hidden] != 0, moves);
+    EXPECT_EQ(g.color[hidden] != 0, TypeParam::value == BlendMode::kSmoeStd);
+  }
+}
+
+TYPED_TEST(BlendOf, EachOutputAloneHasItsOwnDerivative) {
+  Random random(3);
+  const Pixel pixel = differentiable_pixel(random, 0.6);
+  const Weights alone[] = {{1, 0, 0, 0}, {0, 1, 0, 0}, {0, 0, 1, 0}, {0, 0, 0, 1}};
+  for (const Weights& g : alone) {
+    expect_near_all(flat(pixel, backward<TypeParam::value, double>(pixel, g)),
+                    paper_gradient(TypeParam::value, pixel, g, 1e-4), kGradientTolerance);
+  }
+}
+
+// Alphas near 1e-6 under one gate: dL/dalpha is near 1e6, and gamma, not dL/dalpha, is what the kernels carry.
+TYPED_TEST(BlendOf, FloatGradientsOfAFaintPixelKeepFiveDigits) {
+  Pixel pixel;
+  pixel.counts.assign(3, true);
+  pixel.alpha = {1.1e-6, 0.9e-6, 0.6e-6};
+  pixel.color = {0.2, 0.7, 0.9};
+  pixel.depth = {1, 2, 3};
+  pixel.inverse_depth = {1, 0.5, 1.0 / 3};
+  const Vector wide = backward<TypeParam::value, double>(pixel, {}).gamma;
+  // Differences between features of equal size lose about one digit to cancellation.
+  expect_near_all(backward<TypeParam::value, float>(pixel, {}).gamma, wide, 1e-5);
+}
+
+TYPED_TEST(BlendOf, FloatGradientsReachTheDeepestPair) {
+  // Front to back, the last of 300 pairs would lose percents to cancellation.
+  Random random(4);
+  const Pixel pixel = random_pixel(random, 300, 0.05);
+  const Vector wide = backward<TypeParam::value, double>(pixel, {}).gamma;
+  const Vector narrow = backward<TypeParam::value, float>(pixel, {}).gamma;
+  const Vector deepest_wide(wide.end() - 20, wide.end()), deepest_narrow(narrow.end() - 20, narrow.end());
+  // T is rebuilt by at most 300 divisions, each off by 6e-8: 2e-5, and u cancels a digit or so.
+  expect_near_all(deepest_narrow, deepest_wide, 1e-4);
+}
+
+TYPED_TEST(GatedBlendOf, AClosedGateGivesItsGradientToTheBackground) {
+  Pixel pixel;
+  pixel.counts = {true, true};
+  pixel.alpha = {1e-32, 2e-32};
+  pixel.color = {0.2, 0.7};
+  pixel.depth = {1, 2};
+  pixel.inverse_depth = {1, 0.5};
+  const PixelGradient g = backward<TypeParam::value, double>(pixel, {0.7, -0.4, 0.9, 0});
+  EXPECT_EQ(g.background, 0.7);
+  for (int i = 0; i < 2; ++i) {
+    EXPECT_EQ(g.gamma[i], 0);
+    EXPECT_EQ(g.color[i], 0);
+    EXPECT_EQ(g.depth[i], 0);
+    EXPECT_EQ(g.inverse_depth[i], 0);
+  }
+  // The gate sum itself is an output too, and still moves.
+  const PixelGradient on_sum = backward<TypeParam::value, double>(pixel, {0, 0, 0, 0.3});
+  EXPECT_DOUBLE_EQ(on_sum.gamma[1], 0.3 * 2e-32);
+}
+
+}  // namespace
+}  // namespace dsmoe

@@ -1,0 +1,120 @@
+// World to view and to pixels, against the definitions and finite differences.
+#include "dsmoe/camera.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+
+#include "finite_difference.h"
+
+namespace dsmoe {
+namespace {
+
+Camera<double> random_camera(Random& random) {
+  Camera<double> camera;
+  camera.width = 37;
+  camera.height = 23;
+  for (double& entry : camera.view) entry = random.uniform(-1, 1);
+  for (double& entry : camera.projection) entry = random.uniform(-1, 1);
+  camera.projection[15] = 5;  // w stays away from 0 for points in [-1, 1]^3
+  return camera;
+}
+
+Vec3<double> vec3(const double* p) { return {p[0], p[1], p[2]}; }
+
+TEST(TransformPoint, IsARowVectorTimesTheMatrix) {
+  double m[16];
+  for (int i = 0; i < 16; ++i) m[i] = i + 1;
+  const Vec3<double> out = transform_point(m, {1.0, 10.0, 100.0});
+  EXPECT_EQ(out.x, 1 + 50 + 900 + 13);
+  EXPECT_EQ(out.y, 2 + 60 + 1000 + 14);
+  EXPECT_EQ(out.z, 3 + 70 + 1100 + 15);
+}
+
+// x: point, then matrix.
+TEST(TransformPoint, BackwardIsTheDerivative) {
+  Random random(1);
+  const auto x = random.uniforms(19), weights = random.uniforms(3);
+  auto loss = [&](const std::vector<double>& v) { return dot(vec3(weights.data()), transform_point(&v[3], vec3(&v[0]))); };
+  double dL_dm[16] = {};
+  const Vec3<double> dL_dp = transform_point_backward(&x[3], vec3(&x[0]), vec3(weights.data()), dL_dm);
+  std::vector<double> actual = {dL_dp.x, dL_dp.y, dL_dp.z};
+  actual.insert(actual.end(), dL_dm, dL_dm + 16);
+  expect_gradient(actual, loss, x);
+}
+
+TEST(TransformPoint, BackwardAddsToTheMatrixGradientAndNeedsNone) {
+  Random random(2);
+  const auto m = random.uniforms(16);
+  const Vec3<double> p = {1, 2, 3}, g = {1, -1, 2};
+  double once[16] = {}, twice[16] = {};
+  const auto with = transform_point_backward(m.data(), p, g, once);
+  transform_point_backward(m.data(), p, g, twice);
+  transform_point_backward(m.data(), p, g, twice);
+  for (int i = 0; i < 16; ++i) EXPECT_EQ(twice[i], 2 * once[i]);
+  const auto without = transform_point_backward<double>(m.data(), p, g, nullptr);
+  EXPECT_EQ(with.x, without.x);
+  EXPECT_EQ(with.y, without.y);
+  EXPECT_EQ(with.z, without.z);
+}
+
+TEST(ViewRotation, TurnsDirectionsAsTransformPointDoes) {
+  Random random(3);
+  const auto m = random.uniforms(16);
+  const Vec3<double> d = {0.3, -0.7, 0.2};
+  const Vec3<double> turned = view_rotation(m.data()) * d;
+  const Vec3<double> difference = transform_point(m.data(), d) - transform_point<double>(m.data(), {0, 0, 0});
+  // Both are sums of three products of numbers below 1: rounding only.
+  EXPECT_NEAR(turned.x, difference.x, 1e-15);
+  EXPECT_NEAR(turned.y, difference.y, 1e-15);
+  EXPECT_NEAR(turned.z, difference.z, 1e-15);
+}
+
+TEST(ViewRotation, BackwardIsTheDerivative) {
+  Random random(4);
+  const auto x = random.uniforms(16), w = random.uniforms(9);
+  auto loss = [&](const std::vector<double>& m) {
+    const auto r = view_rotation(m.data());
+    return dot(vec3(&w[0]), r.r0) + dot(vec3(&w[3]), r.r1) + dot(vec3(&w[6]), r.r2);
+  };
+  std::vector<double> actual(16);
+  view_rotation_backward<double>({vec3(&w[0]), vec3(&w[3]), vec3(&w[6])}, actual.data());
+  expect_gradient(actual, loss, x);
+}
+
+TEST(ProjectToPixel, PutsTheEdgesOfNdcOnTheEdgesOfTheBorderPixels) {
+  Camera<double> camera;
+  camera.width = 40;
+  camera.height = 30;
+  // Clip = (x, y, z, z): NDC is x / z, y / z.
+  camera.projection[0] = camera.projection[5] = camera.projection[10] = camera.projection[11] = 1;
+  // 1e-7 is added to w = 2, which moves an edge by 1e-7 / 2 of half the image.
+  const double tolerance = 1e-6;
+  const auto low = project_to_pixel(camera, {-2.0, -2.0, 2.0});
+  EXPECT_NEAR(low.x, -0.5, tolerance);
+  EXPECT_NEAR(low.y, -0.5, tolerance);
+  const auto high = project_to_pixel(camera, {2.0, 2.0, 2.0});
+  EXPECT_NEAR(high.x, 39.5, tolerance);
+  EXPECT_NEAR(high.y, 29.5, tolerance);
+}
+
+// x: point, then projection.
+TEST(ProjectToPixel, BackwardIsTheDerivative) {
+  Random random(5);
+  Camera<double> camera = random_camera(random);
+  std::vector<double> x = random.uniforms(3);
+  x.insert(x.end(), camera.projection, camera.projection + 16);
+  auto loss = [&](const std::vector<double>& v) {
+    std::copy(v.begin() + 3, v.end(), camera.projection);
+    const auto pixel = project_to_pixel(camera, vec3(&v[0]));
+    return 0.7 * pixel.x - 0.4 * pixel.y;
+  };
+  double dL_dprojection[16] = {};
+  const auto dL_dp = project_to_pixel_backward<double>(camera, vec3(&x[0]), {0.7, -0.4}, dL_dprojection);
+  std::vector<double> actual = {dL_dp.x, dL_dp.y, dL_dp.z};
+  actual.insert(actual.end(), dL_dprojection, dL_dprojection + 16);
+  expect_gradient(actual, loss, x);
+}
+
+}  // namespace
+}  // namespace dsmoe

@@ -1,0 +1,22 @@
+// Thresholds.
+#include "dsmoe/constants.h"
+
+#include <gtest/gtest.h>
+
+namespace dsmoe {
+namespace {
+
+// Every pixel that starts with two clamped pairs would differ if this depended on the scalar type.
+template <class S> bool two_clamped_pairs_fill_a_pixel() {
+  const S left = S(1) - S(kAlphaMax);
+  return left * left < S(kTransmittanceCut);
+}
+
+TEST(Thresholds, AreTheSameNumbersInEveryScalarType) {
+  EXPECT_TRUE(two_clamped_pairs_fill_a_pixel<float>());
+  EXPECT_TRUE(two_clamped_pairs_fill_a_pixel<double>());
+  EXPECT_TRUE(two_clamped_pairs_fill_a_pixel<long double>());
+}
+
+}  // namespace
+}  // namespace dsmoe

@@ -1,0 +1,276 @@
+// Covariances in space and in the image, conic, antialiasing and radius.
+#include "dsmoe/covariance.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <vector>
+
+#include "finite_difference.h"
+
+namespace dsmoe {
+namespace {
+
+using Vector = std::vector<double>;
+
+Vec3<double> vec3(const double* p) { return {p[0], p[1], p[2]}; }
+Mat3<double> mat3(const double* p) { return {vec3(p), vec3(p + 3), vec3(p + 6)}; }
+Mat23<double> mat23(const double* p) { return {vec3(p), vec3(p + 3)}; }
+Sym2<double> sym2(const double* p) { return {p[0], p[1], p[2]}; }
+Sym3<double> sym3(const double* p) { return {p[0], p[1], p[2], p[3], p[4], p[5]}; }
+Vec4<double> vec4(const double* p) { return {p[0], p[1], p[2], p[3]}; }
+
+void append(Vector& out, Vec3<double> v) { out.insert(out.end(), {v.x, v.y, v.z}); }
+Vector flat(const Mat3<double>& m) {
+  Vector out;
+  for (const auto& row : {m.r0, m.r1, m.r2}) append(out, row);
+  return out;
+}
+Vector flat(const Mat23<double>& m) {
+  Vector out;
+  for (const auto& row : {m.r0, m.r1}) append(out, row);
+  return out;
+}
+Vector flat(const Sym2<double>& s) { return {s.xx, s.xy, s.yy}; }
+Vector flat(const Sym3<double>& s) { return {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz}; }
+
+// Few roundings of numbers near 1.
+constexpr double kRounding = 1e-14;
+
+TEST(QuaternionToRotation, TurnsAroundTheAxis) {
+  const double half = std::sqrt(0.5);  // 90 degrees around z: x goes to y
+  const Vec3<double> turned = quaternion_to_rotation<double>({half, 0, 0, half}) * Vec3<double>{1, 0, 0};
+  EXPECT_NEAR(turned.x, 0, kRounding);
+  EXPECT_NEAR(turned.y, 1, kRounding);
+  EXPECT_NEAR(turned.z, 0, kRounding);
+}
+
+TEST(QuaternionToRotation, IsOrthonormalForUnitQuaternions) {
+  Random random(1);
+  for (int i = 0; i < 20; ++i) {
+    Vector q = random.uniforms(4);
+    const double length = std::sqrt(weighted_sum(q, q));
+    for (double& component : q) component /= length;
+    const Mat3<double> r = quaternion_to_rotation(vec4(q.data()));
+    const Vec3<double> rows[3] = {r.r0, r.r1, r.r2};
+    for (int a = 0; a < 3; ++a) {
+      for (int b = 0; b < 3; ++b) EXPECT_NEAR(dot(rows[a], rows[b]), a == b, kRounding);
+    }
+  }
+}
+
+TEST(QuaternionToRotation, UsesTheQuaternionAsGiven) {
+  // Off the unit sphere the entries are still 1 - 2(...) and 2(...): quadratic in q around the identity.
+  const Vector q = {0.3, -0.5, 0.2, 0.6};
+  const Vector r = flat(quaternion_to_rotation(vec4(q.data())));
+  const Vector scaled = flat(quaternion_to_rotation<double>({0.9, -1.5, 0.6, 1.8}));
+  for (int i = 0; i < 9; ++i) EXPECT_NEAR(scaled[i] - (i % 4 == 0), 9 * (r[i] - (i % 4 == 0)), kRounding);
+}
+
+TEST(QuaternionToRotation, BackwardIsTheDerivativeOffTheUnitSphere) {
+  Random random(2);
+  for (const double size : {0.3, 1.0, 2.5}) {
+    const Vector q = random.uniforms(4, -size, size), w = random.uniforms(9);
+    auto loss = [&](const Vector& v) { return weighted_sum(w, flat(quaternion_to_rotation(vec4(v.data())))); };
+    const Vec4<double> g = quaternion_to_rotation_backward(vec4(q.data()), mat3(w.data()));
+    expect_gradient({g.x, g.y, g.z, g.w}, loss, q);
+  }
+}
+
+TEST(Covariance3D, IsTheProductOfTheMatrices) {
+  Random random(3);
+  const Vector r = random.uniforms(9), s = random.uniforms(3, 0.1, 2);
+  double expected[3][3] = {};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      for (int k = 0; k < 3; ++k) expected[i][j] += r[3 * i + k] * s[k] * s[k] * r[3 * j + k];
+    }
+  }
+  const auto cov = covariance_3d(vec3(s.data()), mat3(r.data()));
+  EXPECT_NEAR(cov.xx, expected[0][0], kRounding);
+  EXPECT_NEAR(cov.xy, expected[0][1], kRounding);
+  EXPECT_NEAR(cov.xz, expected[0][2], kRounding);
+  EXPECT_NEAR(cov.yy, expected[1][1], kRounding);
+  EXPECT_NEAR(cov.yz, expected[1][2], kRounding);
+  EXPECT_NEAR(cov.zz, expected[2][2], kRounding);
+}
+
+// x: scale, then the nine entries of the rotation.
+TEST(Covariance3D, BackwardIsTheDerivative) {
+  Random random(4);
+  const Vector x = random.uniforms(12), w = random.uniforms(6);
+  auto loss = [&](const Vector& v) { return weighted_sum(w, flat(covariance_3d(vec3(&v[0]), mat3(&v[3])))); };
+  Vec3<double> dL_dscale;
+  Mat3<double> dL_drotation;
+  covariance_3d_backward(vec3(&x[0]), mat3(&x[3]), sym3(w.data()), dL_dscale, dL_drotation);
+  Vector actual;
+  append(actual, dL_dscale);
+  for (const double entry : flat(dL_drotation)) actual.push_back(entry);
+  expect_gradient(actual, loss, x);
+}
+
+Camera<double> wide_camera() {
+  Camera<double> camera;
+  camera.width = 64;
+  camera.height = 48;
+  camera.tan_fov_x = 0.8;
+  camera.tan_fov_y = 0.5;
+  return camera;
+}
+
+TEST(ProjectionJacobian, IsTheDerivativeOfThePerspectiveInsideTheFrustum) {
+  const Camera<double> camera = wide_camera();
+  const Vector view = {0.9, -0.4, 2.5};
+  // Pixels per unit slope: half the image spans tan_fov.
+  const double focal_x = 32 / 0.8, focal_y = 24 / 0.5;
+  const Vector jacobian = flat(projection_jacobian(camera, vec3(view.data())).jacobian);
+  auto x = [&](const Vector& v) { return focal_x * v[0] / v[2]; };
+  auto y = [&](const Vector& v) { return focal_y * v[1] / v[2]; };
+  expect_gradient({jacobian.begin(), jacobian.begin() + 3}, x, view);
+  expect_gradient({jacobian.begin() + 3, jacobian.end()}, y, view);
+}
+
+TEST(ProjectionJacobian, ClampsTheSlopeAtOnePointThreeTimesTheHalfFieldOfView) {
+  const Camera<double> camera = wide_camera();
+  for (const double sign : {-1.0, 1.0}) {
+    const auto far_out = flat(projection_jacobian<double>(camera, {sign * 1000, sign * 1000, 2}).jacobian);
+    const double x = sign * 1.3 * 0.8 * 2, y = sign * 1.3 * 0.5 * 2;  // on the margin at z = 2
+    const auto margin = flat(projection_jacobian<double>(camera, {x, y, 2}).jacobian);
+    for (int i = 0; i < 6; ++i) EXPECT_NEAR(far_out[i], margin[i], 1e-13);  // entries up to 60
+  }
+}
+
+TEST(ProjectionJacobian, BackwardIsTheDerivativeInsideAndClamped) {
+  const Camera<double> camera = wide_camera();
+  Random random(5);
+  const Vector w = random.uniforms(6);
+  // Only J's four free entries are functions of the view point.
+  auto loss = [&](const Vector& v) { return weighted_sum(w, flat(projection_jacobian(camera, vec3(v.data())).jacobian)); };
+  const std::vector<std::pair<Vector, int>> cases = {
+      {{0.9, -0.4, 2.5}, 0}, {{5.0, -0.4, 2.5}, 1}, {{-5.0, 0.3, 2.5}, 1}, {{0.9, 4.0, 2.5}, 2}, {{-5.0, -4.0, 2.5}, 3}};
+  for (const auto& [view, clamped] : cases) {
+    const auto forward = projection_jacobian(camera, vec3(view.data()));
+    EXPECT_EQ(forward.clamped_x + 2 * forward.clamped_y, clamped);
+    const auto g = projection_jacobian_backward(forward, mat23(w.data()));
+    expect_gradient({g.x, g.y, g.z}, loss, view);
+  }
+}
+
+TEST(ImageAxes, AreTheJacobianTimesTheRotation) {
+  Random random(6);
+  const Vector j = random.uniforms(6), r = random.uniforms(9);
+  const Vector axes = flat(image_axes(mat23(j.data()), mat3(r.data())));
+  for (int row = 0; row < 2; ++row) {
+    for (int column = 0; column < 3; ++column) {
+      double expected = 0;
+      for (int k = 0; k < 3; ++k) expected += j[3 * row + k] * r[3 * k + column];
+      EXPECT_NEAR(axes[3 * row + column], expected, kRounding);
+    }
+  }
+}
+
+TEST(Covariance2D, IsTheProductOfTheMatrices) {
+  Random random(7);
+  const Vector m = random.uniforms(6), c = random.uniforms(6);
+  const double full[3][3] = {{c[0], c[1], c[2]}, {c[1], c[3], c[4]}, {c[2], c[4], c[5]}};
+  double expected[2][2] = {};
+  for (int a = 0; a < 2; ++a) {
+    for (int b = 0; b < 2; ++b) {
+      for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) expected[a][b] += m[3 * a + i] * full[i][j] * m[3 * b + j];
+      }
+    }
+  }
+  const auto cov = covariance_2d(mat23(m.data()), sym3(c.data()));
+  EXPECT_NEAR(cov.xx, expected[0][0], kRounding);
+  EXPECT_NEAR(cov.xy, expected[0][1], kRounding);
+  EXPECT_NEAR(cov.yy, expected[1][1], kRounding);
+}
+
+// x: axes, then the covariance's six numbers.
+TEST(Covariance2D, BackwardIsTheDerivative) {
+  Random random(8);
+  const Vector x = random.uniforms(12), w = random.uniforms(3);
+  auto loss = [&](const Vector& v) { return weighted_sum(w, flat(covariance_2d(mat23(&v[0]), sym3(&v[6])))); };
+  Sym3<double> dL_dcov;
+  Mat23<double> dL_daxes;
+  covariance_2d_backward(mat23(&x[0]), sym3(&x[6]), sym2(w.data()), dL_dcov, dL_daxes);
+  Vector actual = flat(dL_daxes);
+  for (const double entry : flat(dL_dcov)) actual.push_back(entry);
+  expect_gradient(actual, loss, x);
+}
+
+TEST(Conic, IsTheInverseOfTheFilteredCovariance) {
+  const Conic<double> conic = make_conic<double>({5, 2, 3});
+  EXPECT_DOUBLE_EQ(conic.filtered.xx, 5.3);  // + 0.3 px^2, Inria's low-pass
+  EXPECT_DOUBLE_EQ(conic.filtered.xy, 2);
+  EXPECT_DOUBLE_EQ(conic.filtered.yy, 3.3);
+  const auto &c = conic.filtered, &k = conic.inverse;
+  EXPECT_NEAR(c.xx * k.xx + c.xy * k.xy, 1, kRounding);
+  EXPECT_NEAR(c.xx * k.xy + c.xy * k.yy, 0, kRounding);
+  EXPECT_NEAR(c.xy * k.xx + c.yy * k.xy, 0, kRounding);
+  EXPECT_NEAR(c.xy * k.xy + c.yy * k.yy, 1, kRounding);
+}
+
+TEST(Conic, BackwardIsTheDerivative) {
+  Random random(9);
+  for (const Vector& cov : {Vector{5, 2, 3}, Vector{0.5, -0.2, 4}, Vector{0.3, 0, 0.3}}) {
+    const Vector w = random.uniforms(3);
+    auto loss = [&](const Vector& v) { return weighted_sum(w, flat(make_conic(sym2(v.data())).inverse)); };
+    expect_gradient(flat(make_conic_backward(make_conic(sym2(cov.data())), sym2(w.data()))), loss, cov);
+  }
+}
+
+TEST(Conic, KeepsANeedlesDeterminantInFloat) {
+  // A needle of 2000 x 0 px along the diagonal: the products of its covariance agree to six digits, so a determinant
+  // from rounded products would be wrong from the first digit on. Expected: the float inputs, multiplied exactly.
+  const float variance = 2e6f;
+  const auto conic = make_conic<float>({variance, variance, variance});
+  const long double side = conic.filtered.xx, off = conic.filtered.xy;
+  const long double expected = side * side - off * off;
+  EXPECT_NEAR(conic.determinant / expected, 1, 2e-7L);  // 1.5 ulp
+}
+
+double compensation(const Vector& v) {
+  const auto cov = sym2(v.data());
+  return opacity_compensation(cov, make_conic(cov));
+}
+
+TEST(OpacityCompensation, IsTheRootOfTheDeterminants) {
+  EXPECT_NEAR(compensation({5, 2, 3}), std::sqrt((5.0 * 3 - 4) / (5.3 * 3.3 - 4)), kRounding);
+}
+
+TEST(OpacityCompensation, BackwardIsTheDerivative) {
+  for (const Vector& cov : {Vector{5, 2, 3}, Vector{0.05, 0.02, 0.03}}) {
+    const auto c = sym2(cov.data());
+    auto loss = [](const Vector& v) { return 1.7 * compensation(v); };
+    // The small covariance is 0.02 across, so the steps must be smaller too: 1e-4.
+    expect_gradient(flat(opacity_compensation_backward(c, make_conic(c), 1.7)), loss, cov, 1e-4);
+  }
+}
+
+TEST(OpacityCompensation, HasAFloorWithoutGradient) {
+  for (const Vector& cov : {Vector{1e-4, 0, 1e-4}, Vector{4, 2, 1}, Vector{0.1, 0.15, 0.1}}) {  // tiny; a needle; indefinite
+    const auto c = sym2(cov.data());
+    EXPECT_DOUBLE_EQ(compensation(cov), std::sqrt(static_cast<double>(2.5e-5f)));
+    for (const double g : flat(opacity_compensation_backward(c, make_conic(c), 1.7))) EXPECT_EQ(g, 0);
+  }
+}
+
+TEST(ScreenRadius, IsThreeSigmaOfTheLongAxisRoundedUp) {
+  // Eigenvalues 25 and 4 (low-pass included), turned by 30 degrees.
+  const double c = std::cos(0.5235987755982988), s = std::sin(0.5235987755982988);
+  const Sym2<double> cov = {25 * c * c + 4 * s * s - 0.3, 21 * c * s, 25 * s * s + 4 * c * c - 0.3};
+  EXPECT_EQ(screen_radius(make_conic<double>({cov.xx + 1e-3, cov.xy, cov.yy + 1e-3})), 16);  // just above 15
+  EXPECT_EQ(screen_radius(make_conic<double>({cov.xx - 1e-3, cov.xy, cov.yy - 1e-3})), 15);
+}
+
+TEST(ScreenRadius, TreatsRoundGaussiansByTheFlooredRoot) {
+  // mid^2 - det = 0 is taken as 0.1, so that sigma^2 = 0.3 counts as 0.3 + sqrt(0.1): ceil(3 sqrt(0.616)) = 3.
+  EXPECT_EQ(screen_radius(make_conic<double>({0, 0, 0})), 3);
+  // 99.7 + 0.3 + 0.316: ceil(30.047) = 31, where an exact eigenvalue would give 30.
+  EXPECT_EQ(screen_radius(make_conic<double>({99.7, 0, 99.7})), 31);
+}
+
+}  // namespace
+}  // namespace dsmoe

@@ -1,0 +1,169 @@
+// One (Gaussian, pixel) pair: exponent, gate logit, which pairs count, gradients.
+#include "dsmoe/gate.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <limits>
+#include <string>
+#include <vector>
+
+#include "all_modes.h"
+#include "finite_difference.h"
+
+namespace dsmoe {
+namespace {
+
+using Vector = std::vector<double>;
+
+double quadratic_power(const Sym2<double>& conic, double dx, double dy) {
+  return -0.5 * (conic.xx * dx * dx + 2 * conic.xy * dx * dy + conic.yy * dy * dy);
+}
+
+TEST(ColumnExponent, IsTheQuadraticForm) {
+  Random random(1);
+  for (int i = 0; i < 200; ++i) {
+    const double xx = random.log_uniform(1e-4, 3), yy = random.log_uniform(1e-4, 3);
+    const Sym2<double> conic = {xx, random.uniform(-0.99, 0.99) * std::sqrt(xx * yy), yy};
+    const double dx = random.uniform(-50, 50), dy = random.uniform(-50, 50);
+    const double expected = quadratic_power(conic, dx, dy);
+    // Rounding of the largest of the three terms, in double and in float.
+    const double terms = xx * dx * dx + yy * dy * dy;
+    EXPECT_NEAR((ColumnExponent<double, double>(conic, dx).at(dy)), expected, 1e-15 * terms);
+    const Sym2<float> narrow = {float(conic.xx), float(conic.xy), float(conic.yy)};
+    EXPECT_NEAR((ColumnExponent<float, float>(narrow, float(dx)).at(float(dy))), expected, 1e-6 * terms);
+  }
+}
+
+template <class Mode> struct GateOfMode : testing::Test {};
+TYPED_TEST_SUITE(GateOfMode, AllModes);
+
+// Opacities over the whole legal range; thresholds that never, sometimes and always bind.
+template <class S> std::vector<S> test_opacities() {
+  const S cut = S(kAlphaCut);
+  std::vector<S> out = {S(1e-30), S(1e-6), std::nextafter(cut, S(0)), cut, std::nextafter(cut, S(1)), S(0.99), S(1), S(7)};
+  Random random(2);
+  for (int i = 0; i < 200; ++i) out.push_back(S(random.log_uniform(1e-5, 2)));
+  return out;
+}
+
+template <BlendMode kMode, class S> void expect_squared_reach_is_exact(S margin) {
+  int bounded = 0, without = 0;
+  for (const S opacity : test_opacities<S>()) {
+    for (const S alpha_min : {S(0), S(1e-4), S(0.01), S(0.5)}) {
+      const S reach = squared_reach(kMode, opacity, alpha_min);
+      auto counts = [&](S squared_distance) {
+        return evaluate_gate<kMode>(S(-0.5) * squared_distance, opacity, alpha_min).counts;
+      };
+      if (reach < -margin) {
+        ++without;
+        EXPECT_FALSE(counts(0)) << "opacity " << opacity << " alpha_min " << alpha_min;
+      } else {
+        ++bounded;
+        EXPECT_FALSE(counts(reach + margin)) << "opacity " << opacity << " alpha_min " << alpha_min;
+        if (reach > margin) {
+          EXPECT_TRUE(counts(reach - margin)) << "opacity " << opacity << " alpha_min " << alpha_min;
+        }
+      }
+    }
+  }
+  EXPECT_GT(bounded, 100);
+  EXPECT_GT(without, 10);
+}
+
+// Margins: k^2 is up to 25, its logarithm and the exponential round at epsilon each, so 25 epsilon and a few more.
+TYPED_TEST(GateOfMode, SquaredReachBoundsExactlyThePairsThatCount) {
+  expect_squared_reach_is_exact<TypeParam::value>(1e-5f);
+  expect_squared_reach_is_exact<TypeParam::value>(1e-13);
+}
+
+template <class S> void expect_the_threshold_is_inclusive() {
+  const S cut = S(kAlphaCut);
+  EXPECT_EQ(squared_reach(BlendMode::kAlpha, cut, S(0)), 0);
+  EXPECT_TRUE((evaluate_gate<BlendMode::kAlpha>(S(0), cut, S(0)).counts)) << "alpha = 1/255 counts";
+  const S below = std::nextafter(cut, S(0));
+  EXPECT_FALSE((evaluate_gate<BlendMode::kAlpha>(S(0), below, S(0)).counts));
+  EXPECT_LE(squared_reach(BlendMode::kAlpha, below, S(0)), 0);
+}
+
+TEST(Gate, AnOpacityOfExactlyOneIn255CountsAtTheCentreOnly) {
+  expect_the_threshold_is_inclusive<float>();
+  expect_the_threshold_is_inclusive<double>();
+}
+
+TYPED_TEST(GateOfMode, OpacityNotAboveZeroReachesNothing) {
+  for (const double opacity : {0.0, -0.0, -1.0, std::nan("")}) {
+    EXPECT_LT(squared_reach(TypeParam::value, opacity, 0.0), 0);
+    EXPECT_LT(squared_reach(TypeParam::value, opacity, 0.5), 0);
+  }
+}
+
+TYPED_TEST(GateOfMode, AlphaIsTheLogitClampedAt99Percent) {
+  const auto low = evaluate_gate<TypeParam::value>(-1.0, 0.8, 0.0);
+  EXPECT_DOUBLE_EQ(low.logit, 0.8 * std::exp(-1.0));
+  EXPECT_EQ(low.alpha, low.logit);
+  const auto high = evaluate_gate<TypeParam::value>(-0.25, 3.0, 0.0);
+  EXPECT_DOUBLE_EQ(high.logit, 3 * std::exp(-0.25));
+  EXPECT_EQ(high.alpha, static_cast<double>(0.99f));
+}
+
+TYPED_TEST(GateOfMode, APositiveExponentNeverCounts) {
+  EXPECT_TRUE((evaluate_gate<TypeParam::value>(0.0, 0.5, 0.0).counts));
+  EXPECT_FALSE((evaluate_gate<TypeParam::value>(1e-300, 0.5, 0.0).counts));
+  EXPECT_FALSE((evaluate_gate<TypeParam::value>(std::nan(""), 0.5, 0.0).counts));
+}
+
+TYPED_TEST(GateOfMode, GateCutOffIsOnTheKernelAndAlphaCutOffOnTheAlpha) {
+  const bool smoe = is_smoe(TypeParam::value);
+  // o G = 1e-6, G = 1e-3.
+  EXPECT_EQ((evaluate_gate<TypeParam::value>(std::log(1e-3), 1e-3, 0.0).counts), smoe);
+  // G = 0.9e-5 and o G = 9e-3 at an opacity of 1000.
+  EXPECT_EQ((evaluate_gate<TypeParam::value>(std::log(0.9e-5), 1000.0, 0.0).counts), !smoe);
+}
+
+TYPED_TEST(GateOfMode, ClampPassesTheGradientStraightThrough) {
+  for (const double opacity : {0.3, 0.99, 1.0, 4.0}) {
+    const auto gate = evaluate_gate<TypeParam::value>(-0.1, opacity, 0.0);
+    const double dL_dalpha = -1.3;
+    const double expected = opacity * std::exp(-0.1) * dL_dalpha;  // as if alpha were o G
+    // 1 / 0.99f is rounded once to double and multiplied back.
+    EXPECT_NEAR(gate_backward(gate, gate.alpha * dL_dalpha), expected, 1e-14);
+  }
+}
+
+TEST(Gate, APairThatDoesNotCountHandsBackZeroWhateverItsExponent) {
+  // An indefinite covariance (cov3D_precomp is the caller's) gives exponents without bound.
+  for (const double power : {1.0, 100.0, 1000.0}) {
+    const auto gate = evaluate_gate<BlendMode::kSmoe>(power, 0.5, 0.0);
+    ASSERT_FALSE(gate.counts);
+    EXPECT_EQ(gate_backward(gate, 0.0), 0) << "power " << power;
+    const auto narrow = evaluate_gate<BlendMode::kSmoe>(static_cast<float>(power), 0.5f, 0.0f);
+    EXPECT_EQ(gate_backward(narrow, 0.0f), 0) << "power " << power;
+  }
+}
+
+// x: mean 2, conic 3, opacity. The loss is a weighted sum of squares of o G over a few pixels.
+TEST(Gate, MomentsAreAllThatTheShapeNeeds) {
+  Random random(3);
+  const Vector w = random.uniforms(30), px = random.uniforms(30, -3, 3), py = random.uniforms(30, -3, 3);
+  auto logit = [&](const Vector& v, int k) {
+    return v[5] * std::exp(quadratic_power({v[2], v[3], v[4]}, px[k] - v[0], py[k] - v[1]));
+  };
+  auto loss = [&](const Vector& v) {
+    double sum = 0;
+    for (int k = 0; k < 30; ++k) sum += w[k] * logit(v, k) * logit(v, k);
+    return sum;
+  };
+  const Vector x = {0.3, -0.2, 0.5, 0.1, 0.3, 0.7};
+  GateMoments<double> m = {};
+  for (int k = 0; k < 30; ++k) {
+    const double g = w[k] * 2 * logit(x, k) * logit(x, k);  // dL/dpower
+    const double dx = px[k] - x[0], dy = py[k] - x[1];
+    m = {m.one + g, m.x + g * dx, m.y + g * dy, m.xx + g * dx * dx, m.xy + g * dx * dy, m.yy + g * dy * dy};
+  }
+  const auto g = moments_backward({x[2], x[3], x[4]}, x[5], m);
+  expect_gradient({g.mean.x, g.mean.y, g.conic.xx, g.conic.xy, g.conic.yy, g.opacity}, loss, x);
+}
+
+}  // namespace
+}  // namespace dsmoe
