@@ -106,8 +106,8 @@ def extension():
 
 def packages():
     """Returns the arguments of setup() that say which folder is which package."""
-    folders = {PACKAGE: PACKAGE}
-    folders.update({f"{PACKAGE}.{name}": name for name in FOLDERS_INSTALLED_INSIDE if (ROOT / name).is_dir()})
+    inside = [name for name in FOLDERS_INSTALLED_INSIDE if (ROOT / name / "__init__.py").is_file()]
+    folders = {PACKAGE: PACKAGE, **{f"{PACKAGE}.{name}": name for name in inside}}
     names = list(folders)
     for name, folder in folders.items():
         names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
