@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 from dataclasses import dataclass, field
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List, Optional, Sequence
 
 from ..settings import BLEND_MODES, resolve_blend_mode
 from .errors import ConfigError
@@ -177,8 +177,11 @@ def _flag(option: "dataclasses.Field[Any]") -> str:
 _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str}
 
 
-def add_arguments(parser: argparse.ArgumentParser, skip: tuple = ()) -> None:
-    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser."""
+def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), defaults: bool = True) -> None:
+    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser.
+
+    defaults: whether options that are not given get their default, or are left out of the parsed arguments.
+    """
     for option in dataclasses.fields(TrainConfig):
         if option.name in skip:
             continue
@@ -188,18 +191,22 @@ def add_arguments(parser: argparse.ArgumentParser, skip: tuple = ()) -> None:
             continue
         flags = option.metadata.get("flags", (_flag(option),))
         if option.type == "bool":
-            parser.add_argument(*flags, action="store_true", help=text)
+            parser.add_argument(*flags, action="store_true", help=text, default=_default(option, defaults))
             continue
-        keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": option.default}
+        keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": _default(option, defaults)}
         if option.metadata.get("required"):
             keywords["required"] = True
-        elif option.default is not None:
+        elif option.default is not None and defaults:
             text += f" (default: {option.default})"
         if option.metadata.get("choices"):
             keywords["choices"] = option.metadata["choices"]
         else:
             keywords["metavar"] = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
         parser.add_argument(*flags, help=text, dest=option.name, **keywords)
+
+
+def _default(option: "dataclasses.Field[Any]", defaults: bool) -> Any:
+    return option.default if defaults else argparse.SUPPRESS
 
 
 def config_from_arguments(arguments: argparse.Namespace) -> TrainConfig:

@@ -1,0 +1,135 @@
+"""One scene, both blends: trains with `alpha` and with `smoe`, and shows what differs.
+
+python -m diff_smoe_rasterization.trainer.quickstart [SCENE] [--iterations N] [--resolution R] [-o OUT]
+"""
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+from typing import Any, Dict, List, Optional
+
+import torch
+
+from .config import TrainConfig, add_arguments
+from .errors import TrainerError
+from .inspection import open_renderer, to_image
+from .loop import train
+from .metrics import psnr, quantised
+from .modelfile import model_path
+from .pictures import comparison, evenly_spaced
+from .results import results_table, write_results
+from .scene import Scene, load_scene, read_layout
+from .synthetic import write_synthetic_scene
+
+MODES = ("alpha", "smoe")
+PICTURES = 3  # test views that are shown
+DEFAULT_OUTPUT = "quickstart_output"
+
+# What the made scene gets by default.
+MADE_SCENE_ITERATIONS = 3000
+# What a real scene gets by default, so that a processor with two cores is done with both modes in some minutes.
+REAL_SCENE_ITERATIONS = 2000
+REAL_SCENE_WIDTH = 320
+REAL_SCENE_POINTS = 30_000
+
+# Offered by `dsmoe train` and fixed here.
+FIXED = ("scene", "output", "blend_mode", "eval_every", "checkpoint_every")
+
+
+def main(argv: Optional[List[str]] = None) -> int:
+    """Runs the comparison; returns the exit status."""
+    try:
+        run(_parse(argv))
+        return 0
+    except (TrainerError, ImportError) as error:
+        print(f"quickstart: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\nquickstart: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="quickstart", argument_default=argparse.SUPPRESS,
+        description="Trains a scene twice, with alpha blending and with SMoE gating, and compares the results. "
+                    "Options that are not given are chosen so that a processor finishes in minutes.")
+    parser.add_argument("scene", nargs="?", metavar="SCENE", default=None,
+                        help="folder of a COLMAP or NeRF-synthetic scene (default: a small one made on the spot)")
+    parser.add_argument("-o", "--output", metavar="OUT", default=DEFAULT_OUTPUT,
+                        help=f"folder to write (default: {DEFAULT_OUTPUT})")
+    parser.add_argument("--quiet", action="store_true", default=False, help="no progress bars")
+    add_arguments(parser, skip=FIXED, defaults=False)
+    return parser.parse_args(argv)
+
+
+def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
+    """Makes the scene where none is named, trains both modes, writes results and pictures; returns the rows."""
+    given = {name: value for name, value in vars(arguments).items() if name not in ("scene", "output", "quiet")}
+    output, progress = arguments.output, not arguments.quiet
+    folder = arguments.scene
+    if folder is None:
+        folder = os.path.join(output, "scene")
+        print(f"making a scene in {folder}")
+        write_synthetic_scene(folder)
+    config = choose_options(folder, made=arguments.scene is None, given=given)
+    scene = load_scene(config, progress)
+    rows = []
+    for mode in MODES:
+        rows.append(train(config.changed(blend_mode=mode, output=os.path.join(output, mode)), overwrite=True,
+                          progress=progress, scene=scene))
+        shutil.copyfile(model_path(os.path.join(output, mode), config.iterations), os.path.join(output, mode + ".ply"))
+    write_results(output, rows)
+    pictures = write_pictures(config, scene, output)
+    print()
+    print(results_table(rows))
+    print(f"\n{len(scene.train)} training and {len(scene.test)} test views; "
+          f"results and models: {output}; pictures: {', '.join(pictures)}")
+    return rows
+
+
+def choose_options(folder: str, made: bool, given: Dict[str, Any]) -> TrainConfig:
+    """The given options, and for the others what a processor finishes in minutes; says what it chose.
+
+    The recipe's milestones keep their share of the iterations (`TrainConfig.shortened`).
+    """
+    chosen: Dict[str, Any] = {"iterations": MADE_SCENE_ITERATIONS if made else REAL_SCENE_ITERATIONS}
+    if not made:
+        layout = read_layout(TrainConfig(scene=folder))
+        if max(image.camera.width for image in layout.train) > REAL_SCENE_WIDTH:
+            chosen["resolution"] = REAL_SCENE_WIDTH
+        if len(layout.points.positions) > REAL_SCENE_POINTS:
+            chosen["init_points"] = REAL_SCENE_POINTS
+    for name in given:
+        chosen.pop(name, None)
+    if chosen and not made:
+        texts = (f"--{name.replace('_', '-')} {value}" for name, value in chosen.items())
+        print(f"chosen for a run of some minutes: {' '.join(texts)}")
+    base = TrainConfig(scene=folder, blend_mode=MODES[0], checkpoint_every=0)
+    short = base.changed(**{**chosen, **given}).shortened()
+    return short.changed(**given)
+
+
+def write_pictures(config: TrainConfig, scene: Scene, output: str) -> List[str]:
+    """Ground truth, alpha and smoe beside each other for some test views; returns the paths."""
+    renderers = [(mode, open_renderer(config, os.path.join(output, mode + ".ply"), mode, config.device))
+                 for mode in MODES]
+    views = scene.test or scene.train
+    paths = []
+    for index in evenly_spaced(len(views), PICTURES):
+        view, labelled = views[index], []
+        truth = view.image_float()
+        for mode, renderer in renderers:
+            with torch.no_grad():
+                color = renderer(view.camera).color.cpu()
+            labelled.append((f"{mode}  {psnr(quantised(color), truth):.2f} dB", to_image(color)))
+        name = os.path.splitext(os.path.basename(view.camera.name))[0]
+        paths.append(os.path.join(output, f"compare_{name}.png"))
+        comparison(to_image(truth), labelled).save(paths[-1])
+    return paths
+
+
+if __name__ == "__main__":
+    sys.exit(main())
