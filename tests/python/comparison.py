@@ -1,11 +1,23 @@
 """How the tests compare tensors, and where a comparison in float32 makes sense."""
 from __future__ import annotations
 
+import contextlib
 import math
 
 import torch
 
 from diff_smoe_rasterization import reference
+
+
+@contextlib.contextmanager
+def one_thread():
+    """For the reference on small tensors, where more threads of torch only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def relative_error(actual, expected):
@@ -61,4 +73,3 @@ def threshold_margin(scene):
             distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
         nearest = torch.cat([torch.full_like(x, math.inf)[None]] + [distance.abs() for distance in distances]).min(0)[0]
     return nearest.reshape(settings.image_height, settings.image_width)
-

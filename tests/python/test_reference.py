@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from comparison import assert_all_close, assert_close, threshold_margin
+from comparison import assert_all_close, assert_close, one_thread, threshold_margin
 from scenes import CAMERA_FIELDS, assert_not_empty, camera_settings, gradients, random_scene, random_weights
 
 from diff_smoe_rasterization import reference
@@ -43,12 +43,9 @@ def middle(rendering_image):
 
 
 @pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """The tensors here are small: more threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+def single_threaded():
+    with one_thread():
+        yield
 
 
 @pytest.mark.parametrize("covariance, antialiasing", [("scales", False), ("scales", True), ("cov3D", False)])

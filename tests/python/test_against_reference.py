@@ -1,0 +1,174 @@
+"""The package against the reference: images and every gradient, in both types, over scenes that each stress one thing.
+
+In float64 the two must agree to rounding. In float32 the package is compared with the reference in float64 on the same
+numbers; pixels in which a pair lies within rounding of a threshold (cut-off, early stop) may show another outcome, so
+they are counted and take no part.
+"""
+from __future__ import annotations
+
+import functools
+
+import pytest
+import torch
+from comparison import assert_all_close, assert_close, one_thread, threshold_margin
+from scenes import assert_not_empty, random_scene
+
+import diff_smoe_rasterization
+from diff_smoe_rasterization import _C, reference
+from diff_smoe_rasterization.settings import OUTPUTS
+
+# A gradient is a sum of some thousand terms that cancel in part, each with some hundred roundings of 1e-16.
+FLOAT64_TOLERANCE = 1e-9
+# The same with roundings of 6e-8.
+FLOAT32_IMAGE_TOLERANCE = 1e-5
+FLOAT32_GRADIENT_TOLERANCE = 1e-4
+# ln(value / threshold) that float32 can get wrong: power is a difference of terms of up to 1e4, times 6e-8.
+FLOAT32_MARGIN = 1e-3
+
+
+def _with_negative_opacities(mode):
+    scene = random_scene(mode, seed=8)
+    opacities = scene.inputs["opacities"].clone()
+    opacities[::5] *= -1
+    opacities[1::10] = 0
+    return scene.with_inputs(opacities=opacities)
+
+
+def _with_flat_opacities(mode):
+    scene = random_scene(mode, 60, 30, 20, seed=9)
+    return scene.with_inputs(opacities=scene.inputs["opacities"][:, 0])
+
+
+def _with_unused_coefficients(mode):
+    return random_scene(mode, 60, seed=10, degree=3).with_settings(sh_degree=1)
+
+
+def _with_scale_modifier(mode):
+    return random_scene(mode, seed=11).with_settings(scale_modifier=0.6)
+
+
+def _scene(*arguments, **options):
+    return lambda mode: random_scene(mode, *arguments, **options)
+
+
+# Each takes a mode.
+SCENES = {
+    "default": random_scene,
+    "degree_0": _scene(degree=0, seed=1),
+    "degree_3": _scene(degree=3, seed=2),
+    "split_dc": _scene(degree=2, split_dc=True, seed=3),
+    "split_dc_alone": _scene(60, degree=0, split_dc=True, seed=3),
+    "unused_coefficients": _with_unused_coefficients,
+    "cov3D": _scene(covariance="cov3D", seed=4),
+    "channels_1": _scene(60, channels=1, seed=5),
+    "channels_3": _scene(channels=3, seed=6),
+    "channels_4": _scene(60, channels=4, seed=7),
+    "channels_7": _scene(60, channels=7, seed=7),
+    "channels_33": _scene(60, channels=33, covariance="cov3D", seed=7),
+    "antialiasing": _scene(250, scale=0.05, antialiasing=True, seed=12),
+    "antialiasing_cov3D": _scene(antialiasing=True, covariance="cov3D", seed=13),
+    "principal_point": _scene(principal_point=(7.3, -4.6), seed=14),
+    "saturating": _scene(500, 24, 20, scale=0.3, opacity=(0.3, 1.3), seed=15),
+    "large_splats": _scene(40, 70, 41, scale=1.2, opacity=(0.05, 0.5), seed=16),
+    "tiny_splats": _scene(800, scale=0.01, opacity=(0.3, 1.0), seed=17),
+    "one_tile": _scene(60, 16, 16, seed=18),
+    "one_pixel_more_than_tiles": _scene(60, 33, 17, seed=19),
+    "narrow": _scene(60, 3, 60, fov_x=0.05, seed=20),
+    "near": _scene(near=3.6, seed=21),
+    "alpha_min": _scene(alpha_min=1 / 255, seed=22),
+    "faint": _scene(opacity=(1e-4, 2e-2), scale=0.2, seed=23),
+    "negative_opacities": _with_negative_opacities,
+    "flat_opacities": _with_flat_opacities,
+    "scale_modifier": _with_scale_modifier,
+}
+# Scenes that run with the gradients of the optional outputs beside that of the colour.
+WITH_OUTPUTS = {"default", "split_dc", "channels_7", "antialiasing", "saturating", "alpha_min", "faint", "large_splats"}
+
+
+@functools.lru_cache(maxsize=None)
+def build(name, mode):
+    """Returns (scene, outputs, image gradients that are zero at thresholds, that mask, reference results)."""
+    scene = SCENES[name](mode)
+    outputs = OUTPUTS if name in WITH_OUTPUTS else ()
+    generator = torch.Generator().manual_seed(1)
+    shape = (len(scene.settings.bg) + len(outputs), scene.settings.image_height, scene.settings.image_width)
+    weights = torch.randn(shape, generator=generator, dtype=torch.float64)
+    with one_thread():
+        safe = threshold_margin(scene) > FLOAT32_MARGIN
+        expected = render(reference.rasterize, scene, outputs, weights)
+        expected_safe = render(reference.rasterize, scene, outputs, weights * safe)[2]
+    return scene, outputs, weights, safe, expected, expected_safe
+
+
+def render(function, scene, outputs, weights):
+    """Returns (rendering, images by name, gradients by name)."""
+    scene = scene.requiring_grad()
+    rendering = function(settings=scene.settings, outputs=outputs, **scene.inputs)
+    images = {"color": rendering.color, **{name: getattr(rendering, name) for name in outputs}}
+    leaves = scene.leaves()
+    stacked = torch.cat(list(images.values()))
+    values = torch.autograd.grad(stacked, list(leaves.values()), weights.to(stacked), allow_unused=True)
+    gradients = {name: torch.zeros_like(leaf) if value is None else value
+                 for (name, leaf), value in zip(leaves.items(), values)}
+    return rendering, {name: image.detach() for name, image in images.items()}, gradients
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_float64(mode, name):
+    scene, outputs, weights, _, (expected, expected_images, expected_gradients), _ = build(name, mode)
+    if name != "faint" or mode != "alpha":
+        assert_not_empty(expected, scene.settings)
+    if name == "saturating" and mode in ("alpha", "smoe"):
+        assert (expected_images["alpha"] > 0.999).double().mean() > 0.5
+    rendering, images, gradients = render(diff_smoe_rasterization.rasterize, scene, outputs, weights)
+    assert torch.equal(rendering.radii, expected.radii)
+    assert_all_close(images, expected_images, FLOAT64_TOLERANCE)
+    assert_all_close(gradients, expected_gradients, FLOAT64_TOLERANCE)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_float32(mode, name):
+    scene, outputs, weights, safe, (expected, expected_images, _), expected_gradients = build(name, mode)
+    assert safe.double().mean() > 0.9
+    rendering, images, gradients = render(diff_smoe_rasterization.rasterize, scene.to(torch.float32), outputs,
+                                          weights * safe)
+    assert rendering.color.dtype == torch.float32 and rendering.radii.dtype == torch.int32
+    assert torch.equal(rendering.radii, expected.radii)
+    for output, image in images.items():
+        assert_close(image[:, safe], expected_images[output][:, safe], FLOAT32_IMAGE_TOLERANCE, output)
+        assert torch.isfinite(image).all()
+    assert_all_close(gradients, expected_gradients, FLOAT32_GRADIENT_TOLERANCE)
+
+
+def test_the_optional_outputs_do_not_change_the_colour(mode):
+    scene = random_scene(mode, dtype=torch.float32)
+    alone = diff_smoe_rasterization.rasterize(settings=scene.settings, **scene.inputs)
+    assert alone.alpha is None and alone.depth is None and alone.inverse_depth is None
+    for output in OUTPUTS:
+        rendering = diff_smoe_rasterization.rasterize(settings=scene.settings, outputs=(output,), **scene.inputs)
+        assert torch.equal(rendering.color, alone.color)
+        assert [name for name in OUTPUTS if getattr(rendering, name) is not None] == [output]
+
+
+def test_each_optional_output_has_its_own_gradient(mode):
+    scene = random_scene(mode, 60, seed=30)
+    for output in OUTPUTS:
+        results = []
+        for function in (diff_smoe_rasterization.rasterize, reference.rasterize):
+            leaf = scene.requiring_grad(camera=False)
+            image = getattr(function(settings=leaf.settings, outputs=(output,), **leaf.inputs), output)
+            weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+            values = torch.autograd.grad(image, list(leaf.inputs.values()), weights, allow_unused=True)
+            results.append({name: torch.zeros_like(leaf.inputs[name]) if value is None else value
+                            for name, value in zip(leaf.inputs, values)})
+        assert results[1]["means3D"].any()
+        assert_all_close(results[0], results[1], FLOAT64_TOLERANCE)
+
+
+def test_the_core_has_the_constants_of_the_reference():
+    expected = {"alpha_max": reference.ALPHA_MAX, "alpha_cut": reference.ALPHA_MIN, "gate_cut": reference.KERNEL_MIN,
+                "transmittance_cut": reference.TRANSMITTANCE_MIN, "gate_sum_cut": reference.GATE_SUM_MIN,
+                "radius_root_floor": reference.EIGENVALUE_SPREAD_MIN, "low_pass": reference.LOW_PASS,
+                "compensation_floor": reference.COMPENSATION_MIN, "frustum_margin": reference.FRUSTUM_MARGIN,
+                "homogeneous_epsilon": reference.W_EPSILON, "tile_size": reference.TILE}
+    assert {name: _C.constants[name] for name in expected} == expected

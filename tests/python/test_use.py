@@ -1,0 +1,119 @@
+"""How programs use the rasterizer beside one plain call: views, no_grad, many calls, second derivatives."""
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+from scenes import gradients, random_scene
+
+from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization.settings import OUTPUTS
+
+
+def resident_bytes():
+    with open("/proc/self/statm") as statistics:
+        return int(statistics.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def not_contiguous(tensor):
+    """Returns the same values as every second column of a wider tensor."""
+    wide = torch.stack([tensor, torch.full_like(tensor, float("nan"))], -1).flatten(-2)
+    view = wide[..., ::2]
+    assert torch.equal(view, tensor) and not view.is_contiguous()
+    return view
+
+
+@pytest.mark.parametrize("options", [{}, dict(split_dc=True), dict(channels=4, covariance="cov3D")],
+                         ids=["shs", "dc", "colours"])
+def test_views_that_are_not_contiguous(mode, options):
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32, **options)
+    settings = scene.settings._replace(**{name: not_contiguous(getattr(scene.settings, name))
+                                          for name in ("bg", "viewmatrix", "projmatrix", "campos")})
+    leaves = {name: tensor.clone().requires_grad_(True) for name, tensor in scene.inputs.items()}
+    views = {name: not_contiguous(leaf) for name, leaf in leaves.items()}
+    color = rasterize(settings=settings, **views).color
+    expected, expected_gradients = gradients(rasterize, scene, camera=False)
+    assert torch.equal(color, expected.color)
+    weights = torch.randn(color.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(color)
+    actual = torch.autograd.grad(color, list(leaves.values()), weights)
+    for name, gradient in zip(leaves, actual):
+        assert torch.equal(gradient, expected_gradients[name]), name
+
+
+def test_an_image_gradient_that_is_not_contiguous(mode):
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32).requiring_grad()
+    leaves = list(scene.leaves().values())
+    color = rasterize(settings=scene.settings, **scene.inputs).color
+    expanded = torch.autograd.grad(color.sum(), leaves, retain_graph=True)
+    dense = torch.autograd.grad(color, leaves, torch.ones_like(color), retain_graph=True)
+    transposed = torch.autograd.grad(color, leaves, torch.ones(18, 20, 3).permute(2, 0, 1))
+    for first, second, third in zip(expanded, dense, transposed):
+        assert torch.equal(first, second) and torch.equal(first, third)
+
+
+def test_only_the_wanted_gradients_are_made(mode):
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32)
+    _, expected = gradients(rasterize, scene)
+    for name in scene.inputs:
+        leaf = scene.inputs[name].clone().requires_grad_(True)
+        color = rasterize(settings=scene.settings, **{**scene.inputs, name: leaf}).color
+        weights = torch.randn(color.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(color)
+        color.backward(weights)
+        assert torch.equal(leaf.grad, expected[name]), name
+
+
+@pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])
+def test_without_gradients(mode, context):
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32)
+    leaf = scene.requiring_grad()
+    expected = rasterize(settings=leaf.settings, outputs=OUTPUTS, **leaf.inputs)
+    assert expected.color.requires_grad and not expected.radii.requires_grad
+    with context():
+        rendering = rasterize(settings=leaf.settings, outputs=OUTPUTS, **leaf.inputs)
+    for first, second in zip(rendering, expected):
+        assert not first.requires_grad and torch.equal(first, second.detach())
+
+
+def test_second_derivatives_are_refused(mode):
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32).requiring_grad(camera=False)
+    color = rasterize(settings=scene.settings, **scene.inputs).color
+    with pytest.raises(RuntimeError, match="twice|double|second|once"):
+        first, = torch.autograd.grad((color ** 2).sum(), scene.inputs["means3D"], create_graph=True)
+        first.sum().backward()
+
+
+def test_backward_can_run_again_on_a_retained_graph(mode):
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32).requiring_grad()
+    leaves = list(scene.leaves().values())
+    color = rasterize(settings=scene.settings, **scene.inputs).color
+    first = torch.autograd.grad(color.sum(), leaves, retain_graph=True)
+    second = torch.autograd.grad(color.sum(), leaves)
+    assert all(torch.equal(a, b) for a, b in zip(first, second))
+
+
+def test_an_input_changed_in_place_before_backward_is_noticed():
+    scene = random_scene("smoe", 30, 20, 18, degree=1, dtype=torch.float32)
+    leaf = scene.inputs["shs"].clone().requires_grad_(True)
+    means3D = scene.inputs["means3D"].clone()
+    color = rasterize(settings=scene.settings, **{**scene.inputs, "shs": leaf, "means3D": means3D}).color
+    means3D.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        color.sum().backward()
+
+
+def test_many_identical_calls_keep_the_memory_flat(mode):
+    scene = random_scene(mode, 30, 33, 21, degree=1, dtype=torch.float32).requiring_grad()
+    leaves = list(scene.leaves().values())
+
+    def call():
+        rendering = rasterize(settings=scene.settings, outputs=OUTPUTS, **scene.inputs)
+        torch.autograd.grad(rendering.color.sum() + rendering.depth.sum(), leaves)
+
+    for _ in range(200):
+        call()
+    before = resident_bytes()
+    for _ in range(1000):
+        call()
+    # One image of 8 KiB kept a call would be 8 MiB.
+    assert resident_bytes() - before < 3 * 2 ** 20
