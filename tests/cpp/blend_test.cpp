@@ -223,18 +223,18 @@ template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel
   const Real gate_sum = Real(forward.gate_sum), transmittance = Real(forward.transmittance);
   const Real background = Real(pixel.background);
   auto constants = begin_backward<kMode>(transmittance, Real(g.gate_sum));
-  const Real color = add_feature<kMode>(FeatureRule::kBlended, constants, gate_sum, Real(g.color),
-                                        Real(forward.color), background);
-  const Real depth = add_feature<kMode>(FeatureRule::kAveraged, constants, gate_sum, Real(g.depth),
-                                        Real(forward.depth), Real(0));
+  const Real color =
+      add_feature<kMode>(FeatureRule::kBlended, constants, gate_sum, Real(g.color), Real(forward.color), background);
+  const Real depth =
+      add_feature<kMode>(FeatureRule::kAveraged, constants, gate_sum, Real(g.depth), Real(forward.depth), Real(0));
   const Real inverse_depth = add_feature<kMode>(FeatureRule::kBlended, constants, gate_sum, Real(g.inverse_depth),
                                                 Real(forward.inverse_depth), Real(0));
   PixelGradient out;
   out.background = background_backward<kMode>(transmittance, gate_sum, Real(g.color));
   out.gamma = out.color = out.depth = out.inverse_depth = Vector(pixel.size());
   for (int i = pixel.size() - 1; i >= 0; --i) {
-    const Real value = color * Real(pixel.color[i]) + depth * Real(pixel.depth[i]) +
-                       inverse_depth * Real(pixel.inverse_depth[i]);
+    const Real value =
+        color * Real(pixel.color[i]) + depth * Real(pixel.depth[i]) + inverse_depth * Real(pixel.inverse_depth[i]);
     const auto gate = gate_of<Real>(pixel, i);
     const auto pair = Blend<kMode>::backward(constants, gate, value, gate.counts & (i < forward.last));
     out.gamma[i] = pair.gamma;

@@ -35,7 +35,9 @@ TEST(TransformPoint, IsARowVectorTimesTheMatrix) {
 TEST(TransformPoint, BackwardIsTheDerivative) {
   Random random(1);
   const auto x = random.uniforms(19), weights = random.uniforms(3);
-  auto loss = [&](const std::vector<double>& v) { return dot(vec3(weights.data()), transform_point(&v[3], vec3(&v[0]))); };
+  auto loss = [&](const std::vector<double>& v) {
+    return dot(vec3(weights.data()), transform_point(&v[3], vec3(&v[0])));
+  };
   double dL_dm[16] = {};
   const Vec3<double> dL_dp = transform_point_backward(&x[3], vec3(&x[0]), vec3(weights.data()), dL_dm);
   std::vector<double> actual = {dL_dp.x, dL_dp.y, dL_dp.z};

@@ -145,9 +145,14 @@ TEST(ProjectionJacobian, BackwardIsTheDerivativeInsideAndClamped) {
   Random random(5);
   const Vector w = random.uniforms(6);
   // Only J's four free entries are functions of the view point.
-  auto loss = [&](const Vector& v) { return weighted_sum(w, flat(projection_jacobian(camera, vec3(v.data())).jacobian)); };
-  const std::vector<std::pair<Vector, int>> cases = {
-      {{0.9, -0.4, 2.5}, 0}, {{5.0, -0.4, 2.5}, 1}, {{-5.0, 0.3, 2.5}, 1}, {{0.9, 4.0, 2.5}, 2}, {{-5.0, -4.0, 2.5}, 3}};
+  auto loss = [&](const Vector& v) {
+    return weighted_sum(w, flat(projection_jacobian(camera, vec3(v.data())).jacobian));
+  };
+  const std::vector<std::pair<Vector, int>> cases = {{{0.9, -0.4, 2.5}, 0},
+                                                     {{5.0, -0.4, 2.5}, 1},
+                                                     {{-5.0, 0.3, 2.5}, 1},
+                                                     {{0.9, 4.0, 2.5}, 2},
+                                                     {{-5.0, -4.0, 2.5}, 3}};
   for (const auto& [view, clamped] : cases) {
     const auto forward = projection_jacobian(camera, vec3(view.data()));
     EXPECT_EQ(forward.clamped_x + 2 * forward.clamped_y, clamped);
@@ -250,7 +255,8 @@ TEST(OpacityCompensation, BackwardIsTheDerivative) {
 }
 
 TEST(OpacityCompensation, HasAFloorWithoutGradient) {
-  for (const Vector& cov : {Vector{1e-4, 0, 1e-4}, Vector{4, 2, 1}, Vector{0.1, 0.15, 0.1}}) {  // tiny; a needle; indefinite
+  for (const Vector& cov :
+       {Vector{1e-4, 0, 1e-4}, Vector{4, 2, 1}, Vector{0.1, 0.15, 0.1}}) {  // tiny; a needle; indefinite
     const auto c = sym2(cov.data());
     EXPECT_DOUBLE_EQ(compensation(cov), std::sqrt(static_cast<double>(2.5e-5f)));
     for (const double g : flat(opacity_compensation_backward(c, make_conic(c), 1.7))) EXPECT_EQ(g, 0);

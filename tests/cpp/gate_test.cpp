@@ -41,7 +41,8 @@ TYPED_TEST_SUITE(GateOfMode, AllModes);
 // Opacities over the whole legal range; thresholds that never, sometimes and always bind.
 template <class S> std::vector<S> test_opacities() {
   const S cut = S(kAlphaCut);
-  std::vector<S> out = {S(1e-30), S(1e-6), std::nextafter(cut, S(0)), cut, std::nextafter(cut, S(1)), S(0.99), S(1), S(7)};
+  std::vector<S> out = {S(1e-30), S(1e-6), std::nextafter(cut, S(0)), cut, std::nextafter(cut, S(1)), S(0.99),
+                        S(1),     S(7)};
   Random random(2);
   for (int i = 0; i < 200; ++i) out.push_back(S(random.log_uniform(1e-5, 2)));
   return out;

@@ -86,9 +86,9 @@ Vector random_color_inputs(unsigned seed) {
 
 Vector color_gradient(int degree, const Vector& x, const Vector& dL_dcolor) {
   Vector out(x.size());
-  const auto mean = sh_color_backward<double>(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]),
-                                              color_of(degree, x).data(), dL_dcolor.data(),
-                                              {&out[kCoefficients], &out[kCoefficients + 3]});
+  const auto mean =
+      sh_color_backward<double>(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]), color_of(degree, x).data(),
+                                dL_dcolor.data(), {&out[kCoefficients], &out[kCoefficients + 3]});
   for (int k = 0; k < 3; ++k) {
     out[k] = (&mean.x)[k];
     out[3 + k] = -out[k];
@@ -117,7 +117,8 @@ TEST(ShColor, PassesNoGradientWhereClamped) {
 
 TEST(ShColor, DegreeZeroMayLieApart) {
   const Vector x = random_color_inputs(11), w = {0.7, -1.1, 0.4};
-  const Vector dc(x.begin() + kCoefficients, x.begin() + kCoefficients + 3), rest(x.begin() + kCoefficients + 3, x.end());
+  const Vector dc(x.begin() + kCoefficients, x.begin() + kCoefficients + 3),
+      rest(x.begin() + kCoefficients + 3, x.end());
   const ShCoefficients<const double> apart = {dc.data(), rest.data()};
   Vector color(3), dL_ddc(3), dL_drest(45);
   sh_color(3, vec3(&x[0]), &x[3], apart, color.data());

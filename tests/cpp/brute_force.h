@@ -1,0 +1,107 @@
+// A renderer without tiles, rows or packs: every pixel asks every Gaussian, by the headers' own scalar functions.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <vector>
+
+#include "dispatch.h"
+#include "dsmoe/blend.h"
+#include "dsmoe/project.h"
+#include "test_scene.h"
+
+namespace dsmoe {
+
+template <class S> struct BruteForce {
+  std::vector<int32_t> radii;
+  std::vector<S> color, depth, inverse_depth, gate_sum;
+  // For each pixel, how near, relatively, any decision came to its threshold: where rounding could turn one over,
+  // another order of operations may give another image.
+  std::vector<double> margin;
+  int64_t num_pairs = 0;  // that count
+
+  double smallest_margin() const { return *std::min_element(margin.begin(), margin.end()); }
+};
+
+template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>& scene) {
+  const auto inputs = scene.inputs();
+  const auto config = scene.raster_config();
+  const auto& camera = scene.camera;
+  const int num_features = config.num_features();
+  const TileGrid grid(camera.width, camera.height);
+  std::vector<ProjectedGaussian<S>> projected(scene.count);
+  std::vector<S> features(scene.count * num_features);
+  BruteForce<S> out;
+  for (int64_t i = 0; i < scene.count; ++i) {
+    out.radii.push_back(project_gaussian(inputs, camera, config, i, projected[i], &features[i * num_features]));
+  }
+  std::vector<int64_t> order;
+  for (int64_t i = 0; i < scene.count; ++i) {
+    if (out.radii[i] > 0) order.push_back(i);
+  }
+  std::stable_sort(order.begin(), order.end(),
+                   [&](int64_t a, int64_t b) { return projected[a].depth < projected[b].depth; });
+
+  const int64_t pixels = scene.pixels();
+  out.color.resize(pixels * config.num_channels);
+  out.gate_sum.resize(pixels);
+  out.depth.resize(config.depth ? pixels : 0);
+  out.inverse_depth.resize(config.inverse_depth ? pixels : 0);
+  for (int64_t pixel = 0; pixel < pixels; ++pixel) {
+    const int x = static_cast<int>(pixel % camera.width), y = static_cast<int>(pixel / camera.width);
+    auto state = PixelState<S>::open();
+    std::vector<S> sums(num_features);
+    double margin = std::numeric_limits<double>::infinity();
+    auto decide = [&](double value, double threshold) { margin = std::min(margin, std::abs(value / threshold - 1)); };
+    for (const int64_t i : order) {
+      const auto& g = projected[i];
+      if (!(g.opacity > S(0))) continue;
+      if (kMode == BlendMode::kAlpha) {
+        const TileRect rect = radius_rect(g.mean, S(out.radii[i]), grid);
+        const int tile_x = x / kTileSize, tile_y = y / kTileSize;
+        if (tile_x < rect.x0 || tile_x >= rect.x1 || tile_y < rect.y0 || tile_y >= rect.y1) continue;
+      }
+      const S dx = S(x) - g.mean.x, dy = S(y) - g.mean.y;
+      const S power = ColumnExponent<S, S>(g.conic, dx).at(dy);
+      const auto gate = evaluate_gate<kMode>(power, g.opacity, config.alpha_min);
+      const double terms = double(g.conic.xx) * dx * dx + double(g.conic.yy) * dy * dy;
+      if (terms > 0) margin = std::min(margin, std::abs(double(power)) / terms);
+      if (kMode == BlendMode::kAlpha) {
+        decide(gate.alpha, kAlphaCut);
+      } else {
+        decide(exp(power), kGateCut);
+        if (config.alpha_min > 0) decide(gate.alpha, config.alpha_min);
+      }
+      if (gate.counts) {
+        ++out.num_pairs;
+        if (state.is_open() && kMode != BlendMode::kSmoeStd) {
+          decide(state.transmittance * (S(1) - gate.alpha), kTransmittanceCut);
+        }
+      }
+      const auto pair = Blend<kMode>::accumulate(state, gate);
+      for (int f = 0; f < num_features; ++f) sums[f] += pair.weight * features[i * num_features + f];
+    }
+    if (state.gate_sum > S(0)) decide(state.gate_sum, kGateSumCut);
+    out.margin.push_back(margin);
+    out.gate_sum[pixel] = state.gate_sum;
+    int f = 0;
+    for (; f < config.num_channels; ++f) {
+      out.color[f * pixels + pixel] =
+          finish_feature<kMode>(FeatureRule::kBlended, state, sums[f], config.background[f]);
+    }
+    if (config.depth) out.depth[pixel] = finish_feature<kMode>(FeatureRule::kAveraged, state, sums[f++], S(0));
+    if (config.inverse_depth)
+      out.inverse_depth[pixel] = finish_feature<kMode>(FeatureRule::kBlended, state, sums[f], S(0));
+  }
+  return out;
+}
+
+template <class S> BruteForce<S> brute_force(const Scene<S>& scene) {
+  BruteForce<S> out;
+  dispatch_blend(scene.config.mode, kAnyFeatures, [&](auto mode, auto) { out = brute_force_in<mode()>(scene); });
+  return out;
+}
+
+}  // namespace dsmoe

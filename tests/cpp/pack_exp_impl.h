@@ -1,0 +1,21 @@
+// Included once per instruction set, by a file that has set DSMOE_SIMD and DSMOE_SIMD_BYTES as for cpu/pack.h.
+#pragma once
+
+#include "cpu/pack.h"
+#include "pack_exp.h"
+
+namespace dsmoe {
+namespace DSMOE_SIMD {
+
+template <class T> void exp_each(const T* x, T* result, int count) {
+  using P = Pack<T>;
+  alignas(DSMOE_SIMD_BYTES) T lanes[P::kLanes];
+  for (int i = 0; i < count; i += P::kLanes) {
+    for (int k = 0; k < P::kLanes; ++k) lanes[k] = x[i + k];
+    exp(P::load(lanes)).store(lanes);
+    for (int k = 0; k < P::kLanes; ++k) result[i + k] = lanes[k];
+  }
+}
+
+}  // namespace DSMOE_SIMD
+}  // namespace dsmoe

@@ -1,0 +1,269 @@
+// One Gaussian from world to image plane and its gradient back, and which Gaussians are culled.
+#include "dsmoe/project.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "test_scene.h"
+
+namespace dsmoe {
+namespace {
+
+using Vector = std::vector<double>;
+
+// A single Gaussian well inside the image, 3 pixels across or more, with harmonics up to degree 3.
+Scene<double> single_gaussian() {
+  Scene<double> scene = make_scene(1, 1, 40, 30);
+  scene.config.depth = scene.config.inverse_depth = true;
+  scene.means3D = {0.2, -0.1, 0.3};
+  scene.opacities = {0.7};
+  scene.scales = {0.5, 0.2, 0.3};
+  scene.rotations = {0.9, -0.4, 0.5, 0.3};  // length 1.14
+  scene.sh_degree = 3;
+  scene.shs = Random(2).uniforms(48, -0.15, 0.15);
+  return scene;
+}
+
+struct Projection {
+  int32_t radius = 0;
+  ProjectedGaussian<double> gaussian = {};
+  Vector features;
+};
+
+Projection project(const Scene<double>& scene) {
+  Projection out;
+  out.features.resize(scene.config.num_features());
+  out.radius =
+      project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, out.gaussian, out.features.data());
+  return out;
+}
+
+Vector flat(const Projection& p) {
+  const auto& g = p.gaussian;
+  Vector out = {g.mean.x, g.mean.y, g.conic.xx, g.conic.xy, g.conic.yy, g.opacity};
+  out.insert(out.end(), p.features.begin(), p.features.end());
+  return out;
+}
+
+// All outputs, weighted, by all inputs and the camera.
+void expect_backward_is_the_derivative(Scene<double> scene) {
+  const Projection forward = project(scene);
+  ASSERT_GT(forward.radius, 0);
+  Vector w = Random(3).uniforms(6 + scene.config.num_features());
+  for (int k = 2; k < 5; ++k) w[k] *= 10;  // the conic is small: let it weigh
+  const Vector x = scene.flat();
+  auto loss = [&](const Vector& v) {
+    scene.set_flat(v);
+    return weighted_sum(w, flat(project(scene)));
+  };
+  const Vector expected = finite_differences(loss, x, 1e-4);  // coordinates of 0.1 to 1, so smaller steps
+  scene.set_flat(x);
+
+  SceneGradient<double> gradient(scene);
+  gradient.camera = {};
+  std::fill(gradient.by.background.begin(), gradient.by.background.end(), 0);
+  std::fill(gradient.by.shs.begin(), gradient.by.shs.end(), 0);  // written for the active degree only
+  project_gaussian_backward(scene.inputs(), scene.camera, scene.raster_config(), 0, forward.features.data(),
+                            {{{w[0], w[1]}, {w[2], w[3], w[4]}, w[5]}, &w[6]}, gradient.gradients(), &gradient.camera);
+  // Steps of 1e-4 and pixel coordinates of 20 round at 1e-11.
+  expect_near_all(gradient.flat(), expected, kGradientTolerance);
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeByGaussianAndCamera) {
+  expect_backward_is_the_derivative(single_gaussian());
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeWithAGivenCovariance) {
+  Scene<double> scene = single_gaussian();
+  scene.scales.clear();
+  scene.rotations.clear();
+  scene.cov3D_precomp = {0.25, 0.05, -0.03, 0.1, 0.02, 0.2};
+  expect_backward_is_the_derivative(scene);
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeWithGivenColoursOfAnyNumber) {
+  Scene<double> scene = single_gaussian();
+  scene.shs.clear();
+  scene.colors_precomp = {0.1, -0.5, 2, 0.3, 0.7};
+  scene.config.num_channels = 5;
+  scene.background.resize(5);
+  expect_backward_is_the_derivative(scene);
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeWithDegreeZeroApart) {
+  Scene<double> scene = single_gaussian();
+  scene.dc.assign(scene.shs.begin(), scene.shs.begin() + 3);
+  scene.shs.erase(scene.shs.begin(), scene.shs.begin() + 3);
+  expect_backward_is_the_derivative(scene);
+  EXPECT_EQ(project(scene).features, project(single_gaussian()).features);
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeBelowTheStoredDegree) {
+  for (const int degree : {0, 1, 2}) {
+    Scene<double> scene = single_gaussian();
+    scene.sh_degree = degree;
+    expect_backward_is_the_derivative(scene);
+  }
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeWhereAColourIsClamped) {
+  Scene<double> scene = single_gaussian();
+  scene.shs[1] = -5;
+  ASSERT_EQ(project(scene).features[1], 0);
+  expect_backward_is_the_derivative(scene);
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeWithScaleModifierAndAntialiasing) {
+  Scene<double> scene = single_gaussian();
+  scene.config.scale_modifier = 0.3;
+  scene.config.antialiasing = true;
+  expect_backward_is_the_derivative(scene);
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeAtTheFloorOfTheAntialiasing) {
+  Scene<double> scene = single_gaussian();
+  scene.scales = {1e-3, 1e-3, 1e-3};
+  scene.config.antialiasing = true;
+  // The opacity rests on the floor.
+  EXPECT_NEAR(project(scene).gaussian.opacity, 0.7 * 0.005, 1e-9);
+  expect_backward_is_the_derivative(scene);
+}
+
+TEST(ProjectGaussian, BackwardIsTheDerivativeOutsideTheFrustumWhereTheJacobianIsClamped) {
+  for (const auto& mean : {Vector{4, -0.1, 0.3}, Vector{-5, 0.2, 0.1}, Vector{0.2, 4, 0.3}, Vector{4, -4, 0.3}}) {
+    Scene<double> scene = single_gaussian();
+    scene.means3D = mean;
+    scene.scales = {3, 2, 2.5};  // still reaches the image
+    scene.config.mode = BlendMode::kSmoe;
+    expect_backward_is_the_derivative(scene);
+  }
+}
+
+TEST(ProjectGaussian, DoesNotNormaliseTheQuaternion) {
+  Scene<double> scene = single_gaussian();
+  const auto before = project(scene).gaussian.conic;
+  for (double& component : scene.rotations) component *= 1.2;
+  EXPECT_GT(std::abs(project(scene).gaussian.conic.xx / before.xx - 1), 0.01);
+}
+
+TEST(ProjectGaussian, ScaleModifierMultipliesTheScales) {
+  Scene<double> scene = single_gaussian(), scaled = scene;
+  scene.config.scale_modifier = 0.5;
+  for (double& scale : scaled.scales) scale *= 0.5;
+  EXPECT_EQ(flat(project(scene)), flat(project(scaled)));
+}
+
+TEST(ProjectGaussian, RadiusDoesNotDependOnModeOpacityOrAntialiasing) {
+  Scene<double> scene = single_gaussian();
+  const int32_t radius = project(scene).radius;
+  scene.config.antialiasing = true;
+  EXPECT_EQ(project(scene).radius, radius);
+  for (const double opacity : {-1.0, 0.0, 1e-9, 3.0}) {
+    scene.opacities = {opacity};
+    for (const auto mode : {BlendMode::kAlpha, BlendMode::kSmoe, BlendMode::kSmoeTn, BlendMode::kSmoeStd}) {
+      scene.config.mode = mode;
+      EXPECT_EQ(project(scene).radius, radius);
+    }
+  }
+}
+
+TEST(ProjectGaussian, IsCulledAtTheNearPlane) {
+  Scene<double> scene = single_gaussian();
+  // The camera looks along the third row of its rotation; 0.2 is the near plane.
+  auto at_depth = [&](double z) {
+    for (int k = 0; k < 3; ++k) scene.means3D[k] = scene.camera.position[k] + z * scene.camera.view[4 * k + 2];
+    return project(scene).radius;
+  };
+  EXPECT_GT(at_depth(0.2 + 1e-9), 0);
+  EXPECT_EQ(at_depth(0.2 - 1e-9), 0);
+  EXPECT_EQ(at_depth(-1), 0);
+  scene.camera.near = 0.5;
+  EXPECT_EQ(at_depth(0.4), 0);
+  EXPECT_GT(at_depth(0.6), 0);
+}
+
+TEST(ProjectGaussian, IsCulledWhereAnAttributeIsNotFinite) {
+  Scene<double> with_covariance = single_gaussian(), with_colors = single_gaussian(), with_dc = single_gaussian();
+  with_covariance.scales.clear(), with_covariance.rotations.clear();
+  with_covariance.cov3D_precomp = {0.25, 0.05, -0.03, 0.1, 0.02, 0.2};
+  with_colors.shs.clear(), with_colors.colors_precomp = {0.1, 0.5, 2};
+  with_dc.dc.assign(with_dc.shs.begin(), with_dc.shs.begin() + 3);
+  with_dc.shs.erase(with_dc.shs.begin(), with_dc.shs.begin() + 3);
+  using Attribute = Vector Scene<double>::*;
+  for (Scene<double> scene : {single_gaussian(), with_covariance, with_colors, with_dc}) {
+    ASSERT_GT(project(scene).radius, 0);
+    for (const Attribute attribute :
+         {&Scene<double>::means3D, &Scene<double>::opacities, &Scene<double>::scales, &Scene<double>::rotations,
+          &Scene<double>::cov3D_precomp, &Scene<double>::colors_precomp, &Scene<double>::dc, &Scene<double>::shs}) {
+      for (double& value : scene.*attribute) {
+        const double kept = value;
+        for (const double bad : {std::nan(""), HUGE_VAL, -HUGE_VAL}) {
+          value = bad;
+          EXPECT_EQ(project(scene).radius, 0);
+        }
+        value = kept;
+      }
+    }
+  }
+}
+
+TEST(ProjectGaussian, IsCulledWhereTheCovarianceIsNoCovariance) {
+  Scene<double> scene = single_gaussian();
+  scene.scales.clear(), scene.rotations.clear();
+  scene.cov3D_precomp = {0.1, 5, 0, 0.1, 5, 0.1};  // indefinite: the determinant in the image is negative
+  EXPECT_EQ(project(scene).radius, 0);
+}
+
+TEST(ProjectGaussian, IsCulledWhereTheImagePlaneOverflows) {
+  Scene<float> scene = convert<float>(single_gaussian());
+  ProjectedGaussian<float> out;
+  float features[5];
+  for (const float huge : {1e20f, 1e38f}) {
+    scene.scales = {huge, huge, huge};
+    EXPECT_EQ(project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, out, features), 0);
+  }
+}
+
+// Slides along the camera's x axis, over both sides of the image.
+TEST(ProjectGaussian, RadiusIsPositiveExactlyWhereTheFootprintMeetsTheImage) {
+  for (const auto mode : {BlendMode::kAlpha, BlendMode::kSmoe}) {
+    Scene<double> scene = single_gaussian();
+    const auto& camera = scene.camera;
+    scene.config.mode = mode;
+    scene.scales = {0.1, 0.04, 0.2};
+    int seen = 0, unseen = 0;
+    for (double shift = -6; shift < 6; shift += 0.02) {
+      for (int k = 0; k < 3; ++k) {
+        scene.means3D[k] = camera.position[k] + shift * camera.view[4 * k] + 3 * camera.view[4 * k + 2];
+      }
+      const Vec3<double> mean = load3(scene.means3D.data());
+      const auto jacobian = projection_jacobian(camera, transform_point(camera.view, mean)).jacobian;
+      const auto conic = make_conic(covariance_2d(image_axes(jacobian, view_rotation(camera.view)),
+                                                  world_covariance(scene.inputs(), 1.0, 0).cov));
+      const auto pixel = project_to_pixel(camera, mean);
+      bool expected = false;
+      if (mode == BlendMode::kAlpha) {  // x range of Inria's rectangle against 3 columns of tiles; y is on the image
+        const double r = screen_radius(conic);
+        expected = std::max(0.0, std::floor((pixel.x - r) / 16)) < std::min(3.0, std::floor((pixel.x + r + 15) / 16));
+      } else {  // the ellipse of G = 1e-5, somewhere between the outermost pixel centres
+        for (double y = 0; y <= 29; y += 0.1) {
+          for (const double x : {0.0, 39.0, std::min(39.0, std::max(0.0, pixel.x))}) {
+            const double dx = x - pixel.x, dy = y - pixel.y;
+            const auto& k = conic.inverse;
+            expected |= k.xx * dx * dx + 2 * k.xy * dx * dy + k.yy * dy * dy <= 2 * std::log(1e5);
+          }
+        }
+      }
+      ++(expected ? seen : unseen);
+      EXPECT_EQ(project(scene).radius > 0, expected) << "x " << pixel.x;
+    }
+    EXPECT_GT(seen, 20);
+    EXPECT_GT(unseen, 20);
+  }
+}
+
+}  // namespace
+}  // namespace dsmoe
