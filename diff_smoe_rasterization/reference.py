@@ -9,7 +9,8 @@ What the paper leaves open is decided here:
 - Gaussians are sorted by view depth; equal depths keep the order of the input.
 - A Gaussian is culled (radius 0, gradients exactly 0) where any value of its attributes, used or not, is NaN or
   infinite, its view depth is not beyond `near`, its projected covariance is not positive definite, its pixel position,
-  conic or colour is not finite (a Gaussian at `campos` has no view direction), or its footprint misses the image.
+  conic or colour is not finite, or its footprint misses the image.
+- A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
 - Opacity plays no part in culling or in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
 - The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
@@ -215,7 +216,8 @@ def sh_basis(degree, offset):
     constant = torch.ones_like(offset[:, 0])
     bands = [math.sqrt(1 / (4 * math.pi)) * constant]
     if degree > 0:
-        x, y, z = (offset / offset.norm(dim=1, keepdim=True)).unbind(1)
+        length = offset.norm(dim=1, keepdim=True)
+        x, y, z = (offset / length.masked_fill(length == 0, math.inf)).unbind(1)
         factor = math.sqrt(3 / (4 * math.pi))
         bands += [-factor * y, factor * z, -factor * x]
     if degree > 1:

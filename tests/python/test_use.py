@@ -63,6 +63,23 @@ def test_only_the_wanted_gradients_are_made(mode):
         assert torch.equal(leaf.grad, expected[name]), name
 
 
+def test_means2D_may_be_left_out(mode):
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32).requiring_grad()
+    inputs = {name: tensor for name, tensor in scene.inputs.items() if name != "means2D"}
+    color = rasterize(settings=scene.settings, **inputs).color
+    assert torch.equal(color, rasterize(settings=scene.settings, **scene.inputs).color)
+    color.sum().backward()
+    assert scene.inputs["means3D"].grad.any()
+
+
+def test_debug_changes_no_result(mode):
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32)
+    plain, plain_gradient = gradients(rasterize, scene, OUTPUTS)
+    checked, checked_gradient = gradients(rasterize, scene.with_settings(debug=True), OUTPUTS)
+    assert all(torch.equal(a, b) for a, b in zip(plain, checked))
+    assert all(torch.equal(plain_gradient[name], checked_gradient[name]) for name in plain_gradient)
+
+
 @pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])
 def test_without_gradients(mode, context):
     scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32)
