@@ -97,9 +97,9 @@ def extension():
     class BuildExtension(cpp_extension.BuildExtension):
         def run(self):
             super().run()
-            lines = [f"{name} = {value!r}\n" for name, value in built_against.items()]
-            text = '"""What the extension was built against; readable even where it cannot be loaded."""\n' + "".join(lines)
-            Path(self.get_ext_fullpath(module.name)).with_name("_build_info.py").write_text(text)
+            lines = ['"""What the extension was built against; readable even where it cannot be loaded."""']
+            lines += [f"{name} = {value!r}" for name, value in built_against.items()]
+            Path(self.get_ext_fullpath(module.name)).with_name("_build_info.py").write_text("\n".join(lines) + "\n")
 
     return {"ext_modules": [module], "cmdclass": {"build_ext": BuildExtension}}
 
@@ -114,8 +114,7 @@ def packages():
     return {"packages": names, "package_dir": folders, "package_data": {PACKAGE: ["include/dsmoe/*.h"]}}
 
 
-if int(setuptools.__version__.split(".")[0]) < 61:  # it would ignore pyproject.toml and install "UNKNOWN 0.0.0"
-    sys.exit(f"setuptools {setuptools.__version__} is too old; type: pip install 'setuptools>=61,<82' and build again")
-
 if __name__ == "__main__":
+    if int(setuptools.__version__.split(".")[0]) < 61:  # it would ignore pyproject.toml and install "UNKNOWN 0.0.0"
+        sys.exit(f"setuptools {setuptools.__version__} is too old; type: pip install 'setuptools>=61,<82'; build again")
     setuptools.setup(**packages(), **(extension() if COMMANDS_THAT_COMPILE & set(sys.argv) else {}))
