@@ -4,27 +4,10 @@
 
 as with Inria's rasterizer of 2023; `blend_mode` in the settings is the one addition. `rasterize` is the full function.
 """
-from __future__ import annotations
-
-import importlib
-
 from ._version import __version__
+from .extension import build_info, set_profiling, stage_times
+from .rasterizer import GaussianRasterizer, rasterize, rasterize_gaussians
 from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering
 
-# Loaded on first use, so that the parts in plain torch (`reference`, `settings`) work where nothing is compiled.
-_COMPILED = {"GaussianRasterizer": "rasterizer", "rasterize": "rasterizer", "rasterize_gaussians": "rasterizer",
-             "build_info": "extension", "set_profiling": "extension", "stage_times": "extension"}
-
-__all__ = ["BLEND_MODES", "OUTPUTS", "GaussianRasterizationSettings", "Rendering", "__version__", *_COMPILED]
-
-
-def __getattr__(name):
-    if name not in _COMPILED:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f".{_COMPILED[name]}", __name__), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__():
-    return sorted({*globals(), *__all__})
+__all__ = ["BLEND_MODES", "OUTPUTS", "GaussianRasterizationSettings", "GaussianRasterizer", "Rendering", "__version__",
+           "build_info", "rasterize", "rasterize_gaussians", "set_profiling", "stage_times"]
