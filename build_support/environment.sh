@@ -9,7 +9,7 @@ unset PYTHONPATH PYTHONHOME
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
 fail() {
-  printf 'error: %s\n' "$@" >&2
+  printf 'error: %s\n' "$*" >&2
   exit 1
 }
 
@@ -75,16 +75,17 @@ prepare_environment() {
   case "$venv" in /*) ;; *) venv=$PWD/$venv ;; esac
   log=$venv/install.log
   local stamp=$venv/dsmoe.stamp python=${DSMOE_PYTHON:-python3} over_system=()
+  if [ -n "${DSMOE_PYTHON-}" ] && [ -x "$venv/bin/python" ] &&
+    [ "$("$python" --version)" != "$("$venv/bin/python" --version)" ]; then
+    fail "$venv holds $("$venv/bin/python" --version), but DSMOE_PYTHON is $("$python" --version):" \
+      "remove that folder, or name another one in DSMOE_VENV"
+  fi
   if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$(fingerprint)" ]; then
     echo "Reusing the environment $venv: nothing has changed since it was built."
     return
   fi
   [ $# -gt 0 ] || over_system=(--system-site-packages)
   if [ -x "$venv/bin/pip" ]; then
-    if [ -n "${DSMOE_PYTHON-}" ] && [ "$("$python" --version)" != "$("$venv/bin/python" --version)" ]; then
-      fail "$venv holds $("$venv/bin/python" --version), but DSMOE_PYTHON is $("$python" --version):" \
-        "remove that folder, or name another one in DSMOE_VENV"
-    fi
     echo "Reusing the environment $venv and bringing it up to date (log: $log)"
   else
     check_prerequisites "$python"
