@@ -1,0 +1,98 @@
+"""Cameras against a pinhole projection written here, and against where the rasterizer really puts a Gaussian."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization.trainer.cameras import Camera, scene_extent
+from diff_smoe_rasterization.trainer.synthetic import look_at
+
+
+@pytest.fixture
+def camera():
+    """A phone camera whose principal point is 7 pixels off the centre (as in the fox capture) and fx is not fy."""
+    rotation = Rotation.from_euler("xyz", [0.3, -0.7, 0.2]).as_matrix()
+    return Camera("a.jpg", rotation, np.array([0.2, -0.1, 1.5]), 688.4, 680.9, 274.2, 476.6, 534, 948)
+
+
+def colmap_pixels(camera, points):
+    """COLMAP's PINHOLE model: pixel coordinates with the first pixel's centre at 0.5."""
+    view = points @ camera.rotation.T + camera.translation
+    return np.stack([camera.fx * view[:, 0] / view[:, 2] + camera.cx, camera.fy * view[:, 1] / view[:, 2] + camera.cy], 1)
+
+
+def world_points(camera, random, count=50):
+    """Points that the camera sees in front of it."""
+    view = random.uniform([-0.3, -0.5, 1.0], [0.3, 0.5, 4.0], (count, 3))
+    return (view - camera.translation) @ camera.rotation
+
+
+def test_projmatrix_puts_points_where_the_pinhole_model_does(camera):
+    points = world_points(camera, np.random.RandomState(0))
+    settings = camera.settings(torch.zeros(3, dtype=torch.float64), 0, "alpha")
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    clip = homogeneous @ settings.projmatrix.numpy()
+    ndc = clip[:, :2] / clip[:, 3:]
+    # The rasterizer's pixel index of an NDC coordinate; an index is half a pixel below COLMAP's coordinate.
+    size = np.array([camera.width, camera.height])
+    index = ((ndc + 1) * size - 1) / 2
+    # Doubles throughout: rounding of coordinates of a thousand pixels.
+    np.testing.assert_allclose(index, colmap_pixels(camera, points) - 0.5, rtol=0, atol=1e-9)
+
+
+def test_viewmatrix_and_campos(camera):
+    settings = camera.settings(torch.zeros(3, dtype=torch.float64), 0, "alpha")
+    center = torch.cat([settings.campos, torch.ones(1, dtype=torch.float64)])
+    # The camera's own centre is the origin of view space.
+    np.testing.assert_allclose((center @ settings.viewmatrix).numpy(), [0, 0, 0, 1], rtol=0, atol=1e-12)
+    ahead = torch.tensor(camera.center + 2 * camera.rotation[2])
+    depth = torch.cat([ahead, torch.ones(1, dtype=torch.float64)]) @ settings.viewmatrix
+    np.testing.assert_allclose(depth[:3].numpy(), [0, 0, 2], rtol=0, atol=1e-12)
+
+
+def test_tangents_give_back_the_focal_lengths(camera):
+    settings = camera.settings(torch.zeros(3), 0, "alpha")
+    assert settings.image_width / (2 * settings.tanfovx) == pytest.approx(camera.fx, rel=1e-12)
+    assert settings.image_height / (2 * settings.tanfovy) == pytest.approx(camera.fy, rel=1e-12)
+
+
+@pytest.mark.parametrize("centred", [False, True])
+def test_a_rendered_gaussian_lies_at_its_projection(camera, centred):
+    """The centre of mass of one small splat; with a principal point ignored it would be 7 pixels off."""
+    camera = camera.resized(267, 474)
+    camera = camera.centred() if centred else camera
+    point = world_points(camera, np.random.RandomState(3), 1)
+    settings = camera.settings(torch.zeros(3), 0, "alpha")
+    image = rasterize(
+        torch.tensor(point, dtype=torch.float32), torch.full((1, 1), 0.9), settings,
+        colors_precomp=torch.ones(1, 3), scales=torch.full((1, 3), 0.01), rotations=torch.tensor([[1.0, 0, 0, 0]]),
+    ).color[0].double().numpy()
+    rows, columns = np.mgrid[:camera.height, :camera.width]
+    center = np.array([(image * columns).sum(), (image * rows).sum()]) / image.sum()
+    # The 1/255 cut-off and the pixel grid move the centre of mass by some hundredths of a pixel.
+    np.testing.assert_allclose(center, colmap_pixels(camera, point)[0] - 0.5, rtol=0, atol=0.05)
+
+
+def test_resizing_scales_pixel_coordinates(camera):
+    points = world_points(camera, np.random.RandomState(1))
+    smaller = camera.resized(267, 237)
+    expected = colmap_pixels(camera, points) * [267 / 534, 237 / 948]
+    np.testing.assert_allclose(colmap_pixels(smaller, points), expected, rtol=0, atol=1e-9)
+
+
+def test_look_at_puts_the_target_into_the_centre_upright():
+    camera = look_at("a.png", np.array([2.0, 1.0, -3.0]), np.array([0.1, 0.4, 0.2]), 64, 48, 50.0)
+    np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), rtol=0, atol=1e-12)
+    assert np.linalg.det(camera.rotation) == pytest.approx(1.0)
+    pixels = colmap_pixels(camera, np.array([[0.1, 0.4, 0.2], [0.1, 0.5, 0.2]]))
+    np.testing.assert_allclose(pixels[0], [32, 24], rtol=0, atol=1e-9)
+    assert pixels[1, 1] < 24, "what is higher in the world is higher in the image"
+
+
+def test_scene_extent_is_by_hand():
+    corners = np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]) + [5, 6, 7]
+    assert scene_extent(corners) == pytest.approx(1.1 * 2**0.5)
+    assert scene_extent(corners[:1]) == 1.0
