@@ -29,11 +29,11 @@ def _keep(ctx, inputs, output):
 
 
 def _backward(ctx, *gradients):
-    saved = iter(ctx.saved_tensors)
-    inputs = [next(saved) if present else None for present in ctx.present]
+    present, wanted = ctx.present, list(ctx.needs_input_grad[:_NUM_INPUTS])
+    saved = list(ctx.saved_tensors)
+    inputs, outputs = saved[:sum(present)], saved[sum(present):]
     image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
-    wanted = list(ctx.needs_input_grad[:_NUM_INPUTS])
-    results = iter(_OPS.rasterize_backward(image_gradients, inputs, list(saved), *ctx.options, wanted))
+    results = iter(_OPS.rasterize_backward(*image_gradients, inputs, present, outputs, *ctx.options, wanted))
     return tuple(next(results) if want else None for want in wanted) + (None,) * (_NUM_OPTIONS + _NUM_CHECKS)
 
 
@@ -77,9 +77,11 @@ def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales
             means3D.new_empty((image_height, image_width), dtype=torch.int32))
 
 
-def _fake_rasterize_backward(image_gradients, inputs, outputs, *options_and_wanted):
-    wanted = options_and_wanted[-1]
-    return [tensor.new_empty(tensor.shape) for tensor, want in zip(inputs, wanted) if want]
+def _fake_rasterize_backward(dL_dcolor, dL_dgate_sum, dL_ddepth, dL_dinverse_depth, inputs, present, outputs,
+                             *options_and_wanted):
+    given = iter(inputs)
+    all_inputs = [next(given) if here else None for here in present]
+    return [tensor.new_empty(tensor.shape) for tensor, want in zip(all_inputs, options_and_wanted[-1]) if want]
 
 
 def _fake_mark_visible(positions, viewmatrix, near):

@@ -39,16 +39,16 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         TypeError: a type or a device does not fit.
         RuntimeError: the Gaussians cover more tiles than fit; under `settings.debug` a result or gradient is NaN.
     """
-    _check_backend("means3D", means3D)
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
-    rows = means3D.shape[0] if means3D.dim() > 0 else 0
+    required, optional = _checks("rasterize", "means3D", means3D)
     color, radii, gate_sum, depth, inverse_depth = rasterize_op(
-        means3D, _given("means2D", means2D, rows), _tensor("opacities", opacities), _given("dc", dc, rows),
-        _given("shs", shs, rows), _given("colors_precomp", colors_precomp, rows), _given("scales", scales, rows),
-        _given("rotations", rotations, rows), _given("cov3D_precomp", cov3D_precomp, rows),
-        _tensor("bg", settings.bg), _without_batch("viewmatrix", settings.viewmatrix, 2),
-        _without_batch("projmatrix", settings.projmatrix, 2), _without_batch("campos", settings.campos, 1),
+        means3D, optional("means2D", means2D), required("opacities", opacities), optional("dc", dc),
+        optional("shs", shs), optional("colors_precomp", colors_precomp), optional("scales", scales),
+        optional("rotations", rotations), optional("cov3D_precomp", cov3D_precomp), required("bg", settings.bg),
+        _without_batch(required("viewmatrix", settings.viewmatrix), 2),
+        _without_batch(required("projmatrix", settings.projmatrix), 2),
+        _without_batch(required("campos", settings.campos), 1),
         int(settings.image_height), int(settings.image_width), float(settings.tanfovx), float(settings.tanfovy),
         float(settings.scale_modifier), float(settings.near), float(settings.alpha_min), int(settings.sh_degree),
         BLEND_MODES.index(resolve_blend_mode(settings.blend_mode)), bool(settings.antialiasing), "depth" in outputs,
@@ -58,31 +58,37 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
                      inverse_depth=inverse_depth if "inverse_depth" in outputs else None)
 
 
-def _tensor(name, value):
-    if not isinstance(value, torch.Tensor):
-        raise TypeError(f"rasterize: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
-    return value
+def _checks(function, first_name, first):
+    """Returns functions that pass a required and an optional tensor on, and refuse what torch cannot dispatch.
+
+    Those are values that are no tensors and tensors on different devices; the ops refuse wrong shapes and types.
+    """
+    def required(name, value):
+        if not isinstance(value, torch.Tensor):
+            raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
+        if value.device != first.device:
+            raise TypeError(f"{function}: {name} is on {value.device}; it must be on {first.device}, as {first_name} is")
+        return value
+
+    def optional(name, value):
+        # Inria's callers pass torch.Tensor([]), on the CPU, for what is absent.
+        if value is None:
+            return None
+        if isinstance(value, torch.Tensor) and value.numel() == 0 and (first.numel() > 0 or value.dim() == 1):
+            return None
+        return required(name, value)
+
+    required(first_name, first)
+    if first.device.type not in BACKENDS:
+        reason = build_info()["without_cuda_because"] if first.device.type == "cuda" else None
+        raise TypeError(f"{function}: {first_name} is on {first.device}; this build renders on "
+                        f"{' and '.join(BACKENDS)}" + (f": {reason}" if reason else ""))
+    return required, optional
 
 
-def _given(name, value, rows):
-    """Returns an optional tensor, None for one without elements: Inria's callers pass `torch.Tensor([])`."""
-    if value is None:
-        return None
-    absent = _tensor(name, value).numel() == 0 and (rows > 0 or value.dim() == 1)
-    return None if absent else value
-
-
-def _without_batch(name, value, dim):
+def _without_batch(tensor, dim):
     """Returns a camera tensor without the batch axis of size 1 that some trainers leave in front."""
-    return value[0] if _tensor(name, value).dim() == dim + 1 and value.shape[0] == 1 else value
-
-
-def _check_backend(name, value):
-    device = _tensor(name, value).device
-    if device.type not in BACKENDS:
-        reason = build_info()["without_cuda_because"] if device.type == "cuda" else None
-        raise TypeError(f"rasterize: {name} is on {device}; this build renders on {' and '.join(BACKENDS)}"
-                        + (f": {reason}" if reason else ""))
+    return tensor[0] if tensor.dim() == dim + 1 and tensor.shape[0] == 1 else tensor
 
 
 def rasterize_gaussians(means3D, means2D, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp,
@@ -106,8 +112,8 @@ class GaussianRasterizer(torch.nn.Module):
     @torch.no_grad()
     def markVisible(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns which positions [N, 3] lie beyond the near plane, [N] bool."""
-        _check_backend("positions", positions)
-        viewmatrix = _without_batch("viewmatrix", self.raster_settings.viewmatrix, 2)
+        required, _ = _checks("markVisible", "positions", positions)
+        viewmatrix = _without_batch(required("viewmatrix", self.raster_settings.viewmatrix), 2)
         return torch.ops.diff_smoe_rasterization.mark_visible(positions, viewmatrix, float(self.raster_settings.near))
 
     def forward(self, means3D, means2D, opacities, shs=None, colors_precomp=None, scales=None, rotations=None,

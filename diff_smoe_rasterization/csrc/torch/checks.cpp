@@ -170,7 +170,7 @@ void check_arguments(const Inputs& inputs, const Options& options) {
 }
 
 void check_backward_arguments(const Inputs& inputs, const Options& options, const Outputs& outputs,
-                              const ImageGradientTensors& image_gradients, const Wanted& wanted) {
+                              const ImageGradientTensors& image_gradients, const InputMask& wanted) {
   const char* function = "rasterize_backward";
   check_arguments(inputs, options);
   const auto specs = output_specs(inputs, options);

@@ -12,7 +12,7 @@ void check_arguments(const Inputs& inputs, const Options& options);
 
 // The backward op's own arguments; for a caller that is not our autograd formula.
 void check_backward_arguments(const Inputs& inputs, const Options& options, const Outputs& outputs,
-                              const ImageGradientTensors& image_gradients, const Wanted& wanted);
+                              const ImageGradientTensors& image_gradients, const InputMask& wanted);
 
 void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix);
 

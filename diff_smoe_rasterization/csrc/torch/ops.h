@@ -2,7 +2,9 @@
 // `rasterize<&forward>` and its like under its dispatch key.
 #pragma once
 
+#include <algorithm>
 #include <tuple>
+#include <vector>
 
 #include "checks.h"
 #include "tensors.h"
@@ -52,30 +54,31 @@ auto rasterize(const at::Tensor& means3D, const OptionalTensor& means2D, const a
 }
 
 template <BackwardFunction kBackward>
-std::vector<at::Tensor> rasterize_backward(const c10::List<OptionalTensor>& image_gradient_list,
-                                           const c10::List<OptionalTensor>& input_list, at::TensorList output_list,
+std::vector<at::Tensor> rasterize_backward(const OptionalTensor& dL_dcolor, const OptionalTensor& dL_dgate_sum,
+                                           const OptionalTensor& dL_ddepth, const OptionalTensor& dL_dinverse_depth,
+                                           at::TensorList present_inputs, InputMask present, at::TensorList output_list,
                                            int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
                                            double scale_modifier, double near, double alpha_min, int64_t sh_degree,
                                            int64_t blend_mode, bool antialiasing, bool depth, bool inverse_depth,
-                                           bool debug, Wanted wanted) {
-  const char* function = "rasterize_backward";
-  ImageGradientTensors image_gradients;
-  Inputs inputs;
-  Outputs outputs;
-  const auto check_length = [&](const char* name, size_t length, size_t expected) {
-    TORCH_CHECK_VALUE(length == expected, function, ": ", name, " has length ", length, "; it must be ", expected);
+                                           bool debug, InputMask wanted) {
+  const auto dense = [](const OptionalTensor& tensor) {
+    return tensor.has_value() ? tensor->contiguous() : at::Tensor();
   };
-  check_length("image_gradients", image_gradient_list.size(), image_gradients.size());
-  check_length("inputs", input_list.size(), inputs.size());
-  check_length("outputs", output_list.size(), outputs.size());
-  for (size_t i = 0; i < image_gradients.size(); ++i) {
-    const OptionalTensor tensor = image_gradient_list[i];
-    if (tensor.has_value()) image_gradients[i] = tensor->contiguous();
+  const ImageGradientTensors image_gradients = {dense(dL_dcolor), dense(dL_dgate_sum), dense(dL_ddepth),
+                                                dense(dL_dinverse_depth)};
+  const auto check_length = [](const char* name, size_t length, size_t expected) {
+    TORCH_CHECK_VALUE(length == expected, "rasterize_backward: ", name, " has length ", length, "; it must be ",
+                      expected);
+  };
+  check_length("inputs", present_inputs.size(), std::count(present.begin(), present.end(), true));
+  check_length("outputs", output_list.size(), kNumOutputs);
+  TORCH_CHECK_VALUE(present[kMeans3D], "rasterize_backward: means3D is absent; it must be given");
+  Inputs inputs;
+  auto next = present_inputs.begin();
+  for (int i = 0; i < kNumInputs; ++i) {
+    if (present[i]) inputs[i] = *next++;
   }
-  for (size_t i = 0; i < inputs.size(); ++i) {
-    const OptionalTensor tensor = input_list[i];
-    if (tensor.has_value()) inputs[i] = *tensor;
-  }
+  Outputs outputs;
   std::copy(output_list.begin(), output_list.end(), outputs.begin());
   const Options options = {image_height, image_width, tanfovx,      tanfovy, scale_modifier, near, alpha_min,
                            sh_degree,    blend_mode,  antialiasing, depth,   inverse_depth,  debug};
@@ -86,7 +89,7 @@ std::vector<at::Tensor> rasterize_backward(const c10::List<OptionalTensor>& imag
 
   std::vector<at::Tensor> result;
   for (int i = 0; i < kNumInputs; ++i) {
-    if (debug) refuse_nan("rasterize_backward: gradient", kInputNames[i], gradients[i]);
+    if (debug) refuse_nan("rasterize_backward: gradient of", kInputNames[i], gradients[i]);
     if (wanted[i]) result.push_back(gradients[i]);
   }
   return result;

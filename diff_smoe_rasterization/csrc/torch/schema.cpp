@@ -20,11 +20,12 @@ const std::string kRasterize =
     "Tensor features, Tensor instance_offsets, Tensor tile_offsets, Tensor instances, Tensor final_transmittance, "
     "Tensor last_contributor)";
 
-// image_gradients: of color, gate_sum, depth, inverse_depth; inputs: the 13 tensors of rasterize; outputs: its results;
-// wanted: the inputs whose gradients are returned, in that order.
+// inputs: the present ones of the 13 tensors of rasterize; outputs: all its results. Returned are the gradients of the
+// wanted inputs, in their order. The lists hold no None, or torch would not see that they require a gradient.
 const std::string kRasterizeBackward =
-    "rasterize_backward(Tensor?[] image_gradients, Tensor?[] inputs, Tensor[] outputs, " + kOptions +
-    ", bool[13] wanted) -> Tensor[]";
+    "rasterize_backward(Tensor? dL_dcolor, Tensor? dL_dgate_sum, Tensor? dL_ddepth, Tensor? dL_dinverse_depth, "
+    "Tensor[] inputs, bool[13] present, Tensor[] outputs, " +
+    kOptions + ", bool[13] wanted) -> Tensor[]";
 
 }  // namespace
 

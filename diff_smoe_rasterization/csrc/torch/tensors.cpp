@@ -48,7 +48,7 @@ Outputs allocate_outputs(const Inputs& inputs, const Options& options) {
   return outputs;
 }
 
-Inputs allocate_gradients(const Inputs& inputs, const Wanted& wanted) {
+Inputs allocate_gradients(const Inputs& inputs, const InputMask& wanted) {
   Inputs gradients;
   for (int i = 0; i < kNumInputs; ++i) {
     if (wanted[i]) gradients[i] = at::empty(inputs[i].sizes(), inputs[i].options());

@@ -71,7 +71,7 @@ constexpr const char* kOutputNames[kNumOutputs] = {"color",
                                                    "final_transmittance",
                                                    "last_contributor"};
 
-// The images that loss gradients arrive at, in the order of the backward op's first argument.
+// The images that loss gradients arrive at, in the order of the backward op's arguments.
 enum ImageGradient : int {
   kColorGradient,
   kGateSumGradient,
@@ -86,7 +86,7 @@ constexpr const char* kImageGradientNames[kNumImageGradients] = {"dL_dcolor", "d
 using Inputs = std::array<at::Tensor, kNumInputs>;  // an absent input is an undefined tensor
 using Outputs = std::array<at::Tensor, kNumOutputs>;
 using ImageGradientTensors = std::array<at::Tensor, kNumImageGradients>;
-using Wanted = std::array<bool, kNumInputs>;  // which inputs need their gradient
+using InputMask = std::array<bool, kNumInputs>;
 
 // The plain numbers of GaussianRasterizationSettings.
 struct Options {
@@ -115,7 +115,7 @@ std::array<OutputSpec, kNumOutputs> output_specs(const Inputs& inputs, const Opt
 Outputs allocate_outputs(const Inputs& inputs, const Options& options);
 
 // A gradient for each input that wants one, nothing filled; the others stay undefined.
-Inputs allocate_gradients(const Inputs& inputs, const Wanted& wanted);
+Inputs allocate_gradients(const Inputs& inputs, const InputMask& wanted);
 
 template <class S> const S* data(const at::Tensor& tensor) { return tensor.defined() ? tensor.data_ptr<S>() : nullptr; }
 
