@@ -1,7 +1,7 @@
 """Gradients of the op `rasterize`, and what torch.compile must know of the ops.
 
-Torch 2.4 and later get a registered formula and fake kernels, so that torch.compile sees through the ops; older
-releases an autograd.Function around the same two functions, `_keep` and `_backward`.
+One formula, `_keep` and `_backward`, stands behind the op in two ways: registered with torch (2.4 and later), so that
+torch.compile sees through it, and in an autograd.Function, which costs less a call, for all that is not compiled.
 """
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 
 _OPS = torch.ops.diff_smoe_rasterization
+_CAN_REGISTER = hasattr(torch.library, "register_autograd")
 _NUM_INPUTS = 13  # tensors before the options
 _NUM_OPTIONS = 13  # options that the backward op takes too
 _NUM_CHECKS = 2  # strict, prefiltered
@@ -42,18 +43,22 @@ def _refuse_second_derivative(ctx, *gradients):
 
 
 class _Rasterize(torch.autograd.Function):
-    """For torch without torch.library.register_autograd."""
-
     @staticmethod
     def forward(ctx, *inputs):
         output = _OPS.rasterize(*inputs)
         _keep(ctx, inputs, output)
         return output
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients):
-        return _backward(ctx, *gradients)
+    # Where it can be registered, the backward op refuses its own differentiation.
+    backward = staticmethod(_backward if _CAN_REGISTER else torch.autograd.function.once_differentiable(_backward))
+
+
+def rasterize_op(*inputs):
+    """Calls the op `rasterize` differentiably. Arguments and results: csrc/torch/schema.cpp."""
+    if _CAN_REGISTER and torch.compiler.is_compiling():
+        return _OPS.rasterize(*inputs)
+    differentiable = any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs)
+    return _Rasterize.apply(*inputs) if differentiable and torch.is_grad_enabled() else _OPS.rasterize(*inputs)
 
 
 def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
@@ -88,15 +93,10 @@ def _fake_mark_visible(positions, viewmatrix, near):
     return positions.new_empty((positions.shape[0],), dtype=torch.bool)
 
 
-if hasattr(torch.library, "register_autograd"):
+if _CAN_REGISTER:
     _NAME = "diff_smoe_rasterization::"
     torch.library.register_fake(_NAME + "rasterize", _fake_rasterize)
     torch.library.register_fake(_NAME + "rasterize_backward", _fake_rasterize_backward)
     torch.library.register_fake(_NAME + "mark_visible", _fake_mark_visible)
     torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)
     torch.library.register_autograd(_NAME + "rasterize_backward", _refuse_second_derivative)
-    rasterize_op = _OPS.rasterize
-else:
-    def rasterize_op(*inputs):
-        needed = torch.is_grad_enabled() and any(isinstance(x, torch.Tensor) and x.requires_grad for x in inputs)
-        return _Rasterize.apply(*inputs) if needed else _OPS.rasterize(*inputs)

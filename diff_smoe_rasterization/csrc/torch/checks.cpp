@@ -3,7 +3,6 @@
 #include <climits>
 #include <cmath>
 #include <sstream>
-#include <string>
 #include <vector>
 
 namespace dsmoe {
@@ -34,8 +33,8 @@ std::string dtype_name(at::ScalarType type) {
 // One size of an expected shape: a number, or a letter (or -1) for any.
 struct Size {
   Size(int64_t size) : size(size), letter(size < 0 ? "any" : nullptr) {}
-  Size(const char* letter) : letter(letter) {}
-  int64_t size = -1;
+  Size(const char* letter) : size(-1), letter(letter) {}
+  int64_t size;
   const char* letter;
 };
 using Shape = std::vector<Size>;
@@ -217,14 +216,14 @@ void refuse_culled(const Inputs& inputs, const at::Tensor& visible) {
   TORCH_CHECK_VALUE(false, "rasterize: prefiltered is set, but means3D[", index, "] is not beyond the near plane");
 }
 
-void refuse_nan(const char* function, const char* what, const at::Tensor& result) {
-  if (!result.defined() || result.numel() == 0) return;
-  const at::Tensor indices = at::isnan(result).nonzero();
+void refuse_nan(const std::string& what, const at::Tensor& tensor) {
+  if (!tensor.defined() || tensor.numel() == 0) return;
+  const at::Tensor indices = at::isnan(tensor).nonzero();
   if (indices.size(0) == 0) return;
   std::ostringstream index;
   for (int64_t i = 0; i < indices.size(1); ++i) index << (i == 0 ? "" : ", ") << indices[0][i].item<int64_t>();
-  TORCH_CHECK(false, function, ": ", what, "[", index.str(), "] is NaN, as are ", indices.size(0), " of ",
-              result.numel(), " values (debug=True)");
+  TORCH_CHECK(false, what, "[", index.str(), "] is NaN; so are ", indices.size(0), " of its ", tensor.numel(),
+              " values (debug=True)");
 }
 
 }  // namespace binding

@@ -2,6 +2,8 @@
 // and values, TypeError for types and devices. This is the only place that checks; Python adds none of these.
 #pragma once
 
+#include <string>
+
 #include "tensors.h"
 
 namespace dsmoe {
@@ -22,8 +24,8 @@ void refuse_non_finite(const Inputs& inputs, int64_t index);
 // Under `prefiltered`: raises for a Gaussian that is not visible [N], unless its position is not finite.
 void refuse_culled(const Inputs& inputs, const at::Tensor& visible);
 
-// Under `debug`: raises where a result holds NaN, naming it, the index, and the op.
-void refuse_nan(const char* function, const char* what, const at::Tensor& result);
+// Under `debug`: raises where a tensor holds NaN, naming it and the index. `what` begins with the function's name.
+void refuse_nan(const std::string& what, const at::Tensor& tensor);
 
 }  // namespace binding
 }  // namespace dsmoe

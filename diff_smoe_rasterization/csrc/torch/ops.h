@@ -46,9 +46,12 @@ auto rasterize(const at::Tensor& means3D, const OptionalTensor& means2D, const a
   const Options options = {image_height, image_width, tanfovx,      tanfovy, scale_modifier, near, alpha_min,
                            sh_degree,    blend_mode,  antialiasing, depth,   inverse_depth,  debug};
   check_arguments(inputs, options);
+  if (debug) {
+    for (int i = kBackground; i <= kCampos; ++i) refuse_nan(std::string("rasterize: ") + kInputNames[i], inputs[i]);
+  }
   const Outputs outputs = kForward(contiguous(inputs), options, {strict, prefiltered});
   if (debug) {
-    for (Output image : kImageOfGradient) refuse_nan("rasterize", kOutputNames[image], outputs[image]);
+    for (Output image : kImageOfGradient) refuse_nan(std::string("rasterize: ") + kOutputNames[image], outputs[image]);
   }
   return std::tuple_cat(outputs);
 }
@@ -83,14 +86,20 @@ std::vector<at::Tensor> rasterize_backward(const OptionalTensor& dL_dcolor, cons
   const Options options = {image_height, image_width, tanfovx,      tanfovy, scale_modifier, near, alpha_min,
                            sh_degree,    blend_mode,  antialiasing, depth,   inverse_depth,  debug};
   check_backward_arguments(inputs, options, outputs, image_gradients, wanted);
+  if (debug) {
+    for (int i = 0; i < kNumImageGradients; ++i) {
+      refuse_nan(std::string("rasterize_backward: ") + kImageGradientNames[i], image_gradients[i]);
+    }
+  }
   inputs = contiguous(inputs);
   const Inputs gradients = allocate_gradients(inputs, wanted);
   kBackward(inputs, options, outputs, image_gradients, gradients);
 
   std::vector<at::Tensor> result;
   for (int i = 0; i < kNumInputs; ++i) {
-    if (debug) refuse_nan("rasterize_backward: gradient of", kInputNames[i], gradients[i]);
-    if (wanted[i]) result.push_back(gradients[i]);
+    if (!wanted[i]) continue;
+    if (debug) refuse_nan(std::string("rasterize_backward: the gradient of ") + kInputNames[i], gradients[i]);
+    result.push_back(gradients[i]);
   }
   return result;
 }

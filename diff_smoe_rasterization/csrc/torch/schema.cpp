@@ -7,7 +7,7 @@
 namespace {
 
 const std::string kOptions =
-    "int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, float near, "
+    "SymInt image_height, SymInt image_width, float tanfovx, float tanfovy, float scale_modifier, float near, "
     "float alpha_min, int sh_degree, int blend_mode, bool antialiasing, bool depth, bool inverse_depth, bool debug";
 
 const std::string kRasterize =
