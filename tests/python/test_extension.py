@@ -1,0 +1,186 @@
+"""The compiled extension: what it says when it cannot be loaded, and what its ops refuse when they are called directly."""
+from __future__ import annotations
+
+import importlib
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+import torch
+from scenes import random_scene
+
+import diff_smoe_rasterization
+from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
+from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
+
+IMAGES = (0, 2, 3, 4)  # which results of the op are differentiable images
+
+
+@pytest.fixture
+def copied_package(tmp_path, monkeypatch):
+    """Returns (folder, import function) of a copy of the package's Python files, without the extension."""
+    name = "copy_of_the_package"
+    folder = tmp_path / name
+    folder.mkdir()
+    for file in Path(diff_smoe_rasterization.__file__).parent.glob("*.py"):
+        if file.name != "_build_info.py":
+            shutil.copy(file, folder)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield folder, lambda: importlib.import_module(name)
+    for module in [module for module in sys.modules if module.split(".")[0] == name]:
+        del sys.modules[module]
+
+
+def test_a_package_that_was_not_built_says_what_to_type(copied_package):
+    with pytest.raises(ImportError, match=r"not built[\s\S]*pip install"):
+        copied_package[1]()
+
+
+def test_a_build_against_another_torch_names_both_and_says_what_to_type(copied_package):
+    folder, load = copied_package
+    (folder / "_build_info.py").write_text("TORCH_VERSION = '0.4.1'\n")
+    with pytest.raises(ImportError, match=rf"0\.4\.1[\s\S]*{torch.__version__.split('+')[0]}[\s\S]*pip install"):
+        load()
+
+
+def test_an_extension_that_does_not_load_names_the_reason_and_both_versions(copied_package):
+    folder, load = copied_package
+    (folder / "_build_info.py").write_text(f"TORCH_VERSION = {torch.__version__!r}\n")
+    (folder / ("_C" + sysconfig.get_config_var("EXT_SUFFIX"))).write_bytes(b"not a shared library")
+    with pytest.raises(ImportError, match=r"does not load[\s\S]*_C[\s\S]*built against torch[\s\S]*pip install"):
+        load()
+
+
+def test_build_info_tells_what_runs():
+    info = build_info()
+    assert info["torch"] == torch.__version__
+    assert info["torch_built_with"].split(".")[:2] == torch.__version__.split(".")[:2]
+    assert info["version"] == diff_smoe_rasterization.__version__
+    assert info["num_threads"] == torch.get_num_threads()
+    assert info["simd_level"] in ("avx512", "avx2", "baseline")
+
+
+def test_the_blend_modes_have_the_numbers_of_the_core():
+    assert diff_smoe_rasterization.extension._C.blend_modes == {mode: i for i, mode in enumerate(BLEND_MODES)}
+
+
+def test_stage_times_are_taken_while_profiling_is_on():
+    scene = random_scene("smoe", 200, 50, 40, dtype=torch.float32).requiring_grad()
+
+    def run():
+        rasterize(settings=scene.settings, **scene.inputs).color.sum().backward()
+        return stage_times()
+
+    set_profiling(True)
+    try:
+        first, second = run(), run()
+    finally:
+        set_profiling(False)
+    for name, value in second.items():
+        assert value > 0, name
+    assert first["forward_pairs"] == second["forward_pairs"]
+    assert run() == second
+
+
+def test_images_may_be_edited_in_place(mode):
+    scene = random_scene(mode, 60, 40, 30, dtype=torch.float32)
+
+    def gradients(edit):
+        leaf = scene.requiring_grad()
+        rendering = rasterize(settings=leaf.settings, outputs=OUTPUTS, **leaf.inputs)
+        images = [edit(image) for image in (rendering.color, rendering.alpha, rendering.depth, rendering.inverse_depth)]
+        sum((image ** 2).sum() for image in images).backward()
+        return [tensor.grad for tensor in leaf.leaves().values()]
+
+    for in_place, ordinary in zip(gradients(lambda image: image.mul_(0.5)), gradients(lambda image: image * 0.5)):
+        assert torch.equal(in_place, ordinary)
+
+
+def op_arguments(scene):
+    """Returns the 13 tensors and 13 options of the ops."""
+    settings, inputs = scene.settings, scene.inputs
+    tensors = [inputs.get(name) for name in ("means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales",
+                                             "rotations", "cov3D_precomp")]
+    tensors += [settings.bg, settings.viewmatrix, settings.projmatrix, settings.campos]
+    options = [settings.image_height, settings.image_width, settings.tanfovx, settings.tanfovy, settings.scale_modifier,
+               settings.near, settings.alpha_min, settings.sh_degree, BLEND_MODES.index(settings.blend_mode),
+               settings.antialiasing, True, True, settings.debug]
+    return tensors, options
+
+
+def backward_arguments(mode):
+    """Returns the arguments of the op rasterize_backward, by position."""
+    tensors, options = op_arguments(random_scene(mode, 20, 20, 18, degree=1, dtype=torch.float32))
+    results = torch.ops.diff_smoe_rasterization.rasterize(*tensors, *options, False, False)
+    present = [tensor is not None for tensor in tensors]
+    image_gradients = [torch.randn(results[i].shape, generator=torch.Generator().manual_seed(i)) for i in IMAGES]
+    return [*image_gradients, [tensor for tensor in tensors if tensor is not None], present, list(results), *options,
+            present]
+
+
+@pytest.mark.skipif(not hasattr(torch.library, "opcheck"), reason=f"torch {torch.__version__} has no opcheck")
+def test_opcheck_of_rasterize_backward(mode):
+    torch.library.opcheck(torch.ops.diff_smoe_rasterization.rasterize_backward.default, tuple(backward_arguments(mode)))
+
+
+@pytest.mark.parametrize("result, name", enumerate(["color", "radii", "gate_sum", "depth", "inverse_depth", "projected",
+                                                    "features", "instance_offsets", "tile_offsets", "instances",
+                                                    "final_transmittance", "last_contributor"]))
+def test_the_backward_op_refuses_results_that_were_cut(result, name):
+    arguments = backward_arguments("smoe")
+    arguments[6][result] = arguments[6][result][:-1]
+    with pytest.raises(ValueError, match=rf"rasterize_backward: {name} has "):
+        torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+
+
+def test_the_backward_op_refuses_results_of_another_type():
+    arguments = backward_arguments("smoe")
+    arguments[6][5] = arguments[6][5].double()
+    with pytest.raises(TypeError, match="rasterize_backward: projected .*float32"):
+        torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+
+
+def test_the_backward_op_refuses_lists_of_the_wrong_length():
+    for position, name in ((4, "inputs"), (6, "outputs")):
+        arguments = backward_arguments("smoe")
+        arguments[position] = arguments[position][:-1]
+        with pytest.raises(ValueError, match=f"rasterize_backward: {name} has length"):
+            torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+
+
+def test_the_backward_op_refuses_gradients_of_absent_inputs():
+    arguments = backward_arguments("smoe")
+    arguments[-1] = [True] * 13
+    with pytest.raises(ValueError, match="gradient of dc is wanted, but that input is absent"):
+        torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+
+
+@pytest.mark.skipif(not hasattr(torch.library, "register_autograd"),
+                    reason=f"torch {torch.__version__} only refuses what it sees: a loss that is not linear")
+def test_second_derivatives_of_a_linear_loss_are_refused():
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32).requiring_grad()
+    color = rasterize(settings=scene.settings, **scene.inputs).color
+    first, = torch.autograd.grad(color.sum(), scene.inputs["means3D"], create_graph=True)
+    with pytest.raises(RuntimeError, match="rasterize: second derivatives"):
+        first.sum().backward()
+
+
+@pytest.mark.parametrize("field", ["bg", "viewmatrix", "projmatrix", "campos"])
+def test_debug_names_the_camera_tensor_that_holds_nan(field):
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32)
+    broken = getattr(scene.settings, field).clone()
+    broken.view(-1)[1] = float("nan")
+    settings = scene.settings._replace(debug=True, **{field: broken})
+    with pytest.raises(RuntimeError, match=rf"rasterize: {field}\[.*1\] is NaN"):
+        rasterize(settings=settings, **scene.inputs)
+
+
+def test_debug_names_the_image_gradient_that_holds_nan():
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32).with_settings(debug=True).requiring_grad()
+    color = rasterize(settings=scene.settings, **scene.inputs).color
+    gradient = torch.ones_like(color)
+    gradient[2, 3, 4] = float("nan")
+    with pytest.raises(RuntimeError, match=r"rasterize_backward: dL_dcolor\[2, 3, 4\] is NaN"):
+        color.backward(gradient)
