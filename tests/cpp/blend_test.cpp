@@ -112,7 +112,7 @@ Pixel random_pixel(Random& random, int count, double largest_alpha) {
 Pixel saturated_pixel() {
   Pixel pixel;
   pixel.counts = {true, true, false, true, true, true, true};
-  pixel.alpha = {0.3, 0.9, 0.5, 0.98, 0.97, 0.2, 0.6};  // T: 0.7, 0.07, 0.0014; the fifth would leave 4.2e-5
+  pixel.alpha = {0.3, 0.9, 0.5, 0.98, 0.94, 0.2, 0.6};  // T: 0.7, 0.07, 0.0014; the fifth would leave 8.4e-5
   pixel.color = {0.1, 0.9, 0.4, 0.6, 0.2, 0.8, 0.3};
   pixel.depth = {1, 1.5, 2, 2.5, 3, 3.5, 4};
   for (const double z : pixel.depth) pixel.inverse_depth.push_back(1 / z);

@@ -101,6 +101,14 @@ TEST(ProjectGaussian, BackwardIsTheDerivativeWithDegreeZeroApart) {
   EXPECT_EQ(project(scene).features, project(single_gaussian()).features);
 }
 
+TEST(ProjectGaussian, BackwardIsTheDerivativeWithDegreeZeroAlone) {
+  Scene<double> scene = single_gaussian();
+  scene.dc.assign(scene.shs.begin(), scene.shs.begin() + 3);
+  scene.shs.clear();
+  scene.sh_degree = 0;
+  expect_backward_is_the_derivative(scene);
+}
+
 TEST(ProjectGaussian, BackwardIsTheDerivativeBelowTheStoredDegree) {
   for (const int degree : {0, 1, 2}) {
     Scene<double> scene = single_gaussian();
