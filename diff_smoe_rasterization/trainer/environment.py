@@ -44,25 +44,19 @@ def extension_info() -> Dict[str, Any]:
 
 
 def describe() -> str:
-    """What `dsmoe info` prints; says what is missing where the extension is not built."""
-    lines = [f"{name:<26}{version}" for name, version in versions().items()]
-    lines.append(f"{'processor':<26}{processor_name()}, {os.cpu_count()} cores")
-    lines.append(f"{'torch threads':<26}{torch.get_num_threads()}")
+    """What `dsmoe info` prints; says what is missing where the extension is not usable."""
+    lines = {**versions(), "processor": f"{processor_name()}, {os.cpu_count()} cores"}
     try:
         info = extension_info()
     except ImportError as error:
-        lines.append(f"{'extension':<26}not usable: {error}")
+        lines["extension"] = f"not usable: {error}"
     else:
-        cuda = "built" if info.pop("cuda_built", False) else "not built"
-        info.pop("version", None)
-        lines.append(f"{'backends':<26}cpu; cuda: {cuda}")
-        for name, label in (("simd", "SIMD level"), ("simd_available", "SIMD levels here"),
-                            ("num_threads", "rasterizer threads"), ("compiler", "compiler"),
-                            ("torch_built_with", "built with torch")):
-            if name in info:
-                value = info[name]
-                text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
-                lines.append(f"{label:<26}{text}")
+        reason = info.get("without_cuda_because")
+        without = f"no cuda ({reason})" if reason else "no cuda"
+        lines["backends"] = "cpu, cuda" if info.get("cuda_built") else f"cpu; {without}"
+        lines["SIMD level"] = info.get("simd_level", "unknown")
+        lines["threads"] = info.get("num_threads", torch.get_num_threads())
+        lines["compiled by"] = f"{info.get('compiler', 'unknown')}, with torch {info.get('torch_built_with', 'unknown')}"
     gpus = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
-    lines.append(f"{'GPU':<26}{', '.join(gpus) if gpus else 'none that torch can use'}")
-    return "\n".join(lines)
+    lines["GPU"] = ", ".join(gpus) if gpus else "none that torch can use"
+    return "\n".join(f"{name:<26}{text}" for name, text in lines.items())

@@ -38,9 +38,11 @@ def check_device(device: str) -> None:
         return
     if not torch.cuda.is_available():
         raise TrainerError("--device cuda: torch finds no CUDA device on this machine; use --device cpu")
-    if not extension_info().get("cuda_built"):
-        raise TrainerError("--device cuda: this build of diff_smoe_rasterization has no CUDA backend; "
-                           "use --device cpu or build it with CUDA")
+    info = extension_info()
+    if not info.get("cuda_built"):
+        reason = info.get("without_cuda_because") or "it was built without CUDA"
+        raise TrainerError(f"--device cuda: this diff_smoe_rasterization has no CUDA backend ({reason}); "
+                           "use --device cpu")
 
 
 class Trainer:

@@ -21,7 +21,7 @@ def read_colmap_layout(folder: str, config: TrainConfig) -> Layout:
     except (OSError, ValueError) as error:
         raise SceneError(str(error)) from error
     for camera in model.cameras.values():
-        _check_intrinsics(model.folder, camera)
+        _refuse_distortion(model.folder, camera)
     image_folder = os.path.join(folder, config.images)
     if not os.path.isdir(image_folder):
         raise SceneError(f"{image_folder}: no such folder of images (--images names another)")
@@ -38,15 +38,12 @@ def read_colmap_layout(folder: str, config: TrainConfig) -> Layout:
     return Layout("colmap", train, test, points, f"sorted by name, every {HOLD_OUT}th is a test image")
 
 
-def _check_intrinsics(folder: str, camera: io.ColmapCamera) -> None:
+def _refuse_distortion(folder: str, camera: io.ColmapCamera) -> None:
     if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
         raise SceneError(
             f"{folder}: camera {camera.id} has the model {camera.model}; only PINHOLE and SIMPLE_PINHOLE images "
             "(without lens distortion) can be trained on. Undistort them first, with COLMAP: "
             "colmap image_undistorter --image_path IMAGES --input_path SPARSE --output_path SCENE --output_type COLMAP")
-    if not (camera.params[0] > 0 and camera.params[-3] > 0 and camera.width > 0 and camera.height > 0):
-        raise SceneError(f"{folder}: camera {camera.id} has size {camera.width}x{camera.height} and parameters "
-                         f"{list(camera.params)}; size and focal lengths must be positive")
 
 
 def _camera(image: io.ColmapImage, intrinsics: io.ColmapCamera) -> Camera:

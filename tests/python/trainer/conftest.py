@@ -2,9 +2,19 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Tensors are so small here that torch's threads would only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

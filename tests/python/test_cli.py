@@ -1,0 +1,200 @@
+"""The `dsmoe` command from end to end, on a tiny ray-traced scene."""
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import diff_smoe_rasterization
+from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
+
+SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10", "--densification-interval", "4",
+         "--quiet"]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Tensors are so small here that torch's threads would only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    write_synthetic_scene(str(folder), views=9, width=32, height=24, points=150, supersampling=1)
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """A finished smoe run."""
+    output = str(tmp_path_factory.mktemp("run"))
+    assert main(["train", scene, "-o", output, "--blend-mode", "smoe", *SHORT]) == 0
+    return output
+
+
+def ply_of(output):
+    return os.path.join(output, "point_cloud", "iteration_12", "point_cloud.ply")
+
+
+def results_of(output):
+    with open(os.path.join(output, "results.json"), encoding="utf-8") as file:
+        return json.load(file)
+
+
+def fails(capsys, *arguments):
+    """Runs a command that must fail with one line on stderr, which is returned."""
+    capsys.readouterr()
+    assert main(list(arguments)) == 1
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1 and "Traceback" not in text
+    return text
+
+
+def test_training_leaves_results_config_and_model(trained):
+    row, = results_of(trained)
+    assert {"blend_mode", "psnr", "ssim", "num_gaussians", "train_seconds", "fps", "protocol"} <= set(row)
+    assert row["blend_mode"] == "smoe" and 3 < row["psnr"] < 60 and 0 < row["ssim"] < 1
+    assert row["train_seconds"] > 0 and row["fps"] > 0
+    protocol = row["protocol"]
+    assert (protocol["train_views"], protocol["test_views"], protocol["image_size"]) == (7, 2, [32, 24])
+    for name in ("split", "resolution", "downscaler", "background", "principal_point", "schedule",
+                 "densify_grad_threshold", "iterations", "seed", "machine", "versions"):
+        assert name in protocol
+    with open(ply_of(trained), "rb") as file:
+        header = file.read(2000).split(b"end_header")[0].decode()
+    assert "comment blend_mode smoe" in header
+    assert int(re.search(r"element vertex (\d+)", header).group(1)) == row["num_gaussians"]
+
+
+def test_eval_measures_the_same_again(trained, capsys):
+    before, = results_of(trained)
+    assert main(["eval", trained]) == 0
+    after, = results_of(trained)
+    assert f"{before['psnr']:.2f}" in capsys.readouterr().out
+    # The model makes a trip through a .ply of the same float32 values.
+    for name in ("psnr", "ssim", "num_gaussians", "train_seconds", "blend_mode"):
+        assert after[name] == before[name], name
+
+
+def test_eval_of_a_moved_run_and_a_moved_scene(trained, scene, tmp_path, capsys):
+    run, moved = str(tmp_path / "run"), str(tmp_path / "scene")
+    shutil.copytree(trained, run)
+    shutil.copytree(scene, moved)
+    assert main(["eval", run, "--scene", moved, "--split", "train"]) == 0
+    assert "train views" in capsys.readouterr().out
+    assert results_of(run) == results_of(trained), "only the test views' figures are results"
+    assert "nowhere" in fails(capsys, "eval", run, "--scene", str(tmp_path / "nowhere"))
+
+
+def test_render_writes_what_eval_measures(trained, scene, tmp_path):
+    folder = tmp_path / "images"
+    assert main(["render", trained, "-o", str(folder)]) == 0
+    assert sorted(os.listdir(folder)) == ["view_000.png", "view_008.png"]
+    main(["eval", trained])
+    with open(os.path.join(trained, "per_view.json"), encoding="utf-8") as file:
+        per_view = {row["name"]: row["psnr"] for row in json.load(file)}
+    for name, psnr in per_view.items():
+        rendered = np.asarray(Image.open(folder / name), float)
+        truth = np.asarray(Image.open(os.path.join(scene, "images", name)), float)
+        # Both are 8-bit images; the metric runs in float32.
+        assert 10 * np.log10(255**2 / ((rendered - truth) ** 2).mean()) == pytest.approx(psnr, abs=1e-4)
+
+
+def test_render_a_ply_with_the_mode_that_it_records(trained, scene, tmp_path):
+    assert main(["render", trained, "-o", str(tmp_path / "run"), "--split", "all"]) == 0
+    assert main(["render", ply_of(trained), "-o", str(tmp_path / "ply"), "--scene", scene, "--split", "all"]) == 0
+    names = sorted(os.listdir(tmp_path / "run"))
+    assert len(names) == 9 and names == sorted(os.listdir(tmp_path / "ply"))
+    for name in names:
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
+
+
+def test_render_never_guesses_or_changes_the_mode(trained, scene, tmp_path, capsys):
+    output = str(tmp_path / "images")
+    with open(ply_of(trained), "rb") as file:
+        content = file.read()
+    bare = tmp_path / "bare.ply"
+    bare.write_bytes(content.replace(b"comment blend_mode smoe\n", b""))
+    text = fails(capsys, "render", str(bare), "-o", output, "--scene", scene)
+    assert "bare.ply" in text and "--blend-mode" in text
+    text = fails(capsys, "render", ply_of(trained), "-o", output, "--scene", scene, "--blend-mode", "alpha")
+    assert "smoe, not alpha" in text
+    text = fails(capsys, "render", trained, "-o", output, "--blend-mode", "alpha")
+    assert "smoe, not alpha" in text
+    assert not os.path.exists(output)
+    assert main(["render", str(bare), "-o", output, "--scene", scene, "--blend-mode", "alpha"]) == 0
+    assert main(["render", trained, "-o", output + "2", "--blend-mode", "smoe"]) == 0
+    one, other = (open(os.path.join(folder, "view_000.png"), "rb").read() for folder in (output, output + "2"))
+    assert one != other, "the two modes show different images"
+
+
+def test_a_ply_and_a_config_that_disagree_are_refused(trained, tmp_path, capsys):
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
+    with open(ply_of(run), "r+b") as file:
+        content = file.read().replace(b"comment blend_mode smoe\n", b"comment blend_mode alpha\n")
+        file.seek(0)
+        file.write(content)
+    assert "alpha, not smoe" in fails(capsys, "eval", run)
+    assert "alpha, not smoe" in fails(capsys, "render", run, "-o", str(tmp_path / "images"))
+
+
+def test_resume_on_the_command_line(scene, tmp_path, capsys):
+    output = str(tmp_path / "out")
+    arguments = ["train", scene, "-o", output, *SHORT]
+    assert main(arguments) == 0
+    assert "--resume" in fails(capsys, *arguments)
+    assert main([*arguments, "--resume"]) == 0
+    assert "resumed at iteration 12" in capsys.readouterr().out
+    assert "--seed" in fails(capsys, *arguments, "--resume", "--seed", "7")
+    assert main([*arguments, "--overwrite", "--seed", "7"]) == 0
+
+
+def test_errors_come_before_anything_is_written(scene, tmp_path, capsys):
+    output = str(tmp_path / "out")
+    assert "no such folder" in fails(capsys, "train", str(tmp_path / "nowhere"), "-o", output)
+    assert "--iterations is 0" in fails(capsys, "train", scene, "-o", output, "--iterations", "0")
+    if not torch.cuda.is_available():
+        assert "no CUDA device" in fails(capsys, "train", scene, "-o", output, "--device", "cuda")
+    assert not os.path.exists(output)
+    assert "config.json" in fails(capsys, "eval", str(tmp_path))
+    assert "--scene" in fails(capsys, "render", "model.ply", "-o", output)
+    assert "model.ply" in fails(capsys, "render", "model.ply", "-o", output, "--scene", scene)
+
+
+def test_an_unfinished_run_cannot_be_evaluated(trained, tmp_path, capsys):
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
+    os.remove(ply_of(run))
+    assert "has not ended" in fails(capsys, "eval", run)
+
+
+def test_info(capsys):
+    assert main(["info"]) == 0
+    text = capsys.readouterr().out
+    assert diff_smoe_rasterization.build_info()["version"] in text and torch.__version__ in text
+    for word in ("cuda", "SIMD level", "threads", "GPU"):
+        assert word in text
+
+
+def test_the_module_is_the_command():
+    """Runs the installed package in a process of its own."""
+    done = subprocess.run([sys.executable, "-m", "diff_smoe_rasterization", "train", "--help"], capture_output=True,
+                          text=True, check=False)
+    assert done.returncode == 0 and "--densify-grad-threshold" in done.stdout
+    done = subprocess.run([sys.executable, "-m", "diff_smoe_rasterization", "train", "/nowhere", "-o", "x"],
+                          capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr == "dsmoe train: error: scene /nowhere: no such folder\n"

@@ -1,0 +1,120 @@
+"""Options: the defaults of 3DGS, validation, and a config file that never loses the blend mode."""
+from __future__ import annotations
+
+import argparse
+import json
+
+import pytest
+
+from diff_smoe_rasterization.trainer.config import TrainConfig, add_arguments, config_from_arguments
+from diff_smoe_rasterization.trainer.errors import ConfigError
+
+# The published defaults of 3DGS (2023).
+PUBLISHED = {
+    "iterations": 30_000, "position_lr_init": 0.00016, "position_lr_final": 0.0000016,
+    "position_lr_max_steps": 30_000, "feature_lr": 0.0025, "opacity_lr": 0.05, "scaling_lr": 0.005,
+    "rotation_lr": 0.001, "percent_dense": 0.01, "lambda_dssim": 0.2, "densification_interval": 100,
+    "opacity_reset_interval": 3000, "densify_from_iter": 500, "densify_until_iter": 15_000,
+    "densify_grad_threshold": 0.0002, "sh_degree": 3, "resolution": -1, "white_background": False,
+}
+
+
+def parse(*arguments):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    return config_from_arguments(parser.parse_args(["scene", "-o", "out", *arguments]))
+
+
+def test_defaults_are_those_of_3dgs():
+    config = parse()
+    assert {name: getattr(config, name) for name in PUBLISHED} == PUBLISHED
+    assert (config.scene, config.output, config.blend_mode, config.schedule) == ("scene", "out", "alpha", "3dgs")
+
+
+def test_every_option_is_on_the_command_line():
+    config = parse("--blend-mode", "smoe_tn", "--iterations", "7", "--densify-grad-threshold", "5e-3",
+                   "--white-background", "--schedule", "steady", "--principal-point", "centre", "--seed", "3",
+                   "--init-points", "99", "--percent-dense", "0.5", "--sh-degree", "1")
+    assert (config.blend_mode, config.iterations, config.densify_grad_threshold) == ("smoe_tn", 7, 0.005)
+    assert (config.white_background, config.schedule, config.principal_point) == (True, "steady", "centre")
+    assert (config.seed, config.init_points, config.percent_dense, config.sh_degree) == (3, 99, 0.5, 1)
+
+
+def test_blend_mode_follows_the_environment_unless_given(monkeypatch):
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe_std")
+    assert parse().blend_mode == "smoe_std"
+    assert parse("--blend-mode", "smoe").blend_mode == "smoe"
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "cubist")
+    with pytest.raises(ConfigError, match="DSMOE_BLEND_MODE is 'cubist'"):
+        parse()
+
+
+@pytest.mark.parametrize("option, value, words", [
+    ("iterations", 0, "--iterations is 0; it must be at least 1"),
+    ("resolution", 0, "--resolution is 0"),
+    ("resolution", -2, "--resolution is -2"),
+    ("init_points", 3, "--init-points is 3"),
+    ("sh_degree", 4, "--sh-degree is 4"),
+    ("lambda_dssim", 1.5, "--lambda-dssim is 1.5"),
+    ("seed", -1, "--seed is -1"),
+    ("densification_interval", 0, "--densification-interval is 0"),
+    ("opacity_reset_interval", 0, "--opacity-reset-interval is 0"),
+    ("densify_grad_threshold", 0.0, "--densify-grad-threshold is 0.0"),
+    ("position_lr_final", float("nan"), "--position-lr-final is nan"),
+    ("checkpoint_every", -1, "--checkpoint-every is -1"),
+    ("schedule", "fast", "--schedule is 'fast'; it must be one of 3dgs, steady"),
+    ("device", "tpu", "--device is 'tpu'"),
+])
+def test_bad_values_name_the_option(option, value, words):
+    with pytest.raises(ConfigError) as error:
+        TrainConfig(**{option: value}).validate()
+    assert words in str(error.value)
+
+
+def test_file_round_trip(tmp_path, mode):
+    config = TrainConfig(scene="s", output=str(tmp_path), blend_mode=mode, iterations=5, white_background=True)
+    config.save(str(tmp_path))
+    assert TrainConfig.load(str(tmp_path)) == config
+    assert json.loads((tmp_path / "config.json").read_text())["blend_mode"] == mode
+
+
+@pytest.mark.parametrize("edit, words", [
+    (lambda values: values.pop("blend_mode"), "blend_mode is None"),
+    (lambda values: values.update(blend_mode="Smoe"), "blend_mode is 'Smoe'"),
+    (lambda values: values.update(blend_mode=None), "blend_mode is None"),
+    (lambda values: values.update(colour="red"), "unknown option colour"),
+    (lambda values: values.update(iterations=0), "--iterations is 0"),
+])
+def test_a_wrong_file_is_refused(tmp_path, monkeypatch, edit, words):
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe")  # must not fill the gap
+    TrainConfig(scene="s", output=str(tmp_path), blend_mode="smoe").save(str(tmp_path))
+    values = json.loads((tmp_path / "config.json").read_text())
+    edit(values)
+    (tmp_path / "config.json").write_text(json.dumps(values))
+    with pytest.raises(ConfigError) as error:
+        TrainConfig.load(str(tmp_path))
+    assert "config.json" in str(error.value) and words in str(error.value)
+
+
+def test_a_folder_without_a_run(tmp_path):
+    with pytest.raises(ConfigError, match="dsmoe train"):
+        TrainConfig.load(str(tmp_path))
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(ConfigError, match="config.json: not valid json"):
+        TrainConfig.load(str(tmp_path))
+
+
+def test_differences_ignore_where_and_when_things_are_written():
+    one = TrainConfig(scene="a", output="b", seed=1, checkpoint_every=5)
+    assert one.differences(TrainConfig(scene="c", output="d", seed=1, eval_every=7)) == []
+    texts = one.differences(TrainConfig(seed=2, blend_mode="smoe"))
+    assert len(texts) == 2 and any("--seed is 1 here and 2 there" in text for text in texts)
+
+
+def test_shortened_keeps_the_shares_of_the_recipe():
+    assert TrainConfig(iterations=30_000).shortened() == TrainConfig(iterations=30_000)
+    short = TrainConfig(iterations=3000).shortened()
+    assert (short.densify_from_iter, short.densify_until_iter, short.opacity_reset_interval) == (50, 1500, 300)
+    assert (short.position_lr_max_steps, short.sh_degree_interval, short.densification_interval) == (3000, 100, 100)
+    assert TrainConfig(iterations=60).shortened().densification_interval == 3, "ten densifications in 30 steps"
+    TrainConfig(iterations=1).shortened().validate()

@@ -1,0 +1,103 @@
+"""The comparison of both blends on a tiny scene: table, pictures, models and rows."""
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.trainer import quickstart
+from diff_smoe_rasterization.trainer.pictures import busiest_window, comparison, evenly_spaced
+
+
+@pytest.fixture(scope="module")
+def output(tiny_scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("quickstart")
+    status = quickstart.main([tiny_scene, "-o", str(folder), "--iterations", "30", "--seed", "4", "--quiet"])
+    assert status == 0
+    return folder
+
+
+def test_both_modes_are_trained_with_the_same_settings(output):
+    rows = json.loads((output / "results.json").read_text())
+    assert [row["blend_mode"] for row in rows] == ["alpha", "smoe"]
+    for row in rows:
+        assert {"psnr", "ssim", "num_gaussians", "train_seconds", "fps"} <= set(row)
+    assert rows[0]["protocol"] == rows[1]["protocol"]
+    assert (rows[0]["protocol"]["iterations"], rows[0]["protocol"]["seed"]) == (30, 4)
+
+
+def test_the_models_record_their_modes(output):
+    for mode in ("alpha", "smoe"):
+        assert io.read_gaussians(str(output / f"{mode}.ply")).blend_mode == mode
+
+
+def test_pictures_show_truth_and_both_modes(output):
+    pictures = sorted(path.name for path in output.glob("compare_*.png"))
+    assert pictures == ["compare_view_000.png", "compare_view_008.png"]
+    with Image.open(output / pictures[0]) as picture:
+        assert picture.width > 3 * 400 and np.asarray(picture).std() > 10
+
+
+def test_the_table_and_a_second_run(tiny_scene, output, capsys):
+    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "20", "--quiet"]) == 0
+    text = capsys.readouterr().out
+    for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", "\nsmoe ", "compare_view_000.png"):
+        assert word in text
+
+
+def test_given_options_win_over_chosen_ones(tiny_scene):
+    chosen = quickstart.choose_options(tiny_scene, {})
+    assert (chosen.iterations, chosen.densify_until_iter, chosen.schedule) == (2000, 1000, "steady")
+    assert chosen.resolution == -1, "images this small are not reduced"
+    given = quickstart.choose_options(tiny_scene, {"iterations": 600, "densify_until_iter": 100, "schedule": "3dgs"})
+    assert (given.iterations, given.densify_until_iter, given.opacity_reset_interval) == (600, 100, 60)
+    assert given.schedule == "3dgs"
+
+
+def test_large_scenes_are_reduced_and_told(monkeypatch, tiny_scene, capsys):
+    monkeypatch.setattr(quickstart, "MAX_WIDTH", 16)
+    monkeypatch.setattr(quickstart, "MAX_POINTS", 50)
+    config = quickstart.choose_options(tiny_scene, {})
+    assert (config.resolution, config.init_points) == (16, 50)
+    text = capsys.readouterr().out
+    assert "--resolution 16" in text and "--init-points 50" in text
+    config = quickstart.choose_options(tiny_scene, {"resolution": 1})
+    assert (config.resolution, config.init_points) == (1, 50)
+
+
+def test_errors_are_one_line(tmp_path, capsys):
+    assert quickstart.main([str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err == f"quickstart: error: scene {tmp_path / 'nowhere'}: no such folder\n"
+
+
+def test_without_a_scene_one_is_made(tmp_path, monkeypatch, capsys):
+    make = quickstart.write_synthetic_scene
+    monkeypatch.setattr(quickstart, "write_synthetic_scene",
+                        lambda folder: make(folder, views=9, width=32, height=24, points=150, supersampling=1))
+    assert quickstart.main(["-o", str(tmp_path), "--iterations", "12", "--quiet"]) == 0
+    assert "making a scene" in capsys.readouterr().out
+    assert (tmp_path / "scene" / "images" / "view_003.png").is_file() and (tmp_path / "smoe.ply").is_file()
+
+
+def test_the_busiest_window_is_where_the_edges_are():
+    pixels = np.full((40, 80, 3), 128, np.uint8)
+    pixels[22:30, 50:66:2] = 255  # stripes
+    left, top, right, bottom = busiest_window(Image.fromarray(pixels))
+    assert (right - left, bottom - top) == (20, 10)
+    assert left <= 50 and right >= 66 and top <= 22 and bottom >= 30
+
+
+def test_comparison_lays_out_whole_pictures_above_windows():
+    truth = Image.fromarray(np.random.RandomState(0).randint(0, 255, (30, 40, 3)).astype(np.uint8))
+    sheet = comparison(truth, [("alpha", Image.new("RGB", (40, 30), (10, 20, 30)))])
+    pixels = np.asarray(sheet)
+    assert (pixels[-20, -100] == [10, 20, 30]).all(), "the second column's window shows the second image"
+
+
+@pytest.mark.parametrize("count, wanted, expected", [(0, 3, []), (1, 3, [0]), (2, 3, [0, 1]), (6, 3, [0, 2, 5]),
+                                                     (37, 3, [0, 18, 36])])
+def test_evenly_spaced(count, wanted, expected):
+    assert evenly_spaced(count, wanted) == expected

@@ -1,0 +1,162 @@
+"""A killed run, resumed, ends bit for bit where an undisturbed one does; and runs are reproducible at all."""
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import pytest
+import torch
+
+from diff_smoe_rasterization.trainer import files
+from diff_smoe_rasterization.trainer.checkpoint import load_checkpoint, save_checkpoint
+from diff_smoe_rasterization.trainer.errors import TrainerError
+from diff_smoe_rasterization.trainer.loop import Trainer, train
+from diff_smoe_rasterization.trainer.modelfile import model_path
+from diff_smoe_rasterization.trainer.order import ViewOrder
+from diff_smoe_rasterization.trainer.scene import load_scene
+
+
+class Killed(Exception):
+    """Stands for the signal that ends a process between two steps."""
+
+
+def ply_bytes(config):
+    with open(model_path(config.output, config.iterations), "rb") as file:
+        return file.read()
+
+
+def kill_at(monkeypatch, iteration):
+    """Makes the step of that iteration raise."""
+    step = Trainer.step
+
+    def dying_step(self):
+        if self.iteration + 1 == iteration:
+            raise Killed
+        return step(self)
+
+    monkeypatch.setattr(Trainer, "step", dying_step)
+
+
+@pytest.mark.parametrize("blend_mode, killed_at", [("alpha", 26), ("smoe", 26), ("smoe", 11), ("smoe", 39)])
+def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, blend_mode, killed_at):
+    """Checkpoints are at 10, 20, 30; densifications at 8, 16, 24 and resets at 12, 24 lie on both sides."""
+    straight = dataclasses.replace(tiny_config, blend_mode=blend_mode, output=str(tmp_path / "straight"))
+    row = train(straight, progress=False)
+    broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
+    with monkeypatch.context() as patch:
+        kill_at(patch, killed_at)
+        with pytest.raises(Killed):
+            train(broken, progress=False)
+    # Whatever happens to the generators in between must not matter.
+    torch.manual_seed(12345)
+    resumed = train(broken, resume=True, progress=False)
+    assert ply_bytes(broken) == ply_bytes(straight)
+    assert (resumed["psnr"], resumed["num_gaussians"]) == (row["psnr"], row["num_gaussians"])
+    # The tiny scene must really have been densified, else nothing was shown.
+    assert row["num_gaussians"] != row["protocol"]["init_points"]
+    states = [load_checkpoint(os.path.join(config.output, "checkpoint.pt"), "cpu") for config in (straight, broken)]
+    for name in states[0]["optimizer"]:
+        for key, value in states[0]["optimizer"][name].items():
+            assert torch.equal(torch.as_tensor(value), torch.as_tensor(states[1]["optimizer"][name][key])), (name, key)
+
+
+def test_resume_before_the_first_checkpoint_starts_anew(tiny_config, tmp_path, monkeypatch, capsys):
+    straight = dataclasses.replace(tiny_config, output=str(tmp_path / "straight"))
+    train(straight, progress=False)
+    with monkeypatch.context() as patch:
+        kill_at(patch, 5)
+        with pytest.raises(Killed):
+            train(tiny_config, progress=False)
+    train(tiny_config, resume=True, progress=False)
+    assert "no checkpoint yet" in capsys.readouterr().out
+    assert ply_bytes(tiny_config) == ply_bytes(straight)
+
+
+def test_resuming_a_finished_run_changes_nothing(tiny_config):
+    row = train(tiny_config, progress=False)
+    before = ply_bytes(tiny_config)
+    again = train(tiny_config, resume=True, progress=False)
+    assert ply_bytes(tiny_config) == before
+    assert again["psnr"] == row["psnr"] and again["train_seconds"] == pytest.approx(row["train_seconds"], abs=0.1)
+
+
+def test_the_same_seed_gives_the_same_model_and_another_seed_another(tiny_config, tmp_path):
+    models = []
+    for index, seed in enumerate((5, 5, 6)):
+        config = dataclasses.replace(tiny_config, seed=seed, output=str(tmp_path / str(index)))
+        train(config, progress=False)
+        models.append(ply_bytes(config))
+    assert models[0] == models[1] != models[2]
+
+
+def test_evaluations_on_the_way_do_not_change_the_result(tiny_config, tmp_path):
+    other = dataclasses.replace(tiny_config, eval_every=7, checkpoint_every=0, output=str(tmp_path / "evaluated"))
+    train(tiny_config, progress=False)
+    train(other, progress=False)
+    assert ply_bytes(other) == ply_bytes(tiny_config)
+    assert os.path.isfile(os.path.join(other.output, "history.json"))
+
+
+def test_other_options_cannot_be_resumed(tiny_config):
+    train(tiny_config, progress=False)
+    with pytest.raises(TrainerError, match="--seed is 0 .* 1 "):
+        train(dataclasses.replace(tiny_config, seed=1), resume=True, progress=False)
+    with pytest.raises(TrainerError, match="--blend-mode"):
+        train(dataclasses.replace(tiny_config, blend_mode="alpha"), resume=True, progress=False)
+
+
+def test_a_run_is_not_overwritten_unasked(tiny_config):
+    train(tiny_config, progress=False)
+    with pytest.raises(TrainerError, match="--resume.*--overwrite"):
+        train(tiny_config, progress=False)
+    changed = dataclasses.replace(tiny_config, seed=1)
+    before = ply_bytes(tiny_config)
+    train(changed, overwrite=True, progress=False)
+    assert ply_bytes(changed) != before
+
+
+def test_a_damaged_checkpoint_is_named(tmp_path):
+    path = str(tmp_path / "checkpoint.pt")
+    with pytest.raises(TrainerError, match="no such checkpoint"):
+        load_checkpoint(path, "cpu")
+    save_checkpoint(path, {"tensor": torch.ones(1000)})
+    with open(path, "r+b") as file:
+        file.truncate(os.path.getsize(path) // 2)
+    with pytest.raises(TrainerError, match="checkpoint.pt: not a readable checkpoint"):
+        load_checkpoint(path, "cpu")
+    torch.save({"format": -1}, path)
+    with pytest.raises(TrainerError, match="another version"):
+        load_checkpoint(path, "cpu")
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path):
+    path = str(tmp_path / "file")
+    files.write_text_atomically(path, "old")
+
+    def fails(file):
+        file.write(b"new, but not whole")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        files.write_atomically(path, fails)
+    with open(path, encoding="utf-8") as file:
+        assert file.read() == "old"
+
+
+def test_views_come_once_each_in_random_order():
+    order = ViewOrder(10, seed=0)
+    epochs = [[order.next() for _ in range(10)] for _ in range(5)]
+    assert all(sorted(epoch) == list(range(10)) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) == 5
+    twin = ViewOrder(10, seed=1)
+    order.next()
+    twin.load_state_dict(order.state_dict())
+    assert [order.next() for _ in range(25)] == [twin.next() for _ in range(25)]
+
+
+def test_training_lowers_the_loss(tiny_config, mode):
+    """The whole loop learns: a fixed set of Gaussians, the mean loss of the first and of a later pass over the views."""
+    config = dataclasses.replace(tiny_config, blend_mode=mode, densify_until_iter=0, iterations=200)
+    trainer = Trainer(config, load_scene(config, progress=False))
+    losses = [float(trainer.step().loss.detach()) for _ in range(20 * 7)]
+    assert sum(losses[-7:]) < 0.9 * sum(losses[:7]), losses

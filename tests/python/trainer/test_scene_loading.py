@@ -1,0 +1,327 @@
+"""Scene folders, good and damaged: what is loaded, and which error names which file."""
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.trainer.cameras import Camera
+from diff_smoe_rasterization.trainer.config import TrainConfig
+from diff_smoe_rasterization.trainer.errors import SceneError
+from diff_smoe_rasterization.trainer.images import target_size
+from diff_smoe_rasterization.trainer.layout import PosedImage, hold_out
+from diff_smoe_rasterization.trainer.pointcloud import PointCloud
+from diff_smoe_rasterization.trainer.scene import load_cameras, load_scene
+
+
+def load(folder, **options):
+    return load_scene(TrainConfig(scene=str(folder), **options), progress=False)
+
+
+@pytest.fixture
+def colmap_folder(tiny_scene, tmp_path):
+    """A copy of the tiny scene that a test may damage."""
+    return shutil.copytree(tiny_scene, str(tmp_path / "scene"))
+
+
+@pytest.fixture
+def nerf_folder(tmp_path):
+    """Two 20x10 RGBA images: half transparent red with opaque green on the right."""
+    pixels = np.zeros((10, 20, 4), np.uint8)
+    pixels[:, :10] = [255, 0, 0, 51]
+    pixels[:, 10:] = [0, 255, 0, 255]
+    for split in ("train", "test"):
+        os.makedirs(tmp_path / split)
+        Image.fromarray(pixels).save(tmp_path / split / "r_0.png")
+        frames = [{"file_path": f"./{split}/r_0", "transform_matrix": np.eye(4).tolist()}]
+        (tmp_path / f"transforms_{split}.json").write_text(
+            json.dumps({"camera_angle_x": 2 * math.atan(0.5), "frames": frames}))
+    return tmp_path
+
+
+def edit_json(path, edit):
+    content = json.loads(path.read_text())
+    edit(content)
+    path.write_text(json.dumps(content))
+
+
+# What is loaded.
+
+def test_every_eighth_image_by_sorted_name_is_a_test_image():
+    names = [f"{number:02d}.png" for number in range(20)]
+    shuffled = [names[(7 * index) % 20] for index in range(20)]
+    camera = Camera("", np.eye(3), np.zeros(3), 1, 1, 1, 1, 2, 2)
+    images = [PosedImage(Camera(**{**camera.__dict__, "name": name}), name) for name in shuffled]
+    train, test = hold_out(images)
+    assert [image.camera.name for image in test] == ["00.png", "08.png", "16.png"]
+    assert [image.camera.name for image in train] == [name for name in names if name not in
+                                                      ("00.png", "08.png", "16.png")]
+
+
+@pytest.mark.parametrize("size, resolution, expected", [
+    ((4946, 3286), -1, (1600, 1063)),  # 3286 / 3.09125 = 1063.002
+    ((1600, 1000), -1, (1600, 1000)),
+    ((800, 533), -1, (800, 533)),
+    ((800, 533), 1, (800, 533)),
+    ((800, 533), 2, (400, 266)),  # 266.5 rounds to even
+    ((534, 946), 4, (134, 236)),  # 133.5 and 236.5 round to even
+    ((800, 533), 8, (100, 67)),  # 66.6 rounds up
+    ((800, 533), 400, (400, 266)),  # 266.5 truncates
+    ((800, 535), 300, (300, 200)),  # 200.6 truncates
+    ((800, 533), 1600, (1600, 1066)),  # a width may also enlarge
+    ((3, 3), 8, (1, 1)),
+])
+def test_resolution_rule_of_3dgs(size, resolution, expected):
+    assert target_size(*size, resolution) == expected
+
+
+def test_a_colmap_folder(tiny_scene):
+    scene = load(tiny_scene)
+    assert (scene.kind, len(scene.train), len(scene.test)) == ("colmap", 7, 2)
+    assert [view.camera.name for view in scene.test] == ["view_000.png", "view_008.png"]
+    view = scene.train[2]
+    expected = np.asarray(Image.open(os.path.join(tiny_scene, "images", view.camera.name)))
+    np.testing.assert_array_equal(view.image.permute(1, 2, 0).numpy(), expected)
+    model = io.read_colmap(tiny_scene)
+    image = [image for image in model.images if image.name == view.camera.name][0]
+    w, x, y, z = image.qvec
+    # The rotation of a unit quaternion, its first column written out.
+    np.testing.assert_allclose(view.camera.rotation[:, 0],
+                               [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(view.camera.translation, image.tvec)
+    np.testing.assert_array_equal(scene.points.positions, model.points.positions)
+    np.testing.assert_allclose(scene.points.colors * 255, model.points.colors, rtol=0, atol=1e-9)
+
+
+def test_binary_and_text_models_load_alike(colmap_folder):
+    text = load(colmap_folder)
+    sparse = os.path.join(colmap_folder, "sparse", "0")
+    model = io.read_colmap(colmap_folder)
+    shutil.rmtree(sparse)
+    io.write_colmap(sparse, model)
+    assert sorted(os.listdir(sparse)) == ["cameras.bin", "images.bin", "points3D.bin"]
+    binary = load(colmap_folder)
+    for mine, theirs in zip(text.train, binary.train):
+        np.testing.assert_allclose(mine.camera.rotation, theirs.camera.rotation, rtol=0, atol=1e-12)
+        assert mine.camera.fx == theirs.camera.fx and mine.camera.name == theirs.camera.name
+    np.testing.assert_array_equal(text.points.positions, binary.points.positions)
+
+
+def test_intrinsics_follow_the_resolution_and_the_principal_point(colmap_folder):
+    model = io.read_colmap(colmap_folder)
+    model.cameras[1].params[:] = [30.0, 31.0, 17.5, 9.0]
+    io.write_colmap(model.folder, model, text=True)
+    camera = load(colmap_folder, resolution=2).train[0].camera
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (16, 12, 15.0, 15.5)
+    assert (camera.cx, camera.cy) == (8.75, 4.5)
+    camera = load(colmap_folder, resolution=2, principal_point="centre").train[0].camera
+    assert (camera.cx, camera.cy, camera.fx) == (8, 6, 15.0)
+
+
+def test_simple_pinhole(colmap_folder):
+    model = io.read_colmap(colmap_folder)
+    model.cameras[1] = io.ColmapCamera(1, "SIMPLE_PINHOLE", 32, 24, np.array([30.0, 15.0, 11.0]))
+    io.write_colmap(model.folder, model, text=True)
+    camera = load(colmap_folder).train[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 30, 15, 11)
+
+
+def test_images_smaller_than_their_camera(colmap_folder):
+    """As images_4 beside a model of full-size images: intrinsics follow the file."""
+    half = os.path.join(colmap_folder, "images_2")
+    os.makedirs(half)
+    for name in os.listdir(os.path.join(colmap_folder, "images")):
+        Image.open(os.path.join(colmap_folder, "images", name)).resize((16, 12)).save(os.path.join(half, name))
+    full, small = load(colmap_folder).train[0].camera, load(colmap_folder, images="images_2").train[0].camera
+    assert (small.width, small.fx, small.cy) == (16, full.fx / 2, full.cy / 2)
+
+
+def test_load_cameras_agrees_with_the_loaded_views(tiny_scene):
+    config = TrainConfig(scene=tiny_scene, resolution=2)
+    scene = load_scene(config, progress=False)
+    for split, views in (("train", scene.train), ("test", scene.test), ("all", scene.train + scene.test)):
+        assert [camera.name for camera in load_cameras(config, split)] == [view.camera.name for view in views]
+        assert load_cameras(config, split)[0].fx == views[0].camera.fx
+
+
+def test_init_points_are_a_reproducible_subset(tiny_scene):
+    everything = load(tiny_scene).points.positions
+    few, again, other = (load(tiny_scene, init_points=20, seed=seed).points.positions for seed in (1, 1, 2))
+    assert len(few) == 20 and {tuple(row) for row in few} <= {tuple(row) for row in everything}
+    np.testing.assert_array_equal(few, again)
+    assert not np.array_equal(few, other)
+    assert len(load(tiny_scene, init_points=10**6).points.positions) == len(everything)
+
+
+def test_nerf_images_are_composited(nerf_folder):
+    black = load(nerf_folder).train[0].image.numpy()
+    white = load(nerf_folder, white_background=True).train[0].image.numpy()
+    # Alpha 51 / 255 = 0.2 of red over black and over white.
+    assert black[:, 0, 0].tolist() == [51, 0, 0] and white[:, 0, 0].tolist() == [255, 204, 204]
+    assert black[:, 0, 19].tolist() == white[:, 0, 19].tolist() == [0, 255, 0]
+
+
+def test_nerf_cameras_look_along_minus_z_with_y_up(nerf_folder):
+    camera = load(nerf_folder).train[0].camera
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (20, 10, 10, 5)
+    # The field of view has tangent 0.5 at the half width.
+    assert camera.fx == camera.fy == pytest.approx(20)
+    view = camera.rotation @ [0.1, 0.2, -1.0] + camera.translation
+    np.testing.assert_allclose(view, [0.1, -0.2, 1.0], rtol=0, atol=1e-12)
+
+
+def test_nerf_random_points(nerf_folder):
+    points = load(nerf_folder).points
+    assert points.positions.shape == (100_000, 3)
+    assert np.abs(points.positions).max() <= 1.3
+    # Uniform: each mean within five standard errors, 1.3 / sqrt(3) / sqrt(100,000), of 0.
+    np.testing.assert_allclose(points.positions.mean(axis=0), 0, rtol=0, atol=5 * 1.3 / 3**0.5 / 100_000**0.5)
+    assert len(load(nerf_folder, init_points=50).points.positions) == 50
+
+
+def test_nerf_points_from_a_file(nerf_folder):
+    positions = np.arange(15.0).reshape(5, 3)
+    io.write_points(str(nerf_folder / "points3d.ply"), io.Points(positions, np.full((5, 3), 51, np.uint8)))
+    points = load(nerf_folder).points
+    np.testing.assert_array_equal(points.positions, positions)
+    np.testing.assert_allclose(points.colors, 0.2, rtol=0, atol=1e-12)
+
+
+def test_nerf_explicit_intrinsics(nerf_folder):
+    def edit(content):
+        del content["camera_angle_x"]
+        content.update(fl_x=50.0, fl_y=51.0, cx=19.0, cy=11.0, w=40, h=20)
+
+    edit_json(nerf_folder / "transforms_train.json", edit)
+    camera = load(nerf_folder).train[0].camera  # the image is half as large as the json's size
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (25, 25.5, 9.5, 5.5)
+
+
+def test_nerf_without_a_test_set(nerf_folder):
+    (nerf_folder / "transforms_test.json").unlink()
+    assert len(load(nerf_folder).test) == 0
+
+
+# What is refused.
+
+def refused(folder, *words, **options):
+    """Loading raises a SceneError that has all these words."""
+    with pytest.raises(SceneError) as error:
+        load(folder, **options)
+    for word in words:
+        assert word in str(error.value), str(error.value)
+
+
+def test_no_folder_and_no_scene(tmp_path):
+    refused(tmp_path / "nowhere", "nowhere", "no such folder")
+    refused(tmp_path, str(tmp_path), "COLMAP", "transforms_train.json")
+
+
+def test_a_missing_image(colmap_folder):
+    os.remove(os.path.join(colmap_folder, "images", "view_003.png"))
+    refused(colmap_folder, "view_003.png", "1 of 9 images are missing")
+
+
+def test_a_missing_image_folder(colmap_folder):
+    refused(colmap_folder, "images_4", "no such folder", images="images_4")
+
+
+def test_an_unreadable_image(colmap_folder):
+    path = os.path.join(colmap_folder, "images", "view_004.png")
+    with open(path, "r+b") as file:
+        file.truncate(60)
+    refused(colmap_folder, "view_004.png", "not a readable image")
+
+
+def test_an_image_of_another_shape(colmap_folder):
+    Image.new("RGB", (24, 32)).save(os.path.join(colmap_folder, "images", "view_004.png"))
+    refused(colmap_folder, "view_004.png", "24x32", "32x24")
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_truncated_binary_file(colmap_folder, name):
+    model = io.read_colmap(colmap_folder)
+    shutil.rmtree(model.folder)
+    io.write_colmap(model.folder, model)
+    path = os.path.join(model.folder, name + ".bin")
+    with open(path, "r+b") as file:
+        file.truncate(os.path.getsize(path) - 5)
+    refused(colmap_folder, name + ".bin")
+
+
+def test_a_missing_model_file(colmap_folder):
+    os.remove(os.path.join(colmap_folder, "sparse", "0", "images.txt"))
+    refused(colmap_folder, "images.txt")
+
+
+def test_an_empty_model(colmap_folder):
+    model = io.read_colmap(colmap_folder)
+    open(os.path.join(model.folder, "points3D.txt"), "w").close()
+    refused(colmap_folder, model.folder, "0 points", "at least 4")
+
+
+def test_a_model_with_one_image(colmap_folder):
+    model = io.read_colmap(colmap_folder)
+    io.write_colmap(model.folder, io.ColmapModel(model.cameras, model.images[:1], model.points), text=True)
+    refused(colmap_folder, "no training image is left")
+
+
+def test_a_camera_with_distortion(colmap_folder):
+    model = io.read_colmap(colmap_folder)
+    model.cameras[1] = io.ColmapCamera(1, "OPENCV", 32, 24, np.array([30.0, 30, 16, 12, 0.1, 0, 0, 0]))
+    io.write_colmap(model.folder, model, text=True)
+    refused(colmap_folder, "camera 1", "OPENCV", "PINHOLE", "colmap image_undistorter")
+
+
+def test_a_focal_length_of_zero(colmap_folder):
+    model = io.read_colmap(colmap_folder)
+    model.cameras[1].params[1] = 0.0
+    io.write_colmap(model.folder, model, text=True)
+    refused(colmap_folder, "cameras.txt", "camera 1", "focal length")
+
+
+def test_points_that_are_not_finite():
+    positions = np.zeros((5, 3))
+    positions[3, 1] = math.nan
+    with pytest.raises(SceneError, match="cloud.ply: point 3 .*NaN"):
+        PointCloud(positions, np.zeros((5, 3))).checked("cloud.ply")
+
+
+def without(key):
+    return lambda content: content.pop(key)
+
+
+def frame(**values):
+    return lambda content: content["frames"][0].update(values)
+
+
+@pytest.mark.parametrize("edit, words", [
+    (without("frames"), ["list `frames`"]),
+    (lambda content: content["frames"].clear(), ["`frames` is empty"]),
+    (without("camera_angle_x"), ["camera_angle_x", "None"]),
+    (lambda content: content.update(camera_angle_x="wide"), ["camera_angle_x", "wide"]),
+    (lambda content: content.update(camera_angle_x=4.0), ["camera_angle_x", "4.0"]),
+    (lambda content: content.update(k1=0.1), ["k1", "undistort"]),
+    (lambda content: content.update(cx="middle"), ["cx", "middle"]),
+    (frame(file_path=None), ["frame 0", "file_path"]),
+    (frame(file_path="./train/r_9"), ["r_9.png", "no such image"]),
+    (frame(transform_matrix=[[1, 2], [3, 4]]), ["frame 0", "transform_matrix"]),
+    (frame(transform_matrix=[[1, 0, 0, 0]] * 3 + [[0, 0, 0, "x"]]), ["frame 0", "transform_matrix"]),
+    (frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), ["frame 0", "rotation"]),
+])
+def test_a_wrong_json(nerf_folder, edit, words):
+    edit_json(nerf_folder / "transforms_train.json", edit)
+    refused(nerf_folder, *words)
+
+
+def test_what_is_no_json(nerf_folder):
+    (nerf_folder / "transforms_test.json").write_text('{"frames": [')
+    refused(nerf_folder, "transforms_test.json", "not valid json")
+    (nerf_folder / "transforms_test.json").write_text("[1, 2]")
+    refused(nerf_folder, "transforms_test.json", "frames")
