@@ -305,7 +305,7 @@ def pair_counts(splats, x, y, settings, mode):
     opacity = splats.opacity[:, None]
     power = _power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y)
     kernel = torch.exp(power)
-    alpha = (opacity * kernel).clamp(max=ALPHA_MAX)
+    alpha = opacity * kernel
     counts = (opacity > 0) & (power <= 0)
     if mode != "alpha":
         return counts & (kernel >= KERNEL_MIN) & (alpha >= _float32(settings.alpha_min))

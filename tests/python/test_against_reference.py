@@ -172,12 +172,13 @@ def test_each_optional_output_has_its_own_gradient(mode):
     for output in OUTPUTS:
         results = []
         for function in (diff_smoe_rasterization.rasterize, reference.rasterize):
-            leaf = scene.requiring_grad(camera=False)
-            image = getattr(function(settings=leaf.settings, outputs=(output,), **leaf.inputs), output)
-            weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-            values = torch.autograd.grad(image, list(leaf.inputs.values()), weights, allow_unused=True)
-            results.append({name: torch.zeros_like(leaf.inputs[name]) if value is None else value
-                            for name, value in zip(leaf.inputs, values)})
+            leaves = scene.requiring_grad(camera=False)
+            with one_thread():
+                image = getattr(function(settings=leaves.settings, outputs=(output,), **leaves.inputs), output)
+                weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+                values = torch.autograd.grad(image, list(leaves.inputs.values()), weights, allow_unused=True)
+            results.append({name: torch.zeros_like(leaf) if value is None else value
+                            for (name, leaf), value in zip(leaves.inputs.items(), values)})
         assert results[1]["means3D"].any()
         assert_all_close(results[0], results[1], FLOAT64_TOLERANCE)
 

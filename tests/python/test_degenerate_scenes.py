@@ -262,11 +262,11 @@ def test_without_a_gate_the_background_takes_pixel_and_gradient():
 def test_an_object_in_front_hides_what_is_behind_it():
     """Alpha and smoe have transmittance; the ablations without it ghost (Figure 8)."""
     near = one_gaussian("alpha", (0.0, 0.0, 1.0), opacity=0.99)
-    two = near.with_inputs(**{name: tensor.repeat(4, *[1] * (tensor.dim() - 1)) for name, tensor in near.inputs.items()})
-    means3D, colors = two.inputs["means3D"].clone(), two.inputs["colors_precomp"].clone()
+    four = near.rows([0, 0, 0, 0])
+    means3D, colors = four.inputs["means3D"].clone(), four.inputs["colors_precomp"].clone()
     means3D[:, 2] = torch.tensor([1.0, 1.1, 1.2, 3.0])
     colors[3] = torch.tensor([0.0, 1.0, 0.0])
-    two = two.with_inputs(means3D=means3D, colors_precomp=colors)
-    green = {mode: render(two.with_settings(blend_mode=mode)).color[1, 10, 16].item() for mode in (
+    four = four.with_inputs(means3D=means3D, colors_precomp=colors)
+    green = {mode: render(four.with_settings(blend_mode=mode)).color[1, 10, 16].item() for mode in (
         "alpha", "smoe", "smoe_tn", "smoe_std")}
     assert green["alpha"] < 0.01 and green["smoe"] < 0.01 and green["smoe_std"] > 0.1

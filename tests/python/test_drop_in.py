@@ -191,7 +191,8 @@ def test_an_unknown_blend_mode_names_the_four(scene, monkeypatch, from_environme
 
 
 def test_the_four_modes_differ(scene):
-    images = [rasterize(settings=scene.settings._replace(blend_mode=mode), **scene.inputs).color for mode in BLEND_MODES]
+    images = [rasterize(settings=scene.settings._replace(blend_mode=mode), **scene.inputs).color
+              for mode in BLEND_MODES]
     for index, image in enumerate(images):
         for other in images[index + 1:]:
             assert (image - other).abs().max() > 0.01

@@ -21,6 +21,10 @@ ATTRIBUTES = [
 ]
 
 
+def identifier(part):
+    return part if isinstance(part, str) else "-".join(part)
+
+
 def scene_and_visible(mode, **options):
     scene = random_scene(mode, COUNT, 33, 21, degree=1, dtype=torch.float32, **options)
     visible = (rasterize(settings=scene.settings, **scene.inputs).radii > 0).nonzero()[:, 0].tolist()
@@ -35,7 +39,7 @@ def broken(scene, name, index, value, column=-1):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name, options", ATTRIBUTES, ids=lambda part: part if isinstance(part, str) else "-".join(part))
+@pytest.mark.parametrize("name, options", ATTRIBUTES, ids=identifier)
 def test_a_gaussian_that_is_not_finite_is_culled(mode, name, options, value):
     scene, visible = scene_and_visible(mode, **options)
     index = visible[4]
@@ -70,7 +74,7 @@ def test_a_coefficient_above_the_active_degree_counts_as_an_attribute(mode):
     assert rasterize(settings=scene.settings, **scene.inputs).radii[visible[2]] == 0
 
 
-@pytest.mark.parametrize("name, options", ATTRIBUTES, ids=lambda part: part if isinstance(part, str) else "-".join(part))
+@pytest.mark.parametrize("name, options", ATTRIBUTES, ids=identifier)
 def test_strict_names_argument_and_index(mode, name, options):
     scene, visible = scene_and_visible(mode, **options)
     scene = broken(scene.with_settings(strict=True), name, visible[4], math.nan)

@@ -1,12 +1,14 @@
-"""The reference rasterizer against finite differences and against pixels computed by hand."""
+"""The reference rasterizer against finite differences and against pixels computed by hand; test_reference_rules.py
+has its single rules."""
 from __future__ import annotations
 
 import math
 
 import pytest
 import torch
+from by_hand import facing_camera, middle, on_axis
 from comparison import assert_all_close, assert_close, one_thread, threshold_margin
-from scenes import CAMERA_FIELDS, assert_not_empty, camera_settings, gradients, random_scene, random_weights
+from scenes import CAMERA_FIELDS, assert_not_empty, gradients, random_scene, random_weights
 
 from diff_smoe_rasterization import reference
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -17,29 +19,6 @@ ALPHA_MAX = float(torch.tensor(0.99))  # the float32 value, as in every scalar t
 
 def render(scene, outputs=()):
     return reference.rasterize(settings=scene.settings, outputs=outputs, **scene.inputs)
-
-
-def facing_camera(mode, width=11, height=7, bg=(0.1, 0.2, 0.3), **fields):
-    """A camera in the origin that looks along z; tan(fov / 2) = 1, so that focal lengths are half the image size."""
-    identity = torch.eye(4, dtype=torch.float64)
-    projection = torch.zeros(4, 4, dtype=torch.float64)
-    projection[0, 0] = projection[1, 1] = projection[2, 2] = projection[2, 3] = 1
-    settings = camera_settings(width, height, bg=torch.tensor(bg, dtype=torch.float64), blend_mode=mode, **fields)
-    return settings._replace(tanfovx=1.0, tanfovy=1.0, viewmatrix=identity, projmatrix=projection,
-                             campos=torch.zeros(3, dtype=torch.float64))
-
-
-def on_axis(depths, opacities, colors, variance=0.04):
-    """Isotropic Gaussians on the optical axis: they project to the middle of the image."""
-    count = len(depths)
-    covariance = variance * torch.tensor([1, 0, 0, 1, 0, 1], dtype=torch.float64)
-    return dict(means3D=torch.tensor([[0, 0, depth] for depth in depths], dtype=torch.float64),
-                opacities=torch.tensor(opacities, dtype=torch.float64)[:, None],
-                colors_precomp=torch.tensor(colors, dtype=torch.float64), cov3D_precomp=covariance.repeat(count, 1))
-
-
-def middle(rendering_image):
-    return rendering_image[:, rendering_image.shape[1] // 2, rendering_image.shape[2] // 2].tolist()
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -83,15 +62,6 @@ def test_one_gaussian_by_hand(mode):
         weight = alpha if mode == "alpha" else 1
         assert image.inverse_depth[0, 5, 5 - distance].item() == pytest.approx(weight / depth, rel=EXACT)
     assert image.radii.tolist() == [math.ceil(3 * math.sqrt(variance2D + math.sqrt(0.1)))]
-
-
-def test_a_pixel_beyond_the_cut_off_shows_the_background(mode):
-    settings = facing_camera(mode, 41, 41)
-    image = reference.rasterize(settings=settings, **on_axis([2.0], [0.6], [[1.0, 1.0, 1.0]], variance=0.01)).color
-    sigma = math.sqrt(0.01 * (41 / 4) ** 2 + 0.3)
-    reach = sigma * math.sqrt(2 * math.log(0.6 * 255 if mode == "alpha" else 1e5))
-    row = (image[0, 20, 20:] - 0.1).abs() > 1e-9
-    assert row.tolist() == [distance <= reach for distance in range(21)]
 
 
 def test_two_gaussians_by_hand(mode):
@@ -247,65 +217,6 @@ def test_split_and_joint_spherical_harmonics_agree(mode):
     assert torch.equal(image.color, split_image.color)
     split_gradient["shs"] = torch.cat([split_gradient.pop("dc"), split_gradient["shs"]], 1)
     assert_all_close(split_gradient, gradient, EXACT)
-
-
-def test_spherical_harmonics_are_orthonormal():
-    # Gauss-Legendre in z and the trapezoid rule in longitude integrate products of degree 6 exactly.
-    longitude = torch.arange(16, dtype=torch.float64) * 2 * math.pi / 16
-    eigenvalues = torch.linalg.eigh(torch.diag(torch.tensor(
-        [n / math.sqrt(4 * n * n - 1) for n in range(1, 8)], dtype=torch.float64), 1) + torch.diag(torch.tensor(
-            [n / math.sqrt(4 * n * n - 1) for n in range(1, 8)], dtype=torch.float64), -1))
-    z, weight = eigenvalues[0], 2 * eigenvalues[1][0] ** 2
-    ring = torch.sqrt(1 - z * z)
-    directions = torch.stack([ring[:, None] * torch.cos(longitude), ring[:, None] * torch.sin(longitude),
-                              z[:, None].expand(-1, 16)], -1).reshape(-1, 3)
-    weights = (weight[:, None] * 2 * math.pi / 16).expand(-1, 16).reshape(-1)
-    basis = reference.sh_basis(3, 2.5 * directions)
-    products = basis.T @ (weights[:, None] * basis)
-    assert (products - torch.eye(16, dtype=torch.float64)).abs().max() < EXACT
-
-
-def test_spherical_harmonics_have_the_signs_of_3dgs():
-    signs = {(1.0, 0.0, 0.0): {3: -1, 8: 1, 15: -1}, (0.0, 1.0, 0.0): {1: -1, 8: -1, 9: 1}, (0.0, 0.0, 1.0): {
-        2: 1, 6: 1, 12: 1}, (1.0, 1.0, 1.0): {4: 1, 5: -1, 7: -1, 10: 1, 11: -1, 13: -1}, (1.0, 0.0, 1.0): {14: 1}}
-    for direction, expected in signs.items():
-        basis = reference.sh_basis(3, torch.tensor([direction], dtype=torch.float64))[0]
-        assert {index: int(torch.sign(basis[index])) for index in expected} == expected
-
-
-def test_a_quaternion_turns_the_axes():
-    half = math.sqrt(0.5)
-    inputs = dict(rotations=torch.tensor([[half, 0, 0, half]], dtype=torch.float64),
-                  scales=torch.tensor([[1, 2, 3]], dtype=torch.float64))
-    gaussian = reference.Gaussians(None, None, None, None, None, cov3D_precomp=None, **inputs)
-    quarter_turn_about_z = torch.diag(torch.tensor([4, 1, 9], dtype=torch.float64)) * 0.25
-    assert_close(reference.covariance3D(gaussian, 0.5)[0], quarter_turn_about_z, EXACT, "covariance")
-
-
-def test_the_truncation_of_3dgs_equals_the_floor_on_the_grid():
-    settings = facing_camera("alpha", 50, 37)
-    for radius_squared in (0.3, 4.0, 90.0):
-        reach = math.ceil(3 * math.sqrt(radius_squared + math.sqrt(0.1)))
-        for step in range(-400, 800):
-            x = step / 8 + 0.003
-            splat = reference.Splats(torch.tensor([[x, 11.0]]), None, torch.tensor([[radius_squared, 0, radius_squared]]),
-                                     None, None, None)
-            first, past = reference.tile_rectangle(splat, settings)
-            assert first[0, 0].item() == min(4, max(0, int((x - reach) / 16)))
-            assert past[0, 0].item() == min(4, max(0, int((x + reach + 15) / 16)))
-
-
-def test_antialiasing_keeps_the_weight_of_a_splat_smaller_than_a_pixel():
-    inputs = on_axis([2.0], [0.5], [[1.0]], variance=1e-3)
-    settings = facing_camera("alpha", bg=(0.0,), antialiasing=True)
-    variance = 1e-3 * torch.tensor([(11 / 4) ** 2, (7 / 4) ** 2])
-    expected = 0.5 * math.sqrt(torch.prod(variance / (variance + 0.3)).item())
-    # 1e-6: the expectation is computed in float32.
-    assert middle(reference.rasterize(settings=settings, **inputs).color) == pytest.approx([expected], rel=1e-6)
-    vanishing = on_axis([2.0], [0.9], [[1.0]], variance=1e-9)
-    smallest = 0.9 * math.sqrt(float(torch.tensor(2.5e-5)))
-    image = reference.rasterize(settings=settings, outputs=("alpha",), **vanishing)
-    assert middle(image.alpha) == pytest.approx([smallest], rel=EXACT)
 
 
 def test_the_jacobian_clamp_has_an_exact_gradient(mode):
