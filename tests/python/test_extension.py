@@ -125,9 +125,9 @@ def test_opcheck_of_rasterize_backward(mode):
     torch.library.opcheck(torch.ops.diff_smoe_rasterization.rasterize_backward.default, tuple(backward_arguments(mode)))
 
 
-@pytest.mark.parametrize("result, name", enumerate(["color", "radii", "gate_sum", "depth", "inverse_depth", "projected",
-                                                    "features", "instance_offsets", "tile_offsets", "instances",
-                                                    "final_transmittance", "last_contributor"]))
+@pytest.mark.parametrize("result, name", list(enumerate([
+    "color", "radii", "gate_sum", "depth", "inverse_depth", "projected", "features", "instance_offsets", "tile_offsets",
+    "instances", "final_transmittance", "last_contributor"])))
 def test_the_backward_op_refuses_results_that_were_cut(result, name):
     arguments = backward_arguments("smoe")
     arguments[6][result] = arguments[6][result][:-1]
@@ -148,6 +148,18 @@ def test_the_backward_op_refuses_lists_of_the_wrong_length():
         arguments[position] = arguments[position][:-1]
         with pytest.raises(ValueError, match=f"rasterize_backward: {name} has length"):
             torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+
+
+@pytest.mark.parametrize("row, name", [(0, "means3D"), (1, "opacities"), (-4, "bg"), (-3, "viewmatrix"), (-1, "campos")])
+def test_the_backward_op_refuses_absent_inputs(row, name):
+    arguments = backward_arguments("smoe")
+    inputs, present = list(arguments[4]), list(arguments[5])
+    given = [i for i, here in enumerate(present) if here and i != 1]  # without means2D, which may be absent
+    del inputs[1]
+    present[1] = present[given[row]] = False
+    del inputs[row]
+    with pytest.raises(ValueError, match=f"rasterize_backward: {name} is absent"):
+        torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments[:4], inputs, present, *arguments[6:])
 
 
 def test_the_backward_op_refuses_gradients_of_absent_inputs():

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <algorithm>
+#include <string>
 #include <tuple>
 #include <vector>
 
@@ -30,19 +31,11 @@ auto rasterize(const at::Tensor& means3D, const OptionalTensor& means2D, const a
                double scale_modifier, double near, double alpha_min, int64_t sh_degree, int64_t blend_mode,
                bool antialiasing, bool depth, bool inverse_depth, bool debug, bool strict, bool prefiltered) {
   const auto given = [](const OptionalTensor& tensor) { return tensor.has_value() ? *tensor : at::Tensor(); };
-  const Inputs inputs = {means3D,
-                         given(means2D),
-                         opacities,
-                         given(dc),
-                         given(shs),
-                         given(colors_precomp),
-                         given(scales),
-                         given(rotations),
-                         given(cov3D_precomp),
-                         bg,
-                         viewmatrix,
-                         projmatrix,
-                         campos};
+  // clang-format off
+  const Inputs inputs = {
+      means3D, given(means2D), opacities, given(dc), given(shs), given(colors_precomp), given(scales),
+      given(rotations), given(cov3D_precomp), bg, viewmatrix, projmatrix, campos};
+  // clang-format on
   const Options options = {image_height, image_width, tanfovx,      tanfovy, scale_modifier, near, alpha_min,
                            sh_degree,    blend_mode,  antialiasing, depth,   inverse_depth,  debug};
   check_arguments(inputs, options);
@@ -75,7 +68,9 @@ std::vector<at::Tensor> rasterize_backward(const OptionalTensor& dL_dcolor, cons
   };
   check_length("inputs", present_inputs.size(), std::count(present.begin(), present.end(), true));
   check_length("outputs", output_list.size(), kNumOutputs);
-  TORCH_CHECK_VALUE(present[kMeans3D], "rasterize_backward: means3D is absent; it must be given");
+  for (Input i : {kMeans3D, kOpacities, kBackground, kViewMatrix, kProjMatrix, kCampos}) {
+    TORCH_CHECK_VALUE(present[i], "rasterize_backward: ", kInputNames[i], " is absent; it must be given");
+  }
   Inputs inputs;
   auto next = present_inputs.begin();
   for (int i = 0; i < kNumInputs; ++i) {

@@ -3,11 +3,10 @@
 #pragma once
 
 #include <ATen/ATen.h>
-#include <torch/version.h>
+#include <c10/util/Optional.h>
 
 #include <algorithm>
 #include <array>
-#include <optional>
 #include <vector>
 
 #include "dsmoe/rasterize.h"
@@ -15,11 +14,7 @@
 namespace dsmoe {
 namespace binding {
 
-#if TORCH_VERSION_MAJOR >= 2
-using OptionalTensor = std::optional<at::Tensor>;
-#else
-using OptionalTensor = c10::optional<at::Tensor>;
-#endif
+using OptionalTensor = c10::optional<at::Tensor>;  // std::optional in newer torch
 
 // The tensors that a rendering depends on, in the order of the ops' arguments. N Gaussians, C channels.
 enum Input : int {
