@@ -56,7 +56,8 @@ def describe() -> str:
         lines["backends"] = "cpu, cuda" if info.get("cuda_built") else f"cpu; {without}"
         lines["SIMD level"] = info.get("simd_level", "unknown")
         lines["threads"] = info.get("num_threads", torch.get_num_threads())
-        lines["compiled by"] = f"{info.get('compiler', 'unknown')}, with torch {info.get('torch_built_with', 'unknown')}"
+        lines["compiler"] = info.get("compiler", "unknown")
+        lines["built with torch"] = info.get("torch_built_with", "unknown")
     gpus = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
     lines["GPU"] = ", ".join(gpus) if gpus else "none that torch can use"
     return "\n".join(f"{name:<26}{text}" for name, text in lines.items())

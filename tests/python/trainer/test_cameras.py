@@ -21,7 +21,7 @@ def camera():
 def colmap_pixels(camera, points):
     """COLMAP's PINHOLE model: pixel coordinates with the first pixel's centre at 0.5."""
     view = points @ camera.rotation.T + camera.translation
-    return np.stack([camera.fx * view[:, 0] / view[:, 2] + camera.cx, camera.fy * view[:, 1] / view[:, 2] + camera.cy], 1)
+    return view[:, :2] / view[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
 def world_points(camera, random, count=50):

@@ -129,6 +129,15 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
         load_checkpoint(path, "cpu")
 
 
+def test_a_checkpoint_returns_what_it_was_given(tmp_path):
+    path = str(tmp_path / "checkpoint.pt")
+    state = {"a": {"b": [1, 0.1, None, torch.arange(3)], "c": "text"}, "d": torch.ones(2, dtype=torch.uint8)}
+    save_checkpoint(path, state)
+    loaded = load_checkpoint(path, "cpu")
+    assert loaded["a"]["b"][:3] == [1, 0.1, None] and loaded["a"]["c"] == "text"
+    assert torch.equal(loaded["a"]["b"][3], torch.arange(3)) and torch.equal(loaded["d"], state["d"])
+
+
 def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     path = str(tmp_path / "file")
     files.write_text_atomically(path, "old")
@@ -155,7 +164,7 @@ def test_views_come_once_each_in_random_order():
 
 
 def test_training_lowers_the_loss(tiny_config, mode):
-    """The whole loop learns: a fixed set of Gaussians, the mean loss of the first and of a later pass over the views."""
+    """The whole loop learns: a fixed set of Gaussians, the loss of the first and of a later pass over the views."""
     config = dataclasses.replace(tiny_config, blend_mode=mode, densify_until_iter=0, iterations=200)
     trainer = Trainer(config, load_scene(config, progress=False))
     losses = [float(trainer.step().loss.detach()) for _ in range(20 * 7)]
