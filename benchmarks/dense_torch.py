@@ -1,4 +1,4 @@
-"""The rasterizer as a torch user would write it: one dense [pixels, Gaussians] evaluation a tile, gradients by autograd.
+"""The rasterizer as a torch user would write it: a dense [pixels, Gaussians] evaluation a tile, gradients by autograd.
 
 A baseline for benchmarks only. It does the same work as the library, as well as plain torch allows: projection and
 depth order once, a list of exact bounding boxes for every 16x16 tile, separable terms evaluated on rows and columns
@@ -124,7 +124,8 @@ def blend_tile(rows, x, y, settings, mode):
     kernel = torch.exp(power)
     raw = opacity * kernel
     with torch.no_grad():
-        skipped = (raw < reference.ALPHA_MIN if mode == "alpha" else kernel < reference.KERNEL_MIN).logical_or_(power > 0)
+        skipped = raw < reference.ALPHA_MIN if mode == "alpha" else kernel < reference.KERNEL_MIN
+        skipped |= power > 0
         if mode != "alpha" and settings.alpha_min > 0:
             skipped |= raw < settings.alpha_min
     alpha = reference._PassThroughClamp.apply(raw.masked_fill(skipped, 0))
