@@ -18,7 +18,7 @@ from diff_smoe_rasterization import _C, reference
 from diff_smoe_rasterization.settings import OUTPUTS
 
 # A gradient is a sum of some thousand terms that cancel in part, each with some hundred roundings of 1e-16.
-FLOAT64_TOLERANCE = 1e-9
+FLOAT64_TOLERANCE = 1e-12
 # The same with roundings of 6e-8.
 FLOAT32_IMAGE_TOLERANCE = 1e-5
 FLOAT32_GRADIENT_TOLERANCE = 1e-4
