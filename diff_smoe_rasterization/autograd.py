@@ -1,8 +1,8 @@
 """Gradients of the op `rasterize`, and what torch.compile must know of the ops.
 
 One formula, `_keep` and `_backward`, stands behind the op in two ways: registered with torch (2.4 and later), so that
-torch.compile sees through it, and in an autograd.Function, which costs less a call, for all that is not compiled. Compiled code takes any number
-of Gaussians and any image size; a new field of view or another float of the settings may be compiled anew.
+torch.compile sees through it, and in an autograd.Function, which costs less a call, for all that is not compiled.
+Compiled code takes any number of Gaussians and any image size; another field of view may be compiled anew.
 """
 from __future__ import annotations
 
