@@ -89,10 +89,8 @@ Vector color_gradient(int degree, const Vector& x, const Vector& dL_dcolor) {
   const auto mean =
       sh_color_backward<double>(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]), color_of(degree, x).data(),
                                 dL_dcolor.data(), {&out[kCoefficients], &out[kCoefficients + 3]});
-  for (int k = 0; k < 3; ++k) {
-    out[k] = (&mean.x)[k];
-    out[3 + k] = -out[k];
-  }
+  out[0] = mean.x, out[1] = mean.y, out[2] = mean.z;
+  for (int k = 0; k < 3; ++k) out[3 + k] = -out[k];
   return out;
 }
 
