@@ -50,7 +50,7 @@ void bin(int64_t num_gaussians, const Camera<S>& camera, const RasterConfig<S>& 
 
   // A counting sort by tile. Each thread owns a run of the depth order, and its own counters, so that the lists come
   // out in depth order whatever the number of threads.
-  const int num_runs = static_cast<int>(std::clamp<int64_t>(num_visible / 256, 1, config.num_threads));
+  const int num_runs = static_cast<int>(std::clamp<int64_t>(num_visible / 256, 1, std::max(1, config.num_threads)));
   std::vector<std::vector<int64_t>> cursors(num_runs, std::vector<int64_t>(tiles));
   auto for_each_instance = [&](int run, auto visit) {
     for (int64_t k = num_visible * run / num_runs; k < num_visible * (run + 1) / num_runs; ++k) {

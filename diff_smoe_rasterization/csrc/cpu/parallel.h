@@ -11,8 +11,10 @@
 namespace dsmoe {
 namespace cpu {
 
-// Runs worker(0) ... worker(num_threads - 1) at once, the last on the calling thread; rethrows the first exception.
+// Runs worker(0) ... worker(num_threads - 1), at least worker(0), at once, the last on the calling thread; rethrows the
+// first exception.
 template <class Worker> void run_threads(int num_threads, Worker worker) {
+  num_threads = std::max(1, num_threads);
   std::exception_ptr failure;
   std::atomic_flag failed = ATOMIC_FLAG_INIT;
   auto guarded = [&](int index) {

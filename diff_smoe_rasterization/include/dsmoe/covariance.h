@@ -134,6 +134,11 @@ template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& cov2d) {
   return out;
 }
 
+// Whether the filtered covariance is positive definite; a caller's own cov3D_precomp may be anything.
+template <class S> DSMOE_HD bool is_ellipse(const Conic<S>& conic) {
+  return conic.filtered.xx > S(0) && conic.determinant > S(0) && is_finite(conic.determinant);
+}
+
 // d(C^-1) = -C^-1 dC C^-1; g.xy is the derivative by the one stored off-diagonal number.
 template <class S> DSMOE_HD Sym2<S> make_conic_backward(const Conic<S>& conic, const Sym2<S>& g) {
   const auto& k = conic.inverse;

@@ -44,7 +44,8 @@ template <class Real> struct Gate {
 };
 
 template <BlendMode kMode, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S alpha_min) {
-  const Real kernel = exp(power);
+  // Above 0 the conic is no ellipse, and the pair does not count: it must not overflow either.
+  const Real kernel = exp(min(power, Real(S(0))));
   Gate<Real> gate;
   gate.logit = Real(opacity) * kernel;
   gate.alpha = min(gate.logit, Real(S(kAlphaMax)));

@@ -32,7 +32,7 @@ template <class S> struct RasterConfig {
   bool antialiasing = false;
   bool depth = false;  // the expected depth is asked for
   bool inverse_depth = false;
-  int num_threads = 1;  // CPU backend
+  int num_threads = 1;  // CPU backend; below 1 counts as 1
 
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
 };

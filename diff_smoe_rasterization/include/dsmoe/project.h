@@ -72,7 +72,7 @@ DSMOE_HD int32_t project_gaussian(const GaussianInputs<S>& in, const Camera<S>& 
   const Conic<S> conic = make_conic(cov2d);
   const Vec2<S> pixel = project_to_pixel(camera, mean);
   const S radius = screen_radius(conic);
-  if (!(conic.determinant > S(0)) || !is_finite(conic.determinant) || !is_finite(radius)) return 0;
+  if (!is_ellipse(conic) || !is_finite(radius)) return 0;
   if (!is_finite(pixel.x) || !is_finite(pixel.y)) return 0;
   const S widest_reach = squared_reach(config.mode, S(1), S(0));
   const bool seen = is_smoe(config.mode) ? meets_image(conic.inverse, pixel, widest_reach, camera.width, camera.height)
@@ -172,7 +172,8 @@ DSMOE_HD void project_gaussian_backward(const GaussianInputs<S>& in, const Camer
         sh_color_backward(in.sh_degree, mean, camera.position, sh_of(in, i), features, g.features, dL_dsh);
     dL_dmean = dL_dmean + from_color;
     if (dL_dcamera != nullptr) {
-      for (int k = 0; k < 3; ++k) dL_dcamera->position[k] -= (&from_color.x)[k];
+      S* position = dL_dcamera->position;
+      position[0] -= from_color.x, position[1] -= from_color.y, position[2] -= from_color.z;
     }
   }
   if (out.means3D != nullptr) store3(out.means3D + 3 * i, dL_dmean);
