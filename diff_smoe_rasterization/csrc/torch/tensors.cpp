@@ -39,11 +39,7 @@ Outputs allocate_outputs(const Inputs& inputs, const Options& options) {
   const auto specs = output_specs(inputs, options);
   Outputs outputs;
   for (int i = 0; i < kNumOutputs; ++i) {
-    if (i == kInstances) continue;
-    const auto tensor_options = inputs[kMeans3D].options().dtype(specs[i].type);
-    // Rows of culled Gaussians are never written, and what an op returns must be defined.
-    const bool written_whole = i != kProjected && i != kFeatures;
-    outputs[i] = written_whole ? at::empty(specs[i].shape, tensor_options) : at::zeros(specs[i].shape, tensor_options);
+    if (i != kInstances) outputs[i] = at::empty(specs[i].shape, inputs[kMeans3D].options().dtype(specs[i].type));
   }
   return outputs;
 }

@@ -106,7 +106,7 @@ struct OutputSpec {
 };
 std::array<OutputSpec, kNumOutputs> output_specs(const Inputs& inputs, const Options& options);
 
-// All outputs but the instances, whose number is not known yet.
+// All outputs but the instances, whose number is not known yet; nothing is filled.
 Outputs allocate_outputs(const Inputs& inputs, const Options& options);
 
 // A gradient for each input that wants one, nothing filled; the others stay undefined.
