@@ -19,6 +19,9 @@ def build_parser() -> argparse.ArgumentParser:
     train = commands.add_parser("train", help="train Gaussians on a scene",
                                 description="Trains Gaussians on a COLMAP or NeRF-synthetic scene.")
     add_arguments(train)
+    train.add_argument("--scale-recipe", action="store_true",
+                       help="squeeze the recipe into --iterations: its milestones (densification, resets, learning "
+                            "rate, SH degrees) keep their share of 30,000 steps, unless they are given")
     train.add_argument("--resume", action="store_true", help="continue the run in OUT from its last checkpoint")
     train.add_argument("--overwrite", action="store_true", help="replace a run that is in OUT")
     train.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -78,6 +81,8 @@ def _train(arguments: argparse.Namespace) -> None:
     from .trainer.results import results_table
 
     config = config_from_arguments(arguments)
+    if arguments.scale_recipe:
+        config = config.shortened()
     print(f"{config.scene} -> {config.output}: blend mode {config.blend_mode}, schedule {config.schedule}, "
           f"{config.iterations} iterations, seed {config.seed}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)

@@ -110,21 +110,19 @@ class TrainConfig:
         return dataclasses.replace(self, **options).validate()
 
     def shortened(self) -> "TrainConfig":
-        """The same recipe squeezed into `iterations` steps: every milestone keeps its share of 30,000.
+        """The same recipe squeezed into `iterations` steps: each milestone keeps its share of the 30,000 of 3DGS.
 
-        Only the densification interval stays, as far as at least ten densifications fit.
+        The densification interval stays, as far as ten densifications fit. What is not at its default is kept.
         """
-        share = self.iterations / 30_000
-        until = max(1, round(15_000 * share))
-        return dataclasses.replace(
-            self,
-            position_lr_max_steps=self.iterations,
-            sh_degree_interval=max(1, round(1000 * share)),
-            densify_from_iter=round(500 * share),
-            densify_until_iter=until,
-            densification_interval=max(1, min(100, until // 10)),
-            opacity_reset_interval=max(1, round(3000 * share)),
-        )
+        default = TrainConfig(blend_mode=self.blend_mode)
+        share = self.iterations / default.iterations
+        milestones = {name: max(1, round(getattr(default, name) * share)) for name in (
+            "position_lr_max_steps", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
+            "opacity_reset_interval")}
+        fitting = max(1, milestones["densify_until_iter"] // 10)
+        milestones["densification_interval"] = min(default.densification_interval, fitting)
+        return dataclasses.replace(self, **{name: value for name, value in milestones.items()
+                                            if getattr(self, name) == getattr(default, name)})
 
     def save(self, folder: str) -> None:
         """Writes OUT/config.json."""

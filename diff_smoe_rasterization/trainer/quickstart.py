@@ -5,6 +5,7 @@ python -m diff_smoe_rasterization.trainer.quickstart [SCENE] [--iterations N] [-
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import shutil
 import sys
@@ -14,6 +15,7 @@ import torch
 
 from .config import TrainConfig, add_arguments
 from .errors import TrainerError
+from .images import image_size
 from .inspection import open_renderer, to_image
 from .loop import train
 from .metrics import psnr, quantised
@@ -30,8 +32,8 @@ DEFAULT_OUTPUT = "quickstart_output"
 # A few thousand steps are too few to recover from an opacity reset, so neither kind of scene gets one. The threshold
 # is higher than that of full-size images: in NDC units, small images have larger gradients.
 SHORT_RUN = {"iterations": 2000, "schedule": "steady", "densify_grad_threshold": 0.001}
-# A real scene is also reduced to what two processor cores train in minutes.
-MAX_WIDTH = 320
+# Larger scenes are reduced to what two processor cores train in minutes.
+MAX_PIXELS = 70_000  # of an image
 MAX_POINTS = 30_000
 
 # Offered by `dsmoe train` and fixed here.
@@ -91,14 +93,15 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
 
 
 def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
-    """The given options, and for the others what a processor finishes in minutes; says what it chose.
+    """The given options, and for the others what a processor finishes in minutes; prints what it chose.
 
     The recipe's milestones keep their share of the iterations (`TrainConfig.shortened`).
     """
     chosen: Dict[str, Any] = dict(SHORT_RUN)
     layout = read_layout(TrainConfig(scene=folder))
-    if max(image.camera.width for image in layout.train) > MAX_WIDTH:
-        chosen["resolution"] = MAX_WIDTH
+    width, height = image_size(layout.train[0].path)
+    if width * height > MAX_PIXELS:
+        chosen["resolution"] = int(math.sqrt(MAX_PIXELS * width / height))
     if len(layout.points.positions) > MAX_POINTS:
         chosen["init_points"] = MAX_POINTS
     chosen = {name: value for name, value in chosen.items() if name not in given}
@@ -106,8 +109,7 @@ def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
         texts = (f"--{name.replace('_', '-')} {value}" for name, value in chosen.items())
         print(f"chosen for a run of some minutes: {' '.join(texts)}")
     base = TrainConfig(scene=folder, blend_mode=MODES[0], checkpoint_every=0)
-    short = base.changed(**{**chosen, **given}).shortened()
-    return short.changed(**given)
+    return base.changed(**{**chosen, **given}).shortened().changed(**given)
 
 
 def write_pictures(config: TrainConfig, scene: Scene, output: str) -> List[str]:

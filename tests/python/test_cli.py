@@ -182,6 +182,15 @@ def test_an_unfinished_run_cannot_be_evaluated(trained, tmp_path, capsys):
     assert "has not ended" in fails(capsys, "eval", run)
 
 
+def test_scale_recipe(scene, tmp_path):
+    output = str(tmp_path / "out")
+    assert main(["train", scene, "-o", output, "--iterations", "30", "--scale-recipe", "--densify-from-iter", "3",
+                 "--quiet"]) == 0
+    with open(os.path.join(output, "config.json"), encoding="utf-8") as file:
+        config = json.load(file)
+    assert (config["densify_until_iter"], config["opacity_reset_interval"], config["densify_from_iter"]) == (15, 3, 3)
+
+
 def test_info(capsys):
     assert main(["info"]) == 0
     text = capsys.readouterr().out

@@ -118,3 +118,5 @@ def test_shortened_keeps_the_shares_of_the_recipe():
     assert (short.position_lr_max_steps, short.sh_degree_interval, short.densification_interval) == (3000, 100, 100)
     assert TrainConfig(iterations=60).shortened().densification_interval == 3, "ten densifications in 30 steps"
     TrainConfig(iterations=1).shortened().validate()
+    given = TrainConfig(iterations=3000, densify_until_iter=2000, densify_grad_threshold=0.01).shortened()
+    assert (given.densify_until_iter, given.densify_grad_threshold, given.densify_from_iter) == (2000, 0.01, 50)

@@ -58,7 +58,7 @@ def test_given_options_win_over_chosen_ones(tiny_scene):
 
 
 def test_large_scenes_are_reduced_and_told(monkeypatch, tiny_scene, capsys):
-    monkeypatch.setattr(quickstart, "MAX_WIDTH", 16)
+    monkeypatch.setattr(quickstart, "MAX_PIXELS", 200)  # of 32x24: width 16.3
     monkeypatch.setattr(quickstart, "MAX_POINTS", 50)
     config = quickstart.choose_options(tiny_scene, {})
     assert (config.resolution, config.init_points) == (16, 50)
