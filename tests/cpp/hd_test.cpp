@@ -54,7 +54,7 @@ TEST(Clamp, StaysInTheIntervalAndTakesNanToItsLowerEnd) {
   EXPECT_EQ(clamp(-5.0, -1.0, 2.0), -1.0);
   EXPECT_EQ(clamp(0.5, -1.0, 2.0), 0.5);
   EXPECT_EQ(clamp(std::numeric_limits<double>::infinity(), -1.0, 2.0), 2.0);
-  // clamp_to_int relies on this: NaN must not reach a conversion to int.
+  // floor_to_int and ceil_to_int rely on this: NaN must not reach a conversion to int.
   EXPECT_EQ(clamp(std::numeric_limits<double>::quiet_NaN(), -1.0, 2.0), -1.0);
 }
 

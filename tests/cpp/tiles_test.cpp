@@ -208,9 +208,14 @@ template <class S> void expect_huge_numbers_are_clamped() {
     EXPECT_EQ(all.x1, grid.columns);
     EXPECT_EQ(all.y1, grid.rows);
   }
-  EXPECT_EQ(clamp_to_int(std::numeric_limits<S>::quiet_NaN(), 2, 7), 2);
-  EXPECT_EQ(clamp_to_int(S(1e30), 2, 7), 7);
-  EXPECT_EQ(clamp_to_int(S(-1e30), 2, 7), 2);
+  for (const auto to_int : {floor_to_int<S>, ceil_to_int<S>}) {
+    EXPECT_EQ(to_int(std::numeric_limits<S>::quiet_NaN(), 2, 7), 2);
+    EXPECT_EQ(to_int(S(1e30), 2, 7), 7);
+    EXPECT_EQ(to_int(S(-1e30), 2, 7), 2);
+    EXPECT_EQ(to_int(S(4), 2, 7), 4);
+  }
+  EXPECT_EQ(floor_to_int(S(4.75), 2, 7), 4);
+  EXPECT_EQ(ceil_to_int(S(4.25), 2, 7), 5);
 }
 
 TEST(RadiusRect, TakesCoordinatesBeyondEveryInteger) {

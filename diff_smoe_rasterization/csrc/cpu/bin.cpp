@@ -1,6 +1,7 @@
 // Stage 2: one depth sort of the visible Gaussians, then their tile instances into per-tile lists, front to back.
 #include <algorithm>
 #include <limits>
+#include <memory>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -49,20 +50,27 @@ void bin(int64_t num_gaussians, const Camera<S>& camera, const RasterConfig<S>& 
   const int64_t num_visible = static_cast<int64_t>(order.size());
 
   // A counting sort by tile. Each thread owns a run of the depth order, and its own counters, so that the lists come
-  // out in depth order whatever the number of threads.
+  // out in depth order whatever the number of threads. The tile of each instance, by slot, is found once.
   const int num_runs = static_cast<int>(std::clamp<int64_t>(num_visible / 256, 1, std::max(1, config.num_threads)));
+  const std::unique_ptr<uint32_t[]> tile_of_slot(new uint32_t[saved.instance_offsets[num_gaussians]]);
   std::vector<std::vector<int64_t>> cursors(num_runs, std::vector<int64_t>(tiles));
-  auto for_each_instance = [&](int run, auto visit) {
-    for (int64_t k = num_visible * run / num_runs; k < num_visible * (run + 1) / num_runs; ++k) {
-      const int32_t i = order[k].index;
+  auto for_each_gaussian = [&](int run, auto visit) {
+    for (int64_t k = num_visible * run / num_runs; k < num_visible * (run + 1) / num_runs; ++k) visit(order[k].index);
+  };
+  run_threads(num_runs, [&](int run) {
+    for_each_gaussian(run, [&](int32_t i) {
+      uint32_t* next = &tile_of_slot[saved.instance_offsets[i]];
       const ProjectedGaussian<S>& gaussian = saved.projected[i];
       const TileRect bounds = tile_bounds(config.mode, camera, gaussian.mean, S(radii[i]));
       for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds, [&](int x0, int x1, int y) {
-        for (int x = x0; x < x1; ++x) visit(i, static_cast<int64_t>(y) * grid.columns + x);
+        for (int x = x0; x < x1; ++x) {
+          const uint32_t tile = static_cast<uint32_t>(y) * grid.columns + x;
+          ++cursors[run][tile];
+          *next++ = tile;
+        }
       });
-    }
-  };
-  run_threads(num_runs, [&](int run) { for_each_instance(run, [&](int32_t, int64_t tile) { ++cursors[run][tile]; }); });
+    });
+  });
   int64_t total = 0;
   for (int64_t tile = 0; tile < tiles; ++tile) {
     saved.tile_offsets[tile] = total;
@@ -79,12 +87,10 @@ void bin(int64_t num_gaussians, const Camera<S>& camera, const RasterConfig<S>& 
   }
   saved.tile_offsets[tiles] = total;
   run_threads(num_runs, [&](int run) {
-    int32_t previous = -1;
-    int64_t slot = 0;
-    for_each_instance(run, [&](int32_t i, int64_t tile) {
-      if (i != previous) slot = saved.instance_offsets[i];
-      previous = i;
-      saved.instances[cursors[run][tile]++] = {i, static_cast<uint32_t>(slot++)};
+    for_each_gaussian(run, [&](int32_t i) {
+      for (int64_t slot = saved.instance_offsets[i]; slot < saved.instance_offsets[i + 1]; ++slot) {
+        saved.instances[cursors[run][tile_of_slot[slot]]++] = {i, static_cast<uint32_t>(slot)};
+      }
     });
   });
 }

@@ -1,6 +1,7 @@
 // Stage 1: every Gaussian to the image plane, and how many tiles each meets.
 #include "dsmoe/project.h"
 
+#include <algorithm>
 #include <limits>
 #include <stdexcept>
 #include <string>
@@ -26,10 +27,15 @@ int64_t project(const GaussianInputs<S>& inputs, const Camera<S>& camera, const 
   parallel_for(config.num_threads, inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       ProjectedGaussian<S>& gaussian = saved.projected[i];
-      const int32_t radius = project_gaussian(inputs, camera, config, i, gaussian, saved.features + i * num_features);
+      S* features = saved.features + i * num_features;
+      const int32_t radius = project_gaussian(inputs, camera, config, i, gaussian, features);
       images.radii[i] = radius;
       counts[i] = 0;
-      if (radius == 0) continue;
+      if (radius == 0) {
+        gaussian = {};
+        std::fill_n(features, num_features, S(0));
+        continue;
+      }
       const TileRect bounds = tile_bounds(config.mode, camera, gaussian.mean, S(radius));
       for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds,
                         [&](int x0, int x1, int) { counts[i] += x1 - x0; });

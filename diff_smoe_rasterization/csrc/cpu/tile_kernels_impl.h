@@ -65,12 +65,20 @@ template <class S> DSMOE_HD RowRange rows_of(const ProjectedGaussian<S>& gaussia
   const S left = S(extent.x0) - gaussian.mean.x, top = gaussian.mean.y - S(extent.y0);
   const auto y = EllipseBand<S>(exchanged, gaussian.squared_reach).over({left, left + S(extent.columns - 1)});
   if (y.empty()) return {0, 0};
-  return {clamp_to_int(ceil(top + y.low), 0, extent.rows), clamp_to_int(floor(top + y.high) + S(1), 0, extent.rows)};
+  return {ceil_to_int(top + y.low, 0, extent.rows), floor_to_int(top + y.high + S(1), 0, extent.rows)};
 }
 
 // No pair of the Gaussian has an exponent below this.
 template <class S> DSMOE_HD S least_power(const ProjectedGaussian<S>& gaussian) {
   return S(-0.5) * (gaussian.squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack));
+}
+
+constexpr int64_t kPrefetchDistance = 8;  // instances; the Gaussians of a list lie anywhere in memory
+
+template <class S>
+DSMOE_HD void prefetch_gaussian(const SavedForward<S>& saved, const TileInstance& instance, int num_features) {
+  __builtin_prefetch(saved.projected + instance.gaussian);
+  __builtin_prefetch(saved.features + static_cast<int64_t>(instance.gaussian) * num_features);
 }
 
 template <class S> DSMOE_HD FeatureRule feature_rule(const RasterConfig<S>& config, int feature) {
@@ -112,6 +120,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const Forw
 
   int64_t pairs = 0;
   for (int64_t i = tile.begin; i < tile.end && open_strips > 0; ++i) {
+    prefetch_gaussian(tile.saved, tile.saved.instances[min(i + kPrefetchDistance, tile.end - 1)], num_features);
     const TileInstance& instance = tile.saved.instances[i];
     const ProjectedGaussian<S>& gaussian = tile.saved.projected[instance.gaussian];
     const S* features = tile.saved.features + static_cast<int64_t>(instance.gaussian) * num_features;
@@ -124,7 +133,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const Forw
         if (Blend<kMode>::kStopsEarly && !strip_open[strip][row]) continue;
         pairs += P::kLanes;
         const P power = exponent.at(S(extent.y0 + row) - gaussian.mean.y);
-        if (!any(power >= P(faintest))) continue;
+        if (kStrips < S >> 1 && !any(power >= P(faintest))) continue;  // one strip: its rows are exact
         const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, tile.config.alpha_min);
         PixelState<P> state = {transmittance.load(strip, row), gate_sum.load(strip, row)};
         const auto pair = Blend<kMode>::accumulate(state, gate);
@@ -209,6 +218,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile_backward(c
 
   int64_t pairs = 0;
   for (int64_t i = end - 1; i >= tile.begin; --i) {
+    prefetch_gaussian(tile.saved, tile.saved.instances[max(i - kPrefetchDistance, tile.begin)], num_features);
     const TileInstance& instance = tile.saved.instances[i];
     const ProjectedGaussian<S>& gaussian = tile.saved.projected[instance.gaussian];
     const S* features = tile.saved.features + static_cast<int64_t>(instance.gaussian) * num_features;
@@ -226,7 +236,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile_backward(c
         pairs += P::kLanes;
         const S dy = S(extent.y0 + row) - gaussian.mean.y;
         const P power = exponent.at(dy);
-        if (!any(power >= P(faintest))) continue;
+        if (kStrips < S >> 1 && !any(power >= P(faintest))) continue;  // one strip: its rows are exact
         const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, tile.config.alpha_min);
         const auto contributes = gate.counts & not_past;
         P value = S(0);

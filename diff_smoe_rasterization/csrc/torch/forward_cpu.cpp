@@ -13,16 +13,6 @@ namespace dsmoe {
 namespace binding {
 namespace {
 
-// The core leaves the rows of culled Gaussians as they were, and what an op returns must be defined.
-template <class S>
-void clear_culled(int64_t num_gaussians, int num_features, const int32_t* radii, const SavedForward<S>& saved) {
-  for (int64_t i = 0; i < num_gaussians; ++i) {
-    if (radii[i] != 0) continue;
-    saved.projected[i] = {};
-    std::fill_n(saved.features + i * num_features, num_features, S(0));
-  }
-}
-
 template <class S> Outputs forward(const Inputs& inputs, const Options& options, ForwardChecks checks) {
   const auto gaussians = gaussian_inputs<S>(inputs, options);
   const auto view = camera<S>(inputs, options);
@@ -41,7 +31,6 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options,
   StageRecorder recorder(Pass::kForward);
   try {
     const int64_t num_instances = cpu::project(gaussians, view, config, saved, images, recorder.times());
-    clear_culled(gaussians.num_gaussians, config.num_features(), images.radii, saved);
     outputs[kInstances] = at::empty({num_instances, 2}, at::kInt);
     saved.instances = saved_forward<S>(outputs).instances;
     cpu::bin(gaussians.num_gaussians, view, config, saved, images.radii, recorder.times());

@@ -53,7 +53,7 @@ struct TileInstance {
   uint32_t slot;  // where its gradient goes: the Gaussian's instances lie side by side
 };
 
-// What the forward pass leaves for the backward pass.
+// What the forward pass leaves for the backward pass; rows of culled Gaussians are zero.
 template <class S> struct SavedForward {
   ProjectedGaussian<S>* projected = nullptr;  // [N]
   S* features = nullptr;                      // [N, F]

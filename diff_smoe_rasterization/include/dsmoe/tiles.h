@@ -19,19 +19,23 @@ struct TileGrid {
       : columns((width + kTileSize - 1) / kTileSize), rows((height + kTileSize - 1) / kTileSize) {}
 };
 
-// The integer nearest to x that lies in [low, high]; also defined where x is beyond every integer.
-template <class S> DSMOE_HD int clamp_to_int(S x, int low, int high) {
+// floor(x) and ceil(x), kept in [low, high], 0 <= low; also defined where x is beyond every integer.
+template <class S> DSMOE_HD int floor_to_int(S x, int low, int high) {
   return static_cast<int>(clamp(x, S(low), S(high)));
+}
+template <class S> DSMOE_HD int ceil_to_int(S x, int low, int high) {
+  const S kept = clamp(x, S(low), S(high));
+  const int below = static_cast<int>(kept);
+  return below + (S(below) < kept);
 }
 
 // The tiles that Inria's rasterizer gives to a Gaussian: the square of its radius, in whole tiles. In `alpha` mode a
 // pair counts only inside, although for opacity above 0.353 the 1/255 ellipse leaves it.
 template <class S> DSMOE_HD TileRect radius_rect(Vec2<S> mean, S radius, TileGrid grid) {
   const S size = S(kTileSize);
-  return {clamp_to_int(floor((mean.x - radius) / size), 0, grid.columns),
-          clamp_to_int(floor((mean.y - radius) / size), 0, grid.rows),
-          clamp_to_int(floor((mean.x + radius + size - S(1)) / size), 0, grid.columns),
-          clamp_to_int(floor((mean.y + radius + size - S(1)) / size), 0, grid.rows)};
+  return {floor_to_int((mean.x - radius) / size, 0, grid.columns), floor_to_int((mean.y - radius) / size, 0, grid.rows),
+          floor_to_int((mean.x + radius + size - S(1)) / size, 0, grid.columns),
+          floor_to_int((mean.y + radius + size - S(1)) / size, 0, grid.rows)};
 }
 
 template <class S> struct Interval {
@@ -45,6 +49,7 @@ template <class S> class EllipseBand {
   DSMOE_HD EllipseBand(const Sym2<S>& conic, S squared_reach) : conic_(conic) {
     reach_ = squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack);
     determinant_ = difference_of_products(conic.xx, conic.yy, conic.xy, conic.xy);
+    inverse_xx_ = S(1) / conic.xx;
     v_extent_ = sqrt(max(S(0), reach_ * conic.xx / determinant_));
     // v where u is largest: on the line conic.xy u + conic.yy v = 0.
     v_at_u_extent_ = -conic.xy / conic.yy * sqrt(max(S(0), reach_ * conic.yy / determinant_));
@@ -61,11 +66,11 @@ template <class S> class EllipseBand {
   }
 
  private:
-  DSMOE_HD S centre(S v) const { return -conic_.xy * v / conic_.xx; }
-  DSMOE_HD S half_width(S v) const { return sqrt(max(S(0), conic_.xx * reach_ - determinant_ * v * v)) / conic_.xx; }
+  DSMOE_HD S centre(S v) const { return -conic_.xy * v * inverse_xx_; }
+  DSMOE_HD S half_width(S v) const { return sqrt(max(S(0), conic_.xx * reach_ - determinant_ * v * v)) * inverse_xx_; }
 
   Sym2<S> conic_;
-  S reach_, determinant_, v_extent_, v_at_u_extent_;
+  S reach_, determinant_, inverse_xx_, v_extent_, v_at_u_extent_;
 };
 
 // Calls visit(tile_x0, tile_x1, tile_y) for each tile row that the footprint meets, inside bounds.
@@ -74,15 +79,15 @@ DSMOE_HD void for_each_tile_row(const Sym2<S>& conic, Vec2<S> mean, S squared_re
   if (!(squared_reach >= S(0)) || bounds.empty()) return;
   const EllipseBand<S> ellipse(conic, squared_reach);
   const S size = S(kTileSize), last = S(kTileSize - 1);
-  const int y0 = clamp_to_int(floor((mean.y - ellipse.v_extent()) / size), bounds.y0, bounds.y1);
-  const int y1 = clamp_to_int(floor((mean.y + ellipse.v_extent()) / size) + S(1), bounds.y0, bounds.y1);
+  const int y0 = floor_to_int((mean.y - ellipse.v_extent()) / size, bounds.y0, bounds.y1);
+  const int y1 = floor_to_int((mean.y + ellipse.v_extent()) / size + S(1), bounds.y0, bounds.y1);
   for (int y = y0; y < y1; ++y) {
     const S top = S(y) * size - mean.y;
     const Interval<S> u = ellipse.over({top, top + last});
     if (u.empty()) continue;
     // The first tile whose last pixel is not left of u.low, and the tile after the last whose first pixel is in.
-    const int x0 = clamp_to_int(ceil((mean.x + u.low - last) / size), bounds.x0, bounds.x1);
-    const int x1 = clamp_to_int(floor((mean.x + u.high) / size) + S(1), bounds.x0, bounds.x1);
+    const int x0 = ceil_to_int((mean.x + u.low - last) / size, bounds.x0, bounds.x1);
+    const int x1 = floor_to_int((mean.x + u.high) / size + S(1), bounds.x0, bounds.x1);
     if (x0 < x1) visit(x0, x1, y);
   }
 }
