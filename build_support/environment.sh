@@ -44,13 +44,15 @@ check_prerequisites() {  # PYTHON
 
 pip_install() { "$venv/bin/python" -m pip install --disable-pip-version-check "$@"; }
 
-# A checksum of all that decides what gets installed.
+# A checksum of all that decides what gets installed. Not every path exists in every version.
 fingerprint() {
   (
     cd "$root" || exit
-    find setup.py pyproject.toml sources.txt build_support diff_smoe_rasterization integrations patches benchmarks \
-      -type f ! -name '*.py[co]' ! -name '*.so' ! -name _build_info.py -exec cksum {} + 2>/dev/null | LC_ALL=C sort
-    cat "$venv"/lib/python*/site-packages/torch/version.py 2>/dev/null
+    {
+      find setup.py pyproject.toml sources.txt build_support diff_smoe_rasterization integrations patches benchmarks \
+        -type f ! -name '*.py[co]' ! -name '*.so' ! -name _build_info.py -exec cksum {} + || true
+      cat "$venv"/lib/python*/site-packages/torch/version.py || true
+    } 2>/dev/null | LC_ALL=C sort
     echo "${torch_request[@]}" "${DSMOE_BUILD_CUDA-}" "${TORCH_CUDA_ARCH_LIST-}"
   ) | cksum
 }
