@@ -16,6 +16,7 @@ from .errors import TrainerError
 from .evaluation import Evaluation, evaluate
 from .files import write_json_atomically
 from .losses import training_loss
+from .memory import keep_freed_memory
 from .metrics import psnr
 from .model import GaussianModel, GaussianOptimizer
 from .modelfile import model_path, save_model
@@ -216,6 +217,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     """
     config.validate()
     check_device(config.device)
+    keep_freed_memory()
     if os.path.isfile(os.path.join(config.output, CONFIG_NAME)):
         if resume:
             differences = TrainConfig.load(config.output).differences(config)
