@@ -26,6 +26,9 @@ template <class S> struct PixelArray {
 
 template <class S> constexpr int kStrips = kTileSize / Pack<S>::kLanes;
 
+// A Gaussian's rows are found for the tile's whole width: where that is one strip, each of them holds pixels.
+template <class S> constexpr bool kRowsAreExact = kStrips<S> == 1;
+
 // Hands out PixelArrays one after the other.
 template <class S> struct Scratch {
   S* next;
@@ -133,7 +136,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const Forw
         if (Blend<kMode>::kStopsEarly && !strip_open[strip][row]) continue;
         pairs += P::kLanes;
         const P power = exponent.at(S(extent.y0 + row) - gaussian.mean.y);
-        if (kStrips < S >> 1 && !any(power >= P(faintest))) continue;  // one strip: its rows are exact
+        if (!kRowsAreExact<S> && !any(power >= P(faintest))) continue;
         const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, tile.config.alpha_min);
         PixelState<P> state = {transmittance.load(strip, row), gate_sum.load(strip, row)};
         const auto pair = Blend<kMode>::accumulate(state, gate);
@@ -236,7 +239,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile_backward(c
         pairs += P::kLanes;
         const S dy = S(extent.y0 + row) - gaussian.mean.y;
         const P power = exponent.at(dy);
-        if (kStrips < S >> 1 && !any(power >= P(faintest))) continue;  // one strip: its rows are exact
+        if (!kRowsAreExact<S> && !any(power >= P(faintest))) continue;
         const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, tile.config.alpha_min);
         const auto contributes = gate.counts & not_past;
         P value = S(0);
