@@ -13,7 +13,7 @@ from diff_smoe_rasterization.trainer.model import PARAMETERS, GaussianModel, Gau
 from diff_smoe_rasterization.trainer.strategy import STRATEGIES, Step, Strategy, StrategyContext
 
 EXTENT = 10.0
-SMALL, LARGE = 0.05, 0.5  # on either side of percent_dense * EXTENT = 0.1; both under the size prune's 1.0
+SMALL, LARGE = 0.099, 0.101  # on either side of percent_dense * EXTENT = 0.1
 
 
 def context_of(scales, opacities, **options):
