@@ -16,6 +16,17 @@ namespace {
 
 constexpr int kThreadCounts[] = {1, 2, 3, 7};
 
+TEST(RunThreads, FewerThanOneThreadCountsAsOne) {
+  for (const int num_threads : {0, -3}) {
+    int calls = 0;
+    run_threads(num_threads, [&](int index) {
+      EXPECT_EQ(index, 0);
+      ++calls;
+    });
+    EXPECT_EQ(calls, 1);
+  }
+}
+
 TEST(RunThreads, RunsEachWorkerOnce) {
   for (const int threads : kThreadCounts) {
     std::vector<std::atomic<int>> runs(threads);
