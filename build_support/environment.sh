@@ -7,6 +7,7 @@
 
 unset PYTHONPATH PYTHONHOME
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+case "${DSMOE_VENV-}" in '' | /*) ;; *) DSMOE_VENV=$PWD/$DSMOE_VENV ;; esac
 
 fail() {
   printf 'error: %s\n' "$*" >&2
@@ -74,7 +75,6 @@ prepare_environment() {
   venv=$1
   shift
   torch_request=("$@")
-  case "$venv" in /*) ;; *) venv=$PWD/$venv ;; esac
   log=$venv/install.log
   local stamp=$venv/dsmoe.stamp python=${DSMOE_PYTHON:-python3} over_system=()
   if [ -n "${DSMOE_PYTHON-}" ] && [ -x "$venv/bin/python" ] &&
