@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 
 import pytest
@@ -29,10 +30,10 @@ def kill_at(monkeypatch, iteration):
     """Makes the step of that iteration raise."""
     step = Trainer.step
 
-    def dying_step(self):
+    def dying_step(self, *arguments):
         if self.iteration + 1 == iteration:
             raise Killed
-        return step(self)
+        return step(self, *arguments)
 
     monkeypatch.setattr(Trainer, "step", dying_step)
 
@@ -95,6 +96,30 @@ def test_evaluations_on_the_way_do_not_change_the_result(tiny_config, tmp_path):
     train(other, progress=False)
     assert ply_bytes(other) == ply_bytes(tiny_config)
     assert os.path.isfile(os.path.join(other.output, "history.json"))
+
+
+@pytest.mark.parametrize("option", ["opacity_reset_interval", "densification_interval"])
+def test_the_last_iteration_neither_resets_nor_densifies(tiny_config, tmp_path, option):
+    """Whether an event falls on it or after it makes no difference to what is saved."""
+    models = []
+    for interval in (20, 21):
+        config = dataclasses.replace(tiny_config, iterations=20, output=str(tmp_path / str(interval)),
+                                     **{option: interval})
+        train(config, progress=False)
+        models.append(ply_bytes(config))
+    assert models[0] == models[1]
+
+
+def test_an_evaluation_on_the_way_sees_the_model_before_its_opacity_reset(tiny_config, tmp_path):
+    rows = []
+    for interval in (8, 9):
+        config = dataclasses.replace(tiny_config, iterations=10, eval_every=8, densification_interval=100,
+                                     opacity_reset_interval=interval, output=str(tmp_path / str(interval)))
+        train(config, progress=False)
+        with open(os.path.join(config.output, "history.json"), encoding="utf-8") as file:
+            row, = json.load(file)
+        rows.append((row["iteration"], row["psnr"], row["num_gaussians"]))
+    assert rows[0] == rows[1] and rows[0][0] == 8
 
 
 def test_other_options_cannot_be_resumed(tiny_config):
