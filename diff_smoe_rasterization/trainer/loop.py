@@ -4,7 +4,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from typing import Any, Dict, List, Optional
+from typing import Any, Callable, Dict, List, Optional
 
 import torch
 from tqdm import tqdm
@@ -65,10 +65,12 @@ class Trainer:
         self.watch = Stopwatch(config.device)
         self.iteration = 0
 
-    def step(self) -> Step:
+    def step(self, before_change: Optional[Callable[[], None]] = None) -> Step:
         """One iteration, in the order of 3DGS: densification comes between the gradients and the optimizer's step.
 
-        As there, the last iteration does not step: nothing would be rendered after it.
+        before_change: called once the gradients are known and nothing has changed yet, which is where 3DGS evaluates
+        and saves. So the last iteration changes nothing: what it saves neither an opacity reset nor a densification
+        may have touched.
         """
         config, model = self.config, self.model
         if model.num_gaussians == 0:
@@ -86,11 +88,13 @@ class Trainer:
         step = Step(self.iteration, camera, rendering, means2D, loss)
         self.strategy.before_backward(step)
         loss.backward()
-        with torch.no_grad():
-            self.strategy.after_backward(step)
-            if self.iteration < config.iterations:
+        if before_change:
+            before_change()
+        if self.iteration < config.iterations:
+            with torch.no_grad():
+                self.strategy.after_backward(step)
                 self.optimizer.step()
-            self.strategy.after_step(step)
+                self.strategy.after_step(step)
         self._report = (index, rendering.color.detach())
         return step
 
@@ -157,19 +161,15 @@ class Run:
                   disable=not self.progress, dynamic_ncols=True) as bar:
             trainer.watch.start()
             while trainer.iteration < config.iterations:
-                step = trainer.step()
+                evaluates = (trainer.iteration + 1 < config.iterations
+                             and _is_due(trainer.iteration + 1, config.eval_every))
+                step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
                 bar.update()
                 if trainer.iteration % PROGRESS_EVERY == 0:
                     self._show(bar, float(step.loss.detach()))
-                ends = trainer.iteration == config.iterations
-                evaluates = not ends and _is_due(trainer.iteration, config.eval_every)
-                saves = ends or _is_due(trainer.iteration, config.checkpoint_every)
-                if evaluates or saves:
+                if trainer.iteration == config.iterations or _is_due(trainer.iteration, config.checkpoint_every):
                     trainer.watch.stop()
-                    if evaluates:
-                        self._record(trainer.evaluate(), bar)
-                    if saves:
-                        self.save_checkpoint()
+                    self.save_checkpoint()
                     trainer.watch.start()
             trainer.watch.stop()
         save_model(model_path(config.output, trainer.iteration), trainer.model, str(config.blend_mode))
@@ -190,14 +190,17 @@ class Run:
             bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{self.trainer.training_psnr():.2f}",
                             gaussians=self.trainer.model.num_gaussians, refresh=False)
 
-    def _record(self, evaluation: Evaluation, bar: Any) -> None:
+    def _evaluate(self, bar: Any) -> None:
         trainer = self.trainer
+        trainer.watch.stop()
+        evaluation = trainer.evaluate()
         self.history.append({"iteration": trainer.iteration, **evaluation.metrics,
                              "num_gaussians": trainer.model.num_gaussians, "train_seconds": trainer.watch.seconds})
         write_json_atomically(self._path(HISTORY_NAME), self.history)
         if self.progress and evaluation.metrics["psnr"] is not None:
             bar.write(f"iteration {trainer.iteration}: test PSNR {evaluation.metrics['psnr']:.2f} dB, "
                       f"SSIM {evaluation.metrics['ssim']:.4f}, {trainer.model.num_gaussians} Gaussians")
+        trainer.watch.start()
 
     def _path(self, name: str) -> str:
         return os.path.join(self.trainer.config.output, name)

@@ -48,7 +48,8 @@ class Step:
 class Strategy:
     """Does nothing: a fixed set of Gaussians. The base of every strategy.
 
-    Hooks run in this order in each step; rows may be added or removed in the last two (through the optimizer).
+    Hooks run in this order in each step; rows may be added or removed in the last two (through the optimizer), which
+    the last iteration of a run leaves out.
     """
 
     def __init__(self, context: StrategyContext) -> None:
