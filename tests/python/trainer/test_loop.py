@@ -131,8 +131,8 @@ def test_a_loss_that_is_not_finite_stops_the_run(tiny_config, scene):
     trainer = Trainer(tiny_config, scene)
     step = trainer.step
 
-    def poisoned():
-        result = step()
+    def poisoned(*arguments):
+        result = step(*arguments)
         result.loss = result.loss * math.nan
         return result
 
