@@ -8,7 +8,7 @@ import torch
 
 from ._version import __version__
 
-_BUILD_AGAIN = "build it again against this torch:\n    pip install --no-build-isolation --no-deps --force-reinstall ."
+_BUILD_AGAIN = "build it again against this torch: pip install --no-build-isolation --no-deps --force-reinstall ."
 
 
 def _recorded(name: str) -> Optional[str]:
@@ -37,16 +37,23 @@ def _load() -> Any:
     except ModuleNotFoundError as error:
         if error.name != f"{__package__}._C":
             raise
-        _fail("its extension _C is not built for this Python; in the source folder type\n"
-              "    pip install --no-build-isolation .", error)
+        _fail("its extension _C is not built for this Python; in the source folder type: "
+              "pip install --no-build-isolation .", error)
     except ImportError as error:
         _fail((f"its extension does not load ({error}); it was built against torch {built_against or 'of another build'}"
                f", and torch {torch.__version__} is running; ") + _BUILD_AGAIN, error)
 
 
+def _built_with_cuda() -> bool:
+    try:
+        return _C.build_info()["cuda_built"]
+    except ValueError as error:  # DSMOE_SIMD names no level of this processor
+        _fail(str(error))
+
+
 _C = _load()
 
-BACKENDS = ("cpu", "cuda") if _C.build_info()["cuda_built"] else ("cpu",)
+BACKENDS = ("cpu", "cuda") if _built_with_cuda() else ("cpu",)
 """The device types that this build renders on."""
 
 

@@ -11,7 +11,9 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
-from ._C import io as _io
+from .extension import _C
+
+_io = _C.io
 
 PathLike = Union[str, "os.PathLike[str]"]
 

@@ -2,7 +2,10 @@
 from __future__ import annotations
 
 import importlib
+import os
+import re
 import shutil
+import subprocess
 import sys
 import sysconfig
 from pathlib import Path
@@ -15,6 +18,7 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
+WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
 IMAGES = (0, 2, 3, 4)  # which results of the op are differentiable images
 
 
@@ -23,34 +27,65 @@ def copied_package(tmp_path, monkeypatch):
     """Returns (folder, import function) of a copy of the package's Python files, without the extension."""
     name = "copy_of_the_package"
     folder = tmp_path / name
-    folder.mkdir()
-    for file in Path(diff_smoe_rasterization.__file__).parent.glob("*.py"):
-        if file.name != "_build_info.py":
-            shutil.copy(file, folder)
+    shutil.copytree(Path(diff_smoe_rasterization.__file__).parent, folder,
+                    ignore=shutil.ignore_patterns("_C*", "_build_info.py", "__pycache__", "csrc", "include"))
     monkeypatch.syspath_prepend(tmp_path)
-    yield folder, lambda: importlib.import_module(name)
+    yield folder, lambda submodule="": importlib.import_module(name + submodule)
     for module in [module for module in sys.modules if module.split(".")[0] == name]:
         del sys.modules[module]
 
 
 def test_a_package_that_was_not_built_says_what_to_type(copied_package):
-    with pytest.raises(ImportError, match=r"not built[\s\S]*pip install"):
-        copied_package[1]()
+    package = copied_package[1]()
+    for name in ("rasterize", "GaussianRasterizer", "rasterize_gaussians", "build_info", "stage_times",
+                 "set_profiling"):
+        with pytest.raises(ImportError, match="not built.*pip install"):
+            getattr(package, name)
+    with pytest.raises(ImportError, match="not built.*pip install"):
+        copied_package[1](".io")
+
+
+def test_settings_and_reference_work_where_nothing_was_built(copied_package):
+    package, reference = copied_package[1](), copied_package[1](".reference")
+    scene = random_scene("smoe", 5, 20, 18)
+    settings = package.GaussianRasterizationSettings(**scene.settings._asdict())
+    assert reference.rasterize(settings=settings, **scene.inputs).color.shape == (3, 18, 20)
+    assert not hasattr(package, "no_such_name")
+
+
+def test_the_command_says_in_one_line_that_nothing_was_built(copied_package, capsys):
+    main = copied_package[1](".cli").main
+    assert main(["info"]) == 0
+    assert re.search("^extension +not usable: .*not built.*pip install.*$", capsys.readouterr().out, re.MULTILINE)
+    assert main(["train", "scene", "-o", "out", "--blend-mode", "smoe"]) == 1
+    assert re.fullmatch("dsmoe train: error: .*not built.*pip install.*\n", capsys.readouterr().err)
 
 
 def test_a_build_against_another_torch_names_both_and_says_what_to_type(copied_package):
     folder, load = copied_package
     (folder / "_build_info.py").write_text("TORCH_VERSION = '0.4.1'\n")
-    with pytest.raises(ImportError, match=rf"0\.4\.1[\s\S]*{torch.__version__.split('+')[0]}[\s\S]*pip install"):
-        load()
+    with pytest.raises(ImportError, match=rf"0\.4\.1.*{re.escape(torch.__version__)}.*pip install"):
+        load().rasterize
 
 
 def test_an_extension_that_does_not_load_names_the_reason_and_both_versions(copied_package):
     folder, load = copied_package
     (folder / "_build_info.py").write_text(f"TORCH_VERSION = {torch.__version__!r}\n")
     (folder / ("_C" + sysconfig.get_config_var("EXT_SUFFIX"))).write_bytes(b"not a shared library")
-    with pytest.raises(ImportError, match=r"does not load[\s\S]*_C[\s\S]*built against torch[\s\S]*pip install"):
-        load()
+    with pytest.raises(ImportError, match="does not load.*_C.*built against torch.*pip install"):
+        load().rasterize
+
+
+def test_an_unknown_instruction_set_is_refused_with_those_that_there_are():
+    run = subprocess.run([sys.executable, "-m", "diff_smoe_rasterization", "info"], stdout=subprocess.PIPE,
+                         universal_newlines=True, env={**os.environ, "DSMOE_SIMD": "mmx"}, cwd=WHERE_THE_PACKAGE_LIES)
+    assert run.returncode == 0
+    assert re.search('^extension +not usable: .*DSMOE_SIMD is "mmx".*baseline$', run.stdout, re.MULTILINE)
+
+
+def test_a_plain_import_registers_the_ops():
+    code = "import torch, diff_smoe_rasterization; print(torch.ops.diff_smoe_rasterization.rasterize)"
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL, cwd=WHERE_THE_PACKAGE_LIES)
 
 
 def test_build_info_tells_what_runs():
