@@ -14,7 +14,7 @@ from .files import write_atomically
 
 CHECKPOINT_NAME = "checkpoint.pt"
 TENSOR = "__tensor__"  # marks where a tensor was
-FORMAT = 1  # raised when the content changes so that older files cannot be resumed
+FORMAT = 2  # raised when the content changes so that older files cannot be resumed
 
 
 def save_checkpoint(path: str, state: Dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ from .config import TrainConfig
 from .errors import TrainerError
 from .evaluation import evaluate
 from .files import write_json_atomically
-from .loop import check_device
+from .loop import PER_VIEW_NAME, check_device
 from .metrics import quantised
 from .modelfile import agreed_blend_mode, load_model, trained_model_path
 from .rendering import Rasterize, Renderer, background_color
@@ -41,7 +41,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation)
     if split == "test":
         write_results(output, [row])
-        write_json_atomically(os.path.join(output, "per_view.json"), evaluation.per_view)
+        write_json_atomically(os.path.join(output, PER_VIEW_NAME), evaluation.per_view)
     return row
 
 

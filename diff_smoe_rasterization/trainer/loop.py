@@ -4,6 +4,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import shutil
 from typing import Any, Callable, Dict, List, Optional
 
 import torch
@@ -19,17 +20,18 @@ from .losses import training_loss
 from .memory import keep_freed_memory
 from .metrics import psnr
 from .model import GaussianModel, GaussianOptimizer
-from .modelfile import model_path, save_model
+from .modelfile import FOLDER, model_path, save_model
 from .order import ViewOrder
 from .randomness import random_state, restore_random_state, seed_everything
 from .rendering import Rasterize, Renderer, background_color
-from .results import result_row, write_results
-from .scene import Scene, load_scene
+from .results import RESULTS_NAME, result_row, write_results
+from .scene import Scene, load_scene, read_layout, scene_fingerprint
 from .stopwatch import Stopwatch
 from .strategy import STRATEGIES, Step, StrategyContext
 from .targets import Targets
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
+PER_VIEW_NAME = "per_view.json"
 PROGRESS_EVERY = 10  # steps between two updates of the progress bar
 
 
@@ -111,6 +113,7 @@ class Trainer:
         """Everything the rest of the run depends on, as tensors and plain values."""
         return {
             "config": dataclasses.asdict(self.config),
+            "scene": scene_fingerprint(self.scene),
             "iteration": self.iteration,
             "train_seconds": self.watch.seconds,
             "raw": {name: tensor.detach() for name, tensor in self.model.raw.items()},
@@ -126,6 +129,10 @@ class Trainer:
         differences = TrainConfig(**state["config"]).differences(self.config)
         if differences:
             raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
+        for name, here in scene_fingerprint(self.scene).items():
+            if here != state["scene"][name]:
+                raise TrainerError(f"the checkpoint is of a run on another scene: {name} {state['scene'][name]} there "
+                                   f"and {here} in {self.config.scene}")
         self.iteration = state["iteration"]
         self.watch.seconds = state["train_seconds"]
         self.optimizer.replace_all(state["raw"])
@@ -176,7 +183,7 @@ class Run:
         evaluation = trainer.evaluate(self.progress)
         row = result_row(config, trainer.scene, trainer.model.num_gaussians, trainer.watch.seconds, evaluation)
         write_results(config.output, [row])
-        write_json_atomically(self._path("per_view.json"), evaluation.per_view)
+        write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
         return row
 
     def save_checkpoint(self) -> None:
@@ -210,6 +217,15 @@ def _is_due(iteration: int, interval: int) -> bool:
     return interval > 0 and iteration % interval == 0
 
 
+def _remove_products(output: str) -> None:
+    """Removes what a run leaves in its folder, so that no file of an old run outlives its config."""
+    for name in (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME):
+        if os.path.isfile(os.path.join(output, name)):
+            os.remove(os.path.join(output, name))
+    if os.path.isdir(os.path.join(output, FOLDER)):
+        shutil.rmtree(os.path.join(output, FOLDER))
+
+
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
           scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None) -> Dict[str, Any]:
     """Trains a scene into config.output; returns the row of results.json.
@@ -218,6 +234,8 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     of threads); start it where it has no checkpoint yet. overwrite: replace a run that is there. scene: a loaded
     scene, where one is at hand. Raises TrainerError before training starts where anything does not fit.
     """
+    if resume and overwrite:
+        raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
     config.validate()
     check_device(config.device)
     keep_freed_memory()
@@ -229,13 +247,14 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         elif not overwrite:
             raise TrainerError(f"{config.output} already holds a training run; continue it with --resume, "
                                "replace it with --overwrite, or choose another folder")
-    scene = scene or load_scene(config, progress)
-    os.makedirs(config.output, exist_ok=True)
+    layout = None if scene else read_layout(config)
+    os.makedirs(config.output, exist_ok=True)  # a folder that cannot be made is told before images are read
+    scene = scene or load_scene(config, progress, layout)
     run = Run(Trainer(config, scene, rasterize), progress)
-    config.save(config.output)
     if resume:
         resumed = run.resume()
         print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
-    elif os.path.isfile(os.path.join(config.output, CHECKPOINT_NAME)):
-        os.remove(os.path.join(config.output, CHECKPOINT_NAME))
+    elif overwrite:
+        _remove_products(config.output)
+    config.save(config.output)
     return run.train()

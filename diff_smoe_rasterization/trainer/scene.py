@@ -5,9 +5,10 @@ Everything that can be wrong with a folder is a SceneError here, before training
 """
 from __future__ import annotations
 
+import hashlib
 import os
 from dataclasses import dataclass
-from typing import List, Sequence
+from typing import Any, Dict, List, Optional, Sequence
 
 import numpy as np
 
@@ -41,12 +42,12 @@ class Scene:
         return Scene(self.kind, moved(self.train), moved(self.test), self.points, self.extent, self.split)
 
 
-def load_scene(config: TrainConfig, progress: bool = True) -> Scene:
+def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None) -> Scene:
     """Reads the folder config.scene with the config's resolution, background, principal point and initial points.
 
-    Raises SceneError naming the file and the reason.
+    layout: what `read_layout` gave, where it is at hand. Raises SceneError naming the file and the reason.
     """
-    layout = read_layout(config)
+    layout = layout or read_layout(config)
     images = load_views(list(layout.train) + list(layout.test), config, progress)
     train, test = images[:len(layout.train)], images[len(layout.train):]
     points = layout.points.subset(config.init_points, config.seed)
@@ -70,6 +71,29 @@ def read_layout(config: TrainConfig) -> Layout:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
     check_files([image.path for image in list(layout.train) + list(layout.test)])
     return layout
+
+
+def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
+    """Plain values that differ between scenes and stay when a folder is moved: what a resumed run must find again."""
+
+    def names_and_sizes(views: Sequence[View]) -> str:
+        lines = sorted(f"{view.camera.name} {view.camera.width}x{view.camera.height}" for view in views)
+        return _checksum("\n".join(lines).encode("utf-8"))
+
+    return {
+        "number of training views": len(scene.train),
+        "number of test views": len(scene.test),
+        "number of points": len(scene.points.positions),
+        # Six digits, since another numpy may sum in another order.
+        "extent": f"{scene.extent:.6g}",
+        "checksum of the training views' names and sizes": names_and_sizes(scene.train),
+        "checksum of the test views' names and sizes": names_and_sizes(scene.test),
+        "checksum of the points": _checksum(scene.points.positions.tobytes() + scene.points.colors.tobytes()),
+    }
+
+
+def _checksum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def load_cameras(config: TrainConfig, split: str) -> List[Camera]:

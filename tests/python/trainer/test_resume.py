@@ -4,10 +4,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 
 import pytest
 import torch
 
+from diff_smoe_rasterization import io
 from diff_smoe_rasterization.trainer import files
 from diff_smoe_rasterization.trainer.checkpoint import load_checkpoint, save_checkpoint
 from diff_smoe_rasterization.trainer.errors import TrainerError
@@ -120,6 +122,63 @@ def test_an_evaluation_on_the_way_sees_the_model_before_its_opacity_reset(tiny_c
             row, = json.load(file)
         rows.append((row["iteration"], row["psnr"], row["num_gaussians"]))
     assert rows[0] == rows[1] and rows[0][0] == 8
+
+
+def copied_scene(tiny_scene, folder):
+    return shutil.copytree(tiny_scene, str(folder))
+
+
+def rename_a_view(folder):
+    model = io.read_colmap(folder)
+    os.rename(os.path.join(folder, "images", "view_003.png"), os.path.join(folder, "images", "view_003b.png"))
+    images = [dataclasses.replace(image, name=image.name.replace("view_003.png", "view_003b.png"))
+              for image in model.images]
+    io.write_colmap(model.folder, io.ColmapModel(model.cameras, images, model.points), text=True)
+
+
+def move_a_point(folder):
+    model = io.read_colmap(folder)
+    model.points.positions[5, 1] += 0.01
+    io.write_colmap(model.folder, model, text=True)
+
+
+def remove_a_point(folder):
+    model = io.read_colmap(folder)
+    points = model.points
+    io.write_colmap(model.folder, io.ColmapModel(
+        model.cameras, model.images, io.Points(points.positions[1:], points.colors[1:])), text=True)
+
+
+@pytest.mark.parametrize("edit, words", [
+    (rename_a_view, "training views' names"), (move_a_point, "checksum of the points"),
+    (remove_a_point, "number of points")])
+def test_another_scene_cannot_be_resumed(tiny_scene, tiny_config, tmp_path, edit, words):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    train(config, progress=False)
+    other = copied_scene(tiny_scene, tmp_path / "other")
+    edit(other)
+    with pytest.raises(TrainerError, match=f"another scene: .*{words}.*other"):
+        train(dataclasses.replace(config, scene=other), resume=True, progress=False)
+
+
+def test_a_moved_scene_resumes(tiny_scene, tiny_config, tmp_path):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    row = train(config, progress=False)
+    moved = copied_scene(tiny_scene, tmp_path / "moved")
+    assert train(dataclasses.replace(config, scene=moved), resume=True, progress=False)["psnr"] == row["psnr"]
+
+
+def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, monkeypatch):
+    config = dataclasses.replace(tiny_config, eval_every=10)
+    train(config, progress=False)
+    assert sorted(os.listdir(config.output)) == ["checkpoint.pt", "config.json", "history.json", "per_view.json",
+                                                 "point_cloud", "results.json"]
+    kill_at(monkeypatch, 5)
+    with pytest.raises(Killed):
+        train(dataclasses.replace(config, seed=1), overwrite=True, progress=False)
+    assert os.listdir(config.output) == ["config.json"]
+    with pytest.raises(TrainerError, match="choose one"):
+        train(config, overwrite=True, resume=True, progress=False)
 
 
 def test_other_options_cannot_be_resumed(tiny_config):
