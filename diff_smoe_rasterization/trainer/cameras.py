@@ -105,4 +105,5 @@ def scene_extent(centers: np.ndarray) -> float:
     where the formula would give 0 and stop all positions.
     """
     radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()) * 1.1
-    return radius if radius > 0 else 1.0
+    # Centres computed from poses differ by rounding even where they are one place.
+    return radius if radius > 1e-6 * max(1.0, float(np.abs(centers).max())) else 1.0

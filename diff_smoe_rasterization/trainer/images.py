@@ -17,9 +17,10 @@ from .errors import SceneError
 from .layout import PosedImage
 
 MAX_WIDTH = 1600  # of images at resolution -1
+MAX_PIXELS = 2**27  # of an image to train on, beyond which --resolution is taken for a mistake
 # An image may have another size than its camera (images_4 beside a full-size model) but not another shape.
 MAX_ASPECT_ERROR = 0.02
-UNREADABLE = (OSError, ValueError, SyntaxError)  # what Pillow raises for damaged files
+UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)  # what Pillow raises for damaged files
 DOWNSCALER = "pillow bicubic"
 
 
@@ -77,12 +78,18 @@ def fitted_camera(posed: PosedImage, size: Tuple[int, int], config: TrainConfig)
     if abs(width * camera.height / (height * camera.width) - 1) > MAX_ASPECT_ERROR:
         raise SceneError(f"{posed.path}: the image is {width}x{height}, "
                          f"its camera {camera.width}x{camera.height}: another shape")
-    camera = camera.resized(*target_size(width, height, config.resolution))
+    target_width, target_height = target_size(width, height, config.resolution)
+    if target_width * target_height > MAX_PIXELS:
+        raise SceneError(f"{posed.path}: --resolution {config.resolution} makes the {width}x{height} image "
+                         f"{target_width}x{target_height}, more than {MAX_PIXELS:,} pixels")
+    camera = camera.resized(target_width, target_height)
     return camera.centred() if config.principal_point == "centre" else camera
 
 
 def composited(image: Image.Image, white: bool) -> Image.Image:
-    """The image as RGB; where it has transparency, over white or black."""
+    """The image as RGB; where it has transparency, over white or black. Raises ValueError beyond 8 bits a channel."""
+    if image.mode == "F" or image.mode.startswith("I"):
+        raise ValueError(f"its pixels have more than 8 bits (Pillow's mode {image.mode}); convert it to 8 bits")
     if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
         return image.convert("RGB")
     rgba = np.asarray(image.convert("RGBA"), np.float32) / 255

@@ -16,6 +16,7 @@ from .files import write_json_atomically
 from .loop import PER_VIEW_NAME, check_device
 from .metrics import quantised
 from .modelfile import agreed_blend_mode, load_model, trained_model_path
+from .pictures import file_names
 from .rendering import Rasterize, Renderer, background_color
 from .results import read_results, result_row, write_results
 from .scene import load_cameras, load_scene
@@ -70,12 +71,10 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views")
     os.makedirs(folder, exist_ok=True)
-    paths = []
+    paths = [os.path.join(folder, name + ".png") for name in file_names([camera.name for camera in cameras])]
     with torch.no_grad():
-        for camera in tqdm(cameras, desc="images", unit="image", leave=False):
-            name = os.path.splitext(camera.name)[0].replace("/", "_").replace(os.sep, "_") + ".png"
-            paths.append(os.path.join(folder, name))
-            to_image(renderer(camera).color).save(paths[-1])
+        for camera, path in zip(tqdm(cameras, desc="images", unit="image", leave=False), paths):
+            to_image(renderer(camera).color).save(path)
     return paths
 
 

@@ -1,6 +1,7 @@
 """Side-by-side pictures: ground truth and renderings, labelled, with one magnified window."""
 from __future__ import annotations
 
+import os
 from typing import List, Sequence, Tuple
 
 import numpy as np
@@ -11,6 +12,19 @@ LABEL_HEIGHT = 18
 WINDOW_SHARE = 4  # a window is this part of the picture's width and height, and magnified as much
 MIN_WIDTH = 400  # of each picture; smaller ones are enlarged by a whole factor
 FRAME = (255, 60, 0)
+
+
+def file_names(camera_names: Sequence[str]) -> List[str]:
+    """A file name without extension for each camera: folders joined by "_", equal ones numbered."""
+    names: List[str] = []
+    for camera_name in camera_names:
+        stem = os.path.splitext(camera_name)[0].replace("/", "_").replace(os.sep, "_")
+        name, number = stem, 1
+        while name in names:
+            number += 1
+            name = f"{stem}_{number}"
+        names.append(name)
+    return names
 
 
 def comparison(truth: Image.Image, renderings: Sequence[Tuple[str, Image.Image]]) -> Image.Image:

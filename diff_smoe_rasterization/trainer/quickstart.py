@@ -20,7 +20,7 @@ from .inspection import open_renderer, to_image
 from .loop import train
 from .metrics import psnr, quantised
 from .modelfile import model_path
-from .pictures import comparison, evenly_spaced
+from .pictures import comparison, evenly_spaced, file_names
 from .results import results_table, write_results
 from .scene import Scene, load_scene, read_layout
 from .synthetic import write_synthetic_scene
@@ -117,6 +117,7 @@ def write_pictures(config: TrainConfig, scene: Scene, output: str) -> List[str]:
     renderers = [(mode, open_renderer(config, os.path.join(output, mode + ".ply"), mode, config.device))
                  for mode in MODES]
     views = scene.test or scene.train
+    names = file_names([view.camera.name for view in views])
     paths = []
     for index in evenly_spaced(len(views), PICTURES):
         view, labelled = views[index], []
@@ -125,8 +126,7 @@ def write_pictures(config: TrainConfig, scene: Scene, output: str) -> List[str]:
             with torch.no_grad():
                 color = renderer(view.camera).color.cpu()
             labelled.append((f"{mode}  {psnr(quantised(color), truth):.2f} dB", to_image(color)))
-        name = os.path.splitext(os.path.basename(view.camera.name))[0]
-        paths.append(os.path.join(output, f"compare_{name}.png"))
+        paths.append(os.path.join(output, f"compare_{names[index]}.png"))
         comparison(to_image(truth), labelled).save(paths[-1])
     return paths
 

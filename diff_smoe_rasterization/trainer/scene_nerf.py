@@ -4,6 +4,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 from typing import Any, Dict, List
 
 import numpy as np
@@ -81,7 +82,7 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
         raise SceneError(f"{where}: lens distortion ({', '.join(bent)}) is not supported; undistort the images first")
     try:
         matrix = np.array(frame.get("transform_matrix"), np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise SceneError(f"{where}: `transform_matrix` must be 4 rows of 4 finite numbers")
@@ -94,29 +95,48 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
 
     def number(key: str, default: float) -> float:
         value = frame.get(key, content.get(key, default))
-        if not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise SceneError(f"{where}: `{key}` is {value!r}; it must be a number")
+        if not _is_number(value):
+            raise SceneError(f"{where}: `{key}` is {value!r}; it must be a finite number")
         return float(value)
+
+    def positive(key: str, default: float) -> float:
+        value = number(key, default)
+        if value <= 0:
+            raise SceneError(f"{where}: `{key}` is {value:g}; it must be positive")
+        return value
+
+    def whole(key: str, default: int) -> int:
+        value = positive(key, default)
+        if not value.is_integer():
+            raise SceneError(f"{where}: `{key}` is {value:g}; it must be a whole number of pixels")
+        return int(value)
 
     if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > MAX_SKEW:
         raise SceneError(f"{where}: the left 3x3 block of `transform_matrix` must be a rotation")
-    focal_x = number("fl_x", _focal(content, frame, width, where))
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        raise SceneError(f"{where}: the left 3x3 block of `transform_matrix` mirrors (its determinant is -1); "
+                         "it must be a rotation")
     camera_to_world = matrix[:3, :3] @ FLIP
     rotation = camera_to_world.T
     # Intrinsics in pixels refer to the size that the json gives, where it gives one.
-    json_width, json_height = number("w", width), number("h", height)
-    camera = Camera(os.path.basename(image_path), rotation, -rotation @ matrix[:3, 3], focal_x,
-                    number("fl_y", focal_x), number("cx", json_width / 2), number("cy", json_height / 2),
-                    int(json_width), int(json_height))
+    json_width, json_height = whole("w", width), whole("h", height)
+    given = "fl_x" in frame or "fl_x" in content
+    focal_x = positive("fl_x", 0) if given else _focal(content, frame, json_width, where)
+    # The path below the scene folder, since train/r_0.png and test/r_0.png are two images.
+    name = os.path.relpath(image_path, folder).replace(os.sep, "/")
+    camera = Camera(name, rotation, -rotation @ matrix[:3, 3], focal_x, positive("fl_y", focal_x),
+                    number("cx", json_width / 2), number("cy", json_height / 2), json_width, json_height)
     return PosedImage(camera, image_path)
 
 
 def _focal(content: Dict[str, Any], frame: Dict[str, Any], width: int, where: str) -> float:
-    """Focal length in pixels from `camera_angle_x`; 0 where `fl_x` is given instead."""
+    """Focal length in pixels of an image that wide from `camera_angle_x`."""
     angle = frame.get("camera_angle_x", content.get("camera_angle_x"))
-    if angle is None and ("fl_x" in frame or "fl_x" in content):
-        return 0.0
-    if not isinstance(angle, (int, float)) or not 0 < angle < math.pi:
+    if not _is_number(angle) or not 0 < angle < math.pi:
         raise SceneError(f"{where}: `camera_angle_x` is {angle!r}; it must be an angle between 0 and pi")
-    size = frame.get("w", content.get("w", width))
-    return size / (2 * math.tan(angle / 2))
+    return width / (2 * math.tan(angle / 2))
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a json value is a finite number; true and false, which Python counts among the integers, are not."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

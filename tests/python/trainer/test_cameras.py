@@ -96,3 +96,6 @@ def test_scene_extent_is_by_hand():
     corners = np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]) + [5, 6, 7]
     assert scene_extent(corners) == pytest.approx(1.1 * 2**0.5)
     assert scene_extent(corners[:1]) == 1.0
+    assert scene_extent(corners[0] + 1e-16 * np.arange(9).reshape(3, 3)) == 1.0
+    assert scene_extent(np.array([[0.1, 0, 0], [0.1 + 1e-15, 0, 0], [0.1, 1e-15, 0]])) == 1.0
+    assert scene_extent(0.001 * corners) == pytest.approx(0.0011 * 2**0.5), "a small scene keeps its size"

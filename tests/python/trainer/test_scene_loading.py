@@ -16,6 +16,7 @@ from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import SceneError
 from diff_smoe_rasterization.trainer.images import target_size
 from diff_smoe_rasterization.trainer.layout import PosedImage, hold_out
+from diff_smoe_rasterization.trainer.pictures import file_names
 from diff_smoe_rasterization.trainer.pointcloud import PointCloud
 from diff_smoe_rasterization.trainer.scene import load_cameras, load_scene
 
@@ -176,6 +177,13 @@ def test_nerf_cameras_look_along_minus_z_with_y_up(nerf_folder):
     np.testing.assert_allclose(view, [0.1, -0.2, 1.0], rtol=0, atol=1e-12)
 
 
+def test_nerf_names_are_paths(nerf_folder):
+    scene = load(nerf_folder)
+    assert (scene.train[0].camera.name, scene.test[0].camera.name) == ("train/r_0.png", "test/r_0.png")
+    assert file_names(["cam1/0001.jpg", "cam2/0001.jpg", "cam1/0001.png", "cam1_0001_2.png"]) == [
+        "cam1_0001", "cam2_0001", "cam1_0001_2", "cam1_0001_2_2"]
+
+
 def test_nerf_random_points(nerf_folder):
     points = load(nerf_folder).points
     assert points.positions.shape == (100_000, 3)
@@ -237,6 +245,17 @@ def test_an_unreadable_image(colmap_folder):
     with open(path, "r+b") as file:
         file.truncate(60)
     refused(colmap_folder, "view_004.png", "not a readable image")
+
+
+@pytest.mark.parametrize("dtype, kind", [(np.uint16, "PNG"), (np.int32, "TIFF"), (np.float32, "TIFF")])
+def test_more_than_8_bits(colmap_folder, dtype, kind):
+    path = os.path.join(colmap_folder, "images", "view_004.png")
+    Image.fromarray(np.full((24, 32), 30_000, dtype)).save(path, format=kind)
+    refused(colmap_folder, "view_004.png", "8 bits")
+
+
+def test_a_resolution_beyond_memory(colmap_folder):
+    refused(colmap_folder, "view_00", "--resolution 300000", "32x24", "300000x225000", resolution=300_000)
 
 
 def test_an_image_of_another_shape(colmap_folder):
@@ -314,6 +333,18 @@ def frame(**values):
     (frame(transform_matrix=[[1, 2], [3, 4]]), ["frame 0", "transform_matrix"]),
     (frame(transform_matrix=[[1, 0, 0, 0]] * 3 + [[0, 0, 0, "x"]]), ["frame 0", "transform_matrix"]),
     (frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), ["frame 0", "rotation"]),
+    (frame(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), ["frame 0", "mirrors", "rotation"]),
+    (frame(transform_matrix=[[10**400] * 4] * 4), ["frame 0", "transform_matrix"]),
+    (lambda content: content.update(camera_angle_x=True), ["camera_angle_x", "True"]),
+    (lambda content: content.update(w="32"), ["`w`", "'32'", "number"]),
+    (lambda content: content.update(w=0), ["`w` is 0", "positive"]),
+    (lambda content: content.update(h=-10), ["`h` is -10", "positive"]),
+    (lambda content: content.update(w=20.5), ["`w` is 20.5", "whole"]),
+    (frame(fl_x=0), ["frame 0", "`fl_x` is 0", "positive"]),
+    (frame(fl_x=20, fl_y=-20), ["`fl_y` is -20", "positive"]),
+    (frame(fl_x=True), ["`fl_x` is True", "number"]),
+    (frame(fl_x=10**400), ["`fl_x`", "finite number"]),
+    (frame(fl_x=None), ["`fl_x` is None", "number"]),
 ])
 def test_a_wrong_json(nerf_folder, edit, words):
     edit_json(nerf_folder / "transforms_train.json", edit)
