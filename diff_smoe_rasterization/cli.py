@@ -7,7 +7,8 @@ import sys
 from typing import List, Optional
 
 from .settings import BLEND_MODES
-from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments
+from .trainer.checkpoint import CHECKPOINT_NAME
+from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options
 from .trainer.errors import TrainerError
 
 
@@ -22,8 +23,9 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument("--scale-recipe", action="store_true",
                        help="squeeze the recipe into --iterations: its milestones (densification, resets, learning "
                             "rate, SH degrees) keep their share of 30,000 steps, unless they are given")
-    train.add_argument("--resume", action="store_true", help="continue the run in OUT from its last checkpoint")
-    train.add_argument("--overwrite", action="store_true", help="replace a run that is in OUT")
+    earlier_run = train.add_mutually_exclusive_group()
+    earlier_run.add_argument("--resume", action="store_true", help="continue the run in OUT from its last checkpoint")
+    earlier_run.add_argument("--overwrite", action="store_true", help="replace a run that is in OUT")
     train.add_argument("--quiet", action="store_true", help="no progress bars")
     train.set_defaults(run=_train)
 
@@ -63,11 +65,12 @@ def main(argv: Optional[List[str]] = None) -> int:
     arguments = build_parser().parse_args(argv)
     try:
         return arguments.run(arguments) or 0
-    except (TrainerError, ImportError) as error:
+    except (TrainerError, ImportError, OSError) as error:
         print(f"dsmoe {arguments.command}: error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        hint = "; the last checkpoint can be continued with --resume" if arguments.command == "train" else ""
+        continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
+        hint = "; continue it with --resume" if continues else ""
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return 130
 
@@ -78,11 +81,13 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 
 def _train(arguments: argparse.Namespace) -> None:
     from .trainer.loop import train
+    from .trainer.memory import keep_freed_memory
     from .trainer.results import results_table
 
     config = config_from_arguments(arguments)
     if arguments.scale_recipe:
-        config = config.shortened()
+        config = config.shortened().changed(**given_options(arguments))
+    keep_freed_memory()
     print(f"{config.scene} -> {config.output}: blend mode {config.blend_mode}, schedule {config.schedule}, "
           f"{config.iterations} iterations, seed {config.seed}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)

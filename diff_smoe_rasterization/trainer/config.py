@@ -178,7 +178,8 @@ _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str}
 def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), defaults: bool = True) -> None:
     """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser.
 
-    defaults: whether options that are not given get their default, or are left out of the parsed arguments.
+    Options that are not given are absent from the parsed arguments. defaults: whether the help text names what they
+    are then.
     """
     for option in dataclasses.fields(TrainConfig):
         if option.name in skip:
@@ -189,9 +190,9 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), def
             continue
         flags = option.metadata.get("flags", (_flag(option),))
         if option.type == "bool":
-            parser.add_argument(*flags, action="store_true", help=text, default=_default(option, defaults))
+            parser.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue
-        keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": _default(option, defaults)}
+        keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": argparse.SUPPRESS}
         if option.metadata.get("required"):
             keywords["required"] = True
         elif option.default is not None and defaults:
@@ -203,11 +204,12 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), def
         parser.add_argument(*flags, help=text, dest=option.name, **keywords)
 
 
-def _default(option: "dataclasses.Field[Any]", defaults: bool) -> Any:
-    return option.default if defaults else argparse.SUPPRESS
+def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
+    """The options of TrainConfig among parsed arguments."""
+    names = {option.name for option in dataclasses.fields(TrainConfig)}
+    return {name: value for name, value in vars(arguments).items() if name in names}
 
 
 def config_from_arguments(arguments: argparse.Namespace) -> TrainConfig:
-    """Builds a validated TrainConfig from parsed arguments; options not offered keep their defaults."""
-    names = {option.name for option in dataclasses.fields(TrainConfig)}
-    return TrainConfig(**{name: value for name, value in vars(arguments).items() if name in names}).validate()
+    """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults."""
+    return TrainConfig(**given_options(arguments)).validate()

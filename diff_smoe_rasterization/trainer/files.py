@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from typing import Any, BinaryIO, Callable
 
@@ -24,5 +25,13 @@ def write_text_atomically(path: str, text: str) -> None:
 
 
 def write_json_atomically(path: str, value: Any) -> None:
-    """Writes `value` as indented json."""
-    write_text_atomically(path, json.dumps(value, indent=2) + "\n")
+    """Writes `value` as indented json; what json has no number for, as the PSNR of equal images, becomes null."""
+    write_text_atomically(path, json.dumps(_finite_or_null(value), indent=2, allow_nan=False) + "\n")
+
+
+def _finite_or_null(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite_or_null(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite_or_null(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

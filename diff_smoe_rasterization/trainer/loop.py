@@ -16,8 +16,8 @@ from .environment import extension_info
 from .errors import TrainerError
 from .evaluation import Evaluation, evaluate
 from .files import write_json_atomically
+from .interrupt import DelayedInterrupt
 from .losses import training_loss
-from .memory import keep_freed_memory
 from .metrics import psnr
 from .model import GaussianModel, GaussianOptimizer
 from .modelfile import FOLDER, model_path, save_model
@@ -165,20 +165,25 @@ class Run:
         """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
         trainer, config = self.trainer, self.trainer.config
         with tqdm(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
-                  disable=not self.progress, dynamic_ncols=True) as bar:
+                  disable=not self.progress, dynamic_ncols=True) as bar, DelayedInterrupt() as interrupt:
             trainer.watch.start()
-            while trainer.iteration < config.iterations:
+            ends = trainer.iteration >= config.iterations
+            while not ends:
                 evaluates = (trainer.iteration + 1 < config.iterations
                              and _is_due(trainer.iteration + 1, config.eval_every))
                 step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
                 bar.update()
                 if trainer.iteration % PROGRESS_EVERY == 0:
-                    self._show(bar, float(step.loss.detach()))
-                if trainer.iteration == config.iterations or _is_due(trainer.iteration, config.checkpoint_every):
+                    self._show(bar, _check_loss(step))
+                ends = trainer.iteration >= config.iterations or interrupt.asked
+                if ends or _is_due(trainer.iteration, config.checkpoint_every):
                     trainer.watch.stop()
+                    _check_loss(step)
                     self.save_checkpoint()
                     trainer.watch.start()
             trainer.watch.stop()
+        if interrupt.asked:
+            raise KeyboardInterrupt
         save_model(model_path(config.output, trainer.iteration), trainer.model, str(config.blend_mode))
         evaluation = trainer.evaluate(self.progress)
         row = result_row(config, trainer.scene, trainer.model.num_gaussians, trainer.watch.seconds, evaluation)
@@ -191,8 +196,6 @@ class Run:
         save_checkpoint(self._path(CHECKPOINT_NAME), {**self.trainer.state_dict(), "history": self.history})
 
     def _show(self, bar: Any, loss: float) -> None:
-        if not math.isfinite(loss):
-            raise TrainerError(f"iteration {self.trainer.iteration}: the loss is {loss}; lower the learning rates")
         if self.progress:
             bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{self.trainer.training_psnr():.2f}",
                             gaussians=self.trainer.model.num_gaussians, refresh=False)
@@ -211,6 +214,14 @@ class Run:
 
     def _path(self, name: str) -> str:
         return os.path.join(self.trainer.config.output, name)
+
+
+def _check_loss(step: Step) -> float:
+    """The step's loss. Raises TrainerError where it is not finite: nothing that follows would be worth keeping."""
+    loss = float(step.loss.detach())
+    if not math.isfinite(loss):
+        raise TrainerError(f"iteration {step.iteration}: the loss is {loss}; lower the learning rates")
+    return loss
 
 
 def _is_due(iteration: int, interval: int) -> bool:
@@ -238,7 +249,6 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
     config.validate()
     check_device(config.device)
-    keep_freed_memory()
     if os.path.isfile(os.path.join(config.output, CONFIG_NAME)):
         if resume:
             differences = TrainConfig.load(config.output).differences(config)

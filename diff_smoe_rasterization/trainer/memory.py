@@ -11,8 +11,8 @@ M_MMAP_THRESHOLD, MMAP_BYTES = -3, 1 << 25  # glibc accepts no more
 def keep_freed_memory() -> None:
     """Tells glibc to reuse freed memory instead of returning it to the system after every operation.
 
-    A step frees and allocates the same tensors again; fresh pages cost about a tenth of its time. Does nothing where
-    the C library is another one.
+    A step frees and allocates the same tensors again, and fresh pages cost time. It holds for the whole process, so
+    that commands call it and the library does not. Does nothing where the C library is another one.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -18,6 +18,7 @@ from .errors import TrainerError
 from .images import image_size
 from .inspection import open_renderer, to_image
 from .loop import train
+from .memory import keep_freed_memory
 from .metrics import psnr, quantised
 from .modelfile import model_path
 from .pictures import comparison, evenly_spaced, file_names
@@ -42,10 +43,12 @@ FIXED = ("scene", "output", "blend_mode", "eval_every", "checkpoint_every")
 
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the comparison; returns the exit status."""
+    arguments = _parse(argv)
+    keep_freed_memory()
     try:
-        run(_parse(argv))
+        run(arguments)
         return 0
-    except (TrainerError, ImportError) as error:
+    except (TrainerError, ImportError, OSError) as error:
         print(f"quickstart: error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -77,6 +80,7 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
         print(f"making a scene in {folder}")
         write_synthetic_scene(folder)
     config = choose_options(folder, given)
+    os.makedirs(output, exist_ok=True)  # a folder that cannot be made is told before images are read
     scene = load_scene(config, progress)
     rows = []
     for mode in MODES:

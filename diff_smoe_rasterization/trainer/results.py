@@ -7,6 +7,7 @@ from typing import Any, Dict, List, Optional
 
 from .config import TrainConfig
 from .environment import machine, versions
+from .errors import TrainerError
 from .evaluation import Evaluation
 from .files import write_json_atomically
 from .images import DOWNSCALER
@@ -56,12 +57,18 @@ def write_results(folder: str, rows: List[Dict[str, Any]]) -> None:
 
 
 def read_results(folder: str) -> List[Dict[str, Any]]:
-    """The rows of OUT/results.json; none where the file is absent."""
+    """The rows of OUT/results.json; none where the file is absent. Raises TrainerError where it is damaged."""
     path = os.path.join(folder, RESULTS_NAME)
     if not os.path.isfile(path):
         return []
-    with open(path, encoding="utf-8") as file:
-        return json.load(file)
+    try:
+        with open(path, encoding="utf-8") as file:
+            rows = json.load(file)
+    except ValueError as error:
+        raise TrainerError(f"{path}: not valid json ({error}); remove the file to measure anew") from error
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise TrainerError(f"{path}: expected a list of rows; remove the file to measure anew")
+    return rows
 
 
 def results_table(rows: List[Dict[str, Any]]) -> str:

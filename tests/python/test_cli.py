@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -15,6 +16,7 @@ from PIL import Image
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.loop import Trainer
 from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
@@ -175,6 +177,65 @@ def test_errors_come_before_anything_is_written(scene, tmp_path, capsys):
     assert "model.ply" in fails(capsys, "render", "model.ply", "-o", output, "--scene", scene)
 
 
+def test_an_output_that_cannot_be_written_is_one_line(trained, scene, tmp_path, capsys):
+    path = str(tmp_path / "file")
+    with open(path, "w", encoding="utf-8") as file:
+        file.write("no folder")
+    for arguments in (["train", scene, "-o", path], ["train", scene, "-o", os.path.join(path, "below")],
+                      ["render", trained, "-o", path]):
+        assert path in fails(capsys, *arguments)
+
+
+def test_damaged_results_are_named(trained, tmp_path, capsys):
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
+    for content, words in (("[{", "not valid json"), ("[1]", "list of rows")):
+        with open(os.path.join(run, "results.json"), "w", encoding="utf-8") as file:
+            file.write(content)
+        text = fails(capsys, "eval", run)
+        assert os.path.join(run, "results.json") in text and words in text
+
+
+def test_resume_and_overwrite_exclude_each_other(scene, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", scene, "-o", str(tmp_path / "out"), "--resume", "--overwrite"])
+    assert "not allowed with" in capsys.readouterr().err
+
+
+def interrupt_at(monkeypatch, iteration):
+    """Presses Ctrl-C in the middle of that iteration's step."""
+    step = Trainer.step
+
+    def interrupted_step(self, *arguments):
+        if self.iteration + 1 == iteration:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, *arguments)
+
+    monkeypatch.setattr(Trainer, "step", interrupted_step)
+
+
+def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys):
+    output = str(tmp_path / "out")
+    arguments = ["train", scene, "-o", output, "--blend-mode", "smoe", *SHORT]
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 7)
+        assert main(arguments) == 130
+    assert capsys.readouterr().err.endswith("interrupted; continue it with --resume\n")
+    assert main([*arguments, "--resume"]) == 0
+    assert "resumed at iteration 7" in capsys.readouterr().out
+    with open(ply_of(output), "rb") as mine, open(ply_of(trained), "rb") as theirs:
+        assert mine.read() == theirs.read()
+
+
+def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monkeypatch, capsys):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diff_smoe_rasterization.trainer.loop.load_scene", interrupted)
+    assert main(["train", scene, "-o", str(tmp_path / "out"), *SHORT]) == 130
+    assert capsys.readouterr().err.endswith("interrupted\n")
+
+
 def test_an_unfinished_run_cannot_be_evaluated(trained, tmp_path, capsys):
     run = str(tmp_path / "run")
     shutil.copytree(trained, run)
@@ -185,10 +246,11 @@ def test_an_unfinished_run_cannot_be_evaluated(trained, tmp_path, capsys):
 def test_scale_recipe(scene, tmp_path):
     output = str(tmp_path / "out")
     assert main(["train", scene, "-o", output, "--iterations", "30", "--scale-recipe", "--densify-from-iter", "3",
-                 "--quiet"]) == 0
+                 "--sh-degree-interval", "1000", "--quiet"]) == 0
     with open(os.path.join(output, "config.json"), encoding="utf-8") as file:
         config = json.load(file)
     assert (config["densify_until_iter"], config["opacity_reset_interval"], config["densify_from_iter"]) == (15, 3, 3)
+    assert config["sh_degree_interval"] == 1000, "a value that is given wins, though it equals the default"
 
 
 def test_info(capsys):

@@ -73,6 +73,13 @@ def test_errors_are_one_line(tmp_path, capsys):
     assert capsys.readouterr().err == f"quickstart: error: scene {tmp_path / 'nowhere'}: no such folder\n"
 
 
+def test_an_output_that_is_a_file_is_one_line(tiny_scene, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert quickstart.main([tiny_scene, "-o", str(tmp_path / "file"), "--quiet"]) == 1
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1 and str(tmp_path / "file") in text
+
+
 def test_without_a_scene_one_is_made(tmp_path, monkeypatch, capsys):
     make = quickstart.write_synthetic_scene
     monkeypatch.setattr(quickstart, "write_synthetic_scene",

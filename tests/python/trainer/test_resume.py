@@ -236,6 +236,27 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
         assert file.read() == "old"
 
 
+def test_json_holds_null_where_it_has_no_number(tmp_path):
+    path = str(tmp_path / "file.json")
+    files.write_json_atomically(path, [{"psnr": float("inf"), "ssim": 1.0}, (float("nan"), 2)])
+    with open(path, encoding="utf-8") as file:
+        text = file.read()
+    assert json.loads(text) == [{"psnr": None, "ssim": 1.0}, [None, 2]] and "NaN" not in text
+
+
+def test_a_loss_that_is_not_finite_is_not_saved(tiny_config, monkeypatch):
+    step = Trainer.step
+
+    def diverging_step(self, *arguments):
+        done = step(self, *arguments)
+        return dataclasses.replace(done, loss=done.loss * float("nan")) if self.iteration == 3 else done
+
+    monkeypatch.setattr(Trainer, "step", diverging_step)
+    with pytest.raises(TrainerError, match="iteration 3: the loss is nan"):
+        train(dataclasses.replace(tiny_config, checkpoint_every=3), progress=False)
+    assert os.listdir(tiny_config.output) == ["config.json"]
+
+
 def test_views_come_once_each_in_random_order():
     order = ViewOrder(10, seed=0)
     epochs = [[order.next() for _ in range(10)] for _ in range(5)]
