@@ -31,13 +31,13 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     config = TrainConfig.load(output).changed(device=device, **({"scene": scene_folder} if scene_folder else {}))
     check_device(device)
     ply = trained_model_path(output, config.iterations)
+    earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
     scene = load_scene(config, progress).to(device)
     renderer = open_renderer(config, ply, config.blend_mode, device, rasterize)
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
         raise TrainerError(f"scene {config.scene} has no {split} views")
     evaluation = evaluate(renderer, views, device, progress)
-    earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
     seconds = earlier[0].get("train_seconds") if earlier else None
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation)
     if split == "test":
