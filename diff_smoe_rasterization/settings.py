@@ -51,7 +51,7 @@ class Rendering(NamedTuple):
     """What `rasterize` returns; an output that was not asked for is None."""
 
     color: torch.Tensor  # [C, H, W]
-    radii: torch.Tensor  # [P] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
+    radii: torch.Tensor  # [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
     alpha: Optional[torch.Tensor] = None  # [1, H, W]; alpha: 1 - T, SMoE modes: the denominator (gate sum)
     depth: Optional[torch.Tensor] = None  # [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
     inverse_depth: Optional[torch.Tensor] = None  # [1, H, W]; alpha: sum(w / z), SMoE modes: divided by the gate sum

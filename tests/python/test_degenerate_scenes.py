@@ -164,6 +164,27 @@ def test_extreme_finite_values_do_not_reach_the_others(mode, name, value):
         assert torch.isfinite(rendering.color).all()
 
 
+def test_an_infinite_colour_of_finite_coefficients_is_culled(mode):
+    """Each coefficient is a float; their sum over the basis is not. Pixels beside the Gaussian must not see 0 * inf."""
+    scene = random_scene(mode, 40, 33, 21, degree=3, dtype=torch.float32)
+    index = int((render(scene).radii > 0).nonzero()[5])
+    shs = scene.inputs["shs"].clone()
+    shs[index] = 1e-3  # no channel is clamped, so each derivative by a coefficient has the sign of its basis function
+    leaf = shs.clone().requires_grad_()
+    render(scene.with_inputs(shs=leaf)).color.sum().backward()
+    assert (leaf.grad[index] != 0).all()
+    shs[index] = 3e38 * torch.sign(leaf.grad[index])  # every term is positive
+    others = torch.arange(len(shs)) != index
+    rendering = render(scene.with_inputs(shs=shs))
+    assert rendering.radii[index] == 0
+    assert_close(rendering.color, render(scene.rows(others)).color, REORDERED, "colour")
+
+
+def test_alpha_min_is_compared_before_the_clamp(mode):
+    scene = one_gaussian(mode, (0.0, 0.0, 1.0), opacity=2.0, alpha_min=0.995)
+    assert (assert_equals_reference(scene).color[0] > 0).any()
+
+
 def test_a_gaussian_at_the_camera_centre_is_culled(mode):
     scene = small_scene(mode, dtype=torch.float32)
     index = int((render(scene).radii > 0).nonzero()[5])

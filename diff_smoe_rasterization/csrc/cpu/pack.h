@@ -98,7 +98,6 @@ template <class T> struct Pack {
   friend DSMOE_HD Pack max(Pack a, Pack b) { return maximum(a.v, b.v); }
   friend DSMOE_HD Pack fma(Pack a, Pack b, Pack c) { return fused(a.v, b.v, c.v); }
   friend DSMOE_HD T sum_lanes(Pack a) { return sum(a.v); }
-  friend DSMOE_HD T max_lanes(Pack a) { return largest(a.v); }
 
  private:
   static DSMOE_HD __mmask16 compare_less(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
@@ -115,8 +114,6 @@ template <class T> struct Pack {
   static DSMOE_HD __m512d fused(__m512d a, __m512d b, __m512d c) { return _mm512_fmadd_pd(a, b, c); }
   static DSMOE_HD float sum(__m512 a) { return _mm512_reduce_add_ps(a); }
   static DSMOE_HD double sum(__m512d a) { return _mm512_reduce_add_pd(a); }
-  static DSMOE_HD float largest(__m512 a) { return _mm512_reduce_max_ps(a); }
-  static DSMOE_HD double largest(__m512d a) { return _mm512_reduce_max_pd(a); }
 #else
   friend DSMOE_HD PackMask<T> operator<(Pack a, Pack b) { return {a.v < b.v}; }
   friend DSMOE_HD PackMask<T> operator<=(Pack a, Pack b) { return {a.v <= b.v}; }
@@ -127,11 +124,6 @@ template <class T> struct Pack {
     T total = a.v[0];
     for (int i = 1; i < kLanes; ++i) total += a.v[i];
     return total;
-  }
-  friend DSMOE_HD T max_lanes(Pack a) {
-    T largest = a.v[0];
-    for (int i = 1; i < kLanes; ++i) largest = largest < a.v[i] ? a.v[i] : largest;
-    return largest;
   }
 #if DSMOE_SIMD_BYTES == 32
   friend DSMOE_HD Pack fma(Pack a, Pack b, Pack c) { return fused(a.v, b.v, c.v); }

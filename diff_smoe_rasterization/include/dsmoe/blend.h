@@ -14,7 +14,7 @@
 //   gamma_i = w_i u_i - alpha_i / (1 - alpha_i) R_i,   dL/dc_i = w_i g'
 //
 // where b is 0 in alpha mode (the suffix starts at T_{N+1} g.bg) and g'.C under a gate: the pixel's own colour takes
-// the place of the background. Adding a mode: one enumerator, one specialisation here, one row in the oracle.
+// the place of the background. DEVELOPING.md says what else a new mode needs.
 #pragma once
 
 #include "dsmoe/gate.h"

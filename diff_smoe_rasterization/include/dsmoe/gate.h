@@ -50,7 +50,7 @@ template <BlendMode kMode, class Real, class S> DSMOE_HD Gate<Real> evaluate_gat
   gate.logit = Real(opacity) * kernel;
   gate.alpha = min(gate.logit, Real(S(kAlphaMax)));
   if constexpr (is_smoe(kMode)) {
-    gate.counts = (power <= Real(S(0))) & (kernel >= Real(S(kGateCut))) & (gate.alpha >= Real(alpha_min));
+    gate.counts = (power <= Real(S(0))) & (kernel >= Real(S(kGateCut))) & (gate.logit >= Real(alpha_min));
   } else {
     gate.counts = (power <= Real(S(0))) & (gate.alpha >= Real(S(kAlphaCut)));
   }

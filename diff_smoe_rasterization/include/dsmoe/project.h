@@ -59,7 +59,7 @@ template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, const Camera<S>
   return radius_rect(mean, radius, grid);
 }
 
-// Projects Gaussian i. Returns its radius in pixels, 0 where it is culled (then out is left as it was).
+// Projects Gaussian i. Returns its radius in pixels, 0 where it is culled (then out and features mean nothing).
 template <class S>
 DSMOE_HD int32_t project_gaussian(const GaussianInputs<S>& in, const Camera<S>& camera, const RasterConfig<S>& config,
                                   int64_t i, ProjectedGaussian<S>& out, S* features) {
@@ -79,9 +79,6 @@ DSMOE_HD int32_t project_gaussian(const GaussianInputs<S>& in, const Camera<S>& 
                                          : !tile_bounds(config.mode, camera, pixel, radius).empty();
   if (!seen) return 0;
 
-  S opacity = in.opacities[i];
-  if (config.antialiasing) opacity *= opacity_compensation(cov2d, conic);
-  out = {pixel, conic.inverse, opacity, squared_reach(config.mode, opacity, config.alpha_min), view.z};
   if (in.colors_precomp != nullptr) {
     for (int c = 0; c < config.num_channels; ++c) features[c] = in.colors_precomp[i * config.num_channels + c];
   } else {
@@ -90,6 +87,12 @@ DSMOE_HD int32_t project_gaussian(const GaussianInputs<S>& in, const Camera<S>& 
   S* extra = features + config.num_channels;
   if (config.depth) *extra++ = view.z;
   if (config.inverse_depth) *extra = S(1) / view.z;
+  // Finite coefficients can add up to an infinite colour; times a weight of 0 it would reach pixels next to the
+  // Gaussian.
+  if (!all_finite(features, config.num_features())) return 0;
+  S opacity = in.opacities[i];
+  if (config.antialiasing) opacity *= opacity_compensation(cov2d, conic);
+  out = {pixel, conic.inverse, opacity, squared_reach(config.mode, opacity, config.alpha_min), view.z};
   return static_cast<int32_t>(min(radius, S(1 << 30)));
 }
 

@@ -15,8 +15,7 @@ struct TileRect {
 
 struct TileGrid {
   int columns, rows;
-  DSMOE_HD TileGrid(int width, int height)
-      : columns((width + kTileSize - 1) / kTileSize), rows((height + kTileSize - 1) / kTileSize) {}
+  DSMOE_HD TileGrid(int width, int height) : columns((width - 1) / kTileSize + 1), rows((height - 1) / kTileSize + 1) {}
 };
 
 // floor(x) and ceil(x), kept in [low, high], 0 <= low; also defined where x is beyond every integer.
