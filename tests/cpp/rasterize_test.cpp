@@ -387,7 +387,7 @@ TYPED_TEST(RasterizeIn, CulledGaussiansGetZeroGradientsAndTheOthersAsIfAlone) {
 // cov3D_precomp is the caller's and may be no covariance at all. A determinant above 0 does not exclude negative
 // definite ones, whose exponents grow without bound away from the centre.
 TYPED_TEST(RasterizeIn, GivenCovariancesOfAnyKindLeaveGradientsFinite) {
-  Scene<float> scene = in_mode(convert<float>(make_scene(30, 200, 37, 29)), TypeParam::value);
+  Scene<float> scene = in_mode(convert<float>(make_scene(30, 1000, 37, 29)), TypeParam::value);
   scene.scales.clear(), scene.rotations.clear();
   scene.cov3D_precomp.resize(6 * scene.count);
   Random random(31);
@@ -402,6 +402,7 @@ TYPED_TEST(RasterizeIn, GivenCovariancesOfAnyKindLeaveGradientsFinite) {
     }
   }
   Rendering<float> r = render(scene);
+  for (int64_t i = 0; i < scene.count; i += 2) ASSERT_EQ(r.radii[i], 0) << "negative definite";
   EXPECT_GT(r.instances.size(), 50u);
   for (const float value : r.color) ASSERT_TRUE(std::isfinite(value));
   const ImageWeights<float> weights(scene, 32);
