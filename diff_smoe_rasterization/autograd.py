@@ -77,7 +77,7 @@ def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales
 
     return (means3D.new_empty((channels, image_height, image_width)), means3D.new_empty((count,), dtype=torch.int32),
             image(), image(depth), image(inverse_depth), means3D.new_empty((count, 8)),
-            means3D.new_empty((count, channels + depth + inverse_depth)),
+            means3D.new_empty((count, channels + int(depth) + int(inverse_depth))),
             means3D.new_empty((count + 1,), dtype=torch.int64), means3D.new_empty((tiles + 1,), dtype=torch.int64),
             means3D.new_empty((num_instances, 2), dtype=torch.int32), means3D.new_empty((image_height, image_width)),
             means3D.new_empty((image_height, image_width), dtype=torch.int32))

@@ -65,8 +65,10 @@ void translate_errors(std::exception_ptr pointer) {
   try {
     std::rethrow_exception(pointer);
   } catch (const FileError& error) {
-    const py::tuple arguments = py::make_tuple(error.error_number, decode_utf8(error.reason), decode_utf8(error.path));
-    PyErr_SetObject(PyExc_OSError, arguments.ptr());
+    // Made here, because Python 3.8 does not turn a bare OSError into its subclass (FileNotFoundError ...) by itself.
+    const py::object instance = py::reinterpret_borrow<py::object>(PyExc_OSError)(
+        error.error_number, decode_utf8(error.reason), decode_utf8(error.path));
+    PyErr_SetObject(instance.get_type().ptr(), instance.ptr());
   } catch (const FormatError& error) {
     PyErr_SetObject(PyExc_ValueError, decode_utf8(error.what()).ptr());
   }
