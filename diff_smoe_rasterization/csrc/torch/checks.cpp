@@ -5,11 +5,11 @@
 #include <sstream>
 #include <vector>
 
+#include "dsmoe/sh.h"
+
 namespace dsmoe {
 namespace binding {
 namespace {
-
-constexpr int kMaxShDegree = 3;
 
 std::string dtype_name(at::ScalarType type) {
   switch (type) {
@@ -125,7 +125,7 @@ void check_sh_degree(const Inputs& inputs, int64_t degree) {
   TORCH_CHECK_VALUE(0 <= degree && degree <= kMaxShDegree, "rasterize: sh_degree is ", degree, "; it must be 0 to ",
                     kMaxShDegree);
   const int64_t held = (inputs[kShs].defined() ? inputs[kShs].size(1) : 0) + (inputs[kDc].defined() ? 1 : 0);
-  const int64_t needed = (degree + 1) * (degree + 1);
+  const int64_t needed = sh_coefficients(static_cast<int>(degree));
   const Input last = inputs[kShs].defined() ? kShs : kDc;
   TORCH_CHECK_VALUE(held >= needed, "rasterize: ", kInputNames[last], " has shape ", inputs[last].sizes(),
                     inputs[kShs].defined() && inputs[kDc].defined() ? " besides dc" : "", "; sh_degree ", degree,
