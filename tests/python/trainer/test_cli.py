@@ -23,20 +23,9 @@ SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter
          "--densification-interval", "4", "--quiet"]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Tensors are so small here that torch's threads would only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    write_synthetic_scene(str(folder), views=9, width=32, height=24, points=150, supersampling=1)
-    return str(folder)
+def scene(tiny_scene):
+    return tiny_scene
 
 
 @pytest.fixture(scope="module")
