@@ -5,6 +5,8 @@ import contextlib
 import math
 
 import torch
+from devices import on_the_cpu
+from scenes import gradients
 
 from diff_smoe_rasterization import reference
 
@@ -27,7 +29,11 @@ def relative_error(actual, expected):
 
 
 def assert_close(actual, expected, tolerance, name):
-    """Compares by the norm of the difference relative to the norm; what must be zero must be exactly zero."""
+    """Compares by the norm of the difference relative to the norm; what must be zero must be exactly zero.
+
+    The two may be of different types and on different devices.
+    """
+    actual = actual.to(expected.device)
     assert actual.shape == expected.shape, f"{name}: shape {tuple(actual.shape)}, not {tuple(expected.shape)}"
     assert torch.isfinite(actual).all(), f"{name} is not finite"
     if not expected.any():
@@ -44,15 +50,35 @@ def assert_all_close(actual, expected, tolerance):
         assert_close(actual[name], expected[name], tolerance, name)
 
 
+def assert_same_gradients(actual, expected):
+    """Compares the gradients of equal calls, two dictionaries of tensors: on the CPU no bit may differ.
+
+    A GPU adds a Gaussian's terms in the order in which its tiles are done, which is another one each time.
+    """
+    assert actual.keys() == expected.keys()
+    for name, values in expected.items():
+        if values.device.type == "cpu":
+            assert torch.equal(actual[name], values), name
+        else:
+            # Some thousand terms that cancel in part: roundings of 6e-8 or of 1e-16 each.
+            assert_close(actual[name], values, 1e-5 if values.dtype == torch.float32 else 1e-12, name)
+
+
+def reference_gradients(scene, outputs=(), camera=True):
+    """Returns (rendering, gradients by name) as scenes.gradients, of the reference and on the CPU."""
+    with one_thread(), on_the_cpu():
+        return gradients(reference.rasterize, scene.to("cpu"), outputs, camera)
+
+
 def threshold_margin(scene):
-    """Returns how near each pixel is to another outcome [H, W]: the least |ln(value / threshold)| over its pairs.
+    """Returns how near each pixel is to another outcome [H, W], CPU: the least |ln(value / threshold)| over its pairs.
 
     Thresholds are the cut-off on G or on alpha and the early stop. In float32, and under finite differences, a pixel
     with a margin within the error of its values may fall on the other side. For small scenes: it is dense.
     """
-    scene = scene.to(torch.float64)
+    scene = scene.to("cpu").to(torch.float64)
     settings, mode = scene.settings, reference.resolve_blend_mode(scene.settings.blend_mode)
-    with torch.no_grad():
+    with torch.no_grad(), on_the_cpu():
         gaussians = reference._gather(*(scene.inputs.get(name) for name in (
             "means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")))
         order = reference.visible(gaussians, settings, mode)[1]

@@ -5,8 +5,9 @@ import math
 from typing import Dict, NamedTuple
 
 import torch
+from devices import default_device, random_normal
 
-from diff_smoe_rasterization.settings import GaussianRasterizationSettings
+from diff_smoe_rasterization.settings import BLEND_MODES, GaussianRasterizationSettings
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
 
@@ -17,10 +18,10 @@ class Scene(NamedTuple):
     inputs: Dict[str, torch.Tensor]
     settings: GaussianRasterizationSettings
 
-    def to(self, dtype):
-        """Returns the scene with every tensor of the given type."""
-        camera = {name: getattr(self.settings, name).detach().to(dtype) for name in CAMERA_FIELDS}
-        inputs = {name: tensor.detach().to(dtype) for name, tensor in self.inputs.items()}
+    def to(self, target):
+        """Returns the scene with every tensor of the given type or on the given device."""
+        camera = {name: getattr(self.settings, name).detach().to(target) for name in CAMERA_FIELDS}
+        inputs = {name: tensor.detach().to(target) for name, tensor in self.inputs.items()}
         return Scene(inputs, self.settings._replace(**camera))
 
     def with_settings(self, **fields):
@@ -84,15 +85,16 @@ def random_scene(mode, num_gaussians=120, width=50, height=37, seed=0, degree=2,
     channels: number of channels of colors_precomp; None for spherical harmonics.
     covariance: "scales" for scales and rotations, "cov3D" for cov3D_precomp.
     scale: median standard deviation, world; axes vary by a factor of 3 up and down.
-    Every value is a float32 number, so that the same scene exists in both types.
+    Every value is a float32 number, so that the same scene exists in both types, and drawn on the CPU, so that it is
+    the same on every device.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator(device="cpu").manual_seed(seed)
 
     def uniform(low, high, *shape):
-        return low + (high - low) * torch.rand(*shape, generator=generator)
+        return (low + (high - low) * torch.rand(*shape, generator=generator, device="cpu")).to(default_device())
 
     def normal(*shape):
-        return torch.randn(*shape, generator=generator)
+        return torch.randn(*shape, generator=generator, device="cpu").to(default_device())
 
     means3D = uniform(-2.2, 2.2, num_gaussians, 3)
     means3D[: num_gaussians // 12] -= torch.tensor([0.0, 0.0, 6.0])
@@ -130,9 +132,8 @@ def assert_not_empty(rendering, settings):
 
 def random_weights(rendering, outputs=(), seed=1):
     """Returns fixed random gradients [C, H, W], ... for the colour and the optional outputs of a rendering."""
-    generator = torch.Generator().manual_seed(seed)
     images = [rendering.color] + [getattr(rendering, name) for name in outputs]
-    return images, [torch.randn(image.shape, generator=generator, dtype=torch.float64).to(image) for image in images]
+    return images, [random_normal(image.shape, seed + i).to(image) for i, image in enumerate(images)]
 
 
 def gradients(function, scene, outputs=(), camera=True):
@@ -144,3 +145,11 @@ def gradients(function, scene, outputs=(), camera=True):
     values = torch.autograd.grad(images, list(leaves.values()), weights, allow_unused=True)
     return rendering, {name: torch.zeros_like(leaf) if value is None else value
                        for (name, leaf), value in zip(leaves.items(), values)}
+
+
+def op_arguments(scene, op="rasterize", **others):
+    """Returns the arguments of an op for a scene and all optional images, by the op's schema; others: by name."""
+    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(scene.settings.blend_mode), "depth": True,
+              "inverse_depth": True, **scene.inputs, **others}
+    schema = getattr(torch.ops.diff_smoe_rasterization, op).default._schema
+    return tuple(values.get(argument.name) for argument in schema.arguments)

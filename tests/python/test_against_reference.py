@@ -2,7 +2,7 @@
 
 In float64 the two must agree to rounding. In float32 the package is compared with the reference in float64 on the same
 numbers; pixels in which a pair lies within rounding of a threshold (cut-off, early stop) may show another outcome, so
-they are counted and take no part.
+they are counted and take no part. The reference always runs on the CPU.
 """
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ import functools
 import pytest
 import torch
 from comparison import assert_all_close, assert_close, one_thread, threshold_margin
+from devices import on_the_cpu, random_normal
 from scenes import assert_not_empty, random_scene
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import _C, reference
 from diff_smoe_rasterization.settings import OUTPUTS
+
+pytestmark = pytest.mark.usefixtures("device")
 
 # A gradient is a sum of some thousand terms that cancel in part, each with some hundred roundings of 1e-16.
 FLOAT64_TOLERANCE = 1e-12
@@ -50,10 +53,10 @@ def _with_scale_modifier(mode):
 def _with_any_camera(mode):
     """Different focal lengths, a view matrix that is no rotation, a projection and a centre that match neither."""
     scene = random_scene(mode, seed=24)
-    settings, generator = scene.settings, torch.Generator().manual_seed(24)
+    settings = scene.settings
 
     def disturbed(tensor, amount):
-        return tensor + amount * torch.randn(tensor.shape, generator=generator).to(tensor)
+        return tensor + amount * random_normal(tensor.shape, 24).to(tensor)
 
     view = settings.viewmatrix.clone()
     view[:, :3] = disturbed(view[:, :3], 0.05)
@@ -104,13 +107,15 @@ WITH_OUTPUTS = {"default", "split_dc", "channels_7", "antialiasing", "saturating
 
 @functools.lru_cache(maxsize=None)
 def build(name, mode):
-    """Returns (scene, outputs, image gradients that are zero at thresholds, that mask, reference results)."""
-    scene = SCENES[name](mode)
-    outputs = OUTPUTS if name in WITH_OUTPUTS else ()
-    generator = torch.Generator().manual_seed(1)
-    shape = (len(scene.settings.bg) + len(outputs), scene.settings.image_height, scene.settings.image_width)
-    weights = torch.randn(shape, generator=generator, dtype=torch.float64)
-    with one_thread():
+    """Returns (scene, outputs, image gradients, where no threshold is near, reference results, those without the rest).
+
+    All on the CPU, once for all devices.
+    """
+    with one_thread(), on_the_cpu():
+        scene = SCENES[name](mode)
+        outputs = OUTPUTS if name in WITH_OUTPUTS else ()
+        shape = (len(scene.settings.bg) + len(outputs), scene.settings.image_height, scene.settings.image_width)
+        weights = random_normal(shape, 1)
         safe = threshold_margin(scene) > FLOAT32_MARGIN
         expected = render(reference.rasterize, scene, outputs, weights)
         expected_safe = render(reference.rasterize, scene, outputs, weights * safe)[2]
@@ -131,28 +136,28 @@ def render(function, scene, outputs, weights):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_float64(mode, name):
+def test_float64(mode, name, device):
     scene, outputs, weights, _, (expected, expected_images, expected_gradients), _ = build(name, mode)
     if name != "faint" or mode != "alpha":
         assert_not_empty(expected, scene.settings)
     if name == "saturating" and mode in ("alpha", "smoe"):
         assert (expected_images["alpha"] > 0.999).double().mean() > 0.5
-    rendering, images, gradients = render(diff_smoe_rasterization.rasterize, scene, outputs, weights)
-    assert torch.equal(rendering.radii, expected.radii)
+    rendering, images, gradients = render(diff_smoe_rasterization.rasterize, scene.to(device), outputs, weights)
+    assert torch.equal(rendering.radii.cpu(), expected.radii)
     assert_all_close(images, expected_images, FLOAT64_TOLERANCE)
     assert_all_close(gradients, expected_gradients, FLOAT64_TOLERANCE)
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_float32(mode, name):
+def test_float32(mode, name, device):
     scene, outputs, weights, safe, (expected, expected_images, _), expected_gradients = build(name, mode)
     assert safe.double().mean() > 0.8
-    rendering, images, gradients = render(diff_smoe_rasterization.rasterize, scene.to(torch.float32), outputs,
-                                          weights * safe)
+    rendering, images, gradients = render(diff_smoe_rasterization.rasterize, scene.to(device).to(torch.float32),
+                                          outputs, weights * safe)
     assert rendering.color.dtype == torch.float32 and rendering.radii.dtype == torch.int32
-    assert torch.equal(rendering.radii, expected.radii)
+    assert torch.equal(rendering.radii.cpu(), expected.radii)
     for output, image in images.items():
-        assert_close(image[:, safe], expected_images[output][:, safe], FLOAT32_IMAGE_TOLERANCE, output)
+        assert_close(image.cpu()[:, safe], expected_images[output][:, safe], FLOAT32_IMAGE_TOLERANCE, output)
         assert torch.isfinite(image).all()
     assert_all_close(gradients, expected_gradients, FLOAT32_GRADIENT_TOLERANCE)
 
@@ -170,17 +175,19 @@ def test_the_optional_outputs_do_not_change_the_colour(mode):
 def test_each_optional_output_has_its_own_gradient(mode):
     scene = random_scene(mode, 60, seed=30)
     for output in OUTPUTS:
-        results = []
-        for function in (diff_smoe_rasterization.rasterize, reference.rasterize):
+        weights = random_normal((1, scene.settings.image_height, scene.settings.image_width), 2)
+
+        def gradients(function, scene, output=output, weights=weights):
             leaves = scene.requiring_grad(camera=False)
-            with one_thread():
-                image = getattr(function(settings=leaves.settings, outputs=(output,), **leaves.inputs), output)
-                weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-                values = torch.autograd.grad(image, list(leaves.inputs.values()), weights, allow_unused=True)
-            results.append({name: torch.zeros_like(leaf) if value is None else value
-                            for (name, leaf), value in zip(leaves.inputs.items(), values)})
-        assert results[1]["means3D"].any()
-        assert_all_close(results[0], results[1], FLOAT64_TOLERANCE)
+            image = getattr(function(settings=leaves.settings, outputs=(output,), **leaves.inputs), output)
+            values = torch.autograd.grad(image, list(leaves.inputs.values()), weights.to(image), allow_unused=True)
+            return {name: torch.zeros_like(leaf) if value is None else value
+                    for (name, leaf), value in zip(leaves.inputs.items(), values)}
+
+        with one_thread(), on_the_cpu():
+            expected = gradients(reference.rasterize, scene.to("cpu"))
+        assert expected["means3D"].any()
+        assert_all_close(gradients(diff_smoe_rasterization.rasterize, scene), expected, FLOAT64_TOLERANCE)
 
 
 def test_the_core_has_the_constants_of_the_reference():

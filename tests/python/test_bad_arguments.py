@@ -9,6 +9,8 @@ from scenes import camera_settings, random_scene
 
 from diff_smoe_rasterization import GaussianRasterizer, rasterize
 
+pytestmark = pytest.mark.usefixtures("device")
+
 COUNT = 30
 
 

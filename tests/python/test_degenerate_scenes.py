@@ -4,11 +4,14 @@ from __future__ import annotations
 import numpy
 import pytest
 import torch
-from comparison import assert_all_close, assert_close, one_thread
+from comparison import assert_all_close, assert_close, reference_gradients
+from devices import random_normal
 from scenes import camera_settings, gradients, random_scene
 
-from diff_smoe_rasterization import rasterize, reference
+from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
+
+pytestmark = pytest.mark.usefixtures("device")
 
 EXACT = 1e-9  # float64; the determinant of a flat splat seen edge-on is a difference that loses some digits
 REORDERED = 1e-5  # float32; another Gaussian left out may change the order of sums
@@ -38,9 +41,8 @@ def one_gaussian(mode, mean, scale=(0.1, 0.1, 0.1), opacity=0.8, width=33, heigh
 
 def assert_equals_reference(scene, outputs=OUTPUTS):
     rendering, gradient = gradients(rasterize, scene, outputs)
-    with one_thread():
-        expected, expected_gradient = gradients(reference.rasterize, scene, outputs)
-    assert torch.equal(rendering.radii, expected.radii)
+    expected, expected_gradient = reference_gradients(scene, outputs)
+    assert torch.equal(rendering.radii.cpu(), expected.radii)
     for name in ("color",) + tuple(outputs):
         assert_close(getattr(rendering, name), getattr(expected, name), EXACT, name)
     assert_all_close(gradient, expected_gradient, EXACT)
@@ -57,7 +59,7 @@ def assert_background_only(scene):
             assert not values.any(), name
             assert values.shape == (scene.inputs.get(name) if name in scene.inputs else
                                     getattr(scene.settings, name)).shape
-    weights = torch.randn(rendering.color.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights = random_normal(rendering.color.shape, 1)
     # The order of the sum over the pixels is free.
     assert_close(gradient["bg"], weights.sum((1, 2)), 1e-4 if rendering.color.dtype == torch.float32 else EXACT, "bg")
     return rendering

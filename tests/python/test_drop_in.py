@@ -12,12 +12,14 @@ from scenes import camera_settings, gradients, random_scene, random_weights
 from diff_smoe_rasterization import (
     BLEND_MODES, GaussianRasterizationSettings, GaussianRasterizer, Rendering, rasterize, rasterize_gaussians)
 
+pytestmark = pytest.mark.usefixtures("device")
+
 FIELDS = ("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
           "sh_degree", "campos", "prefiltered", "debug")
 
 
 @pytest.fixture
-def scene():
+def scene(device):
     return random_scene(None, 40, 33, 21, degree=1, dtype=torch.float32)
 
 
@@ -26,7 +28,7 @@ def test_the_settings_are_built_from_twelve_keywords(scene):
     settings = GaussianRasterizationSettings(**values)
     assert settings._fields[:12] == FIELDS
     assert settings[:12] == tuple(values.values())
-    assert settings._fields[-1] == "blend_mode" and settings.blend_mode is None
+    assert settings.blend_mode is None
     color, radii = GaussianRasterizer(raster_settings=settings)(**scene.inputs)
     assert color.shape == (3, 21, 33) and radii.shape == (40,)
 

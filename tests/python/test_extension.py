@@ -12,14 +12,18 @@ from pathlib import Path
 
 import pytest
 import torch
-from scenes import random_scene
+from comparison import assert_same_gradients
+from devices import random_normal
+from scenes import op_arguments, random_scene
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
 WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
-IMAGES = (0, 2, 3, 4)  # which results of the op are differentiable images
+IMAGES = dict(color=0, gate_sum=2, depth=3, inverse_depth=4)  # which results of the op are differentiable images
+NUM_INPUTS = 13  # tensors among the arguments of the op
+on_every_device = pytest.mark.usefixtures("device")
 
 
 @pytest.fixture
@@ -119,6 +123,7 @@ def test_stage_times_are_taken_while_profiling_is_on():
     assert run() == second
 
 
+@on_every_device
 def test_images_may_be_edited_in_place(mode):
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32)
 
@@ -127,34 +132,24 @@ def test_images_may_be_edited_in_place(mode):
         rendering = rasterize(settings=leaf.settings, outputs=OUTPUTS, **leaf.inputs)
         images = [edit(image) for image in (rendering.color, rendering.alpha, rendering.depth, rendering.inverse_depth)]
         sum((image ** 2).sum() for image in images).backward()
-        return [tensor.grad for tensor in leaf.leaves().values()]
+        return {name: tensor.grad for name, tensor in leaf.leaves().items()}
 
-    for in_place, ordinary in zip(gradients(lambda image: image.mul_(0.5)), gradients(lambda image: image * 0.5)):
-        assert torch.equal(in_place, ordinary)
-
-
-def op_arguments(scene):
-    """Returns the 13 tensors and 13 options of the ops."""
-    settings, inputs = scene.settings, scene.inputs
-    tensors = [inputs.get(name) for name in ("means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales",
-                                             "rotations", "cov3D_precomp")]
-    tensors += [settings.bg, settings.viewmatrix, settings.projmatrix, settings.campos]
-    options = [settings.image_height, settings.image_width, settings.tanfovx, settings.tanfovy, settings.scale_modifier,
-               settings.near, settings.alpha_min, settings.sh_degree, BLEND_MODES.index(settings.blend_mode),
-               settings.antialiasing, True, True, settings.debug]
-    return tensors, options
+    assert_same_gradients(gradients(lambda image: image.mul_(0.5)), gradients(lambda image: image * 0.5))
 
 
 def backward_arguments(mode):
     """Returns the arguments of the op rasterize_backward, by position."""
-    tensors, options = op_arguments(random_scene(mode, 20, 20, 18, degree=1, dtype=torch.float32))
-    results = torch.ops.diff_smoe_rasterization.rasterize(*tensors, *options, False, False)
+    scene = random_scene(mode, 20, 20, 18, degree=1, dtype=torch.float32)
+    arguments = op_arguments(scene)
+    tensors = arguments[:NUM_INPUTS]
+    results = torch.ops.diff_smoe_rasterization.rasterize(*arguments)
     present = [tensor is not None for tensor in tensors]
-    image_gradients = [torch.randn(results[i].shape, generator=torch.Generator().manual_seed(i)) for i in IMAGES]
-    return [*image_gradients, [tensor for tensor in tensors if tensor is not None], present, list(results), *options,
-            present]
+    image_gradients = {"dL_d" + name: random_normal(results[i].shape, i, torch.float32) for name, i in IMAGES.items()}
+    return list(op_arguments(scene, "rasterize_backward", **image_gradients, present=present, wanted=present,
+                             inputs=[tensor for tensor in tensors if tensor is not None], outputs=list(results)))
 
 
+@on_every_device
 @pytest.mark.skipif(not hasattr(torch.library, "opcheck"), reason=f"torch {torch.__version__} has no opcheck")
 def test_opcheck_of_rasterize_backward(mode):
     torch.library.opcheck(torch.ops.diff_smoe_rasterization.rasterize_backward.default, tuple(backward_arguments(mode)))
@@ -177,6 +172,7 @@ def test_the_backward_op_refuses_results_of_another_type():
         torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
 
 
+@on_every_device
 def test_the_backward_op_refuses_lists_of_the_wrong_length():
     for position, name in ((4, "inputs"), (6, "outputs")):
         arguments = backward_arguments("smoe")
@@ -185,6 +181,7 @@ def test_the_backward_op_refuses_lists_of_the_wrong_length():
             torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
 
 
+@on_every_device
 @pytest.mark.parametrize("row, name", [(0, "means3D"), (1, "opacities"), (-4, "bg"), (-3, "viewmatrix"), (-1, "campos")])
 def test_the_backward_op_refuses_absent_inputs(row, name):
     arguments = backward_arguments("smoe")
@@ -197,6 +194,7 @@ def test_the_backward_op_refuses_absent_inputs(row, name):
         torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments[:4], inputs, present, *arguments[6:])
 
 
+@on_every_device
 def test_the_backward_op_refuses_gradients_of_absent_inputs():
     arguments = backward_arguments("smoe")
     arguments[-1] = [True] * 13
@@ -204,6 +202,7 @@ def test_the_backward_op_refuses_gradients_of_absent_inputs():
         torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
 
 
+@on_every_device
 @pytest.mark.skipif(not hasattr(torch.library, "register_autograd"),
                     reason=f"torch {torch.__version__} only refuses what it sees: a loss that is not linear")
 def test_second_derivatives_of_a_linear_loss_are_refused():
@@ -214,6 +213,7 @@ def test_second_derivatives_of_a_linear_loss_are_refused():
         first.sum().backward()
 
 
+@on_every_device
 @pytest.mark.parametrize("field", ["bg", "viewmatrix", "projmatrix", "campos"])
 def test_debug_names_the_camera_tensor_that_holds_nan(field):
     scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32)
@@ -224,6 +224,7 @@ def test_debug_names_the_camera_tensor_that_holds_nan(field):
         rasterize(settings=settings, **scene.inputs)
 
 
+@on_every_device
 def test_debug_names_the_image_gradient_that_holds_nan():
     scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32).with_settings(debug=True).requiring_grad()
     color = rasterize(settings=scene.settings, **scene.inputs).color

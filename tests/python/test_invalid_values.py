@@ -11,6 +11,8 @@ from scenes import gradients, random_scene
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
 
+pytestmark = pytest.mark.usefixtures("device")
+
 COUNT = 40
 # Where another Gaussian is left out, sums over Gaussians and tiles may be formed in another order.
 REORDERED = 1e-5

@@ -3,25 +3,17 @@ from __future__ import annotations
 
 import pytest
 import torch
-from scenes import gradients, random_scene
+from comparison import assert_same_gradients
+from scenes import gradients, op_arguments, random_scene
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
+from diff_smoe_rasterization.settings import OUTPUTS
 
-pytestmark = pytest.mark.skipif(not hasattr(torch.library, "opcheck"),
-                                reason=f"torch {torch.__version__} has no torch.library.opcheck, so no fake kernels")
-
-
-def op_arguments(scene, outputs=OUTPUTS):
-    """Returns the arguments of the op `rasterize` for a scene, in the order of its schema."""
-    settings, inputs = scene.settings, scene.inputs
-    tensors = [inputs.get(name) for name in ("means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales",
-                                             "rotations", "cov3D_precomp")]
-    camera = [settings.bg, settings.viewmatrix, settings.projmatrix, settings.campos]
-    options = [settings.image_height, settings.image_width, settings.tanfovx, settings.tanfovy, settings.scale_modifier,
-               settings.near, settings.alpha_min, settings.sh_degree, BLEND_MODES.index(settings.blend_mode),
-               settings.antialiasing, "depth" in outputs, "inverse_depth" in outputs, settings.debug]
-    return tuple(tensors + camera + options + [settings.strict, settings.prefiltered])
+pytestmark = [
+    pytest.mark.usefixtures("device"),
+    pytest.mark.skipif(not hasattr(torch.library, "opcheck"),
+                       reason=f"torch {torch.__version__} has no torch.library.opcheck, so no fake kernels"),
+]
 
 
 @pytest.mark.parametrize("case", [dict(degree=1), dict(degree=1, split_dc=True), dict(channels=5, covariance="cov3D")],
@@ -51,5 +43,4 @@ def test_compiled_equals_eager(mode, backend):
     actual, actual_gradients = gradients(compiled, scene, OUTPUTS)
     for first, second in zip(expected, actual):
         assert torch.equal(first, second)
-    for name, gradient in expected_gradients.items():
-        assert torch.equal(gradient, actual_gradients[name]), name
+    assert_same_gradients(actual_gradients, expected_gradients)
