@@ -1,0 +1,76 @@
+"""How a GPU's results are compared with the CPU backend's in float64, on the same numbers."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from comparison import assert_all_close
+from devices import random_normal
+
+from diff_smoe_rasterization import rasterize
+
+
+class Tolerance(NamedTuple):
+    """What rounding may do to one scene."""
+
+    pixel: float  # of a pixel, relative to the image's largest value
+    gradient: float  # of a gradient, in the 2-norm, relative to its norm
+    flipped: float = 0.0  # part of the pixels that may show another outcome of a threshold
+
+
+# exp and fused multiply-adds round otherwise than the CPU's; 1e-16 each, in sums of up to 1e4 terms that cancel.
+FLOAT64 = Tolerance(1e-11, 1e-11)
+# A position of some hundred pixels is rounded by 3e-5, which can change the alpha of the smallest splats (0.55 px) by
+# 2e-4 of itself, a part of a pixel. In a gradient, sums of thousands of terms that cancel multiply 6e-8 by 1e3.
+# A pair within rounding of a threshold may count on one side alone; such pixels are counted, and take no part.
+FLOAT32 = Tolerance(1e-4, 1e-4, 1e-5)
+
+
+class Pass:
+    """One rendering that waits for its image gradients."""
+
+    def __init__(self, scene, outputs):
+        self.scene = scene.requiring_grad()
+        self.rendering = rasterize(settings=self.scene.settings, outputs=outputs, **self.scene.inputs)
+        self.images = torch.cat([self.rendering.color] + [getattr(self.rendering, name) for name in outputs])
+
+    def gradients(self, weights):
+        """Returns the gradients by name. weights: [images, H, W]"""
+        leaves = self.scene.leaves()
+        values = torch.autograd.grad(self.images, list(leaves.values()), weights.to(self.images), allow_unused=True)
+        return {name: torch.zeros_like(leaf) if value is None else value
+                for (name, leaf), value in zip(leaves.items(), values)}
+
+
+def compare(scene, gpu, dtype, outputs, tolerance):
+    """Asserts that images, radii and all gradients agree; returns the rendering of the GPU.
+
+    scene: on the CPU, of float32 numbers.
+    """
+    expected = Pass(scene.to(torch.float64), outputs)
+    actual = Pass(scene.to(dtype).to(gpu), outputs)
+    compare_radii(actual.rendering.radii.cpu(), expected.rendering.radii)
+    wrong = different_pixels(actual.images.detach().cpu().double(), expected.images.detach(), tolerance.pixel)
+    # Of a small image one pixel is more than the part that a large one is allowed.
+    assert wrong.sum() <= max(tolerance.flipped * wrong.numel(), tolerance.flipped > 0), (
+        f"{int(wrong.sum())} of {wrong.numel()} pixels differ")
+    weights = random_normal(expected.images.shape, 1) * ~wrong
+    assert_all_close({name: values.cpu() for name, values in actual.gradients(weights).items()},
+                     expected.gradients(weights), tolerance.gradient)
+    return actual.rendering
+
+
+def compare_radii(actual, expected):
+    """A radius is the ceiling of a root that float32 rounds by 1e-4 where it is 1000 px: so many may differ by 1."""
+    assert actual.dtype == torch.int32
+    different = (actual != expected).nonzero()[:, 0]
+    assert len(different) <= max(1, 1e-4 * len(expected)), f"{len(different)} of {len(expected)} radii differ"
+    assert ((actual - expected).abs() <= 1).all()
+    assert ((actual > 0) == (expected > 0)).all()
+
+
+def different_pixels(actual, expected, tolerance):
+    """Returns which pixels [H, W] differ by more than the tolerance, relative to each image's largest value."""
+    assert actual.shape == expected.shape and torch.isfinite(actual).all()
+    largest = expected.abs().amax((1, 2), keepdim=True)
+    return ((actual - expected).abs() > tolerance * largest).any(0)

@@ -1,0 +1,16 @@
+"""Where the captures lie."""
+from __future__ import annotations
+
+import os
+
+import pytest
+
+
+def folder(name):
+    """Path of a data set; skips the test where it is absent."""
+    root = os.path.join(os.path.dirname(__file__), "..", "..", "..")
+    data = os.environ.get("DSMOE_DATA") or os.path.join(root, "..", "shared", "data")
+    path = os.path.abspath(os.path.join(data, name))
+    if not os.path.isdir(path):
+        pytest.skip(f"{path} is not there (set DSMOE_DATA to the folder of data sets)")
+    return path

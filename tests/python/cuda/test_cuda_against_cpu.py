@@ -1,0 +1,151 @@
+"""The CUDA backend against the CPU backend in float64: images, radii and all gradients, in all modes."""
+from __future__ import annotations
+
+import pytest
+import torch
+from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
+from scenes import camera_settings, random_scene
+
+from diff_smoe_rasterization.settings import OUTPUTS
+from diff_smoe_rasterization.trainer.config import TrainConfig
+from diff_smoe_rasterization.trainer.model import GaussianModel
+from diff_smoe_rasterization.trainer.scene import load_cameras, read_layout
+from real_data import folder
+
+
+def crowd(mode, **options):
+    """Thousands of small Gaussians, some hundred pairs a pixel."""
+    return random_scene(mode, 3000, 160, 107, scale=0.03, **options)
+
+
+def one_covers_all(mode):
+    """A Gaussian whose footprint is the whole image, before and behind many that are small."""
+    scene = crowd(mode, degree=1)
+    inputs = {name: tensor.clone() for name, tensor in scene.inputs.items()}
+    for index, depth in ((0, -3.0), (1, 3.0)):
+        inputs["means3D"][index] = -scene.settings.campos * depth / 4
+        inputs["scales"][index] = 50.0
+        inputs["opacities"][index] = 0.3
+    return scene._replace(inputs=inputs)
+
+
+def saturated(mode):
+    """Every pixel is full after a few Gaussians."""
+    return random_scene(mode, 3000, 64, 48, scale=0.3, opacity=(0.5, 1.3), degree=1)
+
+
+SCENES = {
+    "harmonics": lambda mode: crowd(mode, degree=3),
+    "split_harmonics": lambda mode: crowd(mode, degree=2, split_dc=True),
+    "colours_1": lambda mode: crowd(mode, channels=1),
+    "colours_3": lambda mode: crowd(mode, channels=3),
+    "colours_7": lambda mode: crowd(mode, channels=7),
+    "covariances": lambda mode: crowd(mode, covariance="cov3D", channels=3),
+    "antialiasing": lambda mode: crowd(mode, degree=1, antialiasing=True),
+    "antialiased_covariances": lambda mode: crowd(mode, covariance="cov3D", degree=1, antialiasing=True),
+    "alpha_min": lambda mode: crowd(mode, degree=1, alpha_min=1 / 255),
+    "principal_point": lambda mode: crowd(mode, degree=0, principal_point=(21.3, -9.6)),
+    "one_covers_all": one_covers_all,
+    "saturated": saturated,
+    "one_pixel": lambda mode: random_scene(mode, 300, 1, 1, scale=0.3, degree=1, fov_x=0.1),
+    "one_tile": lambda mode: random_scene(mode, 500, 16, 16, scale=0.1, degree=1),
+    "one_pixel_more_than_tiles": lambda mode: random_scene(mode, 500, 17, 33, scale=0.1, degree=1),
+}
+# With the optional images and their gradients.
+WITH_OUTPUTS = ("harmonics", "colours_7", "antialiasing", "alpha_min", "saturated", "one_covers_all", "one_tile")
+SANITIZED = ("split_harmonics", "covariances", "one_pixel_more_than_tiles")
+
+
+def selected(names):
+    return [pytest.param(name, marks=pytest.mark.sanitize) if name in SANITIZED else name for name in names]
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, FLOAT32), (torch.float64, FLOAT64)],
+                         ids=["float32", "float64"])
+@pytest.mark.parametrize("name", selected(SCENES))
+def test_random_scenes(mode, name, dtype, tolerance, gpu):
+    scene = SCENES[name](mode)
+    rendering = compare(scene, gpu, dtype, OUTPUTS if name in WITH_OUTPUTS else (), tolerance)
+    assert (rendering.radii > 0).sum() > 5
+    background = scene.settings.bg.to(rendering.color)[:, None, None]
+    assert ((rendering.color - background).abs() > 1e-3).any(0).double().mean() > 0.3
+
+
+def captured(mode, width, height):
+    """The points of a real capture as Gaussians, before one of its cameras."""
+    config = TrainConfig(scene=folder("bonsai"))
+    model = GaussianModel.from_points(read_layout(config).points, 1, "cpu")
+    generator = torch.Generator().manual_seed(0)
+    model.raw["opacities"] = torch.randn(model.num_gaussians, 1, generator=generator)
+    model.raw["shs"] = 0.1 * torch.randn(model.num_gaussians, 3, 3, generator=generator)
+    inputs = dict(means3D=model.raw["means3D"], means2D=torch.zeros(model.num_gaussians, 3), shs=model.raw["shs"],
+                  dc=model.raw["dc"], opacities=model.opacities, scales=model.scales, rotations=model.rotations)
+    camera = load_cameras(config, "test")[0].resized(width, height)
+    scene = random_scene(mode, 1)
+    return scene._replace(inputs=inputs, settings=camera.settings(torch.tensor([0.2, 0.5, 0.8]), 1, mode)).to(
+        torch.float32)
+
+
+def test_a_real_capture(mode, gpu):
+    rendering = compare(captured(mode, 800, 533), gpu, torch.float32, OUTPUTS, FLOAT32)
+    assert (rendering.radii > 0).sum() > 20_000
+
+
+def test_sixteen_thousand_pixels_wide(mode, gpu):
+    scene = random_scene(mode, 2000, 16384, 33, scale=0.02, degree=1, fov_x=1.4)
+    # At 16,384 pixels a position is rounded by 5e-4 px, which is a change of 3e-3 of a splat's alpha at worst.
+    compare(scene, gpu, torch.float32, OUTPUTS, Tolerance(1e-3, 1e-3, 1e-5))
+    compare(scene, gpu, torch.float64, OUTPUTS, FLOAT64)
+
+
+def tall(mode, dtype):
+    """A column of 68,751 tiles: more than a grid may have in y. Gaussians at both ends and all along it."""
+    height, count = 1_100_009, 2000
+    scene = random_scene(mode, count, 16, 32, channels=1)
+    settings = camera_settings(16, height, position=(0.0, 0.0, -1.0), bg=torch.tensor([0.5]), blend_mode=mode)
+    projection = torch.linalg.inv(settings.viewmatrix) @ settings.projmatrix
+    projection[1, 1], projection[0, 0] = 1.0, height / 16
+    settings = settings._replace(viewmatrix=torch.eye(4, dtype=torch.float64), projmatrix=projection, tanfovy=1.0,
+                                 tanfovx=16 / height, campos=torch.zeros(3, dtype=torch.float64))
+    means3D = torch.zeros(count, 3, dtype=torch.float64)
+    means3D[:, 1] = torch.linspace(-4, 4, count, dtype=torch.float64)
+    means3D[:, 2] = 4
+    pixel = 2 * 4 / height  # at depth 4
+    scene = scene._replace(settings=settings).with_inputs(
+        means3D=means3D, scales=40 * pixel * (1 + scene.inputs["scales"]))
+    return scene.to(torch.float32).to(dtype)
+
+
+def test_more_rows_of_tiles_than_a_grid_may_have(mode, gpu):
+    scene = tall(mode, torch.float64)
+    rendering = compare(scene, gpu, torch.float64, (), FLOAT64)
+    assert (rendering.radii > 0).all()
+    assert (rendering.color[0, -20:] != 0.5).all() and (rendering.color[0, :20] != 0.5).all()
+    # In float32 a row number above a million is rounded by 0.06, of a splat of 40 px; a footprint may end a row away.
+    compare(scene, gpu, torch.float32, (), Tolerance(2e-2, 2e-2, 1e-3))
+
+
+@pytest.mark.parametrize("dtype, tolerance", [
+    # Products and sums of a hundred thousand terms: 1e-5, and as much again in what cancels.
+    (torch.float32, Tolerance(1e-4, 3e-4, 1e-5)), (torch.float64, FLOAT64)], ids=["float32", "float64"])
+def test_a_hundred_thousand_gaussians_in_one_tile(mode, dtype, tolerance, gpu):
+    scene = random_scene(mode, 100_000, 16, 16, scale=0.05, opacity=(0.001, 0.02), degree=0, fov_x=0.3)
+    rendering = compare(scene, gpu, dtype, ("alpha",), tolerance)
+    assert (rendering.radii > 0).sum() > 5000
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", ["no_gaussians", "behind_the_camera", "without_opacity", "beside_the_image"])
+def test_nothing_is_drawn(mode, kind, dtype, gpu):
+    scene = random_scene(mode, 200, 33, 21, degree=1)
+    scene = {
+        "no_gaussians": lambda: scene.rows(slice(0, 0)),
+        "behind_the_camera": lambda: scene.with_inputs(means3D=scene.inputs["means3D"] + 30 * scene.settings.campos),
+        "without_opacity": lambda: scene.with_inputs(opacities=torch.zeros(200, 1, dtype=torch.float64)),
+        "beside_the_image": lambda: scene.with_inputs(
+            means3D=scene.inputs["means3D"] + 100 * scene.settings.viewmatrix[:3, 0]),
+    }[kind]()
+    rendering = compare(scene, gpu, dtype, OUTPUTS, FLOAT64 if dtype == torch.float64 else FLOAT32)
+    background = scene.settings.bg.to(rendering.color)[:, None, None].expand_as(rendering.color)
+    assert torch.equal(rendering.color, background)
