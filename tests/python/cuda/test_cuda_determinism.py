@@ -1,0 +1,52 @@
+"""`deterministic=True`: the same call gives the same gradients, bit for bit, and they are those of the usual way."""
+from __future__ import annotations
+
+import pytest
+import torch
+from comparison import assert_all_close
+from scenes import gradients, random_scene
+
+from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization.settings import OUTPUTS
+
+CASES = {
+    "harmonics": dict(degree=2),
+    "split_harmonics": dict(degree=1, split_dc=True, antialiasing=True),
+    "colours_1": dict(channels=1),
+    "colours_7": dict(channels=7, covariance="cov3D"),
+}
+
+
+@pytest.mark.parametrize("dtype, tolerance", [
+    (torch.float32, 1e-5), (torch.float64, 1e-12)], ids=["float32", "float64"])  # sums in another order
+@pytest.mark.parametrize("case", CASES)
+def test_ten_runs_give_the_same_bits(mode, case, dtype, tolerance, gpu):
+    # Most Gaussians lie in several tiles, some in all: their gradients are sums over tiles.
+    scene = random_scene(mode, 4000, 131, 83, scale=0.06, dtype=dtype, **CASES[case]).to(gpu)
+    usual, usual_gradients = gradients(rasterize, scene, OUTPUTS)
+    assert (usual.radii > 16).sum() > 100
+    scene = scene.with_settings(deterministic=True)
+    first, first_gradients = gradients(rasterize, scene, OUTPUTS)
+    for _ in range(9):
+        rendering, gradient = gradients(rasterize, scene, OUTPUTS)
+        assert all(torch.equal(image, other) for image, other in zip(rendering, first))
+        for name, values in first_gradients.items():
+            assert torch.equal(gradient[name], values), name
+    assert all(torch.equal(image, other) for image, other in zip(usual, first))
+    assert_all_close(first_gradients, usual_gradients, tolerance)
+
+
+def test_images_are_the_same_bits_without_it(mode, gpu):
+    scene = random_scene(mode, 4000, 131, 83, scale=0.06, dtype=torch.float32).to(gpu)
+    first = rasterize(settings=scene.settings, outputs=OUTPUTS, **scene.inputs)
+    for _ in range(9):
+        again = rasterize(settings=scene.settings, outputs=OUTPUTS, **scene.inputs)
+        assert all(torch.equal(image, other) for image, other in zip(again, first))
+
+
+def test_nothing_visible(mode, gpu):
+    scene = random_scene(mode, 200, 33, 21, dtype=torch.float32, deterministic=True).to(gpu)
+    scene = scene.with_inputs(means3D=scene.inputs["means3D"] + 30 * scene.settings.campos)
+    rendering, gradient = gradients(rasterize, scene, OUTPUTS)
+    assert not rendering.radii.any()
+    assert not any(values.any() for name, values in gradient.items() if name != "bg")
