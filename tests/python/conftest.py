@@ -27,13 +27,14 @@ def chosen_devices(config):
     return [choice]
 
 
-def pytest_report_header(config):
+def pytest_terminal_summary(terminalreporter, config):
+    """Says on which devices the rasterizer was tested; under -q too, which hides headers."""
     devices, reason = chosen_devices(config), without_cuda_because()
     line = "rasterizer tested on: " + ", ".join(
         device if device == "cpu" else f"cuda ({torch.cuda.get_device_name()})" for device in devices)
     if "cuda" not in devices:
         line += f"; CUDA IS LEFT OUT: {reason or '--device cpu'}"
-    return line
+    terminalreporter.write_line(line)
 
 
 def pytest_generate_tests(metafunc):

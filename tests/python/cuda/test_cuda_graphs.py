@@ -92,6 +92,7 @@ def test_a_replayed_graph_equals_a_call(mode, options, gpu):
         assert_same(results, expected)
 
 
+@pytest.mark.sanitize
 def test_contents_that_outgrow_the_captured_lists(mode, gpu):
     """Scales grow until many times the tiles are touched, and shrink again."""
     small = scene_of(mode, scale=0.004, opacity=(0.02, 0.2))
