@@ -13,7 +13,7 @@ from .extension import _C  # noqa: F401  (loading it registers the ops)
 _OPS = torch.ops.diff_smoe_rasterization
 _CAN_REGISTER = hasattr(torch.library, "register_autograd")
 _NUM_INPUTS = 13  # tensors before the options
-_NUM_OPTIONS = 13  # options that the backward op takes too
+_NUM_OPTIONS = 14  # options that the backward op takes too
 _NUM_CHECKS = 2  # strict, prefiltered
 _NUM_IMAGES = 5  # results that are the caller's: color, radii, gate_sum, depth, inverse_depth
 _RADII = 1
@@ -64,23 +64,35 @@ def rasterize_op(*inputs):
 
 def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
                     viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier, near,
-                    alpha_min, sh_degree, blend_mode, antialiasing, depth, inverse_depth, debug, strict, prefiltered):
+                    alpha_min, sh_degree, blend_mode, antialiasing, depth, inverse_depth, deterministic,
+                    debug, strict, prefiltered):
     """The results' shapes and types, as csrc/torch/tensors.cpp allocates them."""
     count = means3D.shape[0]
     channels = 3 if colors_precomp is None else colors_precomp.shape[1]
     tile = _C.constants["tile_size"]
     tiles = ((image_width + tile - 1) // tile) * ((image_height + tile - 1) // tile)
     num_instances = torch.library.get_ctx().new_dynamic_size()
+    num_features = channels + int(depth) + int(inverse_depth)
+    if means3D.device.type == "cuda":
+        feature_row, num_tile_offsets, instance_row, in_order = (num_features + 3) // 4 * 4, tiles + 2, 1, count
+        instance_offsets = (0,)
+        if deterministic:
+            instance_row, instance_offsets = 2, (count, 2)
+    else:
+        feature_row, num_tile_offsets, instance_row, in_order = num_features, tiles + 1, 2, 0
+        instance_offsets = (count + 1,)
 
     def image(wanted=True):
         return means3D.new_empty((1, image_height, image_width) if wanted else (0,))
 
     return (means3D.new_empty((channels, image_height, image_width)), means3D.new_empty((count,), dtype=torch.int32),
             image(), image(depth), image(inverse_depth), means3D.new_empty((count, 8)),
-            means3D.new_empty((count, channels + int(depth) + int(inverse_depth))),
-            means3D.new_empty((count + 1,), dtype=torch.int64), means3D.new_empty((tiles + 1,), dtype=torch.int64),
-            means3D.new_empty((num_instances, 2), dtype=torch.int32), means3D.new_empty((image_height, image_width)),
-            means3D.new_empty((image_height, image_width), dtype=torch.int32))
+            means3D.new_empty((count, feature_row)), means3D.new_empty(instance_offsets, dtype=torch.int64),
+            means3D.new_empty((num_tile_offsets,), dtype=torch.int64),
+            means3D.new_empty((num_instances, instance_row), dtype=torch.int32),
+            means3D.new_empty((image_height, image_width)),
+            means3D.new_empty((image_height, image_width), dtype=torch.int32),
+            means3D.new_empty((in_order,), dtype=torch.int32))
 
 
 def _fake_rasterize_backward(dL_dcolor, dL_dgate_sum, dL_ddepth, dL_dinverse_depth, inputs, present, outputs,

@@ -45,6 +45,7 @@ class GaussianRasterizationSettings(NamedTuple):
     alpha_min: float = 0.0  # SMoE modes: also skip alpha below this; 0 is the paper's rule
     strict: bool = False  # raise where an attribute is NaN or infinite, instead of culling that Gaussian
     blend_mode: Optional[str] = None  # one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha"
+    deterministic: bool = False  # CUDA: gradients equal bit for bit from run to run; slower. The CPU's always are
 
 
 class Rendering(NamedTuple):

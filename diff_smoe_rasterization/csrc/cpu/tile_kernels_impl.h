@@ -3,7 +3,7 @@
 #pragma once
 
 #include "../dispatch.h"
-#include "dsmoe/blend.h"
+#include "dsmoe/features.h"
 #include "dsmoe/tiles.h"
 #include "pack.h"
 #include "tile_kernels.h"
@@ -82,22 +82,6 @@ template <class S>
 DSMOE_HD void prefetch_gaussian(const SavedForward<S>& saved, const TileInstance& instance, int num_features) {
   __builtin_prefetch(saved.projected + instance.gaussian);
   __builtin_prefetch(saved.features + static_cast<int64_t>(instance.gaussian) * num_features);
-}
-
-template <class S> DSMOE_HD FeatureRule feature_rule(const RasterConfig<S>& config, int feature) {
-  return config.depth && feature == config.num_channels ? FeatureRule::kAveraged : FeatureRule::kBlended;
-}
-
-template <class S> DSMOE_HD S feature_background(const RasterConfig<S>& config, int feature) {
-  return feature < config.num_channels ? config.background[feature] : S(0);
-}
-
-// Where feature f of an image lies; ImageOutputs and ImageGradients have the same fields.
-template <class S, class Images>
-DSMOE_HD auto feature_image(const RasterConfig<S>& config, const Images& images, int feature, int64_t pixels)
-    -> decltype(images.color) {
-  if (feature < config.num_channels) return images.color == nullptr ? nullptr : images.color + feature * pixels;
-  return config.depth && feature == config.num_channels ? images.depth : images.inverse_depth;
 }
 
 template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const ForwardTile<S>& tile, S* memory) {

@@ -8,7 +8,8 @@ namespace {
 
 const std::string kOptions =
     "SymInt image_height, SymInt image_width, float tanfovx, float tanfovy, float scale_modifier, float near, "
-    "float alpha_min, int sh_degree, int blend_mode, bool antialiasing, bool depth, bool inverse_depth, bool debug";
+    "float alpha_min, int sh_degree, int blend_mode, bool antialiasing, bool depth, bool inverse_depth, bool "
+    "deterministic, bool debug";
 
 const std::string kRasterize =
     "rasterize(Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? dc, Tensor? shs, Tensor? colors_precomp, "
@@ -18,7 +19,7 @@ const std::string kRasterize =
     ", bool strict, bool prefiltered) -> "
     "(Tensor color, Tensor radii, Tensor gate_sum, Tensor depth, Tensor inverse_depth, Tensor projected, "
     "Tensor features, Tensor instance_offsets, Tensor tile_offsets, Tensor instances, Tensor final_transmittance, "
-    "Tensor last_contributor)";
+    "Tensor last_contributor, Tensor order)";
 
 // inputs: the present ones of the 13 tensors of rasterize; outputs: all its results. Returned are the gradients of the
 // wanted inputs, in their order. The lists hold no None, or torch would not see that they require a gradient.

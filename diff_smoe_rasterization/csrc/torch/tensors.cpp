@@ -18,6 +18,8 @@ std::array<OutputSpec, kNumOutputs> output_specs(const Inputs& inputs, const Opt
   const int64_t tiles = num_tiles(static_cast<int>(width), static_cast<int>(height));
   const at::ScalarType real = inputs[kMeans3D].scalar_type();
   const std::vector<int64_t> image = {1, height, width}, absent = {0};
+  const int64_t num_features = channels + options.depth + options.inverse_depth;
+  const bool cuda = inputs[kMeans3D].is_cuda();
 
   std::array<OutputSpec, kNumOutputs> specs;
   specs[kColor] = {{channels, height, width}, real};
@@ -26,10 +28,19 @@ std::array<OutputSpec, kNumOutputs> output_specs(const Inputs& inputs, const Opt
   specs[kDepth] = {options.depth ? image : absent, real};
   specs[kInverseDepth] = {options.inverse_depth ? image : absent, real};
   specs[kProjected] = {{count, kProjectedGaussianSize}, real};
-  specs[kFeatures] = {{count, channels + options.depth + options.inverse_depth}, real};
-  specs[kInstanceOffsets] = {{count + 1}, at::kLong};
-  specs[kTileOffsets] = {{tiles + 1}, at::kLong};
-  specs[kInstances] = {{-1, 2}, at::kInt};
+  if (cuda) {
+    specs[kFeatures] = {{count, (num_features + 3) / 4 * 4}, real};
+    specs[kInstanceOffsets] = {options.deterministic ? std::vector<int64_t>{count, 2} : absent, at::kLong};
+    specs[kTileOffsets] = {{tiles + 2}, at::kLong};
+    specs[kInstances] = {{-1, options.deterministic ? 2 : 1}, at::kInt};
+    specs[kOrder] = {{count}, at::kInt};
+  } else {
+    specs[kFeatures] = {{count, num_features}, real};
+    specs[kInstanceOffsets] = {{count + 1}, at::kLong};
+    specs[kTileOffsets] = {{tiles + 1}, at::kLong};
+    specs[kInstances] = {{-1, 2}, at::kInt};
+    specs[kOrder] = {absent, at::kInt};
+  }
   specs[kFinalTransmittance] = {{height, width}, real};
   specs[kLastContributor] = {{height, width}, at::kInt};
   return specs;

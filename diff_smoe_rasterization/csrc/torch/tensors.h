@@ -45,12 +45,13 @@ enum Output : int {
   kDepth,               // [1, H, W], or [0] where it was not asked for
   kInverseDepth,        // [1, H, W], or [0]
   kProjected,           // [N, 8] ProjectedGaussian
-  kFeatures,            // [N, F]
-  kInstanceOffsets,     // [N + 1] int64
-  kTileOffsets,         // [tiles + 1] int64
-  kInstances,           // [I, 2] int32, TileInstance
+  kFeatures,            // CPU: [N, F]; CUDA: [N, feature_stride(F)]
+  kInstanceOffsets,     // int64; CPU: [N + 1]; CUDA: [N, 2] slot ranges where deterministic, else [0]
+  kTileOffsets,         // int64; CPU: [tiles + 1]; CUDA: [tiles + 2], the last one counts all instances
+  kInstances,           // int32; CPU: [I, 2] TileInstance; CUDA: [capacity, 1 or 2]
   kFinalTransmittance,  // [H, W]
   kLastContributor,     // [H, W] int32
+  kOrder,               // CUDA: [N] int32 Gaussians by depth; CPU: [0]
   kNumOutputs
 };
 constexpr const char* kOutputNames[kNumOutputs] = {"color",
@@ -64,7 +65,8 @@ constexpr const char* kOutputNames[kNumOutputs] = {"color",
                                                    "tile_offsets",
                                                    "instances",
                                                    "final_transmittance",
-                                                   "last_contributor"};
+                                                   "last_contributor",
+                                                   "order"};
 
 // The images that loss gradients arrive at, in the order of the backward op's arguments.
 enum ImageGradient : int {
@@ -88,7 +90,7 @@ struct Options {
   int64_t image_height, image_width;
   double tanfovx, tanfovy, scale_modifier, near, alpha_min;
   int64_t sh_degree, blend_mode;
-  bool antialiasing, depth, inverse_depth, debug;
+  bool antialiasing, depth, inverse_depth, deterministic, debug;
 };
 
 inline int64_t num_gaussians(const Inputs& inputs) { return inputs[kMeans3D].size(0); }
@@ -100,6 +102,7 @@ inline int64_t num_channels(const Inputs& inputs) {
 // Dense copies of the tensors that are not dense already.
 Inputs contiguous(Inputs inputs);
 
+// What a backend keeps for its backward pass is its own affair: the images have one shape, the rest differs.
 struct OutputSpec {
   std::vector<int64_t> shape;  // -1: any
   at::ScalarType type;

@@ -25,7 +25,17 @@ template <> struct RealTraits<double> {
 template <class Real> using Mask = typename RealTraits<Real>::Mask;
 template <class Real> using Scalar = typename RealTraits<Real>::Scalar;
 
-DSMOE_HD float exp(float x) { return ::expf(x); }
+// In kernels, exp and reciprocal of a float are the hardware's own. Both run once a (Gaussian, pixel) pair: over the
+// exponents that count, [-11.6, 0], the relative error of exp stays below 1e-6, that of reciprocal below 2^-22.
+DSMOE_HD float exp(float x) {
+#if defined(__CUDA_ARCH__)
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x * 1.4426950408889634f));  // log2(e)
+  return y;
+#else
+  return ::expf(x);
+#endif
+}
 DSMOE_HD double exp(double x) { return ::exp(x); }
 DSMOE_HD float log(float x) { return ::logf(x); }
 DSMOE_HD double log(double x) { return ::log(x); }
@@ -39,11 +49,23 @@ DSMOE_HD float abs(float x) { return ::fabsf(x); }
 DSMOE_HD double abs(double x) { return ::fabs(x); }
 DSMOE_HD float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
 DSMOE_HD double fma(double a, double b, double c) { return ::fma(a, b, c); }
-DSMOE_HD float reciprocal(float x) { return 1.0f / x; }
+DSMOE_HD float reciprocal(float x) {
+#if defined(__CUDA_ARCH__)
+  float y;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+#else
+  return 1.0f / x;
+#endif
+}
 DSMOE_HD double reciprocal(double x) { return 1.0 / x; }
 
 template <class S> DSMOE_HD S min(S a, S b) { return a < b ? a : b; }
 template <class S> DSMOE_HD S max(S a, S b) { return a > b ? a : b; }
+#if defined(__CUDACC__)  // one instruction, which the comparison above does not become
+DSMOE_HD float min(float a, float b) { return ::fminf(a, b); }
+DSMOE_HD float max(float a, float b) { return ::fmaxf(a, b); }
+#endif
 template <class S> DSMOE_HD S clamp(S x, S low, S high) { return min(max(x, low), high); }
 template <class S> DSMOE_HD S select(bool mask, S a, S b) { return mask ? a : b; }
 

@@ -41,15 +41,25 @@ template <class S> DSMOE_HD ShCoefficients<const S> sh_of(const GaussianInputs<S
   return {shs, shs + 3};
 }
 
-// Whether every attribute of Gaussian i is a finite number; one that is not is culled.
-template <class S> DSMOE_HD bool attributes_finite(const GaussianInputs<S>& in, int num_channels, int64_t i) {
+// Whether every attribute that shapes Gaussian i is a finite number, and every one that colours it; a Gaussian with one
+// that is not is culled.
+template <class S> DSMOE_HD bool shape_finite(const GaussianInputs<S>& in, int64_t i) {
   bool finite = all_finite(in.means3D + 3 * i, 3) && is_finite(in.opacities[i]);
   if (in.cov3D_precomp != nullptr) finite = finite && all_finite(in.cov3D_precomp + 6 * i, 6);
   if (in.scales != nullptr) finite = finite && all_finite(in.scales + 3 * i, 3) && all_finite(in.rotations + 4 * i, 4);
+  return finite;
+}
+
+template <class S> DSMOE_HD bool color_finite(const GaussianInputs<S>& in, int num_channels, int64_t i) {
+  bool finite = true;
   if (in.colors_precomp != nullptr) finite = finite && all_finite(in.colors_precomp + i * num_channels, num_channels);
   if (in.shs != nullptr) finite = finite && all_finite(in.shs + i * 3 * in.num_sh, 3 * in.num_sh);
   if (in.dc != nullptr) finite = finite && all_finite(in.dc + 3 * i, 3);
   return finite;
+}
+
+template <class S> DSMOE_HD bool attributes_finite(const GaussianInputs<S>& in, int num_channels, int64_t i) {
+  return shape_finite(in, i) && color_finite(in, num_channels, i);
 }
 
 // The tiles that may hold pairs of a Gaussian.
@@ -59,13 +69,13 @@ template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, const Camera<S>
   return radius_rect(mean, radius, grid);
 }
 
-// Projects Gaussian i. Returns its radius in pixels, 0 where it is culled (then out and features mean nothing).
+// The footprint of Gaussian i. Returns its radius in pixels, 0 where it is culled (then out means nothing).
 template <class S>
-DSMOE_HD int32_t project_gaussian(const GaussianInputs<S>& in, const Camera<S>& camera, const RasterConfig<S>& config,
-                                  int64_t i, ProjectedGaussian<S>& out, S* features) {
+DSMOE_HD int32_t project_shape(const GaussianInputs<S>& in, const Camera<S>& camera, const RasterConfig<S>& config,
+                               int64_t i, ProjectedGaussian<S>& out) {
   const Vec3<S> mean = load3(in.means3D + 3 * i);
   const Vec3<S> view = transform_point(camera.view, mean);
-  if (!(view.z > camera.near) || !attributes_finite(in, config.num_channels, i)) return 0;
+  if (!(view.z > camera.near) || !shape_finite(in, i)) return 0;
   const auto jacobian = projection_jacobian(camera, view);
   const auto axes = image_axes(jacobian.jacobian, view_rotation(camera.view));
   const Sym2<S> cov2d = covariance_2d(axes, world_covariance(in, config.scale_modifier, i).cov);
@@ -78,22 +88,36 @@ DSMOE_HD int32_t project_gaussian(const GaussianInputs<S>& in, const Camera<S>& 
   const bool seen = is_smoe(config.mode) ? meets_image(conic.inverse, pixel, widest_reach, camera.width, camera.height)
                                          : !tile_bounds(config.mode, camera, pixel, radius).empty();
   if (!seen) return 0;
-
-  if (in.colors_precomp != nullptr) {
-    for (int c = 0; c < config.num_channels; ++c) features[c] = in.colors_precomp[i * config.num_channels + c];
-  } else {
-    sh_color(in.sh_degree, mean, camera.position, sh_of(in, i), features);
-  }
-  S* extra = features + config.num_channels;
-  if (config.depth) *extra++ = view.z;
-  if (config.inverse_depth) *extra = S(1) / view.z;
-  // Finite coefficients can add up to an infinite colour; times a weight of 0 it would reach pixels next to the
-  // Gaussian.
-  if (!all_finite(features, config.num_features())) return 0;
   S opacity = in.opacities[i];
   if (config.antialiasing) opacity *= opacity_compensation(cov2d, conic);
   out = {pixel, conic.inverse, opacity, squared_reach(config.mode, opacity, config.alpha_min), view.z};
   return static_cast<int32_t>(min(radius, S(1 << 30)));
+}
+
+// What the pixels blend of Gaussian i; depth is its view z. False where it is culled.
+template <class S>
+DSMOE_HD bool project_features(const GaussianInputs<S>& in, const Camera<S>& camera, const RasterConfig<S>& config,
+                               int64_t i, S depth, S* features) {
+  if (!color_finite(in, config.num_channels, i)) return false;
+  if (in.colors_precomp != nullptr) {
+    for (int c = 0; c < config.num_channels; ++c) features[c] = in.colors_precomp[i * config.num_channels + c];
+  } else {
+    sh_color(in.sh_degree, load3(in.means3D + 3 * i), camera.position, sh_of(in, i), features);
+  }
+  S* extra = features + config.num_channels;
+  if (config.depth) *extra++ = depth;
+  if (config.inverse_depth) *extra = S(1) / depth;
+  // Finite coefficients can add up to an infinite colour; times a weight of 0 it would reach pixels next to the
+  // Gaussian.
+  return all_finite(features, config.num_features());
+}
+
+// Both. Returns the radius, 0 where the Gaussian is culled (then out and features mean nothing).
+template <class S>
+DSMOE_HD int32_t project_gaussian(const GaussianInputs<S>& in, const Camera<S>& camera, const RasterConfig<S>& config,
+                                  int64_t i, ProjectedGaussian<S>& out, S* features) {
+  const int32_t radius = project_shape(in, camera, config, i, out);
+  return radius > 0 && project_features(in, camera, config, i, out.depth, features) ? radius : 0;
 }
 
 // The gradient that a Gaussian's pixels hand back.

@@ -13,10 +13,18 @@ DSMOE_HD constexpr int sh_coefficients(int degree) { return (degree + 1) * (degr
 // sqrt(1 / 4 pi), sqrt(3 / 4 pi), and the factors of degrees 2 and 3 in the field's order and signs.
 constexpr double kSh0 = 0.28209479177387814;
 constexpr double kSh1 = 0.4886025119029199;
-constexpr double kSh2[5] = {1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792,
-                            0.5462742152960396};
-constexpr double kSh3[7] = {-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
-                            -0.4570457994644658, 1.445305721320277, -0.5900435899266435};
+constexpr double kSh2_0 = 1.0925484305920792;
+constexpr double kSh2_1 = -1.0925484305920792;
+constexpr double kSh2_2 = 0.31539156525252005;
+constexpr double kSh2_3 = -1.0925484305920792;
+constexpr double kSh2_4 = 0.5462742152960396;
+constexpr double kSh3_0 = -0.5900435899266435;
+constexpr double kSh3_1 = 2.890611442640554;
+constexpr double kSh3_2 = -0.4570457994644658;
+constexpr double kSh3_3 = 0.3731763325901154;
+constexpr double kSh3_4 = -0.4570457994644658;
+constexpr double kSh3_5 = 1.445305721320277;
+constexpr double kSh3_6 = -0.5900435899266435;
 
 template <class S> DSMOE_HD void sh_basis(int degree, Vec3<S> d, S* basis) {
   basis[0] = S(kSh0);
@@ -27,19 +35,19 @@ template <class S> DSMOE_HD void sh_basis(int degree, Vec3<S> d, S* basis) {
   basis[3] = -S(kSh1) * x;
   if (degree < 2) return;
   const S xx = x * x, yy = y * y, zz = z * z;
-  basis[4] = S(kSh2[0]) * x * y;
-  basis[5] = S(kSh2[1]) * y * z;
-  basis[6] = S(kSh2[2]) * (S(2) * zz - xx - yy);
-  basis[7] = S(kSh2[3]) * x * z;
-  basis[8] = S(kSh2[4]) * (xx - yy);
+  basis[4] = S(kSh2_0) * x * y;
+  basis[5] = S(kSh2_1) * y * z;
+  basis[6] = S(kSh2_2) * (S(2) * zz - xx - yy);
+  basis[7] = S(kSh2_3) * x * z;
+  basis[8] = S(kSh2_4) * (xx - yy);
   if (degree < 3) return;
-  basis[9] = S(kSh3[0]) * y * (S(3) * xx - yy);
-  basis[10] = S(kSh3[1]) * x * y * z;
-  basis[11] = S(kSh3[2]) * y * (S(4) * zz - xx - yy);
-  basis[12] = S(kSh3[3]) * z * (S(2) * zz - S(3) * xx - S(3) * yy);
-  basis[13] = S(kSh3[4]) * x * (S(4) * zz - xx - yy);
-  basis[14] = S(kSh3[5]) * z * (xx - yy);
-  basis[15] = S(kSh3[6]) * x * (xx - S(3) * yy);
+  basis[9] = S(kSh3_0) * y * (S(3) * xx - yy);
+  basis[10] = S(kSh3_1) * x * y * z;
+  basis[11] = S(kSh3_2) * y * (S(4) * zz - xx - yy);
+  basis[12] = S(kSh3_3) * z * (S(2) * zz - S(3) * xx - S(3) * yy);
+  basis[13] = S(kSh3_4) * x * (S(4) * zz - xx - yy);
+  basis[14] = S(kSh3_5) * z * (xx - yy);
+  basis[15] = S(kSh3_6) * x * (xx - S(3) * yy);
 }
 
 // dL/dd from dL/dbasis.
@@ -50,14 +58,14 @@ template <class S> DSMOE_HD Vec3<S> sh_basis_backward(int degree, Vec3<S> d, con
   out = {-S(kSh1) * g[3], -S(kSh1) * g[1], S(kSh1) * g[2]};
   if (degree < 2) return out;
   const S xx = x * x, yy = y * y, zz = z * z;
-  const S g4 = S(kSh2[0]) * g[4], g5 = S(kSh2[1]) * g[5], g6 = S(kSh2[2]) * g[6], g7 = S(kSh2[3]) * g[7],
-          g8 = S(kSh2[4]) * g[8];
+  const S g4 = S(kSh2_0) * g[4], g5 = S(kSh2_1) * g[5], g6 = S(kSh2_2) * g[6], g7 = S(kSh2_3) * g[7],
+          g8 = S(kSh2_4) * g[8];
   out.x += g4 * y - S(2) * g6 * x + g7 * z + S(2) * g8 * x;
   out.y += g4 * x + g5 * z - S(2) * g6 * y - S(2) * g8 * y;
   out.z += g5 * y + S(4) * g6 * z + g7 * x;
   if (degree < 3) return out;
-  const S g9 = S(kSh3[0]) * g[9], g10 = S(kSh3[1]) * g[10], g11 = S(kSh3[2]) * g[11], g12 = S(kSh3[3]) * g[12],
-          g13 = S(kSh3[4]) * g[13], g14 = S(kSh3[5]) * g[14], g15 = S(kSh3[6]) * g[15];
+  const S g9 = S(kSh3_0) * g[9], g10 = S(kSh3_1) * g[10], g11 = S(kSh3_2) * g[11], g12 = S(kSh3_3) * g[12],
+          g13 = S(kSh3_4) * g[13], g14 = S(kSh3_5) * g[14], g15 = S(kSh3_6) * g[15];
   out.x += S(6) * g9 * x * y + g10 * y * z - S(2) * g11 * x * y - S(6) * g12 * x * z +
            g13 * (S(4) * zz - S(3) * xx - yy) + S(2) * g14 * x * z + S(3) * g15 * (xx - yy);
   out.y += S(3) * g9 * (xx - yy) + g10 * x * z + g11 * (S(4) * zz - xx - S(3) * yy) - S(6) * g12 * y * z -

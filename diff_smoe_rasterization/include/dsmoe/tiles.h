@@ -72,36 +72,74 @@ template <class S> class EllipseBand {
   S reach_, determinant_, inverse_xx_, v_extent_, v_at_u_extent_;
 };
 
+// The tiles that a footprint meets, row by row, inside bounds.
+template <class S> class FootprintTiles {
+ public:
+  // A negative reach meets none.
+  DSMOE_HD FootprintTiles(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, TileRect bounds)
+      : ellipse_(conic, squared_reach), mean_(mean), bounds_(bounds), begin_(0), end_(0) {
+    if (!(squared_reach >= S(0)) || bounds.empty()) return;
+    const S size = S(kTileSize);
+    begin_ = floor_to_int((mean.y - ellipse_.v_extent()) / size, bounds.y0, bounds.y1);
+    end_ = floor_to_int((mean.y + ellipse_.v_extent()) / size + S(1), bounds.y0, bounds.y1);
+  }
+
+  DSMOE_HD int begin() const { return begin_; }
+  DSMOE_HD int end() const { return end_; }
+
+  // Half-open range of tiles in row y; may be empty.
+  struct Span {
+    int x0, x1;
+  };
+  DSMOE_HD Span row(int y) const {
+    const S size = S(kTileSize), last = S(kTileSize - 1);
+    const S top = S(y) * size - mean_.y;
+    const Interval<S> u = ellipse_.over({top, top + last});
+    if (u.empty()) return {0, 0};
+    // The first tile whose last pixel is not left of u.low, and the tile after the last whose first pixel is in.
+    return {ceil_to_int((mean_.x + u.low - last) / size, bounds_.x0, bounds_.x1),
+            floor_to_int((mean_.x + u.high) / size + S(1), bounds_.x0, bounds_.x1)};
+  }
+
+ private:
+  EllipseBand<S> ellipse_;
+  Vec2<S> mean_;
+  TileRect bounds_;
+  int begin_, end_;
+};
+
 // Calls visit(tile_x0, tile_x1, tile_y) for each tile row that the footprint meets, inside bounds.
 template <class S, class Visit>
 DSMOE_HD void for_each_tile_row(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, TileRect bounds, Visit visit) {
-  if (!(squared_reach >= S(0)) || bounds.empty()) return;
-  const EllipseBand<S> ellipse(conic, squared_reach);
-  const S size = S(kTileSize), last = S(kTileSize - 1);
-  const int y0 = floor_to_int((mean.y - ellipse.v_extent()) / size, bounds.y0, bounds.y1);
-  const int y1 = floor_to_int((mean.y + ellipse.v_extent()) / size + S(1), bounds.y0, bounds.y1);
-  for (int y = y0; y < y1; ++y) {
-    const S top = S(y) * size - mean.y;
-    const Interval<S> u = ellipse.over({top, top + last});
-    if (u.empty()) continue;
-    // The first tile whose last pixel is not left of u.low, and the tile after the last whose first pixel is in.
-    const int x0 = ceil_to_int((mean.x + u.low - last) / size, bounds.x0, bounds.x1);
-    const int x1 = floor_to_int((mean.x + u.high) / size + S(1), bounds.x0, bounds.x1);
-    if (x0 < x1) visit(x0, x1, y);
+  const FootprintTiles<S> tiles(conic, mean, squared_reach, bounds);
+  for (int y = tiles.begin(); y < tiles.end(); ++y) {
+    const auto span = tiles.row(y);
+    if (span.x0 < span.x1) visit(span.x0, span.x1, y);
   }
 }
 
-// Whether the ellipse meets a rectangle of pixel centres, borders included: the gated modes' rule for radius > 0.
+// The least value of d^T conic d over a rectangle of pixel centres, borders included.
+template <class S> struct PixelRect { S x0, y0, x1, y1; };
+template <class S> DSMOE_HD S least_squared_distance(const Sym2<S>& conic, Vec2<S> mean, PixelRect<S> rect) {
+  const S x0 = rect.x0 - mean.x, x1 = rect.x1 - mean.x, y0 = rect.y0 - mean.y, y1 = rect.y1 - mean.y;
+  if (x0 <= S(0) && S(0) <= x1 && y0 <= S(0) && S(0) <= y1) return S(0);
+  const S slope_y = -conic.xy / conic.yy, slope_x = -conic.xy / conic.xx;
+  auto value = [&](S x, S y) { return conic.xx * x * x + S(2) * conic.xy * x * y + conic.yy * y * y; };
+  auto on_column = [&](S x) { return value(x, clamp(slope_y * x, y0, y1)); };
+  auto on_row = [&](S y) { return value(clamp(slope_x * y, x0, x1), y); };
+  return min(min(on_column(x0), on_column(x1)), min(on_row(y0), on_row(y1)));
+}
+
+// Whether a pair of the Gaussian may count inside the rectangle; a bound.
+template <class S> DSMOE_HD bool may_meet(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, PixelRect<S> rect) {
+  return squared_reach >= S(0) &&
+         least_squared_distance(conic, mean, rect) <= squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack);
+}
+
+// Whether the ellipse meets the image: the gated modes' rule for radius > 0. Exact, without the bounds' slack.
 template <class S>
 DSMOE_HD bool meets_image(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, int width, int height) {
-  // Exact, without the bounds' slack: the least value of the quadratic form over the rectangle.
-  const S x0 = -mean.x, x1 = S(width - 1) - mean.x, y0 = -mean.y, y1 = S(height - 1) - mean.y;
-  if (x0 <= S(0) && S(0) <= x1 && y0 <= S(0) && S(0) <= y1) return true;
-  auto value = [&](S x, S y) { return conic.xx * x * x + S(2) * conic.xy * x * y + conic.yy * y * y; };
-  auto on_column = [&](S x) { return value(x, clamp(-conic.xy * x / conic.yy, y0, y1)); };
-  auto on_row = [&](S y) { return value(clamp(-conic.xy * y / conic.xx, x0, x1), y); };
-  const S least = min(min(on_column(x0), on_column(x1)), min(on_row(y0), on_row(y1)));
-  return least <= squared_reach;
+  return least_squared_distance(conic, mean, {S(0), S(0), S(width - 1), S(height - 1)}) <= squared_reach;
 }
 
 }  // namespace dsmoe

@@ -1,0 +1,118 @@
+// Stage 3: the images.
+#include "../dispatch.h"
+#include "dsmoe/rasterize.h"
+#include "tile_walk.cuh"
+
+namespace dsmoe {
+namespace cuda {
+namespace {
+
+// Blends kSums features from `first_feature` on.
+template <class S, BlendMode kMode, int kSums>
+__device__ void blend_features(const BlendArguments<S>& arguments, const WarpTile<S>& tile, StagedGaussian<S>* staged,
+                               int first_feature) {
+  const RasterConfig<S>& config = arguments.config;
+  PixelState<S> state[kLanePixels];
+  S sums[kLanePixels][kSums];
+  int32_t last[kLanePixels];
+  for (int k = 0; k < kLanePixels; ++k) {
+    state[k] = PixelState<S>::open();
+    if (!tile.inside(arguments, k)) state[k].transmittance = -state[k].transmittance;  // closed
+    for (int f = 0; f < kSums; ++f) sums[k][f] = S(0);
+    last[k] = 0;
+  }
+  unsigned long long pairs = 0;
+
+  auto next = load_entry(arguments, tile, tile.begin + tile.lane, tile.begin + tile.lane < tile.end, first_feature);
+  for (int64_t chunk = tile.begin; chunk < tile.end; chunk += kWarp) {
+    const bool meets = meets_pixels(next, tile);
+    if (meets) staged[tile.lane] = next.staged;
+    unsigned left = __ballot_sync(kAllLanes, meets);
+    const int64_t ahead = chunk + kWarp + tile.lane;
+    next = load_entry(arguments, tile, ahead, ahead < tile.end, first_feature);
+    pairs += __popc(left);
+    const int32_t position = static_cast<int32_t>(chunk - tile.begin) + 1;
+    for (; left != 0; left &= left - 1) {
+      const int j = __ffs(left) - 1;
+      const StagedGaussian<S> current = staged[j];
+      const ProjectedGaussian<S>& gaussian = current.gaussian;
+      const ColumnExponent<S, S> exponent(gaussian.conic, S(tile.x) - gaussian.mean.x);
+      const S dy = S(tile.y) - gaussian.mean.y;
+#pragma unroll
+      for (int k = 0; k < kLanePixels; ++k) {
+        const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, config.alpha_min);
+        const auto pair = Blend<kMode>::accumulate(state[k], gate);
+        for (int f = 0; f < kSums; ++f) sums[k][f] = fma(pair.weight, current.features[f], sums[k][f]);
+        last[k] = pair.contributes ? position + j : last[k];
+      }
+    }
+    __syncwarp();
+    if (Blend<kMode>::kStopsEarly) {
+      bool open = false;
+      for (int k = 0; k < kLanePixels; ++k) open |= state[k].is_open();
+      if (!__any_sync(kAllLanes, open)) break;
+    }
+  }
+
+  const int64_t pixels = int64_t(arguments.width) * arguments.height;
+  for (int k = 0; k < kLanePixels; ++k) {
+    if (!tile.inside(arguments, k)) continue;
+    const int64_t index = tile.pixel_index(arguments, k);
+    if (first_feature == 0) {
+      arguments.saved.final_transmittance[index] = abs(state[k].transmittance);
+      arguments.saved.gate_sum[index] = state[k].gate_sum;
+      arguments.saved.last_contributor[index] = last[k];
+    }
+    for (int f = 0; f < kSums; ++f) {
+      const int feature = first_feature + f;
+      if (kSums == kFeatureChunk && feature >= config.num_features()) break;
+      feature_image(config, arguments.images, feature, pixels)[index] = finish_feature<kMode>(
+          feature_rule(config, feature), state[k], sums[k][f], feature_background(config, feature));
+    }
+  }
+  if (arguments.pairs != nullptr && first_feature == 0 && tile.lane == 0) {
+    atomicAdd(arguments.pairs, pairs * (kWarpTile * kWarpTile));
+  }
+}
+
+template <class S, BlendMode kMode, int kFeatures>
+__global__ void __launch_bounds__(kWarpsPerTile* kWarp)
+    blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
+  __shared__ StagedGaussian<S> staged[kWarpsPerTile][kWarp];
+  const WarpTile<S> tile(arguments);
+  if (tile.empty) return;
+  StagedGaussian<S>* mine = staged[threadIdx.x / kWarp];
+  if constexpr (kFeatures != kAnyFeatures) {
+    blend_features<S, kMode, kFeatures>(arguments, tile, mine, 0);
+  } else {
+    for (int feature = 0; feature < arguments.config.num_features(); feature += kFeatureChunk) {
+      blend_features<S, kMode, kFeatureChunk>(arguments, tile, mine, feature);
+    }
+  }
+}
+
+}  // namespace
+
+template <class S>
+void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+           const SavedForward<S>& saved, const ImageOutputs<S>& images, unsigned long long* pairs,
+           cudaStream_t stream) {
+  const auto arguments = blend_arguments(num_gaussians, camera, config, saved, images, pairs);
+  const unsigned tiles = static_cast<unsigned>(num_tiles(camera.width, camera.height));
+  // Double is for checking: it has the general kernel alone.
+  dispatch_blend(config.mode, sizeof(S) == 4 ? config.num_features() : kAnyFeatures, [&](auto mode, auto features) {
+    constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
+    blend_kernel<S, decltype(mode)::value, kFeatures><<<tiles, kWarpsPerTile * kWarp, 0, stream>>>(arguments);
+    DSMOE_CHECK_LAUNCH("blend");
+  });
+}
+
+#define DSMOE_INSTANTIATE(S)                                                                           \
+  template void blend(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
+                      const ImageOutputs<S>&, unsigned long long*, cudaStream_t);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cuda
+}  // namespace dsmoe

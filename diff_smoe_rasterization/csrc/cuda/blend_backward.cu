@@ -1,0 +1,243 @@
+// From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures.
+#include "../dispatch.h"
+#include "dsmoe/rasterize.h"
+#include "reduce.cuh"
+#include "tile_walk.cuh"
+
+namespace dsmoe {
+namespace cuda {
+namespace {
+
+template <class S> struct BackwardArguments : BlendArguments<S> {
+  ImageGradients<S> dL_dimages;
+  S* dL_dgaussians;        // [N, record]
+  S* slots;                // [capacity, kSlotsPerInstance, record], or null
+  S* dL_dbackground_rows;  // [tiles * kWarpsPerTile, C] of each warp, or null
+  S* scaled;               // [F, H, W] g', where the number of features is not known
+  int num_features;
+};
+
+// g' of one lane's pixels: in registers where the number of features is known, else in memory.
+template <class S, int kFeatures> struct ScaledGradients {
+  S values[kLanePixels][kFeatures];
+  __device__ S get(const BackwardArguments<S>&, const WarpTile<S>&, int k, int f) const { return values[k][f]; }
+  __device__ void set(const BackwardArguments<S>&, const WarpTile<S>&, int k, int f, S value) { values[k][f] = value; }
+};
+template <class S> struct ScaledGradients<S, kAnyFeatures> {
+  __device__ S* at(const BackwardArguments<S>& arguments, const WarpTile<S>& tile, int k, int f) const {
+    return arguments.scaled + int64_t(f) * arguments.width * arguments.height + tile.pixel_index(arguments, k);
+  }
+  __device__ S get(const BackwardArguments<S>& arguments, const WarpTile<S>& tile, int k, int f) const {
+    return tile.inside(arguments, k) ? *at(arguments, tile, k, f) : S(0);
+  }
+  __device__ void set(const BackwardArguments<S>& arguments, const WarpTile<S>& tile, int k, int f, S value) {
+    if (tile.inside(arguments, k)) *at(arguments, tile, k, f) = value;
+  }
+};
+
+// Adds numbers that one warp has summed to the record of a Gaussian, `first` numbers into it.
+template <class S, int kCount>
+__device__ void add_to_record(const BackwardArguments<S>& arguments, const TransposedSum<kCount>& sum,
+                              S (&values)[kCount], int32_t gaussian, int64_t slot, int first, int wanted) {
+  sum(values);
+  if (!sum.holds || sum.number >= wanted) return;
+  const int record = kNumGateMoments + arguments.num_features;
+  if (slot >= 0) {
+    arguments.slots[slot * record + first + sum.number] = values[0];
+  } else {
+    atomicAdd(arguments.dL_dgaussians + int64_t(gaussian) * record + first + sum.number, values[0]);
+  }
+}
+
+// The six moments of a lane's pixels, one below the other.
+template <class S> __device__ void column_moments(const S (&dL_dpower)[kLanePixels], S dx, S dy, S* moments) {
+  S one = S(0), y = S(0), yy = S(0);
+#pragma unroll
+  for (int k = 0; k < kLanePixels; ++k) {
+    const S d = dy + S(k * kLaneStep), first = dL_dpower[k] * d;
+    one = one + dL_dpower[k];
+    y = y + first;
+    yy = fma(first, d, yy);
+  }
+  const GateMoments<S> sums = {one, one * dx, y, one * dx * dx, y * dx, yy};
+  moments[0] = sums.one, moments[1] = sums.x, moments[2] = sums.y;
+  moments[3] = sums.xx, moments[4] = sums.xy, moments[5] = sums.yy;
+}
+
+template <class S, BlendMode kMode, int kFeatures>
+__global__ void __launch_bounds__(kWarpsPerTile* kWarp)
+    blend_backward_kernel(const __grid_constant__ BackwardArguments<S> arguments) {
+  __shared__ StagedGaussian<S> staged[kWarpsPerTile][kWarp];
+  __shared__ int32_t staged_gaussian[kWarpsPerTile][kWarp];
+  const WarpTile<S> tile(arguments);
+  const int warp = threadIdx.x / kWarp;
+  const RasterConfig<S>& config = arguments.config;
+  const int num_features = kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
+  const int64_t pixels = int64_t(arguments.width) * arguments.height;
+
+  PixelBackward<S> pixel[kLanePixels];
+  ScaledGradients<S, kFeatures> scaled;
+  int32_t last[kLanePixels];
+  for (int k = 0; k < kLanePixels; ++k) {
+    const bool inside = tile.inside(arguments, k);
+    const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
+    const S final_transmittance = inside ? arguments.saved.final_transmittance[index] : S(1);
+    const S gate_sum = inside ? arguments.saved.gate_sum[index] : S(0);
+    const S* dL_dgate_sum = arguments.dL_dimages.gate_sum;
+    pixel[k] =
+        begin_backward<kMode>(final_transmittance, inside && dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
+    last[k] = inside ? arguments.saved.last_contributor[index] : 0;
+    for (int f = 0; f < num_features; ++f) {
+      const S* gradient = feature_image(config, arguments.dL_dimages, f, pixels);
+      S value = S(0), dL_dvalue = S(0);
+      if (inside && gradient != nullptr) {
+        value = feature_image(config, arguments.images, f, pixels)[index], dL_dvalue = gradient[index];
+      }
+      scaled.set(arguments, tile, k, f,
+                 add_feature<kMode>(feature_rule(config, f), pixel[k], gate_sum, dL_dvalue, value,
+                                    feature_background(config, f)));
+    }
+  }
+  if (arguments.dL_dbackground_rows != nullptr) {
+    for (int c = 0; c < config.num_channels; ++c) {
+      S share = S(0);
+      for (int k = 0; k < kLanePixels; ++k) {
+        if (!tile.inside(arguments, k) || arguments.dL_dimages.color == nullptr) continue;
+        const int64_t index = tile.pixel_index(arguments, k);
+        share += background_backward<kMode>(arguments.saved.final_transmittance[index], arguments.saved.gate_sum[index],
+                                            arguments.dL_dimages.color[c * pixels + index]);
+      }
+      share = sum_lanes(share);
+      if (tile.lane == 0) {
+        arguments.dL_dbackground_rows[(int64_t(blockIdx.x) * kWarpsPerTile + warp) * config.num_channels + c] = share;
+      }
+    }
+  }
+  if (tile.empty) return;
+
+  int64_t end = tile.end;
+  if (Blend<kMode>::kStopsEarly) {
+    int32_t seen = 0;
+    for (int k = 0; k < kLanePixels; ++k) seen = seen > last[k] ? seen : last[k];
+    end = tile.begin + max_over_lanes(seen);
+  }
+  constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
+  const TransposedSum<kTogether> sum(tile.lane);
+  unsigned long long pairs = 0;
+
+  // Back to front: lane 0 takes the last entry of a chunk.
+  auto next = load_entry(arguments, tile, end - 1 - tile.lane, end - 1 - tile.lane >= tile.begin, 0);
+  for (int64_t chunk = end - 1; chunk >= tile.begin; chunk -= kWarp) {
+    const bool meets = meets_pixels(next, tile);
+    if (meets) {
+      staged[warp][tile.lane] = next.staged;
+      staged_gaussian[warp][tile.lane] = next.gaussian;
+    }
+    unsigned left = __ballot_sync(kAllLanes, meets);
+    const int64_t ahead = chunk - kWarp - tile.lane;
+    next = load_entry(arguments, tile, ahead, ahead >= tile.begin, 0);
+    pairs += __popc(left);
+    for (; left != 0; left &= left - 1) {
+      const int j = __ffs(left) - 1;
+      const StagedGaussian<S> current = staged[warp][j];
+      const ProjectedGaussian<S>& gaussian = current.gaussian;
+      const int32_t position = static_cast<int32_t>(chunk - j - tile.begin);
+      const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
+      const ColumnExponent<S, S> exponent(gaussian.conic, dx);
+      Gate<S> gate[kLanePixels];
+      bool contributes[kLanePixels], any = false;
+#pragma unroll
+      for (int k = 0; k < kLanePixels; ++k) {
+        gate[k] = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, config.alpha_min);
+        contributes[k] = gate[k].counts && position < last[k];
+        any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
+      }
+      if (!__any_sync(kAllLanes, any)) continue;
+
+      const int32_t index = staged_gaussian[warp][j];
+      const S* features = arguments.saved.features + int64_t(index) * feature_stride(num_features);
+      const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? current.features[f] : features[f]; };
+      S weight[kLanePixels], dL_dpower[kLanePixels];
+#pragma unroll
+      for (int k = 0; k < kLanePixels; ++k) {
+        S value = S(0);
+        for (int f = 0; f < num_features; ++f) value = fma(scaled.get(arguments, tile, k, f), feature(f), value);
+        const auto pair = Blend<kMode>::backward(pixel[k], gate[k], value, contributes[k]);
+        weight[k] = pair.weight;
+        dL_dpower[k] = gate_backward(gate[k], pair.gamma);
+      }
+      int64_t slot = -1;
+      if (arguments.slots != nullptr && tile.listed) {
+        const int64_t entry = tile.begin + position;
+        slot = int64_t(static_cast<uint32_t>(arguments.saved.instances[2 * entry + 1])) * kSlotsPerInstance + warp;
+      }
+      S values[kTogether];
+      column_moments(dL_dpower, dx, dy, values);
+      if constexpr (kFeatures != kAnyFeatures) {
+        for (int f = 0; f < kFeatures; ++f) {
+          S share = S(0);
+          for (int k = 0; k < kLanePixels; ++k) share = fma(weight[k], scaled.values[k][f], share);
+          values[kNumGateMoments + f] = share;
+        }
+      }
+      add_to_record(arguments, sum, values, index, slot, 0, kTogether);
+      if constexpr (kFeatures == kAnyFeatures) {
+        const TransposedSum<kFeatureChunk> sum_features(tile.lane);
+        for (int first = 0; first < num_features; first += kFeatureChunk) {
+          S shares[kFeatureChunk];
+          for (int f = 0; f < kFeatureChunk; ++f) {
+            shares[f] = S(0);
+            if (first + f >= num_features) continue;
+            for (int k = 0; k < kLanePixels; ++k) {
+              shares[f] = fma(weight[k], scaled.get(arguments, tile, k, first + f), shares[f]);
+            }
+          }
+          add_to_record(arguments, sum_features, shares, index, slot, kNumGateMoments + first, num_features - first);
+        }
+      }
+    }
+    __syncwarp();
+  }
+  if (arguments.pairs != nullptr && tile.lane == 0) atomicAdd(arguments.pairs, pairs * (kWarpTile * kWarpTile));
+}
+
+}  // namespace
+
+template <class S>
+void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+                    const SavedForward<S>& saved, const ImageOutputs<S>& images,
+                    const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
+                    Scratch& scratch, unsigned long long* pairs, cudaStream_t stream) {
+  const int64_t tiles = num_tiles(camera.width, camera.height);
+  const bool known = sizeof(S) == 4 && config.num_features() == 3;
+  BackwardArguments<S> arguments{blend_arguments(num_gaussians, camera, config, saved, images, pairs)};
+  arguments.dL_dimages = image_gradients;
+  arguments.dL_dgaussians = dL_dgaussians;
+  arguments.slots = slots;
+  arguments.num_features = config.num_features();
+  const int64_t warps = tiles * kWarpsPerTile;
+  if (dL_dbackground != nullptr) arguments.dL_dbackground_rows = allocate<S>(scratch, warps * config.num_channels);
+  if (!known) {
+    arguments.scaled = allocate<S>(scratch, int64_t(camera.width) * camera.height * arguments.num_features);
+  }
+  dispatch_blend(config.mode, known ? 3 : kAnyFeatures, [&](auto mode, auto features) {
+    constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
+    blend_backward_kernel<S, decltype(mode)::value, kFeatures>
+        <<<static_cast<unsigned>(tiles), kWarpsPerTile * kWarp, 0, stream>>>(arguments);
+    DSMOE_CHECK_LAUNCH("blend_backward");
+  });
+  if (dL_dbackground != nullptr) {
+    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels, dL_dbackground, stream);
+  }
+}
+
+#define DSMOE_INSTANTIATE(S)                                                                                    \
+  template void blend_backward(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
+                               const ImageOutputs<S>&, const ImageGradients<S>&, S*, S*, S*, Scratch&,          \
+                               unsigned long long*, cudaStream_t);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cuda
+}  // namespace dsmoe

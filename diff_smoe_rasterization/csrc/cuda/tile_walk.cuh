@@ -1,0 +1,121 @@
+// How a warp walks a tile's list. A warp owns 8x8 pixels, a quarter of a tile: each lane two of them, one below the
+// other, so that a Gaussian's terms in x are shared. It takes 32 instances at a time, one a lane, tests each footprint
+// against its pixels, and stages those that meet them in shared memory, for all lanes to read. Warps do not wait for
+// each other.
+#pragma once
+
+#include "device.cuh"
+#include "dsmoe/features.h"
+#include "dsmoe/project.h"
+
+namespace dsmoe {
+namespace cuda {
+
+constexpr int kWarpTile = 8;  // pixels, each way
+constexpr int kWarpsPerTile = (kTileSize / kWarpTile) * (kTileSize / kWarpTile);
+constexpr int kLanePixels = kWarpTile * kWarpTile / kWarp;  // one below the other
+constexpr int kLaneStep = kWarpTile / kLanePixels;          // rows between them
+constexpr int kFeatureChunk = 4;                            // features that load as one vector
+static_assert(kWarpsPerTile == kSlotsPerInstance, "each quarter of a tile has its slot");
+
+template <class S> struct BlendArguments {
+  int64_t num_gaussians;
+  int width, height;
+  int tile_columns;
+  RasterConfig<S> config;
+  SavedForward<S> saved;
+  ImageOutputs<S> images;
+  unsigned long long* pairs;
+};
+
+template <class S>
+BlendArguments<S> blend_arguments(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+                                  const SavedForward<S>& saved, const ImageOutputs<S>& images,
+                                  unsigned long long* pairs) {
+  const TileGrid grid(camera.width, camera.height);
+  return {num_gaussians, camera.width, camera.height, grid.columns, config, saved, images, pairs};
+}
+
+// A Gaussian that meets the warp's pixels.
+template <class S> struct alignas(16) StagedGaussian {
+  ProjectedGaussian<S> gaussian;
+  S features[kFeatureChunk];
+};
+
+template <class S> class WarpTile {
+ public:
+  __device__ explicit WarpTile(const BlendArguments<S>& arguments) {
+    const int tile = blockIdx.x, quarter = threadIdx.x / kWarp;
+    lane = threadIdx.x % kWarp;
+    tile_x = tile % arguments.tile_columns, tile_y = tile / arguments.tile_columns;
+    constexpr int kAcross = kTileSize / kWarpTile;
+    const int x0 = tile_x * kTileSize + quarter % kAcross * kWarpTile;
+    const int y0 = tile_y * kTileSize + quarter / kAcross * kWarpTile;
+    x = x0 + lane % kWarpTile, y = y0 + lane / kWarpTile;
+    empty = x0 >= arguments.width || y0 >= arguments.height;
+    rect = {S(x0), S(y0), S(min(x0 + kWarpTile, arguments.width) - 1), S(min(y0 + kWarpTile, arguments.height) - 1)};
+    listed = !overflows(arguments.saved);
+    begin = listed ? arguments.saved.tile_offsets[tile] : 0;
+    end = listed ? arguments.saved.tile_offsets[tile + 1] : arguments.num_gaussians;
+  }
+
+  __device__ bool inside(const BlendArguments<S>& arguments, int k) const {
+    return x < arguments.width && y + k * kLaneStep < arguments.height;
+  }
+  __device__ int64_t pixel_index(const BlendArguments<S>& arguments, int k) const {
+    return int64_t(y + k * kLaneStep) * arguments.width + x;
+  }
+
+  int lane, tile_x, tile_y;
+  int x, y;  // of the lane's first pixel
+  bool empty;
+  bool listed;         // the tile has a list; else the depth order serves
+  PixelRect<S> rect;   // the warp's pixels
+  int64_t begin, end;  // of the list
+};
+
+// One entry of a list, as its lane loads it.
+template <class S> struct ListEntry {
+  StagedGaussian<S> staged;
+  int32_t gaussian;
+  bool meets;  // the warp's pixels
+};
+
+// Features from `first_feature` on come along.
+template <class S>
+__device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int64_t position,
+                                   bool valid, int first_feature) {
+  const SavedForward<S>& saved = arguments.saved;
+  ListEntry<S> entry;
+  entry.meets = false;
+  if (!valid) return entry;
+  entry.gaussian = tile.listed ? saved.instances[position * saved.instance_width] : saved.order[position];
+  int32_t radius = 0;
+  if (!tile.listed) {
+    radius = arguments.images.radii[entry.gaussian];
+    if (radius == 0) return entry;
+  }
+  entry.staged.gaussian = saved.projected[entry.gaussian];
+  const S* features = saved.features + int64_t(entry.gaussian) * feature_stride(arguments.config.num_features());
+  struct alignas(4 * sizeof(S) > 16 ? 16 : 4 * sizeof(S)) Chunk {
+    S values[kFeatureChunk];
+  };
+  *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + first_feature);
+  entry.meets = true;
+  if (!tile.listed) {
+    Camera<S> camera;
+    camera.width = arguments.width, camera.height = arguments.height;
+    const TileRect bounds = tile_bounds(arguments.config.mode, camera, entry.staged.gaussian.mean, S(radius));
+    entry.meets =
+        bounds.x0 <= tile.tile_x && tile.tile_x < bounds.x1 && bounds.y0 <= tile.tile_y && tile.tile_y < bounds.y1;
+  }
+  return entry;
+}
+
+template <class S> __device__ bool meets_pixels(const ListEntry<S>& entry, const WarpTile<S>& tile) {
+  const auto& gaussian = entry.staged.gaussian;
+  return entry.meets && may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
+}
+
+}  // namespace cuda
+}  // namespace dsmoe

@@ -1,0 +1,111 @@
+// The rasterizer's public C++ interface, CUDA backend: no torch, float and double, every call asynchronous on the
+// caller's stream. All pointers are device pointers, to memory of the caller's.
+//
+//     cuda::project(inputs, camera, config, saved, images, scratch, stream);  // footprints, depth order, counts
+//     ... copy *saved.num_instances to the host, or take a capacity that was enough before
+//     saved.instances = ... [capacity, saved.instance_width]; saved.capacity = capacity;
+//     cuda::bin(inputs.num_gaussians, camera, config, saved, images.radii, scratch, stream);  // tile lists
+//     cuda::blend(inputs.num_gaussians, camera, config, saved, images, stream);               // the images
+//     cuda::backward(inputs, camera, config, saved, images, image_gradients, gradients, scratch, stream);
+//
+// A capacity that turns out too small costs time, not correctness: where the instances do not fit, the blend reads the
+// depth order itself instead of the tile lists. So the host never has to wait, and a captured graph stays right when
+// its inputs change.
+//
+// Errors are std::runtime_error: a launch that failed, and why.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include <cstddef>
+#include <cstdint>
+
+#include "dsmoe/params.h"
+
+namespace dsmoe {
+namespace cuda {
+
+// A camera whose matrices stay in device memory.
+template <class S> struct DeviceCamera {
+  int width = 0, height = 0;
+  S tan_fov_x = 0, tan_fov_y = 0;
+  S near = S(0.2);
+  const S* view = nullptr;        // [4, 4]
+  const S* projection = nullptr;  // [4, 4]
+  const S* position = nullptr;    // [3]
+};
+
+// Numbers between the rows of `features`: rows begin at multiples of four, so that they load as vectors.
+DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features + 3) / 4 * 4; }
+
+// What the forward pass leaves for the backward pass; rows of culled Gaussians hold anything.
+template <class S> struct SavedForward {
+  ProjectedGaussian<S>* projected = nullptr;  // [N]
+  S* features = nullptr;                      // [N, feature_stride(F)]
+  int32_t* order = nullptr;                   // [N] Gaussians, nearest first, culled ones last
+  int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
+  int64_t* num_instances = nullptr;           // [1] how many there are; those beyond the capacity are not listed
+  int32_t* instances = nullptr;               // [capacity, instance_width] Gaussian (and slot) by tile, front to back
+  int64_t capacity = 0;
+  int instance_width = 1;          // 2: with slots, for gradients that are bitwise reproducible
+  int64_t* slot_ranges = nullptr;  // [N, 2] each Gaussian's slots, begin and end; null without slots
+  S* final_transmittance = nullptr;
+  S* gate_sum = nullptr;
+  int32_t* last_contributor = nullptr;  // [H, W] how many entries of the list the numerator has seen
+};
+
+// Memory for the duration of one call, or null where there is none left; the caller frees it in the stream's order.
+class Scratch {
+ public:
+  virtual void* allocate(size_t bytes) = 0;
+
+ protected:
+  ~Scratch() = default;
+};
+
+// What `project` hands to `bin`.
+struct Binning {
+  int32_t* tile_counts = nullptr;       // [N] tiles of each Gaussian
+  int64_t* instance_offsets = nullptr;  // [N + 1] by position in the depth order
+};
+
+template <class S>
+void project(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+             const SavedForward<S>& saved, const ImageOutputs<S>& images, const Binning& binning, cudaStream_t stream);
+
+// Fills order, instance_offsets and num_instances.
+template <class S>
+void sort_by_depth(int64_t num_gaussians, const RasterConfig<S>& config, const SavedForward<S>& saved,
+                   const int32_t* radii, const Binning& binning, Scratch& scratch, cudaStream_t stream);
+
+template <class S>
+void bin(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+         const SavedForward<S>& saved, const int32_t* radii, const Binning& binning, Scratch& scratch,
+         cudaStream_t stream);
+
+// pairs: where not null, the number of (Gaussian, pixel) pairs that were evaluated is added to it.
+template <class S>
+void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+           const SavedForward<S>& saved, const ImageOutputs<S>& images, unsigned long long* pairs, cudaStream_t stream);
+
+// From image gradients to one record per Gaussian: the sums over its pixels, [N, kNumGateMoments + F], which must be
+// zero before. slots: [capacity, kSlotsPerInstance, kNumGateMoments + F], also zero; or null.
+template <class S>
+void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+                    const SavedForward<S>& saved, const ImageOutputs<S>& images,
+                    const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
+                    Scratch& scratch, unsigned long long* pairs, cudaStream_t stream);
+constexpr int kSlotsPerInstance = 4;  // one for each quarter of a tile
+
+// From the records to the gradients of every input.
+template <class S>
+void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+                      const SavedForward<S>& saved, const int32_t* radii, const S* dL_dgaussians, const S* slots,
+                      const GaussianGradients<S>& gradients, Scratch& scratch, cudaStream_t stream);
+
+// Marks the Gaussians in front of the near plane. visible: [N].
+template <class S>
+void mark_visible(int64_t num_gaussians, const S* means3D, const S* view, S near, bool* visible, cudaStream_t stream);
+
+}  // namespace cuda
+}  // namespace dsmoe
