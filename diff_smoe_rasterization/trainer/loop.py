@@ -10,6 +10,7 @@ from typing import Any, Callable, Dict, List, Optional
 import torch
 from tqdm import tqdm
 
+from ..losses import l1_ssim_loss_and_gradient
 from .checkpoint import CHECKPOINT_NAME, load_checkpoint, save_checkpoint
 from .config import CONFIG_NAME, TrainConfig
 from .environment import extension_info
@@ -17,7 +18,6 @@ from .errors import TrainerError
 from .evaluation import Evaluation, evaluate
 from .files import write_json_atomically
 from .interrupt import DelayedInterrupt
-from .losses import training_loss
 from .metrics import psnr
 from .model import GaussianModel, GaussianOptimizer
 from .modelfile import FOLDER, model_path, save_model
@@ -28,7 +28,6 @@ from .results import RESULTS_NAME, result_row, write_results
 from .scene import Scene, load_scene, read_layout, scene_fingerprint
 from .stopwatch import Stopwatch
 from .strategy import STRATEGIES, Step, StrategyContext
-from .targets import Targets
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
 PER_VIEW_NAME = "per_view.json"
@@ -62,7 +61,6 @@ class Trainer:
         self.renderer = Renderer(self.model, str(config.blend_mode), background, config.antialiasing, rasterize)
         self.strategy = STRATEGIES[config.schedule](StrategyContext(
             config, self.model, self.optimizer, scene.extent, [view.camera for view in scene.train], self.renderer))
-        self.targets = Targets(self.scene.train)
         self.order = ViewOrder(len(scene.train), config.seed)
         self.watch = Stopwatch(config.device)
         self.iteration = 0
@@ -83,13 +81,13 @@ class Trainer:
         if self.iteration % config.sh_degree_interval == 0:
             model.raise_sh_degree()
         index = self.order.next()
-        camera = self.scene.train[index].camera
+        view = self.scene.train[index]
         means2D = torch.zeros_like(model.raw["means3D"], requires_grad=True)
-        rendering = self.renderer(camera, means2D=means2D)
-        loss = training_loss(rendering.color, self.targets[index], config.lambda_dssim)
-        step = Step(self.iteration, camera, rendering, means2D, loss)
+        rendering = self.renderer(view.camera, means2D=means2D)
+        loss, gradient = l1_ssim_loss_and_gradient(rendering.color, view.image, config.lambda_dssim)
+        step = Step(self.iteration, view.camera, rendering, means2D, loss)
         self.strategy.before_backward(step)
-        loss.backward()
+        rendering.color.backward(gradient)
         if before_change:
             before_change()
         if self.iteration < config.iterations:
@@ -103,7 +101,7 @@ class Trainer:
     def training_psnr(self) -> float:
         """PSNR of the last step's rendering against its training image."""
         index, color = self._report
-        return psnr(color.clamp(0, 1), self.targets[index].image)
+        return psnr(color.clamp(0, 1), self.scene.train[index].image_float())
 
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views."""

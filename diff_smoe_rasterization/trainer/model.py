@@ -1,12 +1,13 @@
 """The trainable Gaussians: raw parameters, their activations, Adam, and the Inria-format .ply."""
 from __future__ import annotations
 
-from typing import Callable, Dict, List
+import math
+from typing import Callable, Dict
 
-import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
+from ..neighbors import distCUDA2
+from ..optimizers import FusedAdam
 from .config import TrainConfig
 from .pointcloud import PointCloud
 
@@ -34,12 +35,6 @@ def quaternion_to_matrix(rotations: torch.Tensor) -> torch.Tensor:
     ], dim=1).view(-1, 3, 3)
 
 
-def mean_squared_neighbour_distance(positions: np.ndarray) -> np.ndarray:
-    """[N] mean squared distance to the three nearest other points. positions: [N, 3], N >= 4."""
-    distances, _ = cKDTree(positions).query(positions, k=4, workers=-1)
-    return (distances[:, 1:] ** 2).mean(axis=1)
-
-
 class GaussianModel:
     """N Gaussians as leaf tensors under an Adam optimizer with the learning rates of 3DGS.
 
@@ -56,20 +51,16 @@ class GaussianModel:
     def from_points(cls, points: PointCloud, sh_degree: int, device: str) -> "GaussianModel":
         """Initialises as 3DGS: round Gaussians as wide as the distance to their neighbours, opacity 0.1."""
         count = len(points.positions)
-        squared = np.maximum(mean_squared_neighbour_distance(points.positions), MIN_SQUARED_DISTANCE)
-        log_scales = np.repeat(np.log(np.sqrt(squared))[:, None], 3, axis=1)
-
-        def tensor(array: np.ndarray) -> torch.Tensor:
-            return torch.tensor(array, dtype=torch.float32, device=device)
-
+        positions = torch.tensor(points.positions, device=device)
+        log_scales = distCUDA2(positions).clamp(min=MIN_SQUARED_DISTANCE).sqrt().log()
         rotations = torch.zeros(count, 4, device=device)
         rotations[:, 0] = 1
         return cls({
-            "means3D": tensor(points.positions),
-            "dc": tensor((points.colors - 0.5) / SH_C0).unsqueeze(1),
+            "means3D": positions.float(),
+            "dc": ((torch.tensor(points.colors, device=device) - 0.5) / SH_C0).float().unsqueeze(1),
             "shs": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device=device),
             "opacities": inverse_sigmoid(torch.full((count, 1), INITIAL_OPACITY, device=device)),
-            "scales": tensor(log_scales),
+            "scales": log_scales.float().unsqueeze(1).repeat(1, 3),
             "rotations": rotations,
         }, sh_degree)
 
@@ -119,7 +110,8 @@ class GaussianOptimizer:
             "scales": config.scaling_lr,
             "rotations": config.rotation_lr,
         }
-        self.adam = _make_adam([{"params": [model.raw[name]], "lr": rates[name], "name": name} for name in PARAMETERS])
+        self.adam = FusedAdam([{"params": [model.raw[name]], "lr": rates[name], "name": name} for name in PARAMETERS],
+                              eps=ADAM_EPSILON)
 
     def set_position_rate(self, iteration: int) -> None:
         """Sets the positions' learning rate for this step."""
@@ -141,8 +133,9 @@ class GaussianOptimizer:
 
     def keep(self, mask: torch.Tensor) -> None:
         """Removes the Gaussians where mask [N] (bool) is False."""
+        kept = mask.nonzero().squeeze(1)  # on a GPU the host waits here, once for all tensors
         for name in PARAMETERS:
-            self._replace(name, lambda tensor, _: tensor[mask], self.model.raw[name].new_zeros(0))
+            self._replace(name, lambda tensor, _: tensor.index_select(0, kept), self.model.raw[name].new_zeros(0))
 
     def set_opacity_logits(self, logits: torch.Tensor) -> None:
         """Sets all opacity logits [N, 1] and forgets their moments."""
@@ -184,9 +177,8 @@ class GaussianOptimizer:
         bands, base = self.model.raw["shs"], self.model.raw["dc"]
         if bands.grad is None or bands in self.adam.state or base not in self.adam.state:
             return
-        step = self.adam.state[base]["step"]
         self.adam.state[bands] = {
-            "step": step.clone() if isinstance(step, torch.Tensor) else step,
+            "step": self.adam.state[base]["step"],
             "exp_avg": torch.zeros_like(bands),
             "exp_avg_sq": torch.zeros_like(bands),
         }
@@ -203,15 +195,7 @@ class GaussianOptimizer:
             self.adam.state[self.model.raw[name]] = dict(state)
 
 
-def _make_adam(groups: List[Dict]) -> torch.optim.Adam:
-    """Adam, fused where this torch has a fused kernel for the device (one pass over memory instead of ten)."""
-    try:
-        return torch.optim.Adam([dict(group) for group in groups], lr=0.0, eps=ADAM_EPSILON, fused=True)
-    except (TypeError, RuntimeError):
-        return torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPSILON)
-
-
 def exponential_rate(step: int, first: float, last: float, max_steps: int) -> float:
     """Log-linear interpolation from `first` at step 0 to `last` at max_steps, constant from there on."""
     share = min(max(step / max_steps, 0.0), 1.0)
-    return float(np.exp((1 - share) * np.log(first) + share * np.log(last)))
+    return math.exp((1 - share) * math.log(first) + share * math.log(last))

@@ -1,11 +1,11 @@
 """One image of a GaussianModel through the package's public rasterizer."""
 from __future__ import annotations
 
-from typing import Any, Callable, Optional
+from typing import Any, Callable, Dict, Optional, Tuple
 
 import torch
 
-from ..settings import Rendering
+from ..settings import GaussianRasterizationSettings, Rendering
 from .cameras import Camera
 from .model import GaussianModel
 
@@ -30,15 +30,22 @@ class Renderer:
         self.background = background
         self.antialiasing = antialiasing
         self.rasterize = rasterize or package_rasterizer()
+        self._settings: Dict[int, Tuple[Camera, GaussianRasterizationSettings]] = {}
 
     def __call__(self, camera: Camera, **arguments: Any) -> Rendering:
         """arguments: further ones of `rasterize`, means2D or outputs, or colors_precomp in place of the SH colours."""
         model = self.model
         if "colors_precomp" not in arguments:
             arguments.update(model.color_arguments())
-        settings = camera.settings(self.background, model.active_sh_degree, self.blend_mode, self.antialiasing)
-        return self.rasterize(model.raw["means3D"], model.opacities, settings, scales=model.scales,
+        return self.rasterize(model.raw["means3D"], model.opacities, self._settings_of(camera), scales=model.scales,
                               rotations=model.rotations, **arguments)
+
+    def _settings_of(self, camera: Camera) -> GaussianRasterizationSettings:
+        """The camera's settings; its matrices stay on the device, where sending them anew would hold up the step."""
+        if id(camera) not in self._settings:  # kept with its camera, so that no other one gets this id
+            self._settings[id(camera)] = (camera, camera.settings(self.background, 0, self.blend_mode,
+                                                                  self.antialiasing))
+        return self._settings[id(camera)][1]._replace(sh_degree=self.model.active_sh_degree)
 
 
 def background_color(white: bool, device: str) -> torch.Tensor:

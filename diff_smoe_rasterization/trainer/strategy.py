@@ -105,17 +105,21 @@ class ThreeDGSStrategy(Strategy):
         config, model = self.context.config, self.context.model
         wanted = gradients >= config.densify_grad_threshold
         large = model.scales.detach().max(dim=1).values > config.percent_dense * self.context.extent
-        clones = {name: model.raw[name].detach()[wanted & ~large] for name in PARAMETERS}
         parents = wanted & large
-        children = self._children(parents)
+        clones = self._rows(wanted & ~large)
+        children = self._children(self._rows(parents))
         kept = torch.cat([~parents, parents.new_ones(len(clones["means3D"]) + len(children["means3D"]))])
         self.context.optimizer.append({name: torch.cat([clones[name], children[name]]) for name in PARAMETERS})
         self.context.optimizer.keep(kept)
 
-    def _children(self, parents: torch.Tensor) -> Dict[str, torch.Tensor]:
-        """Smaller Gaussians at places drawn from each parent's own distribution. parents: [N] bool."""
-        raw = {name: self.context.model.raw[name].detach()[parents].repeat(
-            CHILDREN, *[1] * (self.context.model.raw[name].dim() - 1)) for name in PARAMETERS}
+    def _rows(self, mask: torch.Tensor) -> Dict[str, torch.Tensor]:
+        """The raw parameters of the Gaussians where mask [N] (bool) is True."""
+        rows = mask.nonzero().squeeze(1)
+        return {name: self.context.model.raw[name].detach().index_select(0, rows) for name in PARAMETERS}
+
+    def _children(self, parents: Dict[str, torch.Tensor]) -> Dict[str, torch.Tensor]:
+        """Smaller Gaussians at places drawn from each parent's own distribution. parents: raw parameters."""
+        raw = {name: rows.repeat(CHILDREN, *[1] * (rows.dim() - 1)) for name, rows in parents.items()}
         offsets = torch.normal(torch.zeros_like(raw["scales"]), raw["scales"].exp())
         turned = torch.bmm(quaternion_to_matrix(raw["rotations"]), offsets.unsqueeze(2)).squeeze(2)
         raw["means3D"] = raw["means3D"] + turned
@@ -137,8 +141,7 @@ class ThreeDGSStrategy(Strategy):
 
     def _observe(self, step: Step) -> None:
         visible = step.rendering.radii > 0
-        norms = step.means2D.grad[:, :2].norm(dim=1)
-        self.gradient_sum += torch.where(visible, norms, torch.zeros_like(norms))
+        self.gradient_sum += step.means2D.grad[:, :2].norm(dim=1) * visible
         self.view_count += visible
 
     def _mean_gradients(self) -> torch.Tensor:

@@ -11,7 +11,6 @@ from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.loop import Run, Trainer
 from diff_smoe_rasterization.trainer.scene import load_scene
 from diff_smoe_rasterization.trainer.strategy import STRATEGIES, Strategy
-from diff_smoe_rasterization.trainer.targets import Targets
 
 
 @pytest.fixture
@@ -139,12 +138,3 @@ def test_a_loss_that_is_not_finite_stops_the_run(tiny_config, scene):
     trainer.step = poisoned
     with pytest.raises(TrainerError, match="iteration 10: the loss is nan"):
         Run(trainer, progress=False).train()
-
-
-def test_targets_are_the_same_whether_kept_or_not(scene):
-    kept, fresh = Targets(scene.train), Targets(scene.train, max_bytes=0)
-    first = kept[3]
-    assert kept[3] is first and fresh[3] is not fresh[3]
-    for mine, theirs in zip(first, fresh[3]):
-        assert torch.equal(mine, theirs)
-    assert torch.equal(first.image, scene.train[3].image.float() / 255)

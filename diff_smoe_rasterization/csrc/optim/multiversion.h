@@ -1,0 +1,9 @@
+// Compiles a function once per instruction set; the loader takes the best that the processor has. Results are the same
+// bits in each, because no compiler flag lets products and sums contract.
+#pragma once
+
+#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
+#define DSMOE_MULTIVERSION __attribute__((target_clones("avx2", "default")))
+#else
+#define DSMOE_MULTIVERSION
+#endif

@@ -1,0 +1,156 @@
+// The ops as torch calls them, once for all backends: ops_schema.cpp says their signatures, a backend registers
+// `adam<Backend>` and its like under its dispatch key. A Backend has the functions that ops_cpu.cpp and ops_cuda.cpp
+// define.
+#pragma once
+
+#include <ATen/ATen.h>
+#include <ATen/Dispatch.h>
+#include <c10/core/DeviceGuard.h>
+#include <c10/util/Optional.h>
+
+#include <climits>
+#include <string>
+#include <tuple>
+#include <vector>
+
+#include "optim/adam.h"
+#include "optim/image_loss.h"
+
+namespace dsmoe {
+namespace binding {
+
+using OptionalTensor = c10::optional<at::Tensor>;  // std::optional in newer torch
+
+inline void check_same(const char* function, const std::string& name, const at::Tensor& tensor,
+                       const std::string& other_name, const at::Tensor& other) {
+  TORCH_CHECK_VALUE(tensor.sizes() == other.sizes(), function, ": ", name, " has shape ", tensor.sizes(),
+                    "; it must be ", other.sizes(), ", as ", other_name, " is");
+  TORCH_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
+                   "; it must be on ", other.device(), ", as ", other_name, " is");
+}
+
+inline void check_real(const char* function, const std::string& name, const at::Tensor& tensor) {
+  const at::ScalarType type = tensor.scalar_type();
+  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, function, ": ", name, " is ", c10::toString(type),
+                   "; it must be Float or Double");
+}
+
+inline void check_type(const char* function, const std::string& name, const at::Tensor& tensor, at::ScalarType type) {
+  TORCH_CHECK_TYPE(tensor.scalar_type() == type, function, ": ", name, " is ", c10::toString(tensor.scalar_type()),
+                   "; it must be ", c10::toString(type));
+}
+
+template <class Backend>
+void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList moments, at::TensorList squares,
+          at::ArrayRef<double> rates, at::ArrayRef<double> root_scales, double beta1, double beta2, double epsilon,
+          const OptionalTensor& visible) {
+  const size_t count = parameters.size();
+  for (size_t length : {gradients.size(), moments.size(), squares.size(), rates.size(), root_scales.size()}) {
+    TORCH_CHECK_VALUE(length == count, "adam: lists of ", count, " and of ", length,
+                      " items are given; all must have the length of parameters");
+  }
+  if (count == 0) return;
+  const at::Tensor& first = parameters[0];
+  check_real("adam", "parameters[0]", first);
+  const c10::DeviceGuard guard(first.device());
+
+  at::Tensor flags;
+  if (visible.has_value()) {
+    flags = visible->contiguous();
+    check_type("adam", "visible", flags, at::kBool);
+    TORCH_CHECK_VALUE(flags.dim() == 1, "adam: visible has shape ", flags.sizes(), "; it must be [N]");
+    TORCH_CHECK_TYPE(flags.device() == first.device(), "adam: visible is on ", flags.device(), "; it must be on ",
+                     first.device(), ", as parameters[0] is");
+  }
+
+  std::vector<at::Tensor> dense_gradients;
+  for (size_t i = 0; i < count; ++i) {
+    const auto name = [i](const char* list) { return std::string(list) + "[" + std::to_string(i) + "]"; };
+    const auto check_state = [&](const char* list, const at::Tensor& tensor) {
+      check_same("adam", name(list), tensor, name("parameters"), parameters[i]);
+      check_type("adam", name(list), tensor, first.scalar_type());
+      TORCH_CHECK_VALUE(tensor.is_contiguous(), "adam: ", name(list), " is not contiguous; it must be");
+    };
+    check_state("parameters", parameters[i]);
+    TORCH_CHECK_TYPE(parameters[i].device() == first.device(), "adam: ", name("parameters"), " is on ",
+                     parameters[i].device(), "; it must be on ", first.device(), ", as parameters[0] is");
+    check_state("moments", moments[i]);
+    check_state("squares", squares[i]);
+    check_same("adam", name("gradients"), gradients[i], name("parameters"), parameters[i]);
+    check_type("adam", name("gradients"), gradients[i], first.scalar_type());
+    TORCH_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)),
+                      "adam: ", name("parameters"), " has shape ", parameters[i].sizes(), "; visible has ",
+                      flags.defined() ? flags.size(0) : 0, " rows, and so must every parameter");
+    dense_gradients.push_back(gradients[i].contiguous());
+  }
+
+  AT_DISPATCH_FLOATING_TYPES(first.scalar_type(), "adam", [&] {
+    const AdamConstants<scalar_t> constants = {static_cast<scalar_t>(beta1), static_cast<scalar_t>(beta2),
+                                               static_cast<scalar_t>(1 - beta1), static_cast<scalar_t>(1 - beta2),
+                                               static_cast<scalar_t>(epsilon)};
+    std::vector<AdamTensor<scalar_t>> tensors;
+    for (size_t i = 0; i < count; ++i) {
+      const int64_t size = parameters[i].numel();
+      const int64_t rows = flags.defined() ? flags.size(0) : size;
+      tensors.push_back({parameters[i].data_ptr<scalar_t>(),
+                         dense_gradients[i].data_ptr<scalar_t>(),
+                         moments[i].data_ptr<scalar_t>(),
+                         squares[i].data_ptr<scalar_t>(),
+                         size,
+                         rows > 0 && size > 0 ? size / rows : 1,
+                         {static_cast<scalar_t>(rates[i]), static_cast<scalar_t>(root_scales[i])}});
+    }
+    Backend::adam(tensors, constants, flags.defined() ? flags.data_ptr<bool>() : nullptr);
+  });
+  // So that autograd notices where a tensor was changed after it was saved.
+  for (at::TensorList list : {parameters, moments, squares}) {
+    for (const at::Tensor& tensor : list) tensor.unsafeGetTensorImpl()->bump_version();
+  }
+}
+
+// The loss and, if it is wanted, its gradient by the image; an empty tensor otherwise.
+template <class Backend>
+std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at::Tensor& target, double l1_weight,
+                                              double ssim_weight, double offset, int64_t margin, bool with_gradient) {
+  const char* function = "image_loss";
+  check_real(function, "image", image);
+  check_same(function, "target", target, "image", image);
+  TORCH_CHECK_VALUE(image.dim() >= 2 && image.numel() > 0, function, ": image has shape ", image.sizes(),
+                    "; it must be [..., H, W] with at least one pixel");
+  const int64_t height = image.size(-2), width = image.size(-1);
+  TORCH_CHECK_VALUE(height <= INT_MAX && width <= INT_MAX, function, ": image has shape ", image.sizes(),
+                    "; its sides may have ", INT_MAX, " pixels");
+  TORCH_CHECK_VALUE(margin >= 0 && height > 2 * margin && width > 2 * margin, function, ": image has shape ",
+                    image.sizes(), "; with a margin of ", margin, " its sides must be at least ", 2 * margin + 1);
+  const bool bytes = target.scalar_type() == at::kByte;
+  TORCH_CHECK_TYPE(bytes || target.scalar_type() == image.scalar_type(), function, ": target is ",
+                   c10::toString(target.scalar_type()), "; it must be ", c10::toString(image.scalar_type()),
+                   ", as image is, or Byte");
+  const c10::DeviceGuard guard(image.device());
+  const at::Tensor x = image.contiguous(), y = target.contiguous();
+  const int64_t planes = x.numel() / (height * width);
+  const at::Tensor loss = at::empty({}, x.options());
+  const at::Tensor gradient = at::empty(with_gradient ? x.sizes() : at::IntArrayRef({0}), x.options());
+  const at::Tensor derivatives = at::empty({with_gradient ? 3 * x.numel() : 0}, x.options());
+  AT_DISPATCH_FLOATING_TYPES(x.scalar_type(), "image_loss", [&] {
+    ImageLoss<scalar_t> arguments = {};
+    arguments.image = x.data_ptr<scalar_t>();
+    arguments.target = bytes ? nullptr : y.data_ptr<scalar_t>();
+    arguments.target_bytes = bytes ? y.data_ptr<uint8_t>() : nullptr;
+    arguments.planes = planes;
+    arguments.height = static_cast<int>(height), arguments.width = static_cast<int>(width);
+    arguments.margin = static_cast<int>(margin);
+    arguments.l1_weight = l1_weight, arguments.ssim_weight = ssim_weight, arguments.offset = offset;
+    const at::Tensor sums =
+        at::empty({Backend::template num_image_loss_sums<scalar_t>(arguments)}, x.options().dtype(at::kDouble));
+    arguments.sums = sums.data_ptr<double>();
+    arguments.loss = loss.data_ptr<scalar_t>();
+    arguments.gradient = with_gradient ? gradient.data_ptr<scalar_t>() : nullptr;
+    arguments.derivatives = with_gradient ? derivatives.data_ptr<scalar_t>() : nullptr;
+    Backend::image_loss(arguments);
+  });
+  return {loss, gradient};
+}
+
+}  // namespace binding
+}  // namespace dsmoe

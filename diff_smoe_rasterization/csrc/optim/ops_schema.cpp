@@ -1,0 +1,17 @@
+// What torch knows of the trainers' ops.
+#include <torch/library.h>
+
+TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m) {
+  // One step of Adam in place. rates and root_scales: a number per parameter, see dsmoe/adam.h. visible [N]: rows of
+  // every parameter that are stepped.
+  m.def(
+      "adam(Tensor(a!)[] parameters, Tensor[] gradients, Tensor(b!)[] moments, Tensor(c!)[] squares, float[] rates, "
+      "float[] root_scales, float beta1, float beta2, float epsilon, Tensor? visible) -> ()");
+  // offset + l1_weight mean |image - target| + ssim_weight mean SSIM, where the mean of SSIM leaves out `margin` pixels
+  // at each side; gradient by image, or empty. image [..., H, W]; target alike, or bytes.
+  m.def(
+      "image_loss(Tensor image, Tensor target, float l1_weight, float ssim_weight, float offset, int margin, "
+      "bool with_gradient) -> (Tensor loss, Tensor gradient)");
+  // Mean squared distance of each point [N, 3] to its three nearest others; on a GPU alone.
+  m.def("mean_squared_neighbour_distances(Tensor points) -> Tensor");
+}

@@ -1,0 +1,70 @@
+"""SSIM and the training loss of 3DGS, each with its exact gradient, in a few kernels."""
+from __future__ import annotations
+
+from typing import Any, Tuple
+
+import torch
+
+from .extension import _C  # noqa: F401  (loading it registers the ops)
+
+_OPS = torch.ops.diff_smoe_rasterization
+_WINDOW_RADIUS = 5  # pixels; of the 11x11 window
+_MARGINS = {"same": 0, "valid": _WINDOW_RADIUS}
+
+
+def l1_ssim_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 0.2) -> torch.Tensor:
+    """(1 - lambda) mean |image - target| + lambda (1 - SSIM), the loss of 3D Gaussian Splatting.
+
+    image: [..., H, W], float32 or float64. target: of the same shape and type, or uint8 (then 255 is 1); it gets no
+    gradient. SSIM is that of `fused_ssim`.
+    Raises ValueError or TypeError where shapes, types or devices do not fit.
+    """
+    _refuse_gradient("l1_ssim_loss", "target", target)
+    return _image_loss(image, target, 1 - lambda_dssim, -lambda_dssim, lambda_dssim, 0)
+
+
+def l1_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor,
+                              lambda_dssim: float = 0.2) -> Tuple[torch.Tensor, torch.Tensor]:
+    """`l1_ssim_loss` and its gradient by the image, without autograd."""
+    return _OPS.image_loss(image.detach(), target, 1 - lambda_dssim, -lambda_dssim, lambda_dssim, 0, True)
+
+
+def fused_ssim(img1: torch.Tensor, img2: torch.Tensor, padding: str = "same", train: bool = True) -> torch.Tensor:
+    """Mean structural similarity (Wang et al. 2004) of images in [0, 1]: 11x11 Gaussian window of sigma 1.5.
+
+    img1, img2: [B, C, H, W] or [C, H, W]. padding: "same", windows reach into zeros outside the image; "valid", the
+    mean leaves out the 5 pixels at each side whose windows do. train: whether a gradient may be asked for, which img1
+    alone gets. The call is that of the package `fused_ssim`.
+    Raises ValueError or TypeError where arguments do not fit.
+    """
+    if padding not in _MARGINS:
+        raise ValueError(f"fused_ssim: padding is {padding!r}; it must be one of {', '.join(_MARGINS)}")
+    _refuse_gradient("fused_ssim", "img2", img2)
+    return _image_loss(img1 if train else img1.detach(), img2, 0.0, 1.0, 0.0, _MARGINS[padding])
+
+
+def _refuse_gradient(function: str, name: str, tensor: torch.Tensor) -> None:
+    if tensor.requires_grad and torch.is_grad_enabled():
+        raise ValueError(f"{function}: {name} requires a gradient, which only the first image gets; detach it")
+
+
+def _image_loss(image: torch.Tensor, *arguments: Any) -> torch.Tensor:
+    if image.requires_grad and torch.is_grad_enabled():
+        return _ImageLoss.apply(image, *arguments)
+    return _OPS.image_loss(image, *arguments, False)[0]
+
+
+class _ImageLoss(torch.autograd.Function):
+    """The op `image_loss`, whose gradient is computed with the value."""
+
+    @staticmethod
+    def forward(ctx: Any, image: torch.Tensor, *arguments: Any) -> torch.Tensor:
+        loss, gradient = _OPS.image_loss(image, *arguments, True)
+        ctx.save_for_backward(gradient)
+        return loss
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, dL_dloss: torch.Tensor) -> Tuple[Any, ...]:  # type: ignore[override]
+        gradient, = ctx.saved_tensors
+        return (gradient * dL_dloss,) + (None,) * 5

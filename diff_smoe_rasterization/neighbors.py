@@ -1,0 +1,39 @@
+"""Distances to the nearest points, from which trainers take the first scales."""
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+_NEIGHBOURS = 3
+
+
+def distCUDA2(points: torch.Tensor) -> torch.Tensor:
+    """Mean squared distance of each point to its three nearest others: the function of the package simple-knn.
+
+    points: [N, 3], float32 or float64, on a GPU or on the CPU. Fewer than four points: the mean over those there are,
+    0 for a single one. Coinciding points are at distance 0. Returns: [N] of the same type. Exact but for rounding.
+    Raises ValueError where the shape does not fit or a coordinate is not finite.
+    """
+    if points.dim() != 2 or points.shape[1] != 3:
+        raise ValueError(f"distCUDA2: points has shape {list(points.shape)}; it must be [N, 3]")
+    points = points.detach()
+    finite = torch.isfinite(points).all(dim=1)
+    if not bool(finite.all()):
+        index = int((~finite).nonzero()[0])
+        raise ValueError(f"distCUDA2: points[{index}] is not finite")
+    if points.device.type == "cpu":
+        distances = mean_squared_neighbour_distance(points.numpy())
+        return torch.from_numpy(distances).to(points.dtype)
+    from .extension import _C  # noqa: F401  (loading it registers the op)
+
+    return torch.ops.diff_smoe_rasterization.mean_squared_neighbour_distances(points)
+
+
+def mean_squared_neighbour_distance(positions: np.ndarray) -> np.ndarray:
+    """[N] float64, what `distCUDA2` computes, of finite positions [N, 3]."""
+    others = min(_NEIGHBOURS, len(positions) - 1)
+    if others < 1:
+        return np.zeros(len(positions))
+    distances, _ = cKDTree(positions).query(positions, k=others + 1, workers=-1)
+    return (distances[:, 1:] ** 2).mean(axis=1)

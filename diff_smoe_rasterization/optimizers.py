@@ -1,0 +1,118 @@
+"""Adam in one pass over memory: over every Gaussian, or over those that were visible."""
+from __future__ import annotations
+
+import math
+from typing import Any, Callable, Dict, Iterable, List, Optional
+
+import torch
+
+from .extension import _C  # noqa: F401  (loading it registers the ops)
+
+_OPS = torch.ops.diff_smoe_rasterization
+
+
+class FusedAdam(torch.optim.Optimizer):
+    """Adam as torch.optim.Adam computes it, but for rounding: one kernel launch a step for each precision and device.
+
+    The state of a parameter is {"step": int, "exp_avg": tensor, "exp_avg_sq": tensor}; a step counted by a tensor, as
+    torch.optim.Adam keeps it, is taken too. Parameters and moments are dense, float32 or float64.
+    """
+
+    def __init__(self, params: Iterable[Any], lr: float = 1e-3, betas: Any = (0.9, 0.999), eps: float = 1e-8) -> None:
+        if not lr >= 0:
+            raise ValueError(f"FusedAdam: lr is {lr}; it must be 0 or more")
+        if not eps >= 0:
+            raise ValueError(f"FusedAdam: eps is {eps}; it must be 0 or more")
+        if not all(0 <= beta < 1 for beta in betas):
+            raise ValueError(f"FusedAdam: betas is {betas}; both must be in [0, 1)")
+        super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure: Optional[Callable[[], Any]] = None) -> Any:
+        """Steps every parameter that has a gradient."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        launches: Dict[Any, _Launch] = {}
+        for group in self.param_groups:
+            beta1, beta2 = group["betas"]
+            for parameter in group["params"]:
+                if parameter.grad is None:
+                    continue
+                state = self.state[parameter]
+                if not state:
+                    state.update(step=0, **_zero_moments(parameter))
+                age = state["step"] = int(state["step"]) + 1
+                key = (parameter.dtype, parameter.device, beta1, beta2, group["eps"])
+                launches.setdefault(key, _Launch(beta1, beta2, group["eps"])).add(
+                    parameter, state, group["lr"] / (1 - beta1**age), 1 / math.sqrt(1 - beta2**age))
+        for launch in launches.values():
+            launch.run()
+        return loss
+
+
+class SparseGaussianAdam(torch.optim.Adam):
+    """Adam that steps only the Gaussians that a view saw; the call of the 3DGS (2024) and Taming trainers.
+
+    The moments are not corrected for their start at zero, the betas are 0.9 and 0.999, and the rows of Gaussians that
+    were not seen keep value and moments: as those trainers' own optimizer of this name, whose results it matches but
+    for rounding. Each group holds one parameter [N, ...].
+    """
+
+    def __init__(self, params: Iterable[Any], lr: float, eps: float) -> None:
+        super().__init__(params=params, lr=lr, eps=eps)
+
+    @torch.no_grad()
+    def step(self, visibility: torch.Tensor, N: int) -> None:  # type: ignore[override]
+        """Steps the rows where visibility [N] (bool) is set, of every parameter that has a gradient."""
+        if visibility.numel() != N:
+            raise ValueError(f"SparseGaussianAdam.step: visibility has shape {list(visibility.shape)}; "
+                             f"it must be [N] with N = {N}")
+        launches: Dict[Any, _Launch] = {}
+        for group in self.param_groups:
+            if len(group["params"]) != 1:
+                raise ValueError(f"SparseGaussianAdam.step: group {group.get('name', '')!r} has "
+                                 f"{len(group['params'])} parameters; each must have one")
+            parameter = group["params"][0]
+            if parameter.grad is None or N == 0:
+                continue
+            state = self.state[parameter]
+            if not state:
+                state.update(step=torch.tensor(0.0), **_zero_moments(parameter))
+            beta1, beta2 = group["betas"]
+            key = (parameter.dtype, parameter.device, beta1, beta2, group["eps"])
+            launches.setdefault(key, _Launch(beta1, beta2, group["eps"])).add(parameter, state, group["lr"], 1.0)
+        for launch in launches.values():
+            launch.run(visibility.reshape(N))
+
+
+class _Launch:
+    """Parameters that one call of the op steps."""
+
+    def __init__(self, beta1: float, beta2: float, epsilon: float) -> None:
+        self.constants = (beta1, beta2, epsilon)
+        self.parameters: List[torch.Tensor] = []
+        self.gradients: List[torch.Tensor] = []
+        self.moments: List[torch.Tensor] = []
+        self.squares: List[torch.Tensor] = []
+        self.rates: List[float] = []
+        self.root_scales: List[float] = []
+
+    def add(self, parameter: torch.Tensor, state: Dict[str, Any], rate: float, root_scale: float) -> None:
+        """rate, root_scale: as in include/dsmoe/adam.h."""
+        self.parameters.append(parameter)
+        self.gradients.append(parameter.grad)
+        self.moments.append(state["exp_avg"])
+        self.squares.append(state["exp_avg_sq"])
+        self.rates.append(float(rate))
+        self.root_scales.append(float(root_scale))
+
+    def run(self, visible: Optional[torch.Tensor] = None) -> None:
+        _OPS.adam(self.parameters, self.gradients, self.moments, self.squares, self.rates, self.root_scales,
+                  *self.constants, visible)
+
+
+def _zero_moments(parameter: torch.Tensor) -> Dict[str, torch.Tensor]:
+    return {name: torch.zeros_like(parameter, memory_format=torch.contiguous_format)
+            for name in ("exp_avg", "exp_avg_sq")}

@@ -1,0 +1,222 @@
+"""Dense Adam against torch.optim.Adam, visible-only Adam against its formula; on every device."""
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from devices import default_device, random_normal
+
+from diff_smoe_rasterization.optimizers import FusedAdam, SparseGaussianAdam
+
+# Sizes below, at and above a GPU block's 1024 numbers and a CPU thread's 65536, one of them empty.
+SIZES = [(1,), (7, 3), (1024,), (1025,), (0, 4), (300, 45), (65536 + 5, 2)]
+# Both compute in the parameter's precision, in another order of operations: a few units in the last place a step, of
+# numbers and steps of order 1.
+TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-14}
+
+
+def random_parameters(dtype, shapes=SIZES, seed=0):
+    return [random_normal(shape, seed + i, dtype).requires_grad_() for i, shape in enumerate(shapes)]
+
+
+def set_gradients(parameters, seed):
+    for i, parameter in enumerate(parameters):
+        parameter.grad = random_normal(parameter.shape, 1000 * (seed + 1) + i, parameter.dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dense_adam_is_that_of_torch(device, dtype):
+    ours, theirs = random_parameters(dtype), random_parameters(dtype)
+    optimizers = [
+        FusedAdam([{"params": ours[:3], "lr": 0.1}, {"params": ours[3:]}], lr=0.02, eps=1e-15),
+        torch.optim.Adam([{"params": theirs[:3], "lr": 0.1}, {"params": theirs[3:]}], lr=0.02, eps=1e-15),
+    ]
+    for step in range(5):
+        for parameters, optimizer in zip([ours, theirs], optimizers):
+            set_gradients(parameters, step)
+            optimizer.param_groups[0]["lr"] = 0.1 / (1 + step)
+            optimizer.step()
+    for mine, reference in zip(ours, theirs):
+        torch.testing.assert_close(mine, reference, rtol=TOLERANCE[dtype], atol=TOLERANCE[dtype])
+        for key in ("exp_avg", "exp_avg_sq"):
+            torch.testing.assert_close(optimizers[0].state[mine][key], optimizers[1].state[reference][key],
+                                       rtol=TOLERANCE[dtype], atol=TOLERANCE[dtype])
+        assert optimizers[0].state[mine]["step"] == 5
+
+
+def test_more_tensors_than_one_launch_holds(device):
+    shapes = [(i + 1,) for i in range(40)]
+    ours, theirs = random_parameters(torch.float64, shapes), random_parameters(torch.float64, shapes)
+    optimizers = [FusedAdam(ours, lr=0.1), torch.optim.Adam(theirs, lr=0.1)]
+    for parameters, optimizer in zip([ours, theirs], optimizers):
+        set_gradients(parameters, 0)
+        optimizer.step()
+    for mine, reference in zip(ours, theirs):
+        torch.testing.assert_close(mine, reference, rtol=1e-14, atol=1e-14)
+
+
+def test_the_first_step_is_the_learning_rate_against_the_gradient(device):
+    parameter = random_normal((50, 3), 0).requires_grad_()
+    before = parameter.detach().clone()
+    set_gradients([parameter], 0)
+    FusedAdam([parameter], lr=0.25, eps=1e-15).step()
+    # Both corrected moments of the first step are the gradient's own; epsilon is far below them.
+    torch.testing.assert_close(parameter.detach(), before - 0.25 * parameter.grad.sign(), rtol=1e-12, atol=1e-12)
+
+
+def test_parameters_without_a_gradient_stay(device):
+    still, moving = random_parameters(torch.float32, [(5,), (5,)])
+    before = still.detach().clone()
+    set_gradients([moving], 0)
+    optimizer = FusedAdam([still, moving], lr=0.1)
+    optimizer.step()
+    assert torch.equal(still, before) and still not in optimizer.state
+    assert optimizer.state[moving]["step"] == 1
+
+
+def test_a_gradient_need_not_be_dense(device):
+    ours, theirs = random_parameters(torch.float64, [(6, 4)]), random_parameters(torch.float64, [(6, 4)])
+    for parameters, optimizer in ((ours, FusedAdam(ours, lr=0.1)), (theirs, torch.optim.Adam(theirs, lr=0.1))):
+        parameters[0].grad = random_normal((4, 6), 3).t()
+        optimizer.step()
+    torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
+
+
+def test_a_state_of_torch_adam_is_taken(device):
+    ours, theirs = random_parameters(torch.float64, [(30,)]), random_parameters(torch.float64, [(30,)])
+    adam = torch.optim.Adam(theirs, lr=0.1)
+    set_gradients(theirs, 0)
+    adam.step()
+    fused = FusedAdam(ours, lr=0.1)
+    fused.load_state_dict(copy.deepcopy(adam.state_dict()))  # torch would share the moments
+    with torch.no_grad():
+        ours[0].copy_(theirs[0])
+    for parameters, optimizer in ((ours, fused), (theirs, adam)):
+        set_gradients(parameters, 1)
+        optimizer.step()
+    torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
+
+
+def test_autograd_notices_the_step(device):
+    parameter = random_normal((3,), 0).requires_grad_()
+    output = (parameter * parameter).sum()
+    parameter.grad = torch.ones_like(parameter)
+    FusedAdam([parameter], lr=0.1).step()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        output.backward()
+
+
+def test_bad_settings_are_refused():
+    parameter = torch.zeros(2, requires_grad=True)
+    for name, settings in {"lr": {"lr": -1.0}, "eps": {"eps": -1.0}, "betas": {"betas": (0.9, 1.0)}}.items():
+        with pytest.raises(ValueError, match=f"FusedAdam: {name} is"):
+            FusedAdam([parameter], **settings)
+
+
+def test_bad_tensors_are_refused(device):
+    half = torch.zeros(2, dtype=torch.float16, requires_grad=True)
+    half.grad = torch.ones_like(half)
+    with pytest.raises(TypeError, match=r"adam: parameters\[0\] is Half"):
+        FusedAdam([half]).step()
+    transposed = random_normal((3, 2), 0).t().requires_grad_()
+    transposed.grad = torch.ones_like(transposed)
+    with pytest.raises(ValueError, match=r"adam: parameters\[0\] is not contiguous"):
+        FusedAdam([transposed]).step()
+
+
+def sparse_adam_by_hand(parameter, moment, square, gradient, visible, rate, epsilon):
+    """Adam without bias correction on the visible rows, in double."""
+    moment, square, parameter = moment.clone(), square.clone(), parameter.clone()
+    moment[visible] = 0.9 * moment[visible] + 0.1 * gradient[visible]
+    square[visible] = 0.999 * square[visible] + 0.001 * gradient[visible] ** 2
+    parameter[visible] -= rate * moment[visible] / (square[visible].sqrt() + epsilon)
+    return parameter, moment, square
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [1, 2000])
+def test_sparse_adam_steps_the_visible_rows(device, dtype, count):
+    shapes = [(count, 3), (count, 1), (count, 15, 3)]
+    parameters = random_parameters(dtype, shapes)
+    rates = [0.1, 0.01, 0.001]
+    optimizer = SparseGaussianAdam([{"params": [p], "lr": rate} for p, rate in zip(parameters, rates)], lr=0.0, eps=1e-15)
+    expected = [(p.detach().clone().double(), torch.zeros_like(p).double(), torch.zeros_like(p).double()) for p in parameters]
+    for step in range(4):
+        visible = random_normal((count,), 77 + step) > 0
+        set_gradients(parameters, step)
+        optimizer.step(visible, count)
+        expected = [sparse_adam_by_hand(*state, p.grad.double(), visible, rate, 1e-15)
+                    for state, p, rate in zip(expected, parameters, rates)]
+    for parameter, (value, moment, square) in zip(parameters, expected):
+        state = optimizer.state[parameter]
+        for actual, wanted in ((parameter, value), (state["exp_avg"], moment), (state["exp_avg_sq"], square)):
+            torch.testing.assert_close(actual.detach().double(), wanted, rtol=TOLERANCE[dtype], atol=TOLERANCE[dtype])
+
+
+def test_rows_out_of_sight_keep_every_bit(device):
+    parameter = random_normal((100, 7), 0, torch.float32).requires_grad_()
+    before = parameter.detach().clone()
+    visible = torch.zeros(100, dtype=torch.bool)
+    visible[17:40] = True
+    optimizer = SparseGaussianAdam([parameter], lr=0.1, eps=1e-15)
+    set_gradients([parameter], 0)
+    optimizer.step(visible, 100)
+    assert torch.equal(parameter[~visible], before[~visible])
+    assert not optimizer.state[parameter]["exp_avg"][~visible].any()
+    assert (parameter[visible] != before[visible]).all()
+
+
+def test_sparse_adam_of_nothing(device):
+    parameter = torch.zeros(0, 3, requires_grad=True)
+    parameter.grad = torch.zeros(0, 3)
+    SparseGaussianAdam([parameter], lr=0.1, eps=1e-15).step(torch.zeros(0, dtype=torch.bool), 0)
+    assert parameter.shape == (0, 3)
+
+
+def test_sparse_adam_is_an_optimizer_that_densification_can_edit(device):
+    """3DGS trainers reach into param_groups and state, and change learning rates."""
+    parameter = random_normal((4, 3), 0).requires_grad_()
+    optimizer = SparseGaussianAdam([{"params": [parameter], "lr": 0.1, "name": "xyz"}], lr=0.0, eps=1e-15)
+    set_gradients([parameter], 0)
+    optimizer.step(torch.ones(4, dtype=torch.bool), 4)
+    state = optimizer.state.pop(parameter)
+    longer = torch.cat([parameter.detach(), torch.ones(2, 3, dtype=parameter.dtype)]).requires_grad_()
+    for key in ("exp_avg", "exp_avg_sq"):
+        state[key] = torch.cat([state[key], torch.zeros(2, 3, dtype=parameter.dtype)])
+    optimizer.state[longer] = state
+    optimizer.param_groups[0]["params"][0] = longer
+    optimizer.param_groups[0]["lr"] = 0.0
+    before = longer.detach().clone()
+    set_gradients([longer], 1)
+    optimizer.step(torch.ones(6, dtype=torch.bool), 6)
+    assert torch.equal(longer, before), "the learning rate is 0"
+    assert optimizer.state[longer]["exp_avg"].shape == (6, 3)
+
+
+def test_sparse_adam_refuses_what_does_not_fit(device):
+    parameter = torch.zeros(4, 3, requires_grad=True)
+    parameter.grad = torch.ones_like(parameter)
+    optimizer = SparseGaussianAdam([parameter], lr=0.1, eps=1e-15)
+    with pytest.raises(ValueError, match="visibility has shape"):
+        optimizer.step(torch.ones(3, dtype=torch.bool), 4)
+    with pytest.raises(ValueError, match=r"adam: parameters\[0\] has shape"):
+        optimizer.step(torch.ones(5, dtype=torch.bool), 5)
+    with pytest.raises(TypeError, match="adam: visible is Int"):
+        optimizer.step(torch.ones(4, dtype=torch.int32), 4)
+
+
+def test_a_gpu_and_the_cpu_agree(device):
+    """float32 on the device against double on the CPU, over rows as wide as a Gaussian's."""
+    if default_device().type == "cpu":
+        pytest.skip("compares a GPU with the CPU")
+    gpu = random_normal((5000, 59), 0, torch.float32).requires_grad_()
+    cpu = gpu.detach().cpu().double().requires_grad_()
+    optimizers = [FusedAdam([gpu], lr=0.01, eps=1e-15), FusedAdam([cpu], lr=0.01, eps=1e-15)]
+    for step in range(10):
+        set_gradients([gpu], step)
+        cpu.grad = gpu.grad.cpu().double()
+        for optimizer in optimizers:
+            optimizer.step()
+    # Ten roundings of numbers up to 5 in float32.
+    torch.testing.assert_close(gpu.detach().cpu().double(), cpu.detach(), rtol=0, atol=1e-5)

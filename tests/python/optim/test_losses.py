@@ -1,0 +1,168 @@
+"""SSIM and the training loss against a direct two-dimensional convolution in double, on every device."""
+from __future__ import annotations
+
+import pytest
+import torch
+from devices import on_the_cpu
+
+from diff_smoe_rasterization.losses import fused_ssim, l1_ssim_loss, l1_ssim_loss_and_gradient
+
+
+def direct_ssim(x, y, padding="same"):
+    """Wang et al. 2004 as written: one 11x11 Gaussian window of sigma 1.5, zeros outside. x, y: [B, C, H, W]."""
+    grid = torch.arange(11, dtype=x.dtype) - 5
+    window = torch.exp(-(grid[:, None] ** 2 + grid[None, :] ** 2) / (2 * 1.5**2))
+    window = (window / window.sum())[None, None]
+
+    def mean(image):
+        planes = image.reshape(-1, 1, *image.shape[-2:])
+        return torch.nn.functional.conv2d(planes, window, padding=5 if padding == "same" else 0)
+
+    mu_x, mu_y = mean(x), mean(y)
+    var_x, var_y, cov = mean(x * x) - mu_x**2, mean(y * y) - mu_y**2, mean(x * y) - mu_x * mu_y
+    c1, c2 = 0.01**2, 0.03**2
+    return ((2 * mu_x * mu_y + c1) * (2 * cov + c2) / ((mu_x**2 + mu_y**2 + c1) * (var_x + var_y + c2))).mean()
+
+
+def direct_loss(x, y, weight):
+    return (1 - weight) * (x - y).abs().mean() + weight * (1 - direct_ssim(x, y))
+
+
+def image_pair(shape, seed=0):
+    """Two related images of doubles on the CPU."""
+    with on_the_cpu():
+        generator = torch.Generator().manual_seed(seed)
+        target = torch.rand(shape, dtype=torch.float64, generator=generator)
+        noise = torch.rand(shape, dtype=torch.float64, generator=generator)
+        return 0.7 * target + 0.3 * noise, target
+
+
+def direct_gradient(function, x, *arguments):
+    """Value and gradient by x through torch's autograd, on the CPU."""
+    with on_the_cpu():
+        x = x.clone().requires_grad_()
+        value = function(x, *arguments)
+        return value.detach(), torch.autograd.grad(value, x)[0]
+
+
+# One pixel; thinner than the window; no side a multiple of a GPU tile's 16 or 32 or of a CPU band's 64 rows, whole
+# tiles, several bands.
+SHAPES = [(3, 1, 1), (1, 3, 40), (3, 17, 23), (1, 64, 32), (2, 3, 33, 65), (1, 131, 70)]
+
+
+def assert_close(actual, expected, dtype):
+    """In double the same sums in another order; float32 loses digits where moments of order 1 are subtracted."""
+    tolerance = 1e-12 if dtype == torch.float64 else 2e-5
+    torch.testing.assert_close(actual.detach().cpu().double(), expected, rtol=0,
+                               atol=tolerance * max(float(expected.abs().max()), 1e-3))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_ssim_and_its_gradient_are_those_of_the_direct_form(device, dtype, shape):
+    image, target = image_pair(shape)
+    expected, expected_gradient = direct_gradient(direct_ssim, image, target)
+    x = image.to(device, dtype).requires_grad_()
+    actual = fused_ssim(x, target.to(device, dtype))
+    assert actual.dim() == 0 and actual.device.type == device.type
+    assert_close(actual, expected, dtype)
+    gradient, = torch.autograd.grad(actual, x)
+    assert expected_gradient.abs().max() > 0
+    assert_close(gradient, expected_gradient, dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_the_loss_mixes_l1_and_dssim(device, dtype, weight):
+    image, target = image_pair((3, 50, 37))
+    expected, expected_gradient = direct_gradient(direct_loss, image, target, weight)
+    x, y = image.to(device, dtype).requires_grad_(), target.to(device, dtype)
+    loss = l1_ssim_loss(x, y, weight)
+    assert_close(loss, expected, dtype)
+    assert_close(torch.autograd.grad(loss, x)[0], expected_gradient, dtype)
+    loss, gradient = l1_ssim_loss_and_gradient(x, y, weight)
+    assert not loss.requires_grad and not gradient.requires_grad
+    assert_close(loss, expected, dtype)
+    assert_close(gradient, expected_gradient, dtype)
+
+
+def test_a_target_of_bytes_is_one_of_255ths(device):
+    image, _ = image_pair((3, 40, 45))
+    with on_the_cpu():
+        target = torch.randint(0, 256, (3, 40, 45), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    x = image.to(device, torch.float32)
+    loss, gradient = l1_ssim_loss_and_gradient(x, target.to(device))
+    expected, expected_gradient = l1_ssim_loss_and_gradient(x, target.to(device).float() / 255)
+    assert torch.equal(loss, expected) and torch.equal(gradient, expected_gradient)
+
+
+@pytest.mark.parametrize("shape", [(3, 11, 11), (2, 3, 40, 21)])
+def test_valid_padding_leaves_out_windows_that_reach_outside(device, shape):
+    image, target = image_pair(shape)
+    expected, expected_gradient = direct_gradient(direct_ssim, image, target, "valid")
+    x = image.to(device).requires_grad_()
+    actual = fused_ssim(x, target.to(device), padding="valid")
+    assert_close(actual, expected, torch.float64)
+    assert_close(torch.autograd.grad(actual, x)[0], expected_gradient, torch.float64)
+
+
+def test_gradient_by_finite_differences(device):
+    image, target = (tensor[:, :6, :7].to(device) for tensor in image_pair((2, 17, 23)))
+    assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, 0.3), image.contiguous().requires_grad_())
+
+
+def test_the_gradient_is_scaled_by_what_comes_in(device):
+    image, target = (tensor.to(device) for tensor in image_pair((3, 20, 20)))
+    x = image.requires_grad_()
+    once, = torch.autograd.grad(l1_ssim_loss(x, target), x)
+    scaled, = torch.autograd.grad(-3 * l1_ssim_loss(x, target), x)
+    torch.testing.assert_close(scaled, -3 * once, rtol=1e-15, atol=0)
+
+
+def test_ssim_of_equal_images_is_one(device):
+    _, target = image_pair((3, 30, 41))
+    target = target.to(device)
+    assert float(fused_ssim(target, target)) == pytest.approx(1.0, abs=1e-12)
+    # |x - y| has the derivative 0 at 0, as torch has it, and SSIM is at its largest.
+    loss, gradient = l1_ssim_loss_and_gradient(target, target, 0.2)
+    assert float(loss) == pytest.approx(0.0, abs=1e-12)
+    assert float(gradient.abs().max()) < 1e-12
+
+
+def test_images_need_not_be_dense(device):
+    image, target = (tensor.to(device) for tensor in image_pair((3, 20, 30)))
+    expected = l1_ssim_loss(image, target)
+    assert torch.equal(l1_ssim_loss(image.transpose(1, 2).contiguous().transpose(1, 2), target[:, :, :].flip(2).flip(2)),
+                       expected)
+
+
+def test_no_gradient_is_kept_where_none_is_wanted(device):
+    image, target = (tensor.to(device) for tensor in image_pair((3, 20, 20)))
+    x = image.requires_grad_()
+    assert not fused_ssim(x, target, train=False).requires_grad
+    with torch.no_grad():
+        assert not fused_ssim(x, target).requires_grad
+
+
+def test_the_same_bits_every_time(device):
+    image, target = (tensor.to(device, torch.float32) for tensor in image_pair((3, 150, 200)))
+    first, second = (l1_ssim_loss_and_gradient(image, target) for _ in range(2))
+    assert torch.equal(first[0], second[0]) and torch.equal(first[1], second[1])
+
+
+def test_what_does_not_fit_is_refused(device):
+    image = torch.rand(3, 20, 20)
+    for target, error, text in (
+            (torch.rand(3, 20, 21), ValueError, r"target has shape \[3, 20, 21\]"),
+            (torch.rand(3, 20, 20).double(), TypeError, "target is Double; it must be Float"),
+            (torch.rand(3, 20, 20).requires_grad_(), ValueError, "target requires a gradient")):
+        with pytest.raises(error, match=text):
+            l1_ssim_loss(image, target)
+    with pytest.raises(TypeError, match="image is Half"):
+        l1_ssim_loss(image.half(), image.half())
+    with pytest.raises(ValueError, match="padding is 'zero'"):
+        fused_ssim(image, image, padding="zero")
+    with pytest.raises(ValueError, match="its sides must be at least 11"):
+        fused_ssim(image[:, :10], image[:, :10], padding="valid")
+    with pytest.raises(ValueError, match="at least one pixel"):
+        l1_ssim_loss(image[:0], image[:0])
