@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple
+from typing import Dict, List, NamedTuple, Optional
 
 import numpy as np
 import torch
@@ -12,9 +12,6 @@ from diff_smoe_rasterization.trainer.cameras import Camera
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.modelfile import load_model
 from diff_smoe_rasterization.trainer.scene import load_cameras
-
-SH_DEGREE = 3
-
 
 class Model(NamedTuple):
     """Activated Gaussians, by the argument names of `rasterize`, and views of them."""
@@ -27,8 +24,24 @@ class Model(NamedTuple):
     def num_gaussians(self):
         return len(self.inputs["means3D"])
 
+    @property
+    def sh_degree(self):
+        return math.isqrt(self.inputs["shs"].shape[1]) - 1
+
     def settings(self, view: int, mode: str) -> GaussianRasterizationSettings:
-        return self.cameras[view].settings(torch.zeros(3), SH_DEGREE, mode)
+        """The settings of a view before a black background, on the device of the Gaussians."""
+        background = torch.zeros(3, device=self.inputs["means3D"].device)
+        return self.cameras[view].settings(background, self.sh_degree, mode)
+
+    def to(self, device: str) -> "Model":
+        return self._replace(inputs={name: tensor.to(device) for name, tensor in self.inputs.items()})
+
+    def seen(self, num_views: int, width: Optional[int] = None, height: Optional[int] = None) -> "Model":
+        """The model with at most so many of its views, evenly chosen, at another size where one is given."""
+        count = min(num_views, len(self.cameras))
+        chosen = [self.cameras[index * len(self.cameras) // count] for index in range(count)]
+        return self._replace(cameras=[camera.resized(width or camera.width, height or camera.height)
+                                      for camera in chosen])
 
 
 def from_files(ply: str, scene: str, resolution: int) -> Model:
@@ -51,10 +64,25 @@ def from_npz(path: str) -> Model:
                   rotations=torch.nn.functional.normalize(tensor("quat")),
                   shs=torch.cat([tensor("f_dc"), tensor("f_rest")], 1))
     width, height = int(packed["width"]), int(packed["height"])
-    cameras = [Camera(str(view), rotation.astype(np.float64), translation.astype(np.float64), float(packed["fx"]),
-                      float(packed["fy"]), width / 2, height / 2, width, height)
-               for view, (rotation, translation) in enumerate(zip(packed["R"], packed["t"]))]
+    views = zip(packed["R"], packed["t"], *(np.broadcast_to(packed[name], len(packed["R"])) for name in ("fx", "fy")))
+    cameras = [Camera(str(view), rotation.astype(np.float64), translation.astype(np.float64), float(fx), float(fy),
+                      width / 2, height / 2, width, height)
+               for view, (rotation, translation, fx, fy) in enumerate(views)]
     return Model(path, inputs, cameras)
+
+
+def to_npz(model: Model, path: str) -> None:
+    """Writes what `from_npz` reads; the principal points, which most public rasterizers cannot have, become centres."""
+    inputs = {name: tensor.cpu() for name, tensor in model.inputs.items()}
+    cameras = model.cameras
+    if len({(camera.width, camera.height) for camera in cameras}) != 1:
+        raise ValueError("the cameras differ in size; a packed model has one")
+    np.savez(path, xyz=inputs["means3D"], f_dc=inputs["shs"][:, :1], f_rest=inputs["shs"][:, 1:],
+             opacity=torch.logit(inputs["opacities"], 1e-6), scale=torch.log(inputs["scales"]),
+             quat=inputs["rotations"], R=np.stack([camera.rotation for camera in cameras]).astype(np.float32),
+             t=np.stack([camera.translation for camera in cameras]).astype(np.float32),
+             fx=np.array([camera.fx for camera in cameras]), fy=np.array([camera.fy for camera in cameras]),
+             width=cameras[0].width, height=cameras[0].height)
 
 
 def synthetic(num_gaussians: int, width: int = 800, height: int = 533, seed: int = 0) -> Model:

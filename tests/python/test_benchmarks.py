@@ -1,4 +1,4 @@
-"""The benchmark command runs, and the memory that a rendering keeps is what the project promises."""
+"""The benchmark commands run, and the memory that a rendering keeps is what the project promises."""
 from __future__ import annotations
 
 import json
@@ -7,11 +7,14 @@ import sys
 
 import pytest
 import torch
+from devices import without_cuda_because
 
 from diff_smoe_rasterization.settings import BLEND_MODES
 
 sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks"))
 import cpu_rasterizer  # noqa: E402
+import gpu_floor  # noqa: E402
+import gpu_rasterizer  # noqa: E402
 import memory  # noqa: E402
 import models  # noqa: E402
 
@@ -58,3 +61,69 @@ def test_a_graph_keeps_less_than_the_limits(mode):
     # Whatever no unit explains is one number a tile.
     unexplained = sum(size for _, size in kept) - sum(count * by_unit[unit] for count, unit in zip(counts, by_unit))
     assert 0 <= unexplained <= 8 * (800 // 16 * (533 // 16 + 1) + 1)
+
+
+def test_a_packed_model_is_the_model(tmp_path):
+    model = models.synthetic(50, 64, 48)
+    models.to_npz(model, str(tmp_path / "model.npz"))
+    packed = models.from_npz(str(tmp_path / "model.npz"))
+    for name, tensor in model.inputs.items():
+        torch.testing.assert_close(packed.inputs[name], tensor, rtol=1e-5, atol=1e-6)  # log and exp, logit and sigmoid
+    assert packed.settings(0, "smoe")[:4] == model.settings(0, "smoe")[:4]
+    assert torch.equal(packed.settings(0, "smoe").projmatrix, model.settings(0, "smoe").projmatrix)
+    assert packed.sh_degree == 3
+    smaller = packed._replace(cameras=packed.cameras * 5).seen(2, 32, 24)
+    assert [(camera.width, camera.height, camera.fx) for camera in smaller.cameras] == [(32, 24, 32.0)] * 2
+
+
+def test_the_gpu_floor_by_hand():
+    """One Gaussian of 236 parameter bytes in one tile of one pixel."""
+    counts = gpu_floor.Counts(gaussians=1, visible=1, instances=1, pixels=1, forward_pairs=0, backward_pairs=0,
+                              parameter_bytes=236)
+    moved = {"project": 12 + 4 + 224 + 48, "sort": 4 + 4 * 16, "bin": 32 + 4, "blend": 4 + 48 + 24,
+             "blend_backward": 4 + 48 + 24 + 12 + 40, "project_backward": 40 + 32 + 236 + 236}
+    floors = gpu_floor.floors("alpha", counts)
+    assert {name: floor.seconds * 4.2e12 for name, floor in floors.items()} == pytest.approx(moved)
+    many = gpu_floor.floors("smoe", counts._replace(forward_pairs=33.4e12))["blend"]
+    assert many.seconds == many.instructions == pytest.approx(gpu_floor.FORWARD["smoe"])
+
+
+def test_the_gpu_tables():
+    rows = [{"renderer": "inria", "forward_ms": 2.0, "total_ms": 6.0, "note": "first"},
+            {"renderer": "ours alpha", "forward_ms": 0.5, "total_ms": 2.0, "psnr_worst": 71.26, "psnr": 72.0,
+             "stages": {"blend": dict(ms=0.3, floor_ms=0.1, bytes_ms=0.05, instructions_ms=0.1)},
+             "counts": dict(visible=5e5, gaussians=1e6, instances=2e6, pixels=1e6, forward_pairs=9e7,
+                            backward_pairs=5e7)},
+            {"renderer": "gsplat", "error": "ImportError: no gsplat"}]
+    table = gpu_rasterizer.comparison_table(rows)
+    assert "| ours alpha | 0.500 | 2.000 | 4.00 | 3.00 |" in table and "| 71.3 |" in table
+    assert "- gsplat: ImportError: no gsplat" in table and "- inria: first" in table
+    stages = gpu_rasterizer.stage_table(rows)
+    assert "| floor, ms | 0.100 (pairs) | 0.100 |" in stages and "| times the floor | 3.0 |" in stages
+    assert "2.00 M tile instances, 90 and 50 pairs a pixel" in stages
+
+
+def test_the_gpu_command_refuses_what_does_not_fit(capsys, tmp_path):
+    (tmp_path / "inria").mkdir()
+    (tmp_path / "inria" / "diff_gaussian_rasterization").mkdir()
+    (tmp_path / "gsplat").mkdir()  # empty: not installed
+    options = gpu_rasterizer.parse(["--synthetic", "9", "--peers-path", str(tmp_path)])
+    assert options.renderers[:2] == ["inria", "ours alpha"] and "gsplat" not in options.renderers
+    for arguments, reason in (([], "--synthetic"), (["--ply", "a.ply"], "--scene"),
+                              (["--synthetic", "9", "--renderers", "none"], "--renderers"),
+                              (["--synthetic", "9", "--renderers", "ours smoe"], "--renderers")):
+        with pytest.raises(SystemExit):
+            gpu_rasterizer.parse(arguments)
+        assert reason in capsys.readouterr().err
+
+
+@pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
+def test_the_gpu_command_measures(tmp_path, capsys):
+    path = tmp_path / "out.json"
+    assert gpu_rasterizer.main(["--synthetic", "3000", "--repeats", "2", "--warmup", "1", "--renderers",
+                                "ours alpha,ours smoe,ours alpha deterministic", "--json", str(path)]) == 0
+    rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+    assert [row.get("error") for row in rows] == [None] * 3
+    assert all(0 < row["forward_ms"] < row["total_ms"] and row["peak_mib"] > 0 for row in rows)
+    assert rows[2]["psnr_worst"] > 80 and rows[2]["cosine"] > 0.9999
+    assert "times the floor" in capsys.readouterr().out
