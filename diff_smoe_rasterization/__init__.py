@@ -9,18 +9,25 @@ from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rende
 
 try:
     from .extension import build_info, set_profiling, stage_times
+    from .losses import fused_ssim
+    from .neighbors import distCUDA2
+    from .optimizers import FusedAdam, SparseGaussianAdam
     from .rasterizer import GaussianRasterizer, rasterize, rasterize_gaussians
 except ImportError:
     # What is plain Python (settings, reference, the `dsmoe` command's help) works without the compiled part. The other
     # names say why they cannot be had when they are asked for: importing them again raises the same error.
-    def __getattr__(name):
-        if name in ("build_info", "set_profiling", "stage_times"):
-            from . import extension as module
-        elif name in ("GaussianRasterizer", "rasterize", "rasterize_gaussians"):
-            from . import rasterizer as module
-        else:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(module, name)
+    _HOMES = {"build_info": "extension", "set_profiling": "extension", "stage_times": "extension",
+              "fused_ssim": "losses", "distCUDA2": "neighbors", "FusedAdam": "optimizers",
+              "SparseGaussianAdam": "optimizers", "GaussianRasterizer": "rasterizer", "rasterize": "rasterizer",
+              "rasterize_gaussians": "rasterizer"}
 
-__all__ = ["BLEND_MODES", "OUTPUTS", "GaussianRasterizationSettings", "GaussianRasterizer", "Rendering", "__version__",
-           "build_info", "rasterize", "rasterize_gaussians", "set_profiling", "stage_times"]
+    def __getattr__(name):
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        import importlib
+
+        return getattr(importlib.import_module("." + _HOMES[name], __name__), name)
+
+__all__ = ["BLEND_MODES", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer", "OUTPUTS", "Rendering",
+           "SparseGaussianAdam", "__version__", "build_info", "distCUDA2", "fused_ssim", "rasterize",
+           "rasterize_gaussians", "set_profiling", "stage_times"]

@@ -80,6 +80,8 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
+    import torch
+
     from .trainer.loop import train
     from .trainer.memory import keep_freed_memory
     from .trainer.results import results_table
@@ -88,6 +90,8 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.scale_recipe:
         config = config.shortened().changed(**given_options(arguments))
     keep_freed_memory()
+    if config.device == "cuda":
+        torch.set_num_threads(1)  # the host only launches kernels; several runs may share its cores
     print(f"{config.scene} -> {config.output}: blend mode {config.blend_mode}, schedule {config.schedule}, "
           f"{config.iterations} iterations, seed {config.seed}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 _NEIGHBOURS = 3
 
@@ -32,6 +31,8 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
 
 def mean_squared_neighbour_distance(positions: np.ndarray) -> np.ndarray:
     """[N] float64, what `distCUDA2` computes, of finite positions [N, 3]."""
+    from scipy.spatial import cKDTree  # takes longer to import than this package
+
     others = min(_NEIGHBOURS, len(positions) - 1)
     if others < 1:
         return np.zeros(len(positions))

@@ -31,7 +31,7 @@ from .strategy import STRATEGIES, Step, StrategyContext
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
 PER_VIEW_NAME = "per_view.json"
-PROGRESS_EVERY = 10  # steps between two updates of the progress bar
+PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
 
 
 def check_device(device: str) -> None:
@@ -171,7 +171,7 @@ class Run:
                              and _is_due(trainer.iteration + 1, config.eval_every))
                 step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
                 bar.update()
-                if trainer.iteration % PROGRESS_EVERY == 0:
+                if trainer.iteration % PROGRESS_EVERY[config.device] == 0:
                     self._show(bar, _check_loss(step))
                 ends = trainer.iteration >= config.iterations or interrupt.asked
                 if ends or _is_due(trainer.iteration, config.checkpoint_every):

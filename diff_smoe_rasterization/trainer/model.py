@@ -2,10 +2,11 @@
 from __future__ import annotations
 
 import math
-from typing import Callable, Dict
+from typing import Callable, Dict, Tuple
 
 import torch
 
+from ..gaussians import activate
 from ..neighbors import distCUDA2
 from ..optimizers import FusedAdam
 from .config import TrainConfig
@@ -68,20 +69,24 @@ class GaussianModel:
     def num_gaussians(self) -> int:
         return self.raw["means3D"].shape[0]
 
+    def activated(self) -> Tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Opacities [N, 1] in (0, 1), scales [N, 3] in world units, and rotations [N, 4], unit quaternions."""
+        return activate(self.raw["opacities"], self.raw["scales"], self.raw["rotations"])
+
     @property
     def opacities(self) -> torch.Tensor:
         """[N, 1] in (0, 1)"""
-        return torch.sigmoid(self.raw["opacities"])
+        return self.activated()[0]
 
     @property
     def scales(self) -> torch.Tensor:
         """[N, 3] world units"""
-        return torch.exp(self.raw["scales"])
+        return self.activated()[1]
 
     @property
     def rotations(self) -> torch.Tensor:
         """[N, 4] unit quaternions"""
-        return torch.nn.functional.normalize(self.raw["rotations"])
+        return self.activated()[2]
 
     def color_arguments(self) -> Dict[str, torch.Tensor]:
         """The colour arguments of `rasterize`; while degree 0 is active the higher bands are left out."""

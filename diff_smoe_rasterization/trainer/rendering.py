@@ -37,8 +37,9 @@ class Renderer:
         model = self.model
         if "colors_precomp" not in arguments:
             arguments.update(model.color_arguments())
-        return self.rasterize(model.raw["means3D"], model.opacities, self._settings_of(camera), scales=model.scales,
-                              rotations=model.rotations, **arguments)
+        opacities, scales, rotations = model.activated()
+        return self.rasterize(model.raw["means3D"], opacities, self._settings_of(camera), scales=scales,
+                              rotations=rotations, **arguments)
 
     def _settings_of(self, camera: Camera) -> GaussianRasterizationSettings:
         """The camera's settings; its matrices stay on the device, where sending them anew would hold up the step."""

@@ -10,6 +10,7 @@ from typing import Any, Callable, Dict, Sequence
 
 import torch
 
+from ..gaussians import add_view
 from ..settings import Rendering
 from .cameras import Camera
 from .config import TrainConfig
@@ -140,9 +141,7 @@ class ThreeDGSStrategy(Strategy):
         self.context.optimizer.set_opacity_logits(inverse_sigmoid(opacities.clamp(max=RESET_OPACITY)))
 
     def _observe(self, step: Step) -> None:
-        visible = step.rendering.radii > 0
-        self.gradient_sum += step.means2D.grad[:, :2].norm(dim=1) * visible
-        self.view_count += visible
+        add_view(step.means2D.grad, step.rendering.radii, self.gradient_sum, self.view_count)
 
     def _mean_gradients(self) -> torch.Tensor:
         """[N] over the views that saw each Gaussian since the last densification; 0 where none did."""

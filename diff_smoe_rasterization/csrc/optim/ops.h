@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "optim/adam.h"
+#include "optim/gaussians.h"
 #include "optim/image_loss.h"
 
 namespace dsmoe {
@@ -150,6 +151,110 @@ std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at:
     Backend::image_loss(arguments);
   });
   return {loss, gradient};
+}
+
+inline void check_shape(const char* function, const char* name, const at::Tensor& tensor, at::IntArrayRef shape) {
+  TORCH_CHECK_VALUE(tensor.sizes() == shape, function, ": ", name, " has shape ", tensor.sizes(), "; it must be ",
+                    shape);
+}
+
+inline void check_like(const char* function, const char* name, const at::Tensor& tensor, const char* other_name,
+                       const at::Tensor& other) {
+  check_type(function, name, tensor, other.scalar_type());
+  TORCH_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
+                   "; it must be on ", other.device(), ", as ", other_name, " is");
+}
+
+// Opacities [N, 1], scales [N, 3] and rotations [N, 4] of the Gaussians.
+using GaussianTensors = std::tuple<at::Tensor, at::Tensor, at::Tensor>;
+
+inline GaussianTensors checked(const char* function, const at::Tensor& opacities, const at::Tensor& scales,
+                               const at::Tensor& rotations) {
+  check_real(function, "opacities", opacities);
+  check_like(function, "scales", scales, "opacities", opacities);
+  check_like(function, "rotations", rotations, "opacities", opacities);
+  TORCH_CHECK_VALUE(opacities.dim() == 2 && opacities.size(1) == 1, function, ": opacities has shape ",
+                    opacities.sizes(), "; it must be [N, 1]");
+  check_shape(function, "scales", scales, {opacities.size(0), 3});
+  check_shape(function, "rotations", rotations, {opacities.size(0), 4});
+  return {opacities.contiguous(), scales.contiguous(), rotations.contiguous()};
+}
+
+inline GaussianTensors empty_like(const GaussianTensors& tensors) {
+  return {at::empty_like(std::get<0>(tensors)), at::empty_like(std::get<1>(tensors)),
+          at::empty_like(std::get<2>(tensors))};
+}
+
+template <class S> GaussianParameters<S> pointers(const GaussianTensors& tensors) {
+  const auto pointer = [](const at::Tensor& tensor) -> S* {
+    return tensor.defined() ? tensor.data_ptr<std::remove_const_t<S>>() : nullptr;
+  };
+  return {pointer(std::get<0>(tensors)), pointer(std::get<1>(tensors)), pointer(std::get<2>(tensors))};
+}
+
+template <class Backend>
+GaussianTensors activate(const at::Tensor& opacities, const at::Tensor& scales, const at::Tensor& rotations) {
+  const GaussianTensors raw = checked("activate", opacities, scales, rotations);
+  const c10::DeviceGuard guard(opacities.device());
+  const GaussianTensors values = empty_like(raw);
+  AT_DISPATCH_FLOATING_TYPES(opacities.scalar_type(), "activate", [&] {
+    Backend::template activate<scalar_t>(pointers<const scalar_t>(raw), pointers<scalar_t>(values), opacities.size(0));
+  });
+  return values;
+}
+
+// raw: the arguments of `activate`, values: its results, dL_d...: the gradients by these, where there are any.
+template <class Backend>
+GaussianTensors activate_backward(at::TensorList raw, at::TensorList values, const OptionalTensor& dL_dopacities,
+                                  const OptionalTensor& dL_dscales, const OptionalTensor& dL_drotations) {
+  const char* function = "activate_backward";
+  TORCH_CHECK_VALUE(raw.size() == 3 && values.size() == 3, function, ": raw and values must have 3 tensors each");
+  const GaussianTensors raw_tensors = checked(function, raw[0], raw[1], raw[2]);
+  const GaussianTensors value_tensors = checked(function, values[0], values[1], values[2]);
+  check_same(function, "values", values[0], "raw", raw[0]);
+  check_like(function, "values", values[0], "raw", raw[0]);
+  const c10::DeviceGuard guard(raw[0].device());
+  const auto dense = [&](const char* name, const OptionalTensor& gradient, const at::Tensor& value) {
+    if (!gradient.has_value()) return at::Tensor();
+    check_shape(function, name, *gradient, value.sizes());
+    check_like(function, name, *gradient, "raw", raw[0]);
+    return gradient->contiguous();
+  };
+  const GaussianTensors gradients = {dense("dL_dopacities", dL_dopacities, values[0]),
+                                     dense("dL_dscales", dL_dscales, values[1]),
+                                     dense("dL_drotations", dL_drotations, values[2])};
+  const GaussianTensors results = empty_like(raw_tensors);
+  AT_DISPATCH_FLOATING_TYPES(raw[0].scalar_type(), "activate_backward", [&] {
+    Backend::template activate_backward<scalar_t>(
+        pointers<const scalar_t>(raw_tensors), pointers<const scalar_t>(value_tensors),
+        pointers<const scalar_t>(gradients), pointers<scalar_t>(results), raw[0].size(0));
+  });
+  return results;
+}
+
+template <class Backend>
+void add_view(const at::Tensor& dL_dmeans2D, const at::Tensor& radii, const at::Tensor& gradient_sum,
+              const at::Tensor& view_count) {
+  const char* function = "add_view";
+  check_real(function, "dL_dmeans2D", dL_dmeans2D);
+  TORCH_CHECK_VALUE(radii.dim() == 1, function, ": radii has shape ", radii.sizes(), "; it must be [N]");
+  check_type(function, "radii", radii, at::kInt);
+  check_shape(function, "dL_dmeans2D", dL_dmeans2D, {radii.size(0), 3});
+  TORCH_CHECK_TYPE(radii.device() == dL_dmeans2D.device(), function, ": radii is on ", radii.device(),
+                   "; it must be on ", dL_dmeans2D.device(), ", as dL_dmeans2D is");
+  for (const at::Tensor* statistic : {&gradient_sum, &view_count}) {
+    const char* name = statistic == &gradient_sum ? "gradient_sum" : "view_count";
+    check_shape(function, name, *statistic, {radii.size(0)});
+    check_like(function, name, *statistic, "dL_dmeans2D", dL_dmeans2D);
+    TORCH_CHECK_VALUE(statistic->is_contiguous(), function, ": ", name, " is not contiguous; it must be");
+  }
+  const c10::DeviceGuard guard(radii.device());
+  const at::Tensor gradients = dL_dmeans2D.contiguous(), dense_radii = radii.contiguous();
+  AT_DISPATCH_FLOATING_TYPES(gradients.scalar_type(), "add_view", [&] {
+    Backend::template add_view<scalar_t>(gradients.data_ptr<scalar_t>(), dense_radii.data_ptr<int32_t>(),
+                                         gradient_sum.data_ptr<scalar_t>(), view_count.data_ptr<scalar_t>(),
+                                         radii.size(0));
+  });
 }
 
 }  // namespace binding

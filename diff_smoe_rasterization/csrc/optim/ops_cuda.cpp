@@ -22,6 +22,23 @@ struct Cuda {
   }
 
   template <class S> static void image_loss(const ImageLoss<S>& loss) { cuda::image_loss(loss, current_stream()); }
+
+  template <class S>
+  static void activate(const GaussianParameters<const S>& raw, const GaussianParameters<S>& values, int64_t count) {
+    cuda::activate(raw, values, count, current_stream());
+  }
+
+  template <class S>
+  static void activate_backward(const GaussianParameters<const S>& raw, const GaussianParameters<const S>& values,
+                                const GaussianParameters<const S>& dL_dvalues, const GaussianParameters<S>& dL_draw,
+                                int64_t count) {
+    cuda::activate_backward(raw, values, dL_dvalues, dL_draw, count, current_stream());
+  }
+
+  template <class S>
+  static void add_view(const S* dL_dmeans2D, const int32_t* radii, S* gradient_sum, S* view_count, int64_t count) {
+    cuda::add_view(dL_dmeans2D, radii, gradient_sum, view_count, count, current_stream());
+  }
 };
 
 at::Tensor mean_squared_neighbour_distances(const at::Tensor& points) {
@@ -54,5 +71,8 @@ at::Tensor mean_squared_neighbour_distances(const at::Tensor& points) {
 TORCH_LIBRARY_IMPL(diff_smoe_rasterization, CUDA, m) {
   m.impl("adam", &dsmoe::binding::adam<dsmoe::binding::Cuda>);
   m.impl("image_loss", &dsmoe::binding::image_loss<dsmoe::binding::Cuda>);
+  m.impl("activate", &dsmoe::binding::activate<dsmoe::binding::Cuda>);
+  m.impl("activate_backward", &dsmoe::binding::activate_backward<dsmoe::binding::Cuda>);
+  m.impl("add_view", &dsmoe::binding::add_view<dsmoe::binding::Cuda>);
   m.impl("mean_squared_neighbour_distances", &dsmoe::binding::mean_squared_neighbour_distances);
 }

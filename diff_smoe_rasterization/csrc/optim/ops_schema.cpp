@@ -12,6 +12,14 @@ TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m) {
   m.def(
       "image_loss(Tensor image, Tensor target, float l1_weight, float ssim_weight, float offset, int margin, "
       "bool with_gradient) -> (Tensor loss, Tensor gradient)");
+  // Sigmoid of the opacities [N, 1], exp of the scales [N, 3], normalised rotations [N, 4].
+  m.def("activate(Tensor opacities, Tensor scales, Tensor rotations) -> (Tensor, Tensor, Tensor)");
+  // Gradients by the arguments of `activate`, which are `raw`, from those by its results, which are `values`.
+  m.def(
+      "activate_backward(Tensor[] raw, Tensor[] values, Tensor? dL_dopacities, Tensor? dL_dscales, "
+      "Tensor? dL_drotations) -> (Tensor, Tensor, Tensor)");
+  // For densification: adds |dL_dmeans2D[:, :2]| and 1 where radii > 0. All [N] but dL_dmeans2D [N, 3].
+  m.def("add_view(Tensor dL_dmeans2D, Tensor radii, Tensor(a!) gradient_sum, Tensor(b!) view_count) -> ()");
   // Mean squared distance of each point [N, 3] to its three nearest others; on a GPU alone.
   m.def("mean_squared_neighbour_distances(Tensor points) -> Tensor");
 }

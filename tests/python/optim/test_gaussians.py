@@ -1,0 +1,96 @@
+"""Activations against torch's own functions and autograd, and the statistics of densification; on every device."""
+from __future__ import annotations
+
+import pytest
+import torch
+from devices import random_normal
+
+from diff_smoe_rasterization.gaussians import activate, add_view
+
+SHAPES = ((1,), (3,), (4,))  # opacities, scales, rotations of one Gaussian
+
+
+def raw_parameters(count, dtype):
+    return [3 * random_normal((count, *shape), i, dtype) for i, shape in enumerate(SHAPES)]
+
+
+def by_torch(opacities, scales, rotations):
+    return torch.sigmoid(opacities), torch.exp(scales), torch.nn.functional.normalize(rotations)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_values_and_gradients_are_those_of_torch(device, dtype, count):
+    raw = [tensor.requires_grad_() for tensor in raw_parameters(count, dtype)]
+    exact = [tensor.detach().double().requires_grad_() for tensor in raw]
+    values, expected = activate(*raw), by_torch(*exact)
+    weights = [random_normal(value.shape, 10 + i) for i, value in enumerate(expected)]
+    gradients = torch.autograd.grad(values, raw, [weight.to(dtype) for weight in weights])
+    expected_gradients = torch.autograd.grad(expected, exact, weights)
+    # A few roundings; exp of numbers up to 10 turns one in the exponent into ten in the value.
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-13
+    for actual, wanted in zip([*values, *gradients], [*expected, *expected_gradients]):
+        assert actual.dtype == dtype
+        torch.testing.assert_close(actual.double(), wanted, rtol=tolerance, atol=tolerance)
+
+
+def test_gradients_by_finite_differences(device):
+    raw = [tensor.requires_grad_() for tensor in raw_parameters(5, torch.float64)]
+    assert torch.autograd.gradcheck(activate, raw)
+
+
+def test_a_value_that_nothing_depends_on_has_gradient_zero(device):
+    raw = [tensor.requires_grad_() for tensor in raw_parameters(6, torch.float64)]
+    activate(*raw)[1].sum().backward()
+    assert not raw[0].grad.any() and not raw[2].grad.any()
+    torch.testing.assert_close(raw[1].grad, raw[1].detach().exp(), rtol=1e-13, atol=0)
+
+
+def test_extremes_stay_finite(device):
+    opacities = torch.tensor([[-1000.0], [1000.0], [0.0]], requires_grad=True)
+    scales = torch.tensor([[-200.0, 0, 1]] * 3, requires_grad=True)
+    rotations = torch.tensor([[0.0, 0, 0, 0], [1e-20, 0, 0, 0], [0, 3e4, 4e4, 0]], requires_grad=True)
+    values = activate(opacities, scales, rotations)
+    assert values[0].flatten().tolist() == [0.0, 1.0, 0.5]
+    assert values[2][0].tolist() == [0.0] * 4
+    torch.testing.assert_close(values[2][2], torch.tensor([0.0, 0.6, 0.8, 0]))
+    sum(value.sum() for value in values).backward()
+    for tensor in (opacities, scales, rotations):
+        assert torch.isfinite(tensor.grad).all()
+
+
+def test_nothing_is_recorded_without_gradients(device):
+    raw = [tensor.requires_grad_() for tensor in raw_parameters(3, torch.float32)]
+    with torch.no_grad():
+        assert not any(value.requires_grad for value in activate(*raw))
+    assert not any(value.requires_grad for value in activate(*(tensor.detach() for tensor in raw)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_statistics_count_views_and_screen_space_gradients(device, dtype):
+    gradient_sum, view_count = torch.zeros(700, dtype=dtype), torch.zeros(700, dtype=dtype)
+    expected_sum, expected_count = torch.zeros(700).double(), torch.zeros(700).double()
+    for view in range(3):
+        gradients = random_normal((700, 3), view, dtype)  # z must not count, nor what is out of sight
+        radii = (10 * random_normal((700,), 50 + view)).int().clamp(min=0)
+        add_view(gradients, radii, gradient_sum, view_count)
+        expected_sum = expected_sum + gradients[:, :2].double().norm(dim=1) * (radii > 0)
+        expected_count = expected_count + (radii > 0)
+    assert torch.equal(view_count.double(), expected_count) and set(view_count.tolist()) == {0, 1, 2, 3}
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-14  # a few roundings
+    torch.testing.assert_close(gradient_sum.double(), expected_sum, rtol=tolerance, atol=tolerance)
+
+
+def test_what_does_not_fit_is_refused(device):
+    opacities, scales, rotations = raw_parameters(4, torch.float32)
+    for arguments, error, text in (
+            ((opacities[:, 0], scales, rotations), ValueError, r"activate: opacities has shape \[4\]; it must be \[N, 1\]"),
+            ((opacities, scales[:3], rotations), ValueError, r"activate: scales has shape \[3, 3\]; it must be \[4, 3\]"),
+            ((opacities, scales, rotations.double()), TypeError, "activate: rotations is Double; it must be Float"),
+            ((opacities.half(), scales, rotations), TypeError, "activate: opacities is Half")):
+        with pytest.raises(error, match=text):
+            activate(*arguments)
+    with pytest.raises(TypeError, match="add_view: radii is Long; it must be Int"):
+        add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int64), torch.zeros(4), torch.zeros(4))
+    with pytest.raises(ValueError, match=r"add_view: view_count has shape \[5\]; it must be \[4\]"):
+        add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int32), torch.zeros(4), torch.zeros(5))
