@@ -88,6 +88,15 @@ def test_debug_changes_no_result(mode):
     assert_same_gradients(checked_gradient, plain_gradient)
 
 
+def test_reproducible_gradients_are_the_same(mode):
+    """On the CPU they always are reproducible; cuda/test_cuda_determinism.py has what a GPU promises."""
+    scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32)
+    plain, plain_gradient = gradients(rasterize, scene, OUTPUTS)
+    reproducible, gradient = gradients(rasterize, scene.with_settings(deterministic=True), OUTPUTS)
+    assert all(torch.equal(a, b) for a, b in zip(plain, reproducible))
+    assert_same_gradients(gradient, plain_gradient)
+
+
 @pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])
 def test_without_gradients(mode, context):
     scene = random_scene(mode, 30, 20, 18, degree=1, dtype=torch.float32)
