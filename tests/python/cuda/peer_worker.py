@@ -3,7 +3,8 @@
     python peer_worker.py inria|dr_aa|gsplat MODEL.npz VIEWS
 
 test_cuda_peers.py runs it, as a process of its own because peers share one module name. The model is one that
-benchmarks/models.py reads; how a peer is called is in benchmarks/gpu_renderers.py. The last line of the output is JSON, a row for each view.
+benchmarks/models.py reads; how a peer is called is in benchmarks/gpu_renderers.py. The last line of the output is JSON,
+a row for each view.
 """
 from __future__ import annotations
 
