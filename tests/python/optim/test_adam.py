@@ -140,8 +140,10 @@ def test_sparse_adam_steps_the_visible_rows(device, dtype, count):
     shapes = [(count, 3), (count, 1), (count, 15, 3)]
     parameters = random_parameters(dtype, shapes)
     rates = [0.1, 0.01, 0.001]
-    optimizer = SparseGaussianAdam([{"params": [p], "lr": rate} for p, rate in zip(parameters, rates)], lr=0.0, eps=1e-15)
-    expected = [(p.detach().clone().double(), torch.zeros_like(p).double(), torch.zeros_like(p).double()) for p in parameters]
+    groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, rates)]
+    optimizer = SparseGaussianAdam(groups, lr=0.0, eps=1e-15)
+    zeros = [torch.zeros_like(p).double() for p in parameters]
+    expected = [(p.detach().clone().double(), zero, zero) for p, zero in zip(parameters, zeros)]
     for step in range(4):
         visible = random_normal((count,), 77 + step) > 0
         set_gradients(parameters, step)

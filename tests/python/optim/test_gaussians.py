@@ -84,11 +84,11 @@ def test_statistics_count_views_and_screen_space_gradients(device, dtype):
 def test_what_does_not_fit_is_refused(device):
     opacities, scales, rotations = raw_parameters(4, torch.float32)
     for arguments, error, text in (
-            ((opacities[:, 0], scales, rotations), ValueError, r"activate: opacities has shape \[4\]; it must be \[N, 1\]"),
-            ((opacities, scales[:3], rotations), ValueError, r"activate: scales has shape \[3, 3\]; it must be \[4, 3\]"),
-            ((opacities, scales, rotations.double()), TypeError, "activate: rotations is Double; it must be Float"),
-            ((opacities.half(), scales, rotations), TypeError, "activate: opacities is Half")):
-        with pytest.raises(error, match=text):
+            ((opacities[:, 0], scales, rotations), ValueError, r"opacities has shape \[4\]; it must be \[N, 1\]"),
+            ((opacities, scales[:3], rotations), ValueError, r"scales has shape \[3, 3\]; it must be \[4, 3\]"),
+            ((opacities, scales, rotations.double()), TypeError, "rotations is Double; it must be Float"),
+            ((opacities.half(), scales, rotations), TypeError, "opacities is Half")):
+        with pytest.raises(error, match="activate: " + text):
             activate(*arguments)
     with pytest.raises(TypeError, match="add_view: radii is Long; it must be Int"):
         add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int64), torch.zeros(4), torch.zeros(4))
