@@ -44,8 +44,7 @@ class FusedAdam(torch.optim.Optimizer):
                 if not state:
                     state.update(step=0, **_zero_moments(parameter))
                 age = state["step"] = int(state["step"]) + 1
-                key = (parameter.dtype, parameter.device, beta1, beta2, group["eps"])
-                launches.setdefault(key, _Launch(beta1, beta2, group["eps"])).add(
+                _launch_of(launches, parameter, group).add(
                     parameter, state, group["lr"] / (1 - beta1**age), 1 / math.sqrt(1 - beta2**age))
         for launch in launches.values():
             launch.run()
@@ -80,9 +79,7 @@ class SparseGaussianAdam(torch.optim.Adam):
             state = self.state[parameter]
             if not state:
                 state.update(step=torch.tensor(0.0), **_zero_moments(parameter))
-            beta1, beta2 = group["betas"]
-            key = (parameter.dtype, parameter.device, beta1, beta2, group["eps"])
-            launches.setdefault(key, _Launch(beta1, beta2, group["eps"])).add(parameter, state, group["lr"], 1.0)
+            _launch_of(launches, parameter, group).add(parameter, state, group["lr"], 1.0)
         for launch in launches.values():
             launch.run(visibility.reshape(N))
 
@@ -111,6 +108,15 @@ class _Launch:
     def run(self, visible: Optional[torch.Tensor] = None) -> None:
         _OPS.adam(self.parameters, self.gradients, self.moments, self.squares, self.rates, self.root_scales,
                   *self.constants, visible)
+
+
+def _launch_of(launches: Dict[Any, _Launch], parameter: torch.Tensor, group: Dict[str, Any]) -> _Launch:
+    """The launch that the parameter may join."""
+    key = (parameter.dtype, parameter.device, group["betas"], group["eps"])
+    launch = launches.get(key)
+    if launch is None:
+        launch = launches[key] = _Launch(*group["betas"], group["eps"])
+    return launch
 
 
 def _zero_moments(parameter: torch.Tensor) -> Dict[str, torch.Tensor]:

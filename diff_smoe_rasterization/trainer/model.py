@@ -129,7 +129,8 @@ class GaussianOptimizer:
         """Steps every parameter that has a gradient, then drops the gradients."""
         self._start_higher_bands()
         self.adam.step()
-        self.adam.zero_grad(set_to_none=True)
+        for tensor in self.model.raw.values():
+            tensor.grad = None
 
     def append(self, rows: Dict[str, torch.Tensor]) -> None:
         """Adds Gaussians, raw parameters as in PARAMETERS; their moments start at zero."""
