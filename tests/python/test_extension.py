@@ -105,6 +105,7 @@ def test_the_blend_modes_have_the_numbers_of_the_core():
     assert diff_smoe_rasterization.extension._C.blend_modes == {mode: i for i, mode in enumerate(BLEND_MODES)}
 
 
+@on_every_device
 def test_stage_times_are_taken_while_profiling_is_on():
     scene = random_scene("smoe", 200, 50, 40, dtype=torch.float32).requiring_grad()
 

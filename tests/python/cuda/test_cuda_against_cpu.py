@@ -4,8 +4,10 @@ from __future__ import annotations
 import pytest
 import torch
 from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
-from scenes import camera_settings, random_scene
+from comparison import assert_all_close, assert_close, reference_gradients
+from scenes import camera_settings, gradients, random_scene
 
+from diff_smoe_rasterization import reference
 from diff_smoe_rasterization.settings import OUTPUTS
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.model import GaussianModel
@@ -149,3 +151,12 @@ def test_nothing_is_drawn(mode, kind, dtype, gpu):
     rendering = compare(scene, gpu, dtype, OUTPUTS, FLOAT64 if dtype == torch.float64 else FLOAT32)
     background = scene.settings.bg.to(rendering.color)[:, None, None].expand_as(rendering.color)
     assert torch.equal(rendering.color, background)
+
+
+def test_the_reference_runs_on_a_gpu_too(mode, gpu):
+    scene = random_scene(mode, degree=1)
+    expected, expected_gradients = reference_gradients(scene, OUTPUTS)
+    rendering, gradient = gradients(reference.rasterize, scene.to(gpu), OUTPUTS)
+    for name in ("color",) + OUTPUTS:
+        assert_close(getattr(rendering, name), getattr(expected, name), FLOAT64.pixel, name)
+    assert_all_close({name: values.cpu() for name, values in gradient.items()}, expected_gradients, FLOAT64.gradient)
