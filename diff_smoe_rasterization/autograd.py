@@ -6,6 +6,8 @@ Compiled code takes any number of Gaussians and any image size; another field of
 """
 from __future__ import annotations
 
+import contextlib
+
 import torch
 
 from .extension import _C  # noqa: F401  (loading it registers the ops)
@@ -16,27 +18,41 @@ _NUM_INPUTS = 13  # tensors before the options
 _NUM_OPTIONS = 14  # options that the backward op takes too
 _NUM_CHECKS = 2  # strict, prefiltered
 _NUM_IMAGES = 5  # results that are the caller's: color, radii, gate_sum, depth, inverse_depth
-_RADII = 1
+_RADII, _DEPTH = 1, 3
+_BLEND_MODE = _NUM_INPUTS + 8  # among the op's arguments
+_ALPHA = 0  # BLEND_MODES.index("alpha")
 
 
-def _keep(ctx, inputs, output):
-    """Keeps what the backward pass needs. The images are the caller's to edit in place, so they are copied."""
+# Eager calls skip the Python wrapper that register_autograd puts around an op: the formula is already in hand.
+_below_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", contextlib.nullcontext)
+
+
+def _remember(ctx, inputs, output):
+    """Notes what is no tensor, and what needs no gradient. Returns the tensors that were given."""
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(output[_RADII], *output[_NUM_IMAGES:])
     ctx.options = inputs[_NUM_INPUTS:_NUM_INPUTS + _NUM_OPTIONS]
     ctx.present = [tensor is not None for tensor in inputs[:_NUM_INPUTS]]
-    tensors = [tensor for tensor in inputs[:_NUM_INPUTS] if tensor is not None]
+    return [tensor for tensor in inputs[:_NUM_INPUTS] if tensor is not None]
+
+
+def _keep(ctx, inputs, output):
+    """Keeps what the backward pass needs. The images are the caller's to edit in place, so they are copied."""
     images = [image if i == _RADII else image.clone() for i, image in enumerate(output[:_NUM_IMAGES])]
-    ctx.save_for_backward(*tensors, *images, *output[_NUM_IMAGES:])
+    ctx.save_for_backward(*_remember(ctx, inputs, output), *images, *output[_NUM_IMAGES:])
+
+
+def _input_gradients(ctx, gradients, outputs, inputs, op):
+    wanted = list(ctx.needs_input_grad[:_NUM_INPUTS])
+    image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
+    results = iter(op(*image_gradients, inputs, ctx.present, outputs, *ctx.options, wanted))
+    return tuple(next(results) if want else None for want in wanted) + (None,) * (_NUM_OPTIONS + _NUM_CHECKS)
 
 
 def _backward(ctx, *gradients):
-    present, wanted = ctx.present, list(ctx.needs_input_grad[:_NUM_INPUTS])
     saved = list(ctx.saved_tensors)
-    inputs, outputs = saved[:sum(present)], saved[sum(present):]
-    image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
-    results = iter(_OPS.rasterize_backward(*image_gradients, inputs, present, outputs, *ctx.options, wanted))
-    return tuple(next(results) if want else None for want in wanted) + (None,) * (_NUM_OPTIONS + _NUM_CHECKS)
+    count = sum(ctx.present)
+    return _input_gradients(ctx, gradients, saved[count:], saved[:count], _OPS.rasterize_backward)
 
 
 def _refuse_second_derivative(ctx, *gradients):
@@ -44,22 +60,38 @@ def _refuse_second_derivative(ctx, *gradients):
 
 
 class _Rasterize(torch.autograd.Function):
+    """The same formula for eager calls: nothing between Python and the kernels that they do not need."""
+
     @staticmethod
     def forward(ctx, *inputs):
-        output = _OPS.rasterize(*inputs)
-        _keep(ctx, inputs, output)
+        with _below_autograd():
+            output = _OPS.rasterize.default(*inputs)
+        # In `alpha` mode the backward pass reads the images for an expected depth alone; else the caller may edit them.
+        read = inputs[_BLEND_MODE] != _ALPHA or output[_DEPTH].numel() > 0
+        ctx.images = [image.clone() if read and i != _RADII and image.numel() > 0 else image.detach()
+                      for i, image in enumerate(output[:_NUM_IMAGES])]
+        ctx.save_for_backward(*_remember(ctx, inputs, output), *output[_NUM_IMAGES:])
         return output
 
-    # Where it can be registered, the backward op refuses its own differentiation.
-    backward = staticmethod(_backward if _CAN_REGISTER else torch.autograd.function.once_differentiable(_backward))
+    def backward(ctx, *gradients):
+        saved = list(ctx.saved_tensors)
+        count = sum(ctx.present)
+        # Under create_graph=True the op itself is called, which refuses to be differentiated when somebody tries.
+        with contextlib.nullcontext() if torch.is_grad_enabled() else _below_autograd():
+            return _input_gradients(ctx, gradients, ctx.images + saved[count:], saved[:count],
+                                    _OPS.rasterize_backward.default)
+
+    backward = staticmethod(backward if _CAN_REGISTER else torch.autograd.function.once_differentiable(backward))
 
 
 def rasterize_op(*inputs):
     """Calls the op `rasterize` differentiably. Arguments and results: csrc/torch/schema.cpp."""
     if _CAN_REGISTER and torch.compiler.is_compiling():
         return _OPS.rasterize(*inputs)
-    differentiable = any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs)
-    return _Rasterize.apply(*inputs) if differentiable and torch.is_grad_enabled() else _OPS.rasterize(*inputs)
+    if torch.is_grad_enabled() and any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs):
+        return _Rasterize.apply(*inputs)
+    with _below_autograd():
+        return _OPS.rasterize.default(*inputs)
 
 
 def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,

@@ -1,17 +1,14 @@
 // Stage 2: the depth order, and the tile lists front to back. One sort of the Gaussians by depth, then a stable sort of
 // their instances by tile, so that the second sort's keys are short.
-#include <thrust/iterator/counting_iterator.h>
-#include <thrust/iterator/transform_iterator.h>
-
+#include <cub/block/block_scan.cuh>
 #include <cub/device/device_radix_sort.cuh>
-#include <cub/device/device_scan.cuh>
 #include <limits>
-#include <type_traits>
 
 #include "../dispatch.h"
 #include "device.cuh"
 #include "dsmoe/blend.h"
 #include "dsmoe/rasterize.h"
+#include "look_back.cuh"
 #include "tile_rows.cuh"
 
 namespace dsmoe {
@@ -19,30 +16,8 @@ namespace cuda {
 namespace {
 
 constexpr int kBlock = 256;
-
-// The bits of a positive float, read as an integer, are in the order of the float.
-template <class S> using DepthBits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
-__device__ uint32_t depth_bits(float depth) { return __float_as_uint(depth); }
-__device__ uint64_t depth_bits(double depth) { return __double_as_longlong(depth); }
-
-template <class S>
-__global__ void depth_keys_kernel(int64_t num_gaussians, const ProjectedGaussian<S>* projected, const int32_t* radii,
-                                  DepthBits<S>* keys, int32_t* indices) {
-  const int64_t i = int64_t(blockIdx.x) * kBlock + threadIdx.x;
-  if (i >= num_gaussians) return;
-  indices[i] = static_cast<int32_t>(i);
-  if (keys != nullptr) keys[i] = radii[i] > 0 ? depth_bits(projected[i].depth) : ~DepthBits<S>(0);
-}
-
-// Tiles of the Gaussian at a position of the depth order; 0 after the last.
-struct CountAtPosition {
-  int64_t num_gaussians;
-  const int32_t* order;
-  const int32_t* tile_counts;
-  __host__ __device__ int64_t operator()(int64_t position) const {
-    return position < num_gaussians ? tile_counts[order[position]] : 0;
-  }
-};
+constexpr int kSmallRows = 4;    // a Gaussian with more rows of tiles,
+constexpr int kSmallTiles = 16;  // or more tiles, is listed by a warp of its own
 
 // Runs a CUB algorithm: it says how much memory it needs, gets it, and works.
 template <class Algorithm> void with_temporary(Scratch& scratch, const char* what, Algorithm algorithm) {
@@ -51,74 +26,143 @@ template <class Algorithm> void with_temporary(Scratch& scratch, const char* wha
   check(algorithm(allocate<char>(scratch, bytes), bytes), what);
 }
 
-// What an instance carries through the sort: its Gaussian, or its slot where gradients go by slot.
-template <class S, class Key> struct InstanceWriter {
-  Key* keys;
-  int32_t* values;
-  int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
-  int columns;
+struct LargeGaussian {
+  int64_t begin;  // its first instance
+  int32_t gaussian;
+  uint32_t count;  // of its instances
+};
 
-  __device__ void operator()(int64_t slot, int32_t gaussian, int x, int y) const {
+template <class S, class Key> struct ListArguments {
+  int64_t num_gaussians;
+  BlendMode mode;
+  int width, height, columns;
+  SavedForward<S> saved;
+  const int32_t* radii;
+  LookBack look_back;
+  // Null where the instances are only counted:
+  Key* keys;             // [capacity] tile
+  int32_t* values;       // [capacity] what goes along: the Gaussian, or the slot where gradients go by slot
+  int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
+  LargeGaussian* large;  // [max_large] those beyond are listed by one thread each
+  unsigned max_large;
+  unsigned* num_large;
+
+  __device__ void write(int64_t slot, int32_t gaussian, int x, int y) const {
     keys[slot] = static_cast<Key>(y * columns + x);
     if (slot_owners != nullptr) slot_owners[slot] = gaussian;
     values[slot] = slot_owners != nullptr ? static_cast<int32_t>(slot) : gaussian;
   }
 };
 
-constexpr int kTilesOfOneThread = 24;  // a Gaussian with more is listed by its warp together
+template <class S, class Key>
+__device__ TileRect bounds_of(const ListArguments<S, Key>& list, const ProjectedGaussian<S>& projected,
+                              int32_t gaussian) {
+  return footprint_bounds(list.mode, list.width, list.height, projected.mean, list.radii, gaussian);
+}
 
 template <class S, class Key>
-__global__ void __launch_bounds__(kBlock)
-    list_instances_kernel(int64_t num_gaussians, BlendMode mode, int width, int height, SavedForward<S> saved,
-                          const int32_t* radii, const int64_t* instance_offsets, InstanceWriter<S, Key> write) {
-  const int64_t position = int64_t(blockIdx.x) * kBlock + threadIdx.x;
-  const int lane = threadIdx.x % kWarp;
-  const bool listed = !overflows(saved);
-  // Behind the last instance: keys above every tile.
-  if (position < saved.capacity && (!listed || position >= *saved.num_instances)) {
-    write.keys[position] = static_cast<Key>(~Key(0));
-  }
-  if (!listed) return;
+__device__ FootprintTiles<S> tiles_of_large(const ListArguments<S, Key>& list, int32_t gaussian) {
+  const ProjectedGaussian<S> projected = list.saved.projected[gaussian];
+  return shared_tiles(projected, bounds_of(list, projected, gaussian));
+}
 
-  int64_t begin = 0, end = 0;
-  int32_t gaussian = 0;
-  if (position < num_gaussians) {
-    begin = instance_offsets[position], end = instance_offsets[position + 1];
-    gaussian = saved.order[position];
-    if (saved.slot_ranges != nullptr)
-      saved.slot_ranges[2 * gaussian] = begin, saved.slot_ranges[2 * gaussian + 1] = end;
+template <class S, class Key>
+__device__ void list_alone(const ListArguments<S, Key>& list, int32_t gaussian, int64_t slot) {
+  const auto tiles = tiles_of_large(list, gaussian);
+  for (int y = tiles.begin(); y < tiles.end(); ++y) {
+    const auto span = row_of(tiles, y);
+    for (int x = span.x0; x < span.x1; ++x) list.write(slot++, gaussian, x, y);
   }
-  const auto tiles_at = [&](int32_t index) {
-    const ProjectedGaussian<S> projected = saved.projected[index];
-    return tiles_of(projected, bounds_of(mode, width, height, projected.mean, radii[index]));
-  };
-  const bool together = end - begin > kTilesOfOneThread;
-  if (begin < end && !together) {
-    const auto tiles = tiles_at(gaussian);
-    int64_t slot = begin;
-    for (int y = tiles.begin(); y < tiles.end(); ++y) {
-      const auto span = row_of(tiles, y);
-      for (int x = span.x0; x < span.x1 && slot < end; ++x) write(slot++, gaussian, x, y);
+}
+
+template <class S, class Key>
+__global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_constant__ ListArguments<S, Key> list) {
+  using BlockScan = cub::BlockScan<unsigned long long, kBlock>;
+  __shared__ typename BlockScan::TempStorage scan_memory;
+  __shared__ unsigned shared_block;
+  __shared__ unsigned long long shared_before;
+  if (threadIdx.x == 0) shared_block = take_block_number(list.look_back);
+  __syncthreads();
+  const unsigned block = shared_block;
+  const int64_t position = int64_t(block) * kBlock + threadIdx.x;
+
+  int32_t gaussian = 0;
+  unsigned long long count = 0;
+  int first_row = 0, num_rows = 0;
+  bool is_large = false;
+  typename FootprintTiles<S>::Span spans[kSmallRows];
+  if (position < list.num_gaussians) {
+    gaussian = list.saved.order[position];
+    if (list.radii[gaussian] > 0) {
+      const ProjectedGaussian<S> projected = list.saved.projected[gaussian];
+      const FootprintTiles<S> tiles(projected.conic, projected.mean, projected.squared_reach,
+                                    bounds_of(list, projected, gaussian));
+      first_row = tiles.begin(), num_rows = tiles.end() - tiles.begin();
+      if (num_rows <= kSmallRows) {
+#pragma unroll
+        for (int r = 0; r < kSmallRows; ++r) {
+          spans[r] = {0, 0};
+          if (r < num_rows) spans[r] = tiles.row(first_row + r);
+          count += max(0, spans[r].x1 - spans[r].x0);
+        }
+      }
+      is_large = num_rows > kSmallRows || count > kSmallTiles;
+      if (is_large) count = count_tiles(tiles_of_large(list, gaussian));
     }
   }
-  for (unsigned left = __ballot_sync(kAllLanes, together); left != 0; left &= left - 1) {
-    const int owner = __ffs(left) - 1;
-    const int32_t index = __shfl_sync(kAllLanes, gaussian, owner);
-    int64_t slot = __shfl_sync(kAllLanes, begin, owner);
-    const int64_t last = __shfl_sync(kAllLanes, end, owner);
-    const auto tiles = tiles_at(index);
+  unsigned long long begin, total;
+  BlockScan(scan_memory).ExclusiveSum(count, begin, total);
+  if (threadIdx.x < kWarp) {
+    const unsigned long long before = sum_before(list.look_back, block, total);
+    if (threadIdx.x == 0) {
+      shared_before = before;
+      if (block == gridDim.x - 1) *list.saved.num_instances = static_cast<int64_t>(before + total);
+    }
+  }
+  __syncthreads();
+  if (list.keys == nullptr || position >= list.num_gaussians) return;
+  int64_t slot = static_cast<int64_t>(shared_before + begin);
+  const int64_t end = slot + static_cast<int64_t>(count);
+  if (list.saved.slot_ranges != nullptr) {
+    list.saved.slot_ranges[2 * int64_t(gaussian)] = slot, list.saved.slot_ranges[2 * int64_t(gaussian) + 1] = end;
+  }
+  if (count == 0 || end > list.saved.capacity) return;
+  if (is_large) {
+    const unsigned i = atomicAdd(list.num_large, 1u);
+    if (i < list.max_large) {
+      list.large[i] = {slot, gaussian, static_cast<uint32_t>(count)};
+    } else {
+      list_alone(list, gaussian, slot);
+    }
+    return;
+  }
+#pragma unroll
+  for (int r = 0; r < kSmallRows; ++r) {
+    if (r >= num_rows) break;
+    for (int x = spans[r].x0; x < spans[r].x1; ++x) list.write(slot++, gaussian, x, first_row + r);
+  }
+}
+
+// One warp lists one large Gaussian at a time: 32 rows are measured together, then written one after another.
+template <class S, class Key>
+__global__ void __launch_bounds__(kBlock) list_large_kernel(const __grid_constant__ ListArguments<S, Key> list) {
+  const int lane = threadIdx.x % kWarp;
+  const unsigned warps = gridDim.x * (kBlock / kWarp), count = min(*list.num_large, list.max_large);
+  for (unsigned i = (blockIdx.x * kBlock + threadIdx.x) / kWarp; i < count; i += warps) {
+    const LargeGaussian large = list.large[i];
+    const auto tiles = tiles_of_large(list, large.gaussian);
+    int64_t slot = large.begin;
+    const int64_t end = slot + large.count;
     for (int y0 = tiles.begin(); y0 < tiles.end(); y0 += kWarp) {
-      typename FootprintTiles<S>::Span span = {0, 0};
-      if (y0 + lane < tiles.end()) span = row_of(tiles, y0 + lane);
-      const int width_here = max(0, span.x1 - span.x0);
-      int until = width_here;  // tiles of this row and those above it
-      for (int step = 1; step < kWarp; step *= 2) {
-        const int above = __shfl_up_sync(kAllLanes, until, step);
-        if (lane >= step) until += above;
+      typename FootprintTiles<S>::Span mine = {0, 0};
+      if (y0 + lane < tiles.end()) mine = row_of(tiles, y0 + lane);
+      for (int r = 0; r < kWarp && y0 + r < tiles.end(); ++r) {
+        const int x0 = __shfl_sync(kAllLanes, mine.x0, r), x1 = __shfl_sync(kAllLanes, mine.x1, r);
+        for (int x = x0 + lane; x < x1; x += kWarp) {
+          if (slot + x - x0 < end) list.write(slot + x - x0, large.gaussian, x, y0 + r);
+        }
+        slot += max(0, x1 - x0);
       }
-      int64_t next = slot + until - width_here;
-      for (int x = span.x0; x < span.x1 && next < last; ++x) write(next++, index, x, y0 + lane);
-      slot += __shfl_sync(kAllLanes, until, kWarp - 1);
     }
   }
 }
@@ -143,40 +187,72 @@ __global__ void tile_offsets_kernel(int64_t tiles, int64_t capacity, const Key* 
 __global__ void pair_with_slots_kernel(int64_t capacity, const int64_t* num_instances, const int32_t* slots,
                                        const int32_t* slot_owners, int32_t* instances) {
   const int64_t i = int64_t(blockIdx.x) * kBlock + threadIdx.x;
-  if (i >= capacity || i >= *num_instances || *num_instances > capacity) return;
-  const uint32_t slot = static_cast<uint32_t>(slots[i]);
-  instances[2 * i] = slot_owners[slot];
+  if (i >= *num_instances || *num_instances > capacity) return;
+  instances[2 * i] = slot_owners[static_cast<uint32_t>(slots[i])];
   instances[2 * i + 1] = slots[i];
+}
+
+// Lists the instances into the memory that `list` has, or only counts them.
+template <class Key, class S> void list_instances(ListArguments<S, Key> list, Scratch& scratch, cudaStream_t stream) {
+  const unsigned blocks = blocks_for(list.num_gaussians, kBlock);
+  if (blocks == 0) {
+    check(cudaMemsetAsync(list.saved.num_instances, 0, sizeof(int64_t), stream), "counting instances");
+    return;
+  }
+  // The states of the look-back, and two counters behind them.
+  auto* states = allocate<unsigned long long>(scratch, int64_t(blocks) + 1);
+  check(cudaMemsetAsync(states, 0, (size_t(blocks) + 1) * sizeof(*states), stream), "listing instances");
+  auto* counters = reinterpret_cast<unsigned*>(states + blocks);
+  list.look_back = {states, counters};
+  list.num_large = counters + 1;
+  list_instances_kernel<<<blocks, kBlock, 0, stream>>>(list);
+  DSMOE_CHECK_LAUNCH("list_instances");
+  if (list.keys == nullptr) return;
+  constexpr unsigned kLargeBlocks = 1024;
+  list_large_kernel < <<blocks<kLargeBlocks ? blocks : kLargeBlocks, kBlock, 0, stream>>>(list);
+  DSMOE_CHECK_LAUNCH("list_large");
+}
+
+template <class Key, class S>
+ListArguments<S, Key> list_arguments(int64_t num_gaussians, const DeviceCamera<S>& camera,
+                                     const RasterConfig<S>& config, const SavedForward<S>& saved,
+                                     const int32_t* radii) {
+  ListArguments<S, Key> list = {};
+  list.num_gaussians = num_gaussians;
+  list.mode = config.mode;
+  list.width = camera.width, list.height = camera.height;
+  list.columns = TileGrid(camera.width, camera.height).columns;
+  list.saved = saved;
+  list.radii = radii;
+  return list;
 }
 
 template <class Key, class S>
 void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-            const SavedForward<S>& saved, const int32_t* radii, const Binning& binning, Scratch& scratch,
-            cudaStream_t stream) {
+            const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream) {
   const int64_t tiles = num_tiles(camera.width, camera.height), capacity = saved.capacity;
   const bool slots = saved.instance_width == 2;
-  Key* keys = allocate<Key>(scratch, capacity);
+  auto list = list_arguments<Key>(num_gaussians, camera, config, saved, radii);
+  list.keys = allocate<Key>(scratch, capacity);
+  list.values = allocate<int32_t>(scratch, capacity);
+  list.slot_owners = slots ? allocate<int32_t>(scratch, capacity) : nullptr;
+  list.max_large = static_cast<unsigned>(min<int64_t>(capacity / 8 + 1024, num_gaussians));
+  list.large = allocate<LargeGaussian>(scratch, list.max_large);
   Key* sorted_keys = allocate<Key>(scratch, capacity);
-  int32_t* values = allocate<int32_t>(scratch, capacity);
   int32_t* sorted_values = slots ? allocate<int32_t>(scratch, capacity) : saved.instances;
-  int32_t* slot_owners = slots ? allocate<int32_t>(scratch, capacity) : nullptr;
-  const int64_t threads = num_gaussians > capacity ? num_gaussians : capacity;
-  if (threads > 0) {
-    list_instances_kernel<S, Key><<<blocks_for(threads, kBlock), kBlock, 0, stream>>>(
-        num_gaussians, config.mode, camera.width, camera.height, saved, radii, binning.instance_offsets,
-        InstanceWriter<S, Key>{keys, values, slot_owners, TileGrid(camera.width, camera.height).columns});
-    DSMOE_CHECK_LAUNCH("list_instances");
-  }
+  // Behind the last instance: keys above every tile.
+  check(cudaMemsetAsync(list.keys, 0xff, capacity * sizeof(Key), stream), "listing instances");
+  list_instances(list, scratch, stream);
   if (capacity > 0) {
     int bits = 1;  // of the greatest tile, and of the key above all tiles
     while (int64_t(1) << bits <= tiles) ++bits;
     with_temporary(scratch, "sorting instances", [&](void* memory, size_t& bytes) {
-      return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, values, sorted_values, capacity, 0, bits,
-                                             stream);
+      return cub::DeviceRadixSort::SortPairs(memory, bytes, list.keys, sorted_keys, list.values, sorted_values,
+                                             capacity, 0, bits, stream);
     });
     if (slots) {
       pair_with_slots_kernel<<<blocks_for(capacity, kBlock), kBlock, 0, stream>>>(
-          capacity, saved.num_instances, sorted_values, slot_owners, saved.instances);
+          capacity, saved.num_instances, sorted_values, list.slot_owners, saved.instances);
       DSMOE_CHECK_LAUNCH("pair_with_slots");
     }
   }
@@ -187,53 +263,48 @@ void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCo
 
 }  // namespace
 
+bool needs_depth_order(BlendMode mode) {
+  bool needed = false;
+  dispatch_blend(mode, kAnyFeatures,
+                 [&](auto mode_constant, auto) { needed = Blend<decltype(mode_constant)::value>::kNeedsDepthOrder; });
+  return needed;
+}
+
 template <class S>
-void sort_by_depth(int64_t num_gaussians, const RasterConfig<S>& config, const SavedForward<S>& saved,
-                   const int32_t* radii, const Binning& binning, Scratch& scratch, cudaStream_t stream) {
-  bool ordered = false;
-  dispatch_blend(config.mode, kAnyFeatures,
-                 [&](auto mode, auto) { ordered = Blend<decltype(mode)::value>::kNeedsDepthOrder; });
-  if (num_gaussians > 0) {
-    DepthBits<S>* keys = ordered ? allocate<DepthBits<S>>(scratch, num_gaussians) : nullptr;
-    int32_t* indices = ordered ? allocate<int32_t>(scratch, num_gaussians) : saved.order;
-    depth_keys_kernel<<<blocks_for(num_gaussians, kBlock), kBlock, 0, stream>>>(num_gaussians, saved.projected, radii,
-                                                                                keys, indices);
-    DSMOE_CHECK_LAUNCH("depth_keys");
-    if (ordered) {
-      DepthBits<S>* sorted_keys = allocate<DepthBits<S>>(scratch, num_gaussians);
-      with_temporary(scratch, "sorting by depth", [&](void* memory, size_t& bytes) {
-        return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted_keys, indices, saved.order, num_gaussians, 0,
-                                               8 * int(sizeof(S)), stream);
-      });
-    }
-  }
-  const auto counts = thrust::make_transform_iterator(thrust::make_counting_iterator(int64_t(0)),
-                                                      CountAtPosition{num_gaussians, saved.order, binning.tile_counts});
-  with_temporary(scratch, "counting instances", [&](void* memory, size_t& bytes) {
-    return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, binning.instance_offsets, num_gaussians + 1, stream);
+void sort_by_depth(int64_t num_gaussians, const DepthKeys<S>& keys, int32_t* order, Scratch& scratch,
+                   cudaStream_t stream) {
+  if (num_gaussians == 0) return;
+  auto* sorted_keys = allocate<DepthBits<S>>(scratch, num_gaussians);
+  with_temporary(scratch, "sorting by depth", [&](void* memory, size_t& bytes) {
+    return cub::DeviceRadixSort::SortPairs(memory, bytes, keys.depths, sorted_keys, keys.gaussians, order,
+                                           num_gaussians, 0, 8 * int(sizeof(S)), stream);
   });
-  check(cudaMemcpyAsync(saved.num_instances, binning.instance_offsets + num_gaussians, sizeof(int64_t),
-                        cudaMemcpyDeviceToDevice, stream),
-        "counting instances");
+}
+
+template <class S>
+void count_instances(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+                     const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream) {
+  auto counted = saved;
+  counted.slot_ranges = nullptr;
+  list_instances(list_arguments<uint32_t>(num_gaussians, camera, config, counted, radii), scratch, stream);
 }
 
 template <class S>
 void bin(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-         const SavedForward<S>& saved, const int32_t* radii, const Binning& binning, Scratch& scratch,
-         cudaStream_t stream) {
-  const int64_t tiles = num_tiles(camera.width, camera.height);
-  if (tiles < std::numeric_limits<uint16_t>::max()) {
-    bin_by<uint16_t>(num_gaussians, camera, config, saved, radii, binning, scratch, stream);
+         const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream) {
+  if (num_tiles(camera.width, camera.height) < std::numeric_limits<uint16_t>::max()) {
+    bin_by<uint16_t>(num_gaussians, camera, config, saved, radii, scratch, stream);
   } else {
-    bin_by<uint32_t>(num_gaussians, camera, config, saved, radii, binning, scratch, stream);
+    bin_by<uint32_t>(num_gaussians, camera, config, saved, radii, scratch, stream);
   }
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                           \
-  template void sort_by_depth(int64_t, const RasterConfig<S>&, const SavedForward<S>&, const int32_t*, const Binning&, \
-                              Scratch&, cudaStream_t);                                                                 \
-  template void bin(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&, const int32_t*,   \
-                    const Binning&, Scratch&, cudaStream_t);
+#define DSMOE_INSTANTIATE(S)                                                                                         \
+  template void sort_by_depth(int64_t, const DepthKeys<S>&, int32_t*, Scratch&, cudaStream_t);                       \
+  template void count_instances(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&,     \
+                                const int32_t*, Scratch&, cudaStream_t);                                             \
+  template void bin(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&, const int32_t*, \
+                    Scratch&, cudaStream_t);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

@@ -21,17 +21,16 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     for (int f = 0; f < kSums; ++f) sums[k][f] = S(0);
     last[k] = 0;
   }
-  unsigned long long pairs = 0;
+  unsigned hits = 0;
 
-  auto next = load_entry(arguments, tile, tile.begin + tile.lane, tile.begin + tile.lane < tile.end, first_feature);
-  for (int64_t chunk = tile.begin; chunk < tile.end; chunk += kWarp) {
+  auto next = load_entry(arguments, tile, tile.lane, first_feature);
+  for (int32_t chunk = 0; chunk < tile.length; chunk += kWarp) {
     const bool meets = meets_pixels(next, tile);
     if (meets) staged[tile.lane] = next.staged;
     unsigned left = __ballot_sync(kAllLanes, meets);
-    const int64_t ahead = chunk + kWarp + tile.lane;
-    next = load_entry(arguments, tile, ahead, ahead < tile.end, first_feature);
-    pairs += __popc(left);
-    const int32_t position = static_cast<int32_t>(chunk - tile.begin) + 1;
+    __syncwarp();
+    next = load_entry(arguments, tile, chunk + kWarp + tile.lane, first_feature);
+    hits += __popc(left);
     for (; left != 0; left &= left - 1) {
       const int j = __ffs(left) - 1;
       const StagedGaussian<S> current = staged[j];
@@ -43,7 +42,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
         const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, config.alpha_min);
         const auto pair = Blend<kMode>::accumulate(state[k], gate);
         for (int f = 0; f < kSums; ++f) sums[k][f] = fma(pair.weight, current.features[f], sums[k][f]);
-        last[k] = pair.contributes ? position + j : last[k];
+        last[k] = pair.contributes ? chunk + j + 1 : last[k];
       }
     }
     __syncwarp();
@@ -71,7 +70,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     }
   }
   if (arguments.pairs != nullptr && first_feature == 0 && tile.lane == 0) {
-    atomicAdd(arguments.pairs, pairs * (kWarpTile * kWarpTile));
+    atomicAdd(arguments.pairs, static_cast<unsigned long long>(hits) * (kWarpTile * kWarpTile));
   }
 }
 

@@ -115,33 +115,33 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
   }
   if (tile.empty) return;
 
-  int64_t end = tile.end;
+  int32_t end = tile.length;
   if (Blend<kMode>::kStopsEarly) {
     int32_t seen = 0;
     for (int k = 0; k < kLanePixels; ++k) seen = seen > last[k] ? seen : last[k];
-    end = tile.begin + max_over_lanes(seen);
+    end = max_over_lanes(seen);
   }
   constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
   const TransposedSum<kTogether> sum(tile.lane);
-  unsigned long long pairs = 0;
+  unsigned hits = 0;
 
   // Back to front: lane 0 takes the last entry of a chunk.
-  auto next = load_entry(arguments, tile, end - 1 - tile.lane, end - 1 - tile.lane >= tile.begin, 0);
-  for (int64_t chunk = end - 1; chunk >= tile.begin; chunk -= kWarp) {
+  auto next = load_entry(arguments, tile, end - 1 - tile.lane, 0);
+  for (int32_t chunk = end - 1; chunk >= 0; chunk -= kWarp) {
     const bool meets = meets_pixels(next, tile);
     if (meets) {
       staged[warp][tile.lane] = next.staged;
       staged_gaussian[warp][tile.lane] = next.gaussian;
     }
     unsigned left = __ballot_sync(kAllLanes, meets);
-    const int64_t ahead = chunk - kWarp - tile.lane;
-    next = load_entry(arguments, tile, ahead, ahead >= tile.begin, 0);
-    pairs += __popc(left);
+    __syncwarp();
+    next = load_entry(arguments, tile, chunk - kWarp - tile.lane, 0);
+    hits += __popc(left);
     for (; left != 0; left &= left - 1) {
       const int j = __ffs(left) - 1;
       const StagedGaussian<S> current = staged[warp][j];
       const ProjectedGaussian<S>& gaussian = current.gaussian;
-      const int32_t position = static_cast<int32_t>(chunk - j - tile.begin);
+      const int32_t position = chunk - j;
       const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
       const ColumnExponent<S, S> exponent(gaussian.conic, dx);
       Gate<S> gate[kLanePixels];
@@ -168,8 +168,8 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
       }
       int64_t slot = -1;
       if (arguments.slots != nullptr && tile.listed) {
-        const int64_t entry = tile.begin + position;
-        slot = int64_t(static_cast<uint32_t>(arguments.saved.instances[2 * entry + 1])) * kSlotsPerInstance + warp;
+        const uint32_t of_tile = static_cast<uint32_t>(tile.list[2 * int64_t(position) + 1]);
+        slot = int64_t(of_tile) * kSlotsPerInstance + warp;
       }
       S values[kTogether];
       column_moments(dL_dpower, dx, dy, values);
@@ -198,7 +198,9 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
     }
     __syncwarp();
   }
-  if (arguments.pairs != nullptr && tile.lane == 0) atomicAdd(arguments.pairs, pairs * (kWarpTile * kWarpTile));
+  if (arguments.pairs != nullptr && tile.lane == 0) {
+    atomicAdd(arguments.pairs, static_cast<unsigned long long>(hits) * (kWarpTile * kWarpTile));
+  }
 }
 
 }  // namespace

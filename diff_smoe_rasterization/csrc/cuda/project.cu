@@ -1,15 +1,16 @@
-// Stage 1: every Gaussian to the image plane, how many tiles each meets, and its place in the depth order.
-#include "device.cuh"
+// Stage 1: every Gaussian to the image plane.
 #include "dsmoe/project.h"
-#include "tile_rows.cuh"
+#include "sh_rows.cuh"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
 
-constexpr int kBlock = 128;
+__device__ uint32_t depth_bits(float depth) { return __float_as_uint(depth); }
+__device__ uint64_t depth_bits(double depth) { return __double_as_longlong(depth); }
 
-// The features of a Gaussian; where their number is known they stay in registers on their way to memory.
+// The features of a Gaussian, as one row of saved.features; where their number is known they stay in registers until
+// they are written.
 template <int kFeatures, class S>
 __device__ bool write_features(const GaussianInputs<S>& in, const Camera<S>& camera, const RasterConfig<S>& config,
                                S depth, S* out) {
@@ -18,47 +19,47 @@ __device__ bool write_features(const GaussianInputs<S>& in, const Camera<S>& cam
     known.num_channels = 3, known.depth = false, known.inverse_depth = false;
     S features[3];
     if (!project_features(in, camera, known, 0, depth, features)) return false;
-    for (int c = 0; c < 3; ++c) out[c] = features[c];
+    *reinterpret_cast<float4*>(out) = make_float4(features[0], features[1], features[2], 0);
     return true;
   } else {
+    for (int f = config.num_features(); f < feature_stride(config.num_features()); ++f) out[f] = S(0);
     return project_features(in, camera, config, 0, depth, out);
   }
 }
 
-// kStaged: the SH rows pass through shared memory.
-template <class S, int kFeatures, bool kStaged>
-__global__ void __launch_bounds__(kBlock)
-    project_kernel(GaussianInputs<S> inputs, DeviceCamera<S> device_camera, RasterConfig<S> config,
-                   SavedForward<S> saved, int32_t* radii, int32_t* tile_counts) {
+template <class S, int kFeatures, class Rows>
+__global__ void __launch_bounds__(kRowsBlock)
+    project_kernel(const __grid_constant__ GaussianInputs<S> inputs, const DeviceCamera<S> device_camera,
+                   const RasterConfig<S> config, const SavedForward<S> saved, int32_t* radii, const DepthKeys<S> keys) {
   __shared__ Camera<S> camera;
   extern __shared__ float sh_rows[];
   load_camera(device_camera, camera);
   __syncthreads();
 
-  const int64_t i = int64_t(blockIdx.x) * kBlock + threadIdx.x;
+  const int64_t i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
   const int lane = threadIdx.x % kWarp;
   const bool exists = i < inputs.num_gaussians;
   auto gaussian_inputs = inputs_of(inputs, config.num_channels, exists ? i : 0);
+  Rows::specialise(gaussian_inputs);
   ProjectedGaussian<S> gaussian;
   int32_t radius = exists ? project_shape(gaussian_inputs, camera, config, 0, gaussian) : 0;
-  if constexpr (kStaged) {
-    const int length = 3 * inputs.num_sh;
+  if constexpr (Rows::kStaged) {
+    const int length = 3 * gaussian_inputs.num_sh;
     float* rows = sh_rows + threadIdx.x / kWarp * (kWarp * row_stride(length));
-    load_rows(inputs.shs + (i - lane) * length, rows, length, __ballot_sync(kAllLanes, radius > 0), lane);
+    load_rows<Rows::kLength>(inputs.shs + (i - lane) * length, rows, length, __ballot_sync(kAllLanes, radius > 0),
+                             lane);
     gaussian_inputs.shs = rows + lane * row_stride(length);
   }
+  if (radius > 0) saved.projected[i] = gaussian;
+  if constexpr (Rows::kStaged) wait_for_rows();
   if (!exists) return;
   if (radius > 0) {
     S* features = saved.features + i * feature_stride(config.num_features());
     if (!write_features<kFeatures>(gaussian_inputs, camera, config, gaussian.depth, features)) radius = 0;
   }
   radii[i] = radius;
-  int32_t count = 0;
-  if (radius > 0) {
-    saved.projected[i] = gaussian;
-    count = count_tiles(gaussian, tile_bounds(config.mode, camera, gaussian.mean, S(radius)));
-  }
-  tile_counts[i] = count;
+  keys.gaussians[i] = static_cast<int32_t>(i);
+  if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(gaussian.depth) : ~DepthBits<S>(0);
 }
 
 template <class S>
@@ -71,21 +72,21 @@ __global__ void mark_visible_kernel(int64_t num_gaussians, const S* means3D, con
 
 template <class S>
 void project(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-             const SavedForward<S>& saved, const ImageOutputs<S>& images, const Binning& binning, cudaStream_t stream) {
+             const SavedForward<S>& saved, const ImageOutputs<S>& images, const DepthKeys<S>& keys,
+             cudaStream_t stream) {
   if (inputs.num_gaussians == 0) return;
-  const auto launch = [&](auto kernel, size_t shared) {
-    kernel<<<blocks_for(inputs.num_gaussians, kBlock), kBlock, shared, stream>>>(inputs, camera, config, saved,
-                                                                                 images.radii, binning.tile_counts);
-    DSMOE_CHECK_LAUNCH("project");
-  };
-  if constexpr (sizeof(S) == sizeof(float)) {
-    if (inputs.shs != nullptr && inputs.num_sh > 0 && inputs.num_sh <= kMaxShCoefficients) {
-      const size_t shared = sizeof(float) * kBlock * row_stride(3 * inputs.num_sh);
-      if (config.num_features() == 3) return launch(project_kernel<S, 3, true>, shared);
-      return launch(project_kernel<S, 0, true>, shared);
+  dispatch_sh_rows(inputs, [&](auto rows, size_t shared) {
+    using Rows = decltype(rows);
+    const auto launch = [&](auto kernel) {
+      kernel<<<blocks_for(inputs.num_gaussians, kRowsBlock), kRowsBlock, shared, stream>>>(inputs, camera, config,
+                                                                                           saved, images.radii, keys);
+      DSMOE_CHECK_LAUNCH("project");
+    };
+    if constexpr (Rows::kStaged) {
+      if (config.num_features() == 3) return launch(project_kernel<S, 3, Rows>);
     }
-  }
-  launch(project_kernel<S, 0, false>, 0);
+    launch(project_kernel<S, 0, Rows>);
+  });
 }
 
 template <class S>
@@ -95,9 +96,9 @@ void mark_visible(int64_t num_gaussians, const S* means3D, const S* view, S near
   DSMOE_CHECK_LAUNCH("mark_visible");
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                           \
-  template void project(const GaussianInputs<S>&, const DeviceCamera<S>&, const RasterConfig<S>&,      \
-                        const SavedForward<S>&, const ImageOutputs<S>&, const Binning&, cudaStream_t); \
+#define DSMOE_INSTANTIATE(S)                                                                                \
+  template void project(const GaussianInputs<S>&, const DeviceCamera<S>&, const RasterConfig<S>&,           \
+                        const SavedForward<S>&, const ImageOutputs<S>&, const DepthKeys<S>&, cudaStream_t); \
   template void mark_visible(int64_t, const S*, const S*, S, bool*, cudaStream_t);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

@@ -1,12 +1,12 @@
 // From one record per Gaussian to the gradients of every input. Also writes the zeros of Gaussians that no pixel saw.
 #include "dsmoe/project.h"
 #include "reduce.cuh"
+#include "sh_rows.cuh"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
 
-constexpr int kBlock = 128;
 constexpr int kCameraGradientSize = sizeof(CameraGradient<float>) / sizeof(float);
 static_assert(kCameraGradientSize == 35, "view, projection and position lie side by side");
 
@@ -53,43 +53,45 @@ __device__ S record_number(const ProjectBackwardArguments<S>& arguments, int64_t
   return static_cast<S>(sum);
 }
 
-// kStaged: the SH rows, and then their gradients in the same place, pass through shared memory.
-template <class S, int kFeatures, bool kStaged, bool kCamera>
-__global__ void __launch_bounds__(kBlock)
+// Staged SH rows leave their gradients in the same place.
+template <class S, int kFeatures, bool kCamera, class Rows>
+__global__ void __launch_bounds__(kRowsBlock, sizeof(S) == sizeof(float) && !kCamera ? 5 : 1)
     project_backward_kernel(const __grid_constant__ ProjectBackwardArguments<S> arguments) {
   __shared__ Camera<S> camera;
   extern __shared__ float sh_rows[];
   load_camera(arguments.camera, camera);
   __syncthreads();
 
-  const int64_t count = arguments.inputs.num_gaussians, i = int64_t(blockIdx.x) * kBlock + threadIdx.x;
-  const int lane = threadIdx.x % kWarp, length = 3 * arguments.inputs.num_sh;
+  const int64_t count = arguments.inputs.num_gaussians, i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
+  const int lane = threadIdx.x % kWarp;
   const bool exists = i < count;
   RasterConfig<S> config = arguments.config;
   if constexpr (kFeatures == 3) config.num_channels = 3, config.depth = false, config.inverse_depth = false;
   const int num_features = config.num_features();
   auto inputs = inputs_of(arguments.inputs, config.num_channels, exists ? i : 0);
+  Rows::specialise(inputs);
+  const int length = 3 * inputs.num_sh;
   auto gradients = gradients_of(arguments.gradients, config.num_channels, inputs.num_sh, exists ? i : 0);
   const bool seen = exists && arguments.radii[i] > 0;
   float* rows = sh_rows + threadIdx.x / kWarp * (kWarp * row_stride(length));
   float* row = rows + lane * row_stride(length);
-  if constexpr (kStaged) {
-    load_rows(arguments.inputs.shs + (i - lane) * length, rows, length, __ballot_sync(kAllLanes, seen), lane);
+  if constexpr (Rows::kStaged) {
+    load_rows<Rows::kLength>(arguments.inputs.shs + (i - lane) * length, rows, length, __ballot_sync(kAllLanes, seen),
+                             lane);
     inputs.shs = row;
     if (gradients.shs != nullptr) gradients.shs = row;
   }
 
-  CameraGradient<S> dL_dcamera = {};
+  const ProjectedGaussian<S> gaussian = arguments.saved.projected[seen ? i : 0];
+  const S* features = arguments.saved.features + i * feature_stride(num_features);
+  GateMoments<S> moments;
+  S known_features[kFeatures == 3 ? 3 : 1], known_gradients[kFeatures == 3 ? 3 : 1];
+  const S* dL_dfeatures = known_gradients;
   if (seen) {
-    const ProjectedGaussian<S> gaussian = arguments.saved.projected[i];
-    const S* features = arguments.saved.features + i * feature_stride(num_features);
     const int size = kNumGateMoments + num_features;
-    GateMoments<S> moments;
     moments.one = record_number(arguments, i, size, 0), moments.x = record_number(arguments, i, size, 1);
     moments.y = record_number(arguments, i, size, 2), moments.xx = record_number(arguments, i, size, 3);
     moments.xy = record_number(arguments, i, size, 4), moments.yy = record_number(arguments, i, size, 5);
-    S known_features[kFeatures == 3 ? 3 : 1], known_gradients[kFeatures == 3 ? 3 : 1];
-    const S* dL_dfeatures = known_gradients;
     if constexpr (kFeatures == 3) {
       for (int f = 0; f < 3; ++f) {
         known_features[f] = features[f];
@@ -101,7 +103,12 @@ __global__ void __launch_bounds__(kBlock)
       for (int f = 0; f < num_features; ++f) summed[f] = record_number(arguments, i, size, kNumGateMoments + f);
       dL_dfeatures = summed;
     }
-    if constexpr (kStaged) {
+  }
+  if constexpr (Rows::kStaged) wait_for_rows();
+
+  CameraGradient<S> dL_dcamera = {};
+  if (seen) {
+    if constexpr (Rows::kStaged) {
       // Coefficients above the active degree have no gradient.
       const int active = 3 * (sh_coefficients(inputs.sh_degree) - (inputs.dc != nullptr));
       for (int k = active; k < length; ++k) row[k] = 0.0f;
@@ -114,11 +121,11 @@ __global__ void __launch_bounds__(kBlock)
   } else if (exists) {
     set_zero(gradients, config.num_channels, inputs.num_sh);
   }
-  if constexpr (kStaged) {
+  if constexpr (Rows::kStaged) {
     if (arguments.gradients.shs != nullptr) {
       const int64_t first = i - lane;
       const int here = static_cast<int>(count - first < kWarp ? count - first : kWarp);
-      store_rows(rows, arguments.gradients.shs + first * length, length, here, lane);
+      store_rows<Rows::kLength>(rows, arguments.gradients.shs + first * length, length, here, lane);
     }
   }
   if constexpr (kCamera) {
@@ -140,31 +147,26 @@ void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& ca
   ProjectBackwardArguments<S> arguments = {inputs,        camera, config,    saved,   radii,
                                            dL_dgaussians, slots,  gradients, nullptr, nullptr};
   const bool with_camera = gradients.camera != nullptr;
-  const int64_t blocks = blocks_for(inputs.num_gaussians, kBlock), warps = blocks * (kBlock / kWarp);
+  const int64_t blocks = blocks_for(inputs.num_gaussians, kRowsBlock), warps = blocks * (kRowsBlock / kWarp);
   if (with_camera) arguments.camera_rows = allocate<S>(scratch, warps * kCameraGradientSize);
   if (inputs.num_gaussians > 0) {
-    const auto launch = [&](auto kernel, size_t shared) {
-      kernel<<<static_cast<unsigned>(blocks), kBlock, shared, stream>>>(arguments);
-      DSMOE_CHECK_LAUNCH("project_backward");
-    };
-    const bool staged =
-        sizeof(S) == sizeof(float) && inputs.shs != nullptr && inputs.num_sh > 0 && inputs.num_sh <= kMaxShCoefficients;
-    const bool known = staged && config.num_features() == 3;
-    const size_t shared = staged ? sizeof(float) * kBlock * row_stride(3 * inputs.num_sh) : 0;
-    if (!known) arguments.dL_dfeature_rows = allocate<S>(scratch, inputs.num_gaussians * config.num_features());
-    if constexpr (sizeof(S) == sizeof(float)) {
-      if (known) {
-        with_camera ? launch(project_backward_kernel<S, 3, true, true>, shared)
-                    : launch(project_backward_kernel<S, 3, true, false>, shared);
-      } else if (staged) {
-        with_camera ? launch(project_backward_kernel<S, 0, true, true>, shared)
-                    : launch(project_backward_kernel<S, 0, true, false>, shared);
+    dispatch_sh_rows(inputs, [&](auto rows, size_t shared) {
+      using Rows = decltype(rows);
+      const auto launch = [&](auto kernel) {
+        kernel<<<static_cast<unsigned>(blocks), kRowsBlock, shared, stream>>>(arguments);
+        DSMOE_CHECK_LAUNCH("project_backward");
+      };
+      if constexpr (Rows::kStaged) {
+        if (config.num_features() == 3) {
+          with_camera ? launch(project_backward_kernel<S, 3, true, Rows>)
+                      : launch(project_backward_kernel<S, 3, false, Rows>);
+          return;
+        }
       }
-    }
-    if (!staged) {
-      with_camera ? launch(project_backward_kernel<S, 0, false, true>, shared)
-                  : launch(project_backward_kernel<S, 0, false, false>, shared);
-    }
+      arguments.dL_dfeature_rows = allocate<S>(scratch, inputs.num_gaussians * config.num_features());
+      with_camera ? launch(project_backward_kernel<S, 0, true, Rows>)
+                  : launch(project_backward_kernel<S, 0, false, Rows>);
+    });
   }
   if (with_camera) {
     sum_columns(arguments.camera_rows, warps, kCameraGradientSize, gradients.camera->view, stream);

@@ -6,7 +6,7 @@
 
 #include "device.cuh"
 #include "dsmoe/features.h"
-#include "dsmoe/project.h"
+#include "tile_rows.cuh"
 
 namespace dsmoe {
 namespace cuda {
@@ -54,9 +54,12 @@ template <class S> class WarpTile {
     x = x0 + lane % kWarpTile, y = y0 + lane / kWarpTile;
     empty = x0 >= arguments.width || y0 >= arguments.height;
     rect = {S(x0), S(y0), S(min(x0 + kWarpTile, arguments.width) - 1), S(min(y0 + kWarpTile, arguments.height) - 1)};
-    listed = !overflows(arguments.saved);
-    begin = listed ? arguments.saved.tile_offsets[tile] : 0;
-    end = listed ? arguments.saved.tile_offsets[tile + 1] : arguments.num_gaussians;
+    const SavedForward<S>& saved = arguments.saved;
+    listed = !overflows(saved);
+    const int64_t begin = listed ? saved.tile_offsets[tile] : 0;
+    length = static_cast<int32_t>(listed ? saved.tile_offsets[tile + 1] - begin : arguments.num_gaussians);
+    list = listed ? saved.instances + begin * saved.instance_width : saved.order;
+    stride = listed ? saved.instance_width : 1;
   }
 
   __device__ bool inside(const BlendArguments<S>& arguments, int k) const {
@@ -69,44 +72,44 @@ template <class S> class WarpTile {
   int lane, tile_x, tile_y;
   int x, y;  // of the lane's first pixel
   bool empty;
-  bool listed;         // the tile has a list; else the depth order serves
-  PixelRect<S> rect;   // the warp's pixels
-  int64_t begin, end;  // of the list
+  PixelRect<S> rect;    // the warp's pixels
+  bool listed;          // the tile has a list; else the depth order serves
+  const int32_t* list;  // Gaussians, front to back
+  int stride;           // numbers an entry
+  int32_t length;
 };
 
 // One entry of a list, as its lane loads it.
 template <class S> struct ListEntry {
   StagedGaussian<S> staged;
   int32_t gaussian;
-  bool meets;  // the warp's pixels
+  bool valid;
 };
 
-// Features from `first_feature` on come along.
+// Four features from `first_feature` on come along.
 template <class S>
-__device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int64_t position,
-                                   bool valid, int first_feature) {
+__device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int32_t position,
+                                   int first_feature) {
   const SavedForward<S>& saved = arguments.saved;
   ListEntry<S> entry;
-  entry.meets = false;
-  if (!valid) return entry;
-  entry.gaussian = tile.listed ? saved.instances[position * saved.instance_width] : saved.order[position];
-  int32_t radius = 0;
-  if (!tile.listed) {
-    radius = arguments.images.radii[entry.gaussian];
-    if (radius == 0) return entry;
+  entry.valid = 0 <= position && position < tile.length;
+  if (!entry.valid) return entry;
+  entry.gaussian = tile.list[int64_t(position) * tile.stride];
+  if (!tile.listed) {  // culled Gaussians are in the depth order too, and its entries know nothing of tiles
+    const int32_t radius = arguments.images.radii[entry.gaussian];
+    entry.valid = radius > 0;
+    if (!entry.valid) return entry;
   }
   entry.staged.gaussian = saved.projected[entry.gaussian];
   const S* features = saved.features + int64_t(entry.gaussian) * feature_stride(arguments.config.num_features());
-  struct alignas(4 * sizeof(S) > 16 ? 16 : 4 * sizeof(S)) Chunk {
+  struct alignas(16) Chunk {
     S values[kFeatureChunk];
   };
   *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + first_feature);
-  entry.meets = true;
   if (!tile.listed) {
-    Camera<S> camera;
-    camera.width = arguments.width, camera.height = arguments.height;
-    const TileRect bounds = tile_bounds(arguments.config.mode, camera, entry.staged.gaussian.mean, S(radius));
-    entry.meets =
+    const TileRect bounds = footprint_bounds(arguments.config.mode, arguments.width, arguments.height,
+                                             entry.staged.gaussian.mean, arguments.images.radii, entry.gaussian);
+    entry.valid =
         bounds.x0 <= tile.tile_x && tile.tile_x < bounds.x1 && bounds.y0 <= tile.tile_y && tile.tile_y < bounds.y1;
   }
   return entry;
@@ -114,7 +117,7 @@ __device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const War
 
 template <class S> __device__ bool meets_pixels(const ListEntry<S>& entry, const WarpTile<S>& tile) {
   const auto& gaussian = entry.staged.gaussian;
-  return entry.meets && may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
+  return entry.valid && may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
 }
 
 }  // namespace cuda

@@ -18,9 +18,11 @@ class InstanceCapacities {
  public:
   using Key = std::tuple<int, int64_t, int64_t, int64_t>;  // device, width, height, blend mode
 
-  // The capacity for a rendering whose count lies at `num_instances` on the device. Waits for the stream only where
-  // nothing is known of the key, or `exact` is asked for, and the stream is not being captured.
-  int64_t choose(const Key& key, const int64_t* num_instances, int64_t num_gaussians, bool exact, cudaStream_t stream);
+  // What is likely to be enough, or -1 where nothing is known of the key.
+  int64_t likely(const Key& key);
+
+  // Learns the count of a rendering that has just been launched, as soon as the device has it.
+  void learn(const Key& key, const int64_t* num_instances, cudaStream_t stream);
 
   static InstanceCapacities& shared();
 
@@ -29,12 +31,14 @@ class InstanceCapacities {
   // captured graph may write it at any time.
   struct Count {
     int64_t* latest = nullptr;
-    int64_t greatest = 0;
+    int64_t greatest = -1;
   };
 
   std::mutex mutex_;
   std::map<Key, Count> counts_;
 };
+
+bool is_capturing(cudaStream_t stream);
 
 }  // namespace binding
 }  // namespace dsmoe

@@ -37,6 +37,20 @@ at::Tensor visible_positions(const at::Tensor& positions, const at::Tensor& view
   return visible;
 }
 
+// The number of instances. Waits for the device.
+template <class S>
+int64_t counted_instances(const cuda::DeviceCamera<S>& camera, const RasterConfig<S>& config,
+                          const cuda::SavedForward<S>& saved, const int32_t* radii, int64_t num_gaussians,
+                          const at::Tensor& like, cudaStream_t stream) {
+  TensorScratch scratch(like);
+  cuda::count_instances(num_gaussians, camera, config, saved, radii, scratch, stream);
+  int64_t count = 0;
+  cuda::check(cudaMemcpyAsync(&count, saved.num_instances, sizeof(count), cudaMemcpyDeviceToHost, stream),
+              "counting instances");
+  cuda::check(cudaStreamSynchronize(stream), "projecting Gaussians");
+  return count;
+}
+
 template <class S> Outputs forward(const Inputs& inputs, const Options& options) {
   const cudaStream_t stream = at::cuda::getCurrentCUDAStream();
   const auto gaussians = gaussian_inputs<S>(inputs, options);
@@ -48,30 +62,38 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options)
   Outputs outputs = allocate_outputs(inputs, options);
   auto saved = saved_on_device<S>(outputs, options);
   const auto images = image_outputs<S>(outputs);
-  const at::Tensor tile_counts = at::empty({count}, like.options().dtype(at::kInt));
-  const at::Tensor instance_offsets = at::empty({count + 1}, like.options().dtype(at::kLong));
-  const cuda::Binning binning = {tile_counts.data_ptr<int32_t>(), instance_offsets.data_ptr<int64_t>()};
+  const auto integers = like.options().dtype(at::kInt);
 
   StageRecorder recorder(Pass::kForward);
   EventClock clock(recorder.times(), stream);
-  cuda::project(gaussians, camera, config, saved, images, binning, stream);
-  clock.end(&cpu::StageTimes::project);
   {
     TensorScratch scratch(like);
-    cuda::sort_by_depth(count, config, saved, images.radii, binning, scratch, stream);
+    cuda::DepthKeys<S> keys;
+    const bool sorted = cuda::needs_depth_order(config.mode);
+    if (sorted) keys.depths = static_cast<cuda::DepthBits<S>*>(scratch.allocate(count * sizeof(S)));
+    keys.gaussians = sorted ? static_cast<int32_t*>(scratch.allocate(count * sizeof(int32_t))) : saved.order;
+    cuda::project(gaussians, camera, config, saved, images, keys, stream);
+    clock.end(&cpu::StageTimes::project);
+    if (sorted) cuda::sort_by_depth(count, keys, saved.order, scratch, stream);
+    clock.end(&cpu::StageTimes::sort);
   }
-  clock.end(&cpu::StageTimes::sort);
-  const int64_t capacity = InstanceCapacities::shared().choose(
-      {like.get_device(), options.image_width, options.image_height, options.blend_mode}, saved.num_instances, count,
-      options.deterministic, stream);
+  const InstanceCapacities::Key key = {like.get_device(), options.image_width, options.image_height,
+                                       options.blend_mode};
+  int64_t capacity = InstanceCapacities::shared().likely(key);
+  if (is_capturing(stream)) {
+    if (capacity < 0) capacity = 8 * count + 1024;
+  } else if (capacity < 0 || options.deterministic) {
+    capacity = counted_instances(camera, config, saved, images.radii, count, like, stream);
+  }
   TORCH_CHECK(!options.deterministic || capacity <= std::numeric_limits<uint32_t>::max(), "rasterize: ", capacity,
               " tile instances; with deterministic=True the most is ", std::numeric_limits<uint32_t>::max());
-  outputs[kInstances] = at::empty({capacity, saved.instance_width}, like.options().dtype(at::kInt));
+  outputs[kInstances] = at::empty({capacity, saved.instance_width}, integers);
   saved = saved_on_device<S>(outputs, options);
   {
     TensorScratch scratch(like);
-    cuda::bin(count, camera, config, saved, images.radii, binning, scratch, stream);
+    cuda::bin(count, camera, config, saved, images.radii, scratch, stream);
   }
+  InstanceCapacities::shared().learn(key, saved.num_instances, stream);
   clock.end(&cpu::StageTimes::bin);
 
   at::Tensor pairs;

@@ -1,12 +1,12 @@
 // The rasterizer's public C++ interface, CUDA backend: no torch, float and double, every call asynchronous on the
 // caller's stream. All pointers are device pointers, to memory of the caller's.
 //
-//     cuda::project(inputs, camera, config, saved, images, scratch, stream);  // footprints, depth order, counts
-//     ... copy *saved.num_instances to the host, or take a capacity that was enough before
+//     cuda::project(inputs, camera, config, saved, images, keys, stream);                     // footprints, colours
+//     cuda::sort_by_depth(inputs.num_gaussians, keys, saved.order, scratch, stream);
 //     saved.instances = ... [capacity, saved.instance_width]; saved.capacity = capacity;
 //     cuda::bin(inputs.num_gaussians, camera, config, saved, images.radii, scratch, stream);  // tile lists
-//     cuda::blend(inputs.num_gaussians, camera, config, saved, images, stream);               // the images
-//     cuda::backward(inputs, camera, config, saved, images, image_gradients, gradients, scratch, stream);
+//     cuda::blend(inputs.num_gaussians, camera, config, saved, images, pairs, stream);        // the images
+//     cuda::blend_backward(...); cuda::project_backward(...);                                 // the gradients
 //
 // A capacity that turns out too small costs time, not correctness: where the instances do not fit, the blend reads the
 // depth order itself instead of the tile lists. So the host never has to wait, and a captured graph stays right when
@@ -19,6 +19,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <type_traits>
 
 #include "dsmoe/params.h"
 
@@ -63,25 +64,38 @@ class Scratch {
   ~Scratch() = default;
 };
 
-// What `project` hands to `bin`.
-struct Binning {
-  int32_t* tile_counts = nullptr;       // [N] tiles of each Gaussian
-  int64_t* instance_offsets = nullptr;  // [N + 1] by position in the depth order
+// The bits of a positive float, read as an integer, are in the order of the float.
+template <class S> using DepthBits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
+
+// What the depth sort sorts.
+template <class S> struct DepthKeys {
+  DepthBits<S>* depths = nullptr;  // [N] the greatest number for culled Gaussians; null: no depth order is wanted
+  int32_t* gaussians = nullptr;    // [N] 0, 1, 2, ...
 };
 
+// Whether the mode needs saved.order by depth. Where not, project gets saved.order itself as keys.gaussians.
+bool needs_depth_order(BlendMode mode);
+
+// Fills saved.projected, saved.features, images.radii and keys.
 template <class S>
 void project(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-             const SavedForward<S>& saved, const ImageOutputs<S>& images, const Binning& binning, cudaStream_t stream);
+             const SavedForward<S>& saved, const ImageOutputs<S>& images, const DepthKeys<S>& keys,
+             cudaStream_t stream);
 
-// Fills order, instance_offsets and num_instances.
+// Fills order [N].
 template <class S>
-void sort_by_depth(int64_t num_gaussians, const RasterConfig<S>& config, const SavedForward<S>& saved,
-                   const int32_t* radii, const Binning& binning, Scratch& scratch, cudaStream_t stream);
+void sort_by_depth(int64_t num_gaussians, const DepthKeys<S>& keys, int32_t* order, Scratch& scratch,
+                   cudaStream_t stream);
 
+// Fills saved.num_instances alone, for a caller that wants exactly as much memory as is needed.
+template <class S>
+void count_instances(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
+                     const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream);
+
+// Fills saved.num_instances, instances, tile_offsets and slot_ranges.
 template <class S>
 void bin(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-         const SavedForward<S>& saved, const int32_t* radii, const Binning& binning, Scratch& scratch,
-         cudaStream_t stream);
+         const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream);
 
 // pairs: where not null, the number of (Gaussian, pixel) pairs that were evaluated is added to it.
 template <class S>

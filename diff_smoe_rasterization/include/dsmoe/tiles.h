@@ -48,10 +48,11 @@ template <class S> class EllipseBand {
   DSMOE_HD EllipseBand(const Sym2<S>& conic, S squared_reach) : conic_(conic) {
     reach_ = squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack);
     determinant_ = difference_of_products(conic.xx, conic.yy, conic.xy, conic.xy);
-    inverse_xx_ = S(1) / conic.xx;
-    v_extent_ = sqrt(max(S(0), reach_ * conic.xx / determinant_));
+    inverse_xx_ = rough_reciprocal(conic.xx);
+    const S scale = max(S(0), reach_ * rough_reciprocal(determinant_));
+    v_extent_ = rough_sqrt(scale * conic.xx);
     // v where u is largest: on the line conic.xy u + conic.yy v = 0.
-    v_at_u_extent_ = -conic.xy / conic.yy * sqrt(max(S(0), reach_ * conic.yy / determinant_));
+    v_at_u_extent_ = -conic.xy * rough_reciprocal(conic.yy) * rough_sqrt(scale * conic.yy);
   }
 
   DSMOE_HD S v_extent() const { return v_extent_; }
@@ -66,7 +67,9 @@ template <class S> class EllipseBand {
 
  private:
   DSMOE_HD S centre(S v) const { return -conic_.xy * v * inverse_xx_; }
-  DSMOE_HD S half_width(S v) const { return sqrt(max(S(0), conic_.xx * reach_ - determinant_ * v * v)) * inverse_xx_; }
+  DSMOE_HD S half_width(S v) const {
+    return rough_sqrt(max(S(0), conic_.xx * reach_ - determinant_ * v * v)) * inverse_xx_;
+  }
 
   Sym2<S> conic_;
   S reach_, determinant_, inverse_xx_, v_extent_, v_at_u_extent_;
@@ -118,16 +121,19 @@ DSMOE_HD void for_each_tile_row(const Sym2<S>& conic, Vec2<S> mean, S squared_re
   }
 }
 
-// The least value of d^T conic d over a rectangle of pixel centres, borders included.
-template <class S> struct PixelRect { S x0, y0, x1, y1; };
+template <class S> struct PixelRect {
+  S x0, y0, x1, y1;  // pixel centres, borders included
+};
+
+// The least value of d^T conic d over a rectangle. The form grows along every ray from the mean, so the least value
+// lies where a ray enters: on the column or the row that is nearest to the mean.
 template <class S> DSMOE_HD S least_squared_distance(const Sym2<S>& conic, Vec2<S> mean, PixelRect<S> rect) {
   const S x0 = rect.x0 - mean.x, x1 = rect.x1 - mean.x, y0 = rect.y0 - mean.y, y1 = rect.y1 - mean.y;
-  if (x0 <= S(0) && S(0) <= x1 && y0 <= S(0) && S(0) <= y1) return S(0);
-  const S slope_y = -conic.xy / conic.yy, slope_x = -conic.xy / conic.xx;
-  auto value = [&](S x, S y) { return conic.xx * x * x + S(2) * conic.xy * x * y + conic.yy * y * y; };
-  auto on_column = [&](S x) { return value(x, clamp(slope_y * x, y0, y1)); };
-  auto on_row = [&](S y) { return value(clamp(slope_x * y, x0, x1), y); };
-  return min(min(on_column(x0), on_column(x1)), min(on_row(y0), on_row(y1)));
+  auto value = [&](S x, S y) { return (conic.xx * x + S(2) * conic.xy * y) * x + conic.yy * y * y; };
+  const S x = clamp(S(0), x0, x1), y = clamp(S(0), y0, y1);
+  const S on_column = value(x, clamp(-conic.xy * x * rough_reciprocal(conic.yy), y0, y1));
+  const S on_row = value(clamp(-conic.xy * y * rough_reciprocal(conic.xx), x0, x1), y);
+  return min(on_column, on_row);
 }
 
 // Whether a pair of the Gaussian may count inside the rectangle; a bound.

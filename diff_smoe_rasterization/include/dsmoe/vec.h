@@ -43,15 +43,15 @@ template <class S> DSMOE_HD Vec3<S> transposed_times(const Mat3<S>& m, Vec3<S> v
 template <class S> DSMOE_HD bool is_finite(S x) { return x - x == S(0); }
 template <class S> DSMOE_HD bool is_finite(Vec3<S> v) { return is_finite(v.x) && is_finite(v.y) && is_finite(v.z); }
 
-// x - x is 0 for every finite x; NaN and infinity leave a NaN that survives the sums. Four sums, so that the
+// 0 x is 0 for every finite x; NaN and infinity leave a NaN that survives the sums. Four sums, so that the
 // additions do not wait for each other.
 template <class S> DSMOE_HD bool all_finite(const S* values, int count) {
   S poison[4] = {S(0), S(0), S(0), S(0)};
   int i = 0;
   for (; i + 4 <= count; i += 4) {
-    for (int k = 0; k < 4; ++k) poison[k] += values[i + k] - values[i + k];
+    for (int k = 0; k < 4; ++k) poison[k] += S(0) * values[i + k];
   }
-  for (; i < count; ++i) poison[0] += values[i] - values[i];
+  for (; i < count; ++i) poison[0] += S(0) * values[i];
   return (poison[0] + poison[1]) + (poison[2] + poison[3]) == S(0);
 }
 
