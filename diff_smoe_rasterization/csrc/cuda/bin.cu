@@ -1,6 +1,5 @@
 // Stage 2: the depth order, and the tile lists front to back. One sort of the Gaussians by depth, then a stable sort of
 // their instances by tile, so that the second sort's keys are short.
-#include <cub/block/block_scan.cuh>
 #include <cub/device/device_radix_sort.cuh>
 #include <limits>
 
@@ -9,6 +8,7 @@
 #include "dsmoe/blend.h"
 #include "dsmoe/rasterize.h"
 #include "look_back.cuh"
+#include "reduce.cuh"
 #include "tile_rows.cuh"
 
 namespace dsmoe {
@@ -16,8 +16,9 @@ namespace cuda {
 namespace {
 
 constexpr int kBlock = 256;
-constexpr int kSmallRows = 4;    // a Gaussian with more rows of tiles,
-constexpr int kSmallTiles = 16;  // or more tiles, is listed by a warp of its own
+constexpr int kWarps = kBlock / kWarp;
+constexpr int kKeptRows = 128;              // rows of tiles of a warp that are kept between counting and listing
+constexpr int64_t kEnoughWarps = 32 * 132;  // where fewer warps would do, each takes fewer Gaussians
 
 // Runs a CUB algorithm: it says how much memory it needs, gets it, and works.
 template <class Algorithm> void with_temporary(Scratch& scratch, const char* what, Algorithm algorithm) {
@@ -26,14 +27,9 @@ template <class Algorithm> void with_temporary(Scratch& scratch, const char* wha
   check(algorithm(allocate<char>(scratch, bytes), bytes), what);
 }
 
-struct LargeGaussian {
-  int64_t begin;  // its first instance
-  int32_t gaussian;
-  uint32_t count;  // of its instances
-};
-
 template <class S, class Key> struct ListArguments {
   int64_t num_gaussians;
+  int gaussians_per_warp;
   BlendMode mode;
   int width, height, columns;
   SavedForward<S> saved;
@@ -43,127 +39,100 @@ template <class S, class Key> struct ListArguments {
   Key* keys;             // [capacity] tile
   int32_t* values;       // [capacity] what goes along: the Gaussian, or the slot where gradients go by slot
   int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
-  LargeGaussian* large;  // [max_large] those beyond are listed by one thread each
-  unsigned max_large;
-  unsigned* num_large;
 
-  __device__ void write(int64_t slot, int32_t gaussian, int x, int y) const {
-    keys[slot] = static_cast<Key>(y * columns + x);
+  __device__ void write(int64_t slot, int32_t gaussian, uint32_t tile) const {
+    keys[slot] = static_cast<Key>(tile);
     if (slot_owners != nullptr) slot_owners[slot] = gaussian;
     values[slot] = slot_owners != nullptr ? static_cast<int32_t>(slot) : gaussian;
   }
 };
 
+// The rows of tiles of the Gaussians whose turn it is; `position` is the lane's in the depth order.
 template <class S, class Key>
-__device__ TileRect bounds_of(const ListArguments<S, Key>& list, const ProjectedGaussian<S>& projected,
-                              int32_t gaussian) {
-  return footprint_bounds(list.mode, list.width, list.height, projected.mean, list.radii, gaussian);
-}
-
-template <class S, class Key>
-__device__ FootprintTiles<S> tiles_of_large(const ListArguments<S, Key>& list, int32_t gaussian) {
-  const ProjectedGaussian<S> projected = list.saved.projected[gaussian];
-  return shared_tiles(projected, bounds_of(list, projected, gaussian));
-}
-
-template <class S, class Key>
-__device__ void list_alone(const ListArguments<S, Key>& list, int32_t gaussian, int64_t slot) {
-  const auto tiles = tiles_of_large(list, gaussian);
-  for (int y = tiles.begin(); y < tiles.end(); ++y) {
-    const auto span = row_of(tiles, y);
-    for (int x = span.x0; x < span.x1; ++x) list.write(slot++, gaussian, x, y);
+__device__ WarpRows<S> rows_at(const ListArguments<S, Key>& list, int64_t position, int lane) {
+  const bool exists = lane < list.gaussians_per_warp && position < list.num_gaussians;
+  const int32_t gaussian = exists ? list.saved.order[position] : -1;
+  ProjectedGaussian<S> projected = {};
+  projected.squared_reach = S(-1);
+  TileRect bounds = {};
+  if (gaussian >= 0) {
+    projected = list.saved.projected[gaussian];
+    bounds = footprint_bounds(list.mode, list.width, list.height, projected.mean, list.radii, gaussian);
   }
+  const WarpRows<S> rows(gaussian, projected, bounds, list.columns, lane);
+  if (list.saved.slot_ranges != nullptr && gaussian >= 0 && rows.lane_has_none()) {
+    list.saved.slot_ranges[2 * int64_t(gaussian)] = list.saved.slot_ranges[2 * int64_t(gaussian) + 1] = 0;
+  }
+  return rows;
+}
+
+// Lists a row a lane from `slot` on, but not beyond `end`. Lanes that write together write side by side.
+template <class S, class Key>
+__device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row, int64_t& slot, int64_t end, int lane) {
+  const WarpLine instances(row.width, lane);
+  if (list.saved.slot_ranges != nullptr) {
+    int64_t* range = list.saved.slot_ranges + 2 * int64_t(row.gaussian);
+    if (row.first) range[0] = slot + instances.begin;
+    if (row.last) range[1] = slot + instances.begin + row.width;
+  }
+  for (unsigned k = lane; k - lane < instances.total; k += kWarp) {
+    const int owner = instances.owner(k);
+    const uint32_t tile = from_lane(row.tile - instances.begin, owner) + k;
+    const int32_t gaussian = from_lane(row.gaussian, owner);
+    if (k < instances.total && slot + k < end) list.write(slot + k, gaussian, tile);
+  }
+  slot += instances.total;
 }
 
 template <class S, class Key>
 __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_constant__ ListArguments<S, Key> list) {
-  using BlockScan = cub::BlockScan<unsigned long long, kBlock>;
-  __shared__ typename BlockScan::TempStorage scan_memory;
+  __shared__ TileRow kept_rows[kKeptRows / kWarp][kBlock];
   __shared__ unsigned shared_block;
-  __shared__ unsigned long long shared_before;
+  __shared__ unsigned long long counts[kWarps], shared_before;
   if (threadIdx.x == 0) shared_block = take_block_number(list.look_back);
   __syncthreads();
   const unsigned block = shared_block;
-  const int64_t position = int64_t(block) * kBlock + threadIdx.x;
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  const auto rows = rows_at(list, (int64_t(block) * kWarps + warp) * list.gaussians_per_warp + lane, lane);
 
-  int32_t gaussian = 0;
-  unsigned long long count = 0;
-  int first_row = 0, num_rows = 0;
-  bool is_large = false;
-  typename FootprintTiles<S>::Span spans[kSmallRows];
-  if (position < list.num_gaussians) {
-    gaussian = list.saved.order[position];
-    if (list.radii[gaussian] > 0) {
-      const ProjectedGaussian<S> projected = list.saved.projected[gaussian];
-      const FootprintTiles<S> tiles(projected.conic, projected.mean, projected.squared_reach,
-                                    bounds_of(list, projected, gaussian));
-      first_row = tiles.begin(), num_rows = tiles.end() - tiles.begin();
-      if (num_rows <= kSmallRows) {
-#pragma unroll
-        for (int r = 0; r < kSmallRows; ++r) {
-          spans[r] = {0, 0};
-          if (r < num_rows) spans[r] = tiles.row(first_row + r);
-          count += max(0, spans[r].x1 - spans[r].x0);
-        }
-      }
-      is_large = num_rows > kSmallRows || count > kSmallTiles;
-      if (is_large) count = count_tiles(tiles_of_large(list, gaussian));
-    }
-  }
-  unsigned long long begin, total;
-  BlockScan(scan_memory).ExclusiveSum(count, begin, total);
-  if (threadIdx.x < kWarp) {
-    const unsigned long long before = sum_before(list.look_back, block, total);
-    if (threadIdx.x == 0) {
-      shared_before = before;
-      if (block == gridDim.x - 1) *list.saved.num_instances = static_cast<int64_t>(before + total);
-    }
-  }
-  __syncthreads();
-  if (list.keys == nullptr || position >= list.num_gaussians) return;
-  int64_t slot = static_cast<int64_t>(shared_before + begin);
-  const int64_t end = slot + static_cast<int64_t>(count);
-  if (list.saved.slot_ranges != nullptr) {
-    list.saved.slot_ranges[2 * int64_t(gaussian)] = slot, list.saved.slot_ranges[2 * int64_t(gaussian) + 1] = end;
-  }
-  if (count == 0 || end > list.saved.capacity) return;
-  if (is_large) {
-    const unsigned i = atomicAdd(list.num_large, 1u);
-    if (i < list.max_large) {
-      list.large[i] = {slot, gaussian, static_cast<uint32_t>(count)};
-    } else {
-      list_alone(list, gaussian, slot);
-    }
-    return;
-  }
-#pragma unroll
-  for (int r = 0; r < kSmallRows; ++r) {
-    if (r >= num_rows) break;
-    for (int x = spans[r].x0; x < spans[r].x1; ++x) list.write(slot++, gaussian, x, first_row + r);
-  }
-}
-
-// One warp lists one large Gaussian at a time: 32 rows are measured together, then written one after another.
-template <class S, class Key>
-__global__ void __launch_bounds__(kBlock) list_large_kernel(const __grid_constant__ ListArguments<S, Key> list) {
-  const int lane = threadIdx.x % kWarp;
-  const unsigned warps = gridDim.x * (kBlock / kWarp), count = min(*list.num_large, list.max_large);
-  for (unsigned i = (blockIdx.x * kBlock + threadIdx.x) / kWarp; i < count; i += warps) {
-    const LargeGaussian large = list.large[i];
-    const auto tiles = tiles_of_large(list, large.gaussian);
-    int64_t slot = large.begin;
-    const int64_t end = slot + large.count;
-    for (int y0 = tiles.begin(); y0 < tiles.end(); y0 += kWarp) {
-      typename FootprintTiles<S>::Span mine = {0, 0};
-      if (y0 + lane < tiles.end()) mine = row_of(tiles, y0 + lane);
-      for (int r = 0; r < kWarp && y0 + r < tiles.end(); ++r) {
-        const int x0 = __shfl_sync(kAllLanes, mine.x0, r), x1 = __shfl_sync(kAllLanes, mine.x1, r);
-        for (int x = x0 + lane; x < x1; x += kWarp) {
-          if (slot + x - x0 < end) list.write(slot + x - x0, large.gaussian, x, y0 + r);
-        }
-        slot += max(0, x1 - x0);
+  // Twice over the rows: to count their tiles, then to list them. One loop serves both, so that both find the same.
+  int64_t slot = 0, end = 0;
+#pragma unroll 1
+  for (bool listing = false;; listing = true) {
+    unsigned long long count = 0;
+#pragma unroll 1
+    for (unsigned first = 0; first < rows.total(); first += kWarp) {
+      TileRow& kept = kept_rows[first / kWarp % (kKeptRows / kWarp)][threadIdx.x];
+      const bool keep = first < kKeptRows;
+      const TileRow row = listing && keep ? kept : rows.at(first + lane);
+      if (listing) {
+        list_rows(list, row, slot, end, lane);
+      } else {
+        if (keep) kept = row;
+        count += row.width;
       }
     }
+    if (listing) return;
+
+    count = sum_lanes(count);
+    if (lane == 0) counts[warp] = count;
+    __syncthreads();
+    unsigned long long before = 0, total = 0;
+    for (int w = 0; w < kWarps; ++w) {
+      if (w == warp) before = total;
+      total += counts[w];
+    }
+    if (warp == 0) {
+      const unsigned long long before_block = sum_before(list.look_back, block, total);
+      if (lane == 0) {
+        shared_before = before_block;
+        if (block == gridDim.x - 1) *list.saved.num_instances = static_cast<int64_t>(before_block + total);
+      }
+    }
+    __syncthreads();
+    if (list.keys == nullptr) return;
+    slot = static_cast<int64_t>(shared_before + before);
+    end = min(slot + static_cast<int64_t>(count), list.saved.capacity);
   }
 }
 
@@ -194,23 +163,21 @@ __global__ void pair_with_slots_kernel(int64_t capacity, const int64_t* num_inst
 
 // Lists the instances into the memory that `list` has, or only counts them.
 template <class Key, class S> void list_instances(ListArguments<S, Key> list, Scratch& scratch, cudaStream_t stream) {
-  const unsigned blocks = blocks_for(list.num_gaussians, kBlock);
+  list.gaussians_per_warp = kWarp;
+  while (list.gaussians_per_warp > 1 && list.num_gaussians < kEnoughWarps * list.gaussians_per_warp) {
+    list.gaussians_per_warp /= 2;
+  }
+  const unsigned blocks = blocks_for(list.num_gaussians, kWarps * list.gaussians_per_warp);
   if (blocks == 0) {
     check(cudaMemsetAsync(list.saved.num_instances, 0, sizeof(int64_t), stream), "counting instances");
     return;
   }
-  // The states of the look-back, and two counters behind them.
+  // The states of the look-back, and its counter behind them.
   auto* states = allocate<unsigned long long>(scratch, int64_t(blocks) + 1);
   check(cudaMemsetAsync(states, 0, (size_t(blocks) + 1) * sizeof(*states), stream), "listing instances");
-  auto* counters = reinterpret_cast<unsigned*>(states + blocks);
-  list.look_back = {states, counters};
-  list.num_large = counters + 1;
+  list.look_back = {states, reinterpret_cast<unsigned*>(states + blocks)};
   list_instances_kernel<<<blocks, kBlock, 0, stream>>>(list);
   DSMOE_CHECK_LAUNCH("list_instances");
-  if (list.keys == nullptr) return;
-  constexpr unsigned kLargeBlocks = 1024;
-  list_large_kernel < <<blocks<kLargeBlocks ? blocks : kLargeBlocks, kBlock, 0, stream>>>(list);
-  DSMOE_CHECK_LAUNCH("list_large");
 }
 
 template <class Key, class S>
@@ -236,8 +203,6 @@ void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCo
   list.keys = allocate<Key>(scratch, capacity);
   list.values = allocate<int32_t>(scratch, capacity);
   list.slot_owners = slots ? allocate<int32_t>(scratch, capacity) : nullptr;
-  list.max_large = static_cast<unsigned>(min<int64_t>(capacity / 8 + 1024, num_gaussians));
-  list.large = allocate<LargeGaussian>(scratch, list.max_large);
   Key* sorted_keys = allocate<Key>(scratch, capacity);
   int32_t* sorted_values = slots ? allocate<int32_t>(scratch, capacity) : saved.instances;
   // Behind the last instance: keys above every tile.
