@@ -72,8 +72,8 @@ __device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row,
   const WarpLine instances(row.width, lane);
   if (list.saved.slot_ranges != nullptr) {
     int64_t* range = list.saved.slot_ranges + 2 * int64_t(row.gaussian);
-    if (row.first) range[0] = slot + instances.begin;
-    if (row.last) range[1] = slot + instances.begin + row.width;
+    if (row.ends & kFirstRow) range[0] = slot + instances.begin;
+    if (row.ends & kLastRow) range[1] = slot + instances.begin + row.width;
   }
   for (unsigned k = lane; k - lane < instances.total; k += kWarp) {
     const int owner = instances.owner(k);

@@ -58,7 +58,7 @@ __global__ void __launch_bounds__(kRowsBlock)
     if (!write_features<kFeatures>(gaussian_inputs, camera, config, gaussian.depth, features)) radius = 0;
   }
   radii[i] = radius;
-  keys.gaussians[i] = static_cast<int32_t>(i);
+  keys.gaussians[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
   if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(gaussian.depth) : ~DepthBits<S>(0);
 }
 

@@ -95,18 +95,15 @@ __device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const War
   entry.valid = 0 <= position && position < tile.length;
   if (!entry.valid) return entry;
   entry.gaussian = tile.list[int64_t(position) * tile.stride];
-  if (!tile.listed) {  // culled Gaussians are in the depth order too, and its entries know nothing of tiles
-    const int32_t radius = arguments.images.radii[entry.gaussian];
-    entry.valid = radius > 0;
-    if (!entry.valid) return entry;
-  }
+  entry.valid = entry.gaussian >= 0;  // the depth order has culled Gaussians too, below 0
+  if (!entry.valid) return entry;
   entry.staged.gaussian = saved.projected[entry.gaussian];
   const S* features = saved.features + int64_t(entry.gaussian) * feature_stride(arguments.config.num_features());
   struct alignas(16) Chunk {
     S values[kFeatureChunk];
   };
   *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + first_feature);
-  if (!tile.listed) {
+  if (!tile.listed) {  // the entries of the depth order know nothing of tiles
     const TileRect bounds = footprint_bounds(arguments.config.mode, arguments.width, arguments.height,
                                              entry.staged.gaussian.mean, arguments.images.radii, entry.gaussian);
     entry.valid =

@@ -51,7 +51,7 @@ enum Output : int {
   kInstances,           // int32; CPU: [I, 2] TileInstance; CUDA: [capacity, 1 or 2]
   kFinalTransmittance,  // [H, W]
   kLastContributor,     // [H, W] int32
-  kOrder,               // CUDA: [N] int32 Gaussians by depth; CPU: [0]
+  kOrder,               // CUDA: [N] int32 Gaussians by depth, culled ones as ~index; CPU: [0]
   kNumOutputs
 };
 constexpr const char* kOutputNames[kNumOutputs] = {"color",

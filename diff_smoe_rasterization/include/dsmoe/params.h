@@ -37,8 +37,8 @@ template <class S> struct RasterConfig {
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
 };
 
-// One Gaussian on the image plane: all that the blend reads of it besides its features.
-template <class S> struct ProjectedGaussian {
+// One Gaussian on the image plane: all that the blend reads of it besides its features. Aligned to load as vectors.
+template <class S> struct alignas(16) ProjectedGaussian {
   Vec2<S> mean;     // pixels
   Sym2<S> conic;    // per px^2
   S opacity;        // after antialiasing

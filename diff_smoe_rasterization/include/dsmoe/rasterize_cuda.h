@@ -43,7 +43,7 @@ DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features +
 template <class S> struct SavedForward {
   ProjectedGaussian<S>* projected = nullptr;  // [N]
   S* features = nullptr;                      // [N, feature_stride(F)]
-  int32_t* order = nullptr;                   // [N] Gaussians, nearest first, culled ones last
+  int32_t* order = nullptr;                   // [N] Gaussians, nearest first; culled ones last, Gaussian i as ~i
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
   int64_t* num_instances = nullptr;           // [1] how many there are; those beyond the capacity are not listed
   int32_t* instances = nullptr;               // [capacity, instance_width] Gaussian (and slot) by tile, front to back
@@ -70,10 +70,11 @@ template <class S> using DepthBits = std::conditional_t<sizeof(S) == 4, uint32_t
 // What the depth sort sorts.
 template <class S> struct DepthKeys {
   DepthBits<S>* depths = nullptr;  // [N] the greatest number for culled Gaussians; null: no depth order is wanted
-  int32_t* gaussians = nullptr;    // [N] 0, 1, 2, ...
+  int32_t* gaussians = nullptr;    // [N] 0, 1, 2, ...; ~i for a culled Gaussian i
 };
 
-// Whether the mode needs saved.order by depth. Where not, project gets saved.order itself as keys.gaussians.
+// Whether the mode needs saved.order by depth. Where not, project gets saved.order itself as keys.gaussians, and
+// culled ones keep their places.
 bool needs_depth_order(BlendMode mode);
 
 // Fills saved.projected, saved.features, images.radii and keys.
