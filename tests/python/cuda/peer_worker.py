@@ -14,9 +14,11 @@ import sys
 
 import torch
 
-sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "..", "benchmarks"))
+HERE = os.path.dirname(os.path.abspath(__file__))
+sys.path[:0] = [HERE, os.path.join(HERE, "..", "..", "..", "benchmarks")]
 import gpu_renderers  # noqa: E402
 import models  # noqa: E402
+from flips import explain  # noqa: E402
 
 from diff_smoe_rasterization import rasterize  # noqa: E402
 
@@ -38,10 +40,10 @@ def jacobian_is_clamped(means3D, settings):
         y.abs() > 0.999 * JACOBIAN_MARGIN * settings.tanfovy)
 
 
-def image_gradient(flipped):
-    """Fixed random numbers [3, H, W], 0 where the two images show different outcomes of a threshold."""
+def image_gradient(left_out):
+    """Fixed random numbers [3, H, W], 0 where `left_out` is set."""
     generator = torch.Generator(device="cpu").manual_seed(0)
-    return torch.randn(3, *flipped.shape, generator=generator).to(flipped.device) * ~flipped
+    return torch.randn(3, *left_out.shape, generator=generator).to(left_out.device) * ~left_out
 
 
 def gradient_differences(actual, expected, settings, means3D):
@@ -67,16 +69,17 @@ def against_inria(model, view, peer):
     rendering = rasterize(settings=settings, outputs=("inverse_depth",), **ours)
     results = peer.views[view](**theirs)
     color, radii = results[:2]
-    flipped = ((rendering.color - color).abs() > COLOR_TOLERANCE).any(0)
+    different = ((rendering.color - color).abs() > COLOR_TOLERANCE).any(0)
     difference = (rendering.radii - radii).abs()
     row = {
-        "gaussians": model.num_gaussians, "visible": int((radii > 0).sum()), "pixels": flipped.numel(),
+        "gaussians": model.num_gaussians, "visible": int((radii > 0).sum()), "pixels": different.numel(),
         "radii_different": int((difference > 0).sum()), "radii_largest": int(difference.max()),
-        "flipped": int(flipped.sum()), "clamped": int(jacobian_is_clamped(ours["means3D"], settings).sum()),
+        **explain(rendering.color, color, different, model.inputs, settings, "alpha"),
+        "largest_difference": (rendering.color - color).abs().max().item(), "clamped": int(jacobian_is_clamped(ours["means3D"], settings).sum()),
     }
     if len(results) > 2:
-        row["inverse_depth"] = relative(rendering.inverse_depth[:, ~flipped], results[2][:, ~flipped])
-    dL_dcolor = image_gradient(flipped)
+        row["inverse_depth"] = relative(rendering.inverse_depth[:, ~different], results[2][:, ~different])
+    dL_dcolor = image_gradient(different)
     rendering.color.backward(dL_dcolor)
     color.backward(dL_dcolor)
     row["gradients"] = gradient_differences({name: leaf.grad for name, leaf in ours.items()},
@@ -96,10 +99,13 @@ def against_gsplat(model, view, peer):
     alpha = alphas[0].permute(2, 0, 1)
     gated = colors[0].permute(2, 0, 1) / alpha.clamp(min=ALPHA_LEAST)
     compared = alpha[0] > ALPHA_LEAST
-    flipped = ((rendering.color - gated).abs() > GATED_TOLERANCE).any(0) | (
+    different = ((rendering.color - gated).abs() > GATED_TOLERANCE).any(0) | (
         (rendering.alpha - alpha)[0].abs() > COLOR_TOLERANCE)
-    row = {"pixels": int(compared.sum()), "flipped": int((flipped & compared).sum())}
-    dL_dcolor = image_gradient(flipped | ~compared)
+    row = {"pixels": int(compared.sum()),
+           **explain(torch.cat([rendering.color, rendering.alpha]), torch.cat([gated, alpha]), different & compared,
+                     model.inputs, settings, "smoe"),
+           "largest_difference": ((rendering.color - gated).abs() * compared).max().item()}
+    dL_dcolor = image_gradient(different | ~compared)
     dL_dalpha = dL_dcolor[:1]
     torch.autograd.backward([rendering.color, rendering.alpha], [dL_dcolor, dL_dalpha])
     torch.autograd.backward([gated, alpha], [dL_dcolor, dL_dalpha])

@@ -26,9 +26,10 @@ from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 VIEWS = 10
 WORKER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "peer_worker.py")
 RADII = 1e-5  # part of the Gaussians whose radius, the ceiling of a rounded root, may differ by 1
-# Part of the pixels in which a pair lies within rounding of 1/255 and counts on one side alone: of some hundred pairs
-# a pixel, spread over a few units of ln(alpha), each rounded by up to 1e-5 on either side.
-FLIPPED = 2e-4
+# Every pixel that differs is looked into (flips.py): it must show another outcome of a threshold, or what roundings can
+# add up to. How many do is limited too, so that a rule that is a little wrong cannot pass for either.
+FLIPPED = 5e-4  # part of the pixels: of some tens of pairs a pixel, one within 1e-5 of the cut in ln(alpha)
+ROUNDED = 2e-3  # part of the pixels: splats of half a pixel, whose alpha a position's rounding moves by 1e-4 of itself
 GRADIENT = 1e-3  # in float32 on both sides, each a sum by atomics in any order
 
 
@@ -65,9 +66,12 @@ def compared(name, model):
     return rows
 
 
-def assert_flips_are_rare(rows, largest):
-    pixels, flipped = (sum(row[key] for row in rows) for key in ("pixels", "flipped"))
-    assert flipped <= largest * pixels, f"{flipped} of {pixels} pixels differ"
+def assert_differences_are_explained(rows):
+    keys = ("pixels", "flipped", "rounded", "unexplained")
+    pixels, flipped, rounded, unexplained = (sum(row[key] for row in rows) for key in keys)
+    counts = f"of {pixels} pixels {flipped} are flipped, {rounded} rounded, {unexplained} differ without a reason"
+    print("PEER", counts)
+    assert unexplained == 0 and flipped <= FLIPPED * pixels and rounded <= ROUNDED * pixels, counts
 
 
 def assert_gradients(rows, names):
@@ -79,7 +83,7 @@ def assert_gradients(rows, names):
 def assert_renders_as_inria(rows):
     assert sum(row["radii_different"] for row in rows) <= max(1, RADII * sum(row["gaussians"] for row in rows))
     assert all(row["radii_largest"] <= 1 and row["visible"] > 100 for row in rows)
-    assert_flips_are_rare(rows, FLIPPED)
+    assert_differences_are_explained(rows)
 
 
 ALL = ("means3D", "means2D", "opacities", "shs", "scales", "rotations")
@@ -103,7 +107,7 @@ def test_antialiasing_renders_as_inrias(model):
 def test_smoe_is_colour_over_alpha_of_gsplat(model):
     rows = compared("gsplat", model)
     assert all(row["pixels"] > 0 for row in rows)
-    assert_flips_are_rare(rows, FLIPPED)
+    assert_differences_are_explained(rows)
     assert_gradients(rows, [name for name in ALL if name != "means2D"])
 
 
