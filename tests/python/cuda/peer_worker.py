@@ -74,8 +74,9 @@ def against_inria(model, view, peer):
     row = {
         "gaussians": model.num_gaussians, "visible": int((radii > 0).sum()), "pixels": different.numel(),
         "radii_different": int((difference > 0).sum()), "radii_largest": int(difference.max()),
+        "clamped": int(jacobian_is_clamped(ours["means3D"], settings).sum()),
         **explain(rendering.color, color, different, model.inputs, settings, "alpha"),
-        "largest_difference": (rendering.color - color).abs().max().item(), "clamped": int(jacobian_is_clamped(ours["means3D"], settings).sum()),
+        "largest_difference": (rendering.color - color).abs().max().item(),
     }
     if len(results) > 2:
         row["inverse_depth"] = relative(rendering.inverse_depth[:, ~different], results[2][:, ~different])
