@@ -3,6 +3,7 @@
 Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA), TORCH_CUDA_ARCH_LIST, MAX_JOBS.
 """
 import os
+import subprocess
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -11,6 +12,9 @@ import setuptools
 
 ROOT = Path(__file__).resolve().parent
 PACKAGE = "diff_smoe_rasterization"
+# What is compiled for where no card is seen: what torch's own builds are for, and 11.0. A kernel runs on later cards of
+# the same major number too; cards after the last compile its PTX when they first run it.
+CAPABILITIES = (70, 75, 80, 86, 90, 100, 110, 120)
 FOLDERS_INSTALLED_INSIDE = ("integrations", "patches", "benchmarks")
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
 
@@ -69,6 +73,19 @@ def reasons_against_cuda(cuda_sources, torch, cuda_home):
     return reasons
 
 
+def architecture_flags(nvcc, torch):
+    """Returns nvcc's flags for every card that it and the package know, as torch has no default where no card is seen.
+
+    Empty where TORCH_CUDA_ARCH_LIST says for which cards, or where torch sees some: it compiles for those.
+    """
+    if os.environ.get("TORCH_CUDA_ARCH_LIST") or torch.cuda.device_count() > 0:
+        return []
+    known = subprocess.run([nvcc, "--list-gpu-arch"], stdout=subprocess.PIPE, check=True, universal_newlines=True)
+    chosen = [number for number in CAPABILITIES if f"compute_{number}" in known.stdout.split()]
+    kinds = [(number, f"sm_{number}") for number in chosen] + [(chosen[-1], f"compute_{chosen[-1]}")]
+    return [f"-gencode=arch=compute_{number},code={kind}" for number, kind in kinds]
+
+
 def extension():
     """Returns the arguments of setup() that build `diff_smoe_rasterization._C`."""
     torch, cpp_extension = import_build_tools()
@@ -78,6 +95,9 @@ def extension():
     flags = sources["flags"] + ["-g0", "-fvisibility=hidden", "-pthread"]
     if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
         flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
+    nvcc_flags = ["-O3"]
+    if not without_cuda:
+        nvcc_flags += architecture_flags(os.path.join(cpp_extension.CUDA_HOME, "bin", "nvcc"), torch)
     folders = [str(ROOT / PACKAGE / folder) for folder in ("include", "csrc")]
     make = cpp_extension.CppExtension if without_cuda else cpp_extension.CUDAExtension
     module = make(
@@ -85,7 +105,7 @@ def extension():
         [f"{PACKAGE}/{path}" for group in groups for path in sources[group]],
         include_dirs=folders,
         define_macros=[] if without_cuda else [("DSMOE_WITH_CUDA", None)],
-        extra_compile_args={"cxx": flags, "nvcc": ["-O3"]},
+        extra_compile_args={"cxx": flags, "nvcc": nvcc_flags},
         extra_link_args=["-pthread"],
     )
     built_against = {

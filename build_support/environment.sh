@@ -66,6 +66,11 @@ sys.exit(tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 3))' && numpy=
   # Objects stay for the next build; assembled packages do not, or deleted modules would live on in them.
   rm -rf "$venv"/build/lib* "$venv"/build/bdist*
   printf '[build]\nbuild_base = %s\n' "$venv/build" >"$venv/build.cfg"
+  # Without a GPU its kernels cannot run here: it is enough that they compile, for one card.
+  if [ -z "${TORCH_CUDA_ARCH_LIST-}" ] &&
+    "$venv/bin/python" -I -W ignore -c 'import sys, torch; sys.exit(torch.cuda.device_count() > 0)'; then
+    local -x TORCH_CUDA_ARCH_LIST=8.0+PTX
+  fi
   DIST_EXTRA_CONFIG=$venv/build.cfg pip_install --no-build-isolation "$root" "$numpy"
 }
 

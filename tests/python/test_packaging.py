@@ -2,9 +2,11 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -37,6 +39,59 @@ def test_the_build_wrote_down_its_torch():
     info = pytest.importorskip("diff_smoe_rasterization._build_info", reason="not built by setup.py")
     assert info.TORCH_VERSION == torch.__version__
     assert info.WITHOUT_CUDA_BECAUSE or "cuda" in extension.BACKENDS
+
+
+def load_setup():
+    """setup.py as a module; it builds nothing unless it is run."""
+    pytest.importorskip("setuptools")
+    spec = importlib.util.spec_from_file_location("dsmoe_setup", ROOT / "setup.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def toolkit(tmp_path, *numbers):
+    """A program that answers as nvcc of a CUDA release that knows these architectures."""
+    path = tmp_path / "nvcc"
+    path.write_text("#!/bin/sh\n[ \"$*\" = --list-gpu-arch ] && printf 'compute_%s\\n' " + " ".join(map(str, numbers)))
+    path.chmod(0o755)
+    return str(path)
+
+
+def torch_that_sees(cards):
+    return SimpleNamespace(cuda=SimpleNamespace(device_count=lambda: cards))
+
+
+def runs_on(capability, flags):
+    """Whether a card has a kernel: a binary of its major number and no later minor one, or PTX that is no later."""
+    binaries = [int(flag.rpartition("code=sm_")[2]) for flag in flags if "code=sm_" in flag]
+    intermediate = [int(flag.rpartition("code=compute_")[2]) for flag in flags if "code=compute_" in flag]
+    return (any(number // 10 == capability // 10 and number <= capability for number in binaries)
+            or any(number <= capability for number in intermediate))
+
+
+@pytest.mark.parametrize("known, oldest", [
+    ((50, 52, 60, 61, 70, 72, 75, 80, 86, 87, 89, 90), 70),  # CUDA 12.0
+    ((75, 80, 86, 87, 88, 89, 90, 100, 110, 103, 120, 121), 75),  # CUDA 13.0
+])
+def test_without_a_card_kernels_are_built_for_all(tmp_path, monkeypatch, known, oldest):
+    """Those that the toolkit knows from 7.0 on, and those that come later."""
+    monkeypatch.delenv("TORCH_CUDA_ARCH_LIST", raising=False)
+    flags = load_setup().architecture_flags(toolkit(tmp_path, *known), torch_that_sees(0))
+    assert all(flag.startswith("-gencode=arch=compute_") for flag in flags)
+    built = [int(flag.rpartition("_")[2]) for flag in flags]
+    assert set(built) <= set(known) and min(built) == oldest
+    for capability in [number for number in known if number >= 70] + [129, 130]:
+        assert runs_on(capability, flags), capability
+
+
+def test_a_card_or_a_list_decides_for_which_cards_kernels_are_built(tmp_path, monkeypatch):
+    """Without such a flag torch builds for the cards that it sees, or for the list."""
+    setup, nvcc = load_setup(), toolkit(tmp_path, 80, 90)
+    monkeypatch.delenv("TORCH_CUDA_ARCH_LIST", raising=False)
+    assert setup.architecture_flags(nvcc, torch_that_sees(1)) == []
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6")
+    assert setup.architecture_flags(nvcc, torch_that_sees(0)) == []
 
 
 @pytest.mark.skipif(INSTALLED == SOURCE, reason="runs from the source folder; nothing is installed")
