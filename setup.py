@@ -3,6 +3,7 @@
 Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA), TORCH_CUDA_ARCH_LIST, MAX_JOBS.
 """
 import os
+import re
 import subprocess
 import sys
 from collections import defaultdict
@@ -54,6 +55,16 @@ def import_build_tools():
     return torch, cpp_extension
 
 
+def nvcc_of(cuda_home):
+    """Returns the path of the toolkit's compiler, or None."""
+    path = os.path.join(cuda_home or "", "bin", "nvcc")
+    return path if cuda_home and os.path.isfile(path) else None
+
+
+def answer(*command):
+    return subprocess.run(command, stdout=subprocess.PIPE, check=True, universal_newlines=True).stdout
+
+
 def reasons_against_cuda(cuda_sources, torch, cuda_home):
     """Returns why the CUDA backend is not built, as a list; empty where it is."""
     wish = os.environ.get("DSMOE_BUILD_CUDA", "auto")
@@ -66,8 +77,13 @@ def reasons_against_cuda(cuda_sources, torch, cuda_home):
         reasons.append("this version has no CUDA backend")
     if torch.version.cuda is None:
         reasons.append(f"torch {torch.__version__} is a build without CUDA")
-    if cuda_home is None:
+    nvcc = nvcc_of(cuda_home)
+    if nvcc is None:
         reasons.append("no CUDA toolkit was found (nvcc; CUDA_HOME names its folder)")
+    elif torch.version.cuda is not None:
+        release = re.search(r"release ([0-9.]+)", answer(nvcc, "--version")).group(1)
+        if release.split(".")[0] != torch.version.cuda.split(".")[0]:  # torch refuses to build with another one
+            reasons.append(f"{nvcc} is of CUDA {release}, but torch {torch.__version__} of {torch.version.cuda}")
     if wish == "1" and reasons:
         sys.exit("DSMOE_BUILD_CUDA=1, but " + "; ".join(reasons))
     return reasons
@@ -80,8 +96,8 @@ def architecture_flags(nvcc, torch):
     """
     if os.environ.get("TORCH_CUDA_ARCH_LIST") or torch.cuda.device_count() > 0:
         return []
-    known = subprocess.run([nvcc, "--list-gpu-arch"], stdout=subprocess.PIPE, check=True, universal_newlines=True)
-    chosen = [number for number in CAPABILITIES if f"compute_{number}" in known.stdout.split()]
+    known = answer(nvcc, "--list-gpu-arch").split()
+    chosen = [number for number in CAPABILITIES if f"compute_{number}" in known]
     kinds = [(number, f"sm_{number}") for number in chosen] + [(chosen[-1], f"compute_{chosen[-1]}")]
     return [f"-gencode=arch=compute_{number},code={kind}" for number, kind in kinds]
 
@@ -97,7 +113,7 @@ def extension():
         flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
     nvcc_flags = ["-O3"]
     if not without_cuda:
-        nvcc_flags += architecture_flags(os.path.join(cpp_extension.CUDA_HOME, "bin", "nvcc"), torch)
+        nvcc_flags += architecture_flags(nvcc_of(cpp_extension.CUDA_HOME), torch)
     folders = [str(ROOT / PACKAGE / folder) for folder in ("include", "csrc")]
     make = cpp_extension.CppExtension if without_cuda else cpp_extension.CUDAExtension
     module = make(

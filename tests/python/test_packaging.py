@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -50,16 +51,25 @@ def load_setup():
     return module
 
 
-def toolkit(tmp_path, *numbers):
-    """A program that answers as nvcc of a CUDA release that knows these architectures."""
-    path = tmp_path / "nvcc"
-    path.write_text("#!/bin/sh\n[ \"$*\" = --list-gpu-arch ] && printf 'compute_%s\\n' " + " ".join(map(str, numbers)))
-    path.chmod(0o755)
-    return str(path)
+def toolkit(folder, release, *architectures):
+    """Makes the folder of a CUDA toolkit, whose nvcc only answers questions; returns (folder, nvcc)."""
+    nvcc = folder / "bin" / "nvcc"
+    nvcc.parent.mkdir()
+    nvcc.write_text(f"""#!/bin/sh
+case "$*" in
+  --version) echo 'Cuda compilation tools, release {release}, V{release}.48' ;;
+  --list-gpu-arch) printf 'compute_%s\\n' {" ".join(map(str, architectures))} ;;
+  *) exit 1 ;;
+esac
+""")
+    nvcc.chmod(0o755)
+    return str(folder), str(nvcc)
 
 
-def torch_that_sees(cards):
-    return SimpleNamespace(cuda=SimpleNamespace(device_count=lambda: cards))
+def torch_of(cuda=None, cards=0):
+    """What setup.py asks torch for: the CUDA release that it was built with, and how many cards it sees."""
+    return SimpleNamespace(__version__="2.0", version=SimpleNamespace(cuda=cuda),
+                           cuda=SimpleNamespace(device_count=lambda: cards))
 
 
 def runs_on(capability, flags):
@@ -70,14 +80,14 @@ def runs_on(capability, flags):
             or any(number <= capability for number in intermediate))
 
 
-@pytest.mark.parametrize("known, oldest", [
-    ((50, 52, 60, 61, 70, 72, 75, 80, 86, 87, 89, 90), 70),  # CUDA 12.0
-    ((75, 80, 86, 87, 88, 89, 90, 100, 110, 103, 120, 121), 75),  # CUDA 13.0
+@pytest.mark.parametrize("release, known, oldest", [
+    ("12.0", (50, 52, 60, 61, 70, 72, 75, 80, 86, 87, 89, 90), 70),
+    ("13.0", (75, 80, 86, 87, 88, 89, 90, 100, 110, 103, 120, 121), 75),
 ])
-def test_without_a_card_kernels_are_built_for_all(tmp_path, monkeypatch, known, oldest):
+def test_without_a_card_kernels_are_built_for_all(tmp_path, monkeypatch, release, known, oldest):
     """Those that the toolkit knows from 7.0 on, and those that come later."""
     monkeypatch.delenv("TORCH_CUDA_ARCH_LIST", raising=False)
-    flags = load_setup().architecture_flags(toolkit(tmp_path, *known), torch_that_sees(0))
+    flags = load_setup().architecture_flags(toolkit(tmp_path, release, *known)[1], torch_of(release))
     assert all(flag.startswith("-gencode=arch=compute_") for flag in flags)
     built = [int(flag.rpartition("_")[2]) for flag in flags]
     assert set(built) <= set(known) and min(built) == oldest
@@ -85,13 +95,28 @@ def test_without_a_card_kernels_are_built_for_all(tmp_path, monkeypatch, known, 
         assert runs_on(capability, flags), capability
 
 
+@pytest.mark.parametrize("torch_cuda, built", [("12.8", True), ("12.1", True), ("11.8", False), (None, False)])
+def test_cuda_is_built_where_torch_and_the_toolkit_fit(tmp_path, monkeypatch, torch_cuda, built):
+    monkeypatch.delenv("DSMOE_BUILD_CUDA", raising=False)
+    setup, (folder, _) = load_setup(), toolkit(tmp_path, "12.8", 80)
+    reasons = setup.reasons_against_cuda(["a.cu"], torch_of(torch_cuda), folder)
+    assert len(reasons) == (0 if built else 1)
+    assert setup.reasons_against_cuda(["a.cu"], torch_of(torch_cuda), str(tmp_path / "bin")) != []
+    monkeypatch.setenv("DSMOE_BUILD_CUDA", "1")
+    if built:
+        assert setup.reasons_against_cuda(["a.cu"], torch_of(torch_cuda), folder) == []
+    else:
+        with pytest.raises(SystemExit, match="DSMOE_BUILD_CUDA=1, but " + re.escape(reasons[0])):
+            setup.reasons_against_cuda(["a.cu"], torch_of(torch_cuda), folder)
+
+
 def test_a_card_or_a_list_decides_for_which_cards_kernels_are_built(tmp_path, monkeypatch):
     """Without such a flag torch builds for the cards that it sees, or for the list."""
-    setup, nvcc = load_setup(), toolkit(tmp_path, 80, 90)
+    setup, (_, nvcc) = load_setup(), toolkit(tmp_path, "12.0", 80, 90)
     monkeypatch.delenv("TORCH_CUDA_ARCH_LIST", raising=False)
-    assert setup.architecture_flags(nvcc, torch_that_sees(1)) == []
+    assert setup.architecture_flags(nvcc, torch_of("12.0", cards=1)) == []
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6")
-    assert setup.architecture_flags(nvcc, torch_that_sees(0)) == []
+    assert setup.architecture_flags(nvcc, torch_of("12.0")) == []
 
 
 @pytest.mark.skipif(INSTALLED == SOURCE, reason="runs from the source folder; nothing is installed")
