@@ -49,7 +49,7 @@ template <class S, class Key> struct ListArguments {
 
 // The rows of tiles of the Gaussians whose turn it is; `position` is the lane's in the depth order.
 template <class S, class Key>
-__device__ WarpRows<S> rows_at(const ListArguments<S, Key>& list, int64_t position, int lane) {
+__device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t position, int lane) {
   const bool exists = lane < list.gaussians_per_warp && position < list.num_gaussians;
   const int32_t gaussian = exists ? list.saved.order[position] : -1;
   ProjectedGaussian<S> projected = {};
@@ -59,7 +59,7 @@ __device__ WarpRows<S> rows_at(const ListArguments<S, Key>& list, int64_t positi
     projected = list.saved.projected[gaussian];
     bounds = footprint_bounds(list.mode, list.width, list.height, projected.mean, list.radii, gaussian);
   }
-  const WarpRows<S> rows(gaussian, projected, bounds, list.columns, lane);
+  const WarpTileRows<S> rows(gaussian, projected, bounds, list.columns, lane);
   if (list.saved.slot_ranges != nullptr && gaussian >= 0 && rows.lane_has_none()) {
     list.saved.slot_ranges[2 * int64_t(gaussian)] = list.saved.slot_ranges[2 * int64_t(gaussian) + 1] = 0;
   }

@@ -1,7 +1,5 @@
-// What several kernels share: warps, the camera in shared memory, and rows of memory that a warp copies together.
+// What several kernels share: warps, scratch memory, the camera in shared memory.
 #pragma once
-
-#include <cuda_pipeline.h>
 
 #include <cstdint>
 
@@ -31,57 +29,6 @@ template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Came
     to.tan_fov_x = from.tan_fov_x, to.tan_fov_y = from.tan_fov_y;
     to.near = from.near;
   }
-}
-
-// The rows of a warp's 32 Gaussians lie side by side in global memory; in shared memory they are an odd number of words
-// apart, so that lanes that read the same column meet no bank twice. Visits their numbers in memory order, 32 at a
-// time. kLength: where it is known, else 0.
-DSMOE_HD constexpr int row_stride(int length) { return length | 1; }
-
-template <int kLength, class Visit> __device__ void for_each_row_element(int lane, int run_time_length, Visit visit) {
-  if constexpr (kLength == 48) {
-    // Three steps of 32 numbers are two rows, so the places repeat every two rows.
-#pragma unroll
-    for (int step = 0; step < 3; ++step) {
-      const int row = (lane + step * kWarp) / kLength, column = (lane + step * kWarp) % kLength;
-#pragma unroll
-      for (int pair = 0; pair < kWarp / 2; ++pair) visit(row + 2 * pair, column);
-    }
-  } else {
-    const int length = kLength != 0 ? kLength : run_time_length;
-    int row = 0, column = lane;
-    while (column >= length) column -= length, ++row;
-    while (row < kWarp) {
-      visit(row, column);
-      column += kWarp;
-      while (column >= length) column -= length, ++row;
-    }
-  }
-}
-
-// Copies the rows that `rows` marks from global memory to the warp's rows in shared memory.
-template <int kLength> __device__ void load_rows(const float* from, float* to, int length, unsigned rows, int lane) {
-  if (kLength != 0) length = kLength;
-  for_each_row_element<kLength>(lane, length, [&](int row, int column) {
-    if (rows >> row & 1)
-      __pipeline_memcpy_async(to + row * row_stride(length) + column, from + row * length + column, 4);
-  });
-  __pipeline_commit();
-}
-
-// Waits for the rows, and for all lanes.
-inline __device__ void wait_for_rows() {
-  __pipeline_wait_prior(0);
-  __syncwarp();
-}
-
-// Writes the warp's rows from shared memory, the first `count` of them.
-template <int kLength> __device__ void store_rows(const float* from, float* to, int length, int count, int lane) {
-  if (kLength != 0) length = kLength;
-  __syncwarp();
-  for_each_row_element<kLength>(lane, length, [&](int row, int column) {
-    if (row < count) to[row * length + column] = from[row * row_stride(length) + column];
-  });
 }
 
 // The inputs and gradients of Gaussian i alone, as number 0.

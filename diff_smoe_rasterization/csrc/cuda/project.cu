@@ -32,30 +32,37 @@ __global__ void __launch_bounds__(kRowsBlock)
     project_kernel(const __grid_constant__ GaussianInputs<S> inputs, const DeviceCamera<S> device_camera,
                    const RasterConfig<S> config, const SavedForward<S> saved, int32_t* radii, const DepthKeys<S> keys) {
   __shared__ Camera<S> camera;
-  extern __shared__ float sh_rows[];
+  extern __shared__ float4 shared_rows[];
+  const int64_t i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  const bool exists = i < inputs.num_gaussians;
+  auto own = inputs_of(inputs, config.num_channels, exists ? i : 0);
+  Rows::specialise(own);
+  InputRegisters<S, Rows> registers;
+  registers.take(own, true);
   load_camera(device_camera, camera);
   __syncthreads();
-
-  const int64_t i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
-  const int lane = threadIdx.x % kWarp;
-  const bool exists = i < inputs.num_gaussians;
-  auto gaussian_inputs = inputs_of(inputs, config.num_channels, exists ? i : 0);
-  Rows::specialise(gaussian_inputs);
   ProjectedGaussian<S> gaussian;
-  int32_t radius = exists ? project_shape(gaussian_inputs, camera, config, 0, gaussian) : 0;
+  int32_t radius = exists ? project_shape(own, camera, config, 0, gaussian) : 0;
+  S sh[Rows::kKnown ? Rows::kLength : 1];
   if constexpr (Rows::kStaged) {
-    const int length = 3 * gaussian_inputs.num_sh;
-    float* rows = sh_rows + threadIdx.x / kWarp * (kWarp * row_stride(length));
-    load_rows<Rows::kLength>(inputs.shs + (i - lane) * length, rows, length, __ballot_sync(kAllLanes, radius > 0),
-                             lane);
-    gaussian_inputs.shs = rows + lane * row_stride(length);
+    const int length = 3 * own.num_sh;
+    const int64_t first = i - lane;
+    const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length,
+                    static_cast<int>(min<int64_t>(kWarp, inputs.num_gaussians - first)), lane);
+    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, radius > 0));
+    wait_for_copies();
+    own.shs = rows.own();
+    if constexpr (Rows::kKnown) {
+      rows.read(sh);
+      own.shs = sh;
+    }
   }
-  if (radius > 0) saved.projected[i] = gaussian;
-  if constexpr (Rows::kStaged) wait_for_rows();
   if (!exists) return;
   if (radius > 0) {
     S* features = saved.features + i * feature_stride(config.num_features());
-    if (!write_features<kFeatures>(gaussian_inputs, camera, config, gaussian.depth, features)) radius = 0;
+    if (!write_features<kFeatures>(own, camera, config, gaussian.depth, features)) radius = 0;
+    saved.projected[i] = gaussian;
   }
   radii[i] = radius;
   keys.gaussians[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
@@ -75,8 +82,8 @@ void project(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, con
              const SavedForward<S>& saved, const ImageOutputs<S>& images, const DepthKeys<S>& keys,
              cudaStream_t stream) {
   if (inputs.num_gaussians == 0) return;
-  dispatch_sh_rows(inputs, [&](auto rows, size_t shared) {
-    using Rows = decltype(rows);
+  dispatch_sh_rows(inputs, true, [&](auto type, size_t shared) {
+    using Rows = typename decltype(type)::type;
     const auto launch = [&](auto kernel) {
       kernel<<<blocks_for(inputs.num_gaussians, kRowsBlock), kRowsBlock, shared, stream>>>(inputs, camera, config,
                                                                                            saved, images.radii, keys);

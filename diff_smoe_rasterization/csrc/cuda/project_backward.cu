@@ -40,102 +40,204 @@ template <class S> __device__ void set_zero(const GaussianGradients<S>& g, int n
   set_zero(g.shs, 3 * num_sh);
 }
 
-// Number k of Gaussian i's record: what was added to it, or the sum over its slots.
+// The sum over the warp of the camera's gradients.
 template <class S>
-__device__ S record_number(const ProjectBackwardArguments<S>& arguments, int64_t i, int size, int k) {
-  const S direct = arguments.dL_dgaussians[i * size + k];
-  if (arguments.slots == nullptr || overflows(arguments.saved)) return direct;
-  double sum = direct;
-  for (int64_t slot = arguments.saved.slot_ranges[2 * i] * kSlotsPerInstance;
-       slot < arguments.saved.slot_ranges[2 * i + 1] * kSlotsPerInstance; ++slot) {
-    sum += double(arguments.slots[slot * size + k]);
+__device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, int64_t i,
+                                 const CameraGradient<S>& dL_dcamera, int lane) {
+  const S* numbers = dL_dcamera.view;
+  S* out = arguments.camera_rows + (i / kWarp) * kCameraGradientSize;
+  for (int k = 0; k < kCameraGradientSize; ++k) {
+    const S sum = sum_lanes(numbers[k]);
+    if (lane == 0) out[k] = sum;
   }
-  return static_cast<S>(sum);
 }
 
-// Staged SH rows leave their gradients in the same place.
-template <class S, int kFeatures, bool kCamera, class Rows>
-__global__ void __launch_bounds__(kRowsBlock, sizeof(S) == sizeof(float) && !kCamera ? 5 : 1)
+// Adds a Gaussian's slots to its record, numbers `first` to first + kCount of `size`, where there are slots.
+template <int kCount, class S>
+__device__ void add_slots(const ProjectBackwardArguments<S>& arguments, int64_t i, int size, int first,
+                          S (&record)[kCount]) {
+  if (arguments.slots == nullptr || overflows(arguments.saved)) return;
+  double sums[kCount];
+  for (int k = 0; k < kCount; ++k) sums[k] = record[k];
+  const int64_t end = arguments.saved.slot_ranges[2 * i + 1] * kSlotsPerInstance;
+  for (int64_t slot = arguments.saved.slot_ranges[2 * i] * kSlotsPerInstance; slot < end; ++slot) {
+    for (int k = 0; k < kCount; ++k) sums[k] += double(arguments.slots[slot * size + first + k]);
+  }
+  for (int k = 0; k < kCount; ++k) record[k] = static_cast<S>(sums[k]);
+}
+
+// Numbers `first` to first + kCount of Gaussian i's record.
+template <int kCount, class S>
+__device__ void load_record(const ProjectBackwardArguments<S>& arguments, int64_t i, int size, int first,
+                            S (&record)[kCount]) {
+  for (int k = 0; k < kCount; ++k) record[k] = arguments.dL_dgaussians[i * size + first + k];
+  add_slots(arguments, i, size, first, record);
+}
+
+template <class S> __device__ GateMoments<S> moments_of(const S* record) {
+  return {record[0], record[1], record[2], record[3], record[4], record[5]};
+}
+
+constexpr int kRecordLength = kNumGateMoments + 3;  // of three features
+using RecordRows = WarpRows<kRecordLength>;
+
+// A Gaussian's gradients in registers, zero where nothing is written, and those of its SH rows in shared memory: all
+// lanes hand theirs on together.
+template <class Rows> struct GradientRegisters {
+  float mean[3], mean2D[3], opacity[1], scale[3], rotation[4], dc[3];
+
+  __device__ GaussianGradients<float> pointers(float* sh) {
+    GaussianGradients<float> out;
+    out.means3D = mean, out.means2D = mean2D, out.opacities = opacity, out.scales = scale, out.rotations = rotation;
+    if (Rows::kLength == kShRestLength) out.dc = dc;
+    out.shs = sh;
+    return out;
+  }
+
+  // first: the warp's first Gaussian; rows: of shared memory, which serves the others too.
+  __device__ void store(const GaussianGradients<float>& to, int64_t first, const Rows& rows, int exist,
+                        int lane) const {
+    if (to.shs != nullptr) rows.store(to.shs + first * Rows::kLength);
+    if (lane < exist) {
+      if (to.opacities != nullptr) to.opacities[first + lane] = opacity[0];
+      if (to.rotations != nullptr) {
+        reinterpret_cast<float4*>(to.rotations)[first + lane] =
+            make_float4(rotation[0], rotation[1], rotation[2], rotation[3]);
+      }
+    }
+    __syncwarp();
+    const auto store3 = [&](float* array, const float(&values)[3], int place) {
+      if (array == nullptr) return;
+      const WarpRows<3> threes(rows.memory() + place * 3 * kWarp, 3, exist, lane);
+      threes.write(values);
+      threes.store(array + 3 * first);
+    };
+    store3(to.means3D, mean, 0), store3(to.means2D, mean2D, 1), store3(to.scales, scale, 2);
+    if (Rows::kLength == kShRestLength) store3(to.dc, dc, 3);
+  }
+};
+
+// The common case: SH rows and records come through shared memory, and everything else lives in registers.
+template <bool kCamera, class Rows>
+__global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
+    known_backward_kernel(const __grid_constant__ ProjectBackwardArguments<float> arguments) {
+  __shared__ Camera<float> camera;
+  extern __shared__ float4 shared_rows[];
+  const int64_t count = arguments.inputs.num_gaussians, i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  const int64_t first = i - lane;
+  const int exist = static_cast<int>(max<int64_t>(0, min<int64_t>(kWarp, count - first)));
+  const bool seen = lane < exist && arguments.radii[i] > 0;
+  load_camera(arguments.camera, camera);
+  __syncthreads();
+
+  RasterConfig<float> config = arguments.config;
+  config.num_channels = 3, config.depth = false, config.inverse_depth = false;
+  auto inputs = inputs_of(arguments.inputs, config.num_channels, seen ? i : 0);
+  Rows::specialise(inputs);
+  float* memory = reinterpret_cast<float*>(shared_rows) +
+                  warp * kWarp * (Rows::stride(Rows::kLength) + RecordRows::stride(kRecordLength));
+  const Rows rows(memory, Rows::kLength, exist, lane);
+  const RecordRows records(memory + kWarp * Rows::stride(Rows::kLength), kRecordLength, exist, lane);
+  const unsigned all_seen = __ballot_sync(kAllLanes, seen);
+  records.load(arguments.dL_dgaussians + first * kRecordLength, all_seen);
+  rows.load(arguments.inputs.shs + first * Rows::kLength, all_seen);
+  InputRegisters<float, Rows> registers;
+  registers.take(inputs, seen);
+  ProjectedGaussian<float> gaussian;
+  float4 features;
+  if (seen) {
+    gaussian = arguments.saved.projected[i];
+    features = reinterpret_cast<const float4*>(arguments.saved.features)[i];
+  }
+  wait_for_copies();
+
+  GradientRegisters<Rows> gradients = {};
+  CameraGradient<float> dL_dcamera = {};
+  float sh[Rows::kLength], dL_dsh[Rows::kLength] = {};
+  if (seen) {
+    CameraGradient<float>* to_camera = kCamera ? &dL_dcamera : nullptr;
+    const auto to = gradients.pointers(dL_dsh);
+    float record[kRecordLength];
+    records.read(record);
+    add_slots(arguments, i, kRecordLength, 0, record);
+    const float color[3] = {features.x, features.y, features.z};
+    rows.read(sh);
+    inputs.shs = sh;
+    const auto from_color =
+        project_color_backward(inputs, camera, config, 0, color, record + kNumGateMoments, to, to_camera);
+    rows.write(dL_dsh);  // the row's registers are free from here on
+    project_shape_backward(inputs, camera, config, 0,
+                           {moments_backward(gaussian.conic, gaussian.opacity, moments_of(record)), nullptr},
+                           from_color, to, to_camera);
+  } else {
+    rows.write(dL_dsh);
+  }
+  gradients.store(arguments.gradients, first, rows, exist, lane);
+  if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
+}
+
+// Every other case. Staged SH rows leave their gradients in the same place.
+template <class S, bool kCamera, class Rows>
+__global__ void __launch_bounds__(kRowsBlock)
     project_backward_kernel(const __grid_constant__ ProjectBackwardArguments<S> arguments) {
   __shared__ Camera<S> camera;
-  extern __shared__ float sh_rows[];
+  extern __shared__ float4 shared_rows[];
   load_camera(arguments.camera, camera);
   __syncthreads();
 
   const int64_t count = arguments.inputs.num_gaussians, i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
-  const int lane = threadIdx.x % kWarp;
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const bool exists = i < count;
-  RasterConfig<S> config = arguments.config;
-  if constexpr (kFeatures == 3) config.num_channels = 3, config.depth = false, config.inverse_depth = false;
+  const RasterConfig<S>& config = arguments.config;
   const int num_features = config.num_features();
   auto inputs = inputs_of(arguments.inputs, config.num_channels, exists ? i : 0);
-  Rows::specialise(inputs);
   const int length = 3 * inputs.num_sh;
   auto gradients = gradients_of(arguments.gradients, config.num_channels, inputs.num_sh, exists ? i : 0);
   const bool seen = exists && arguments.radii[i] > 0;
-  float* rows = sh_rows + threadIdx.x / kWarp * (kWarp * row_stride(length));
-  float* row = rows + lane * row_stride(length);
+  const int64_t first = i - lane;
+  const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length,
+                  static_cast<int>(max<int64_t>(0, min<int64_t>(kWarp, count - first))), lane);
   if constexpr (Rows::kStaged) {
-    load_rows<Rows::kLength>(arguments.inputs.shs + (i - lane) * length, rows, length, __ballot_sync(kAllLanes, seen),
-                             lane);
-    inputs.shs = row;
-    if (gradients.shs != nullptr) gradients.shs = row;
+    rows.load(arguments.inputs.shs + first * length, __ballot_sync(kAllLanes, seen));
+    inputs.shs = rows.own();
+    if (gradients.shs != nullptr) gradients.shs = rows.own();
   }
 
   const ProjectedGaussian<S> gaussian = arguments.saved.projected[seen ? i : 0];
   const S* features = arguments.saved.features + i * feature_stride(num_features);
-  GateMoments<S> moments;
-  S known_features[kFeatures == 3 ? 3 : 1], known_gradients[kFeatures == 3 ? 3 : 1];
-  const S* dL_dfeatures = known_gradients;
+  S moments[kNumGateMoments];
+  S* dL_dfeatures = arguments.dL_dfeature_rows + i * num_features;
   if (seen) {
     const int size = kNumGateMoments + num_features;
-    moments.one = record_number(arguments, i, size, 0), moments.x = record_number(arguments, i, size, 1);
-    moments.y = record_number(arguments, i, size, 2), moments.xx = record_number(arguments, i, size, 3);
-    moments.xy = record_number(arguments, i, size, 4), moments.yy = record_number(arguments, i, size, 5);
-    if constexpr (kFeatures == 3) {
-      for (int f = 0; f < 3; ++f) {
-        known_features[f] = features[f];
-        known_gradients[f] = record_number(arguments, i, size, kNumGateMoments + f);
-      }
-      features = known_features;
-    } else {
-      S* summed = arguments.dL_dfeature_rows + i * num_features;
-      for (int f = 0; f < num_features; ++f) summed[f] = record_number(arguments, i, size, kNumGateMoments + f);
-      dL_dfeatures = summed;
+    load_record(arguments, i, size, 0, moments);
+    for (int f = 0; f < num_features; ++f) {
+      S number[1];
+      load_record(arguments, i, size, kNumGateMoments + f, number);
+      dL_dfeatures[f] = number[0];
     }
   }
-  if constexpr (Rows::kStaged) wait_for_rows();
+  if constexpr (Rows::kStaged) wait_for_copies();
 
   CameraGradient<S> dL_dcamera = {};
   if (seen) {
+    // Coefficients above the active degree have no gradient.
     if constexpr (Rows::kStaged) {
-      // Coefficients above the active degree have no gradient.
       const int active = 3 * (sh_coefficients(inputs.sh_degree) - (inputs.dc != nullptr));
-      for (int k = active; k < length; ++k) row[k] = 0.0f;
+      for (int k = active; k < length; ++k) rows.own()[k] = 0.0f;
     } else if (gradients.shs != nullptr) {
       set_zero(gradients.shs, length);
     }
     project_gaussian_backward(inputs, camera, config, 0, features,
-                              {moments_backward(gaussian.conic, gaussian.opacity, moments), dL_dfeatures}, gradients,
-                              kCamera ? &dL_dcamera : nullptr);
+                              {moments_backward(gaussian.conic, gaussian.opacity, moments_of(moments)), dL_dfeatures},
+                              gradients, kCamera ? &dL_dcamera : nullptr);
   } else if (exists) {
     set_zero(gradients, config.num_channels, inputs.num_sh);
   }
   if constexpr (Rows::kStaged) {
-    if (arguments.gradients.shs != nullptr) {
-      const int64_t first = i - lane;
-      const int here = static_cast<int>(count - first < kWarp ? count - first : kWarp);
-      store_rows<Rows::kLength>(rows, arguments.gradients.shs + first * length, length, here, lane);
-    }
+    if (arguments.gradients.shs != nullptr) rows.store(arguments.gradients.shs + first * length);
   }
-  if constexpr (kCamera) {
-    const S* numbers = dL_dcamera.view;
-    S* out = arguments.camera_rows + (i / kWarp) * kCameraGradientSize;
-    for (int k = 0; k < kCameraGradientSize; ++k) {
-      const S sum = sum_lanes(numbers[k]);
-      if (lane == 0) out[k] = sum;
-    }
-  }
+  if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
 }
 
 }  // namespace
@@ -150,22 +252,24 @@ void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& ca
   const int64_t blocks = blocks_for(inputs.num_gaussians, kRowsBlock), warps = blocks * (kRowsBlock / kWarp);
   if (with_camera) arguments.camera_rows = allocate<S>(scratch, warps * kCameraGradientSize);
   if (inputs.num_gaussians > 0) {
-    dispatch_sh_rows(inputs, [&](auto rows, size_t shared) {
-      using Rows = decltype(rows);
-      const auto launch = [&](auto kernel) {
-        kernel<<<static_cast<unsigned>(blocks), kRowsBlock, shared, stream>>>(arguments);
+    const bool aligned =
+        config.num_features() == 3 && are_vector_aligned(dL_dgaussians, gradients.shs, gradients.dc, gradients.means3D,
+                                                         gradients.means2D, gradients.scales, gradients.rotations);
+    dispatch_sh_rows(inputs, aligned, [&](auto type, size_t shared) {
+      using Rows = typename decltype(type)::type;
+      const auto launch = [&](auto kernel, size_t shared_bytes) {
+        kernel<<<static_cast<unsigned>(blocks), kRowsBlock, shared_bytes, stream>>>(arguments);
         DSMOE_CHECK_LAUNCH("project_backward");
       };
-      if constexpr (Rows::kStaged) {
-        if (config.num_features() == 3) {
-          with_camera ? launch(project_backward_kernel<S, 3, true, Rows>)
-                      : launch(project_backward_kernel<S, 3, false, Rows>);
-          return;
-        }
+      if constexpr (Rows::kKnown) {
+        shared += sizeof(float) * kRowsBlock * RecordRows::stride(kRecordLength);
+        with_camera ? launch(known_backward_kernel<true, Rows>, shared)
+                    : launch(known_backward_kernel<false, Rows>, shared);
+      } else {
+        arguments.dL_dfeature_rows = allocate<S>(scratch, inputs.num_gaussians * config.num_features());
+        with_camera ? launch(project_backward_kernel<S, true, Rows>, shared)
+                    : launch(project_backward_kernel<S, false, Rows>, shared);
       }
-      arguments.dL_dfeature_rows = allocate<S>(scratch, inputs.num_gaussians * config.num_features());
-      with_camera ? launch(project_backward_kernel<S, 0, true, Rows>)
-                  : launch(project_backward_kernel<S, 0, false, Rows>);
     });
   }
   if (with_camera) {

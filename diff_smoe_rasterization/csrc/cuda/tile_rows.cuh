@@ -68,17 +68,18 @@ struct alignas(16) TileRow {
 };
 constexpr int32_t kFirstRow = 1, kLastRow = 2;
 
-template <class S> class WarpRows {
+template <class S> class WarpTileRows {
  public:
   // The lane's own Gaussian; no rows where its reach is negative.
-  __device__ WarpRows(int32_t gaussian, const ProjectedGaussian<S>& projected, TileRect bounds, int columns, int lane)
+  __device__ WarpTileRows(int32_t gaussian, const ProjectedGaussian<S>& projected, TileRect bounds, int columns,
+                          int lane)
       : tiles_(projected.conic, projected.mean, projected.squared_reach, bounds),
         gaussian_(gaussian),
         columns_(columns),
-        line_(tiles_.end() - tiles_.begin(), lane) {}
+        line_(max(0, tiles_.end() - tiles_.begin()), lane) {}
 
   __device__ unsigned total() const { return line_.total; }
-  __device__ bool lane_has_none() const { return tiles_.end() == tiles_.begin(); }
+  __device__ bool lane_has_none() const { return tiles_.end() <= tiles_.begin(); }
 
   // Row k of all; all lanes take part.
   __device__ TileRow at(unsigned k) const {

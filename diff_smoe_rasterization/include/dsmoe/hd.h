@@ -1,12 +1,14 @@
-// One qualifier for functions that run on host and device, and the scalar functions that the math needs.
+// Qualifiers for functions that run on host and device, and the scalar functions that the math needs.
 #pragma once
 
 #include <cmath>
 
 #if defined(__CUDACC__)
 #define DSMOE_HD __host__ __device__ __forceinline__
+#define DSMOE_UNROLL _Pragma("unroll")  // in kernels: keeps arrays in registers
 #else
 #define DSMOE_HD inline __attribute__((always_inline))
+#define DSMOE_UNROLL
 #endif
 
 namespace dsmoe {

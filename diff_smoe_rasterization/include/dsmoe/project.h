@@ -126,12 +126,39 @@ template <class S> struct ProjectedGradient {
   const S* features;  // [F]
 };
 
-// Writes the gradients of Gaussian i, and adds its share of the camera's where that is wanted.
+// Writes the gradients of Gaussian i's colours; returns dL/dmean by way of them.
 template <class S>
-DSMOE_HD void project_gaussian_backward(const GaussianInputs<S>& in, const Camera<S>& camera,
+DSMOE_HD Vec3<S> project_color_backward(const GaussianInputs<S>& in, const Camera<S>& camera,
                                         const RasterConfig<S>& config, int64_t i, const S* features,
-                                        const ProjectedGradient<S>& g, const GaussianGradients<S>& out,
+                                        const S* dL_dfeatures, const GaussianGradients<S>& out,
                                         CameraGradient<S>* dL_dcamera) {
+  if (in.colors_precomp != nullptr) {
+    if (out.colors_precomp != nullptr) {
+      for (int c = 0; c < config.num_channels; ++c) out.colors_precomp[i * config.num_channels + c] = dL_dfeatures[c];
+    }
+    return {S(0), S(0), S(0)};
+  }
+  ShCoefficients<S> dL_dsh = {out.dc != nullptr ? out.dc + 3 * i : nullptr, nullptr};
+  if (out.shs != nullptr) {
+    S* shs = out.shs + i * 3 * in.num_sh;
+    if (in.dc == nullptr) dL_dsh.dc = shs, shs += 3;
+    dL_dsh.rest = shs;
+  }
+  const Vec3<S> dL_dmean = sh_color_backward(in.sh_degree, load3(in.means3D + 3 * i), camera.position, sh_of(in, i),
+                                             features, dL_dfeatures, dL_dsh);
+  if (dL_dcamera != nullptr) {
+    S* position = dL_dcamera->position;
+    position[0] -= dL_dmean.x, position[1] -= dL_dmean.y, position[2] -= dL_dmean.z;
+  }
+  return dL_dmean;
+}
+
+// Writes all its other gradients; from_color is what the function above returns.
+template <class S>
+DSMOE_HD void project_shape_backward(const GaussianInputs<S>& in, const Camera<S>& camera,
+                                     const RasterConfig<S>& config, int64_t i, const ProjectedGradient<S>& g,
+                                     Vec3<S> from_color, const GaussianGradients<S>& out,
+                                     CameraGradient<S>* dL_dcamera) {
   const Vec3<S> mean = load3(in.means3D + 3 * i);
   const Vec3<S> view = transform_point(camera.view, mean);
   const auto jacobian = projection_jacobian(camera, view);
@@ -184,30 +211,22 @@ DSMOE_HD void project_gaussian_backward(const GaussianInputs<S>& in, const Camer
                               dL_dviewmatrix);
   }
 
-  if (in.colors_precomp != nullptr) {
-    if (out.colors_precomp != nullptr) {
-      for (int c = 0; c < config.num_channels; ++c) out.colors_precomp[i * config.num_channels + c] = g.features[c];
-    }
-  } else {
-    ShCoefficients<S> dL_dsh = {out.dc != nullptr ? out.dc + 3 * i : nullptr, nullptr};
-    if (out.shs != nullptr) {
-      S* shs = out.shs + i * 3 * in.num_sh;
-      if (in.dc == nullptr) dL_dsh.dc = shs, shs += 3;
-      dL_dsh.rest = shs;
-    }
-    const Vec3<S> from_color =
-        sh_color_backward(in.sh_degree, mean, camera.position, sh_of(in, i), features, g.features, dL_dsh);
-    dL_dmean = dL_dmean + from_color;
-    if (dL_dcamera != nullptr) {
-      S* position = dL_dcamera->position;
-      position[0] -= from_color.x, position[1] -= from_color.y, position[2] -= from_color.z;
-    }
-  }
+  dL_dmean = dL_dmean + from_color;
   if (out.means3D != nullptr) store3(out.means3D + 3 * i, dL_dmean);
   if (out.means2D != nullptr) {
     store3<S>(out.means2D + 3 * i,
               {g.gate.mean.x * S(0.5) * S(camera.width), g.gate.mean.y * S(0.5) * S(camera.height), S(0)});
   }
+}
+
+// Writes the gradients of Gaussian i, and adds its share of the camera's where that is wanted.
+template <class S>
+DSMOE_HD void project_gaussian_backward(const GaussianInputs<S>& in, const Camera<S>& camera,
+                                        const RasterConfig<S>& config, int64_t i, const S* features,
+                                        const ProjectedGradient<S>& g, const GaussianGradients<S>& out,
+                                        CameraGradient<S>* dL_dcamera) {
+  const Vec3<S> from_color = project_color_backward(in, camera, config, i, features, g.features, out, dL_dcamera);
+  project_shape_backward(in, camera, config, i, g, from_color, out, dL_dcamera);
 }
 
 }  // namespace dsmoe

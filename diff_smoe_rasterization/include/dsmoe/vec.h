@@ -48,6 +48,7 @@ template <class S> DSMOE_HD bool is_finite(Vec3<S> v) { return is_finite(v.x) &&
 template <class S> DSMOE_HD bool all_finite(const S* values, int count) {
   S poison[4] = {S(0), S(0), S(0), S(0)};
   int i = 0;
+  DSMOE_UNROLL
   for (; i + 4 <= count; i += 4) {
     for (int k = 0; k < 4; ++k) poison[k] += S(0) * values[i + k];
   }
