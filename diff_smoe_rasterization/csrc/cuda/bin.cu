@@ -136,21 +136,22 @@ __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_con
   }
 }
 
-// The first instance of each tile, by bisection of the sorted keys.
+// The first instance of each tile. A warp looks for one of them: it cuts what is left of the sorted keys into 32 parts,
+// and goes on in the first that ends at the tile or behind.
 template <class Key>
 __global__ void tile_offsets_kernel(int64_t tiles, int64_t capacity, const Key* keys, int64_t* offsets) {
-  const int64_t tile = int64_t(blockIdx.x) * kBlock + threadIdx.x;
+  const int64_t tile = (int64_t(blockIdx.x) * kBlock + threadIdx.x) / kWarp;
+  const int lane = threadIdx.x % kWarp;
   if (tile > tiles) return;
   int64_t low = 0, high = capacity;
   while (low < high) {
-    const int64_t middle = (low + high) / 2;
-    if (static_cast<int64_t>(keys[middle]) < tile) {
-      low = middle + 1;
-    } else {
-      high = middle;
-    }
+    const int64_t part = (high - low + kWarp - 1) / kWarp, last = min(low + (lane + 1) * part, high) - 1;
+    const bool before = static_cast<int64_t>(keys[last]) < tile;
+    const int parts_before = __popc(__ballot_sync(kAllLanes, before));
+    low = min(low + parts_before * part, high);
+    high = min(low + part - 1, high);
   }
-  offsets[tile] = low;
+  if (lane == 0) offsets[tile] = low;
 }
 
 __global__ void pair_with_slots_kernel(int64_t capacity, const int64_t* num_instances, const int32_t* slots,
@@ -178,6 +179,12 @@ template <class Key, class S> void list_instances(ListArguments<S, Key> list, Sc
   list.look_back = {states, reinterpret_cast<unsigned*>(states + blocks)};
   list_instances_kernel<<<blocks, kBlock, 0, stream>>>(list);
   DSMOE_CHECK_LAUNCH("list_instances");
+}
+
+// Calls launch with a key of the type that holds every tile, and one above them. Whoever counts and whoever lists get
+// the same, so that they run the same code.
+template <class Launch> void dispatch_keys(int64_t tiles, Launch launch) {
+  tiles < std::numeric_limits<uint16_t>::max() ? launch(uint16_t()) : launch(uint32_t());
 }
 
 template <class Key, class S>
@@ -221,8 +228,8 @@ void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCo
       DSMOE_CHECK_LAUNCH("pair_with_slots");
     }
   }
-  tile_offsets_kernel<<<blocks_for(tiles + 1, kBlock), kBlock, 0, stream>>>(tiles, capacity, sorted_keys,
-                                                                            saved.tile_offsets);
+  tile_offsets_kernel<<<blocks_for((tiles + 1) * kWarp, kBlock), kBlock, 0, stream>>>(tiles, capacity, sorted_keys,
+                                                                                      saved.tile_offsets);
   DSMOE_CHECK_LAUNCH("tile_offsets");
 }
 
@@ -251,17 +258,16 @@ void count_instances(int64_t num_gaussians, const DeviceCamera<S>& camera, const
                      const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream) {
   auto counted = saved;
   counted.slot_ranges = nullptr;
-  list_instances(list_arguments<uint32_t>(num_gaussians, camera, config, counted, radii), scratch, stream);
+  dispatch_keys(num_tiles(camera.width, camera.height), [&](auto key) {
+    list_instances(list_arguments<decltype(key)>(num_gaussians, camera, config, counted, radii), scratch, stream);
+  });
 }
 
 template <class S>
 void bin(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
          const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream) {
-  if (num_tiles(camera.width, camera.height) < std::numeric_limits<uint16_t>::max()) {
-    bin_by<uint16_t>(num_gaussians, camera, config, saved, radii, scratch, stream);
-  } else {
-    bin_by<uint32_t>(num_gaussians, camera, config, saved, radii, scratch, stream);
-  }
+  dispatch_keys(num_tiles(camera.width, camera.height),
+                [&](auto key) { bin_by<decltype(key)>(num_gaussians, camera, config, saved, radii, scratch, stream); });
 }
 
 #define DSMOE_INSTANTIATE(S)                                                                                         \
