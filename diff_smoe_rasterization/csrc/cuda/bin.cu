@@ -17,7 +17,7 @@ namespace {
 
 constexpr int kBlock = 256;
 constexpr int kWarps = kBlock / kWarp;
-constexpr int kKeptRows = 128;              // rows of tiles of a warp that are kept between counting and listing
+constexpr int kKeptRows = 96;               // rows of tiles of a warp that are kept between counting and listing
 constexpr int64_t kEnoughWarps = 32 * 132;  // where fewer warps would do, each takes fewer Gaussians
 
 // Runs a CUB algorithm: it says how much memory it needs, gets it, and works.
@@ -39,31 +39,24 @@ template <class S, class Key> struct ListArguments {
   Key* keys;             // [capacity] tile
   int32_t* values;       // [capacity] what goes along: the Gaussian, or the slot where gradients go by slot
   int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
-
-  __device__ void write(int64_t slot, int32_t gaussian, uint32_t tile) const {
-    keys[slot] = static_cast<Key>(tile);
-    if (slot_owners != nullptr) slot_owners[slot] = gaussian;
-    values[slot] = slot_owners != nullptr ? static_cast<int32_t>(slot) : gaussian;
-  }
 };
 
 // The rows of tiles of the Gaussians whose turn it is; `position` is the lane's in the depth order.
 template <class S, class Key>
-__device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t position, int lane) {
+__device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t position,
+                                   typename WarpTileRows<S>::Shared* shared, int lane) {
   const bool exists = lane < list.gaussians_per_warp && position < list.num_gaussians;
   const int32_t gaussian = exists ? list.saved.order[position] : -1;
-  ProjectedGaussian<S> projected = {};
-  projected.squared_reach = S(-1);
-  TileRect bounds = {};
+  FootprintTiles<S> tiles;
   if (gaussian >= 0) {
-    projected = list.saved.projected[gaussian];
-    bounds = footprint_bounds(list.mode, list.width, list.height, projected.mean, list.radii, gaussian);
+    const ProjectedGaussian<S> projected = list.saved.projected[gaussian];
+    const TileRect bounds = footprint_bounds(list.mode, list.width, list.height, projected.mean, list.radii, gaussian);
+    tiles = {projected.conic, projected.mean, projected.squared_reach, bounds};
   }
-  const WarpTileRows<S> rows(gaussian, projected, bounds, list.columns, lane);
-  if (list.saved.slot_ranges != nullptr && gaussian >= 0 && rows.lane_has_none()) {
+  if (list.saved.slot_ranges != nullptr && gaussian >= 0 && tiles.end() <= tiles.begin()) {
     list.saved.slot_ranges[2 * int64_t(gaussian)] = list.saved.slot_ranges[2 * int64_t(gaussian) + 1] = 0;
   }
-  return rows;
+  return {gaussian, tiles, list.columns, shared, lane};
 }
 
 // Lists a row a lane from `slot` on, but not beyond `end`. Lanes that write together write side by side.
@@ -75,17 +68,24 @@ __device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row,
     if (row.ends & kFirstRow) range[0] = slot + instances.begin;
     if (row.ends & kLastRow) range[1] = slot + instances.begin + row.width;
   }
-  for (unsigned k = lane; k - lane < instances.total; k += kWarp) {
+  const unsigned fit = static_cast<unsigned>(max<int64_t>(0, min<int64_t>(end - slot, instances.total)));
+  Key* keys = list.keys + slot;
+  int32_t* values = list.values + slot;
+  for (unsigned k = lane; k - lane < fit; k += kWarp) {
     const int owner = instances.owner(k);
     const uint32_t tile = from_lane(row.tile - instances.begin, owner) + k;
     const int32_t gaussian = from_lane(row.gaussian, owner);
-    if (k < instances.total && slot + k < end) list.write(slot + k, gaussian, tile);
+    if (k >= fit) continue;
+    keys[k] = static_cast<Key>(tile);
+    values[k] = list.slot_owners != nullptr ? static_cast<int32_t>(slot + k) : gaussian;
+    if (list.slot_owners != nullptr) list.slot_owners[slot + k] = gaussian;
   }
   slot += instances.total;
 }
 
 template <class S, class Key>
 __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_constant__ ListArguments<S, Key> list) {
+  __shared__ typename WarpTileRows<S>::Shared tiles[kBlock];
   __shared__ TileRow kept_rows[kKeptRows / kWarp][kBlock];
   __shared__ unsigned shared_block;
   __shared__ unsigned long long counts[kWarps], shared_before;
@@ -93,7 +93,8 @@ __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_con
   __syncthreads();
   const unsigned block = shared_block;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  const auto rows = rows_at(list, (int64_t(block) * kWarps + warp) * list.gaussians_per_warp + lane, lane);
+  const auto rows =
+      rows_at(list, (int64_t(block) * kWarps + warp) * list.gaussians_per_warp + lane, tiles + warp * kWarp, lane);
 
   // Twice over the rows: to count their tiles, then to list them. One loop serves both, so that both find the same.
   int64_t slot = 0, end = 0;
@@ -102,8 +103,8 @@ __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_con
     unsigned long long count = 0;
 #pragma unroll 1
     for (unsigned first = 0; first < rows.total(); first += kWarp) {
-      TileRow& kept = kept_rows[first / kWarp % (kKeptRows / kWarp)][threadIdx.x];
       const bool keep = first < kKeptRows;
+      TileRow& kept = kept_rows[keep ? first / kWarp : 0][threadIdx.x];
       const TileRow row = listing && keep ? kept : rows.at(first + lane);
       if (listing) {
         list_rows(list, row, slot, end, lane);

@@ -19,18 +19,7 @@ __device__ TileRect footprint_bounds(BlendMode mode, int width, int height, Vec2
   return tile_bounds(mode, camera, mean, is_smoe(mode) ? S(0) : S(radii[gaussian]));
 }
 
-// What `lane` has, word by word.
-template <class T> __device__ T from_lane(const T& value, int lane) {
-  constexpr int kWords = sizeof(T) / sizeof(unsigned);
-  static_assert(sizeof(T) == kWords * sizeof(unsigned), "whole words");
-  unsigned words[kWords];
-  memcpy(words, &value, sizeof(T));
-#pragma unroll
-  for (int k = 0; k < kWords; ++k) words[k] = __shfl_sync(kAllLanes, words[k], lane);
-  T result = value;
-  memcpy(&result, words, sizeof(T));
-  return result;
-}
+template <class T> __device__ T from_lane(T value, int lane) { return __shfl_sync(kAllLanes, value, lane); }
 
 // Items of all lanes in one line, lane by lane: where each lane's items begin, and how many there are.
 class WarpLine {
@@ -70,24 +59,28 @@ constexpr int32_t kFirstRow = 1, kLastRow = 2;
 
 template <class S> class WarpTileRows {
  public:
-  // The lane's own Gaussian; no rows where its reach is negative.
-  __device__ WarpTileRows(int32_t gaussian, const ProjectedGaussian<S>& projected, TileRect bounds, int columns,
-                          int lane)
-      : tiles_(projected.conic, projected.mean, projected.squared_reach, bounds),
-        gaussian_(gaussian),
-        columns_(columns),
-        line_(max(0, tiles_.end() - tiles_.begin()), lane) {}
+  // A lane's tiles in shared memory, for all lanes to read; so far apart that lanes meet no bank twice.
+  struct alignas(16) Shared {
+    unsigned char tiles[sizeof(FootprintTiles<S>) + 16];
+  };
+
+  // gaussian and its tiles: the lane's own. shared: [32] the warp's.
+  __device__ WarpTileRows(int32_t gaussian, const FootprintTiles<S>& tiles, int columns, Shared* shared, int lane)
+      : gaussian_(gaussian), columns_(columns), shared_(shared), line_(max(0, tiles.end() - tiles.begin()), lane) {
+    memcpy(shared[lane].tiles, &tiles, sizeof(tiles));
+    __syncwarp();
+  }
 
   __device__ unsigned total() const { return line_.total; }
-  __device__ bool lane_has_none() const { return tiles_.end() <= tiles_.begin(); }
 
   // Row k of all; all lanes take part.
   __device__ TileRow at(unsigned k) const {
     const int owner = line_.owner(k);
     const unsigned row = k - from_lane(line_.begin, owner);
     const int32_t gaussian = from_lane(gaussian_, owner);
-    const FootprintTiles<S> tiles = from_lane(tiles_, owner);
     if (k >= line_.total) return {};
+    FootprintTiles<S> tiles;
+    memcpy(&tiles, shared_[owner].tiles, sizeof(tiles));
     const int y = tiles.begin() + static_cast<int>(row);
     const auto span = tiles.row(y);
     const int32_t ends = (row == 0 ? kFirstRow : 0) | (y + 1 == tiles.end() ? kLastRow : 0);
@@ -95,9 +88,9 @@ template <class S> class WarpTileRows {
   }
 
  private:
-  FootprintTiles<S> tiles_;
   int32_t gaussian_;
   int columns_;
+  const Shared* shared_;
   WarpLine line_;
 };
 

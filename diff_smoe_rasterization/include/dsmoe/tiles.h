@@ -45,6 +45,7 @@ template <class S> struct Interval {
 // The ellipse conic.xx u^2 + 2 conic.xy u v + conic.yy v^2 <= reach, centred at 0: its extent in u over a band of v.
 template <class S> class EllipseBand {
  public:
+  EllipseBand() = default;
   DSMOE_HD EllipseBand(const Sym2<S>& conic, S squared_reach) : conic_(conic) {
     reach_ = squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack);
     determinant_ = difference_of_products(conic.xx, conic.yy, conic.xy, conic.xy);
@@ -78,7 +79,8 @@ template <class S> class EllipseBand {
 // The tiles that a footprint meets, row by row, inside bounds.
 template <class S> class FootprintTiles {
  public:
-  // A negative reach meets none.
+  // Meets none; nor does a negative reach.
+  DSMOE_HD FootprintTiles() : begin_(0), end_(0) {}
   DSMOE_HD FootprintTiles(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, TileRect bounds)
       : ellipse_(conic, squared_reach), mean_(mean), bounds_(bounds), begin_(0), end_(0) {
     if (!(squared_reach >= S(0)) || bounds.empty()) return;
