@@ -52,7 +52,8 @@ __device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, i
   }
 }
 
-// Adds a Gaussian's slots to its record, numbers `first` to first + kCount of `size`, where there are slots.
+// Adds a Gaussian's slots to its record, numbers `first` to first + kCount of `size`, where there are slots and as many
+// numbers.
 template <int kCount, class S>
 __device__ void add_slots(const ProjectBackwardArguments<S>& arguments, int64_t i, int size, int first,
                           S (&record)[kCount]) {
@@ -61,7 +62,9 @@ __device__ void add_slots(const ProjectBackwardArguments<S>& arguments, int64_t 
   for (int k = 0; k < kCount; ++k) sums[k] = record[k];
   const int64_t end = arguments.saved.slot_ranges[2 * i + 1] * kSlotsPerInstance;
   for (int64_t slot = arguments.saved.slot_ranges[2 * i] * kSlotsPerInstance; slot < end; ++slot) {
-    for (int k = 0; k < kCount; ++k) sums[k] += double(arguments.slots[slot * size + first + k]);
+    for (int k = 0; k < kCount; ++k) {
+      if (first + k < size) sums[k] += double(arguments.slots[slot * size + first + k]);
+    }
   }
   for (int k = 0; k < kCount; ++k) record[k] = static_cast<S>(sums[k]);
 }
@@ -78,7 +81,8 @@ template <class S> __device__ GateMoments<S> moments_of(const S* record) {
   return {record[0], record[1], record[2], record[3], record[4], record[5]};
 }
 
-constexpr int kRecordLength = kNumGateMoments + 3;  // of three features
+constexpr int kRecordLength = kNumGateMoments + 3;    // of three features
+constexpr int kMostRecordLength = kRecordLength + 2;  // with depth and inverse depth
 using RecordRows = WarpRows<kRecordLength>;
 
 // A Gaussian's gradients in registers, zero where nothing is written, and those of its SH rows in shared memory: all
@@ -117,8 +121,9 @@ template <class Rows> struct GradientRegisters {
   }
 };
 
-// The common case: SH rows and records come through shared memory, and everything else lives in registers.
-template <bool kCamera, class Rows>
+// The common case: SH rows and the records of colours alone come through shared memory, everything else lives in
+// registers.
+template <bool kCamera, bool kColorsAlone, class Rows>
 __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
     known_backward_kernel(const __grid_constant__ ProjectBackwardArguments<float> arguments) {
   __shared__ Camera<float> camera;
@@ -132,7 +137,8 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
   __syncthreads();
 
   RasterConfig<float> config = arguments.config;
-  config.num_channels = 3, config.depth = false, config.inverse_depth = false;
+  config.num_channels = 3;
+  if constexpr (kColorsAlone) config.depth = false, config.inverse_depth = false;
   auto inputs = inputs_of(arguments.inputs, config.num_channels, seen ? i : 0);
   Rows::specialise(inputs);
   float* memory = reinterpret_cast<float*>(shared_rows) +
@@ -140,7 +146,7 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
   const Rows rows(memory, Rows::kLength, exist, lane);
   const RecordRows records(memory + kWarp * Rows::stride(Rows::kLength), kRecordLength, exist, lane);
   const unsigned all_seen = __ballot_sync(kAllLanes, seen);
-  records.load(arguments.dL_dgaussians + first * kRecordLength, all_seen);
+  if constexpr (kColorsAlone) records.load(arguments.dL_dgaussians + first * kRecordLength, all_seen);
   rows.load(arguments.inputs.shs + first * Rows::kLength, all_seen);
   InputRegisters<float, Rows> registers;
   registers.take(inputs, seen);
@@ -148,7 +154,7 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
   float4 features;
   if (seen) {
     gaussian = arguments.saved.projected[i];
-    features = reinterpret_cast<const float4*>(arguments.saved.features)[i];
+    features = *reinterpret_cast<const float4*>(arguments.saved.features + i * feature_stride(config.num_features()));
   }
   wait_for_copies();
 
@@ -158,18 +164,24 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
   if (seen) {
     CameraGradient<float>* to_camera = kCamera ? &dL_dcamera : nullptr;
     const auto to = gradients.pointers(dL_dsh);
-    float record[kRecordLength];
-    records.read(record);
-    add_slots(arguments, i, kRecordLength, 0, record);
+    const int size = kNumGateMoments + config.num_features();
+    float record[kColorsAlone ? kRecordLength : kMostRecordLength];
+    if constexpr (kColorsAlone) {
+      records.read(record);
+    } else {
+      for (int k = 0; k < kMostRecordLength; ++k) record[k] = k < size ? arguments.dL_dgaussians[i * size + k] : 0.0f;
+    }
+    add_slots(arguments, i, size, 0, record);
     const float color[3] = {features.x, features.y, features.z};
     rows.read(sh);
     inputs.shs = sh;
     const auto from_color =
         project_color_backward(inputs, camera, config, 0, color, record + kNumGateMoments, to, to_camera);
     rows.write(dL_dsh);  // the row's registers are free from here on
-    project_shape_backward(inputs, camera, config, 0,
-                           {moments_backward(gaussian.conic, gaussian.opacity, moments_of(record)), nullptr},
-                           from_color, to, to_camera);
+    project_shape_backward(
+        inputs, camera, config, 0,
+        {moments_backward(gaussian.conic, gaussian.opacity, moments_of(record)), record + kNumGateMoments}, from_color,
+        to, to_camera);
   } else {
     rows.write(dL_dsh);
   }
@@ -252,9 +264,8 @@ void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& ca
   const int64_t blocks = blocks_for(inputs.num_gaussians, kRowsBlock), warps = blocks * (kRowsBlock / kWarp);
   if (with_camera) arguments.camera_rows = allocate<S>(scratch, warps * kCameraGradientSize);
   if (inputs.num_gaussians > 0) {
-    const bool aligned =
-        config.num_features() == 3 && are_vector_aligned(dL_dgaussians, gradients.shs, gradients.dc, gradients.means3D,
-                                                         gradients.means2D, gradients.scales, gradients.rotations);
+    const bool aligned = are_vector_aligned(dL_dgaussians, gradients.shs, gradients.dc, gradients.means3D,
+                                            gradients.means2D, gradients.scales, gradients.rotations);
     dispatch_sh_rows(inputs, aligned, [&](auto type, size_t shared) {
       using Rows = typename decltype(type)::type;
       const auto launch = [&](auto kernel, size_t shared_bytes) {
@@ -263,8 +274,13 @@ void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& ca
       };
       if constexpr (Rows::kKnown) {
         shared += sizeof(float) * kRowsBlock * RecordRows::stride(kRecordLength);
-        with_camera ? launch(known_backward_kernel<true, Rows>, shared)
-                    : launch(known_backward_kernel<false, Rows>, shared);
+        if (config.num_features() == 3) {
+          with_camera ? launch(known_backward_kernel<true, true, Rows>, shared)
+                      : launch(known_backward_kernel<false, true, Rows>, shared);
+        } else {
+          with_camera ? launch(known_backward_kernel<true, false, Rows>, shared)
+                      : launch(known_backward_kernel<false, false, Rows>, shared);
+        }
       } else {
         arguments.dL_dfeature_rows = allocate<S>(scratch, inputs.num_gaussians * config.num_features());
         with_camera ? launch(project_backward_kernel<S, true, Rows>, shared)
