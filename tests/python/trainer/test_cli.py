@@ -203,7 +203,15 @@ def interrupt_at(monkeypatch, iteration):
     monkeypatch.setattr(Trainer, "step", interrupted_step)
 
 
-def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def ctrl_c_works():
+    """Programs that a shell starts in the background inherit that Ctrl-C is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works):
     output = str(tmp_path / "out")
     arguments = ["train", scene, "-o", output, "--blend-mode", "smoe", *SHORT]
     with monkeypatch.context() as patch:
