@@ -2,6 +2,7 @@
 #include "../dispatch.h"
 #include "dsmoe/rasterize.h"
 #include "reduce.cuh"
+#include "tensor_sums.cuh"
 #include "tile_walk.cuh"
 
 namespace dsmoe {
@@ -35,15 +36,48 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
+// Whether gradients go to slots, one for each warp that lists a Gaussian, instead of records that warps share.
+template <class S> __device__ bool has_slots(const BackwardArguments<S>& arguments, const WarpTile<S>& tile) {
+  return arguments.slots != nullptr && tile.listed;
+}
+
+template <class S> __device__ int64_t slot_of(const WarpTile<S>& tile, int32_t position) {
+  const uint32_t of_tile = static_cast<uint32_t>(tile.list[2 * int64_t(position) + 1]);
+  return int64_t(of_tile) * kSlotsPerInstance + threadIdx.x / kWarp;
+}
+
+// Adds the first `count` Gaussians of a batch to their records.
+inline __device__ void add_batch(const BackwardArguments<float>& arguments, const WarpTile<float>& tile,
+                                 const TensorStage& stage, const TensorBasis& basis, int count) {
+  __syncwarp();
+  TensorSums sums = sum_pixels(stage, basis, tile.lane);
+  const TensorLane at(tile.lane);
+  const float4 gaussian = stage.gaussians[at.row];
+  recentre(sums, {gaussian.x, gaussian.y}, tile.lane);
+  __syncwarp();
+  if (at.row >= count || at.column >= kTensorFeatures) return;
+  const int moment = 2 * at.column, feature = kNumGateMoments + at.column;
+  if (has_slots(arguments, tile)) {
+    float* record = arguments.slots + slot_of(tile, __float_as_int(gaussian.w)) * kTensorRecord;
+    record[moment] = sums.moments[0], record[moment + 1] = sums.moments[1], record[feature] = sums.feature;
+  } else {
+    float* record = arguments.dL_dgaussians + int64_t(__float_as_int(gaussian.z)) * kTensorRecord;
+    atomicAdd(record + moment, sums.moments[0]);
+    atomicAdd(record + moment + 1, sums.moments[1]);
+    atomicAdd(record + feature, sums.feature);
+  }
+}
+
 // Adds numbers that one warp has summed to the record of a Gaussian, `first` numbers into it.
 template <class S, int kCount>
 __device__ void add_to_record(const BackwardArguments<S>& arguments, const TransposedSum<kCount>& sum,
-                              S (&values)[kCount], int32_t gaussian, int64_t slot, int first, int wanted) {
+                              S (&values)[kCount], const WarpTile<S>& tile, int32_t gaussian, int32_t position,
+                              int first, int wanted) {
   sum(values);
   if (!sum.holds || sum.number >= wanted) return;
   const int record = kNumGateMoments + arguments.num_features;
-  if (slot >= 0) {
-    arguments.slots[slot * record + first + sum.number] = values[0];
+  if (has_slots(arguments, tile)) {
+    arguments.slots[slot_of(tile, position) * record + first + sum.number] = values[0];
   } else {
     atomicAdd(arguments.dL_dgaussians + int64_t(gaussian) * record + first + sum.number, values[0]);
   }
@@ -65,10 +99,17 @@ template <class S> __device__ void column_moments(const S (&dL_dpower)[kLanePixe
 }
 
 template <class S, BlendMode kMode, int kFeatures>
-__global__ void __launch_bounds__(kWarpsPerTile* kWarp)
+__global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatures != kAnyFeatures ? 5 : 1)
     blend_backward_kernel(const __grid_constant__ BackwardArguments<S> arguments) {
   __shared__ StagedGaussian<S> staged[kWarpsPerTile][kWarp];
   __shared__ int32_t staged_gaussian[kWarpsPerTile][kWarp];
+  constexpr bool kTensor = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kTensorFeatures;
+  __shared__ TensorStage tensor_stages[kTensor ? kWarpsPerTile : 1];
+  __shared__ TensorBasis moment_basis;
+  if constexpr (kTensor) {
+    fill_moment_basis(moment_basis);
+    __syncthreads();
+  }
   const WarpTile<S> tile(arguments);
   const int warp = threadIdx.x / kWarp;
   const RasterConfig<S>& config = arguments.config;
@@ -121,6 +162,9 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
     for (int k = 0; k < kLanePixels; ++k) seen = seen > last[k] ? seen : last[k];
     end = max_over_lanes(seen);
   }
+  TensorStage& tensor_stage = tensor_stages[kTensor ? warp : 0];
+  int batch = 0;  // Gaussians that wait in the stage
+  if constexpr (kTensor) fill_gradient_basis(tensor_stage, scaled.values, tile.lane);
   constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
   const TransposedSum<kTogether> sum(tile.lane);
   unsigned hits = 0;
@@ -166,10 +210,20 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
         weight[k] = pair.weight;
         dL_dpower[k] = gate_backward(gate[k], pair.gamma);
       }
-      int64_t slot = -1;
-      if (arguments.slots != nullptr && tile.listed) {
-        const uint32_t of_tile = static_cast<uint32_t>(tile.list[2 * int64_t(position) + 1]);
-        slot = int64_t(of_tile) * kSlotsPerInstance + warp;
+      if constexpr (kTensor) {
+        *reinterpret_cast<float2*>(&tensor_stage.values[batch][2 * tile.lane]) =
+            make_float2(dL_dpower[0], dL_dpower[1]);
+        *reinterpret_cast<float2*>(&tensor_stage.values[kTensorBatch + batch][2 * tile.lane]) =
+            make_float2(weight[0], weight[1]);
+        if (tile.lane == 0) {
+          tensor_stage.gaussians[batch] =
+              make_float4(dx + kWarpTileCentre, dy + kWarpTileCentre, __int_as_float(index), __int_as_float(position));
+        }
+        if (++batch == kTensorBatch) {
+          add_batch(arguments, tile, tensor_stage, moment_basis, batch);
+          batch = 0;
+        }
+        continue;
       }
       S values[kTogether];
       column_moments(dL_dpower, dx, dy, values);
@@ -180,7 +234,7 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
           values[kNumGateMoments + f] = share;
         }
       }
-      add_to_record(arguments, sum, values, index, slot, 0, kTogether);
+      add_to_record(arguments, sum, values, tile, index, position, 0, kTogether);
       if constexpr (kFeatures == kAnyFeatures) {
         const TransposedSum<kFeatureChunk> sum_features(tile.lane);
         for (int first = 0; first < num_features; first += kFeatureChunk) {
@@ -192,11 +246,15 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
               shares[f] = fma(weight[k], scaled.get(arguments, tile, k, first + f), shares[f]);
             }
           }
-          add_to_record(arguments, sum_features, shares, index, slot, kNumGateMoments + first, num_features - first);
+          add_to_record(arguments, sum_features, shares, tile, index, position, kNumGateMoments + first,
+                        num_features - first);
         }
       }
     }
     __syncwarp();
+  }
+  if constexpr (kTensor) {
+    if (batch > 0) add_batch(arguments, tile, tensor_stage, moment_basis, batch);
   }
   if (arguments.pairs != nullptr && tile.lane == 0) {
     atomicAdd(arguments.pairs, static_cast<unsigned long long>(hits) * (kWarpTile * kWarpTile));

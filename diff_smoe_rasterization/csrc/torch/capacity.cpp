@@ -12,7 +12,7 @@ constexpr size_t kMostKeys = 256;  // more sizes than that are not remembered
 constexpr int64_t kGranularity = 1 << 16;
 
 // Room for what the next views may add.
-int64_t with_margin(int64_t count) { return (count + count / 4 + kGranularity) / kGranularity * kGranularity; }
+int64_t with_margin(int64_t count) { return (count + count / 8 + kGranularity) / kGranularity * kGranularity; }
 
 }  // namespace
 

@@ -67,6 +67,12 @@ template <class Real> DSMOE_HD Real gate_backward(const Gate<Real>& gate, Real g
 template <class S> struct GateMoments { S one, x, y, xx, xy, yy; };
 constexpr int kNumGateMoments = 6;
 
+// The same sums about another centre: every d becomes d + shift.
+template <class S> DSMOE_HD GateMoments<S> shift_moments(const GateMoments<S>& m, Vec2<S> shift) {
+  const S x = m.x + shift.x * m.one, y = m.y + shift.y * m.one;
+  return {m.one, x, y, m.xx + shift.x * (m.x + x), m.xy + shift.x * m.y + shift.y * x, m.yy + shift.y * (m.y + y)};
+}
+
 template <class S> struct GateGradient {
   Vec2<S> mean;   // by the pixel position of the centre
   Sym2<S> conic;  // by the three stored numbers
