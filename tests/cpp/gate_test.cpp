@@ -166,5 +166,28 @@ TEST(Gate, MomentsAreAllThatTheShapeNeeds) {
   expect_gradient({g.mean.x, g.mean.y, g.conic.xx, g.conic.xy, g.conic.yy, g.opacity}, loss, x);
 }
 
+TEST(Gate, MomentsMoveToAnotherCentre) {
+  Random random(4);
+  const Vector w = random.uniforms(30, -1, 1), px = random.uniforms(30, -3, 3), py = random.uniforms(30, -3, 3);
+  auto moments_about = [&](double x, double y) {
+    GateMoments<double> m = {};
+    for (int k = 0; k < 30; ++k) {
+      const double dx = px[k] - x, dy = py[k] - y;
+      m = {m.one + w[k],          m.x + w[k] * dx,       m.y + w[k] * dy,
+           m.xx + w[k] * dx * dx, m.xy + w[k] * dx * dy, m.yy + w[k] * dy * dy};
+    }
+    return m;
+  };
+  const auto moved = shift_moments(moments_about(0.4, -0.3), {0.4 - 2.5, -0.3 - 1.5});
+  const auto expected = moments_about(2.5, 1.5);
+  const double tolerance = 1e-12;  // sums of 30 terms of up to 30
+  EXPECT_NEAR(moved.one, expected.one, tolerance);
+  EXPECT_NEAR(moved.x, expected.x, tolerance);
+  EXPECT_NEAR(moved.y, expected.y, tolerance);
+  EXPECT_NEAR(moved.xx, expected.xx, tolerance);
+  EXPECT_NEAR(moved.xy, expected.xy, tolerance);
+  EXPECT_NEAR(moved.yy, expected.yy, tolerance);
+}
+
 }  // namespace
 }  // namespace dsmoe
