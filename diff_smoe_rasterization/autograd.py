@@ -24,7 +24,9 @@ _ALPHA = 0  # BLEND_MODES.index("alpha")
 
 
 # Eager calls skip the Python wrapper that register_autograd puts around an op: the formula is already in hand.
-_below_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", contextlib.nullcontext)
+_below_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", None)
+if not hasattr(_below_autograd, "__enter__"):  # torch 1.13 has it, but not as a context manager
+    _below_autograd = contextlib.nullcontext
 
 
 def _remember(ctx, inputs, output):
