@@ -216,7 +216,8 @@ __global__ void __launch_bounds__(kRowsBlock)
     if (gradients.shs != nullptr) gradients.shs = rows.own();
   }
 
-  const ProjectedGaussian<S> gaussian = arguments.saved.projected[seen ? i : 0];
+  ProjectedGaussian<S> gaussian = {};
+  if (seen) gaussian = arguments.saved.projected[i];
   const S* features = arguments.saved.features + i * feature_stride(num_features);
   S moments[kNumGateMoments];
   S* dL_dfeatures = arguments.dL_dfeature_rows + i * num_features;
