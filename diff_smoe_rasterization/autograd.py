@@ -70,18 +70,19 @@ class _Rasterize(torch.autograd.Function):
             output = _OPS.rasterize.default(*inputs)
         # In `alpha` mode the backward pass reads the images for an expected depth alone; else the caller may edit them.
         read = inputs[_BLEND_MODE] != _ALPHA or output[_DEPTH].numel() > 0
-        ctx.images = [image.clone() if read and i != _RADII and image.numel() > 0 else image.detach()
-                      for i, image in enumerate(output[:_NUM_IMAGES])]
-        ctx.save_for_backward(*_remember(ctx, inputs, output), *output[_NUM_IMAGES:])
+        ctx.images = [image.clone() if read and image.numel() > 0 else image.detach()
+                      for i, image in enumerate(output[:_NUM_IMAGES]) if i != _RADII]
+        ctx.save_for_backward(*_remember(ctx, inputs, output), output[_RADII], *output[_NUM_IMAGES:])
         return output
 
     def backward(ctx, *gradients):
         saved = list(ctx.saved_tensors)
         count = sum(ctx.present)
+        radii, *internal = saved[count:]
+        outputs = [*ctx.images[:_RADII], radii, *ctx.images[_RADII:], *internal]
         # Under create_graph=True the op itself is called, which refuses to be differentiated when somebody tries.
         with contextlib.nullcontext() if torch.is_grad_enabled() else _below_autograd():
-            return _input_gradients(ctx, gradients, ctx.images + saved[count:], saved[:count],
-                                    _OPS.rasterize_backward.default)
+            return _input_gradients(ctx, gradients, outputs, saved[:count], _OPS.rasterize_backward.default)
 
     backward = staticmethod(backward if _CAN_REGISTER else torch.autograd.function.once_differentiable(backward))
 

@@ -125,17 +125,28 @@ def test_stage_times_are_taken_while_profiling_is_on():
 
 
 @on_every_device
-def test_images_may_be_edited_in_place(mode):
+@pytest.mark.parametrize("outputs", [(), ("alpha", "inverse_depth"), OUTPUTS])
+def test_images_may_be_edited_in_place(mode, outputs):
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32)
 
     def gradients(edit):
         leaf = scene.requiring_grad()
-        rendering = rasterize(settings=leaf.settings, outputs=OUTPUTS, **leaf.inputs)
-        images = [edit(image) for image in (rendering.color, rendering.alpha, rendering.depth, rendering.inverse_depth)]
+        rendering = rasterize(settings=leaf.settings, outputs=outputs, **leaf.inputs)
+        images = [edit(image) for image in [rendering.color] + [getattr(rendering, name) for name in outputs]]
         sum((image ** 2).sum() for image in images).backward()
         return {name: tensor.grad for name, tensor in leaf.leaves().items()}
 
     assert_same_gradients(gradients(lambda image: image.mul_(0.5)), gradients(lambda image: image * 0.5))
+
+
+@on_every_device
+def test_radii_changed_in_place_before_backward_are_noticed(mode):
+    """They are no image, and say which Gaussians have a gradient."""
+    scene = random_scene(mode, 60, 40, 30, dtype=torch.float32).requiring_grad()
+    rendering = rasterize(settings=scene.settings, **scene.inputs)
+    rendering.radii.fill_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        rendering.color.sum().backward()
 
 
 def backward_arguments(mode):
