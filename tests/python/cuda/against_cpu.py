@@ -29,8 +29,8 @@ FLOAT32 = Tolerance(1e-4, 1e-4, 1e-5)
 class Pass:
     """One rendering that waits for its image gradients."""
 
-    def __init__(self, scene, outputs):
-        self.scene = scene.requiring_grad()
+    def __init__(self, scene, outputs, camera):
+        self.scene = scene.requiring_grad(camera)
         self.rendering = rasterize(settings=self.scene.settings, outputs=outputs, **self.scene.inputs)
         self.images = torch.cat([self.rendering.color] + [getattr(self.rendering, name) for name in outputs])
 
@@ -42,13 +42,13 @@ class Pass:
                 for (name, leaf), value in zip(leaves.items(), values)}
 
 
-def compare(scene, gpu, dtype, outputs, tolerance):
+def compare(scene, gpu, dtype, outputs, tolerance, camera=True):
     """Asserts that images, radii and all gradients agree; returns the rendering of the GPU.
 
-    scene: on the CPU, of float32 numbers.
+    scene: on the CPU, of float32 numbers. camera: whether its gradients are asked for too.
     """
-    expected = Pass(scene.to(torch.float64), outputs)
-    actual = Pass(scene.to(dtype).to(gpu), outputs)
+    expected = Pass(scene.to(torch.float64), outputs, camera)
+    actual = Pass(scene.to(dtype).to(gpu), outputs, camera)
     compare_radii(actual.rendering.radii.cpu(), expected.rendering.radii)
     wrong = different_pixels(actual.images.detach().cpu().double(), expected.images.detach(), tolerance.pixel)
     # Of a small image one pixel is more than the part that a large one is allowed.

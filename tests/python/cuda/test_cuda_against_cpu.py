@@ -7,7 +7,7 @@ from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
 from comparison import assert_all_close, assert_close, reference_gradients
 from scenes import camera_settings, gradients, random_scene
 
-from diff_smoe_rasterization import reference
+from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.settings import OUTPUTS
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.model import GaussianModel
@@ -71,6 +71,35 @@ def test_random_scenes(mode, name, dtype, tolerance, gpu):
     assert (rendering.radii > 0).sum() > 5
     background = scene.settings.bg.to(rendering.color)[:, None, None]
     assert ((rendering.color - background).abs() > 1e-3).any(0).double().mean() > 0.3
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("camera", [False, True], ids=["fixed_camera", "camera"])
+@pytest.mark.parametrize("split_dc", [False, True], ids=["harmonics", "split_harmonics"])
+def test_what_trainers_render(mode, split_dc, camera, gpu):
+    """Colours of degree 3 alone, in float32: kernels are compiled for them, with and without the camera's gradients."""
+    scene = crowd(mode, degree=3, split_dc=split_dc)
+    assert scene.inputs["means3D"].shape[0] % 32 > 0, "the last warp must be a part of one"
+    rendering = compare(scene, gpu, torch.float32, (), FLOAT32, camera)
+    assert (rendering.radii > 0).sum() > 500
+
+
+@pytest.mark.parametrize("split_dc", [False, True], ids=["harmonics", "split_harmonics"])
+def test_arrays_that_begin_anywhere(split_dc, gpu):
+    """Rows behind others, at no multiple of 16 bytes: they cannot be read as vectors, and give the same."""
+    scene = crowd("smoe", degree=3, split_dc=split_dc).to(torch.float32).to(gpu)
+    padding = 16 * 1024 + 1  # numbers before each array
+
+    def shifted(settings, outputs, **inputs):
+        return rasterize(settings=settings, outputs=outputs, **{
+            name: torch.cat([tensor.new_zeros(padding), tensor.flatten()])[padding:].view(tensor.shape)
+            for name, tensor in inputs.items()})
+
+    expected, expected_gradients = gradients(rasterize, scene, camera=False)
+    rendering, gradient = gradients(shifted, scene, camera=False)
+    # Other kernels, which round otherwise; and sums in any order.
+    assert_close(rendering.color, expected.color, FLOAT32.pixel, "color")
+    assert_all_close(gradient, expected_gradients, FLOAT32.gradient)
 
 
 def captured(mode, width, height):
