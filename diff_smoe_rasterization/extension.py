@@ -69,12 +69,15 @@ def build_info() -> Dict[str, Any]:
 
 
 def set_profiling(enabled: bool) -> None:
-    """Turns the clock of `stage_times` on or off; it is off at first. It covers the whole process."""
+    """Turns the clock of `stage_times` on or off; it is off at first. It covers the whole process.
+
+    On CUDA every pass then waits for its kernels.
+    """
     _C.set_profiling(enabled)
 
 
 def stage_times() -> Dict[str, float]:
-    """Returns the seconds of each stage of the CPU backend's last rendering and of its last backward pass.
+    """Returns the seconds of each stage of the last rendering and of the last backward pass, on any device.
 
     Keys: project, sort, bin, blend, blend_backward, project_backward in seconds; forward_pairs and backward_pairs count
     the (Gaussian, pixel) pairs that the blend evaluated. All are 0 until something was rendered under

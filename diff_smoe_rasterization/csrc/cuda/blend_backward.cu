@@ -47,8 +47,8 @@ template <class S> __device__ int64_t slot_of(const WarpTile<S>& tile, int32_t p
 }
 
 // Adds the first `count` Gaussians of a batch to their records.
-inline __device__ void add_batch(const BackwardArguments<float>& arguments, const WarpTile<float>& tile,
-                                 const TensorStage& stage, const TensorBasis& basis, int count) {
+[[maybe_unused]] __device__ void add_batch(const BackwardArguments<float>& arguments, const WarpTile<float>& tile,
+                                           const TensorStage& stage, const TensorBasis& basis, int count) {
   __syncwarp();
   TensorSums sums = sum_pixels(stage, basis, tile.lane);
   const TensorLane at(tile.lane);

@@ -21,8 +21,7 @@ int64_t first_non_finite(const Inputs& inputs) {
   at::Tensor finite = at::ones({num_gaussians(inputs)}, inputs[kMeans3D].options().dtype(at::kBool));
   for (int i = kMeans3D; i <= kCov3DPrecomp; ++i) {
     if (i == kMeans2D || !inputs[i].defined() || inputs[i].numel() == 0) continue;
-    finite = finite.logical_and(
-        at::isfinite(inputs[i]).flatten(1 < inputs[i].dim() ? 1 : 0).reshape({finite.size(0), -1}).all(1));
+    finite = finite.logical_and(at::isfinite(inputs[i]).reshape({finite.size(0), -1}).all(1));
   }
   const at::Tensor indices = at::logical_not(finite).nonzero();
   return indices.numel() == 0 ? -1 : indices[0][0].item<int64_t>();
