@@ -12,8 +12,10 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
 
     points: [N, 3], float32 or float64, on a GPU or on the CPU. Fewer than four points: the mean over those there are,
     0 for a single one. Coinciding points are at distance 0. Returns: [N] of the same type. Exact but for rounding.
-    Raises ValueError where the shape does not fit or a coordinate is not finite.
+    Raises ValueError where the shape does not fit or a coordinate is not finite, TypeError for another type.
     """
+    if points.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"distCUDA2: points is {points.dtype}; it must be torch.float32 or torch.float64")
     if points.dim() != 2 or points.shape[1] != 3:
         raise ValueError(f"distCUDA2: points has shape {list(points.shape)}; it must be [N, 3]")
     points = points.detach()

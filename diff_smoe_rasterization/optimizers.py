@@ -112,7 +112,7 @@ class _Launch:
 
 def _launch_of(launches: Dict[Any, _Launch], parameter: torch.Tensor, group: Dict[str, Any]) -> _Launch:
     """The launch that the parameter may join."""
-    key = (parameter.dtype, parameter.device, group["betas"], group["eps"])
+    key = (parameter.dtype, parameter.device, *group["betas"], group["eps"])
     launch = launches.get(key)
     if launch is None:
         launch = launches[key] = _Launch(*group["betas"], group["eps"])

@@ -45,6 +45,22 @@ def test_dense_adam_is_that_of_torch(device, dtype):
         assert optimizers[0].state[mine]["step"] == 5
 
 
+def test_groups_with_settings_of_their_own(device):
+    ours, theirs = random_parameters(torch.float64, [(9,)] * 3), random_parameters(torch.float64, [(9,)] * 3)
+
+    def groups(parameters):
+        return [{"params": parameters[:1], "betas": [0.5, 0.8]}, {"params": parameters[1:2], "eps": 0.1},
+                {"params": parameters[2:]}]
+
+    optimizers = [FusedAdam(groups(ours), lr=0.1), torch.optim.Adam(groups(theirs), lr=0.1)]
+    for parameters, optimizer in zip([ours, theirs], optimizers):
+        for step in range(3):
+            set_gradients(parameters, step)
+            optimizer.step()
+    for mine, reference in zip(ours, theirs):
+        torch.testing.assert_close(mine, reference, rtol=1e-14, atol=1e-14)
+
+
 def test_more_tensors_than_one_launch_holds(device):
     shapes = [(i + 1,) for i in range(40)]
     ours, theirs = random_parameters(torch.float64, shapes), random_parameters(torch.float64, shapes)

@@ -90,6 +90,12 @@ def test_a_point_that_is_not_finite_is_named(device, value):
         distCUDA2(points)
 
 
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float16])
+def test_another_type_is_refused(device, dtype):
+    with pytest.raises(TypeError, match=f"points is {dtype}; it must be torch.float32 or"):
+        distCUDA2(torch.zeros(10, 3, dtype=dtype))
+
+
 def test_another_shape_is_refused(device):
     with pytest.raises(ValueError, match=r"points has shape \[10, 2\]; it must be \[N, 3\]"):
         distCUDA2(torch.zeros(10, 2))
