@@ -24,7 +24,8 @@ std::string this_card() {
 
 void check(cudaError_t status, const char* what) {
   if (status == cudaSuccess) return;
-  std::string message = std::string("rasterize: ") + what + ": ";
+  cudaGetLastError();  // forgets it: the next launch must not be blamed for it
+  std::string message = std::string("diff_smoe_rasterization: ") + what + ": ";
   if (status == cudaErrorNoKernelImageForDevice || status == cudaErrorInvalidDeviceFunction) {
     message += "this build has no kernels for " + this_card() +
                "; it was built for the architectures " DSMOE_TEXT(__CUDA_ARCH_LIST__) ". Build it again with "
