@@ -93,15 +93,16 @@ def test_a_replayed_graph_equals_a_call(mode, options, gpu):
 
 
 @pytest.mark.sanitize
-def test_contents_that_outgrow_the_captured_lists(mode, gpu):
+@pytest.mark.parametrize("outputs, degree", [(OUTPUTS, 1), ((), 3)], ids=["all_images", "colour_alone"])
+def test_contents_that_outgrow_the_captured_lists(mode, outputs, degree, gpu):
     """Scales grow until many times the tiles are touched, and shrink again."""
-    small = scene_of(mode, scale=0.004, opacity=(0.02, 0.2))
+    small = scene_of(mode, scale=0.004, opacity=(0.02, 0.2), degree=degree)
     larger = small.with_inputs(scales=small.inputs["scales"] * 30)
     in_one_tile = small.with_inputs(means3D=small.inputs["means3D"] * 1e-3)
-    step = TrainingStep(small, gpu)
+    step = TrainingStep(small, gpu, outputs)
     graph, results = step.captured()
     for scene in (small, larger, small, in_one_tile, larger, small):
-        expected = TrainingStep(scene, gpu)()
+        expected = TrainingStep(scene, gpu, outputs)()
         step.set_to(scene.to(torch.float32))
         graph.replay()
         assert_same(results, expected)
