@@ -8,7 +8,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import Scene, random_scene
+from scenes import Scene, op_arguments, random_scene
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -92,15 +92,29 @@ def test_a_replayed_graph_equals_a_call(mode, options, gpu):
         assert_same(results, expected)
 
 
+def list_size(scene, gpu):
+    """Returns for how many tile instances a call has room, and how many there are."""
+    results = torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene.to(torch.float32).to(gpu)))
+    offsets, instances = results[8], results[9]
+    torch.cuda.synchronize()
+    return len(instances), int(offsets[-1])
+
+
+# Room for the lists is what earlier calls of the size and mode needed, and up to 65,536 more: only scenes of many
+# Gaussians outgrow it, and only at a size of their own.
 @pytest.mark.sanitize
-@pytest.mark.parametrize("outputs, degree", [(OUTPUTS, 1), ((), 3)], ids=["all_images", "colour_alone"])
-def test_contents_that_outgrow_the_captured_lists(mode, outputs, degree, gpu):
+@pytest.mark.parametrize("outputs, degree, width", [(OUTPUTS, 1, 203), ((), 3, 219)],
+                         ids=["all_images", "colour_alone"])
+def test_contents_that_outgrow_the_captured_lists(mode, outputs, degree, width, gpu):
     """Scales grow until many times the tiles are touched, and shrink again."""
-    small = scene_of(mode, scale=0.004, opacity=(0.02, 0.2), degree=degree)
+    small = scene_of(mode, num_gaussians=20_000, width=width, height=151, scale=0.004, opacity=(0.02, 0.2),
+                     degree=degree)
     larger = small.with_inputs(scales=small.inputs["scales"] * 30)
     in_one_tile = small.with_inputs(means3D=small.inputs["means3D"] * 1e-3)
     step = TrainingStep(small, gpu, outputs)
     graph, results = step.captured()
+    room = list_size(small, gpu)[0]
+    assert list_size(larger, gpu)[1] > room, "nothing is outgrown"
     for scene in (small, larger, small, in_one_tile, larger, small):
         expected = TrainingStep(scene, gpu, outputs)()
         step.set_to(scene.to(torch.float32))
@@ -165,10 +179,15 @@ def test_the_host_waits_for_nothing(mode, gpu):
 
 def test_growing_contents_without_a_graph(mode, gpu):
     """Each call has more than the one before: what was learned from the last never limits the next."""
-    base = scene_of(mode, opacity=(0.02, 0.2))
-    scenes = [base.with_inputs(scales=base.inputs["scales"] * factor) for factor in (0.1, 1.0, 10.0, 0.1)]
-    fresh = [TrainingStep(scene, gpu)() for scene in reversed(scenes)][::-1]
-    step = TrainingStep(base, gpu)
-    for scene, expected in zip(scenes, fresh):
+    base = scene_of(mode, num_gaussians=20_000, width=235, height=151, opacity=(0.02, 0.2))
+    scenes = [base.with_inputs(scales=base.inputs["scales"] * factor) for factor in (0.1, 1.0, 4.0, 0.1)]
+    step, results = TrainingStep(base, gpu), []
+    for index, scene in enumerate(scenes):
+        if index == 2:
+            room = list_size(scenes[1], gpu)[0]
         step.set_to(scene.to(torch.float32))
-        assert_same(step(), expected)
+        results.append(step())
+        torch.cuda.synchronize()  # the count is there for the next call
+    assert list_size(scenes[2], gpu)[1] > room, "nothing is outgrown"
+    for scene, result in zip(scenes, results):
+        assert_same(result, TrainingStep(scene, gpu)())  # which now has room
