@@ -15,13 +15,13 @@
 // Errors are std::runtime_error: a launch that failed, and why.
 #pragma once
 
-#include <cuda_runtime_api.h>
-
 #include <cstddef>
 #include <cstdint>
 #include <type_traits>
 
 #include "dsmoe/params.h"
+
+using cudaStream_t = struct CUstream_st*;  // as CUDA's own headers have it, which callers without CUDA lack
 
 namespace dsmoe {
 namespace cuda {
