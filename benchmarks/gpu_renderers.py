@@ -107,8 +107,11 @@ class Inria(Renderer):
 
     def __init__(self, model: Model):
         self.module = importlib.import_module("diff_gaussian_rasterization")
-        self.means2D = torch.zeros_like(model.inputs["means3D"]).requires_grad_()
         super().__init__(model)
+
+    def make_parameters(self, inputs):
+        parameters = super().make_parameters(inputs)
+        return {**parameters, "means2D": torch.zeros_like(parameters["means3D"])}
 
     def make_view(self, model, view):
         ours = model.settings(view, "alpha")
@@ -117,7 +120,7 @@ class Inria(Renderer):
                                                                                        **self.more_settings))
 
     def render(self, view):
-        return view(means2D=self.means2D, **self.parameters, **self.more_arguments)[0]
+        return view(**self.parameters, **self.more_arguments)[0]
 
 
 class InriaAntialiasing(Inria):

@@ -58,7 +58,8 @@ def _backward(ctx, *gradients):
 
 
 def _refuse_second_derivative(ctx, *gradients):
-    raise RuntimeError("rasterize: second derivatives are not implemented; its gradients cannot be differentiated again")
+    raise RuntimeError("rasterize: second derivatives are not implemented; its gradients cannot be differentiated "
+                       "again")
 
 
 class _Rasterize(torch.autograd.Function):

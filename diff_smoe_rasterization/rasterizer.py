@@ -68,7 +68,8 @@ def _checks(function, first_name, first):
         if not isinstance(value, torch.Tensor):
             raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
         if value.device != first.device:
-            raise TypeError(f"{function}: {name} is on {value.device}; it must be on {first.device}, as {first_name} is")
+            raise TypeError(f"{function}: {name} is on {value.device}; it must be on {first.device}, as {first_name} "
+                            "is")
         return value
 
     def optional(name, value):

@@ -8,11 +8,15 @@ namespace dsmoe {
 namespace binding {
 namespace {
 
-constexpr size_t kMostKeys = 256;  // more sizes than that are not remembered
+constexpr size_t kMostKeys = 1024;  // more sizes than that are not remembered
 constexpr int64_t kGranularity = 1 << 16;
+constexpr int64_t kFirstCalls = 64;
 
-// Room for what the next views may add.
-int64_t with_margin(int64_t count) { return (count + count / 8 + kGranularity) / kGranularity * kGranularity; }
+// Room for what the next views may add: much, while few views have been counted.
+int64_t with_margin(int64_t count, int64_t calls) {
+  const int64_t margin = calls < kFirstCalls ? count : count / 8;
+  return (count + margin + kGranularity) / kGranularity * kGranularity;
+}
 
 }  // namespace
 
@@ -29,7 +33,7 @@ int64_t InstanceCapacities::likely(const Key& key) {
   Count& count = found->second;
   const int64_t latest = *static_cast<volatile int64_t*>(count.latest);  // the device writes it
   count.greatest = std::max(count.greatest, latest);
-  return count.greatest < 0 ? -1 : with_margin(count.greatest);
+  return count.greatest < 0 ? -1 : with_margin(count.greatest, count.calls++);
 }
 
 void InstanceCapacities::learn(const Key& key, const int64_t* num_instances, cudaStream_t stream) {

@@ -1,5 +1,6 @@
 // How much memory the tile instances of a rendering get, before the GPU has counted them. The counts of earlier
-// renderings of the same size and mode are a good guess; a bad one costs time, never correctness (rasterize_cuda.h).
+// renderings of the same size, mode and order of N are a good guess; a bad one costs time, never correctness
+// (rasterize_cuda.h).
 // This table of sizes is all that outlives a call.
 #pragma once
 
@@ -16,7 +17,7 @@ namespace binding {
 
 class InstanceCapacities {
  public:
-  using Key = std::tuple<int, int64_t, int64_t, int64_t>;  // device, width, height, blend mode
+  using Key = std::tuple<int, int64_t, int64_t, int64_t, int>;  // device, width, height, blend mode, bits of N
 
   // What is likely to be enough, or -1 where nothing is known of the key.
   int64_t likely(const Key& key);
@@ -32,6 +33,7 @@ class InstanceCapacities {
   struct Count {
     int64_t* latest = nullptr;
     int64_t greatest = -1;
+    int64_t calls = 0;
   };
 
   std::mutex mutex_;

@@ -76,8 +76,10 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options)
     if (sorted) cuda::sort_by_depth(count, keys, saved.order, scratch, stream);
     clock.end(&cpu::StageTimes::sort);
   }
-  const InstanceCapacities::Key key = {like.get_device(), options.image_width, options.image_height,
-                                       options.blend_mode};
+  int bits_of_count = 0;
+  while (count >> bits_of_count != 0) ++bits_of_count;
+  const InstanceCapacities::Key key = {like.get_device(), options.image_width, options.image_height, options.blend_mode,
+                                       bits_of_count};
   int64_t capacity = InstanceCapacities::shared().likely(key);
   if (is_capturing(stream)) {
     if (capacity < 0) capacity = 8 * count + 1024;

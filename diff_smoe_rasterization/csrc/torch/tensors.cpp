@@ -2,6 +2,8 @@
 
 #include <utility>
 
+#include "dsmoe/rasterize_cuda.h"
+
 namespace dsmoe {
 namespace binding {
 
@@ -29,7 +31,7 @@ std::array<OutputSpec, kNumOutputs> output_specs(const Inputs& inputs, const Opt
   specs[kInverseDepth] = {options.inverse_depth ? image : absent, real};
   specs[kProjected] = {{count, kProjectedGaussianSize}, real};
   if (cuda) {
-    specs[kFeatures] = {{count, (num_features + 3) / 4 * 4}, real};
+    specs[kFeatures] = {{count, cuda::feature_stride(static_cast<int>(num_features))}, real};
     specs[kInstanceOffsets] = {options.deterministic ? std::vector<int64_t>{count, 2} : absent, at::kLong};
     specs[kTileOffsets] = {{tiles + 2}, at::kLong};
     specs[kInstances] = {{-1, options.deterministic ? 2 : 1}, at::kInt};

@@ -99,7 +99,7 @@ DSMOE_HD void sh_color(int degree, Vec3<S> mean, const S* position, ShCoefficien
   for (int k = 1; k < sh_coefficients(degree); ++k) {
     for (int c = 0; c < 3; ++c) color[c] += basis[k] * sh.rest[3 * (k - 1) + c];
   }
-  for (int c = 0; c < 3; ++c) color[c] = max(S(0), color[c]);
+  for (int c = 0; c < 3; ++c) color[c] = color[c] < S(0) ? S(0) : color[c];  // NaN stays, and is culled
 }
 
 // Writes dL/dsh for the active degree, where the outputs are given; returns dL/dmean (dL/dposition is its negative).
