@@ -1,4 +1,4 @@
-"""The call of gsplat's `rasterization`, for code written for gsplat or nerfstudio: cameras in a batch, channels last."""
+"""gsplat's call `rasterization`, for code written for gsplat or nerfstudio: cameras in a batch, channels last."""
 from __future__ import annotations
 
 from typing import Any, Dict, Optional, Tuple

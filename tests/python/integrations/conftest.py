@@ -12,7 +12,8 @@ NAME = "diff_smoe_rasterization.integrations"
 
 if Path(diff_smoe_rasterization.__file__).parent == ROOT / "diff_smoe_rasterization":
     folder = ROOT / "integrations"
-    spec = importlib.util.spec_from_file_location(NAME, folder / "__init__.py", submodule_search_locations=[str(folder)])
+    spec = importlib.util.spec_from_file_location(NAME, folder / "__init__.py",
+                                                  submodule_search_locations=[str(folder)])
     package = sys.modules[NAME] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(package)
     diff_smoe_rasterization.integrations = package

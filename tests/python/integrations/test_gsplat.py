@@ -55,6 +55,12 @@ def reference_renderings(inputs, cameras, outputs=("alpha", "depth")):
             **inputs) for c in cameras]
 
 
+def gaussians_of(inputs):
+    """The reference's own table of the inputs."""
+    return reference._gather(*(inputs.get(name) for name in (
+        "means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")))
+
+
 def channels_last(images):
     return torch.stack([image.permute(1, 2, 0) for image in images])
 
@@ -109,8 +115,8 @@ def test_depth_is_a_sum_of_weighted_depths(mode):
     cameras = make_cameras(mode, 3)
     arguments = arguments_of(scene, cameras)
     depth, alphas, meta = rasterization(**arguments, blend_mode=mode, render_mode="D")
-    in_view = torch.stack([torch.cat([scene.inputs["means3D"], torch.ones(60, 1, dtype=torch.float64)], 1) @ c.viewmatrix
-                           for c in cameras])
+    points = torch.cat([scene.inputs["means3D"], torch.ones(60, 1, dtype=torch.float64)], 1)
+    in_view = torch.stack([points @ c.viewmatrix for c in cameras])
     assert_close(meta["depths"], in_view[..., 2], TOLERANCE, "depths")
     arguments.update(colors=in_view[..., 2:3], backgrounds=None)
     image, _, _ = rasterization(**arguments, blend_mode=mode)
@@ -164,9 +170,7 @@ def test_means2d_are_pixels_whose_first_centre_is_a_half():
     scene = random_scene("alpha", 60, seed=38, channels=3)
     cameras = make_cameras("alpha", 3)
     means2d = rasterization(**arguments_of(scene, cameras))[2]["means2d"]
-    splats = [reference.project(reference._gather(
-        *(scene.inputs.get(name) for name in ("means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales",
-                                              "rotations", "cov3D_precomp"))), camera) for camera in cameras]
+    splats = [reference.project(gaussians_of(scene.inputs), camera) for camera in cameras]
     # The reference counts from the first pixel's centre, and adds 1e-7 to w.
     assert_close(means2d, torch.stack([splat.position for splat in splats]) + 0.5, 1e-6, "means2d")
     assert not means2d.requires_grad
@@ -202,9 +206,7 @@ def test_covariances_in_place_of_quaternions_and_scales(mode):
     arguments = arguments_of(scene, cameras)
     rotations = scene.inputs["rotations"]
     normalised = {**scene.inputs, "rotations": rotations / rotations.norm(dim=1, keepdim=True)}
-    gaussians = reference._gather(*(normalised.get(name) for name in (
-        "means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")))
-    covars = reference.covariance3D(gaussians, 1.0)
+    covars = reference.covariance3D(gaussians_of(normalised), 1.0)
     expected = rasterization(**arguments, blend_mode=mode)[0]
     renders = rasterization(**{**arguments, "quats": None, "scales": None}, covars=covars, blend_mode=mode)[0]
     assert_close(renders, expected, TOLERANCE, "renders")
@@ -244,6 +246,17 @@ def test_inputs_need_not_be_contiguous(mode):
                if isinstance(value, torch.Tensor) else value for name, value in arguments.items()}
     assert not strided["viewmats"].is_contiguous()
     assert_close(rasterization(**strided, blend_mode=mode)[0], expected, TOLERANCE, "renders")
+
+
+def test_no_gaussians_leave_the_background(mode):
+    cameras = make_cameras(mode, 3)
+    arguments = arguments_of(random_scene(mode, 12, channels=3).rows(slice(0)), cameras)
+    means = arguments["means"].clone().requires_grad_(True)
+    renders, alphas, meta = rasterization(**{**arguments, "means": means}, blend_mode=mode)
+    assert torch.equal(renders, arguments["backgrounds"][:, None, None].expand(2, HEIGHT, WIDTH, 3))
+    assert not alphas.any() and meta["means2d"].shape == meta["radii"].shape == (2, 0, 2)
+    renders.sum().backward()
+    assert means.grad.shape == (0, 3)
 
 
 @pytest.fixture

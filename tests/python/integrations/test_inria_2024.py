@@ -47,7 +47,7 @@ def test_inverse_depth_and_its_gradient_are_the_references(mode):
 
 
 def test_inverse_depth_is_not_normalised_in_alpha_and_is_in_smoe():
-    """One faint Gaussian straight ahead, at depth z: sum(w / z) is alpha / z, and 1 / z once it is divided by sum(w)."""
+    """One faint Gaussian straight ahead, at depth z: sum(w / z) is alpha / z, and divided by sum(w) it is 1 / z."""
     for mode in ("alpha", "smoe"):
         scene = random_scene(mode, 1, 33, 33).with_inputs(
             means3D=torch.zeros(1, 3, dtype=torch.float64), opacities=torch.full((1, 1), 0.25, dtype=torch.float64),
@@ -93,8 +93,8 @@ def test_shs_in_the_place_of_dc_is_an_error():
     scene = random_scene("alpha", 60, 45, 30, degree=1)
     i = scene.inputs
     with pytest.raises(ValueError, match="dc"):
-        GaussianRasterizer(scene.settings)(i["means3D"], i["means2D"], i["opacities"], i["shs"], None, None, i["scales"],
-                                           i["rotations"])
+        GaussianRasterizer(scene.settings)(i["means3D"], i["means2D"], i["opacities"], i["shs"], None, None,
+                                           i["scales"], i["rotations"])
 
 
 def test_the_sparse_optimizer_steps_what_the_view_saw(mode):
