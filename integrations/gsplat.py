@@ -1,0 +1,173 @@
+"""gsplat's call `rasterization`, for code written for gsplat or nerfstudio: cameras in a batch, channels last."""
+from __future__ import annotations
+
+from typing import Any, Dict, Optional, Tuple
+
+import torch
+import torch.nn.functional as functional
+
+from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize
+
+__all__ = ["rasterization"]
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+# Arguments of later versions of gsplat. Callers spell them out with the values that switch them off.
+OF_LATER_VERSIONS = ("with_ut", "with_eval3d", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs",
+                     "ftheta_coeffs", "rolling_shutter", "viewmats_rs")
+
+
+def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Optional[torch.Tensor],
+                  opacities: torch.Tensor, colors: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor, width: int,
+                  height: int, near_plane: float = 0.01, far_plane: float = 1e10, radius_clip: float = 0.0,
+                  eps2d: float = 0.3, sh_degree: Optional[int] = None, packed: bool = False,
+                  tile_size: Optional[int] = None, backgrounds: Optional[torch.Tensor] = None, render_mode: str = "RGB",
+                  sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: str = "classic",
+                  channel_chunk: int = 32, distributed: bool = False, camera_model: str = "pinhole",
+                  segmented: bool = False, covars: Optional[torch.Tensor] = None, blend_mode: Optional[str] = None,
+                  **others: Any) -> Tuple[torch.Tensor, torch.Tensor, Dict[str, Any]]:
+    """Renders N Gaussians with C pinhole cameras.
+
+    Args:
+        means: [N, 3] centres, world.
+        quats, scales: [N, 4] quaternions w, x, y, z of any length, and [N, 3] standard deviations.
+        opacities: [N].
+        colors: [N, D] or [C, N, D]; where sh_degree is given harmonics [N, K, 3] or [C, N, K, 3].
+        viewmats: [C, 4, 4] world to camera, for column vectors; differentiable.
+        Ks: [C, 3, 3] focal lengths and principal points in pixels, without skew; they get no gradient and are read by
+            the host, which on a GPU waits for them.
+        near_plane: Gaussians with view depth <= near_plane are culled.
+        backgrounds: [C, D]; None is black. The background of a depth is 0.
+        render_mode: "RGB", and D for depth sum(w z) or ED for depth sum(w z) / sum(w), alone or as the last channel.
+        rasterize_mode: "classic" or "antialiased".
+        covars: [N, 3, 3] in place of quats and scales, which are then ignored.
+        blend_mode: one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha".
+        tile_size, channel_chunk, segmented: taken and without effect, as they change no image.
+
+    Returns:
+        renders: [C, H, W, X], X = D, 1 or D + 1 by render_mode.
+        alphas: [C, H, W, 1], sum(w); in `smoe_tn` and `smoe_std`, where it is the sum of alpha, it may exceed 1.
+        meta: means2d [C, N, 2], pixels, which receives the gradient of the images by them (also in pixels) and passes
+            none on; radii [C, N, 2] int32, 3 sigma of the longer axis twice, 0 where not seen; depths [C, N]; width,
+            height, n_cameras, n_batches; batch_ids, camera_ids and gaussian_ids are None, as always without `packed`.
+
+    Raises:
+        NotImplementedError: what is asked for is not offered: far_plane, radius_clip or eps2d other than the defaults,
+            packed, sparse_grad, absgrad, distributed, other cameras, arguments of later versions of gsplat.
+        ValueError, TypeError: arguments do not fit.
+    """
+    _refuse_what_is_not_offered(
+        others, packed=(packed, False), sparse_grad=(sparse_grad, False), absgrad=(absgrad, False),
+        distributed=(distributed, False), camera_model=(camera_model, "pinhole"), far_plane=(far_plane, 1e10),
+        radius_clip=(radius_clip, 0.0), eps2d=(eps2d, 0.3))
+    _check_choice("render_mode", render_mode, RENDER_MODES)
+    _check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    _check_shape("means", means, (-1, 3))
+    _check_shape("viewmats", viewmats, (-1, 4, 4))
+    count, num_cameras = len(means), len(viewmats)
+    if num_cameras == 0:
+        raise ValueError("rasterization: viewmats has shape [0, 4, 4]; there must be a camera")
+    _check_shape("Ks", Ks, (num_cameras, 3, 3))
+    _check_shape("opacities", opacities, (count,))
+    with_color, with_depth = "RGB" in render_mode, "D" in render_mode
+    color_name, color_shape = ("colors_precomp", (count, -1)) if sh_degree is None else ("shs", (count, -1, 3))
+    _check_shape("colors", colors, color_shape, (num_cameras,) + color_shape)
+    if not with_color:  # a depth has no use for them
+        color_name, color_shape, colors, backgrounds = "colors_precomp", (count, 1), means.new_zeros(count, 1), None
+    channels = colors.shape[-1]
+    if backgrounds is None:
+        backgrounds = means.new_zeros(num_cameras, channels)
+    _check_shape("backgrounds", backgrounds, (num_cameras, channels))
+    shape = _shape(quats, scales, covars, count)
+
+    means2d, depths = _image_points(means, viewmats, Ks)
+    differentiable = [means, opacities, colors, viewmats, backgrounds, *shape.values()]
+    means2d.requires_grad_(torch.is_grad_enabled() and any(tensor.requires_grad for tensor in differentiable))
+    projections = viewmats.transpose(1, 2) @ _clip_matrices(Ks.detach(), width, height)
+    centres = torch.inverse(viewmats)[:, :3, 3]
+    focal_lengths = Ks[:, (0, 1), (0, 1)].tolist()
+    renders, alphas, radii = [], [], []
+    for camera, (focal_x, focal_y) in enumerate(focal_lengths):
+        settings = GaussianRasterizationSettings(
+            image_height=height, image_width=width, tanfovx=width / (2 * focal_x), tanfovy=height / (2 * focal_y),
+            bg=backgrounds[camera], scale_modifier=1.0, viewmatrix=viewmats[camera].T, projmatrix=projections[camera],
+            sh_degree=sh_degree or 0, campos=centres[camera], antialiasing=rasterize_mode == "antialiased",
+            near=near_plane, blend_mode=blend_mode)
+        color = colors[camera] if colors.dim() > len(color_shape) else colors
+        rendering = rasterize(means, opacities, settings, means2D=_in_ndc(means2d[camera], width, height),
+                              outputs=("alpha", "depth") if with_depth else ("alpha",), **{color_name: color}, **shape)
+        images = [rendering.color] if with_color else []
+        if with_depth:
+            images.append(rendering.depth if "ED" in render_mode else rendering.depth * rendering.alpha)
+        renders.append(torch.cat(images).permute(1, 2, 0))
+        alphas.append(rendering.alpha.permute(1, 2, 0))
+        radii.append(rendering.radii)
+    meta = {"means2d": means2d, "radii": torch.stack(radii)[..., None].repeat(1, 1, 2), "depths": depths,
+            "width": width, "height": height, "n_cameras": num_cameras, "n_batches": 1, "batch_ids": None,
+            "camera_ids": None, "gaussian_ids": None}
+    return torch.stack(renders), torch.stack(alphas), meta
+
+
+def _shape(quats, scales, covars, count):
+    """Returns the arguments of `rasterize` that say how the Gaussians extend."""
+    if covars is not None:
+        _check_shape("covars", covars, (count, 3, 3))
+        return {"cov3D_precomp": covars[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]}
+    _check_shape("quats", quats, (count, 4))
+    _check_shape("scales", scales, (count, 3))
+    return {"scales": scales, "rotations": functional.normalize(quats, dim=1)}
+
+
+@torch.no_grad()
+def _image_points(means, viewmats, Ks):
+    """Returns where the centres fall [C, N, 2] in pixels, detached, and their depths [C, N].
+
+    The centre of the first pixel is at (0.5, 0.5), as gsplat has it.
+    """
+    in_view = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
+    depths = in_view[..., 2]
+    focal_lengths, principal_points = Ks[:, None, (0, 1), (0, 1)], Ks[:, None, :2, 2]
+    return focal_lengths * in_view[..., :2] / depths[..., None] + principal_points, depths
+
+
+def _clip_matrices(Ks, width, height):
+    """Returns camera to clip coordinates [C, 4, 4], for row vectors; pixels [0, width] become x in [-1, 1]."""
+    clip = Ks.new_zeros(len(Ks), 4, 4)
+    clip[:, 0, 0], clip[:, 1, 1] = 2 * Ks[:, 0, 0] / width, 2 * Ks[:, 1, 1] / height
+    clip[:, 2, 0], clip[:, 2, 1] = 2 * Ks[:, 0, 2] / width - 1, 2 * Ks[:, 1, 2] / height - 1
+    clip[:, 2, 2:] = 1
+    return clip
+
+
+def _in_ndc(points, width, height):
+    """Returns the argument means2D of `rasterize` [N, 3], whose gradient reaches the points [N, 2] in pixels."""
+    if not points.requires_grad:
+        return None
+    return torch.stack([points[:, 0] * (2 / width), points[:, 1] * (2 / height), torch.zeros_like(points[:, 0])], 1)
+
+
+def _refuse_what_is_not_offered(others, **arguments):
+    for name, (value, only) in arguments.items():
+        if value != only:
+            raise NotImplementedError(f"rasterization: {name} is {value!r}; this module offers {only!r} alone")
+    for name, value in others.items():
+        if name not in OF_LATER_VERSIONS:
+            raise TypeError(f"rasterization: there is no argument {name}")
+        if value is not None and value is not False:
+            raise NotImplementedError(f"rasterization: {name} is {value!r}; this module does not offer it")
+
+
+def _check_choice(name, value, choices):
+    if value not in choices:
+        raise ValueError(f"rasterization: {name} is {value!r}; it must be one of {', '.join(choices)}")
+
+
+def _check_shape(name, tensor, *allowed):
+    """Raises unless the tensor has one of the allowed shapes; -1 is any size."""
+    if not isinstance(tensor, torch.Tensor):
+        raise TypeError(f"rasterization: {name} is of type {type(tensor).__name__}; it must be a torch.Tensor")
+    for shape in allowed:
+        if tensor.dim() == len(shape) and all(want in (-1, size) for size, want in zip(tensor.shape, shape)):
+            return
+    wanted = " or ".join(str(["*" if size == -1 else size for size in shape]).replace("'", "") for shape in allowed)
+    raise ValueError(f"rasterization: {name} has shape {list(tensor.shape)}; it must be {wanted}")

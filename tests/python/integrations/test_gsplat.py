@@ -1,0 +1,303 @@
+"""The call of gsplat: what it renders, with which gradients, and what it refuses; against the reference."""
+from __future__ import annotations
+
+import inspect
+import math
+
+import pytest
+import torch
+from comparison import assert_all_close, assert_close, one_thread, threshold_margin
+from devices import on_the_cpu, random_normal
+from scenes import camera_settings, random_scene
+
+from diff_smoe_rasterization import reference
+from diff_smoe_rasterization.integrations.gsplat import rasterization
+
+pytestmark = pytest.mark.usefixtures("device")
+
+WIDTH, HEIGHT = 45, 30
+POSITIONS = ((0.4, -0.3, -4.0), (-1.5, 0.6, -3.0))
+PRINCIPAL_POINTS = ((0.0, 0.0), (2.5, -1.5))  # px off the image centre
+FIELDS_OF_VIEW = (0.9, 1.1)
+# A sum of some thousand terms in float64, each with some hundred roundings of 1e-16; the two sides build their camera
+# matrices in different ways, which differ by as much.
+TOLERANCE = 1e-11
+
+
+def make_cameras(mode, channels, degree=0, **fields):
+    """Two cameras as settings, in float64; the background of each is its own."""
+    return [camera_settings(WIDTH, HEIGHT, position, fov, principal_point, degree, blend_mode=mode, near=0.01,
+                            bg=random_normal((channels,), 31 + index).sigmoid(), **fields)
+            for index, (position, fov, principal_point)
+            in enumerate(zip(POSITIONS, FIELDS_OF_VIEW, PRINCIPAL_POINTS))]
+
+
+def arguments_of(scene, cameras):
+    """The same for `rasterization`; the quaternions are not of length 1."""
+    Ks = [[[c.image_width / (2 * c.tanfovx), 0, WIDTH / 2 + x], [0, c.image_height / (2 * c.tanfovy), HEIGHT / 2 + y],
+           [0, 0, 1]] for c, (x, y) in zip(cameras, PRINCIPAL_POINTS)]
+    inputs = scene.inputs
+    colors = inputs["shs"] if "shs" in inputs else inputs["colors_precomp"]
+    return {"means": inputs["means3D"], "quats": 2 * inputs["rotations"], "scales": inputs["scales"],
+            "opacities": inputs["opacities"][:, 0], "colors": colors,
+            "viewmats": torch.stack([c.viewmatrix.T for c in cameras]).contiguous(),
+            "Ks": torch.tensor(Ks, dtype=torch.float64), "width": WIDTH, "height": HEIGHT,
+            "backgrounds": torch.stack([c.bg for c in cameras])}
+
+
+def reference_renderings(inputs, cameras, outputs=("alpha", "depth")):
+    with one_thread(), on_the_cpu():
+        inputs = {name: tensor.cpu() for name, tensor in inputs.items()}
+        rotations = inputs["rotations"]
+        inputs["rotations"] = rotations / rotations.norm(dim=1, keepdim=True)
+        return [reference.rasterize(settings=c._replace(**{
+            name: getattr(c, name).cpu() for name in ("bg", "viewmatrix", "projmatrix", "campos")}), outputs=outputs,
+            **inputs) for c in cameras]
+
+
+def gaussians_of(inputs):
+    """The reference's own table of the inputs."""
+    return reference._gather(*(inputs.get(name) for name in (
+        "means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")))
+
+
+def channels_last(images):
+    return torch.stack([image.permute(1, 2, 0) for image in images])
+
+
+def test_the_order_of_arguments():
+    """Those that gsplat's callers pass by position, and the names of the others."""
+    names = list(inspect.signature(rasterization).parameters)
+    assert names[:9] == ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height"]
+    assert names[9:27] == ["near_plane", "far_plane", "radius_clip", "eps2d", "sh_degree", "packed", "tile_size",
+                           "backgrounds", "render_mode", "sparse_grad", "absgrad", "rasterize_mode", "channel_chunk",
+                           "distributed", "camera_model", "segmented", "covars", "blend_mode"]
+
+
+@pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("degree", [None, 2])
+def test_a_batch_of_cameras_is_the_references(mode, degree, rasterize_mode):
+    scene = random_scene(mode, 60, seed=31, degree=degree or 0, channels=5 if degree is None else None, scale=0.05)
+    channels = 5 if degree is None else 3
+    cameras = make_cameras(mode, channels, degree or 0, antialiasing=rasterize_mode == "antialiased")
+    renders, alphas, meta = rasterization(**arguments_of(scene, cameras), sh_degree=degree, blend_mode=mode,
+                                          rasterize_mode=rasterize_mode)
+    expected = reference_renderings(scene.inputs, cameras)
+    assert renders.shape == (2, HEIGHT, WIDTH, channels) and alphas.shape == (2, HEIGHT, WIDTH, 1)
+    assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
+    assert_close(alphas, channels_last([image.alpha for image in expected]), TOLERANCE, "alphas")
+    radii = torch.stack([image.radii for image in expected])
+    assert (radii > 0).any() and (radii == 0).any()
+    assert meta["radii"].dtype == torch.int32
+    assert torch.equal(meta["radii"].cpu(), torch.stack([radii, radii], 2))
+    assert (meta["width"], meta["height"], meta["n_cameras"]) == (WIDTH, HEIGHT, 2)
+    assert meta["gaussian_ids"] is None and meta["camera_ids"] is None
+
+
+@pytest.mark.parametrize("render_mode, width", [("RGB", 3), ("D", 1), ("ED", 1), ("RGB+D", 4), ("RGB+ED", 4)])
+def test_render_modes(mode, render_mode, width):
+    scene = random_scene(mode, 60, seed=32, channels=3)
+    cameras = make_cameras(mode, 3)
+    renders, alphas, _ = rasterization(**arguments_of(scene, cameras), blend_mode=mode, render_mode=render_mode)
+    expected = reference_renderings(scene.inputs, cameras)
+    assert renders.shape == (2, HEIGHT, WIDTH, width)
+    assert_close(alphas, channels_last([image.alpha for image in expected]), TOLERANCE, "alphas")
+    if "RGB" in render_mode:
+        assert_close(renders[..., :3], channels_last([image.color for image in expected]), TOLERANCE, "color")
+    if "D" in render_mode:
+        depths = [image.depth * (1 if "ED" in render_mode else image.alpha) for image in expected]
+        assert_close(renders[..., -1:], channels_last(depths), TOLERANCE, "depth")
+
+
+def test_depth_is_a_sum_of_weighted_depths(mode):
+    """Rendered another way: each Gaussian's view depth as its colour, without a background."""
+    scene = random_scene(mode, 60, seed=33, channels=3)
+    cameras = make_cameras(mode, 3)
+    arguments = arguments_of(scene, cameras)
+    depth, alphas, meta = rasterization(**arguments, blend_mode=mode, render_mode="D")
+    points = torch.cat([scene.inputs["means3D"], torch.ones(60, 1, dtype=torch.float64)], 1)
+    in_view = torch.stack([points @ c.viewmatrix for c in cameras])
+    assert_close(meta["depths"], in_view[..., 2], TOLERANCE, "depths")
+    arguments.update(colors=in_view[..., 2:3], backgrounds=None)
+    image, _, _ = rasterization(**arguments, blend_mode=mode)
+    # A colour is divided by the gate sum in the SMoE modes, and not in `alpha`.
+    assert_close(depth, image if mode == "alpha" else image * alphas, TOLERANCE, "depth")
+
+
+def test_every_camera_may_have_its_colours(mode):
+    scene = random_scene(mode, 60, seed=34, degree=1)
+    cameras = make_cameras(mode, 3, degree=1)
+    arguments = arguments_of(scene, cameras)
+    both = torch.stack([scene.inputs["shs"], scene.inputs["shs"].flip(0)])
+    renders, _, _ = rasterization(**{**arguments, "colors": both}, sh_degree=1, blend_mode=mode)
+    for index in range(2):
+        expected = reference_renderings({**scene.inputs, "shs": both[index]}, cameras)[index]
+        assert_close(renders[index], expected.color.permute(1, 2, 0), TOLERANCE, f"camera {index}")
+
+
+def test_gradients_are_the_references(mode):
+    """Those of means2d among them: in pixels, one row for each camera."""
+    scene = random_scene(mode, 60, seed=35, degree=1)
+    cameras = make_cameras(mode, 3, degree=1)
+    arguments = arguments_of(scene, cameras)
+    names = {"means": "means3D", "scales": "scales", "quats": "rotations", "opacities": "opacities", "colors": "shs"}
+    for name in names:
+        arguments[name] = arguments[name].detach().clone().requires_grad_(True)
+    renders, alphas, meta = rasterization(**arguments, sh_degree=1, blend_mode=mode, render_mode="RGB+ED")
+    means2d = meta["means2d"]
+    means2d.retain_grad()  # as gsplat's strategies do
+    weights, alpha_weights = random_normal(renders.shape, 36), random_normal(alphas.shape, 37)
+    ((renders * weights).sum() + (alphas * alpha_weights).sum()).backward()
+
+    leaves = {name: tensor.detach().cpu().requires_grad_(True) for name, tensor in scene.inputs.items()}
+    leaves["rotations"] = (2 * scene.inputs["rotations"]).detach().cpu().requires_grad_(True)
+    points = [torch.zeros(60, 3, dtype=torch.float64, device="cpu", requires_grad=True) for _ in cameras]
+    for index in range(2):
+        image = reference_renderings({**leaves, "means2D": points[index]}, cameras)[index]
+        ((torch.cat([image.color, image.depth]).permute(1, 2, 0) * weights[index].cpu()).sum()
+         + (image.alpha.permute(1, 2, 0) * alpha_weights[index].cpu()).sum()).backward()
+    expected = {name: leaves[other].grad for name, other in names.items()}
+    expected["opacities"] = expected["opacities"][:, 0]
+    expected["means2d"] = torch.stack([point.grad[:, :2] for point in points]) * torch.tensor(
+        [2 / WIDTH, 2 / HEIGHT], dtype=torch.float64, device="cpu")
+    actual = {name: arguments[name].grad for name in names}
+    actual["means2d"] = means2d.grad
+    assert expected["means2d"].any()
+    assert_all_close(actual, expected, TOLERANCE)
+
+
+def test_means2d_are_pixels_whose_first_centre_is_a_half():
+    scene = random_scene("alpha", 60, seed=38, channels=3)
+    cameras = make_cameras("alpha", 3)
+    means2d = rasterization(**arguments_of(scene, cameras))[2]["means2d"]
+    splats = [reference.project(gaussians_of(scene.inputs), camera) for camera in cameras]
+    # The reference counts from the first pixel's centre, and adds 1e-7 to w.
+    assert_close(means2d, torch.stack([splat.position for splat in splats]) + 0.5, 1e-6, "means2d")
+    assert not means2d.requires_grad
+
+
+def test_the_gradient_of_the_camera_is_a_whole_derivative(mode):
+    """By finite differences: moving a camera moves its matrices and its centre, and with that the colours."""
+    scene = random_scene(mode, 8, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)
+    cameras = make_cameras(mode, 3, degree=1)
+    for camera in cameras:
+        assert threshold_margin(scene._replace(settings=camera)).min() > 1e-4
+    arguments = arguments_of(scene, cameras)
+    viewmats = arguments.pop("viewmats")
+    weights = random_normal((2, HEIGHT, WIDTH, 3), 39)
+
+    def loss(viewmats):
+        return (rasterization(viewmats=viewmats, sh_degree=1, blend_mode=mode, **arguments)[0] * weights).sum()
+
+    leaf = viewmats.clone().requires_grad_(True)
+    analytic, = torch.autograd.grad(loss(leaf), leaf)
+    step = 1e-6
+    for index in ((0, 0, 3), (0, 2, 3), (1, 1, 3), (1, 0, 1), (0, 2, 0), (1, 1, 1)):
+        change = torch.zeros_like(viewmats)
+        change[index] = step
+        numeric = ((loss(viewmats + change) - loss(viewmats - change)) / (2 * step)).item()
+        # The loss, up to 1e3, is rounded by 1e-13, and 2e-6 divides that; the step's own error is of order 1e-12.
+        assert analytic[index].item() == pytest.approx(numeric, rel=1e-5, abs=1e-5), index
+
+
+def test_covariances_in_place_of_quaternions_and_scales(mode):
+    scene = random_scene(mode, 60, seed=40, channels=3)
+    cameras = make_cameras(mode, 3)
+    arguments = arguments_of(scene, cameras)
+    rotations = scene.inputs["rotations"]
+    normalised = {**scene.inputs, "rotations": rotations / rotations.norm(dim=1, keepdim=True)}
+    covars = reference.covariance3D(gaussians_of(normalised), 1.0)
+    expected = rasterization(**arguments, blend_mode=mode)[0]
+    renders = rasterization(**{**arguments, "quats": None, "scales": None}, covars=covars, blend_mode=mode)[0]
+    assert_close(renders, expected, TOLERANCE, "renders")
+
+
+def test_without_a_background_it_is_black(mode):
+    scene = random_scene(mode, 60, seed=41, channels=3)
+    arguments = arguments_of(scene, make_cameras(mode, 3))
+    black = rasterization(**{**arguments, "backgrounds": torch.zeros(2, 3, dtype=torch.float64)}, blend_mode=mode)[0]
+    assert torch.equal(rasterization(**{**arguments, "backgrounds": None}, blend_mode=mode)[0], black)
+    assert not torch.equal(rasterization(**arguments, blend_mode=mode)[0], black)
+
+
+def test_the_near_plane_is_an_argument():
+    means = torch.tensor([[0.0, 0.0, depth] for depth in (0.005, 0.05, 0.5)])
+    arguments = {"means": means, "quats": torch.tensor([[1.0, 0, 0, 0]] * 3), "scales": torch.full((3, 3), 0.01),
+                 "opacities": torch.ones(3), "colors": torch.ones(3, 3), "viewmats": torch.eye(4)[None],
+                 "Ks": torch.tensor([[[20.0, 0, 16], [0, 20, 16], [0, 0, 1]]]), "width": 32, "height": 32}
+    assert rasterization(**arguments)[2]["radii"][0].gt(0).tolist() == [[False] * 2, [True] * 2, [True] * 2]
+    far = rasterization(**arguments, near_plane=0.1)[2]["radii"][0]
+    assert far.gt(0).tolist() == [[False] * 2, [False] * 2, [True] * 2]
+
+
+def test_an_opacity_above_one_and_the_environments_blend_mode(mode, monkeypatch):
+    scene = random_scene(mode, 60, seed=42, channels=3, opacity=(1.5, 6.0))
+    cameras = make_cameras(mode, 3)
+    monkeypatch.setenv("DSMOE_BLEND_MODE", mode)
+    renders = rasterization(**arguments_of(scene, cameras))[0]
+    expected = reference_renderings(scene.inputs, cameras)
+    assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
+
+
+def test_inputs_need_not_be_contiguous(mode):
+    arguments = arguments_of(random_scene(mode, 60, seed=43, channels=3), make_cameras(mode, 3))
+    expected = rasterization(**arguments, blend_mode=mode)[0]
+    strided = {name: torch.stack([value, torch.full_like(value, math.nan)], -1)[..., 0]
+               if isinstance(value, torch.Tensor) else value for name, value in arguments.items()}
+    assert not strided["viewmats"].is_contiguous()
+    assert_close(rasterization(**strided, blend_mode=mode)[0], expected, TOLERANCE, "renders")
+
+
+def test_no_gaussians_leave_the_background(mode):
+    cameras = make_cameras(mode, 3)
+    arguments = arguments_of(random_scene(mode, 12, channels=3).rows(slice(0)), cameras)
+    means = arguments["means"].clone().requires_grad_(True)
+    renders, alphas, meta = rasterization(**{**arguments, "means": means}, blend_mode=mode)
+    assert torch.equal(renders, arguments["backgrounds"][:, None, None].expand(2, HEIGHT, WIDTH, 3))
+    assert not alphas.any() and meta["means2d"].shape == meta["radii"].shape == (2, 0, 2)
+    renders.sum().backward()
+    assert means.grad.shape == (0, 3)
+
+
+@pytest.fixture
+def small():
+    return arguments_of(random_scene("alpha", 12, seed=44, channels=3), make_cameras("alpha", 3))
+
+
+@pytest.mark.parametrize("name, value", [
+    ("packed", True), ("sparse_grad", True), ("absgrad", True), ("distributed", True), ("camera_model", "fisheye"),
+    ("far_plane", 100.0), ("radius_clip", 3.0), ("eps2d", 0.1), ("with_ut", True), ("rolling_shutter", 1),
+    ("radial_coeffs", torch.zeros(2, 6))])
+def test_what_is_not_offered_is_refused_by_name(small, name, value):
+    with pytest.raises(NotImplementedError, match=name):
+        rasterization(**small, **{name: value})
+
+
+def test_what_is_switched_off_or_changes_nothing_is_accepted(small):
+    expected = rasterization(**small)[0]
+    renders = rasterization(**small, packed=False, tile_size=8, channel_chunk=2, segmented=True, with_ut=False,
+                            with_eval3d=False, radial_coeffs=None, viewmats_rs=None)[0]
+    assert torch.equal(renders, expected)
+
+
+def test_arguments_that_nobody_knows_are_refused(small):
+    with pytest.raises(TypeError, match="blend_moed"):
+        rasterization(**small, blend_moed=None)
+
+
+@pytest.mark.parametrize("name, value, error", [
+    ("means", torch.zeros(12, 2), "means"), ("means", torch.zeros(1, 12, 3), "means"),
+    ("quats", torch.zeros(12, 3), "quats"), ("scales", torch.zeros(12, 1), "scales"),
+    ("opacities", torch.zeros(12, 1), "opacities"), ("colors", torch.zeros(11, 3), "colors"),
+    ("viewmats", torch.eye(4), "viewmats"), ("viewmats", torch.zeros(0, 4, 4), "viewmats"),
+    ("Ks", torch.zeros(1, 3, 3), "Ks"), ("backgrounds", torch.zeros(3), "backgrounds"),
+    ("render_mode", "RGBD", "render_mode"), ("rasterize_mode", "smooth", "rasterize_mode"),
+    ("covars", torch.zeros(12, 6), "covars"), ("blend_mode", "gamma", "blend_mode")])
+def test_what_does_not_fit_is_named(small, name, value, error):
+    with pytest.raises(ValueError, match=error):
+        rasterization(**{**small, name: value})
+
+
+def test_missing_tensors_are_named(small):
+    with pytest.raises(TypeError, match="quats"):
+        rasterization(**{**small, "quats": None})
