@@ -1,7 +1,7 @@
 // The three nearest neighbours of every point: exact, by leaving out boxes that are too far.
 #include <cmath>
 
-#include "cuda/check.h"
+#include "cuda/device.cuh"
 #include "dsmoe/hd.h"
 #include "optim/neighbors.h"
 
@@ -11,8 +11,6 @@ namespace {
 
 constexpr int kBlock = 256;
 constexpr int kBitsPerAxis = 21;  // three axes fill an int64
-
-unsigned blocks_for(int64_t items, int block) { return static_cast<unsigned>((items + block - 1) / block); }
 
 // The lowest kBitsPerAxis bits, each with two zeros above it.
 __device__ uint64_t spread_bits(uint64_t bits) {

@@ -26,6 +26,13 @@ bool is_capturing(cudaStream_t stream) {
   return status != cudaStreamCaptureStatusNone;
 }
 
+InstanceCapacities::Key InstanceCapacities::key(int device, int64_t width, int64_t height, int64_t blend_mode,
+                                                int64_t num_gaussians) {
+  int bits = 0;
+  while (num_gaussians >> bits != 0) ++bits;
+  return {device, width, height, blend_mode, bits};
+}
+
 int64_t InstanceCapacities::likely(const Key& key) {
   const std::lock_guard<std::mutex> lock(mutex_);
   const auto found = counts_.find(key);

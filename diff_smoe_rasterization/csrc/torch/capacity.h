@@ -18,6 +18,7 @@ namespace binding {
 class InstanceCapacities {
  public:
   using Key = std::tuple<int, int64_t, int64_t, int64_t, int>;  // device, width, height, blend mode, bits of N
+  static Key key(int device, int64_t width, int64_t height, int64_t blend_mode, int64_t num_gaussians);
 
   // What is likely to be enough, or -1 where nothing is known of the key.
   int64_t likely(const Key& key);

@@ -61,7 +61,6 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options)
   Outputs outputs = allocate_outputs(inputs, options);
   auto saved = saved_on_device<S>(outputs, options);
   const auto images = image_outputs<S>(outputs);
-  const auto integers = like.options().dtype(at::kInt);
 
   StageRecorder recorder(Pass::kForward);
   EventClock clock(recorder.times(), stream);
@@ -76,10 +75,8 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options)
     if (sorted) cuda::sort_by_depth(count, keys, saved.order, scratch, stream);
     clock.end(&cpu::StageTimes::sort);
   }
-  int bits_of_count = 0;
-  while (count >> bits_of_count != 0) ++bits_of_count;
-  const InstanceCapacities::Key key = {like.get_device(), options.image_width, options.image_height, options.blend_mode,
-                                       bits_of_count};
+  const auto key =
+      InstanceCapacities::key(like.get_device(), options.image_width, options.image_height, options.blend_mode, count);
   int64_t capacity = InstanceCapacities::shared().likely(key);
   if (is_capturing(stream)) {
     if (capacity < 0) capacity = 8 * count + 1024;
@@ -88,7 +85,7 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options)
   }
   TORCH_CHECK(!options.deterministic || capacity <= std::numeric_limits<uint32_t>::max(), "rasterize: ", capacity,
               " tile instances; with deterministic=True the most is ", std::numeric_limits<uint32_t>::max());
-  outputs[kInstances] = at::empty({capacity, saved.instance_width}, integers);
+  outputs[kInstances] = at::empty({capacity, saved.instance_width}, like.options().dtype(at::kInt));
   saved = saved_on_device<S>(outputs, options);
   {
     TensorScratch scratch(like);

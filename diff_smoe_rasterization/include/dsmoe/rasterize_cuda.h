@@ -104,7 +104,8 @@ void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCon
            const SavedForward<S>& saved, const ImageOutputs<S>& images, unsigned long long* pairs, cudaStream_t stream);
 
 // From image gradients to one record per Gaussian: the sums over its pixels, [N, kNumGateMoments + F], which must be
-// zero before. slots: [capacity, kSlotsPerInstance, kNumGateMoments + F], also zero; or null.
+// zero before. slots: [capacity, kSlotsPerInstance, kNumGateMoments + F], also zero, which take the place of the
+// records where the instances fit; or null. dL_dbackground: [C], or null. pairs: as above.
 template <class S>
 void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
                     const SavedForward<S>& saved, const ImageOutputs<S>& images,

@@ -1,23 +1,12 @@
 """The captures beside the repository, where they are there: what the loader makes of them, and that they train."""
 from __future__ import annotations
 
-import os
-
 import pytest
 
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.loop import Trainer
 from diff_smoe_rasterization.trainer.scene import load_scene
-
-
-def folder(name):
-    """Path of a data set; skips the test where it is absent."""
-    root = os.path.join(os.path.dirname(__file__), "..", "..", "..")
-    data = os.environ.get("DSMOE_DATA") or os.path.join(root, "..", "shared", "data")
-    path = os.path.abspath(os.path.join(data, name))
-    if not os.path.isdir(path):
-        pytest.skip(f"{path} is not there (set DSMOE_DATA to the folder of data sets)")
-    return path
+from real_data import folder
 
 
 @pytest.mark.parametrize("name, views, points, size", [("fox", (43, 7), 13_710, (67, 118)),

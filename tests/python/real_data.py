@@ -8,7 +8,7 @@ import pytest
 
 def folder(name):
     """Path of a data set; skips the test where it is absent."""
-    root = os.path.join(os.path.dirname(__file__), "..", "..", "..")
+    root = os.path.join(os.path.dirname(__file__), "..", "..")
     data = os.environ.get("DSMOE_DATA") or os.path.join(root, "..", "shared", "data")
     path = os.path.abspath(os.path.join(data, name))
     if not os.path.isdir(path):
