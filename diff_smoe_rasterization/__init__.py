@@ -30,8 +30,8 @@ except ImportError:
 
         return getattr(importlib.import_module("." + _HOMES[name], __name__), name)
 
-# setup.py installs the folders integrations, patches and benchmarks inside the package. In a source tree they lie beside
-# it, where its submodules are then looked for too. Beside an installed package such folders are a stranger's.
+# setup.py installs the folders integrations, patches and benchmarks inside the package. In a source tree they lie
+# beside it, where its submodules are then looked for too. Beside an installed package such folders are a stranger's.
 _beside = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
 if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",), ("build_support", "backend.py"))):
     __path__.append(_beside)

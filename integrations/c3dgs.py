@@ -52,7 +52,7 @@ def rasterize_gaussians_indexed(means3D, means2D, sh, sh_indices, g_indices, col
         scale_factors: [N, 1] or [N], what a Gaussian's scales are multiplied by, beside `scale_modifier`; absent: 1.
     The others are those of `diff_smoe_rasterization.rasterize`, and so are types, errors, and what is absent. An index
     that is negative or beyond its codebook raises ValueError. The host looks for one when it meets a tensor of indices
-    for the first time or changed, or with a codebook of another length; on a GPU it waits in that call, and in no other.
+    for the first time, or changed, or with a codebook of another length; on a GPU it waits in that call, in no other.
 
     Returns: color [C, H, W], radii [N] int32. Gradients equal bit for bit from run to run where those of `rasterize`
     do: codebooks add nothing by atomics.
