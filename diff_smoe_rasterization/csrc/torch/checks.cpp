@@ -5,6 +5,7 @@
 #include <sstream>
 #include <vector>
 
+#include "dsmoe/rasterize_cuda.h"
 #include "dsmoe/sh.h"
 
 namespace dsmoe {
@@ -179,6 +180,12 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
                          outputs[i].device() == inputs[kMeans3D].device(),
                      function, ": ", kOutputNames[i], " must be as rasterize returned it: dense ",
                      dtype_name(specs[i].type), " on ", inputs[kMeans3D].device());
+  }
+  if (outputs[kSegments].numel() > 0) {
+    const int64_t capacity = outputs[kInstances].size(0);
+    check_shape(function, kOutputNames[kSegments], outputs[kSegments],
+                {cuda::num_segment_rows(capacity), cuda::kSegmentRow});
+    check_shape(function, kOutputNames[kSegmentQueue], outputs[kSegmentQueue], {cuda::num_queue_entries(capacity), 2});
   }
   for (int i = 0; i < kNumImageGradients; ++i) {
     if (!image_gradients[i].defined()) continue;
