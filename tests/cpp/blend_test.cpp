@@ -219,8 +219,7 @@ struct PixelGradient {
 };
 
 // The pairs in front of `middle` belong to another walk, which knows those behind by their sum alone.
-template <BlendMode kMode, class Real>
-PixelGradient backward(const Pixel& pixel, const Weights& g, int middle = 0) {
+template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel, const Weights& g, int middle = 0) {
   const Finished forward = blended<kMode, Real>(pixel);
   const Real gate_sum = Real(forward.gate_sum), transmittance = Real(forward.transmittance);
   const Real background = Real(pixel.background);

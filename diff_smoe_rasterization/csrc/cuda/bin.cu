@@ -137,8 +137,8 @@ __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_con
   }
 }
 
-// The first instance of each tile, and the queue of segments emptied for the blend. A warp looks for one of them: it cuts what is left of the sorted keys into 32 parts,
-// and goes on in the first that ends at the tile or behind.
+// The first instance of each tile, and the queue of segments emptied for the blend. A warp looks for one of them: it
+// cuts what is left of the sorted keys into 32 parts, and goes on in the first that ends at the tile or behind.
 template <class Key>
 __global__ void tile_offsets_kernel(int64_t tiles, int64_t capacity, const Key* keys, int64_t* offsets,
                                     int32_t* segment_queue) {
@@ -231,9 +231,8 @@ void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCo
       DSMOE_CHECK_LAUNCH("pair_with_slots");
     }
   }
-  tile_offsets_kernel<<<blocks_for((tiles + 1) * kWarp, kBlock), kBlock, 0, stream>>>(tiles, capacity, sorted_keys,
-                                                                                      saved.tile_offsets,
-                                                                                      saved.segment_queue);
+  tile_offsets_kernel<<<blocks_for((tiles + 1) * kWarp, kBlock), kBlock, 0, stream>>>(
+      tiles, capacity, sorted_keys, saved.tile_offsets, saved.segment_queue);
   DSMOE_CHECK_LAUNCH("tile_offsets");
 }
 

@@ -19,9 +19,11 @@ __device__ S& segment_sum(const BlendArguments<S>& arguments, const WarpTile<S>&
 template <class S, int kSums>
 __device__ void next_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
                              const PixelState<S> (&state)[kLanePixels], S (&sums)[kLanePixels][kSums]) {
+#pragma unroll
   for (int k = 0; k < kLanePixels; ++k) {
     if (!tile.inside(arguments, k)) continue;
     segment_pixel(arguments.saved, tile, segment, k).transmittance = abs(state[k].transmittance);
+#pragma unroll
     for (int f = 0; f < kSums; ++f) {
       segment_sum(arguments, tile, segment - 1, k, f) = sums[k][f];
       sums[k][f] = S(0);
@@ -36,10 +38,13 @@ __device__ void next_segment(const BlendArguments<S>& arguments, const WarpTile<
 template <class S, int kSums>
 __device__ void join_segments(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int last,
                               S (&sums)[kLanePixels][kSums]) {
+#pragma unroll
   for (int k = 0; k < kLanePixels; ++k) {
     if (!tile.inside(arguments, k)) continue;
+#pragma unroll
     for (int f = 0; f < kSums; ++f) {
       segment_sum(arguments, tile, last, k, f) = sums[k][f];
+#pragma unroll 1
       for (int before = last - 1; before >= 0; --before) sums[k][f] += segment_sum(arguments, tile, before, k, f);
     }
   }
@@ -123,8 +128,9 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   }
 }
 
+// Ten blocks a multiprocessor: what the segments need is kept out of the inner loop's registers.
 template <class S, BlendMode kMode, int kFeatures>
-__global__ void __launch_bounds__(kWarpsPerTile* kWarp)
+__global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 ? 10 : 1)
     blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
   __shared__ StagedGaussian<S> staged[kWarpsPerTile][kWarp];
   const WarpTile<S> tile(arguments);

@@ -154,7 +154,8 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
       }
       share = sum_lanes(share);
       if (tile.lane == 0) {
-        arguments.dL_dbackground_rows[(int64_t(tile_index) * kWarpsPerTile + quarter) * config.num_channels + c] = share;
+        arguments.dL_dbackground_rows[(int64_t(tile_index) * kWarpsPerTile + quarter) * config.num_channels + c] =
+            share;
       }
     }
   }
@@ -177,7 +178,8 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
         S behind = S(0);
         for (int later = segment + 1; later < segments; ++later) {
           const SegmentPixel<S>& at = segment_pixel(arguments.saved, tile, later, k);
-          for (int f = 0; f < kSegmentFeatures; ++f) behind = fma(scaled.get(arguments, tile, k, f), at.sums[f], behind);
+          for (int f = 0; f < kSegmentFeatures; ++f)
+            behind = fma(scaled.get(arguments, tile, k, f), at.sums[f], behind);
         }
         const S transmittance = segment_pixel(arguments.saved, tile, segment + 1, k).transmittance;
         resume_backward<kMode>(pixel[k], transmittance, behind);

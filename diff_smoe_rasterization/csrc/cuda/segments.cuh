@@ -1,9 +1,10 @@
-// Long lists in segments. The forward pass notes each pixel's state where a segment begins, so that the backward pass can
-// give every segment to a warp of its own: alone, the warp with the longest list would decide how long the pass takes.
+// Long lists in segments. The forward pass notes each pixel's state where a segment begins, so that the backward pass
+// can give every segment to a warp of its own: alone, the warp with the longest list would decide how long the pass
+// takes.
 //
 // Segment s of a tile holds entries [s L, (s + 1) L) of its list. A tile's first segment needs no state. The state of
-// another lies in row floor(begin / L) + s, with `begin` the tile's first instance: no two segments share a row, because
-// a tile's last row is at most floor(end / L), and the next tile's first one is above that.
+// another lies in row floor(begin / L) + s, with `begin` the tile's first instance: no two segments share a row,
+// because a tile's last row is at most floor(end / L), and the next tile's first one is above that.
 #pragma once
 
 #include "tile_walk.cuh"

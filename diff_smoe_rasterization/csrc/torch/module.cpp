@@ -20,7 +20,8 @@ py::dict constants() {
                   "transmittance_cut"_a = dsmoe::kTransmittanceCut, "gate_sum_cut"_a = dsmoe::kGateSumCut,
                   "radius_root_floor"_a = dsmoe::kRadiusRootFloor, "compensation_floor"_a = dsmoe::kCompensationFloor,
                   "low_pass"_a = dsmoe::kLowPass, "frustum_margin"_a = dsmoe::kFrustumMargin,
-                  "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon, "tile_size"_a = dsmoe::kTileSize, "segment_length"_a = dsmoe::cuda::kSegmentLength);
+                  "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon, "tile_size"_a = dsmoe::kTileSize,
+                  "segment_length"_a = dsmoe::cuda::kSegmentLength);
 }
 
 py::dict blend_modes() {

@@ -55,9 +55,9 @@ template <class S> struct SavedForward {
   int64_t* num_instances = nullptr;           // [1] how many there are; those beyond the capacity are not listed
   int32_t* instances = nullptr;               // [capacity, instance_width] Gaussian (and slot) by tile, front to back
   int64_t capacity = 0;
-  int instance_width = 1;          // 2: with slots, for gradients that are bitwise reproducible
-  int64_t* slot_ranges = nullptr;  // [N, 2] each Gaussian's slots, begin and end; null without slots
-  S* segments = nullptr;           // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
+  int instance_width = 1;            // 2: with slots, for gradients that are bitwise reproducible
+  int64_t* slot_ranges = nullptr;    // [N, 2] each Gaussian's slots, begin and end; null without slots
+  S* segments = nullptr;             // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
   int32_t* segment_queue = nullptr;  // [num_queue_entries(capacity), 2] which segments some pixel has reached, or null
   S* final_transmittance = nullptr;
   S* gate_sum = nullptr;
