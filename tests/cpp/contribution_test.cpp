@@ -78,7 +78,7 @@ template <class S> void expect_brute_force(const Scene<S>& scene) {
     EXPECT_NEAR(actual.distances[i], sum.distance, tolerance * sum.distance) << i;
     num_pairs += actual.pixels[i];
   }
-  EXPECT_GT(num_pairs, scene.pixels());
+  EXPECT_GT(num_pairs, 500);
 }
 
 template <class Mode> struct ContributionsIn : testing::Test {};
