@@ -30,5 +30,5 @@ except ImportError:
         return getattr(importlib.import_module("." + _HOMES[name], __name__), name)
 
 __all__ = ["BLEND_MODES", "Contributions", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer",
-           "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info", "distCUDA2", "fused_ssim",
-           "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling", "stage_times"]
+           "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info", "distCUDA2",
+           "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling", "stage_times"]
