@@ -15,7 +15,7 @@ from .extension import _C  # noqa: F401  (loading it registers the ops)
 _OPS = torch.ops.diff_smoe_rasterization
 _CAN_REGISTER = hasattr(torch.library, "register_autograd")
 _NUM_INPUTS = 13  # tensors before the options
-_NUM_OPTIONS = 14  # options that the backward op takes too
+_NUM_OPTIONS = 15  # options that the backward op takes too
 _NUM_CHECKS = 2  # strict, prefiltered
 _NUM_IMAGES = 5  # results that are the caller's: color, radii, gate_sum, depth, inverse_depth
 _RADII, _DEPTH = 1, 3
@@ -101,7 +101,7 @@ def rasterize_op(*inputs):
 def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
                     viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier, near,
                     alpha_min, sh_degree, blend_mode, antialiasing, depth, inverse_depth, deterministic,
-                    debug, strict, prefiltered):
+                    debug, clamp_color, strict, prefiltered):
     """The results' shapes and types, as csrc/torch/tensors.cpp allocates them."""
     count = means3D.shape[0]
     channels = 3 if colors_precomp is None else colors_precomp.shape[1]

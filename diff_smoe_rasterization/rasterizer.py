@@ -74,8 +74,8 @@ def _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scal
         int(settings.image_height), int(settings.image_width), float(settings.tanfovx), float(settings.tanfovy),
         float(settings.scale_modifier), float(settings.near), float(settings.alpha_min), int(settings.sh_degree),
         BLEND_MODES.index(resolve_blend_mode(settings.blend_mode)), bool(settings.antialiasing), "depth" in outputs,
-        "inverse_depth" in outputs, bool(settings.deterministic), bool(settings.debug), bool(settings.strict),
-        bool(settings.prefiltered))
+        "inverse_depth" in outputs, bool(settings.deterministic), bool(settings.debug),
+        bool(settings.clamp_color), bool(settings.strict), bool(settings.prefiltered))
     return Rendering(color, radii, alpha=gate_sum if "alpha" in outputs else None,
                      depth=depth if "depth" in outputs else None,
                      inverse_depth=inverse_depth if "inverse_depth" in outputs else None), saved

@@ -233,11 +233,12 @@ def covariance3D(gaussians, scale_modifier):
 
 
 def color(gaussians, settings):
-    """Returns the experts [n, C]: the given colours, or spherical harmonics plus 0.5, at least 0."""
+    """Returns the experts [n, C]: the given colours, or spherical harmonics plus 0.5, at least 0 by `clamp_color`."""
     if gaussians.colors_precomp is not None:
         return gaussians.colors_precomp
     basis = sh_basis(settings.sh_degree, gaussians.means3D - settings.campos)
-    return (0.5 + torch.einsum("nk,nkc->nc", basis, gaussians.shs[:, :basis.shape[1]])).clamp(min=0)
+    unclamped = 0.5 + torch.einsum("nk,nkc->nc", basis, gaussians.shs[:, :basis.shape[1]])
+    return unclamped.clamp(min=0) if settings.clamp_color else unclamped
 
 
 def sh_basis(degree, offset):

@@ -46,6 +46,7 @@ class GaussianRasterizationSettings(NamedTuple):
     strict: bool = False  # raise where an attribute is NaN or infinite, instead of culling that Gaussian
     blend_mode: Optional[str] = None  # one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha"
     deterministic: bool = False  # CUDA: gradients equal bit for bit from run to run; slower. The CPU's always are
+    clamp_color: bool = True  # colours from shs are at least 0; False: as the harmonics give them, with their gradient
 
 
 class Rendering(NamedTuple):

@@ -5,7 +5,7 @@ SparseGaussianAdam and `fused_ssim` are here.
 """
 from __future__ import annotations
 
-import collections
+from collections import namedtuple
 
 import torch
 
@@ -15,15 +15,13 @@ from diff_smoe_rasterization import SparseGaussianAdam, fused_ssim, rasterize_wi
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "fused_ssim",
            "rasterize_gaussians"]
 
-_PLAIN = diff_smoe_rasterization.GaussianRasterizationSettings
-_BEHIND = _PLAIN._fields.index("debug") + 1
-_FIELDS = _PLAIN._fields[:_BEHIND] + ("pixel_weights",) + _PLAIN._fields[_BEHIND:]
-_DEFAULTS = {**_PLAIN._field_defaults, "pixel_weights": None}
+_fields = list(diff_smoe_rasterization.GaussianRasterizationSettings._fields)
+_fields.insert(_fields.index("debug") + 1, "pixel_weights")
+_defaults = {**diff_smoe_rasterization.GaussianRasterizationSettings._field_defaults, "pixel_weights": None}
 
-GaussianRasterizationSettings = collections.namedtuple(
-    "GaussianRasterizationSettings", _FIELDS, defaults=[_DEFAULTS[name] for name in _FIELDS if name in _DEFAULTS],
-    module=__name__)
-GaussianRasterizationSettings.__doc__ = """The package's settings, and behind `debug` one field more.
+GaussianRasterizationSettings = namedtuple(
+    "GaussianRasterizationSettings", _fields, defaults=[_defaults[name] for name in _fields if name in _defaults])
+GaussianRasterizationSettings.__doc__ = """The package's settings, with `pixel_weights` as the thirteenth.
 
 pixel_weights: [H, W], what to sum over the pixels of each Gaussian; None, or a tensor without elements, for no sums.
 """
@@ -45,8 +43,7 @@ def rasterize_gaussians(means3D, means2D, dc, sh, colors_precomp, opacities, sca
             centre in pixels. The weight is alpha T, in `smoe_std` alpha, divided by no gate sum.
     Raises ValueError or TypeError where pixel_weights does not fit too.
     """
-    settings = _PLAIN(**{name: getattr(raster_settings, name) for name in _PLAIN._fields})
-    rendering, splats = rasterize_with_splats(means3D, opacities, settings, means2D=means2D, dc=dc, shs=sh,
+    rendering, splats = rasterize_with_splats(means3D, opacities, raster_settings, means2D=means2D, dc=dc, shs=sh,
                                               colors_precomp=colors_precomp, scales=scales, rotations=rotations,
                                               cov3D_precomp=cov3Ds_precomp)
     color, radii, pixel_weights = rendering.color, rendering.radii, raster_settings.pixel_weights

@@ -124,6 +124,14 @@ TEST(ProjectGaussian, BackwardIsTheDerivativeWhereAColourIsClamped) {
   expect_backward_is_the_derivative(scene);
 }
 
+TEST(ProjectGaussian, BackwardIsTheDerivativeWhereANegativeColourIsNotClamped) {
+  Scene<double> scene = single_gaussian();
+  scene.shs[1] = -5;
+  scene.config.clamp_color = false;
+  ASSERT_LT(project(scene).features[1], 0);
+  expect_backward_is_the_derivative(scene);
+}
+
 TEST(ProjectGaussian, BackwardIsTheDerivativeWithScaleModifierAndAntialiasing) {
   Scene<double> scene = single_gaussian();
   scene.config.scale_modifier = 0.3;

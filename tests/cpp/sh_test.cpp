@@ -70,9 +70,9 @@ constexpr int kCoefficients = 6;
 
 ShCoefficients<const double> joint(const double* sh) { return {sh, sh + 3}; }
 
-Vector color_of(int degree, const Vector& x) {
+Vector color_of(int degree, const Vector& x, bool clamp = true) {
   Vector color(3);
-  sh_color(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]), color.data());
+  sh_color(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]), clamp, color.data());
   return color;
 }
 
@@ -84,11 +84,11 @@ Vector random_color_inputs(unsigned seed) {
   return x;
 }
 
-Vector color_gradient(int degree, const Vector& x, const Vector& dL_dcolor) {
+Vector color_gradient(int degree, const Vector& x, const Vector& dL_dcolor, bool clamp = true) {
   Vector out(x.size());
-  const auto mean =
-      sh_color_backward<double>(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]), color_of(degree, x).data(),
-                                dL_dcolor.data(), {&out[kCoefficients], &out[kCoefficients + 3]});
+  const Vector color = color_of(degree, x, clamp);
+  const auto mean = sh_color_backward<double>(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]), clamp, color.data(),
+                                              dL_dcolor.data(), {&out[kCoefficients], &out[kCoefficients + 3]});
   out[0] = mean.x, out[1] = mean.y, out[2] = mean.z;
   for (int k = 0; k < 3; ++k) out[3 + k] = -out[k];
   return out;
@@ -113,15 +113,25 @@ TEST(ShColor, PassesNoGradientWhereClamped) {
   for (int k = 0; k < kMaxShCoefficients; ++k) EXPECT_EQ(actual[kCoefficients + 3 * k + 1], 0);
 }
 
+TEST(ShColor, WithoutTheClampColoursMayBeNegativeAndPassTheirGradient) {
+  Vector x = random_color_inputs(10);
+  x[kCoefficients + 1] = -4;
+  const Vector w = {0.7, -1.1, 0.4};
+  EXPECT_LT(color_of(3, x, false)[1], 0);
+  auto loss = [&](const Vector& v) { return weighted_sum(w, color_of(3, v, false)); };
+  expect_gradient(color_gradient(3, x, w, false), loss, x);
+}
+
 TEST(ShColor, DegreeZeroMayLieApart) {
   const Vector x = random_color_inputs(11), w = {0.7, -1.1, 0.4};
   const Vector dc(x.begin() + kCoefficients, x.begin() + kCoefficients + 3),
       rest(x.begin() + kCoefficients + 3, x.end());
   const ShCoefficients<const double> apart = {dc.data(), rest.data()};
   Vector color(3), dL_ddc(3), dL_drest(45);
-  sh_color(3, vec3(&x[0]), &x[3], apart, color.data());
+  sh_color(3, vec3(&x[0]), &x[3], apart, true, color.data());
   EXPECT_EQ(color, color_of(3, x));
-  sh_color_backward<double>(3, vec3(&x[0]), &x[3], apart, color.data(), w.data(), {dL_ddc.data(), dL_drest.data()});
+  sh_color_backward<double>(3, vec3(&x[0]), &x[3], apart, true, color.data(), w.data(),
+                            {dL_ddc.data(), dL_drest.data()});
   Vector joined = dL_ddc;
   joined.insert(joined.end(), dL_drest.begin(), dL_drest.end());
   const Vector expected = color_gradient(3, x, w);
@@ -132,7 +142,7 @@ TEST(ShColor, EitherCoefficientGradientMayBeLeftOut) {
   const Vector x = random_color_inputs(12), w = {0.7, -1.1, 0.4};
   const Vector color = color_of(3, x), expected = color_gradient(3, x, w);
   const auto sh = joint(&x[kCoefficients]);
-  const auto g = sh_color_backward<double>(3, vec3(&x[0]), &x[3], sh, color.data(), w.data(), {nullptr, nullptr});
+  const auto g = sh_color_backward<double>(3, vec3(&x[0]), &x[3], sh, true, color.data(), w.data(), {nullptr, nullptr});
   EXPECT_EQ(g.x, expected[0]);
   EXPECT_EQ(g.y, expected[1]);
   EXPECT_EQ(g.z, expected[2]);

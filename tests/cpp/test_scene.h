@@ -131,6 +131,7 @@ template <class To, class From> Scene<To> convert(const Scene<From>& from) {
   to.config.scale_modifier = To(from.config.scale_modifier);
   to.config.alpha_min = To(from.config.alpha_min);
   to.config.antialiasing = from.config.antialiasing;
+  to.config.clamp_color = from.config.clamp_color;
   to.config.depth = from.config.depth;
   to.config.inverse_depth = from.config.inverse_depth;
   to.config.num_threads = from.config.num_threads;

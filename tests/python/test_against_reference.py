@@ -10,7 +10,7 @@ import functools
 
 import pytest
 import torch
-from comparison import assert_all_close, assert_close, one_thread, threshold_margin
+from comparison import assert_all_close, assert_close, assert_same_gradients, one_thread, threshold_margin
 from devices import on_the_cpu, random_normal
 from scenes import assert_not_empty, random_scene
 
@@ -100,6 +100,8 @@ SCENES = {
     "negative_opacities": _with_negative_opacities,
     "flat_opacities": _with_flat_opacities,
     "scale_modifier": _with_scale_modifier,
+    "unclamped": _scene(degree=3, clamp_color=False, seed=26),
+    "unclamped_split_dc": _scene(degree=2, split_dc=True, covariance="cov3D", clamp_color=False, seed=27),
 }
 # Scenes that run with the gradients of the optional outputs beside that of the colour.
 WITH_OUTPUTS = {"default", "split_dc", "channels_7", "antialiasing", "saturating", "alpha_min", "faint", "large_splats"}
@@ -170,6 +172,20 @@ def test_the_optional_outputs_do_not_change_the_colour(mode):
         rendering = diff_smoe_rasterization.rasterize(settings=scene.settings, outputs=(output,), **scene.inputs)
         assert torch.equal(rendering.color, alone.color)
         assert [name for name in OUTPUTS if getattr(rendering, name) is not None] == [output]
+
+
+def test_clamp_color_decides_on_colours_below_zero(mode, device):
+    """Those of harmonics alone: given colours are used as they are."""
+    scene = random_scene(mode, degree=3, seed=26, bg=torch.zeros(3))
+    least = {clamp: diff_smoe_rasterization.rasterize(
+        settings=scene.settings._replace(clamp_color=clamp), **scene.inputs).color.min() for clamp in (True, False)}
+    assert least[True] >= 0 and least[False] < -0.01
+    given = random_scene(mode, channels=3, seed=26)
+    given = given.with_inputs(colors_precomp=given.inputs["colors_precomp"] - 0.5)
+    unclamped, clamped = (render(diff_smoe_rasterization.rasterize, given.with_settings(clamp_color=clamp), (),
+                                 random_normal((3, 37, 50), 1)) for clamp in (False, True))
+    assert clamped[0].color.min() < -0.01 and torch.equal(clamped[0].color, unclamped[0].color)
+    assert_same_gradients(clamped[2], unclamped[2])
 
 
 def test_each_optional_output_has_its_own_gradient(mode):

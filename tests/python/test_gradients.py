@@ -23,6 +23,7 @@ CASES = {
     "colours": dict(channels=3),
     "five_channels": dict(channels=5, covariance="cov3D"),
     "antialiasing": dict(degree=1, antialiasing=True, principal_point=(2.5, -1.5)),
+    "unclamped": dict(degree=2, clamp_color=False),
 }
 
 

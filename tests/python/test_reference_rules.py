@@ -183,6 +183,22 @@ def test_colours_from_harmonics_are_at_least_zero_without_a_gradient_below():
     assert (inputs["shs"].grad[:, 0] != 0).tolist() == [[False, True, True], [True, False, True]]
 
 
+def test_without_clamp_color_harmonics_may_give_less_than_zero():
+    inputs = on_axis([DEPTH, 3.0], [0.5, 0.5], [[0.0], [0.0]])
+    del inputs["colors_precomp"]
+    band0 = math.sqrt(1 / (4 * math.pi))
+    inputs["shs"] = torch.tensor([[[-4.0, 1.0, 0.0]], [[0.5, -9.0, 9.0]]], dtype=torch.float64, requires_grad=True)
+    settings = facing_camera("alpha", bg=(0.0, 0.0, 0.0), clamp_color=False)
+    color = reference.rasterize(settings=settings, **inputs).color
+    expected = [0.5 * (0.5 + front * band0) + 0.25 * (0.5 + behind * band0)
+                for front, behind in ((-4.0, 0.5), (1.0, -9.0), (0.0, 9.0))]
+    assert expected[0] < 0
+    assert middle(color) == pytest.approx(expected, rel=EXACT)
+    color.sum().backward()
+    gradient = inputs["shs"].grad
+    assert (gradient > 0).all() and torch.equal(gradient, gradient[..., :1].expand_as(gradient))
+
+
 def test_spherical_harmonics_are_orthonormal():
     # Gauss-Legendre in z and the trapezoid rule in longitude integrate products of degree 6 exactly.
     longitude = torch.arange(16, dtype=torch.float64) * 2 * math.pi / 16

@@ -9,7 +9,7 @@ namespace {
 const std::string kOptions =
     "SymInt image_height, SymInt image_width, float tanfovx, float tanfovy, float scale_modifier, float near, "
     "float alpha_min, int sh_degree, int blend_mode, bool antialiasing, bool depth, bool inverse_depth, bool "
-    "deterministic, bool debug";
+    "deterministic, bool debug, bool clamp_color";
 
 const std::string kRasterize =
     "rasterize(Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? dc, Tensor? shs, Tensor? colors_precomp, "

@@ -90,7 +90,7 @@ struct Options {
   int64_t image_height, image_width;
   double tanfovx, tanfovy, scale_modifier, near, alpha_min;
   int64_t sh_degree, blend_mode;
-  bool antialiasing, depth, inverse_depth, deterministic, debug;
+  bool antialiasing, depth, inverse_depth, deterministic, debug, clamp_color;
 };
 
 inline int64_t num_gaussians(const Inputs& inputs) { return inputs[kMeans3D].size(0); }
@@ -161,6 +161,7 @@ template <class S> RasterConfig<S> raster_config(const Inputs& inputs, const Opt
   out.antialiasing = options.antialiasing;
   out.depth = options.depth;
   out.inverse_depth = options.inverse_depth;
+  out.clamp_color = options.clamp_color;
   return out;
 }
 

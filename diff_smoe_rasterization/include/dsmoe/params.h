@@ -30,7 +30,8 @@ template <class S> struct RasterConfig {
   S scale_modifier = 1;
   S alpha_min = 0;  // SMoE modes: also skip alpha below this
   bool antialiasing = false;
-  bool depth = false;  // the expected depth is asked for
+  bool clamp_color = true;  // colours from shs are at least 0
+  bool depth = false;       // the expected depth is asked for
   bool inverse_depth = false;
   int num_threads = 1;  // CPU backend; below 1 counts as 1
 

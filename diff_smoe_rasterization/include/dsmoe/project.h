@@ -102,7 +102,7 @@ DSMOE_HD bool project_features(const GaussianInputs<S>& in, const Camera<S>& cam
   if (in.colors_precomp != nullptr) {
     for (int c = 0; c < config.num_channels; ++c) features[c] = in.colors_precomp[i * config.num_channels + c];
   } else {
-    sh_color(in.sh_degree, load3(in.means3D + 3 * i), camera.position, sh_of(in, i), features);
+    sh_color(in.sh_degree, load3(in.means3D + 3 * i), camera.position, sh_of(in, i), config.clamp_color, features);
   }
   S* extra = features + config.num_channels;
   if (config.depth) *extra++ = depth;
@@ -145,7 +145,7 @@ DSMOE_HD Vec3<S> project_color_backward(const GaussianInputs<S>& in, const Camer
     dL_dsh.rest = shs;
   }
   const Vec3<S> dL_dmean = sh_color_backward(in.sh_degree, load3(in.means3D + 3 * i), camera.position, sh_of(in, i),
-                                             features, dL_dfeatures, dL_dsh);
+                                             config.clamp_color, features, dL_dfeatures, dL_dsh);
   if (dL_dcamera != nullptr) {
     S* position = dL_dcamera->position;
     position[0] -= dL_dmean.x, position[1] -= dL_dmean.y, position[2] -= dL_dmean.z;

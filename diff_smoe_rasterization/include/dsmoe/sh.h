@@ -90,28 +90,28 @@ template <class S> DSMOE_HD Vec3<S> view_direction(Vec3<S> mean, const S* positi
   return inverse_length * offset;
 }
 
-// colour = max(0, 1/2 + sum_k basis_k sh_k)
+// colour = 1/2 + sum_k basis_k sh_k, and with `clamp` max(0, that)
 template <class S>
-DSMOE_HD void sh_color(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh, S* color) {
+DSMOE_HD void sh_color(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh, bool clamp, S* color) {
   S inverse_length, basis[kMaxShCoefficients];
   sh_basis(degree, view_direction(mean, position, inverse_length), basis);
   for (int c = 0; c < 3; ++c) color[c] = S(0.5) + basis[0] * sh.dc[c];
   for (int k = 1; k < sh_coefficients(degree); ++k) {
     for (int c = 0; c < 3; ++c) color[c] += basis[k] * sh.rest[3 * (k - 1) + c];
   }
-  for (int c = 0; c < 3; ++c) color[c] = color[c] < S(0) ? S(0) : color[c];  // NaN stays, and is culled
+  for (int c = 0; c < 3; ++c) color[c] = clamp && color[c] < S(0) ? S(0) : color[c];  // NaN stays, and is culled
 }
 
 // Writes dL/dsh for the active degree, where the outputs are given; returns dL/dmean (dL/dposition is its negative).
-// color is the forward's result: 0 means clamped, and a clamped channel passes no gradient.
+// color is the forward's result: with `clamp` 0 means clamped, and a clamped channel passes no gradient.
 template <class S>
-DSMOE_HD Vec3<S> sh_color_backward(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh,
+DSMOE_HD Vec3<S> sh_color_backward(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh, bool clamp,
                                    const S* color, const S* dL_dcolor, ShCoefficients<S> dL_dsh) {
   S inverse_length, basis[kMaxShCoefficients], dL_dbasis[kMaxShCoefficients];
   const Vec3<S> direction = view_direction(mean, position, inverse_length);
   sh_basis(degree, direction, basis);
   S g[3];
-  for (int c = 0; c < 3; ++c) g[c] = color[c] > S(0) ? dL_dcolor[c] : S(0);
+  for (int c = 0; c < 3; ++c) g[c] = !clamp || color[c] > S(0) ? dL_dcolor[c] : S(0);
   if (dL_dsh.dc != nullptr) {
     for (int c = 0; c < 3; ++c) dL_dsh.dc[c] = basis[0] * g[c];
   }

@@ -102,7 +102,6 @@ def list_size(scene, gpu):
 
 # Room for the lists is what earlier calls of the size and mode needed, and up to 65,536 more: only scenes of many
 # Gaussians outgrow it, and only at a size of their own.
-@pytest.mark.sanitize
 @pytest.mark.parametrize("outputs, degree, width", [(OUTPUTS, 1, 203), ((), 3, 219)],
                          ids=["all_images", "colour_alone"])
 def test_contents_that_outgrow_the_captured_lists(mode, outputs, degree, width, gpu):
@@ -177,6 +176,7 @@ def test_the_host_waits_for_nothing(mode, gpu):
     assert_same(result, step())
 
 
+@pytest.mark.sanitize
 def test_growing_contents_without_a_graph(mode, gpu):
     """Each call has more than the one before: what was learned from the last never limits the next."""
     base = scene_of(mode, num_gaussians=20_000, width=235, height=151, opacity=(0.02, 0.2))

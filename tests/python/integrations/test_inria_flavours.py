@@ -11,7 +11,7 @@ from comparison import assert_all_close, assert_close, assert_same_gradients, re
 from scenes import gradients, random_scene, random_weights
 
 from diff_smoe_rasterization import Rendering
-from diff_smoe_rasterization.integrations import inria, inria_2024, scaffold
+from diff_smoe_rasterization.integrations import c3dgs, inria, inria_2024, scaffold
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -27,14 +27,14 @@ FUNCTION_2024 = FUNCTION_2023[:2] + ["dc"] + FUNCTION_2023[2:]
 TOLERANCE = 1e-12
 
 
-@pytest.fixture(params=[inria, inria_2024, scaffold], ids=["inria", "inria_2024", "scaffold"])
+@pytest.fixture(params=[inria, inria_2024, c3dgs, scaffold], ids=["inria", "inria_2024", "c3dgs", "scaffold"])
 def flavour(request):
     return request.param
 
 
 def settings_of(flavour, settings, **others):
     """The settings as that trainer makes them: by keyword, its own fields and no other, then what the user adds."""
-    names = FIELDS + (["antialiasing"] if flavour is inria_2024 else [])
+    names = FIELDS + {inria_2024: ["antialiasing"], c3dgs: ["clamp_color"]}.get(flavour, [])
     return flavour.GaussianRasterizationSettings(**{name: getattr(settings, name) for name in names}, **others)
 
 

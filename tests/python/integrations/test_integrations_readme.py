@@ -13,7 +13,7 @@ def test_the_examples_run():
     text = README.read_text(encoding="utf-8")
     preamble, *flavours = re.split(r"^## (\w+)$", text, flags=re.MULTILINE)
     names, sections = flavours[::2], flavours[1::2]
-    assert names == ["inria", "inria_2024", "taming", "scaffold", "gsplat"]
+    assert names == ["inria", "inria_2024", "taming", "c3dgs", "scaffold", "gsplat"]
     torch.manual_seed(0)
     variables = {}
     example = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -34,5 +34,8 @@ def test_the_examples_run():
             assert ((variables["accum_count"] > 0) <= (variables["radii"] > 0)).all()
         if name == "inria":
             variables["from_inria"] = variables["color"]
+        if name == "c3dgs":
+            used = torch.zeros(40, dtype=torch.bool).index_fill(0, variables["sh_indices"], True)
+            assert torch.equal(variables["sh_codebook"].grad.flatten(1).any(1), used)
         if name == "inria_2024":
             assert (variables["dc"] != variables["shs"][:, :1]).any() and variables["inverse_depth"].max() > 0.1
