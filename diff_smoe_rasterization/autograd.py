@@ -111,12 +111,15 @@ def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales
     num_features = channels + int(depth) + int(inverse_depth)
     if means3D.device.type == "cuda":
         feature_row, num_tile_offsets, instance_row, in_order = (num_features + 3) // 4 * 4, tiles + 2, 1, count
-        instance_offsets = (0,)
+        instance_offsets, segments, segment_queue = (0,), (0,), (0,)
+        if means3D.dtype == torch.float32 and num_features == 3:
+            rows = num_instances // _C.constants["segment_length"] + 1
+            segments, segment_queue = (rows, 4 * tile * tile), (1 + 4 * rows, 2)
         if deterministic:
             instance_row, instance_offsets = 2, (count, 2)
     else:
         feature_row, num_tile_offsets, instance_row, in_order = num_features, tiles + 1, 2, 0
-        instance_offsets = (count + 1,)
+        instance_offsets, segments, segment_queue = (count + 1,), (0,), (0,)
 
     def image(wanted=True):
         return means3D.new_empty((1, image_height, image_width) if wanted else (0,))
@@ -128,7 +131,8 @@ def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales
             means3D.new_empty((num_instances, instance_row), dtype=torch.int32),
             means3D.new_empty((image_height, image_width)),
             means3D.new_empty((image_height, image_width), dtype=torch.int32),
-            means3D.new_empty((in_order,), dtype=torch.int32))
+            means3D.new_empty((in_order,), dtype=torch.int32), means3D.new_empty(segments),
+            means3D.new_empty(segment_queue, dtype=torch.int32))
 
 
 def _fake_rasterize_backward(dL_dcolor, dL_dgate_sum, dL_ddepth, dL_dinverse_depth, inputs, present, outputs,

@@ -18,9 +18,9 @@ class Splats:
     """
 
     def __init__(self, radii: torch.Tensor, saved: Sequence[torch.Tensor], settings: GaussianRasterizationSettings):
-        """saved: the results of the op `rasterize` behind its images."""
+        """saved: the results of the op `rasterize` behind its images, in the order of csrc/torch/schema.cpp."""
         (self._projected, _, self._instance_offsets, self._tile_offsets, self._instances, _, self._last_contributor,
-         self._order) = (tensor.detach() for tensor in saved)
+         self._order, *_) = (tensor.detach() for tensor in saved)
         self._radii = radii
         self._alpha_min = float(settings.alpha_min)
         self._blend_mode = BLEND_MODES.index(resolve_blend_mode(settings.blend_mode))

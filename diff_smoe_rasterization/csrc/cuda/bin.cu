@@ -137,10 +137,12 @@ __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_con
   }
 }
 
-// The first instance of each tile. A warp looks for one of them: it cuts what is left of the sorted keys into 32 parts,
+// The first instance of each tile, and the queue of segments emptied for the blend. A warp looks for one of them: it cuts what is left of the sorted keys into 32 parts,
 // and goes on in the first that ends at the tile or behind.
 template <class Key>
-__global__ void tile_offsets_kernel(int64_t tiles, int64_t capacity, const Key* keys, int64_t* offsets) {
+__global__ void tile_offsets_kernel(int64_t tiles, int64_t capacity, const Key* keys, int64_t* offsets,
+                                    int32_t* segment_queue) {
+  if (segment_queue != nullptr && blockIdx.x == 0 && threadIdx.x == 0) segment_queue[0] = 0;
   const int64_t tile = (int64_t(blockIdx.x) * kBlock + threadIdx.x) / kWarp;
   const int lane = threadIdx.x % kWarp;
   if (tile > tiles) return;
@@ -230,7 +232,8 @@ void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCo
     }
   }
   tile_offsets_kernel<<<blocks_for((tiles + 1) * kWarp, kBlock), kBlock, 0, stream>>>(tiles, capacity, sorted_keys,
-                                                                                      saved.tile_offsets);
+                                                                                      saved.tile_offsets,
+                                                                                      saved.segment_queue);
   DSMOE_CHECK_LAUNCH("tile_offsets");
 }
 

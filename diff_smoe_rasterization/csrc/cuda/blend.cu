@@ -1,11 +1,49 @@
 // Stage 3: the images.
 #include "../dispatch.h"
 #include "dsmoe/rasterize.h"
-#include "tile_walk.cuh"
+#include "segments.cuh"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
+
+// Where the sums of a segment lie until the pixel is made: those of the first one in the image itself.
+template <class S>
+__device__ S& segment_sum(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment, int k, int f) {
+  if (segment > 0) return segment_pixel(arguments.saved, tile, segment, k).sums[f];
+  const int64_t pixels = int64_t(arguments.width) * arguments.height;
+  return feature_image(arguments.config, arguments.images, f, pixels)[tile.pixel_index(arguments, k)];
+}
+
+// Ends the segment in front of `segment` and begins that one.
+template <class S, int kSums>
+__device__ void next_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
+                             const PixelState<S> (&state)[kLanePixels], S (&sums)[kLanePixels][kSums]) {
+  for (int k = 0; k < kLanePixels; ++k) {
+    if (!tile.inside(arguments, k)) continue;
+    segment_pixel(arguments.saved, tile, segment, k).transmittance = abs(state[k].transmittance);
+    for (int f = 0; f < kSums; ++f) {
+      segment_sum(arguments, tile, segment - 1, k, f) = sums[k][f];
+      sums[k][f] = S(0);
+    }
+  }
+  if (tile.lane == 0) {
+    segment_queue(arguments.saved).push(tile.tile_y * arguments.tile_columns + tile.tile_x, tile.quarter, segment);
+  }
+}
+
+// Ends the last segment, and makes the sums those of the whole list.
+template <class S, int kSums>
+__device__ void join_segments(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int last,
+                              S (&sums)[kLanePixels][kSums]) {
+  for (int k = 0; k < kLanePixels; ++k) {
+    if (!tile.inside(arguments, k)) continue;
+    for (int f = 0; f < kSums; ++f) {
+      segment_sum(arguments, tile, last, k, f) = sums[k][f];
+      for (int before = last - 1; before >= 0; --before) sums[k][f] += segment_sum(arguments, tile, before, k, f);
+    }
+  }
+}
 
 // Blends kSums features from `first_feature` on.
 template <class S, BlendMode kMode, int kSums>
@@ -22,9 +60,17 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     last[k] = 0;
   }
   unsigned hits = 0;
+  constexpr bool kSegments = kSums == kSegmentFeatures && sizeof(S) == sizeof(float);
+  const bool segments = kSegments && has_segments(arguments.saved, tile);
+  int segment = 0;
 
   auto next = load_entry(arguments, tile, tile.lane, first_feature);
   for (int32_t chunk = 0; chunk < tile.length; chunk += kWarp) {
+    if constexpr (kSegments) {
+      if (segments && chunk == (segment + 1) * kSegmentLength) {
+        next_segment(arguments, tile, ++segment, state, sums);
+      }
+    }
     const bool meets = meets_pixels(next, tile);
     if (meets) staged[tile.lane] = next.staged;
     unsigned left = __ballot_sync(kAllLanes, meets);
@@ -51,6 +97,9 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
       for (int k = 0; k < kLanePixels; ++k) open |= state[k].is_open();
       if (!__any_sync(kAllLanes, open)) break;
     }
+  }
+  if constexpr (kSegments) {
+    if (segment > 0) join_segments(arguments, tile, segment, sums);
   }
 
   const int64_t pixels = int64_t(arguments.width) * arguments.height;

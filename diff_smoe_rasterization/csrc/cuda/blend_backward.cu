@@ -2,8 +2,8 @@
 #include "../dispatch.h"
 #include "dsmoe/rasterize.h"
 #include "reduce.cuh"
+#include "segments.cuh"
 #include "tensor_sums.cuh"
-#include "tile_walk.cuh"
 
 namespace dsmoe {
 namespace cuda {
@@ -16,6 +16,7 @@ template <class S> struct BackwardArguments : BlendArguments<S> {
   S* dL_dbackground_rows;  // [tiles * kWarpsPerTile, C] of each warp, or null
   S* scaled;               // [F, H, W] g', where the number of features is not known
   int num_features;
+  int tiles;
 };
 
 // g' of one lane's pixels: in registers where the number of features is known, else in memory.
@@ -43,7 +44,7 @@ template <class S> __device__ bool has_slots(const BackwardArguments<S>& argumen
 
 template <class S> __device__ int64_t slot_of(const WarpTile<S>& tile, int32_t position) {
   const uint32_t of_tile = static_cast<uint32_t>(tile.list[2 * int64_t(position) + 1]);
-  return int64_t(of_tile) * kSlotsPerInstance + threadIdx.x / kWarp;
+  return int64_t(of_tile) * kSlotsPerInstance + tile.quarter;
 }
 
 // Adds the first `count` Gaussians of a batch to their records.
@@ -106,11 +107,14 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
   constexpr bool kTensor = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kTensorFeatures;
   __shared__ TensorStage tensor_stages[kTensor ? kWarpsPerTile : 1];
   __shared__ TensorBasis moment_basis;
+  if (is_idle_block(arguments.saved, arguments.tiles)) return;
   if constexpr (kTensor) {
     fill_moment_basis(moment_basis);
     __syncthreads();
   }
-  const WarpTile<S> tile(arguments);
+  const auto [tile_index, quarter, segment] = segment_of_warp(arguments.saved, arguments.tiles);
+  if (tile_index < 0) return;
+  const WarpTile<S> tile(arguments, tile_index, quarter);
   const int warp = threadIdx.x / kWarp;
   const RasterConfig<S>& config = arguments.config;
   const int num_features = kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
@@ -139,7 +143,7 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
                                     feature_background(config, f)));
     }
   }
-  if (arguments.dL_dbackground_rows != nullptr) {
+  if (arguments.dL_dbackground_rows != nullptr && segment == 0) {
     for (int c = 0; c < config.num_channels; ++c) {
       S share = S(0);
       for (int k = 0; k < kLanePixels; ++k) {
@@ -150,7 +154,7 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
       }
       share = sum_lanes(share);
       if (tile.lane == 0) {
-        arguments.dL_dbackground_rows[(int64_t(blockIdx.x) * kWarpsPerTile + warp) * config.num_channels + c] = share;
+        arguments.dL_dbackground_rows[(int64_t(tile_index) * kWarpsPerTile + quarter) * config.num_channels + c] = share;
       }
     }
   }
@@ -162,6 +166,25 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
     for (int k = 0; k < kLanePixels; ++k) seen = seen > last[k] ? seen : last[k];
     end = max_over_lanes(seen);
   }
+  int32_t begin = 0;
+  if (has_segments(arguments.saved, tile)) {
+    begin = segment * kSegmentLength;
+    if (begin >= end) return;
+    const int segments = (end + kSegmentLength - 1) / kSegmentLength;
+    if (segment + 1 < segments) {
+      for (int k = 0; k < kLanePixels; ++k) {
+        if (!tile.inside(arguments, k)) continue;
+        S behind = S(0);
+        for (int later = segment + 1; later < segments; ++later) {
+          const SegmentPixel<S>& at = segment_pixel(arguments.saved, tile, later, k);
+          for (int f = 0; f < kSegmentFeatures; ++f) behind = fma(scaled.get(arguments, tile, k, f), at.sums[f], behind);
+        }
+        const S transmittance = segment_pixel(arguments.saved, tile, segment + 1, k).transmittance;
+        resume_backward<kMode>(pixel[k], transmittance, behind);
+      }
+      end = begin + kSegmentLength;
+    }
+  }
   TensorStage& tensor_stage = tensor_stages[kTensor ? warp : 0];
   int batch = 0;  // Gaussians that wait in the stage
   if constexpr (kTensor) fill_gradient_basis(tensor_stage, scaled.values, tile.lane);
@@ -170,8 +193,8 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
   unsigned hits = 0;
 
   // Back to front: lane 0 takes the last entry of a chunk.
-  auto next = load_entry(arguments, tile, end - 1 - tile.lane, 0);
-  for (int32_t chunk = end - 1; chunk >= 0; chunk -= kWarp) {
+  auto next = load_entry(arguments, tile, end - 1 - tile.lane, 0, begin);
+  for (int32_t chunk = end - 1; chunk >= begin; chunk -= kWarp) {
     const bool meets = meets_pixels(next, tile);
     if (meets) {
       staged[warp][tile.lane] = next.staged;
@@ -179,7 +202,7 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
     }
     unsigned left = __ballot_sync(kAllLanes, meets);
     __syncwarp();
-    next = load_entry(arguments, tile, chunk - kWarp - tile.lane, 0);
+    next = load_entry(arguments, tile, chunk - kWarp - tile.lane, 0, begin);
     hits += __popc(left);
     for (; left != 0; left &= left - 1) {
       const int j = __ffs(left) - 1;
@@ -275,6 +298,8 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
   arguments.dL_dgaussians = dL_dgaussians;
   arguments.slots = slots;
   arguments.num_features = config.num_features();
+  arguments.tiles = static_cast<int>(tiles);
+  const int64_t blocks = tiles + (saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0);
   const int64_t warps = tiles * kWarpsPerTile;
   if (dL_dbackground != nullptr) arguments.dL_dbackground_rows = allocate<S>(scratch, warps * config.num_channels);
   if (!known) {
@@ -283,7 +308,7 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
   dispatch_blend(config.mode, known ? 3 : kAnyFeatures, [&](auto mode, auto features) {
     constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
     blend_backward_kernel<S, decltype(mode)::value, kFeatures>
-        <<<static_cast<unsigned>(tiles), kWarpsPerTile * kWarp, 0, stream>>>(arguments);
+        <<<static_cast<unsigned>(blocks), kWarpsPerTile * kWarp, 0, stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("blend_backward");
   });
   if (dL_dbackground != nullptr) {

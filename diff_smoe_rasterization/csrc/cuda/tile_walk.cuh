@@ -44,8 +44,10 @@ template <class S> struct alignas(16) StagedGaussian {
 
 template <class S> class WarpTile {
  public:
-  __device__ explicit WarpTile(const BlendArguments<S>& arguments) {
-    const int tile = blockIdx.x, quarter = threadIdx.x / kWarp;
+  __device__ explicit WarpTile(const BlendArguments<S>& arguments)
+      : WarpTile(arguments, blockIdx.x, threadIdx.x / kWarp) {}
+
+  __device__ WarpTile(const BlendArguments<S>& arguments, int tile, int quarter) : quarter(quarter) {
     lane = threadIdx.x % kWarp;
     tile_x = tile % arguments.tile_columns, tile_y = tile / arguments.tile_columns;
     constexpr int kAcross = kTileSize / kWarpTile;
@@ -56,7 +58,7 @@ template <class S> class WarpTile {
     rect = {S(x0), S(y0), S(min(x0 + kWarpTile, arguments.width) - 1), S(min(y0 + kWarpTile, arguments.height) - 1)};
     const SavedForward<S>& saved = arguments.saved;
     listed = !overflows(saved);
-    const int64_t begin = listed ? saved.tile_offsets[tile] : 0;
+    begin = listed ? saved.tile_offsets[tile] : 0;
     length = static_cast<int32_t>(listed ? saved.tile_offsets[tile + 1] - begin : arguments.num_gaussians);
     list = listed ? saved.instances + begin * saved.instance_width : saved.order;
     stride = listed ? saved.instance_width : 1;
@@ -69,11 +71,13 @@ template <class S> class WarpTile {
     return int64_t(y + k * kLaneStep) * arguments.width + x;
   }
 
+  int quarter;
   int lane, tile_x, tile_y;
   int x, y;  // of the lane's first pixel
   bool empty;
   PixelRect<S> rect;    // the warp's pixels
   bool listed;          // the tile has a list; else the depth order serves
+  int64_t begin;        // the list's first instance
   const int32_t* list;  // Gaussians, front to back
   int stride;           // numbers an entry
   int32_t length;
@@ -86,13 +90,14 @@ template <class S> struct ListEntry {
   bool valid;
 };
 
-// Four features from `first_feature` on come along, where the kernel has a use for them.
+// Four features from `first_feature` on come along, where the kernel has a use for them. Entries in front of `first` are
+// not wanted.
 template <bool kWithFeatures = true, class S>
 __device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int32_t position,
-                                   int first_feature) {
+                                   int first_feature, int32_t first = 0) {
   const SavedForward<S>& saved = arguments.saved;
   ListEntry<S> entry;
-  entry.valid = 0 <= position && position < tile.length;
+  entry.valid = first <= position && position < tile.length;
   if (!entry.valid) return entry;
   entry.gaussian = tile.list[int64_t(position) * tile.stride];
   entry.valid = entry.gaussian >= 0;  // the depth order has culled Gaussians too, below 0

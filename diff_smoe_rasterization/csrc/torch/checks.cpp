@@ -5,6 +5,7 @@
 #include <sstream>
 #include <vector>
 
+#include "dsmoe/rasterize_cuda.h"
 #include "dsmoe/sh.h"
 
 namespace dsmoe {
@@ -189,6 +190,12 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
   const auto specs = output_specs(inputs, options);
   for (int i = 0; i < kNumOutputs; ++i) {
     check_saved(function, static_cast<Output>(i), outputs, specs[i], inputs[kMeans3D].device());
+  }
+  if (outputs[kSegments].numel() > 0) {
+    const int64_t capacity = outputs[kInstances].size(0);
+    check_shape(function, kOutputNames[kSegments], outputs[kSegments],
+                {cuda::num_segment_rows(capacity), cuda::kSegmentRow});
+    check_shape(function, kOutputNames[kSegmentQueue], outputs[kSegmentQueue], {cuda::num_queue_entries(capacity), 2});
   }
   for (int i = 0; i < kNumImageGradients; ++i) {
     if (!image_gradients[i].defined()) continue;

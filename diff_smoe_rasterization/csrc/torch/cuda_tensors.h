@@ -33,6 +33,10 @@ template <class S> cuda::SavedForward<S> saved_on_device(const Outputs& outputs,
     out.instances = mutable_data<int32_t>(outputs[kInstances]);
     out.capacity = outputs[kInstances].size(0);
   }
+  if (outputs[kSegments].defined() && outputs[kSegments].numel() > 0) {
+    out.segments = mutable_data<S>(outputs[kSegments]);
+    out.segment_queue = mutable_data<int32_t>(outputs[kSegmentQueue]);
+  }
   if (options.deterministic) {
     out.instance_width = 2;
     out.slot_ranges = mutable_data<int64_t>(outputs[kInstanceOffsets]);

@@ -86,6 +86,10 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options)
   TORCH_CHECK(!options.deterministic || capacity <= std::numeric_limits<uint32_t>::max(), "rasterize: ", capacity,
               " tile instances; with deterministic=True the most is ", std::numeric_limits<uint32_t>::max());
   outputs[kInstances] = at::empty({capacity, saved.instance_width}, like.options().dtype(at::kInt));
+  if (!outputs[kSegments].defined()) {
+    outputs[kSegments] = at::empty({cuda::num_segment_rows(capacity), cuda::kSegmentRow}, like.options());
+    outputs[kSegmentQueue] = at::empty({cuda::num_queue_entries(capacity), 2}, like.options().dtype(at::kInt));
+  }
   saved = saved_on_device<S>(outputs, options);
   {
     TensorScratch scratch(like);

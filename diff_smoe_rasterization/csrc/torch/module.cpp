@@ -5,6 +5,7 @@
 
 #include "dsmoe/constants.h"
 #include "dsmoe/gate.h"
+#include "dsmoe/rasterize_cuda.h"
 #include "io/python_bindings.h"
 #include "profiling.h"
 
@@ -19,7 +20,7 @@ py::dict constants() {
                   "transmittance_cut"_a = dsmoe::kTransmittanceCut, "gate_sum_cut"_a = dsmoe::kGateSumCut,
                   "radius_root_floor"_a = dsmoe::kRadiusRootFloor, "compensation_floor"_a = dsmoe::kCompensationFloor,
                   "low_pass"_a = dsmoe::kLowPass, "frustum_margin"_a = dsmoe::kFrustumMargin,
-                  "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon, "tile_size"_a = dsmoe::kTileSize);
+                  "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon, "tile_size"_a = dsmoe::kTileSize, "segment_length"_a = dsmoe::cuda::kSegmentLength);
 }
 
 py::dict blend_modes() {

@@ -19,7 +19,8 @@ const std::string kRasterize =
     ", bool strict, bool prefiltered) -> "
     "(Tensor color, Tensor radii, Tensor gate_sum, Tensor depth, Tensor inverse_depth, Tensor projected, "
     "Tensor features, Tensor instance_offsets, Tensor tile_offsets, Tensor instances, Tensor final_transmittance, "
-    "Tensor last_contributor, Tensor order)";
+    "Tensor last_contributor, Tensor order, Tensor segments, "
+    "Tensor segment_queue)";
 
 // inputs: the present ones of the 13 tensors of rasterize; outputs: all its results. Returned are the gradients of the
 // wanted inputs, in their order. The lists hold no None, or torch would not see that they require a gradient.

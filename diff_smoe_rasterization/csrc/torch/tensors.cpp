@@ -1,5 +1,6 @@
 #include "tensors.h"
 
+#include <algorithm>
 #include <utility>
 
 #include "dsmoe/rasterize_cuda.h"
@@ -36,12 +37,17 @@ std::array<OutputSpec, kNumOutputs> output_specs(const Inputs& inputs, const Opt
     specs[kTileOffsets] = {{tiles + 2}, at::kLong};
     specs[kInstances] = {{-1, options.deterministic ? 2 : 1}, at::kInt};
     specs[kOrder] = {{count}, at::kInt};
+    const bool segments = real == at::kFloat && num_features == cuda::kSegmentFeatures;
+    specs[kSegments] = {segments ? std::vector<int64_t>{-1, cuda::kSegmentRow} : absent, real};
+    specs[kSegmentQueue] = {segments ? std::vector<int64_t>{-1, 2} : absent, at::kInt};
   } else {
     specs[kFeatures] = {{count, num_features}, real};
     specs[kInstanceOffsets] = {{count + 1}, at::kLong};
     specs[kTileOffsets] = {{tiles + 1}, at::kLong};
     specs[kInstances] = {{-1, 2}, at::kInt};
     specs[kOrder] = {absent, at::kInt};
+    specs[kSegments] = {absent, real};
+    specs[kSegmentQueue] = {absent, at::kInt};
   }
   specs[kFinalTransmittance] = {{height, width}, real};
   specs[kLastContributor] = {{height, width}, at::kInt};
@@ -52,7 +58,9 @@ Outputs allocate_outputs(const Inputs& inputs, const Options& options) {
   const auto specs = output_specs(inputs, options);
   Outputs outputs;
   for (int i = 0; i < kNumOutputs; ++i) {
-    if (i != kInstances) outputs[i] = at::empty(specs[i].shape, inputs[kMeans3D].options().dtype(specs[i].type));
+    const auto& shape = specs[i].shape;
+    if (std::find(shape.begin(), shape.end(), -1) != shape.end()) continue;  // the caller will know
+    outputs[i] = at::empty(shape, inputs[kMeans3D].options().dtype(specs[i].type));
   }
   return outputs;
 }

@@ -52,6 +52,8 @@ enum Output : int {
   kFinalTransmittance,  // [H, W]
   kLastContributor,     // [H, W] int32
   kOrder,               // CUDA: [N] int32 Gaussians by depth, culled ones as ~index; CPU: [0]
+  kSegments,            // CUDA: [rows, kSegmentRow] where the backward pass walks segments, else [0]
+  kSegmentQueue,        // CUDA: [entries, 2] int32 where there are segments, else [0]
   kNumOutputs
 };
 constexpr const char* kOutputNames[kNumOutputs] = {"color",
@@ -66,7 +68,9 @@ constexpr const char* kOutputNames[kNumOutputs] = {"color",
                                                    "instances",
                                                    "final_transmittance",
                                                    "last_contributor",
-                                                   "order"};
+                                                   "order",
+                                                   "segments",
+                                                   "segment_queue"};
 
 // The images that loss gradients arrive at, in the order of the backward op's arguments.
 enum ImageGradient : int {

@@ -192,6 +192,16 @@ DSMOE_HD Real add_feature(FeatureRule rule, PixelBackward<Real>& pixel, Real gat
   return dL_dvalue;
 }
 
+// Continues in front of pairs that another walk has taken: `transmittance` is what they met, `behind` their sum w g'.c.
+// Without a base their weights sum to the transmittance they took.
+template <BlendMode kMode, class Real>
+DSMOE_HD void resume_backward(PixelBackward<Real>& pixel, Real transmittance, Real behind) {
+  const bool about_base = kMode == BlendMode::kAlpha || kMode == BlendMode::kSmoe;  // u = g'.c - b, else g'.c
+  pixel.suffix = pixel.suffix + behind;
+  if (about_base) pixel.suffix = pixel.suffix - pixel.base * (transmittance - pixel.transmittance);
+  pixel.transmittance = transmittance;
+}
+
 // dL/dbackground of one pixel and channel.
 template <BlendMode kMode, class Real>
 DSMOE_HD Real background_backward(Real final_transmittance, Real gate_sum, Real dL_dvalue) {

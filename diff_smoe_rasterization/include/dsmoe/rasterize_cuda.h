@@ -40,6 +40,13 @@ template <class S> struct DeviceCamera {
 // Numbers between the rows of `features`: rows begin at multiples of four, so that they load as vectors.
 DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features + 3) / 4 * 4; }
 
+// Lists longer than this are walked in segments by the backward pass of float and three features, the rest whole.
+constexpr int kSegmentLength = 512;
+constexpr int kSegmentFeatures = 3;
+constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kSegmentFeatures);  // numbers
+DSMOE_HD constexpr int64_t num_segment_rows(int64_t capacity) { return capacity / kSegmentLength + 1; }
+DSMOE_HD constexpr int64_t num_queue_entries(int64_t capacity) { return 1 + 4 * num_segment_rows(capacity); }
+
 // What the forward pass leaves for the backward pass; rows of culled Gaussians hold anything.
 template <class S> struct SavedForward {
   ProjectedGaussian<S>* projected = nullptr;  // [N]
@@ -51,6 +58,8 @@ template <class S> struct SavedForward {
   int64_t capacity = 0;
   int instance_width = 1;          // 2: with slots, for gradients that are bitwise reproducible
   int64_t* slot_ranges = nullptr;  // [N, 2] each Gaussian's slots, begin and end; null without slots
+  S* segments = nullptr;           // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
+  int32_t* segment_queue = nullptr;  // [num_queue_entries(capacity), 2] which segments some pixel has reached, or null
   S* final_transmittance = nullptr;
   S* gate_sum = nullptr;
   int32_t* last_contributor = nullptr;  // [H, W] how many entries of the list the numerator has seen

@@ -1,0 +1,71 @@
+// Long lists in segments. The forward pass notes each pixel's state where a segment begins, so that the backward pass can
+// give every segment to a warp of its own: alone, the warp with the longest list would decide how long the pass takes.
+//
+// Segment s of a tile holds entries [s L, (s + 1) L) of its list. A tile's first segment needs no state. The state of
+// another lies in row floor(begin / L) + s, with `begin` the tile's first instance: no two segments share a row, because
+// a tile's last row is at most floor(end / L), and the next tile's first one is above that.
+#pragma once
+
+#include "tile_walk.cuh"
+
+namespace dsmoe {
+namespace cuda {
+
+static_assert(kSegmentLength % kWarp == 0, "a segment is a number of whole chunks");
+static_assert(kSegmentRow == kTileSize * kTileSize * (1 + kSegmentFeatures), "a row has a place for each pixel");
+
+// One pixel where a segment begins.
+template <class S> struct alignas(4 * sizeof(S)) SegmentPixel {
+  S transmittance;           // in front of the segment
+  S sums[kSegmentFeatures];  // sum w c over the segment alone
+};
+
+// The lane's pixel k in a segment of its tile, the first segment aside.
+template <class S>
+__device__ SegmentPixel<S>& segment_pixel(const SavedForward<S>& saved, const WarpTile<S>& tile, int segment, int k) {
+  const int64_t row = tile.begin / kSegmentLength + segment;
+  const int pixel = (tile.quarter * kLanePixels + k) * kWarp + tile.lane;
+  return reinterpret_cast<SegmentPixel<S>*>(saved.segments)[row * (kTileSize * kTileSize) + pixel];
+}
+
+template <class S> __device__ bool has_segments(const SavedForward<S>& saved, const WarpTile<S>& tile) {
+  return saved.segments != nullptr && tile.listed && tile.length > kSegmentLength;
+}
+
+// The segments that some pixel of a warp has reached, in no order. Entry 0 counts those behind it.
+struct SegmentQueue {
+  int2* entries;  // (tile and quarter, segment)
+
+  __device__ void push(int tile, int quarter, int segment) const {
+    entries[1 + atomicAdd(&entries[0].x, 1)] = make_int2(tile * kWarpsPerTile + quarter, segment);
+  }
+};
+template <class S> __device__ SegmentQueue segment_queue(const SavedForward<S>& saved) {
+  return {reinterpret_cast<int2*>(saved.segment_queue)};
+}
+
+// What a warp of the backward pass walks: a quarter of a tile, in one segment.
+struct WarpSegment {
+  int tile, quarter, segment;
+};
+
+// Whether no warp of the block has work.
+template <class S> __device__ bool is_idle_block(const SavedForward<S>& saved, int tiles) {
+  const int block = blockIdx.x;
+  return block >= tiles && (block - tiles) * kWarpsPerTile >= segment_queue(saved).entries[0].x;
+}
+
+// The first blocks have a tile each, in its first segment; the warps of those behind have an entry of the queue each.
+// tile is -1 where nothing is left.
+template <class S> __device__ WarpSegment segment_of_warp(const SavedForward<S>& saved, int tiles) {
+  const int block = blockIdx.x, warp = threadIdx.x / kWarp;
+  if (block < tiles) return {block, warp, 0};
+  const int2* entries = segment_queue(saved).entries;
+  const int i = (block - tiles) * kWarpsPerTile + warp;
+  if (i >= entries[0].x) return {-1, 0, 0};
+  const int2 entry = entries[1 + i];
+  return {entry.x / kWarpsPerTile, entry.x % kWarpsPerTile, entry.y};
+}
+
+}  // namespace cuda
+}  // namespace dsmoe
