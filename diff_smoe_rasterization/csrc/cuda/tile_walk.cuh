@@ -90,8 +90,8 @@ template <class S> struct ListEntry {
   bool valid;
 };
 
-// Four features from `first_feature` on come along, where the kernel has a use for them. Entries in front of `first` are
-// not wanted.
+// Four features from `first_feature` on come along, where the kernel has a use for them. Entries in front of `first`
+// are not wanted.
 template <bool kWithFeatures = true, class S>
 __device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int32_t position,
                                    int first_feature, int32_t first = 0) {
