@@ -146,10 +146,18 @@ def _fake_mark_visible(positions, viewmatrix, near):
     return positions.new_empty((positions.shape[0],), dtype=torch.bool)
 
 
+def _fake_contributions(pixel_weights, radii, projected, *others):
+    def sums():
+        return projected.new_empty((projected.shape[0],))
+
+    return sums(), radii.new_empty((projected.shape[0],)), sums(), sums()
+
+
 if _CAN_REGISTER:
     _NAME = "diff_smoe_rasterization::"
     torch.library.register_fake(_NAME + "rasterize", _fake_rasterize)
     torch.library.register_fake(_NAME + "rasterize_backward", _fake_rasterize_backward)
     torch.library.register_fake(_NAME + "mark_visible", _fake_mark_visible)
+    torch.library.register_fake(_NAME + "contributions", _fake_contributions)
     torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)
     torch.library.register_autograd(_NAME + "rasterize_backward", _refuse_second_derivative)

@@ -1,13 +1,14 @@
 """The rasterizer as a function, and as the function and the module that 3D Gaussian Splatting trainers call."""
 from __future__ import annotations
 
-from typing import Optional, Sequence
+from typing import Optional, Sequence, Tuple
 
 import torch
 
 from .autograd import rasterize_op
 from .extension import BACKENDS, build_info
 from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend_mode
+from .splats import Splats
 
 
 def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
@@ -39,10 +40,31 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         TypeError: a type or a device does not fit.
         RuntimeError: the Gaussians cover more tiles than fit; under `settings.debug` a result or gradient is NaN.
     """
+    return _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scales, rotations, cov3D_precomp,
+                   outputs)[0]
+
+
+def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
+                          means2D: Optional[torch.Tensor] = None, dc: Optional[torch.Tensor] = None,
+                          shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
+                          scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
+                          cov3D_precomp: Optional[torch.Tensor] = None,
+                          outputs: Sequence[str] = ()) -> Tuple[Rendering, Splats]:
+    """Renders as `rasterize`, and also returns where the Gaussians are on the image and can say what each gave to it.
+
+    Arguments and errors are those of `rasterize`. Splats hold on to memory of the rendering as long as they live.
+    """
+    rendering, saved = _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scales, rotations,
+                               cov3D_precomp, outputs)
+    return rendering, Splats(rendering.radii, saved, settings)
+
+
+def _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, outputs):
+    """Returns the Rendering, and the results of the op that are no images: what it saved."""
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     required, optional = _checks("rasterize", "means3D", means3D)
-    color, radii, gate_sum, depth, inverse_depth = rasterize_op(
+    color, radii, gate_sum, depth, inverse_depth, *saved = rasterize_op(
         means3D, optional("means2D", means2D), required("opacities", opacities), optional("dc", dc),
         optional("shs", shs), optional("colors_precomp", colors_precomp), optional("scales", scales),
         optional("rotations", rotations), optional("cov3D_precomp", cov3D_precomp), required("bg", settings.bg),
@@ -53,10 +75,10 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         float(settings.scale_modifier), float(settings.near), float(settings.alpha_min), int(settings.sh_degree),
         BLEND_MODES.index(resolve_blend_mode(settings.blend_mode)), bool(settings.antialiasing), "depth" in outputs,
         "inverse_depth" in outputs, bool(settings.deterministic), bool(settings.debug),
-        bool(settings.clamp_color), bool(settings.strict), bool(settings.prefiltered))[:5]
+        bool(settings.clamp_color), bool(settings.strict), bool(settings.prefiltered))
     return Rendering(color, radii, alpha=gate_sum if "alpha" in outputs else None,
                      depth=depth if "depth" in outputs else None,
-                     inverse_depth=inverse_depth if "inverse_depth" in outputs else None)
+                     inverse_depth=inverse_depth if "inverse_depth" in outputs else None), saved
 
 
 def _checks(function, first_name, first):

@@ -24,7 +24,7 @@ from typing import NamedTuple, Optional
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from .settings import OUTPUTS, Rendering, resolve_blend_mode
+from .settings import OUTPUTS, Contributions, Rendering, resolve_blend_mode
 
 
 def _float32(value):
@@ -105,6 +105,38 @@ def rasterize(means3D, opacities, settings, means2D=None, dc=None, shs=None, col
     channels = settings.bg.shape[0]
     images = dict(zip(OUTPUTS, image[channels:].split(1)))
     return Rendering(image[:channels], radii, **{name: images[name] for name in outputs})
+
+
+def contributions(means3D, opacities, settings, pixel_weights, dc=None, shs=None, colors_precomp=None, scales=None,
+                  rotations=None, cov3D_precomp=None):
+    """Scores Gaussians by their pixels; what `diff_smoe_rasterization.Splats` returns, without gradients.
+
+    pixel_weights: [height, width]. The others are the arguments of `rasterize`.
+    Returns: centres [N, 2] in pixels, depths [N], Contributions. Culled Gaussians have 0.
+    """
+    with torch.no_grad():
+        mode = resolve_blend_mode(settings.blend_mode)
+        gaussians = _gather(means3D, None, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        order = visible(gaussians, settings, mode)[1]
+        splats = project(_rows(gaussians, order), settings)
+        sums = splats.depth.new_zeros(4, len(order))
+        for y in range(settings.image_height):
+            columns = torch.arange(settings.image_width).to(splats.depth)
+            row = torch.full_like(columns, y)
+            counts = pair_counts(splats, columns, row, settings, mode)
+            weight, stopped = numerator(pair_alphas(splats, columns, row, counts), mode)
+            blended = counts & ~stopped
+            distance = torch.hypot(columns - splats.position[:, :1], row - splats.position[:, 1:])
+            for total, values in zip(sums, (pixel_weights[y].expand_as(weight), torch.ones_like(weight), weight,
+                                            distance)):
+                total += values.masked_fill(~blended, 0).sum(1)
+
+    def of_all(values):
+        return values.new_zeros((len(means3D),) + values.shape[1:]).index_copy(0, order, values)
+
+    scores = [of_all(total) for total in sums]
+    scores[1] = scores[1].to(torch.int32)
+    return of_all(splats.position), of_all(splats.depth), Contributions(*scores)
 
 
 def _gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp):
@@ -332,16 +364,26 @@ def _power(conic, dx, dy):
     return -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
 
 
+def numerator(alpha, mode):
+    """Returns each pair's weight in the numerator of its pixel's colour, and which pairs a full pixel leaves out of it.
+
+    alpha: [n, pixels], Gaussians nearest first; so are the results.
+    """
+    transmittance_behind = torch.cumprod(1 - alpha, 0)
+    transmittance = torch.cat([torch.ones_like(alpha[:1]), transmittance_behind])[:len(alpha)]  # T_i, Eq. 4
+    stopped = transmittance_behind < TRANSMITTANCE_MIN  # from the Gaussian on that would saturate the pixel
+    if mode == "smoe_std":
+        return alpha, torch.zeros_like(stopped)
+    return (alpha * transmittance).masked_fill(stopped, 0), stopped
+
+
 def blend(alpha, color, depth, bg, mode):
     """Blends the Gaussians of every pixel, front to back.
 
     alpha: [n, pixels]; color: [n, C]; depth: [n]; bg: [C].
     Returns [C + 3, pixels]: colour, alpha, depth, inverse depth.
     """
-    transmittance_behind = torch.cumprod(1 - alpha, 0)
-    transmittance = torch.cat([torch.ones_like(alpha[:1]), transmittance_behind])[:len(alpha)]  # T_i, Eq. 4
-    stopped = transmittance_behind < TRANSMITTANCE_MIN  # from the Gaussian on that would saturate the pixel
-    weight = alpha if mode == "smoe_std" else (alpha * transmittance).masked_fill(stopped, 0)
+    weight, stopped = numerator(alpha, mode)
     gate_sum = weight.sum(0) if mode in ("alpha", "smoe") else alpha.sum(0)
     has_gate = gate_sum >= GATE_SUM_MIN
     safe_sum = gate_sum.masked_fill(~has_gate, 1)

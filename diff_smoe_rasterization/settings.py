@@ -59,6 +59,19 @@ class Rendering(NamedTuple):
     inverse_depth: Optional[torch.Tensor] = None  # [1, H, W]; alpha: sum(w / z), SMoE modes: divided by the gate sum
 
 
+class Contributions(NamedTuple):
+    """Sums over the pixels that blended each of N Gaussians: what `Splats.contributions` returns.
+
+    A pixel is among those of a Gaussian where the Gaussian has a weight in the numerator of the pixel's colour, so none
+    behind a full pixel is. A Gaussian without pixels has 0.
+    """
+
+    pixel_weights: torch.Tensor  # [N] sum of the given map
+    pixels: torch.Tensor  # [N] int32, how many they are
+    blend_weights: torch.Tensor  # [N] sum of alpha T, in `smoe_std` of alpha; divided by no gate sum
+    distances: torch.Tensor  # [N] sum of |pixel - centre| in pixels
+
+
 OUTPUTS = ("alpha", "depth", "inverse_depth")
 """The optional outputs of `rasterize`."""
 

@@ -9,6 +9,7 @@
 
 #include "dispatch.h"
 #include "dsmoe/blend.h"
+#include "dsmoe/contribution.h"
 #include "dsmoe/project.h"
 #include "test_scene.h"
 
@@ -20,10 +21,14 @@ template <class S> struct BruteForce {
   // For each pixel, how near, relatively, any decision came to its threshold: where rounding could turn one over,
   // another order of operations may give another image.
   std::vector<double> margin;
-  int64_t num_pairs = 0;  // that count
+  int64_t num_pairs = 0;                            // that count
+  std::vector<Contribution<double>> contributions;  // of each Gaussian, under brute_force_pixel_weight
 
   double smallest_margin() const { return *std::min_element(margin.begin(), margin.end()); }
 };
+
+// Positive, and a number of every scalar type.
+template <class S> S brute_force_pixel_weight(int64_t pixel) { return S(1 + pixel % 97) / S(64); }
 
 template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>& scene) {
   const auto inputs = scene.inputs();
@@ -37,6 +42,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
   for (int64_t i = 0; i < scene.count; ++i) {
     out.radii.push_back(project_gaussian(inputs, camera, config, i, projected[i], &features[i * num_features]));
   }
+  out.contributions.resize(scene.count, no_contribution<double>());
   std::vector<int64_t> order;
   for (int64_t i = 0; i < scene.count; ++i) {
     if (out.radii[i] > 0) order.push_back(i);
@@ -81,6 +87,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
         }
       }
       const auto pair = Blend<kMode>::accumulate(state, gate);
+      add_pair<double>(out.contributions[i], pair.contributes, brute_force_pixel_weight<S>(pixel), pair.weight, dx, dy);
       for (int f = 0; f < num_features; ++f) sums[f] += pair.weight * features[i * num_features + f];
     }
     if (state.gate_sum > S(0)) decide(state.gate_sum, kGateSumCut);

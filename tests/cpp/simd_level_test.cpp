@@ -67,6 +67,24 @@ std::vector<S> backward_at(const SimdLevel& level, const Scene<S>& scene, Render
   return out;
 }
 
+// What each instance's pixels say of its Gaussian, four numbers each.
+template <class S> std::vector<S> contributions_at(const SimdLevel& level, const Scene<S>& scene, Rendering<S>& r) {
+  const auto config = scene.raster_config();
+  const auto saved = r.saved();
+  const auto& camera = scene.camera;
+  std::vector<S> pixel_weights;
+  for (int64_t pixel = 0; pixel < scene.pixels(); ++pixel) pixel_weights.push_back(brute_force_pixel_weight<S>(pixel));
+  std::vector<Contribution<S>> out(r.instances.size(), Contribution<S>{-1, -1, -1, -1});
+  for_each_tile<S>(1, camera.width, camera.height, 0, [&](int64_t tile, int x, int y, S* scratch) {
+    return kernels_of<S>(level).contributions({config, saved, pixel_weights.data(), camera.width, camera.height, x, y,
+                                               saved.tile_offsets[tile], saved.tile_offsets[tile + 1], out.data()},
+                                              scratch);
+  });
+  std::vector<S> flat;
+  for (const auto& c : out) flat.insert(flat.end(), {c.pixel_weight, c.pixels, c.blend_weight, c.distance});
+  return flat;
+}
+
 template <class S>
 void expect_close(const std::vector<S>& a, const std::vector<S>& b, double tolerance, const char* name) {
   expect_near_all(std::vector<double>(a.begin(), a.end()), std::vector<double>(b.begin(), b.end()), tolerance);
@@ -84,6 +102,7 @@ template <class S> void expect_levels_agree(BlendMode mode, bool depths) {
   ASSERT_GT(brute_force(scene).smallest_margin(), 20 * epsilon);
   Rendering<S> expected = render_at(kBaselineLevel, scene);
   const auto expected_gradient = backward_at(kBaselineLevel, scene, expected, weights);
+  const auto expected_contributions = contributions_at(kBaselineLevel, scene, expected);
   for (const SimdLevel* level : available_levels()) {
     Rendering<S> actual = render_at(*level, scene);
     // With and without fused multiply-add: an ulp here and there in some dozens of terms.
@@ -96,6 +115,7 @@ template <class S> void expect_levels_agree(BlendMode mode, bool depths) {
     EXPECT_EQ(actual.last_contributor, expected.last_contributor) << level->name;
     // Sums over a tile's 256 pixels.
     expect_close(backward_at(*level, scene, expected, weights), expected_gradient, 256 * epsilon, level->name);
+    expect_close(contributions_at(*level, scene, expected), expected_contributions, 256 * epsilon, level->name);
   }
 }
 

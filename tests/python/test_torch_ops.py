@@ -8,8 +8,9 @@ from devices import random_normal
 from scenes import gradients, op_arguments, random_scene
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization.settings import OUTPUTS
+from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
+RESULTS = [result.name for result in torch.ops.diff_smoe_rasterization.rasterize.default._schema.returns]
 NUM_IMAGES = 5  # results of the op that are the caller's: color, radii, gate_sum, depth, inverse_depth
 
 pytestmark = [
@@ -76,6 +77,33 @@ def test_opcheck_of_mark_visible():
     scene = random_scene("alpha", 20, dtype=torch.float32)
     torch.library.opcheck(torch.ops.diff_smoe_rasterization.mark_visible.default,
                           (scene.inputs["means3D"], scene.settings.viewmatrix, 0.2))
+
+
+def test_opcheck_of_contributions(mode):
+    scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
+    saved = dict(zip(RESULTS, torch.ops.diff_smoe_rasterization.rasterize.default(*op_arguments(scene))))
+    op, weights = torch.ops.diff_smoe_rasterization.contributions.default, random_normal((18, 20), 1, torch.float32)
+    arguments = [saved.get(argument.name) for argument in op._schema.arguments[1:-2]]
+    last = scene.settings.alpha_min, BLEND_MODES.index(mode)
+    # Sums by atomics differ in their last digits, which the last part of opcheck does not allow.
+    parts = {} if weights.device.type == "cpu" else {
+        "test_utils": ("test_schema", "test_autograd_registration", "test_faketensor")}
+    torch.library.opcheck(op, (weights, *arguments, *last), **parts)
+
+
+def test_compiled_contributions_equal_eager(mode):
+    def score(settings, pixel_weights, **inputs):
+        rendering, splats = diff_smoe_rasterization.rasterize_with_splats(settings=settings, **inputs)
+        return (rendering.color, splats.centers, splats.depths, *splats.contributions(pixel_weights))
+
+    scene = random_scene(mode, 60, 40, 30, dtype=torch.float32, degree=1)
+    pixel_weights = random_normal((30, 40), 1, torch.float32).abs()
+    torch._dynamo.reset()
+    compiled = torch.compile(score, fullgraph=True, backend="aot_eager")
+    for actual, expected in zip(compiled(scene.settings, pixel_weights, **scene.inputs),
+                                score(scene.settings, pixel_weights, **scene.inputs)):
+        # Positive numbers: a GPU adds them in any order, each rounded by 6e-8.
+        torch.testing.assert_close(actual, expected, rtol=0 if actual.device.type == "cpu" else 1e-5, atol=0)
 
 
 @pytest.mark.parametrize("backend", ["eager", "aot_eager"])

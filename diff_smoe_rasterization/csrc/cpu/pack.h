@@ -98,6 +98,7 @@ template <class T> struct Pack {
   friend DSMOE_HD Pack max(Pack a, Pack b) { return maximum(a.v, b.v); }
   friend DSMOE_HD Pack fma(Pack a, Pack b, Pack c) { return fused(a.v, b.v, c.v); }
   friend DSMOE_HD T sum_lanes(Pack a) { return sum(a.v); }
+  friend DSMOE_HD Pack sqrt(Pack a) { return root(a.v); }
 
  private:
   static DSMOE_HD __mmask16 compare_less(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
@@ -112,6 +113,8 @@ template <class T> struct Pack {
   static DSMOE_HD __m512d maximum(__m512d a, __m512d b) { return _mm512_max_pd(a, b); }
   static DSMOE_HD __m512 fused(__m512 a, __m512 b, __m512 c) { return _mm512_fmadd_ps(a, b, c); }
   static DSMOE_HD __m512d fused(__m512d a, __m512d b, __m512d c) { return _mm512_fmadd_pd(a, b, c); }
+  static DSMOE_HD __m512 root(__m512 a) { return _mm512_sqrt_ps(a); }
+  static DSMOE_HD __m512d root(__m512d a) { return _mm512_sqrt_pd(a); }
   static DSMOE_HD float sum(__m512 a) { return _mm512_reduce_add_ps(a); }
   static DSMOE_HD double sum(__m512d a) { return _mm512_reduce_add_pd(a); }
 #else
@@ -127,12 +130,19 @@ template <class T> struct Pack {
   }
 #if DSMOE_SIMD_BYTES == 32
   friend DSMOE_HD Pack fma(Pack a, Pack b, Pack c) { return fused(a.v, b.v, c.v); }
+  friend DSMOE_HD Pack sqrt(Pack a) { return root(a.v); }
 
  private:
+  static DSMOE_HD __m256 root(__m256 a) { return _mm256_sqrt_ps(a); }
+  static DSMOE_HD __m256d root(__m256d a) { return _mm256_sqrt_pd(a); }
   static DSMOE_HD __m256 fused(__m256 a, __m256 b, __m256 c) { return _mm256_fmadd_ps(a, b, c); }
   static DSMOE_HD __m256d fused(__m256d a, __m256d b, __m256d c) { return _mm256_fmadd_pd(a, b, c); }
 #else
   friend DSMOE_HD Pack fma(Pack a, Pack b, Pack c) { return a.v * b.v + c.v; }
+  friend DSMOE_HD Pack sqrt(Pack a) {
+    for (int i = 0; i < kLanes; ++i) a.v[i] = ::dsmoe::sqrt(a.v[i]);
+    return a;
+  }
 #endif
 #endif
 };

@@ -1,8 +1,10 @@
-// The blend of one tile, forward and backward: compiled once per instruction set, chosen at run time.
+// The blend of one tile, forward and backward, and what it says of each Gaussian: compiled once per instruction set,
+// chosen at run time.
 #pragma once
 
 #include <cstdint>
 
+#include "dsmoe/contribution.h"
 #include "dsmoe/params.h"
 
 namespace dsmoe {
@@ -31,15 +33,26 @@ template <class S> struct BackwardTile {
   S* dL_dbackground;  // [C] the tile's share, or null
 };
 
-// Numbers of scratch memory that one tile needs, for either direction.
+template <class S> struct ContributionTile {
+  const RasterConfig<S>& config;
+  const SavedForward<S>& saved;
+  const S* pixel_weights;  // [H, W]
+  int width, height;
+  int tile_x, tile_y;
+  int64_t begin, end;
+  Contribution<S>* instances;  // [I] by slot; the tile's are written whole
+};
+
+// Numbers of scratch memory that one tile needs, for any of the kernels.
 inline int64_t tile_scratch_size(int num_features) {
   return static_cast<int64_t>(kTilePixels) * (num_features + 5) + 16 * num_features;
 }
 
-// Both return the number of (Gaussian, pixel) pairs whose exponent they evaluated. scratch: 64-byte aligned.
+// All return the number of (Gaussian, pixel) pairs whose exponent they evaluated. scratch: 64-byte aligned.
 template <class S> struct TileKernels {
   int64_t (*forward)(const ForwardTile<S>& tile, S* scratch);
   int64_t (*backward)(const BackwardTile<S>& tile, S* scratch);
+  int64_t (*contributions)(const ContributionTile<S>& tile, S* scratch);
 };
 
 // One of these per instruction set that the compiler can build for.

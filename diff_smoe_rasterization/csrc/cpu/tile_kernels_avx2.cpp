@@ -16,12 +16,14 @@
 
 #define DSMOE_SIMD avx2
 #define DSMOE_SIMD_BYTES 32
+#include "tile_contributions_impl.h"
 #include "tile_kernels_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kAvx2Level = {
-    "avx2", {avx2::forward<float>, avx2::backward<float>}, {avx2::forward<double>, avx2::backward<double>}};
+const SimdLevel kAvx2Level = {"avx2",
+                              {avx2::forward<float>, avx2::backward<float>, avx2::contributions<float>},
+                              {avx2::forward<double>, avx2::backward<double>, avx2::contributions<double>}};
 }  // namespace cpu
 }  // namespace dsmoe
 

@@ -1,12 +1,14 @@
 // The tile kernels for any machine: 16-byte packs, which SSE2 and NEON have.
 #define DSMOE_SIMD baseline
 #define DSMOE_SIMD_BYTES 16
+#include "tile_contributions_impl.h"
 #include "tile_kernels_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kBaselineLevel = {"baseline",
-                                  {baseline::forward<float>, baseline::backward<float>},
-                                  {baseline::forward<double>, baseline::backward<double>}};
+const SimdLevel kBaselineLevel = {
+    "baseline",
+    {baseline::forward<float>, baseline::backward<float>, baseline::contributions<float>},
+    {baseline::forward<double>, baseline::backward<double>, baseline::contributions<double>}};
 }  // namespace cpu
 }  // namespace dsmoe

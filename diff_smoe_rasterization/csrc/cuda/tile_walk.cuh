@@ -90,8 +90,9 @@ template <class S> struct ListEntry {
   bool valid;
 };
 
-// Four features from `first_feature` on come along. Entries in front of `first` are not wanted.
-template <class S>
+// Four features from `first_feature` on come along, where the kernel has a use for them. Entries in front of `first`
+// are not wanted.
+template <bool kWithFeatures = true, class S>
 __device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int32_t position,
                                    int first_feature, int32_t first = 0) {
   const SavedForward<S>& saved = arguments.saved;
@@ -102,11 +103,13 @@ __device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const War
   entry.valid = entry.gaussian >= 0;  // the depth order has culled Gaussians too, below 0
   if (!entry.valid) return entry;
   entry.staged.gaussian = saved.projected[entry.gaussian];
-  const S* features = saved.features + int64_t(entry.gaussian) * feature_stride(arguments.config.num_features());
-  struct alignas(16) Chunk {
-    S values[kFeatureChunk];
-  };
-  *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + first_feature);
+  if constexpr (kWithFeatures) {
+    const S* features = saved.features + int64_t(entry.gaussian) * feature_stride(arguments.config.num_features());
+    struct alignas(16) Chunk {
+      S values[kFeatureChunk];
+    };
+    *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + first_feature);
+  }
   if (!tile.listed) {  // the entries of the depth order know nothing of tiles
     const TileRect bounds = footprint_bounds(arguments.config.mode, arguments.width, arguments.height,
                                              entry.staged.gaussian.mean, arguments.images.radii, entry.gaussian);

@@ -133,6 +133,21 @@ void check_sh_degree(const Inputs& inputs, int64_t degree) {
                     " needs ", needed, " coefficients a Gaussian, not ", held);
 }
 
+void check_blend_mode(const char* function, int64_t blend_mode) {
+  TORCH_CHECK_VALUE(0 <= blend_mode && blend_mode < kNumBlendModes, function, ": blend_mode is ", blend_mode,
+                    "; it must be 0 to ", kNumBlendModes - 1);
+}
+
+// What a rendering saved: unchanged, and of that rendering.
+void check_saved(const char* function, Output output, const Outputs& outputs, const OutputSpec& spec,
+                 const at::Device& device) {
+  const at::Tensor& tensor = outputs[output];
+  check_shape(function, kOutputNames[output], tensor, {spec.shape.begin(), spec.shape.end()});
+  TORCH_CHECK_TYPE(tensor.scalar_type() == spec.type && tensor.is_contiguous() && tensor.device() == device, function,
+                   ": ", kOutputNames[output], " must be as rasterize returned it: dense ", dtype_name(spec.type),
+                   " on ", device);
+}
+
 void check_options(const Options& options) {
   const int64_t height = options.image_height, width = options.image_width;
   TORCH_CHECK_VALUE(height > 0 && width > 0, "rasterize: image_height x image_width is ", height, " x ", width,
@@ -152,8 +167,7 @@ void check_options(const Options& options) {
   check_not_negative("scale_modifier", options.scale_modifier);
   check_not_negative("near", options.near);
   check_not_negative("alpha_min", options.alpha_min);
-  TORCH_CHECK_VALUE(0 <= options.blend_mode && options.blend_mode < kNumBlendModes, "rasterize: blend_mode is ",
-                    options.blend_mode, "; it must be 0 to ", kNumBlendModes - 1);
+  check_blend_mode("rasterize", options.blend_mode);
 }
 
 }  // namespace
@@ -175,11 +189,7 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
   check_arguments(inputs, options);
   const auto specs = output_specs(inputs, options);
   for (int i = 0; i < kNumOutputs; ++i) {
-    check_shape(function, kOutputNames[i], outputs[i], {specs[i].shape.begin(), specs[i].shape.end()});
-    TORCH_CHECK_TYPE(outputs[i].scalar_type() == specs[i].type && outputs[i].is_contiguous() &&
-                         outputs[i].device() == inputs[kMeans3D].device(),
-                     function, ": ", kOutputNames[i], " must be as rasterize returned it: dense ",
-                     dtype_name(specs[i].type), " on ", inputs[kMeans3D].device());
+    check_saved(function, static_cast<Output>(i), outputs, specs[i], inputs[kMeans3D].device());
   }
   if (outputs[kSegments].numel() > 0) {
     const int64_t capacity = outputs[kInstances].size(0);
@@ -198,6 +208,33 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
     TORCH_CHECK_VALUE(!wanted[i] || inputs[i].defined(), function, ": the gradient of ", kInputNames[i],
                       " is wanted, but that input is absent");
   }
+}
+
+void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs& outputs, double alpha_min,
+                                  int64_t blend_mode) {
+  const char* function = "contributions";
+  const at::Tensor &projected = outputs[kProjected], &image = outputs[kLastContributor];
+  check_real(function, kOutputNames[kProjected], projected);
+  check_shape(function, kOutputNames[kProjected], projected, {"N", kProjectedGaussianSize});
+  check_shape(function, kOutputNames[kLastContributor], image, {"H", "W"});
+  TORCH_CHECK_VALUE(image.numel() > 0, function, ": last_contributor has shape ", image.sizes(),
+                    "; an image has pixels");
+  // All that the specifications of these outputs depend on.
+  Inputs inputs;
+  inputs[kMeans3D] = projected;
+  Options options = {};
+  options.image_height = image.size(0), options.image_width = image.size(1);
+  const at::Tensor& instances = outputs[kInstances];
+  options.deterministic = projected.is_cuda() && instances.dim() == 2 && instances.size(1) == 2;
+  const auto specs = output_specs(inputs, options);
+  for (Output i : {kRadii, kProjected, kInstanceOffsets, kTileOffsets, kInstances, kLastContributor, kOrder}) {
+    check_saved(function, i, outputs, specs[i], projected.device());
+  }
+  check_like(function, "pixel_weights", pixel_weights, "means3D", projected);
+  check_shape(function, "pixel_weights", pixel_weights, {image.size(0), image.size(1)});
+  TORCH_CHECK_VALUE(std::isfinite(alpha_min) && alpha_min >= 0, function, ": alpha_min is ", alpha_min,
+                    "; it must be 0 or more and finite");
+  check_blend_mode(function, blend_mode);
 }
 
 void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix) {

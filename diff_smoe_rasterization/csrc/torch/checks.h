@@ -16,6 +16,10 @@ void check_arguments(const Inputs& inputs, const Options& options);
 void check_backward_arguments(const Inputs& inputs, const Options& options, const Outputs& outputs,
                               const ImageGradientTensors& image_gradients, const InputMask& wanted);
 
+// The op contributions: of the outputs those that it reads.
+void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs& outputs, double alpha_min,
+                                  int64_t blend_mode);
+
 void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix);
 
 // Under `strict`: raises for Gaussian `index`, which has an attribute that is not finite; -1 is none.

@@ -29,10 +29,17 @@ const std::string kRasterizeBackward =
     "Tensor[] inputs, bool[13] present, Tensor[] outputs, " +
     kOptions + ", bool[13] wanted) -> Tensor[]";
 
+// From a map and what one rasterize saved: sums over the pixels of each Gaussian.
+const std::string kContributions =
+    "contributions(Tensor pixel_weights, Tensor radii, Tensor projected, Tensor instance_offsets, "
+    "Tensor tile_offsets, Tensor instances, Tensor last_contributor, Tensor order, float alpha_min, int blend_mode) -> "
+    "(Tensor pixel_weights, Tensor pixels, Tensor blend_weights, Tensor distances)";
+
 }  // namespace
 
 TORCH_LIBRARY(diff_smoe_rasterization, m) {
   m.def(kRasterize.c_str());
   m.def(kRasterizeBackward.c_str());
+  m.def(kContributions.c_str());
   m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near) -> Tensor");
 }

@@ -73,6 +73,14 @@ template <class S> struct ImageOutputs {
   int32_t* radii = nullptr;    // [N] pixels
 };
 
+// Sums over the pixels that blended a Gaussian, as contribution.h says; written whole.
+template <class S> struct ContributionSums {
+  S* pixel_weights = nullptr;  // [N]
+  int32_t* pixels = nullptr;   // [N]
+  S* blend_weights = nullptr;  // [N]
+  S* distances = nullptr;      // [N] pixels
+};
+
 // Any of these may be null: that output was not used.
 template <class S> struct ImageGradients {
   const S* color = nullptr;          // [C, H, W]

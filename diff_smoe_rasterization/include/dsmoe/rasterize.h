@@ -8,6 +8,7 @@
 //     cpu::bin(inputs.num_gaussians, camera, config, saved, images.radii);   // tile lists, front to back
 //     cpu::blend(camera, config, saved, images);                             // the images
 //     cpu::backward(inputs, camera, config, saved, images, image_gradients, gradients);
+//     cpu::contributions(inputs.num_gaussians, width, height, config, saved, pixel_weights, sums);  // of each Gaussian
 //
 // Results do not depend on config.num_threads, bit for bit.
 #pragma once
@@ -50,6 +51,12 @@ template <class S>
 void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
               const SavedForward<S>& saved, const ImageOutputs<S>& images, const ImageGradients<S>& image_gradients,
               const GaussianGradients<S>& gradients, StageTimes* times = nullptr);
+
+// Walks the tile lists once more, and sums what the pixels of each Gaussian say. pixel_weights: [H, W]. Of config it
+// reads the mode, alpha_min and num_threads; of saved neither features nor images but last_contributor.
+template <class S>
+void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
+                   const SavedForward<S>& saved, const S* pixel_weights, const ContributionSums<S>& sums);
 
 // Marks the Gaussians in front of the near plane. visible: [N].
 template <class S> void mark_visible(int64_t num_gaussians, const S* means3D, const Camera<S>& camera, bool* visible);

@@ -7,6 +7,7 @@
 //     cuda::bin(inputs.num_gaussians, camera, config, saved, images.radii, scratch, stream);  // tile lists
 //     cuda::blend(inputs.num_gaussians, camera, config, saved, images, pairs, stream);        // the images
 //     cuda::blend_backward(...); cuda::project_backward(...);                                 // the gradients
+//     cuda::contributions(...);                                                               // scores of Gaussians
 //
 // A capacity that turns out too small costs time, not correctness: where the instances do not fit, the blend reads the
 // depth order itself instead of the tile lists. So the host never has to wait, and a captured graph stays right when
@@ -127,6 +128,14 @@ template <class S>
 void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
                       const SavedForward<S>& saved, const int32_t* radii, const S* dL_dgaussians, const S* slots,
                       const GaussianGradients<S>& gradients, Scratch& scratch, cudaStream_t stream);
+
+// Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
+// may differ in their last digits from call to call. pixel_weights: [H, W]. Of config it reads the mode and alpha_min;
+// of saved neither features nor images but last_contributor; of images the radii.
+template <class S>
+void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
+                   const SavedForward<S>& saved, const ImageOutputs<S>& images, const S* pixel_weights,
+                   const ContributionSums<S>& sums, cudaStream_t stream);
 
 // Marks the Gaussians in front of the near plane. visible: [N].
 template <class S>

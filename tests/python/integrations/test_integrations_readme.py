@@ -13,7 +13,7 @@ def test_the_examples_run():
     text = README.read_text(encoding="utf-8")
     preamble, *flavours = re.split(r"^## (\w+)$", text, flags=re.MULTILINE)
     names, sections = flavours[::2], flavours[1::2]
-    assert names == ["inria", "inria_2024", "c3dgs", "scaffold", "gsplat"]
+    assert names == ["inria", "inria_2024", "taming", "c3dgs", "scaffold", "gsplat"]
     torch.manual_seed(0)
     variables = {}
     example = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -29,6 +29,9 @@ def test_the_examples_run():
         else:
             assert variables["color"].shape == (3, 48, 64) and variables["color"].max() > 0.1
             assert (variables["radii"] > 0).any()
+        if name == "taming":
+            assert len(variables["accum_weights"]) == 500 and variables["accum_blend"].sum() > 1
+            assert ((variables["accum_count"] > 0) <= (variables["radii"] > 0)).all()
         if name == "inria":
             variables["from_inria"] = variables["color"]
         if name == "c3dgs":

@@ -1,0 +1,51 @@
+// What is summed over the pixels of each Gaussian: tiles write one record per instance, then each Gaussian sums its
+// own, which lie side by side. No atomics, so the result does not depend on the threads.
+#include <memory>
+
+#include "dsmoe/contribution.h"
+#include "dsmoe/rasterize.h"
+#include "parallel.h"
+#include "tile_kernels.h"
+#include "tile_loop.h"
+
+namespace dsmoe {
+namespace cpu {
+namespace {
+
+constexpr int64_t kChunk = 4096;  // Gaussians: a few additions each
+
+}  // namespace
+
+template <class S>
+void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
+                   const SavedForward<S>& saved, const S* pixel_weights, const ContributionSums<S>& sums) {
+  const std::unique_ptr<Contribution<S>[]> instances(new Contribution<S>[saved.instance_offsets[num_gaussians]]);
+  const auto& kernels = tile_kernels<S>();
+  for_each_tile<S>(config.num_threads, width, height, 0, [&](int64_t tile, int x, int y, S* scratch) {
+    return kernels.contributions({config, saved, pixel_weights, width, height, x, y, saved.tile_offsets[tile],
+                                  saved.tile_offsets[tile + 1], instances.get()},
+                                 scratch);
+  });
+  parallel_for(config.num_threads, num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      auto sum = no_contribution<double>();  // a large Gaussian has thousands of instances
+      for (int64_t slot = saved.instance_offsets[i]; slot < saved.instance_offsets[i + 1]; ++slot) {
+        const Contribution<S>& part = instances[slot];
+        sum.pixel_weight += part.pixel_weight, sum.pixels += part.pixels;
+        sum.blend_weight += part.blend_weight, sum.distance += part.distance;
+      }
+      sums.pixel_weights[i] = static_cast<S>(sum.pixel_weight), sums.pixels[i] = static_cast<int32_t>(sum.pixels);
+      sums.blend_weights[i] = static_cast<S>(sum.blend_weight), sums.distances[i] = static_cast<S>(sum.distance);
+    }
+  });
+}
+
+#define DSMOE_INSTANTIATE(S)                                                                               \
+  template void contributions(int64_t, int, int, const RasterConfig<S>&, const SavedForward<S>&, const S*, \
+                              const ContributionSums<S>&);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cpu
+}  // namespace dsmoe
