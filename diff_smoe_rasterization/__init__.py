@@ -4,6 +4,8 @@
 
 as with Inria's rasterizer of 2023; `blend_mode` in the settings is the one addition. `rasterize` is the full function.
 """
+import os
+
 from ._version import __version__
 from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering
 
@@ -27,6 +29,12 @@ except ImportError:
         import importlib
 
         return getattr(importlib.import_module("." + _HOMES[name], __name__), name)
+
+# setup.py installs the folders integrations, patches and benchmarks inside the package. In a source tree they lie beside
+# it, where its submodules are then looked for too. Beside an installed package such folders are a stranger's.
+_beside = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
+if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",), ("build_support", "backend.py"))):
+    __path__.append(_beside)
 
 __all__ = ["BLEND_MODES", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer", "OUTPUTS", "Rendering",
            "SparseGaussianAdam", "__version__", "build_info", "distCUDA2", "fused_ssim", "rasterize",

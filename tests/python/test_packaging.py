@@ -137,3 +137,33 @@ def test_extension_of_another_torch_explains_itself(tmp_path):
     assert run.returncode != 0
     for word in ("ImportError", "built against torch 0.4.1", f"torch {torch.__version__} is running", "pip install"):
         assert word in run.stderr
+
+
+def import_in(folder, name):
+    """Imports a module in a new Python, with `folder` first on its path; returns what it printed and its status."""
+    program = f"import sys; sys.path.insert(0, {str(folder)!r}); import {name}; print({name}.__file__)"
+    run = subprocess.run([sys.executable, "-I", "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                         universal_newlines=True)
+    return run.stdout + run.stderr, run.returncode
+
+
+def test_folders_installed_inside_are_imported_in_place_too():
+    """Nothing has to be installed or built: the path of the source tree is enough."""
+    folders = [name for name in load_setup().FOLDERS_INSTALLED_INSIDE if (ROOT / name / "__init__.py").is_file()]
+    assert "integrations" in folders
+    for name in folders:
+        printed, status = import_in(ROOT, f"diff_smoe_rasterization.{name}")
+        assert status == 0 and Path(printed.strip()) == ROOT / name / "__init__.py", printed
+
+
+def test_a_strangers_folder_beside_the_installed_package_is_not_imported(tmp_path):
+    (tmp_path / "integrations").mkdir()
+    (tmp_path / "integrations" / "__init__.py").write_text("")
+    package = tmp_path / "diff_smoe_rasterization"
+    package.mkdir()
+    for path in SOURCE.glob("*.py"):
+        (package / path.name).write_bytes(path.read_bytes())
+    printed, status = import_in(tmp_path, "diff_smoe_rasterization.integrations")
+    assert status != 0 and "No module named 'diff_smoe_rasterization.integrations'" in printed
+    printed, status = import_in(tmp_path, "diff_smoe_rasterization")
+    assert status == 0 and str(package) in printed, printed
