@@ -41,6 +41,8 @@ def _of_node(node: ast.AST) -> Set[str]:
             imported = {f"imports {alias.name}" for alias in node.names}
             return imported if node.module == RASTERIZER else imported | {PATCHED}
         return {"imports " + node.module.rpartition(".")[2]}
+    if isinstance(node, ast.Import):
+        return {"imports " + alias.name.rpartition(".")[2] for alias in node.names}
     if isinstance(node, ast.Call):
         called = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if called == "GaussianRasterizationSettings":
@@ -59,7 +61,8 @@ def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
     if foreign:
         return None, (f"its GaussianRasterizationSettings have {', '.join(foreign)}, which no trainer has that is "
                       f"known here ({', '.join(names())})")
-    return next(trainer for trainer in TRAINERS if facts & set(trainer.signs)), ""
+    return next(trainer for trainer in TRAINERS
+                if any(facts.issuperset(sign.split(" and ")) for sign in trainer.signs)), ""
 
 
 def names() -> Tuple[str, ...]:

@@ -72,7 +72,7 @@ class Trainer(NamedTuple):
 
     name: str  # as in --trainer
     flavour: str  # module of integrations whose API it calls
-    signs: Tuple[str, ...]  # any of these, as facts.py writes them, and none of a trainer before it in the list
+    signs: Tuple[str, ...]  # it shows one of these ("... and ..."), as facts.py says it, and none of those before it
     rules: Tuple[NamedTuple, ...]
 
 

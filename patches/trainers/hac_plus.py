@@ -2,4 +2,9 @@
 from ..rules import Trainer
 from .hac import FLAVOUR, RULES
 
-HAC_PLUS = Trainer(name="hac-plus", flavour=FLAVOUR, signs=("imports gpcc_utils",), rules=RULES)
+HAC_PLUS = Trainer(
+    name="hac-plus",
+    flavour=FLAVOUR,
+    signs=("imports gpcc_utils", "calls visible_filter and imports lpips"),
+    rules=RULES,
+)
