@@ -7,6 +7,7 @@ to apply it is to write what differs from it.
 from __future__ import annotations
 
 import difflib
+import io
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional, Tuple, Union
 
@@ -16,7 +17,7 @@ from . import facts, source
 from .errors import PatchError
 from .record import FOLDER, Record, check_writable, replace_file
 from .rules import RASTERIZER, ImportRasterizer, Trainer
-from .scope import callers_out_of_reach, python_files, submodule_files
+from .scope import build_files, callers_out_of_reach, python_files
 from .trainers import TRAINERS
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
@@ -163,7 +164,7 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
         return Plan(root, Verdict("unknown", None, [reason]), (), (), modernise, record)
     files = {name: read(name) for name in python_files(root)}
     if modernise:
-        files.update((name, read(name)) for name in submodule_files(root))
+        files.update((name, read(name)) for name in build_files(root))
     patch = _Patch(files, chosen)
     notes = patch.modernise() if modernise and not patch.problems else []
     notes += callers_out_of_reach(files, chosen)
@@ -204,7 +205,7 @@ class _Patch:
         # A script of the user's that imports the rasterizer must not get another one than the trainer's own files.
         known = {rule.file for rule in trainer.rules if isinstance(rule, ImportRasterizer)}
         for name in sorted(set(files) - known):
-            if name.endswith(".py") and RASTERIZER.encode() in files[name] and not self.problems:
+            if RASTERIZER.encode() in files[name] and not name.startswith("submodules/") and not self.problems:
                 self._run(codemods.run, ImportRasterizer(name, trainer.flavour), name)
 
     def modernise(self) -> List[str]:
@@ -213,7 +214,7 @@ class _Patch:
 
         notes = []
         for rule in modernise.RULES:
-            changed = [name for name in sorted(self.files) if rule.looks_at(name, self.files[name])
+            changed = [name for name in sorted(self.files) if rule.looks_at(self.files[name])
                        and self._run(modernise.run, rule, name).pending]
             notes.append(f"modernise {rule.name}: " + (f"{', '.join(changed)}: {rule.reason}" if changed
                                                        else "skipped, nothing matches"))
@@ -232,18 +233,13 @@ class _Patch:
     def changes(self) -> Tuple[Change, ...]:
         changes = []
         for name, rules in self.rules.items():
-            tree = self.trees[name]
-            after = tree if isinstance(tree, bytes) else tree.code.encode(self.encodings[name])
+            after = self.trees[name].code.encode(self.encodings[name])
             changes.append(Change(name, self.files[name], after, tuple(rules)))
         return tuple(changes)
 
     def _run(self, run, rule, name: str):
-        """Applies a rule to a file; what is no Python is given to it as bytes."""
         if name not in self.trees:
-            if name.endswith(".py"):
-                self.trees[name], self.encodings[name] = source.parse(name, self.files[name])
-            else:
-                self.trees[name] = self.files[name]
+            self.trees[name], self.encodings[name] = source.parse(name, self.files[name])
         outcome = run(rule, self.trees[name])
         self.trees[name] = outcome.tree
         if outcome.pending:
@@ -301,7 +297,7 @@ def refusal(verdict: Verdict) -> str:
 
 def diff_of(change: Change) -> str:
     """Returns the unified diff of one file."""
-    before, after = (data.decode(source.decode(change.name, change.before)[1] if change.name.endswith(".py") else "latin-1")
-                     .splitlines(keepends=True) for data in (change.before, change.after))
+    before, after = (io.StringIO(source.decode(change.name, data)[0], newline="\n").readlines()
+                     for data in (change.before, change.after))
     lines = difflib.unified_diff(before, after, "a/" + change.name, "b/" + change.name)
     return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in lines)

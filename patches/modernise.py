@@ -1,7 +1,7 @@
 """What a trainer needs to start on today's torch, CUDA and Python, and has nothing to do with blending: --modernise.
 
-Each rule has a name and the reason for it, and one that matches nothing is skipped. A Python rule is a LibCST codemod, as
-in codemods.py; one for C++ works on the text.
+Each rule has a name and the reason for it, and is a LibCST codemod as those in codemods.py. One that matches nothing is
+skipped.
 """
 from __future__ import annotations
 
@@ -21,17 +21,15 @@ class Rule(NamedTuple):
     reason: str
     codemod: Type[Codemod]
     hints: Tuple[str, ...]  # a file without any of these words cannot match and is not parsed
-    endings: Tuple[str, ...] = (".py",)
 
-    def looks_at(self, name: str, data: bytes) -> bool:
-        return name.endswith(self.endings) and any(hint.encode() in data for hint in self.hints)
+    def looks_at(self, data: bytes) -> bool:
+        return any(hint.encode() in data for hint in self.hints)
 
 
-def run(rule: Rule, tree) -> Outcome:
-    """Applies a rule to a tree, or to the bytes of a C++ file."""
+def run(rule: Rule, tree: cst.Module) -> Outcome:
+    """Applies a rule to a tree."""
     codemod = rule.codemod(rule)
-    changed = codemod.text(tree) if isinstance(tree, bytes) else tree.visit(codemod)
-    return Outcome(changed, codemod.pending, 0)
+    return Outcome(tree.visit(codemod), codemod.pending, 0)
 
 
 class _ImportFrom(Codemod):
@@ -78,7 +76,7 @@ class _WeightsOnly(Codemod):
 
 
 class _NumpyByte(Codemod):
-    """In a call that makes an array only: there numpy must not take 0...255 for a signed byte."""
+    """`dtype=np.byte` becomes `dtype=np.uint8`."""
 
     def leave_Arg(self, original_node: cst.Arg, updated_node: cst.Arg) -> cst.Arg:
         is_dtype = updated_node.keyword is not None and updated_node.keyword.value == "dtype"
@@ -142,17 +140,22 @@ class _LpipsOffline(Codemod):
 
 
 class _CppStandard(Codemod):
-    def leave_SimpleString(self, original_node: cst.SimpleString, updated_node: cst.SimpleString) -> cst.SimpleString:
-        if updated_node.raw_value != "-std=c++14":
+    """The flag goes: torch gives the compiler the standard that it needs itself where nobody does."""
+
+    def is_flag(self, element: cst.BaseElement) -> bool:
+        return isinstance(element.value, cst.SimpleString) and element.value.raw_value == "-std=c++14"
+
+    def leave_Element(self, original_node: cst.Element, updated_node: cst.Element):
+        if not self.is_flag(updated_node):
             return updated_node
         self.pending += 1
-        return updated_node.with_changes(value=updated_node.value.replace("c++14", "c++17"))
+        return cst.RemoveFromParent()
 
-
-class _StdOptional(Codemod):
-    def text(self, data: bytes) -> bytes:
-        self.pending = data.count(b"at::optional")
-        return data.replace(b"at::optional", b"std::optional")
+    def leave_List(self, original_node: cst.List, updated_node: cst.List) -> cst.List:
+        if not updated_node.elements or not self.is_flag(original_node.elements[-1]):
+            return updated_node
+        *before, last = updated_node.elements  # it is the last one now, and has the comma, or none, of the one that was
+        return updated_node.with_changes(elements=[*before, last.with_changes(comma=original_node.elements[-1].comma)])
 
 
 RULES = (
@@ -169,10 +172,8 @@ RULES = (
          _LpipsWhenUsed, ("lpips.LPIPS",)),
     Rule("lpips-offline", "where the weights of LPIPS cannot be downloaded, a measurement ends the training; it is NaN then, "
          "with a warning", _LpipsOffline, ("def lpips",)),
-    Rule("blender-images", "numpy 2 refuses values above 127 in a signed byte, and the images of Blender scenes have them",
+    Rule("blender-images", "new Pillow releases take no signed bytes for a picture, which the reader of Blender scenes makes",
          _NumpyByte, ("np.byte", "numpy.byte")),
-    Rule("cpp-standard", "torch 2.1 and later do not compile as C++14, which a submodule's setup.py asks for", _CppStandard,
+    Rule("cpp-standard", "a submodule's setup.py asks for C++14; torch 2.1 needs C++17, 2.13 C++20, and asks for it itself", _CppStandard,
          ("c++14",)),
-    Rule("std-optional", "at::optional is gone from new torch releases; it was another name of std::optional",
-         _StdOptional, ("at::optional",), (".cpp", ".cu", ".h", ".cuh")),
 )

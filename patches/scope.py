@@ -10,7 +10,6 @@ from .rules import PipeBlendMode, Trainer
 
 # Not all folders: outputs hold copies of the code, environments whole packages.
 FOLDERS = ("", "arguments", "compression", "gaussian_renderer", "lpipsPyTorch", "scene", "utils")
-NATIVE_ENDINGS = (".cpp", ".cu", ".h", ".cuh")
 RENDERERS = {"render", "prefilter_voxel"}
 
 
@@ -22,11 +21,10 @@ def python_files(root: Path) -> Iterator[str]:
                 yield path.relative_to(root).as_posix()
 
 
-def submodule_files(root: Path) -> Iterator[str]:
-    """Yields the names of what the checkout's submodules are built from, but for third parties' code."""
-    for path in sorted((root / "submodules").rglob("*")):
-        if path.is_file() and "third_party" not in path.parts and (path.name in ("setup.py", "backend.py")
-                                                                   or path.suffix in NATIVE_ENDINGS):
+def build_files(root: Path) -> Iterator[str]:
+    """Yields the names of the Python files that say how the checkout's submodules are built."""
+    for pattern in ("setup.py", "backend.py"):
+        for path in sorted((root / "submodules").glob("*/" + pattern)):
             yield path.relative_to(root).as_posix()
 
 

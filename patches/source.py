@@ -1,6 +1,7 @@
 """A source file as text and as a syntax tree, and back to the same bytes."""
 from __future__ import annotations
 
+import ast
 import io
 import tokenize
 from typing import Tuple
@@ -25,10 +26,19 @@ def parse(name: str, data: bytes):
     try:
         tree = libcst.parse_module(text)
     except libcst.ParserSyntaxError as error:
-        raise PatchError(f"{name}: is not Python that can be parsed: line {error.raw_line}: {error.message}") from None
+        raise PatchError(f"{name}: is not Python that can be parsed: {_where(data) or error.message}") from None
     if tree.code != text:
         raise PatchError(f"{name}: would not be written back as it is; LibCST cannot represent it")
     return tree, encoding
+
+
+def _where(data: bytes) -> str:
+    """Returns what Python itself says of a file that LibCST cannot parse."""
+    try:
+        ast.parse(data)
+    except SyntaxError as error:
+        return f"line {error.lineno}: {error.msg}"
+    return ""
 
 
 def have_libcst() -> None:
