@@ -147,7 +147,8 @@ def packages():
     names = list(folders)
     for name, folder in folders.items():
         names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
-    return {"packages": names, "package_dir": folders, "package_data": {PACKAGE: ["include/dsmoe/*.h"]}}
+    data = {PACKAGE: ["include/dsmoe/*.h"], f"{PACKAGE}.patches": ["shims/*/*/*.py"]}  # shims are no packages of ours
+    return {"packages": names, "package_dir": folders, "package_data": data}
 
 
 if __name__ == "__main__":

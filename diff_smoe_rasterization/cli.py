@@ -1,4 +1,4 @@
-"""The `dsmoe` command: train, eval, render, info. Each is a few lines over the trainer library."""
+"""The `dsmoe` command: train, eval, render, patch, run, info. Each is a few lines over the trainer library or patches."""
 from __future__ import annotations
 
 import argparse
@@ -6,6 +6,7 @@ import os
 import sys
 from typing import List, Optional
 
+from .patches.errors import PatchError
 from .settings import BLEND_MODES
 from .trainer.checkpoint import CHECKPOINT_NAME
 from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options
@@ -55,6 +56,23 @@ def build_parser() -> argparse.ArgumentParser:
     _add_device(render)
     render.set_defaults(run=_render)
 
+    patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
+                                description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming-3DGS, HAC or HAC++, "
+                                            "which then knows the option --blend_mode.")
+    _add_patch_arguments(patch)
+
+    run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
+                              usage="dsmoe run --blend-mode MODE [--trainer NAME] -- COMMAND ...",
+                              description="Runs a command of an unmodified trainer with this rasterizer. Nothing is written "
+                                          "into the checkout; processes that the command starts have the rasterizer too.")
+    run.add_argument("--blend-mode", choices=BLEND_MODES, required=True,
+                     help="nothing records it: give the same where a trained model is rendered")
+    run.add_argument("--trainer", metavar="NAME",
+                     help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call (inria, "
+                          "inria_2024, scaffold, ...); default: found out from the script's folder")
+    run.add_argument("words", metavar="COMMAND", nargs=argparse.REMAINDER, help="such as: python train.py -s DATA")
+    run.set_defaults(run=_run)
+
     info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
     info.set_defaults(run=_info)
     return parser
@@ -65,7 +83,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     arguments = build_parser().parse_args(argv)
     try:
         return arguments.run(arguments) or 0
-    except (TrainerError, ImportError, OSError) as error:
+    except (TrainerError, PatchError, ImportError, OSError) as error:
         print(f"dsmoe {arguments.command}: error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -77,6 +95,35 @@ def main(argv: Optional[List[str]] = None) -> int:
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to render (default: cpu)")
+
+
+def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
+    actions = patch.add_subparsers(dest="action", required=True, metavar="ACTION")
+    for name, text in (("apply", "patch the checkout; the originals are kept in PATH/.dsmoe_patch"),
+                       ("check", "say whether it is patchable, patched, half-patched, drifted or unknown"),
+                       ("diff", "show what the patch changes"), ("revert", "put every file back byte for byte")):
+        action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        action.add_argument("path", metavar="PATH", help="the checkout's folder")
+        if name in ("apply", "diff"):
+            action.add_argument("--modernise", action="store_true",
+                                help="also what the trainer needs to start on today's torch, CUDA and Python")
+            action.add_argument("--trainer", metavar="NAME", help="which trainer it is (default: found out)")
+        if name == "apply":
+            action.add_argument("--dry-run", action="store_true", help="show the changes, write nothing")
+        action.set_defaults(run=_patch)
+
+
+def _patch(arguments: argparse.Namespace) -> int:
+    from .patches import commands
+
+    return getattr(commands, arguments.action)(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from .patches.run import run
+
+    words = arguments.words[1:] if arguments.words[:1] == ["--"] else arguments.words
+    run(words, arguments.blend_mode, arguments.trainer)
 
 
 def _train(arguments: argparse.Namespace) -> None:

@@ -1,0 +1,61 @@
+"""The two functions of torch_scatter that trainers use, in plain torch: `scatter` (c3dgs) and `scatter_max` (HAC, HAC++)."""
+from __future__ import annotations
+
+from typing import Optional, Tuple
+
+import torch
+
+__all__ = ["scatter", "scatter_max"]
+
+
+def scatter(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Optional[torch.Tensor] = None,
+            dim_size: Optional[int] = None, reduce: str = "sum") -> torch.Tensor:
+    """Sums the elements of `src` that have the same index along `dim`.
+
+    src: any shape. index: int64, of the shape of `src` or, in one dimension, of the size of its `dim`. dim_size: the
+    size of the result along `dim`; None: the largest index + 1. Has a gradient by `src`.
+    Raises NotImplementedError for what the trainers do not use: `out`, and another reduction than "sum" or "add".
+    """
+    if out is not None or reduce not in ("sum", "add"):
+        raise NotImplementedError(f"scatter: reduce is {reduce!r}, out is {'None' if out is None else 'given'}; this "
+                                  "module offers sums into a new tensor alone")
+    index, shape = _fitted("scatter", src, index, dim, dim_size)
+    return src.new_zeros(shape).scatter_add_(dim, index, src)
+
+
+def scatter_max(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Optional[torch.Tensor] = None,
+                dim_size: Optional[int] = None) -> Tuple[torch.Tensor, torch.Tensor]:
+    """Returns the largest of the elements of `src` that have the same index along `dim`, and where it is.
+
+    Arguments as for `scatter`. Returns the maxima, 0 where no element has that index, and int64 positions along `dim`, the
+    first of equal ones, and the size of `src` where there is none. The maxima have a gradient by `src`.
+    Raises NotImplementedError where `out` is given.
+    """
+    if out is not None:
+        raise NotImplementedError("scatter_max: out is given; this module offers maxima in a new tensor alone")
+    index, shape = _fitted("scatter_max", src, index, dim, dim_size)
+    size = src.shape[dim]
+    values = src.detach()
+    largest = values.new_zeros(shape).scatter_reduce_(dim, index, values, "amax", include_self=False)
+    is_largest = values == largest.gather(dim, index)
+    along = [1] * src.dim()
+    along[dim] = size
+    places = torch.arange(size, device=src.device).reshape(along).expand_as(src).masked_fill(~is_largest, size)
+    places = places.new_full(shape, size).scatter_reduce_(dim, index, places, "amin")
+    # Gathered by place, the maxima carry the gradient; a row of zeros stands for what no element belongs to.
+    padding = list(src.shape)
+    padding[dim] = 1
+    return torch.cat([src, src.new_zeros(padding)], dim).gather(dim, places), places
+
+
+def _fitted(function, src, index, dim, dim_size):
+    """Returns the index in the shape of `src`, and the shape of the result."""
+    if index.dim() == 1 and src.dim() > 1:
+        along = [1] * src.dim()
+        along[dim] = -1
+        index = index.reshape(along)
+    if index.dim() != src.dim():
+        raise ValueError(f"{function}: index has shape {list(index.shape)}; it must fit src, {list(src.shape)}")
+    index, shape = index.expand_as(src), list(src.shape)
+    shape[dim] = dim_size if dim_size is not None else (int(index.max()) + 1 if index.numel() else 0)
+    return index, shape

@@ -1,0 +1,303 @@
+"""Plans a patch, and makes it, shows it or takes it back. Everything is planned before anything is written.
+
+A plan is made of the files as they were before any patch: those in the record where there is one, else those on disk. So
+the plan is the same for a checkout that is patched, half patched by an interruption, or patched with other options, and
+to apply it is to write what differs from it.
+"""
+from __future__ import annotations
+
+import difflib
+import io
+from pathlib import Path
+from typing import Dict, List, NamedTuple, Optional, Tuple, Union
+
+from diff_smoe_rasterization._version import __version__
+
+from . import facts, source
+from .errors import PatchError
+from .record import FOLDER, Record, check_writable, replace_file
+from .rules import RASTERIZER, ImportRasterizer, Trainer
+from .scope import build_files, callers_out_of_reach, python_files
+from .trainers import TRAINERS
+
+STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
+PathLike = Union[str, Path]
+
+
+class Verdict(str):
+    """One of STATES, as a string, with `trainer` (a name or None) and `reasons` (lines)."""
+
+    trainer: Optional[str]
+    reasons: Tuple[str, ...]
+
+    def __new__(cls, state: str, trainer: Optional[str], reasons: List[str]) -> Verdict:
+        assert state in STATES
+        verdict = super().__new__(cls, state)
+        verdict.state, verdict.trainer, verdict.reasons = state, trainer, tuple(reasons)
+        return verdict
+
+
+class Change(NamedTuple):
+    """What becomes of one file."""
+
+    name: str  # relative to the checkout
+    before: bytes
+    after: bytes
+    rules: Tuple[str, ...]
+
+
+class Plan(NamedTuple):
+    """What `apply` would do, and why it would not."""
+
+    root: Path
+    verdict: Verdict
+    changes: Tuple[Change, ...]
+    notes: Tuple[str, ...]  # what the user should know: modernise rules that were applied or skipped, scripts out of reach
+    modernise: bool
+    record: Optional[Record]
+    written: bool = False  # whether `apply` wrote files by this plan
+
+
+def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+    """Plans the patch of a checkout. Raises PatchError where it is refused; a checkout that is patched is no refusal."""
+    planned = _inspect(path, modernise, trainer)
+    if planned.verdict in ("patchable", "patched"):
+        return planned
+    if planned.verdict == "half-patched" and planned.record and _can_be_finished(planned):
+        return planned
+    raise PatchError(refusal(planned.verdict))
+
+
+def check(path: PathLike) -> Verdict:
+    """Says how a checkout is: unknown, patchable, patched, half-patched or drifted, with `.trainer` and `.reasons`."""
+    return _inspect(path).verdict
+
+
+def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> str:
+    """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
+    return "".join(diff_of(change) for change in plan(path, modernise, trainer).changes)
+
+
+def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+    """Patches a checkout. Where it is patched already nothing is written. Raises PatchError, and then nothing is written.
+
+    Returns the plan; its `verdict` is how the checkout was before.
+    """
+    planned = plan(path, modernise, trainer)
+    root, record = planned.root, planned.record
+    if planned.verdict == "patched" and record is None:
+        return planned
+    states = record.states() if record else {}
+    edited = [name for name, state in states.items() if state == "changed"]
+    if edited and planned.modernise == record.manifest["modernise"]:
+        return planned  # every rule is applied
+    if edited:
+        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise has to be given at the first patch")
+    before = {change.name: change.before for change in planned.changes}
+    after = {change.name: change.after for change in planned.changes}
+    for name in set(states) - set(after):  # of an earlier version's rules
+        before[name] = after[name] = record.original(name)
+    pending = {name: data for name, data in after.items() if (root / name).read_bytes() != data}
+    if record and not pending:
+        return planned
+    for name in pending:
+        check_writable(root, name)
+    notes = {"version": __version__, "trainer": planned.verdict.trainer, "modernise": planned.modernise,
+             "rules": {change.name: change.rules for change in planned.changes}}
+    try:
+        Record.write(root, before, after, notes)
+    except OSError as error:
+        raise PatchError(f"{FOLDER}: the originals cannot be kept, so nothing was changed: {error}") from None
+    undo = {name: (root / name).read_bytes() for name in pending}
+    try:
+        for name, data in pending.items():
+            replace_file(root / name, data)
+    except OSError as error:
+        for done, data in undo.items():
+            if (root / done).read_bytes() != data:
+                replace_file(root / done, data)
+        if record is None:
+            Record.load(root).remove()
+        raise PatchError(f"{name}: cannot be written, so all was put back: {error}") from None
+    return planned._replace(written=True)
+
+
+def revert(path: PathLike) -> Tuple[str, ...]:
+    """Puts every file back byte for byte and removes the record; returns the files' names.
+
+    Raises PatchError, and touches nothing, where a file was changed since or where there is no record.
+    """
+    root = _root(path)
+    record = Record.load(root)
+    if record is None:
+        raise PatchError(f"{root}: there is no {FOLDER}, so nothing can be put back: it was not patched, or by hand")
+    states = record.states()
+    for name, state in states.items():
+        if state in ("changed", "gone"):
+            raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. The original is in {FOLDER}/originals")
+    patched = [name for name, state in states.items() if state == "patched"]
+    for name in patched:
+        check_writable(root, name)
+    for name in patched:
+        replace_file(root / name, record.original(name))
+    record.remove()
+    return tuple(patched)
+
+
+_SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
+          "original": "is the original, though the record says that it was patched"}
+
+
+def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+    source.have_libcst()
+    root = _root(path)
+    record = Record.load(root)
+    modernise = modernise or bool(record and record.manifest["modernise"])
+
+    def read(name: str) -> Optional[bytes]:
+        if record and name in record.files:
+            return record.original(name)
+        return _read(root / name)
+
+    chosen, reason = _trainer(read, trainer or (record.manifest["trainer"] if record else None))
+    if chosen is None:
+        return Plan(root, Verdict("unknown", None, [reason]), (), (), modernise, record)
+    files = {name: read(name) for name in python_files(root)}
+    if modernise:
+        files.update((name, read(name)) for name in build_files(root))
+    patch = _Patch(files, chosen)
+    notes = patch.modernise() if modernise and not patch.problems else []
+    notes += callers_out_of_reach(files, chosen)
+    state, reasons = patch.state()
+    if record and not patch.problems:
+        state, reasons = _state_by_record(record, root, chosen)
+    return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), tuple(notes), modernise, record)
+
+
+class _Patch:
+    """The rules of a trainer, applied to its files in memory."""
+
+    def __init__(self, files: Dict[str, bytes], trainer: Trainer) -> None:
+        from . import codemods
+
+        self.files, self.trees, self.encodings = files, {}, {}
+        self.rules: Dict[str, List[str]] = {}  # of each file, those that changed it
+        self.problems: List[str] = []  # why it cannot be patched
+        self.pending: List[str] = []
+        self.done: List[str] = []
+        for rule in trainer.rules:
+            if rule.file not in files:
+                self.problems.append(f"{rule.file}: rule {rule.name}: there is no such file; expected is {rule.right}")
+                continue
+            try:
+                outcome = self._run(codemods.run, rule, rule.file)
+            except PatchError as error:
+                self.problems.append(str(error))
+                continue
+            found = outcome.pending + outcome.done
+            line = f"{rule.file}: rule {rule.name}"
+            if found != rule.expected:
+                self.problems.append(f"{line}: {found} matches instead of {rule.expected} of {rule.right}")
+            if outcome.pending:
+                self.pending.append(line)
+            if outcome.done:
+                self.done.append(line)
+        # A script of the user's that imports the rasterizer must not get another one than the trainer's own files.
+        known = {rule.file for rule in trainer.rules if isinstance(rule, ImportRasterizer)}
+        for name in sorted(set(files) - known):
+            if RASTERIZER.encode() in files[name] and not name.startswith("submodules/") and not self.problems:
+                self._run(codemods.run, ImportRasterizer(name, trainer.flavour), name)
+
+    def modernise(self) -> List[str]:
+        """Applies the modernise rules; returns a line for each."""
+        from . import modernise
+
+        notes = []
+        for rule in modernise.RULES:
+            changed = [name for name in sorted(self.files) if rule.looks_at(self.files[name])
+                       and self._run(modernise.run, rule, name).pending]
+            notes.append(f"modernise {rule.name}: " + (f"{', '.join(changed)}: {rule.reason}" if changed
+                                                       else "skipped, nothing matches"))
+        return notes
+
+    def state(self) -> Tuple[str, List[str]]:
+        if self.problems:
+            return "drifted", self.problems
+        if self.done and self.pending:
+            return "half-patched", ([f"{line}: is not applied" for line in self.pending]
+                                    + [f"{line}: is applied already" for line in self.done])
+        if self.done:
+            return "patched", [f"every rule is applied; there is no {FOLDER}, so `revert` cannot undo it"]
+        return "patchable", []
+
+    def changes(self) -> Tuple[Change, ...]:
+        changes = []
+        for name, rules in self.rules.items():
+            after = self.trees[name].code.encode(self.encodings[name])
+            changes.append(Change(name, self.files[name], after, tuple(rules)))
+        return tuple(changes)
+
+    def _run(self, run, rule, name: str):
+        if name not in self.trees:
+            self.trees[name], self.encodings[name] = source.parse(name, self.files[name])
+        outcome = run(rule, self.trees[name])
+        self.trees[name] = outcome.tree
+        if outcome.pending:
+            self.rules.setdefault(name, []).append(rule.name)
+        return outcome
+
+
+def _state_by_record(record: Record, root: Path, trainer: Trainer) -> Tuple[str, List[str]]:
+    """How a checkout is that has a record: `patched`, or what the record and the files disagree in."""
+    states = record.states()
+    if set(states.values()) <= {"patched"}:
+        return "patched", [f"by version {record.manifest['version']}"
+                           + (", with --modernise" if record.manifest["modernise"] else "")]
+    return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
+
+
+def _can_be_finished(planned: Plan) -> bool:
+    """Whether an interrupted patch can be finished, or what was edited since still has every rule applied."""
+    states = set(planned.record.states().values())
+    if states <= {"patched", "original"}:
+        return True
+    trainer = next(trainer for trainer in TRAINERS if trainer.name == planned.verdict.trainer)
+    files = {name: _read(planned.root / name) for name in python_files(planned.root)}
+    return "gone" not in states and _Patch(files, trainer).state()[0] == "patched"
+
+
+def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:
+    if name is None:
+        return facts.recognise(facts.of_checkout(read))
+    for trainer in TRAINERS:
+        if trainer.name == name:
+            return trainer, ""
+    raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(facts.names())}")
+
+
+def _root(path: PathLike) -> Path:
+    root = Path(path)
+    if not root.is_dir():
+        raise PatchError(f"{root}: is not a folder; the checkout's own is wanted, in which train.py or compress.py lies")
+    return root
+
+
+def _read(path: Path) -> Optional[bytes]:
+    try:
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        return None
+
+
+def refusal(verdict: Verdict) -> str:
+    """Returns why a checkout cannot be patched."""
+    trainer = f" ({verdict.trainer})" if verdict.trainer else ""
+    return "\n".join([f"the checkout is {verdict}{trainer}:", *("  " + reason for reason in verdict.reasons)])
+
+
+def diff_of(change: Change) -> str:
+    """Returns the unified diff of one file."""
+    before, after = (io.StringIO(source.decode(change.name, data)[0], newline="\n").readlines()
+                     for data in (change.before, change.after))
+    lines = difflib.unified_diff(before, after, "a/" + change.name, "b/" + change.name)
+    return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in lines)

@@ -1,0 +1,70 @@
+"""What a checkout imports and calls, from which it is told which trainer it is. Needs no LibCST."""
+from __future__ import annotations
+
+import ast
+import warnings
+from typing import Callable, Optional, Set, Tuple
+
+from .rules import GR, INTEGRATIONS, RASTERIZER, Trainer
+from .trainers import TRAINERS
+
+PATCHED = "imports from " + INTEGRATIONS
+LOOKED_AT = (GR, "scene/gaussian_model.py", "train.py", "render.py")
+BASE_SETTINGS = {"image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
+                 "sh_degree", "campos", "prefiltered", "debug"}
+FURTHER_SETTINGS = {"antialiasing", "pixel_weights", "clamp_color", "blend_mode"}
+
+
+def of_checkout(read: Callable[[str], Optional[bytes]]) -> Set[str]:
+    """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "calls visible_filter".
+
+    read: the bytes of a file of the checkout, or None where there is no such file.
+    """
+    facts: Set[str] = set()
+    for name in LOOKED_AT:
+        data = read(name)
+        if data is not None:
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # such as of invalid escapes in a string
+                    tree = ast.parse(data)
+            except (SyntaxError, ValueError):
+                continue  # a rule that needs the file will say so
+            for node in ast.walk(tree):
+                facts |= _of_node(node)
+    return facts
+
+
+def _of_node(node: ast.AST) -> Set[str]:
+    if isinstance(node, ast.ImportFrom) and node.module:
+        if node.module == RASTERIZER or node.module.startswith(INTEGRATIONS + "."):
+            imported = {f"imports {alias.name}" for alias in node.names}
+            return imported if node.module == RASTERIZER else imported | {PATCHED}
+        return {"imports " + node.module.rpartition(".")[2]}
+    if isinstance(node, ast.Import):
+        return {"imports " + alias.name.rpartition(".")[2] for alias in node.names}
+    if isinstance(node, ast.Call):
+        called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        if called == "GaussianRasterizationSettings":
+            return {f"sets {keyword.arg}" for keyword in node.keywords}
+        if called == "visible_filter":
+            return {"calls visible_filter"}
+    return set()
+
+
+def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
+    """Returns the trainer and "", or None and why it is none that is known."""
+    if "imports GaussianRasterizationSettings" not in facts:
+        return None, f"{GR} imports GaussianRasterizationSettings neither from {RASTERIZER} nor from {INTEGRATIONS}"
+    foreign = sorted(fact[5:] for fact in facts if fact.startswith("sets ")
+                     and fact[5:] not in BASE_SETTINGS | FURTHER_SETTINGS)
+    if foreign:
+        return None, (f"its GaussianRasterizationSettings have {', '.join(foreign)}, which no trainer has that is "
+                      f"known here ({', '.join(names())})")
+    return next(trainer for trainer in TRAINERS
+                if any(facts.issuperset(sign.split(" and ")) for sign in trainer.signs)), ""
+
+
+def names() -> Tuple[str, ...]:
+    """The names of the trainers."""
+    return tuple(sorted(trainer.name for trainer in TRAINERS))

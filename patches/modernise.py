@@ -1,0 +1,179 @@
+"""What a trainer needs to start on today's torch, CUDA and Python, and has nothing to do with blending: --modernise.
+
+Each rule has a name and the reason for it, and is a LibCST codemod as those in codemods.py. One that matches nothing is
+skipped.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple, Tuple, Type
+
+import libcst as cst
+from libcst.helpers import get_full_name_for_node
+
+from .codemods import Codemod, Outcome, statement, with_import
+from .rules import INTEGRATIONS, RUNTIME
+
+
+class Rule(NamedTuple):
+    """A rule of --modernise."""
+
+    name: str
+    reason: str
+    codemod: Type[Codemod]
+    hints: Tuple[str, ...]  # a file without any of these words cannot match and is not parsed
+
+    def looks_at(self, data: bytes) -> bool:
+        return any(hint.encode() in data for hint in self.hints)
+
+
+def run(rule: Rule, tree: cst.Module) -> Outcome:
+    """Applies a rule to a tree."""
+    codemod = rule.codemod(rule)
+    return Outcome(tree.visit(codemod), codemod.pending, 0)
+
+
+class _ImportFrom(Codemod):
+    """`from FOREIGN import NAMES` takes the names from OURS, where it has all of them."""
+
+    foreign = ours = ""
+    names: Tuple[str, ...] = ()
+
+    def leave_ImportFrom(self, original_node: cst.ImportFrom, updated_node: cst.ImportFrom) -> cst.ImportFrom:
+        if updated_node.relative or isinstance(updated_node.names, cst.ImportStar) or updated_node.module is None:
+            return updated_node
+        if (get_full_name_for_node(updated_node.module) != self.foreign
+                or not {get_full_name_for_node(alias.name) for alias in updated_node.names} <= set(self.names)):
+            return updated_node
+        self.pending += 1
+        return updated_node.with_changes(module=cst.parse_expression(self.ours))
+
+
+class _SimpleKnn(_ImportFrom):
+    foreign, ours, names = "simple_knn._C", "diff_smoe_rasterization", ("distCUDA2",)
+
+
+class _FusedSsim(_ImportFrom):
+    foreign, ours, names = "fused_ssim", "diff_smoe_rasterization", ("fused_ssim",)
+
+
+class _TorchScatter(_ImportFrom):
+    foreign, ours, names = "torch_scatter", f"{INTEGRATIONS}.torch_scatter", ("scatter", "scatter_max")
+
+
+class _WeightsOnly(Codemod):
+    def leave_Call(self, original_node: cst.Call, updated_node: cst.Call) -> cst.Call:
+        given = {argument.keyword.value for argument in updated_node.args if argument.keyword}
+        if get_full_name_for_node(updated_node.func) != "torch.load" or "weights_only" in given or not updated_node.args:
+            return updated_node
+        self.pending += 1
+        *before, last = updated_node.args
+        more = cst.Arg(cst.Name("False"), cst.Name("weights_only"), comma=last.comma,
+                       whitespace_after_arg=last.whitespace_after_arg,
+                       equal=cst.AssignEqual(cst.SimpleWhitespace(""), cst.SimpleWhitespace("")))
+        last = last.with_changes(comma=cst.Comma(whitespace_after=cst.SimpleWhitespace(" ")),
+                                 whitespace_after_arg=cst.SimpleWhitespace(""))
+        return updated_node.with_changes(args=[*before, last, more])
+
+
+class _NumpyByte(Codemod):
+    """`dtype=np.byte` becomes `dtype=np.uint8`."""
+
+    def leave_Arg(self, original_node: cst.Arg, updated_node: cst.Arg) -> cst.Arg:
+        is_dtype = updated_node.keyword is not None and updated_node.keyword.value == "dtype"
+        if not is_dtype or get_full_name_for_node(updated_node.value) not in ("np.byte", "numpy.byte"):
+            return updated_node
+        self.pending += 1
+        return updated_node.with_changes(value=updated_node.value.with_changes(attr=cst.Name("uint8")))
+
+
+class _OptionalImport(Codemod):
+    """`import wandb` becomes `wandb = optional_import("wandb")`."""
+
+    names = ("lpips", "wandb", "websockets")
+
+    def leave_SimpleStatementLine(self, original_node: cst.SimpleStatementLine,
+                                  updated_node: cst.SimpleStatementLine):
+        only = updated_node.body[0]
+        if len(updated_node.body) != 1 or not isinstance(only, cst.Import) or len(only.names) != 1:
+            return updated_node
+        name = get_full_name_for_node(only.names[0].name)
+        if name not in self.names or only.names[0].asname or self.within:
+            return updated_node
+        self.pending += 1
+        helper = statement(f"from {RUNTIME} import optional_import")
+        return cst.FlattenSentinel([helper.with_changes(leading_lines=updated_node.leading_lines), updated_node.with_changes(
+            leading_lines=[], body=statement(f'{name} = optional_import("{name}")').body)])
+
+
+class _LpipsWhenUsed(Codemod):
+    """`name = lpips.LPIPS(...)...` at the top of a module is made when it is called first."""
+
+    def leave_SimpleStatementLine(self, original_node: cst.SimpleStatementLine,
+                                  updated_node: cst.SimpleStatementLine):
+        only = updated_node.body[0]
+        if self.within or len(updated_node.body) != 1 or not isinstance(only, cst.Assign):
+            return updated_node
+        call = only.value
+        while isinstance(call, cst.Call) and isinstance(call.func, cst.Attribute) and isinstance(call.func.value, cst.Call):
+            call = call.func.value  # from .to('cuda') or .cuda() inwards
+        if not isinstance(call, cst.Call) or get_full_name_for_node(call.func) != "lpips.LPIPS":
+            return updated_node
+        self.pending += 1
+        value = cst.parse_expression("nan_without_network(deferred(lambda: None))")
+        value = value.with_deep_changes(value.args[0].value.args[0].value, body=only.value)
+        helper = statement(f"from {RUNTIME} import deferred, nan_without_network")
+        return cst.FlattenSentinel([helper.with_changes(leading_lines=updated_node.leading_lines),
+                                    updated_node.with_changes(leading_lines=[], body=[only.with_changes(value=value)])])
+
+
+class _LpipsOffline(Codemod):
+    """The function `lpips` of lpipsPyTorch gets a decorator."""
+
+    def changed_function(self, function: cst.FunctionDef) -> cst.FunctionDef:
+        if self.within or function.name.value != "lpips" or function.decorators:
+            return function
+        self.pending += 1
+        return function.with_changes(decorators=[cst.Decorator(cst.Name("nan_without_network"))])
+
+    def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
+        return with_import(updated_node, RUNTIME, "nan_without_network") if self.pending else updated_node
+
+
+class _CppStandard(Codemod):
+    """The flag goes: torch gives the compiler the standard that it needs itself where nobody does."""
+
+    def is_flag(self, element: cst.BaseElement) -> bool:
+        return isinstance(element.value, cst.SimpleString) and element.value.raw_value == "-std=c++14"
+
+    def leave_Element(self, original_node: cst.Element, updated_node: cst.Element):
+        if not self.is_flag(updated_node):
+            return updated_node
+        self.pending += 1
+        return cst.RemoveFromParent()
+
+    def leave_List(self, original_node: cst.List, updated_node: cst.List) -> cst.List:
+        if not updated_node.elements or not self.is_flag(original_node.elements[-1]):
+            return updated_node
+        *before, last = updated_node.elements  # it is the last one now, and has the comma, or none, of the one that was
+        return updated_node.with_changes(elements=[*before, last.with_changes(comma=original_node.elements[-1].comma)])
+
+
+RULES = (
+    Rule("checkpoint-load", "torch 2.6 and later load tensors alone unless told otherwise, and the trainers' checkpoints "
+         "hold numpy numbers and optimizer states", _WeightsOnly, ("torch.load",)),
+    Rule("simple-knn", "distCUDA2 is in this package, for CUDA and CPU: one extension less to compile", _SimpleKnn,
+         ("simple_knn",)),
+    Rule("fused-ssim", "fused_ssim is in this package: one extension less to compile", _FusedSsim, ("fused_ssim",)),
+    Rule("torch-scatter", "torch_scatter has no builds for new torch releases; torch itself has what the trainers use of "
+         "it", _TorchScatter, ("torch_scatter",)),
+    Rule("optional-import", "wandb, websockets and lpips are imported by every run, but used by an option or a metric "
+         "alone", _OptionalImport, _OptionalImport.names),
+    Rule("lpips-when-used", "the network of LPIPS is built, and its weights are downloaded, when the script is imported",
+         _LpipsWhenUsed, ("lpips.LPIPS",)),
+    Rule("lpips-offline", "where the weights of LPIPS cannot be downloaded, a measurement ends the training; it is NaN then, "
+         "with a warning", _LpipsOffline, ("def lpips",)),
+    Rule("blender-images", "new Pillow releases take no signed bytes for a picture, which the reader of Blender scenes makes",
+         _NumpyByte, ("np.byte", "numpy.byte")),
+    Rule("cpp-standard", "a submodule's setup.py asks for C++14; torch 2.1 needs C++17, 2.13 C++20, and asks for it itself", _CppStandard,
+         ("c++14",)),
+)

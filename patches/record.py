@@ -1,0 +1,126 @@
+"""PATH/.dsmoe_patch: the originals, byte for byte, and a manifest of what was changed. Written before any file is.
+
+    .dsmoe_patch/manifest.json     {"files": {name: {"before": sha256, "after": [sha256, ...]}}, "trainer": ..., ...}
+    .dsmoe_patch/originals/NAME    the file as it was
+
+The last of "after" is what the file became; earlier ones are of a patch that this one took over from, so that whatever
+moment an interruption came at, each file is known to be the original, patched, or changed by someone else.
+"""
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import stat
+import tempfile
+from pathlib import Path
+from typing import Dict, Mapping, Optional
+
+from .errors import PatchError
+
+FOLDER = ".dsmoe_patch"
+FORMAT = 1
+
+
+def sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+class Record:
+    """The record of a checkout that was patched."""
+
+    def __init__(self, root: Path, manifest: Mapping) -> None:
+        self.folder, self.manifest = root / FOLDER, manifest
+        self.root, self.files = root, manifest["files"]
+
+    @classmethod
+    def load(cls, root: Path) -> Optional[Record]:
+        """Returns the record, or None where the checkout has none. Raises PatchError where it cannot be read."""
+        path = root / FOLDER / "manifest.json"
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return None
+        try:
+            manifest = json.loads(text)
+            if manifest["format"] != FORMAT:
+                raise ValueError(f"its format is {manifest['format']!r}, not {FORMAT}")
+            record = cls(root, manifest)
+            for name, hashes in record.files.items():
+                if sha256(record.original(name)) != hashes["before"]:
+                    raise ValueError(f"the original of {name} is not what was recorded")
+            return record
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch is damaged ({error}); put the files back "
+                             f"from your version control, then delete {FOLDER}") from None
+
+    @classmethod
+    def write(cls, root: Path, originals: Mapping[str, bytes], after: Mapping[str, bytes], notes: Mapping) -> Record:
+        """Writes the record of a patch that is about to be made; of one that was made before, it keeps the hashes."""
+        earlier = cls.load(root)
+        files = {}
+        for name, data in originals.items():
+            before = earlier.files[name]["after"] if earlier and name in earlier.files else []
+            new = sha256(after[name])
+            files[name] = {"before": sha256(data), "after": [known for known in before if known != new] + [new]}
+            copy = root / FOLDER / "originals" / name
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(copy, data)
+        replace_file(root / FOLDER / ".gitignore", b"*\n")
+        manifest = {"format": FORMAT, **notes, "files": files}
+        text = json.dumps(manifest, indent=1) + "\n"
+        replace_file(root / FOLDER / "manifest.json", text.encode())
+        return cls(root, manifest)
+
+    def original(self, name: str) -> bytes:
+        return (self.folder / "originals" / name).read_bytes()
+
+    def states(self) -> Dict[str, str]:
+        """Returns of each file whether it is "original", "patched", or "changed" (or gone) since."""
+        return {name: self._state(name, hashes) for name, hashes in self.files.items()}
+
+    def _state(self, name: str, hashes: Mapping) -> str:
+        try:
+            now = sha256((self.root / name).read_bytes())
+        except FileNotFoundError:
+            return "gone"
+        if now == hashes["before"]:
+            return "original"
+        return "patched" if now in hashes["after"] else "changed"
+
+    def remove(self) -> None:
+        """Removes the record; the manifest first, without which the rest means nothing."""
+        (self.folder / "manifest.json").unlink()
+        shutil.rmtree(self.folder)
+
+
+def check_writable(root: Path, name: str) -> None:
+    """Raises PatchError where a file, or one beside it, may not be written, or lies outside the checkout."""
+    path = root / name
+    target = path.resolve()
+    if root.resolve() not in target.parents:
+        raise PatchError(f"{name}: is a link to {target}, outside the checkout; copy it into the checkout first")
+    if not target.stat().st_mode & stat.S_IWUSR or not os.access(str(target), os.W_OK):
+        raise PatchError(f"{name}: is read-only; make it writable first (chmod u+w)")
+    if not os.access(str(target.parent), os.W_OK):
+        raise PatchError(f"{name}: its folder {target.parent} is read-only; make it writable first (chmod u+w)")
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Writes a file at once or not at all. What a link points to is written; a file that was there keeps its mode."""
+    target = path.resolve()
+    handle, temporary = tempfile.mkstemp(dir=str(target.parent), prefix=".dsmoe_patch_")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        if target.exists():
+            shutil.copymode(str(target), temporary)
+        else:
+            os.chmod(temporary, 0o644)
+        os.replace(temporary, str(target))
+    except BaseException:
+        os.unlink(temporary)
+        raise

@@ -1,0 +1,134 @@
+"""`dsmoe run`: a command of an unmodified trainer, with this package's rasterizer in front of its own.
+
+PYTHONPATH names a folder of shims/, in which `diff_gaussian_rasterization` is the module of integrations whose API the
+trainer calls, and DSMOE_BLEND_MODE the mode; whatever the command starts has both. dsmoe becomes the command (exec), so
+that its exit status and signals are the command's own.
+"""
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
+
+from diff_smoe_rasterization.settings import BLEND_MODE_VARIABLE
+
+from . import facts
+from .errors import PatchError
+from .record import FOLDER
+from .rules import RASTERIZER
+from .trainers import TRAINERS
+
+SHIMS = Path(__file__).resolve().parent / "shims"
+STAND_INS = {"simple_knn": "simple_knn._C", "fused_ssim": "fused_ssim", "torch_scatter": "torch_scatter"}
+PROBE = """
+import importlib, importlib.util, json, sys
+def usable(module):
+    if importlib.util.find_spec(module.partition(".")[0]) is None:
+        return False
+    try:
+        import torch
+        importlib.import_module(module)
+        return True
+    except Exception:
+        return False
+print(json.dumps({"version": sys.version.split()[0], "ours": importlib.util.find_spec(sys.argv[1]) is not None,
+                  "usable": [name for name in sys.argv[2:] if usable(name)]}))
+"""
+
+
+def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None) -> NoReturn:
+    """Becomes the command. Raises PatchError where it would not run with this rasterizer."""
+    environment, lines = prepare(words, blend_mode, trainer, dict(os.environ))
+    for line in lines:
+        print("dsmoe run: " + line, file=sys.stderr)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execvpe(words[0], list(words), environment)
+
+
+def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
+            environment: Dict[str, str]) -> Tuple[Dict[str, str], List[str]]:
+    """Returns the environment of the command, and what the user is told about it."""
+    if not words:
+        raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
+    if shutil.which(words[0], path=environment.get("PATH")) is None:
+        raise PatchError(f"{words[0]}: there is no such command")
+    flavour, found = _flavour(words, trainer)
+    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode}
+    if "PYTHONPYCACHEPREFIX" not in environment:
+        environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
+    answer, lines = _ask_python(words, environment)
+    absent = [name for name, module in STAND_INS.items() if module not in answer["usable"]]
+    folders = [str(SHIMS / name) for name in [flavour, *absent]]
+    environment["PYTHONPATH"] = os.pathsep.join(folders + [path for path in [environment.get("PYTHONPATH")] if path])
+    lines.insert(0, f"{found}: {RASTERIZER} is {flavour} of this package, blend mode {blend_mode}")
+    if absent:
+        lines.append(f"{', '.join(absent)} cannot be imported there: this package's own take their place")
+    return environment, lines
+
+
+def flavours() -> Tuple[str, ...]:
+    """The rasterizers whose API there is a shim for."""
+    return tuple(sorted(folder.name for folder in SHIMS.iterdir() if (folder / RASTERIZER).is_dir()))
+
+
+def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str]:
+    """Returns the flavour, and for which trainer it was chosen."""
+    by_name = {**{name: name for name in flavours()}, **{known.name: known.flavour for known in TRAINERS}}
+    if trainer is not None and trainer not in by_name:
+        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(facts.names())}, or for another "
+                         f"trainer the rasterizer whose API it calls: {', '.join(flavours())}")
+    reasons = []
+    for folder in _folders(words):
+        found = facts.of_checkout(lambda name: (folder / name).read_bytes() if (folder / name).is_file() else None)
+        if facts.PATCHED in found or (folder / FOLDER / "manifest.json").is_file():
+            raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or without "
+                             "(render.py, which reads it from cfg_args)")
+        if (folder / RASTERIZER).exists():
+            raise PatchError(f"{folder / RASTERIZER} would be imported before this package's; move it away")
+        if trainer is None:
+            known, reason = facts.recognise(found)
+            if known:
+                return known.flavour, f"{known.name} in {folder}"
+            reasons.append(f"{folder}: {reason}")
+    if trainer is not None:
+        return by_name[trainer], trainer
+    raise PatchError("no trainer that is known was found; name it with --trainer, or the rasterizer whose API it calls "
+                     f"({', '.join(flavours())}):\n  " + "\n  ".join(reasons))
+
+
+def _folders(words: Sequence[str]) -> List[Path]:
+    """Returns where the checkout may be: the script's folder, those above it, the current folder."""
+    script = next((Path(word).resolve() for word in words if word.endswith(".py") and Path(word).is_file()), None)
+    folders = [script.parent, *list(script.parent.parents)[:2]] if script else []
+    return list(dict.fromkeys([*folders, Path.cwd()]))
+
+
+def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[Dict, List[str]]:
+    """Asks the command's Python what it can import. Raises PatchError where that is not this package."""
+    is_python = re.fullmatch(r"python[0-9.]*t?", os.path.basename(words[0])) is not None
+    options = [word for index, word in enumerate(words[1:], 1) if all(before.startswith("-") for before in words[1:index + 1])]
+    if is_python and {"-I", "-E"} & set(options):
+        raise PatchError(f"{words[0]} {' '.join(options)}: does not look at PYTHONPATH, by which it would find the rasterizer")
+    python = words[0] if is_python else next((name for name in ("python", "python3")
+                                              if shutil.which(name, path=environment.get("PATH"))), None)
+    if python is None:
+        return {"usable": list(STAND_INS.values())}, []
+    asked = subprocess.run([python, "-c", PROBE, "diff_smoe_rasterization", *STAND_INS.values()], env=environment,
+                           stdout=subprocess.PIPE, stderr=subprocess.PIPE, universal_newlines=True)
+    try:
+        answer = json.loads(asked.stdout.splitlines()[-1])
+    except (ValueError, IndexError):
+        raise PatchError(f"{python} cannot be asked what it can import: {asked.stderr.strip() or 'it printed nothing'}") from None
+    if answer["ours"]:
+        return answer, []
+    message = (f"{python} (Python {answer['version']}) cannot import diff_smoe_rasterization; install it there: "
+               f"{python} -m pip install PATH_OF_THIS_PROJECT")
+    if is_python:
+        raise PatchError(message)
+    return answer, [message + f", unless {words[0]} starts another Python"]

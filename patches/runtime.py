@@ -1,0 +1,101 @@
+"""What a patched trainer calls while it runs: where its blend mode comes from, and stand-ins for what may be absent."""
+from __future__ import annotations
+
+import functools
+import importlib
+import os
+import sys
+import warnings
+from typing import Any, Callable
+
+from diff_smoe_rasterization.settings import BLEND_MODE_VARIABLE, BLEND_MODES, resolve_blend_mode
+
+
+def default_blend_mode() -> str:
+    """Returns the default of --blend_mode: $DSMOE_BLEND_MODE, else "alpha".
+
+    Scripts that build fixed command lines for train.py pass the mode on by this variable.
+    Raises ValueError where the variable names no mode.
+    """
+    return resolve_blend_mode(None)
+
+
+def blend_mode_of(dataset: Any) -> str:
+    """Returns the blend mode of a run, and notes it in `dataset`, of which the trainer saves what it holds as cfg_args.
+
+    dataset: the trainer's extracted ModelParams. Without a `blend_mode` (a cfg_args of before the patch): "alpha".
+    Warns, once, where the mode may not be the one that was meant or where it changes what the background does.
+    Raises ValueError where the mode is not one of BLEND_MODES.
+    """
+    recorded = getattr(dataset, "blend_mode", None)
+    mode = recorded or "alpha"
+    if mode not in BLEND_MODES:
+        raise ValueError(f"--blend_mode is {mode!r}; it must be one of {', '.join(BLEND_MODES)}")
+    if not recorded:
+        _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
+              "the patch); --blend_mode says otherwise")
+    variable = os.environ.get(BLEND_MODE_VARIABLE)
+    if variable and variable != mode:
+        _warn(f"{BLEND_MODE_VARIABLE} is {variable}, but the blend mode is {mode}: --blend_mode and cfg_args win")
+    # The option lies in the trainers' OptimizationParams, which are not at hand where a model is rendered.
+    chosen = [name for name, is_on in (("--random_background", "--random_background" in sys.argv),
+                                       ("--white_background", getattr(dataset, "white_background", False))) if is_on]
+    if mode != "alpha" and chosen:
+        _warn(f"{' and '.join(chosen)} with blend mode {mode}: the background shows only where no gate is open, so it "
+              "does not penalise transparent Gaussians as it does in alpha mode")
+    dataset.blend_mode = mode
+    return mode
+
+
+def optional_import(name: str) -> Any:
+    """Returns the module, or, where it is not installed, an object whose attributes raise the ImportError when used."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        return _Absent(error)
+
+
+def deferred(make: Callable[[], Callable[..., Any]]) -> Callable[..., Any]:
+    """Returns a function that calls make() when it is called first, and then what make() returned."""
+    made = functools.lru_cache(maxsize=None)(make)
+
+    @functools.wraps(make)
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        return made()(*arguments, **keywords)
+
+    return call
+
+
+def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns the metric, whose value is NaN, with a warning, where its weights cannot be downloaded.
+
+    A measurement then does not end a training of hours. The first failure is remembered: later calls do not wait.
+    """
+    failed = []
+
+    @functools.wraps(metric)
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        import torch
+
+        if not failed:
+            try:
+                return metric(*arguments, **keywords)
+            except OSError as error:  # urllib's URLError is one
+                failed.append(error)
+                _warn(f"LPIPS is NaN: its weights could not be had ({error})")
+        return torch.tensor(float("nan"))
+
+    return call
+
+
+class _Absent:
+    def __init__(self, error: ImportError) -> None:
+        self._error = error
+
+    def __getattr__(self, name: str) -> Any:
+        raise self._error
+
+
+@functools.lru_cache(maxsize=None)
+def _warn(text: str) -> None:
+    warnings.warn("diff_smoe_rasterization: " + text, stacklevel=4)

@@ -1,0 +1,1 @@
+"""For `dsmoe run`, where simple_knn is not installed."""

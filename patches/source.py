@@ -1,0 +1,50 @@
+"""A source file as text and as a syntax tree, and back to the same bytes."""
+from __future__ import annotations
+
+import ast
+import io
+import tokenize
+from typing import Tuple
+
+from .errors import PatchError
+
+
+def decode(name: str, data: bytes) -> Tuple[str, str]:
+    """Returns the text of a Python file, newlines untouched, and the encoding that makes the same bytes of it."""
+    try:
+        encoding = tokenize.detect_encoding(io.BytesIO(data).readline)[0]  # "utf-8-sig" where there is a BOM
+        return data.decode(encoding), encoding
+    except (SyntaxError, UnicodeDecodeError) as error:
+        raise PatchError(f"{name}: cannot be decoded: {error}") from None
+
+
+def parse(name: str, data: bytes):
+    """Returns the LibCST tree of a Python file and its encoding. Raises PatchError where it cannot be read."""
+    import libcst
+
+    text, encoding = decode(name, data)
+    try:
+        tree = libcst.parse_module(text)
+    except libcst.ParserSyntaxError as error:
+        raise PatchError(f"{name}: is not Python that can be parsed: {_where(data) or error.message}") from None
+    if tree.code != text:
+        raise PatchError(f"{name}: would not be written back as it is; LibCST cannot represent it")
+    return tree, encoding
+
+
+def _where(data: bytes) -> str:
+    """Returns what Python itself says of a file that LibCST cannot parse."""
+    try:
+        ast.parse(data)
+    except SyntaxError as error:
+        return f"line {error.lineno}: {error.msg}"
+    return ""
+
+
+def have_libcst() -> None:
+    """Raises ImportError, which says what to type, where LibCST is missing."""
+    try:
+        import libcst  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"patching reads and writes Python with LibCST, which cannot be imported ({error}): "
+                          "pip install libcst; `dsmoe run` needs no patch") from None

@@ -1,0 +1,346 @@
+"""The engine of the patches on a checkout of a few lines: what is planned, written, kept and put back, and when not."""
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from diff_smoe_rasterization import patches
+from diff_smoe_rasterization.patches import engine, facts
+from diff_smoe_rasterization.patches import record as record_module
+
+pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
+
+GR, ARGS = "gaussian_renderer/__init__.py", "arguments/__init__.py"
+RENDERER = '''import math  # the camera's angles
+from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+
+
+def render(camera, pc, pipe, bg_color, scaling_modifier=1.0):
+    """Renders."""
+    settings = GaussianRasterizationSettings(
+        image_height=camera.height, bg=bg_color,  # both of the view
+        prefiltered=False,  # never
+        debug=pipe.debug  # slow
+    )
+    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)
+'''
+ARGUMENTS = '''class ParamGroup:
+    def __init__(self, parser, name, fill_none=False):
+        pass
+
+
+class ModelParams(ParamGroup):
+    def __init__(self, parser, sentinel=False):
+        self.sh_degree = 3
+        # everything above becomes an option
+        super().__init__(parser, "Loading Parameters", sentinel)
+
+
+class PipelineParams(ParamGroup):
+    def __init__(self, parser):
+        self.debug = False
+        super().__init__(parser, "Pipeline Parameters")
+'''
+TRAIN = '''import torch
+from gaussian_renderer import render
+
+
+def training(dataset, opt, pipe, checkpoint):
+    # the first iteration is 1
+    first_iter = 0
+    if checkpoint:
+        first_iter = torch.load(checkpoint)
+    return render(None, None, pipe, None), first_iter
+'''
+RENDER = '''from gaussian_renderer import render
+
+
+def render_sets(dataset : object, iteration : int, pipeline : object):
+    "Renders both sets."
+    return render(None, None, pipeline, None)'''
+CHECKOUT = {GR: RENDERER, ARGS: ARGUMENTS, "train.py": TRAIN,
+            "render.py": RENDER}
+PATCHED = {
+    GR: RENDERER.replace(
+        "from diff_gaussian_rasterization import", "from diff_smoe_rasterization.integrations.inria import").replace(
+        "# never\n", "# never\n        blend_mode=pipe.blend_mode,\n"),
+    ARGS:
+        "from diff_smoe_rasterization.patches.runtime import default_blend_mode\n" + ARGUMENTS.replace(
+            "sh_degree = 3\n", "sh_degree = 3\n        self.blend_mode = default_blend_mode()\n"),
+    "train.py": TRAIN.replace("import render\n", "import render\nfrom diff_smoe_rasterization.patches.runtime import "
+                              "blend_mode_of\n").replace(
+        "checkpoint):\n", "checkpoint):\n    pipe.blend_mode = blend_mode_of(dataset)\n"),
+    "render.py": RENDER.replace("import render\n", "import render\nfrom diff_smoe_rasterization.patches.runtime import "
+                                "blend_mode_of\n").replace(
+        'sets."\n', 'sets."\n    pipeline.blend_mode = blend_mode_of(dataset)\n'),
+}
+
+
+def make(folder: Path, changes=None):
+    """Writes the checkout; changes: other texts, or bytes, by name; None leaves a file out."""
+    for name, text in {**CHECKOUT, **(changes or {})}.items():
+        if text is not None:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    return folder
+
+
+def snapshot(folder: Path):
+    """Everything below a folder: bytes, modes, and what links point to."""
+    return {path.relative_to(folder).as_posix(): (stat.S_IMODE(path.lstat().st_mode),
+            os.readlink(str(path)) if path.is_symlink() else path.read_bytes() if path.is_file() else None)
+            for path in folder.rglob("*")}
+
+
+def refused(path, *words, call=patches.apply, **options):
+    before = snapshot(path)
+    with pytest.raises(patches.PatchError) as caught:
+        call(path, **options)
+    assert snapshot(path) == before
+    for word in words:
+        assert word in str(caught.value), str(caught.value)
+
+
+def test_only_the_statements_change(tmp_path):
+    """Comments, blanks, the unusual colons and the missing last newline are where they were."""
+    make(tmp_path)
+    assert patches.check(tmp_path) == "patchable" and patches.check(tmp_path).trainer == "3dgs-2023"
+    patches.apply(tmp_path)
+    for name, text in PATCHED.items():
+        assert (tmp_path / name).read_text() == text, name
+    assert patches.check(tmp_path) == "patched"
+
+
+@pytest.mark.parametrize("form", ["crlf", "bom", "latin-1", "tabs"])
+def test_every_form_of_text_comes_back(tmp_path, form):
+    encoded = {"crlf": lambda text: text.replace("\n", "\r\n").encode(), "bom": lambda text: text.encode("utf-8-sig"),
+               "latin-1": lambda text: ("# -*- coding: latin-1 -*-\n# \xe9t\xe9\n" + text).encode("latin-1"),
+               "tabs": lambda text: text.replace("    ", "\t").encode()}[form]
+    make(tmp_path, {name: encoded(text) for name, text in CHECKOUT.items()})
+    before = snapshot(tmp_path)
+    patches.apply(tmp_path)
+    if form in ("crlf", "bom"):  # then every line of ours is of the same form
+        assert (tmp_path / "train.py").read_bytes() == encoded(PATCHED["train.py"])
+        assert (tmp_path / ARGS).read_bytes() == encoded(PATCHED[ARGS])
+    if form == "latin-1":
+        assert (tmp_path / "train.py").read_bytes() == encoded(PATCHED["train.py"])
+    if form == "tabs":
+        assert b"\n\tpipe.blend_mode = blend_mode_of(dataset)\n" in (tmp_path / "train.py").read_bytes()
+    for name in CHECKOUT:
+        compile((tmp_path / name).read_bytes(), name, "exec")
+    patches.revert(tmp_path)
+    assert snapshot(tmp_path) == before
+
+
+def test_applying_twice_writes_nothing(tmp_path):
+    patches.apply(make(tmp_path))
+    before = snapshot(tmp_path)
+    assert not patches.apply(tmp_path).written
+    assert snapshot(tmp_path) == before
+
+
+def test_the_diff_is_the_same_before_and_after(tmp_path):
+    make(tmp_path)
+    before, text = snapshot(tmp_path), patches.diff(tmp_path)
+    assert snapshot(tmp_path) == before
+    assert "+    pipe.blend_mode = blend_mode_of(dataset)\n" in text and "No newline at end of file" in text
+    patches.apply(tmp_path)
+    assert patches.diff(tmp_path) == text
+
+
+def test_modernise_may_be_added_to_a_patch(tmp_path):
+    make(tmp_path)
+    before = snapshot(tmp_path)
+    patches.apply(tmp_path)
+    assert patches.apply(tmp_path, modernise=True).written
+    assert "torch.load(checkpoint, weights_only=False)" in (tmp_path / "train.py").read_text()
+    assert not patches.apply(tmp_path).written  # the patch that is there has all of it
+    patches.revert(tmp_path)
+    assert snapshot(tmp_path) == before
+
+
+@pytest.mark.parametrize("name, old, new, rule, count", [
+    (GR, "debug=pipe.debug", "debug=False", "settings-blend-mode", 0),
+    (GR, "debug=pipe.debug", "debug=other.debug", "settings-blend-mode", 0),
+    (GR, "image_height=camera.height", "camera.height", "settings-blend-mode", 0),
+    (GR, "# slow\n    )\n", "# slow\n    )\n    settings = "
+     "GaussianRasterizationSettings(image_height=1, debug=pipe.debug)\n", "settings-blend-mode", 2),
+    (GR, "\n\ndef render(", "from diff_gaussian_rasterization import "
+     "rasterize_gaussians\n\n\ndef render(", "import-rasterizer", 2),
+    (ARGS, "class ModelParams", "class SceneParams", "model-parameter", 0),
+    (ARGS, "super().__init__(parser, \"Loading", "ParamGroup.__init__(self, parser, \"Loading",
+     "model-parameter", 0),
+    ("train.py", "def training(dataset", "def training(scene", "pipe-blend-mode", 0),
+    ("train.py", "def training(", "def fit(", "pipe-blend-mode", 0),
+    ("render.py", "pipeline : object", "args : object", "pipe-blend-mode", 0),
+])
+def test_drift_is_refused_by_file_and_rule(tmp_path, name, old, new, rule, count):
+    assert CHECKOUT[name].count(old) == 1
+    make(tmp_path, {name: CHECKOUT[name].replace(old, new)})
+    refused(tmp_path, name, rule, f"{count} matches instead of 1")
+    verdict = patches.check(tmp_path)
+    assert verdict == "drifted" and any(name in reason and rule in reason for reason in verdict.reasons)
+
+
+def test_a_missing_or_broken_file_is_refused(tmp_path):
+    refused(make(tmp_path / "missing", {"render.py": None}), "render.py", "pipe-blend-mode", "no such file")
+    refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py", "line 11")
+
+
+def test_what_is_no_trainer_is_unknown(tmp_path):
+    other = make(tmp_path / "other", {GR: RENDERER.replace("bg=bg_color", "kernel_size=0.1")})
+    assert patches.check(other) == "unknown"
+    refused(other, "kernel_size")
+    refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown")
+    refused(make(tmp_path / "chosen"), "no trainer 'x'", *patches.TRAINERS, trainer="x")
+    with pytest.raises(patches.PatchError, match="not a folder"):
+        patches.apply(tmp_path / "nowhere")
+
+
+def test_a_patch_by_hand_is_half_or_whole(tmp_path):
+    whole = make(tmp_path / "whole", PATCHED)
+    assert patches.check(whole) == "patched"
+    assert not patches.apply(whole).written
+    refused(whole, ".dsmoe_patch", call=patches.revert)
+    half = make(tmp_path / "half", {**PATCHED, "train.py": TRAIN})
+    assert patches.check(half) == "half-patched"
+    refused(half, "train.py: rule pipe-blend-mode: is not applied", "render.py: rule pipe-blend-mode: is applied")
+
+
+@pytest.mark.parametrize("until", range(1, 12))
+def test_an_interruption_leaves_what_can_be_finished_or_put_back(tmp_path, monkeypatch, until):
+    """The power fails before the n-th file is in its place."""
+    make(tmp_path)
+    original = snapshot(tmp_path)
+    finished = make(tmp_path.parent / f"finished{until}")
+    patches.apply(finished)
+    written = []
+
+    def failing(path, data, replace=record_module.replace_file):
+        written.append(path)
+        if len(written) >= until:
+            raise KeyboardInterrupt
+        replace(path, data)
+
+    for module in (record_module, engine):
+        monkeypatch.setattr(module, "replace_file", failing)
+    try:
+        patches.apply(tmp_path)
+    except KeyboardInterrupt:
+        pass
+    monkeypatch.undo()
+    changed = [name for name in CHECKOUT if (tmp_path / name).read_bytes() != original[name][1]]
+    assert patches.check(tmp_path) == ("patched" if len(changed) == 4 else "half-patched" if until > 6 else "patchable")
+    if until > 6:  # the record is complete
+        other = tmp_path.parent / f"reverted{until}"
+        os.rename(str(tmp_path), str(other))
+        if until % 2:
+            patches.revert(other)
+            assert snapshot(other) == original
+        else:
+            patches.apply(other)
+            assert snapshot(other) == snapshot(finished)
+    else:
+        assert changed == []
+        patches.apply(tmp_path)
+        assert snapshot(tmp_path) == snapshot(finished)
+
+
+def test_a_disk_that_is_full_changes_nothing(tmp_path, monkeypatch):
+    make(tmp_path)
+    before = snapshot(tmp_path)
+
+    def failing(path, data, replace=record_module.replace_file):
+        if path == tmp_path / "train.py" and b"blend_mode" in data:
+            raise OSError(28, "No space left on device")
+        replace(path, data)
+
+    monkeypatch.setattr(engine, "replace_file", failing)
+    with pytest.raises(patches.PatchError, match="train.py: cannot be written, so all was put back"):
+        patches.apply(tmp_path)
+    assert snapshot(tmp_path) == before
+
+
+def test_a_file_that_changed_since_is_not_overwritten(tmp_path):
+    patches.apply(make(tmp_path))
+    with open(str(tmp_path / "train.py"), "a") as file:
+        file.write("# mine\n")
+    assert patches.check(tmp_path) == "half-patched"
+    assert not patches.apply(tmp_path).written  # every rule is applied
+    refused(tmp_path, "train.py", "changed", call=patches.revert)
+    refused(tmp_path, "train.py", "changed", modernise=True)
+    (tmp_path / "train.py").write_text(TRAIN + "# mine\n")  # the edit is kept, the patch is not
+    refused(tmp_path, "train.py", "changed")
+
+
+def test_a_damaged_record_is_no_ground_to_write(tmp_path):
+    patches.apply(make(tmp_path))
+    (tmp_path / ".dsmoe_patch/originals/train.py").write_text("something else")
+    for call in (patches.apply, patches.revert, patches.check):
+        refused(tmp_path, "manifest.json", "train.py", call=call)
+
+
+def test_modes_links_and_blanks(tmp_path):
+    folder = make(tmp_path / "a checkout with blanks")
+    (folder / "train.py").chmod(0o755)
+    (folder / "render.py").rename(folder / "render of mine.py")
+    (folder / "render.py").symlink_to("render of mine.py")
+    before = snapshot(folder)
+    patches.apply(folder)
+    after = snapshot(folder)
+    assert after["train.py"][0] == 0o755 and after["render.py"] == before["render.py"]
+    assert b"blend_mode_of" in after["render of mine.py"][1]
+    patches.revert(folder)
+    assert snapshot(folder) == before
+
+
+def test_what_may_not_be_written_is_refused(tmp_path):
+    folder = make(tmp_path / "checkout")
+    (folder / "train.py").chmod(0o444)
+    refused(folder, "train.py", "read-only")
+    (folder / "train.py").chmod(0o644)
+    (folder / "render.py").rename(tmp_path / "render.py")
+    (folder / "render.py").symlink_to(tmp_path / "render.py")
+    refused(folder, "render.py", "outside the checkout")
+    assert (tmp_path / "render.py").read_text() == RENDER
+
+
+def test_scripts_of_the_user(tmp_path):
+    """One that renders is named; one that imports the rasterizer gets the trainer's own."""
+    folder = make(tmp_path, {"video.py": "from gaussian_renderer import render\n", "utils/score.py": "import math\n",
+                             "viewer.py": "from diff_gaussian_rasterization import GaussianRasterizer\n"})
+    notes = patches.plan(folder).notes
+    assert [note.partition(":")[0] for note in notes] == ["video.py"]
+    patches.apply(folder)
+    assert "diff_smoe_rasterization.integrations.inria " in (folder / "viewer.py").read_text()
+
+
+def test_recognised_by_structure_alone():
+    base = {"imports GaussianRasterizationSettings", "sets bg", "sets debug"}
+    for name, signs in (("3dgs-2023", set()), ("3dgs-2024", {"sets antialiasing", "imports SparseGaussianAdam"}),
+                        ("taming", {"sets pixel_weights", "imports SparseGaussianAdam"}),
+                        ("c3dgs", {"sets clamp_color", "imports GaussianRasterizerIndexed"}),
+                        ("hac", {"calls visible_filter"}), ("hac-plus", {"calls visible_filter", "imports gpcc_utils"})):
+        assert facts.recognise(base | signs)[0].name == name
+    assert facts.recognise({"sets bg"})[0] is None
+
+
+@pytest.mark.skipif("DSMOE_TRAINERS" not in os.environ, reason="DSMOE_TRAINERS names no folder of public checkouts")
+@pytest.mark.parametrize("name", patches.TRAINERS)
+def test_in_public_checkouts_only_the_statements_change(name):
+    """Densification, optimizers, losses: no line of them is touched."""
+    folder = Path(os.environ["DSMOE_TRAINERS"]) / name
+    digest = hashlib.sha256(repr(sorted(snapshot(folder).items())).encode()).hexdigest()
+    lines = [line for line in patches.diff(folder).splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")]
+    removed = [line[1:].strip() for line in lines if line[0] == "-"]
+    added = [line[1:].strip() for line in lines if line[0] == "+"]
+    assert removed and all(line.startswith("from diff_gaussian_rasterization import") for line in removed)
+    statements = ("from diff_smoe_rasterization.", "blend_mode=pipe.blend_mode,", "self.blend_mode = default_blend_mode()",
+                  "pipe.blend_mode = blend_mode_of(dataset)", "pipeline.blend_mode = blend_mode_of(dataset)",
+                  "pipeline_params.blend_mode = blend_mode_of(model_params)")
+    assert all(line.startswith(statements) for line in added)
+    assert digest == hashlib.sha256(repr(sorted(snapshot(folder).items())).encode()).hexdigest()

@@ -1,0 +1,70 @@
+import os
+import sys
+from argparse import ArgumentParser, Namespace
+
+
+class GroupParams:
+    pass
+
+
+class ParamGroup:
+    """A group of flags: one for every attribute; a leading underscore asks for a short form too."""
+
+    def __init__(self, parser: ArgumentParser, title, no_defaults):
+        flags = parser.add_argument_group(title)
+        for attribute, default in vars(self).items():
+            name = attribute.lstrip("_")
+            spellings = ["--" + name] + ["-" + name[0]] * attribute.startswith("_")
+            kind = {"action": "store_true"} if isinstance(default, bool) else {"type": type(default)}
+            flags.add_argument(*spellings, default=None if no_defaults else default, **kind)
+
+    def extract(self, args):
+        names = {attribute.lstrip("_") for attribute in vars(self)}
+        taken = GroupParams()
+        vars(taken).update({key: value for key, value in vars(args).items() if key in names})
+        return taken
+
+
+class ModelParams(ParamGroup):
+    def __init__(self, parser, sentinel=False):
+        self.sh_degree = 1
+        self._source_path = ""
+        self._model_path = ""
+        self._images = "images"
+        self._resolution = -1
+        self._white_background = False
+        self.data_device = "cpu"
+        self.eval = False
+        super().__init__(parser, "What is loaded", sentinel)
+
+    def extract(self, args):
+        taken = super().extract(args)
+        taken.source_path = os.path.abspath(taken.source_path)
+        return taken
+
+
+class PipelineParams(ParamGroup):
+    def __init__(self, parser):
+        self.convert_SHs_python = self.compute_cov3D_python = self.debug = False
+        super().__init__(parser, "How it is rendered", False)
+
+
+class OptimizationParams(ParamGroup):
+    def __init__(self, parser):
+        self.iterations = 7
+        self.position_lr_init, self.position_lr_final = 0.002, 0.001
+        self.feature_lr, self.opacity_lr, self.scaling_lr, self.rotation_lr = 0.02, 0.05, 0.02, 0.01
+        self.percent_dense, self.densify_grad_threshold = 0.02, 0.0001
+        self.lambda_dssim = 0.25
+        self.densification_interval, self.opacity_reset_interval = 2, 5
+        self.densify_from_iter, self.densify_until_iter = 1, 6
+        self.random_background = False
+        super().__init__(parser, "How it is trained", False)
+
+
+def get_combined_args(parser: ArgumentParser):
+    """The flags of the command line over those of the model's cfg_args."""
+    typed = parser.parse_args(sys.argv[1:])
+    with open(os.path.join(typed.model_path, "cfg_args")) as file:
+        saved = eval(file.read())
+    return Namespace(**{**vars(saved), **{key: value for key, value in vars(typed).items() if value is not None}})

@@ -1,0 +1,40 @@
+import os
+from argparse import ArgumentParser
+
+import torch
+
+from arguments import ModelParams, PipelineParams, get_combined_args
+from gaussian_renderer import GaussianModel, render
+from scene import Scene
+from utils.flags import RENDERING, add_flags
+from utils.general_utils import safe_state
+from utils.image_utils import save_image
+from utils.loops import background_of
+
+
+def render_set(model_path, name, iteration, views, gaussians, pipeline, background):
+    folder = os.path.join(model_path, name, f"ours_{iteration}", "renders")
+    for index, view in enumerate(views):
+        image = render(view, gaussians, pipeline, background)["render"]
+        save_image(image, os.path.join(folder, f"{index:05d}.png"))
+
+
+def render_sets(dataset: ModelParams, iteration: int, pipeline: PipelineParams, skip_train: bool, skip_test: bool):
+    with torch.no_grad():
+        model = GaussianModel(dataset.sh_degree)
+        world = Scene(dataset, model, load_iteration=iteration, shuffle=False)
+        sets = {"train": world.getTrainCameras()} if not skip_train else {}
+        if not skip_test:
+            sets["test"] = world.getTestCameras()
+        for name, views in sets.items():
+            render_set(dataset.model_path, name, world.loaded_iter, views, model, pipeline, background_of(dataset))
+
+
+if __name__ == "__main__":
+    flags = ArgumentParser(description="Renders the views of a trained model.")
+    model_flags, pipe_flags = ModelParams(flags, sentinel=True), PipelineParams(flags)
+    add_flags(flags, **RENDERING)
+    args = get_combined_args(flags)
+
+    safe_state(args.quiet)
+    render_sets(model_flags.extract(args), args.iteration, pipe_flags.extract(args), args.skip_train, args.skip_test)

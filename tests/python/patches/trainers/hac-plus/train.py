@@ -1,0 +1,131 @@
+import logging
+import os
+import uuid
+from argparse import ArgumentParser
+
+import lpips
+import torch
+from tqdm import tqdm
+
+from arguments import ModelParams, OptimizationParams, PipelineParams
+from gaussian_renderer import network_gui, prefilter_voxel, render
+from scene import GaussianModel, Scene
+from utils.encodings import get_binary_vxl_size
+from utils.flags import TRAINING, add_flags
+from utils.general_utils import safe_state
+from utils.image_utils import psnr, save_image
+from utils.loops import background_of, endlessly, write_cfg_args
+from utils.loss_utils import l1_loss, ssim
+
+lpips_fn = lpips.LPIPS(net="vgg").to("cpu")
+run_codec = True
+
+
+def training(args_param, dataset, opt, pipe, dataset_name, testing_iterations, saving_iterations,
+             checkpoint_iterations, checkpoint, debug_from, wandb=None, logger=None, ply_path=None):
+    prepare_output_and_logger(dataset)
+    is_synthetic_nerf = os.path.exists(os.path.join(dataset.source_path, "transforms_train.json"))
+    model = GaussianModel(dataset.feat_dim, dataset.n_offsets, dataset.voxel_size, dataset.update_depth,
+                          dataset.update_init_factor, dataset.update_hierachy_factor, dataset.use_feat_bank,
+                          n_features_per_level=args_param.n_features, log2_hashmap_size=args_param.log2,
+                          log2_hashmap_size_2D=args_param.log2_2D, is_synthetic_nerf=is_synthetic_nerf)
+    world = Scene(dataset, model, ply_path=ply_path)
+    model.training_setup(opt)
+
+    fixed = background_of(dataset)
+    views = endlessly(world.getTrainCameras())
+    for step in tqdm(range(1, opt.iterations + 1)):
+        if network_gui.conn is not None:
+            wanted, zoom = network_gui.receive()
+            network_gui.send(render(wanted, model, pipe, fixed, zoom)["render"], dataset.source_path)
+        pipe.debug = pipe.debug or step == debug_from
+
+        view = next(views)
+        visible = prefilter_voxel(view, model, pipe, fixed)
+        result = render(view, model, pipe, fixed, visible_mask=visible, retain_grad=step < opt.update_until, step=step)
+        image, target = result["render"], view.original_image
+        loss = torch.lerp(l1_loss(image, target), 1 - ssim(image, target), opt.lambda_dssim)
+        loss = loss + 0.01 * result["scaling"].prod(dim=1).mean() + args_param.lmbda * model._mask.sigmoid().mean()
+        loss.backward()
+        logger.info(f"step {step}: loss {loss.item():.9g}, {int(visible.sum())} of {len(visible)} anchors")
+
+        with torch.no_grad():
+            training_report(None, dataset_name, step, testing_iterations, world, render, (pipe, fixed), wandb, logger)
+            if step in saving_iterations:
+                world.save(step)
+            model.optimizer.step()
+            model.optimizer.zero_grad()
+            if opt.start_stat < step < opt.update_until:
+                model.training_statis(result["viewspace_points"], result["neural_opacity"],
+                                      result["visibility_filter"], result["selection_mask"], visible)
+                if step > opt.update_from and step % opt.update_interval == 0:
+                    model.adjust_anchor(check_interval=opt.update_interval, success_threshold=opt.success_threshold,
+                                        grad_threshold=opt.densify_grad_threshold, min_opacity=opt.min_opacity)
+
+
+def prepare_output_and_logger(args):
+    args.model_path = args.model_path or os.path.join("output", uuid.uuid4().hex[:10])
+    write_cfg_args(args.model_path, args)
+
+
+def training_report(tb_writer, dataset_name, step, testing_iterations, world: Scene, renderFunc, renderArgs,
+                    wandb=None, logger=None):
+    if step not in testing_iterations:
+        return
+    world.gaussians.eval()
+    logger.info(f"masks: {get_binary_vxl_size(world.gaussians.get_mask)[1]:.9g} bits")
+    for view in world.getTestCameras():
+        visible = prefilter_voxel(view, world.gaussians, *renderArgs)
+        image = renderFunc(view, world.gaussians, *renderArgs, visible_mask=visible)["render"].clamp(0, 1)
+        logger.info(f"step {step}: PSNR {psnr(image, view.original_image).item():.9g}")
+        logger.info(f"step {step}: LPIPS {lpips_fn(image, view.original_image).item():.9g}")
+    world.gaussians.train()
+
+
+def render_set(model_path, name, iteration, views, gaussians, pipeline, background):
+    folder = os.path.join(model_path, name, f"ours_{iteration}", "renders")
+    for index, view in enumerate(views):
+        visible = prefilter_voxel(view, gaussians, pipeline, background)
+        image = render(view, gaussians, pipeline, background, visible_mask=visible)["render"]
+        save_image(image, os.path.join(folder, f"{index:05d}.png"))
+
+
+def render_sets(args_param, dataset: ModelParams, iteration: int, pipeline: PipelineParams, skip_train=True,
+                skip_test=False, wandb=None, tb_writer=None, dataset_name=None, logger=None):
+    with torch.no_grad():
+        is_synthetic_nerf = os.path.exists(os.path.join(dataset.source_path, "transforms_train.json"))
+        model = GaussianModel(dataset.feat_dim, dataset.n_offsets, dataset.voxel_size, dataset.update_depth,
+                              dataset.update_init_factor, dataset.update_hierachy_factor, dataset.use_feat_bank,
+                              n_features_per_level=args_param.n_features, log2_hashmap_size=args_param.log2,
+                              log2_hashmap_size_2D=args_param.log2_2D, decoded_version=run_codec,
+                              is_synthetic_nerf=is_synthetic_nerf)
+        world = Scene(dataset, model, load_iteration=iteration, shuffle=False)
+        model.eval()
+        if not skip_test:
+            render_set(dataset.model_path, "test", world.loaded_iter, world.getTestCameras(), model, pipeline,
+                       background_of(dataset))
+
+
+def get_logger(path):
+    logger = logging.getLogger("trainer")
+    logger.setLevel(logging.INFO)
+    logger.addHandler(logging.FileHandler(os.path.join(path, "outputs.log")))
+    return logger
+
+
+if __name__ == "__main__":
+    flags = ArgumentParser(description="Trains anchors and their networks for a few steps, and renders the result.")
+    model_flags, step_flags, pipe_flags = ModelParams(flags), OptimizationParams(flags), PipelineParams(flags)
+    add_flags(flags, warmup=False, log2=13, log2_2D=15, n_features=4, lmbda=0.001, gpu="-1", **TRAINING)
+    args = flags.parse_args()
+
+    os.makedirs(args.model_path, exist_ok=True)
+    logger = get_logger(args.model_path)
+    experiment = args.model_path.split("/")[-2]
+    logger.info(f"experiment {experiment}")
+
+    safe_state(args.quiet)
+    training(args, model_flags.extract(args), step_flags.extract(args), pipe_flags.extract(args), experiment,
+             args.test_iterations, args.save_iterations + [args.iterations], args.checkpoint_iterations,
+             args.start_checkpoint, args.debug_from, None, logger)
+    render_sets(args, model_flags.extract(args), -1, pipe_flags.extract(args), logger=logger)
