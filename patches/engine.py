@@ -180,7 +180,7 @@ class _Patch:
     def __init__(self, files: Dict[str, bytes], trainer: Trainer) -> None:
         from . import codemods
 
-        self.files, self.trees, self.encodings = files, {}, {}
+        self.files, self.trees, self.writers = files, {}, {}
         self.rules: Dict[str, List[str]] = {}  # of each file, those that changed it
         self.problems: List[str] = []  # why it cannot be patched
         self.pending: List[str] = []
@@ -233,13 +233,13 @@ class _Patch:
     def changes(self) -> Tuple[Change, ...]:
         changes = []
         for name, rules in self.rules.items():
-            after = self.trees[name].code.encode(self.encodings[name])
+            after = self.writers[name](self.trees[name])
             changes.append(Change(name, self.files[name], after, tuple(rules)))
         return tuple(changes)
 
     def _run(self, run, rule, name: str):
         if name not in self.trees:
-            self.trees[name], self.encodings[name] = source.parse(name, self.files[name])
+            self.trees[name], self.writers[name] = source.parse(name, self.files[name])
         outcome = run(rule, self.trees[name])
         self.trees[name] = outcome.tree
         if outcome.pending:
