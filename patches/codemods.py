@@ -19,13 +19,14 @@ class Outcome(NamedTuple):
     tree: cst.Module  # with the rule applied
     pending: int  # matches that were not patched yet
     done: int  # matches that were
+    misfits: int = 0  # what has to be patched, but has another form than the rule knows
 
 
 def run(rule, tree: cst.Module) -> Outcome:
     """Applies a rule to a tree."""
     codemod = CODEMODS[type(rule)](rule)
     changed = tree.visit(codemod)
-    return Outcome(changed, codemod.pending, codemod.done)
+    return Outcome(changed, codemod.pending, codemod.done, codemod.misfits)
 
 
 def statement(text: str) -> cst.SimpleStatementLine:
@@ -36,7 +37,7 @@ def statement(text: str) -> cst.SimpleStatementLine:
 class Codemod(cst.CSTTransformer):
     def __init__(self, rule) -> None:
         super().__init__()
-        self.rule, self.pending, self.done = rule, 0, 0
+        self.rule, self.pending, self.done, self.misfits = rule, 0, 0, 0
         self.within: List[cst.CSTNode] = []  # the classes and functions around the node, outermost first
 
     def visit_ClassDef(self, node: cst.ClassDef) -> None:
@@ -80,11 +81,12 @@ class _SettingsBlendMode(Codemod):
             return updated_node
         arguments = {argument.keyword.value: argument.value for argument in updated_node.args if argument.keyword}
         pipe = self.pipe_of(arguments)
-        if pipe is None or len(arguments) != len(updated_node.args):
+        wanted = cst.parse_expression(f"{pipe}.blend_mode") if pipe else None
+        if wanted is not None and "blend_mode" in arguments and arguments["blend_mode"].deep_equals(wanted):
+            self.done += 1
             return updated_node
-        wanted = cst.parse_expression(f"{pipe}.blend_mode")
-        if "blend_mode" in arguments:
-            self.done += arguments["blend_mode"].deep_equals(wanted)
+        if wanted is None or "blend_mode" in arguments or len(arguments) != len(updated_node.args):
+            self.misfits += 1
             return updated_node
         self.pending += 1
         # Before the last one: then every comma, comment and closing parenthesis stays where it is.

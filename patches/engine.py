@@ -15,7 +15,7 @@ from diff_smoe_rasterization._version import __version__
 
 from . import facts, source
 from .errors import PatchError
-from .record import FOLDER, Record, check_writable, replace_file
+from .record import FOLDER, Record, check_writable, remove_rest, replace_file
 from .rules import RASTERIZER, ImportRasterizer, Trainer
 from .scope import build_files, callers_out_of_reach, python_files
 from .trainers import TRAINERS
@@ -98,26 +98,28 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     for name in set(states) - set(after):  # of an earlier version's rules
         before[name] = after[name] = record.original(name)
     pending = {name: data for name, data in after.items() if (root / name).read_bytes() != data}
-    if record and not pending:
+    if record and not pending and record.manifest["complete"]:
         return planned
     for name in pending:
         check_writable(root, name)
     notes = {"version": __version__, "trainer": planned.verdict.trainer, "modernise": planned.modernise,
              "rules": {change.name: change.rules for change in planned.changes}}
     try:
-        Record.write(root, before, after, notes)
+        begun = Record.write(root, before, after, notes)
     except OSError as error:
+        remove_rest(root)
         raise PatchError(f"{FOLDER}: the originals cannot be kept, so nothing was changed: {error}") from None
     undo = {name: (root / name).read_bytes() for name in pending}
     try:
         for name, data in pending.items():
-            replace_file(root / name, data)
+            replace_file(root, root / name, data)
+        begun.completed()
     except OSError as error:
         for done, data in undo.items():
             if (root / done).read_bytes() != data:
-                replace_file(root / done, data)
+                replace_file(root, root / done, data)
         if record is None:
-            Record.load(root).remove()
+            begun.remove()
         raise PatchError(f"{name}: cannot be written, so all was put back: {error}") from None
     return planned._replace(written=True)
 
@@ -129,6 +131,8 @@ def revert(path: PathLike) -> Tuple[str, ...]:
     """
     root = _root(path)
     record = Record.load(root)
+    if record is None and remove_rest(root):
+        return ()
     if record is None:
         raise PatchError(f"{root}: there is no {FOLDER}, so nothing can be put back: it was not patched, or by hand")
     states = record.states()
@@ -139,13 +143,13 @@ def revert(path: PathLike) -> Tuple[str, ...]:
     for name in patched:
         check_writable(root, name)
     for name in patched:
-        replace_file(root / name, record.original(name))
+        replace_file(root, root / name, record.original(name))
     record.remove()
     return tuple(patched)
 
 
 _SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
-          "original": "is the original, though the record says that it was patched"}
+          "original": "is the original, though the record says that it was patched; `revert` puts back the others too"}
 
 
 def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
@@ -180,7 +184,7 @@ class _Patch:
     def __init__(self, files: Dict[str, bytes], trainer: Trainer) -> None:
         from . import codemods
 
-        self.files, self.trees, self.encodings = files, {}, {}
+        self.files, self.trees, self.writers = files, {}, {}
         self.rules: Dict[str, List[str]] = {}  # of each file, those that changed it
         self.problems: List[str] = []  # why it cannot be patched
         self.pending: List[str] = []
@@ -196,8 +200,10 @@ class _Patch:
                 continue
             found = outcome.pending + outcome.done
             line = f"{rule.file}: rule {rule.name}"
-            if found != rule.expected:
-                self.problems.append(f"{line}: {found} matches instead of {rule.expected} of {rule.right}")
+            if found != rule.expected or outcome.misfits:
+                misfits = f", and {outcome.misfits} that look alike" if outcome.misfits else ""
+                self.problems.append(f"{line}: {found} matches instead of {rule.expected}{misfits}; right would be "
+                                     f"{rule.right}")
             if outcome.pending:
                 self.pending.append(line)
             if outcome.done:
@@ -233,13 +239,13 @@ class _Patch:
     def changes(self) -> Tuple[Change, ...]:
         changes = []
         for name, rules in self.rules.items():
-            after = self.trees[name].code.encode(self.encodings[name])
+            after = self.writers[name](self.trees[name])
             changes.append(Change(name, self.files[name], after, tuple(rules)))
         return tuple(changes)
 
     def _run(self, run, rule, name: str):
         if name not in self.trees:
-            self.trees[name], self.encodings[name] = source.parse(name, self.files[name])
+            self.trees[name], self.writers[name] = source.parse(name, self.files[name])
         outcome = run(rule, self.trees[name])
         self.trees[name] = outcome.tree
         if outcome.pending:
@@ -253,6 +259,8 @@ def _state_by_record(record: Record, root: Path, trainer: Trainer) -> Tuple[str,
     if set(states.values()) <= {"patched"}:
         return "patched", [f"by version {record.manifest['version']}"
                            + (", with --modernise" if record.manifest["modernise"] else "")]
+    if not record.manifest["complete"] and set(states.values()) <= {"patched", "original"}:
+        return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
     return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
 
 
@@ -260,7 +268,7 @@ def _can_be_finished(planned: Plan) -> bool:
     """Whether an interrupted patch can be finished, or what was edited since still has every rule applied."""
     states = set(planned.record.states().values())
     if states <= {"patched", "original"}:
-        return True
+        return states == {"patched"} or not planned.record.manifest["complete"]
     trainer = next(trainer for trainer in TRAINERS if trainer.name == planned.verdict.trainer)
     files = {name: _read(planned.root / name) for name in python_files(planned.root)}
     return "gone" not in states and _Patch(files, trainer).state()[0] == "patched"

@@ -4,7 +4,8 @@
     .dsmoe_patch/originals/NAME    the file as it was
 
 The last of "after" is what the file became; earlier ones are of a patch that this one took over from, so that whatever
-moment an interruption came at, each file is known to be the original, patched, or changed by someone else.
+moment an interruption came at, each file is known to be the original, patched, or changed by someone else. "complete" says
+that the last file was written: else it was an interruption, not the user, that left originals.
 """
 from __future__ import annotations
 
@@ -66,12 +67,19 @@ class Record:
             files[name] = {"before": sha256(data), "after": [known for known in before if known != new] + [new]}
             copy = root / FOLDER / "originals" / name
             copy.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(copy, data)
-        replace_file(root / FOLDER / ".gitignore", b"*\n")
-        manifest = {"format": FORMAT, **notes, "files": files}
-        text = json.dumps(manifest, indent=1) + "\n"
-        replace_file(root / FOLDER / "manifest.json", text.encode())
-        return cls(root, manifest)
+            replace_file(root, copy, data)
+        replace_file(root, root / FOLDER / ".gitignore", b"*\n")
+        record = cls(root, {"format": FORMAT, "complete": False, **notes, "files": files})
+        record._write_manifest()
+        return record
+
+    def completed(self) -> None:
+        """Notes that every file was written."""
+        self.manifest = {**self.manifest, "complete": True}
+        self._write_manifest()
+
+    def _write_manifest(self) -> None:
+        replace_file(self.root, self.folder / "manifest.json", (json.dumps(self.manifest, indent=1) + "\n").encode())
 
     def original(self, name: str) -> bytes:
         return (self.folder / "originals" / name).read_bytes()
@@ -107,10 +115,13 @@ def check_writable(root: Path, name: str) -> None:
         raise PatchError(f"{name}: its folder {target.parent} is read-only; make it writable first (chmod u+w)")
 
 
-def replace_file(path: Path, data: bytes) -> None:
-    """Writes a file at once or not at all. What a link points to is written; a file that was there keeps its mode."""
+def replace_file(root: Path, path: Path, data: bytes) -> None:
+    """Writes a file at once or not at all. What a link points to is written; a file that was there keeps its mode.
+
+    What an interruption leaves of it lies in the record's folder, and goes with it.
+    """
     target = path.resolve()
-    handle, temporary = tempfile.mkstemp(dir=str(target.parent), prefix=".dsmoe_patch_")
+    handle, temporary = tempfile.mkstemp(dir=str(root / FOLDER), prefix="unfinished_")
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
@@ -124,3 +135,14 @@ def replace_file(path: Path, data: bytes) -> None:
     except BaseException:
         os.unlink(temporary)
         raise
+
+
+def remove_rest(root: Path) -> bool:
+    """Removes what is left of a patch that was interrupted before it changed a file; returns whether there was such."""
+    folder = root / FOLDER
+    copies = [path for path in (folder / "originals").rglob("*") if path.is_file()]
+    if not folder.is_dir() or any(path.read_bytes() != (root / path.relative_to(folder / "originals")).read_bytes()
+                                  for path in copies):
+        return False
+    shutil.rmtree(folder)
+    return True

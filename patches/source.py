@@ -19,17 +19,26 @@ def decode(name: str, data: bytes) -> Tuple[str, str]:
 
 
 def parse(name: str, data: bytes):
-    """Returns the LibCST tree of a Python file and its encoding. Raises PatchError where it cannot be read."""
+    """Returns the LibCST tree of a Python file, and a function that makes the file's bytes of a tree.
+
+    Raises PatchError where the file cannot be read, or would not come back as it was.
+    """
     import libcst
 
     text, encoding = decode(name, data)
+    code = text.rstrip(" \t\f")  # LibCST drops blanks after the last newline
+    rest = text[len(code):]
     try:
-        tree = libcst.parse_module(text)
+        tree = libcst.parse_module(code)
     except libcst.ParserSyntaxError as error:
         raise PatchError(f"{name}: is not Python that can be parsed: {_where(data) or error.message}") from None
-    if tree.code != text:
+
+    def write(changed) -> bytes:
+        return (changed.code + rest).encode(encoding)
+
+    if write(tree) != data:
         raise PatchError(f"{name}: would not be written back as it is; LibCST cannot represent it")
-    return tree, encoding
+    return tree, write
 
 
 def _where(data: bytes) -> str:

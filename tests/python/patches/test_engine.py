@@ -211,7 +211,7 @@ def test_a_patch_by_hand_is_half_or_whole(tmp_path):
     refused(half, "train.py: rule pipe-blend-mode: is not applied", "render.py: rule pipe-blend-mode: is applied")
 
 
-@pytest.mark.parametrize("until", range(1, 12))
+@pytest.mark.parametrize("until", range(1, 13))
 def test_an_interruption_leaves_what_can_be_finished_or_put_back(tmp_path, monkeypatch, until):
     """The power fails before the n-th file is in its place."""
     make(tmp_path)
@@ -220,11 +220,11 @@ def test_an_interruption_leaves_what_can_be_finished_or_put_back(tmp_path, monke
     patches.apply(finished)
     written = []
 
-    def failing(path, data, replace=record_module.replace_file):
+    def failing(root, path, data, replace=record_module.replace_file):
         written.append(path)
         if len(written) >= until:
             raise KeyboardInterrupt
-        replace(path, data)
+        replace(root, path, data)
 
     for module in (record_module, engine):
         monkeypatch.setattr(module, "replace_file", failing)
@@ -254,10 +254,10 @@ def test_a_disk_that_is_full_changes_nothing(tmp_path, monkeypatch):
     make(tmp_path)
     before = snapshot(tmp_path)
 
-    def failing(path, data, replace=record_module.replace_file):
+    def failing(root, path, data, replace=record_module.replace_file):
         if path == tmp_path / "train.py" and b"blend_mode" in data:
             raise OSError(28, "No space left on device")
-        replace(path, data)
+        replace(root, path, data)
 
     monkeypatch.setattr(engine, "replace_file", failing)
     with pytest.raises(patches.PatchError, match="train.py: cannot be written, so all was put back"):

@@ -1,7 +1,7 @@
 import os
 from argparse import ArgumentParser
 
-SCENES = ("chairs", "lamps")
+SCENES = ("chairs",)
 
 
 def call(command):
