@@ -106,8 +106,16 @@ class _Launch:
         self.root_scales.append(float(root_scale))
 
     def run(self, visible: Optional[torch.Tensor] = None) -> None:
-        _OPS.adam(self.parameters, self.gradients, self.moments, self.squares, self.rates, self.root_scales,
-                  *self.constants, visible)
+        # The op takes rows that lie one behind the other. A parameter made from a transposed array, as trainers make
+        # the first means, has other strides, and gives them to its moments.
+        updated = self.parameters + self.moments + self.squares
+        dense = [tensor.contiguous() for tensor in updated]
+        count = len(self.parameters)
+        _OPS.adam(dense[:count], [gradient.contiguous() for gradient in self.gradients], dense[count:2 * count],
+                  dense[2 * count:], self.rates, self.root_scales, *self.constants, visible)
+        for tensor, copy in zip(updated, dense):
+            if not tensor.is_contiguous():
+                tensor.copy_(copy)
 
 
 def _launch_of(launches: Dict[Any, _Launch], parameter: torch.Tensor, group: Dict[str, Any]) -> _Launch:

@@ -8,7 +8,6 @@ import weakref
 from collections import namedtuple
 
 import torch
-import torch.nn.functional as functional
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import GaussianRasterizer, rasterize_gaussians
@@ -55,7 +54,7 @@ def rasterize_gaussians_indexed(means3D, means2D, sh, sh_indices, g_indices, col
     for the first time, or changed, or with a codebook of another length; on a GPU it waits in that call, in no other.
 
     Returns: color [C, H, W], radii [N] int32. Gradients equal bit for bit from run to run where those of `rasterize`
-    do: codebooks add nothing by atomics.
+    do.
     """
     required, _ = _checks("rasterize_gaussians_indexed", "means3D", means3D)
     count = len(means3D)
@@ -65,8 +64,9 @@ def rasterize_gaussians_indexed(means3D, means2D, sh, sh_indices, g_indices, col
             return None
         required(name, codebook)
         _check_indices(index_name, required(index_name, indices), count, name, codebook)
-        gathered = functional.embedding(indices, codebook.flatten(1))  # whose backward sums in a fixed order
-        return gathered.reshape(count, *codebook.shape[1:])
+        # On a GPU the gradient of index_select adds by atomics; that of an index sorts, which takes longer.
+        sorts = raster_settings.deterministic and codebook.is_cuda
+        return codebook[indices] if sorts else codebook.index_select(0, indices)
 
     sh = rows("shs", sh, "sh_indices", sh_indices)
     scales = rows("scales", scales, "g_indices", g_indices)

@@ -50,7 +50,7 @@ def assert_all_close(actual, expected, tolerance):
         assert_close(actual[name], expected[name], tolerance, name)
 
 
-def assert_same_gradients(actual, expected):
+def assert_same_gradients(actual, expected, tolerance=1e-5):
     """Compares the gradients of equal calls, two dictionaries of tensors: on the CPU no bit may differ.
 
     A GPU adds a Gaussian's terms in the order in which its tiles are done, which is another one each time.
@@ -61,7 +61,7 @@ def assert_same_gradients(actual, expected):
             assert torch.equal(actual[name], values), name
         else:
             # Some thousand terms that cancel in part: roundings of 6e-8 or of 1e-16 each.
-            assert_close(actual[name], values, 1e-5 if values.dtype == torch.float32 else 1e-12, name)
+            assert_close(actual[name], values, tolerance if values.dtype == torch.float32 else 1e-12, name)
 
 
 def reference_gradients(scene, outputs=(), camera=True):

@@ -102,7 +102,7 @@ def test_lists_that_are_outgrown(mode, gpu):
         held.inputs["scales"].copy_(scene.inputs["scales"])
         graph.replay()
         assert torch.equal(results[0], expected[0]) and torch.equal(results[3].pixels, expected[3].pixels)
-        assert expected[3].pixels.sum() > 100_000
+        assert expected[3].pixels.sum() > 50_000
         for name, actual, other in zip(("centers", "depths") + Contributions._fields,
                                        (*results[1:3], *results[3]), (*expected[1:3], *expected[3])):
             # The same pairs with the same numbers, added in another order: 6e-8 each.

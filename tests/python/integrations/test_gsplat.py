@@ -181,7 +181,7 @@ def test_the_gradient_of_the_camera_is_a_whole_derivative(mode):
     scene = random_scene(mode, 8, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)
     cameras = make_cameras(mode, 3, degree=1)
     for camera in cameras:
-        assert threshold_margin(scene._replace(settings=camera)).min() > 1e-4
+        assert threshold_margin(scene._replace(settings=camera)).min() > 5e-5  # the step below moves it by about 1e-6
     arguments = arguments_of(scene, cameras)
     viewmats = arguments.pop("viewmats")
     weights = random_normal((2, HEIGHT, WIDTH, 3), 39)
