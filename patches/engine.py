@@ -1,8 +1,8 @@
 """Plans a patch, and makes it, shows it or takes it back. Everything is planned before anything is written.
 
-A plan is made of the files as they were before any patch: those in the record where there is one, else those on disk. So
-the plan is the same for a checkout that is patched, half patched by an interruption, or patched with other options, and
-to apply it is to write what differs from it.
+A plan is made of the files as they were before any patch: those in the record where there is one, else those on disk.
+So the plan is the same for a checkout that is patched, half patched by an interruption, or patched with other options,
+and to apply it is to write what differs from it.
 """
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ class Plan(NamedTuple):
     root: Path
     verdict: Verdict
     changes: Tuple[Change, ...]
-    notes: Tuple[str, ...]  # what the user should know: modernise rules that were applied or skipped, scripts out of reach
+    notes: Tuple[str, ...]  # which modernise rules are applied or skipped, which scripts render out of reach
     modernise: bool
     record: Optional[Record]
     written: bool = False  # whether `apply` wrote files by this plan
 
 
 def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
-    """Plans the patch of a checkout. Raises PatchError where it is refused; a checkout that is patched is no refusal."""
+    """Plans the patch of a checkout, also of one that is patched. Raises PatchError where it is refused."""
     planned = _inspect(path, modernise, trainer)
     if planned.verdict in ("patchable", "patched"):
         return planned
@@ -79,9 +79,10 @@ def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None)
 
 
 def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
-    """Patches a checkout. Where it is patched already nothing is written. Raises PatchError, and then nothing is written.
+    """Patches a checkout; writes nothing where it is patched already.
 
-    Returns the plan; its `verdict` is how the checkout was before.
+    Returns the plan; its `verdict` is how the checkout was before, `written` whether anything was changed.
+    Raises PatchError where it is refused, and then every file is as it was.
     """
     planned = plan(path, modernise, trainer)
     root, record = planned.root, planned.record
@@ -92,7 +93,7 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     if edited and planned.modernise == record.manifest["modernise"]:
         return planned  # every rule is applied
     if edited:
-        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise has to be given at the first patch")
+        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise belongs to the first patch")
     before = {change.name: change.before for change in planned.changes}
     after = {change.name: change.after for change in planned.changes}
     for name in set(states) - set(after):  # of an earlier version's rules
@@ -286,7 +287,7 @@ def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:
 def _root(path: PathLike) -> Path:
     root = Path(path)
     if not root.is_dir():
-        raise PatchError(f"{root}: is not a folder; the checkout's own is wanted, in which train.py or compress.py lies")
+        raise PatchError(f"{root}: is not a folder; wanted is the checkout's, in which train.py or compress.py lies")
     return root
 
 

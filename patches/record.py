@@ -4,8 +4,8 @@
     .dsmoe_patch/originals/NAME    the file as it was
 
 The last of "after" is what the file became; earlier ones are of a patch that this one took over from, so that whatever
-moment an interruption came at, each file is known to be the original, patched, or changed by someone else. "complete" says
-that the last file was written: else it was an interruption, not the user, that left originals.
+moment an interruption came at, each file is known to be the original, patched, or changed by someone else. "complete"
+says that the last file was written: else it was an interruption, not the user, that left originals.
 """
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ class Record:
                     raise ValueError(f"the original of {name} is not what was recorded")
             return record
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch is damaged ({error}); put the files back "
-                             f"from your version control, then delete {FOLDER}") from None
+            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch is damaged ({error}); put the files "
+                             f"back from your version control, then delete {FOLDER}") from None
 
     @classmethod
     def write(cls, root: Path, originals: Mapping[str, bytes], after: Mapping[str, bytes], notes: Mapping) -> Record:

@@ -324,7 +324,8 @@ def test_recognised_by_structure_alone():
     for name, signs in (("3dgs-2023", set()), ("3dgs-2024", {"sets antialiasing", "imports SparseGaussianAdam"}),
                         ("taming", {"sets pixel_weights", "imports SparseGaussianAdam"}),
                         ("c3dgs", {"sets clamp_color", "imports GaussianRasterizerIndexed"}),
-                        ("hac", {"calls visible_filter"}), ("hac-plus", {"calls visible_filter", "imports gpcc_utils"})):
+                        ("hac", {"calls visible_filter"}),
+                        ("hac-plus", {"calls visible_filter", "imports gpcc_utils"})):
         assert facts.recognise(base | signs)[0].name == name
     assert facts.recognise({"sets bg"})[0] is None
 
@@ -339,8 +340,9 @@ def test_in_public_checkouts_only_the_statements_change(name):
     removed = [line[1:].strip() for line in lines if line[0] == "-"]
     added = [line[1:].strip() for line in lines if line[0] == "+"]
     assert removed and all(line.startswith("from diff_gaussian_rasterization import") for line in removed)
-    statements = ("from diff_smoe_rasterization.", "blend_mode=pipe.blend_mode,", "self.blend_mode = default_blend_mode()",
-                  "pipe.blend_mode = blend_mode_of(dataset)", "pipeline.blend_mode = blend_mode_of(dataset)",
+    statements = ("from diff_smoe_rasterization.", "blend_mode=pipe.blend_mode,",
+                  "self.blend_mode = default_blend_mode()", "pipe.blend_mode = blend_mode_of(dataset)",
+                  "pipeline.blend_mode = blend_mode_of(dataset)",
                   "pipeline_params.blend_mode = blend_mode_of(model_params)")
     assert all(line.startswith(statements) for line in added)
     assert digest == hashlib.sha256(repr(sorted(snapshot(folder).items())).encode()).hexdigest()

@@ -31,9 +31,12 @@ BEFORE_AND_AFTER = [
     ("lpips-when-used", "f = lpips.LPIPS(net='vgg').to('cuda')\n",
      f"from {RUNTIME} import deferred, nan_without_network\n"
      "f = nan_without_network(deferred(lambda: lpips.LPIPS(net='vgg').to('cuda')))\n"),
+    ("lpips-when-used", "f = lpips.LPIPS()\n", f"from {RUNTIME} import deferred, nan_without_network\n"
+     "f = nan_without_network(deferred(lambda: lpips.LPIPS()))\n"),
     ("lpips-when-used", "def f():\n    g = lpips.LPIPS(net='vgg')\n", None),
     ("lpips-offline", "import torch\n\ndef lpips(x, y):\n    return x\n",
-     f"import torch\nfrom {RUNTIME} import nan_without_network\n\n@nan_without_network\ndef lpips(x, y):\n    return x\n"),
+     f"import torch\nfrom {RUNTIME} import nan_without_network\n\n"
+     "@nan_without_network\ndef lpips(x, y):\n    return x\n"),
     ("blender-images", "np.array(a * 255.0, dtype=np.byte)\n", "np.array(a * 255.0, dtype=np.uint8)\n"),
     ("cpp-standard", "f = [\n    '-O3', '-std=c++14',\n    '-U',\n]\n", "f = [\n    '-O3', '-U',\n]\n"),
     ("cpp-standard", "f = ['-O3', '-std=c++14']\n", "f = ['-O3']\n"),

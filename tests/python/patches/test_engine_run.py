@@ -85,9 +85,9 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path):
 def test_signals_and_status_are_the_commands(tmp_path):
     """dsmoe becomes the command: a signal to the one is a signal to the other."""
     wait = "import signal, sys, time; print('ready', flush=True); time.sleep(600)"
-    process = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization", "run", "--blend-mode", "smoe", "--trainer",
-                                "inria", "--", sys.executable, "-c", wait], cwd=str(tmp_path), env=environment(),
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    words = ["run", "--blend-mode", "smoe", "--trainer", "inria", "--", sys.executable, "-c", wait]
+    process = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization", *words], cwd=str(tmp_path),
+                               env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout.readline() == b"ready\n"
     process.terminate()
     process.communicate()
