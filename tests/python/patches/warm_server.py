@@ -1,7 +1,7 @@
 """Runs Python scripts without the seconds that importing torch takes: each in a fork of this process.
 
 Reads one job a line from stdin, as JSON: argv (a script and its arguments, or "-m", a module and its arguments), cwd,
-env, uid, out, err, done. Writes the exit status into `done` when the job has ended.
+env, out, err, done. Writes the exit status into `done` when the job has ended.
 """
 import json
 import os
@@ -21,9 +21,6 @@ def run(job):
     os.environ.update(job["env"])
     for number, name in ((0, os.devnull), (1, job["out"]), (2, job["err"])):
         os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644), number)
-    if job["uid"] is not None:
-        os.setgid(job["uid"])
-        os.setuid(job["uid"])
     sys.dont_write_bytecode = "PYTHONDONTWRITEBYTECODE" in job["env"]
     paths = job["env"]["PYTHONPATH"].split(os.pathsep)
     sys.path[:] = paths + [path for path in sys.path[1:] if path not in paths]
