@@ -91,6 +91,13 @@ class _OptionalImport(Codemod):
 
     names = ("lpips", "wandb", "websockets")
 
+    def visit_Try(self, node: cst.Try) -> None:
+        self.within.append(node)  # who tries it expects that it may fail
+
+    def leave_Try(self, original_node: cst.Try, updated_node: cst.Try) -> cst.Try:
+        self.within.pop()
+        return updated_node
+
     def leave_SimpleStatementLine(self, original_node: cst.SimpleStatementLine,
                                   updated_node: cst.SimpleStatementLine):
         only = updated_node.body[0]

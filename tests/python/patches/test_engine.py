@@ -312,9 +312,10 @@ def test_what_may_not_be_written_is_refused(tmp_path):
 def test_scripts_of_the_user(tmp_path):
     """One that renders is named; one that imports the rasterizer gets the trainer's own."""
     folder = make(tmp_path, {"video.py": "from gaussian_renderer import render\n", "utils/score.py": "import math\n",
-                             "viewer.py": "from diff_gaussian_rasterization import GaussianRasterizer\n"})
+                             "viewer.py": "from diff_gaussian_rasterization import GaussianRasterizer\n",
+                             "python2.py": "print 'diff_gaussian_rasterization'\n"})
     notes = patches.plan(folder).notes
-    assert [note.partition(":")[0] for note in notes] == ["video.py"]
+    assert [note.partition(".py")[0] for note in notes] == ["left as it is: python2", "video"]
     patches.apply(folder)
     assert "diff_smoe_rasterization.integrations.inria " in (folder / "viewer.py").read_text()
 

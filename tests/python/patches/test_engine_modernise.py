@@ -28,6 +28,7 @@ BEFORE_AND_AFTER = [
     ("optional-import", "# logs\nimport wandb  # online\n",
      f'# logs\nfrom {RUNTIME} import optional_import\nwandb = optional_import("wandb")  # online\n'),
     ("optional-import", "def f():\n    import wandb\n", None),
+    ("optional-import", "try:\n    import wandb\nexcept ImportError:\n    wandb = None\n", None),
     ("lpips-when-used", "f = lpips.LPIPS(net='vgg').to('cuda')\n",
      f"from {RUNTIME} import deferred, nan_without_network\n"
      "f = nan_without_network(deferred(lambda: lpips.LPIPS(net='vgg').to('cuda')))\n"),
