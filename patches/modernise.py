@@ -60,6 +60,11 @@ class _TorchScatter(_ImportFrom):
     foreign, ours, names = "torch_scatter", f"{INTEGRATIONS}.torch_scatter", ("scatter", "scatter_max")
 
 
+class _WeightedDistance(_ImportFrom):
+    foreign, ours = "weighted_distance._C", f"{INTEGRATIONS}.weighted_distance"
+    names = ("weightedDistance",)
+
+
 class _WeightsOnly(Codemod):
     def leave_Call(self, original_node: cst.Call, updated_node: cst.Call) -> cst.Call:
         given = [argument.keyword.value if argument.keyword else None for argument in updated_node.args]
@@ -180,6 +185,8 @@ RULES = (
          _FusedSsim, ("fused_ssim",)),
     Rule("torch-scatter", "torch_scatter has no builds for new torch releases, and torch has what is used of it",
          _TorchScatter, ("torch_scatter",)),
+    Rule("weighted-distance", "torch finds the nearest row of a codebook too: one extension less to compile",
+         _WeightedDistance, ("weighted_distance",)),
     Rule("optional-import", "every run imports wandb, websockets or lpips, but only an option or a metric uses them",
          _OptionalImport, _OptionalImport.names),
     Rule("lpips-when-used", "the network of LPIPS was built, and its weights downloaded, when the script was imported",

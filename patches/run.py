@@ -25,7 +25,8 @@ from .rules import RASTERIZER
 from .trainers import TRAINERS
 
 SHIMS = Path(__file__).resolve().parent / "shims"
-STAND_INS = {"simple_knn": "simple_knn._C", "fused_ssim": "fused_ssim", "torch_scatter": "torch_scatter"}
+STAND_INS = {"simple_knn": "simple_knn._C", "fused_ssim": "fused_ssim", "torch_scatter": "torch_scatter",
+             "weighted_distance": "weighted_distance._C"}
 PROBE = """
 import importlib, importlib.util, json, sys
 def usable(module):

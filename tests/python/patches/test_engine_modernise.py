@@ -25,6 +25,8 @@ BEFORE_AND_AFTER = [
     ("torch-scatter", "from torch_scatter import scatter_max\n",
      "from diff_smoe_rasterization.integrations.torch_scatter import scatter_max\n"),
     ("torch-scatter", "from torch_scatter import scatter, segment_csr\n", None),
+    ("weighted-distance", "from weighted_distance._C import weightedDistance\n",
+     "from diff_smoe_rasterization.integrations.weighted_distance import weightedDistance\n"),
     ("optional-import", "# logs\nimport wandb  # online\n",
      f'# logs\nfrom {RUNTIME} import optional_import\nwandb = optional_import("wandb")  # online\n'),
     ("optional-import", "def f():\n    import wandb\n", None),
