@@ -153,20 +153,16 @@ class _LpipsOffline(Codemod):
 class _CppStandard(Codemod):
     """The flag goes: torch gives the compiler the standard that it needs itself where nobody does."""
 
-    def is_flag(self, element: cst.BaseElement) -> bool:
-        return isinstance(element.value, cst.SimpleString) and element.value.raw_value == "-std=c++14"
-
-    def leave_Element(self, original_node: cst.Element, updated_node: cst.Element):
-        if not self.is_flag(updated_node):
-            return updated_node
-        self.pending += 1
-        return cst.RemoveFromParent()
-
     def leave_List(self, original_node: cst.List, updated_node: cst.List) -> cst.List:
-        if not updated_node.elements or not self.is_flag(original_node.elements[-1]):
-            return updated_node
-        *before, last = updated_node.elements  # it is the last one now, and has the comma, or none, of the one that was
-        return updated_node.with_changes(elements=[*before, last.with_changes(comma=original_node.elements[-1].comma)])
+        kept = []
+        for element in updated_node.elements:
+            if not isinstance(element.value, cst.SimpleString) or element.value.raw_value != "-std=c++14":
+                kept.append(element)
+                continue
+            self.pending += 1
+            if kept:  # what follows the flag, comma and line break, follows the word before it then
+                kept[-1] = kept[-1].with_changes(comma=element.comma)
+        return updated_node.with_changes(elements=kept)
 
 
 def with_line_before(line: cst.SimpleStatementLine, before: str, **changes) -> cst.FlattenSentinel:

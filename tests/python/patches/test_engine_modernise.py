@@ -41,7 +41,8 @@ BEFORE_AND_AFTER = [
      f"import torch\nfrom {RUNTIME} import nan_without_network\n\n"
      "@nan_without_network\ndef lpips(x, y):\n    return x\n"),
     ("blender-images", "np.array(a * 255.0, dtype=np.byte)\n", "np.array(a * 255.0, dtype=np.uint8)\n"),
-    ("cpp-standard", "f = [\n    '-O3', '-std=c++14',\n    '-U',\n]\n", "f = [\n    '-O3', '-U',\n]\n"),
+    ("cpp-standard", "f = [\n    '-O3', '-std=c++14',\n    '-U',\n]\n", "f = [\n    '-O3',\n    '-U',\n]\n"),
+    ("cpp-standard", "f = ['-std=c++14', '-O3']\n", "f = ['-O3']\n"),
     ("cpp-standard", "f = ['-O3', '-std=c++14']\n", "f = ['-O3']\n"),
 ]
 
