@@ -42,7 +42,8 @@ every_trainer = pytest.mark.parametrize("name", TRAINERS)
 with_render = pytest.mark.parametrize("name", WITH_RENDER)
 
 
-@pytest.mark.parametrize("name, mode", [(name, "smoe") for name in TRAINERS] + [("3dgs-2023", "alpha")])
+@every_trainer
+@pytest.mark.parametrize("mode", MODES)
 def test_patched_and_run_train_to_the_same_bits(name, mode, runs):
     made = runs(name)
     logs = [log(made.outputs[kind, mode], made.results[kind, mode]) for kind in ("patched", "plain")]

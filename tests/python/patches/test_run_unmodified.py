@@ -21,7 +21,7 @@ def test_child_processes_have_the_rasterizer_too(runs, run, tmp_path):
     before = contents(checkout)
     # A mode in the environment gives way to the one that is asked for.
     job = run("--blend-mode", "smoe", "--", "python", "full_eval.py", "-mu", runs.scene.parent, "--output_path",
-              tmp_path / "eval", cwd=checkout, DSMOE_BLEND_MODE="alpha")
+              tmp_path / "eval", cwd=checkout, DSMOE_BLEND_MODE="alpha", real=True)
     assert job.result().status == 0, job.result().err
     assert contents(checkout) == before
     trained, = (tmp_path / "eval").rglob("point_cloud.npz")
