@@ -298,6 +298,16 @@ def test_modes_links_and_blanks(tmp_path):
     assert snapshot(folder) == before
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes files that stay another user's")
+def test_the_owner_stays(tmp_path):
+    make(tmp_path)
+    os.chown(str(tmp_path / "train.py"), 65534, 65534)
+    for call in (patches.apply, patches.revert):
+        call(tmp_path)
+        owner = (tmp_path / "train.py").stat()
+        assert (owner.st_uid, owner.st_gid) == (65534, 65534)
+
+
 def test_what_may_not_be_written_is_refused(tmp_path):
     folder = make(tmp_path / "checkout")
     (folder / "train.py").chmod(0o444)
