@@ -116,7 +116,7 @@ def check_writable(root: Path, name: str) -> None:
 
 
 def replace_file(root: Path, path: Path, data: bytes) -> None:
-    """Writes a file at once or not at all. A file that was there keeps mode and owner; what a link points to is written.
+    """Writes a file at once or not at all. One that was there keeps mode and owner; a link's target is written.
 
     What an interruption leaves of it lies in the record's folder, and goes with it.
     """
@@ -129,7 +129,7 @@ def replace_file(root: Path, path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         if target.exists():
             shutil.copymode(str(target), temporary)
-            if os.stat(temporary).st_uid != target.stat().st_uid:  # root, as in a container, patches a user's checkout
+            if os.geteuid() == 0:  # in a container root patches a user's checkout
                 shutil.chown(temporary, target.stat().st_uid, target.stat().st_gid)
         else:
             os.chmod(temporary, 0o644)

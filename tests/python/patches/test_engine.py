@@ -323,11 +323,15 @@ def test_scripts_of_the_user(tmp_path):
     """One that renders is named; one that imports the rasterizer gets the trainer's own."""
     folder = make(tmp_path, {"video.py": "from gaussian_renderer import render\n", "utils/score.py": "import math\n",
                              "viewer.py": "from diff_gaussian_rasterization import GaussianRasterizer\n",
-                             "python2.py": "print 'diff_gaussian_rasterization'\n"})
+                             "python2.py": "print 'diff_gaussian_rasterization'\n",
+                             "utils/loss.py": "try:\n    from diff_gaussian_rasterization._C import fusedssim\n"
+                                              "except ImportError:\n    pass\n"})
+    before = snapshot(folder)
     notes = patches.plan(folder).notes
-    assert [note.partition(".py")[0] for note in notes] == ["left as it is: python2", "video"]
+    assert [note.partition(".py")[0] for note in notes] == ["left as it is: python2", "utils/loss", "video"]
     patches.apply(folder)
     assert "diff_smoe_rasterization.integrations.inria " in (folder / "viewer.py").read_text()
+    assert snapshot(folder)["utils/loss.py"] == before["utils/loss.py"]
 
 
 def test_recognised_by_structure_alone():
