@@ -1,4 +1,4 @@
-"""The `dsmoe` command: train, eval, render, patch, run, info. Each is a few lines over the trainer library or patches."""
+"""The `dsmoe` command: train, eval, render, patch, run, info; a few lines each over the trainer library or patches."""
 from __future__ import annotations
 
 import argparse
@@ -57,19 +57,19 @@ def build_parser() -> argparse.ArgumentParser:
     render.set_defaults(run=_render)
 
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
-                                description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming-3DGS, HAC or HAC++, "
-                                            "which then knows the option --blend_mode.")
+                                description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, HAC or "
+                                            "HAC++, which then knows the option --blend_mode.")
     _add_patch_arguments(patch)
 
     run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
                               usage="dsmoe run --blend-mode MODE [--trainer NAME] -- COMMAND ...",
-                              description="Runs a command of an unmodified trainer with this rasterizer. Nothing is written "
-                                          "into the checkout; processes that the command starts have the rasterizer too.")
+                              description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
+                                          "written into the checkout; what the command starts has the rasterizer too.")
     run.add_argument("--blend-mode", choices=BLEND_MODES, required=True,
                      help="nothing records it: give the same where a trained model is rendered")
     run.add_argument("--trainer", metavar="NAME",
-                     help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call (inria, "
-                          "inria_2024, scaffold, ...); default: found out from the script's folder")
+                     help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
+                          "(inria, inria_2024, scaffold, ...); default: found out from the script's folder")
     run.add_argument("words", metavar="COMMAND", nargs=argparse.REMAINDER, help="such as: python train.py -s DATA")
     run.set_defaults(run=_run)
 

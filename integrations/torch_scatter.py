@@ -1,4 +1,4 @@
-"""The two functions of torch_scatter that trainers use, in plain torch: `scatter` (c3dgs) and `scatter_max` (HAC, HAC++)."""
+"""What trainers use of torch_scatter, in plain torch: `scatter` (c3dgs) and `scatter_max` (HAC, HAC++)."""
 from __future__ import annotations
 
 from typing import Optional, Tuple
@@ -27,8 +27,8 @@ def scatter_max(src: torch.Tensor, index: torch.Tensor, dim: int = -1, out: Opti
                 dim_size: Optional[int] = None) -> Tuple[torch.Tensor, torch.Tensor]:
     """Returns the largest of the elements of `src` that have the same index along `dim`, and where it is.
 
-    Arguments as for `scatter`. Returns the maxima, 0 where no element has that index, and int64 positions along `dim`, the
-    first of equal ones, and the size of `src` where there is none. The maxima have a gradient by `src`.
+    Arguments as for `scatter`. Returns the maxima, 0 where no element has that index, and their int64 positions along
+    `dim`: the first of equal ones, the size of `src` where there is none. The maxima have a gradient by `src`.
     Raises NotImplementedError where `out` is given.
     """
     if out is not None:

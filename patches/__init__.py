@@ -3,8 +3,9 @@
     from diff_smoe_rasterization import patches
     patches.apply("gaussian-splatting")        # what `dsmoe patch apply gaussian-splatting` does
 
-engine.py plans and carries out; trainers/ has a short file of rules for each trainer; codemods.py is how a rule changes a
-file; shims/ is what `dsmoe run` puts in front of an unmodified checkout. runtime.py is what a patched trainer imports.
+engine.py plans and carries out; trainers/ has a short file of rules for each trainer; codemods.py is how a rule
+changes a file; shims/ is what `dsmoe run` puts in front of an unmodified checkout. runtime.py is what a patched trainer
+imports.
 """
 from .engine import apply, check, diff, plan, revert
 from .errors import PatchError

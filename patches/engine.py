@@ -1,24 +1,27 @@
 """Plans a patch, and makes it, shows it or takes it back. Everything is planned before anything is written.
 
-A plan is made of the files as they were before any patch: those in the record where there is one, else those on disk. So
-the plan is the same for a checkout that is patched, half patched by an interruption, or patched with other options, and
-to apply it is to write what differs from it.
+A plan is made of the files as they were before any patch: those in the record where there is one, else those on disk.
+So the plan is the same for a checkout that is patched, half patched by an interruption, or patched with other options,
+and to apply it is to write what differs from it.
 """
 from __future__ import annotations
 
 import difflib
 import io
 from pathlib import Path
-from typing import Dict, List, NamedTuple, Optional, Tuple, Union
+from typing import TYPE_CHECKING, List, NamedTuple, Optional, Tuple, Union
 
 from diff_smoe_rasterization._version import __version__
 
 from . import facts, source
 from .errors import PatchError
 from .record import FOLDER, Record, check_writable, remove_rest, replace_file
-from .rules import RASTERIZER, ImportRasterizer, Trainer
+from .rules import Trainer
 from .scope import build_files, callers_out_of_reach, python_files
 from .trainers import TRAINERS
+
+if TYPE_CHECKING:
+    from .patch import Change  # which needs LibCST
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
 PathLike = Union[str, Path]
@@ -27,6 +30,7 @@ PathLike = Union[str, Path]
 class Verdict(str):
     """One of STATES, as a string, with `trainer` (a name or None) and `reasons` (lines)."""
 
+    state: str
     trainer: Optional[str]
     reasons: Tuple[str, ...]
 
@@ -37,29 +41,20 @@ class Verdict(str):
         return verdict
 
 
-class Change(NamedTuple):
-    """What becomes of one file."""
-
-    name: str  # relative to the checkout
-    before: bytes
-    after: bytes
-    rules: Tuple[str, ...]
-
-
 class Plan(NamedTuple):
     """What `apply` would do, and why it would not."""
 
     root: Path
     verdict: Verdict
     changes: Tuple[Change, ...]
-    notes: Tuple[str, ...]  # what the user should know: modernise rules that were applied or skipped, scripts out of reach
+    notes: Tuple[str, ...]  # which modernise rules are applied or skipped, which scripts render out of reach
     modernise: bool
     record: Optional[Record]
     written: bool = False  # whether `apply` wrote files by this plan
 
 
 def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
-    """Plans the patch of a checkout. Raises PatchError where it is refused; a checkout that is patched is no refusal."""
+    """Plans the patch of a checkout, also of one that is patched. Raises PatchError where it is refused."""
     planned = _inspect(path, modernise, trainer)
     if planned.verdict in ("patchable", "patched"):
         return planned
@@ -79,9 +74,10 @@ def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None)
 
 
 def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
-    """Patches a checkout. Where it is patched already nothing is written. Raises PatchError, and then nothing is written.
+    """Patches a checkout; writes nothing where it is patched already.
 
-    Returns the plan; its `verdict` is how the checkout was before.
+    Returns the plan; its `verdict` is how the checkout was before, `written` whether anything was changed.
+    Raises PatchError where it is refused, and then every file is as it was.
     """
     planned = plan(path, modernise, trainer)
     root, record = planned.root, planned.record
@@ -92,7 +88,7 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     if edited and planned.modernise == record.manifest["modernise"]:
         return planned  # every rule is applied
     if edited:
-        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise has to be given at the first patch")
+        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise belongs to the first patch")
     before = {change.name: change.before for change in planned.changes}
     after = {change.name: change.after for change in planned.changes}
     for name in set(states) - set(after):  # of an earlier version's rules
@@ -154,6 +150,8 @@ _SINCE = {"changed": "was changed since it was patched", "gone": "was removed si
 
 def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
     source.have_libcst()
+    from .patch import Patch
+
     root = _root(path)
     record = Record.load(root)
     modernise = modernise or bool(record and record.manifest["modernise"])
@@ -169,91 +167,17 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
     files = {name: read(name) for name in python_files(root)}
     if modernise:
         files.update((name, read(name)) for name in build_files(root))
-    patch = _Patch(files, chosen)
-    notes = patch.modernise() if modernise and not patch.problems else []
-    notes += callers_out_of_reach(files, chosen)
+    patch = Patch(files, chosen)
+    if modernise:
+        patch.modernise()
     state, reasons = patch.state()
     if record and not patch.problems:
-        state, reasons = _state_by_record(record, root, chosen)
-    return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), tuple(notes), modernise, record)
+        state, reasons = _state_by_record(record)
+    notes = (*patch.notes, *callers_out_of_reach(files, chosen))
+    return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), notes, modernise, record)
 
 
-class _Patch:
-    """The rules of a trainer, applied to its files in memory."""
-
-    def __init__(self, files: Dict[str, bytes], trainer: Trainer) -> None:
-        from . import codemods
-
-        self.files, self.trees, self.writers = files, {}, {}
-        self.rules: Dict[str, List[str]] = {}  # of each file, those that changed it
-        self.problems: List[str] = []  # why it cannot be patched
-        self.pending: List[str] = []
-        self.done: List[str] = []
-        for rule in trainer.rules:
-            if rule.file not in files:
-                self.problems.append(f"{rule.file}: rule {rule.name}: there is no such file; expected is {rule.right}")
-                continue
-            try:
-                outcome = self._run(codemods.run, rule, rule.file)
-            except PatchError as error:
-                self.problems.append(str(error))
-                continue
-            found = outcome.pending + outcome.done
-            line = f"{rule.file}: rule {rule.name}"
-            if found != rule.expected or outcome.misfits:
-                misfits = f", and {outcome.misfits} that look alike" if outcome.misfits else ""
-                self.problems.append(f"{line}: {found} matches instead of {rule.expected}{misfits}; right would be "
-                                     f"{rule.right}")
-            if outcome.pending:
-                self.pending.append(line)
-            if outcome.done:
-                self.done.append(line)
-        # A script of the user's that imports the rasterizer must not get another one than the trainer's own files.
-        known = {rule.file for rule in trainer.rules if isinstance(rule, ImportRasterizer)}
-        for name in sorted(set(files) - known):
-            if RASTERIZER.encode() in files[name] and not name.startswith("submodules/") and not self.problems:
-                self._run(codemods.run, ImportRasterizer(name, trainer.flavour), name)
-
-    def modernise(self) -> List[str]:
-        """Applies the modernise rules; returns a line for each."""
-        from . import modernise
-
-        notes = []
-        for rule in modernise.RULES:
-            changed = [name for name in sorted(self.files) if rule.looks_at(self.files[name])
-                       and self._run(modernise.run, rule, name).pending]
-            notes.append(f"modernise {rule.name}: " + (f"{', '.join(changed)}: {rule.reason}" if changed
-                                                       else "skipped, nothing matches"))
-        return notes
-
-    def state(self) -> Tuple[str, List[str]]:
-        if self.problems:
-            return "drifted", self.problems
-        if self.done and self.pending:
-            return "half-patched", ([f"{line}: is not applied" for line in self.pending]
-                                    + [f"{line}: is applied already" for line in self.done])
-        if self.done:
-            return "patched", [f"every rule is applied; there is no {FOLDER}, so `revert` cannot undo it"]
-        return "patchable", []
-
-    def changes(self) -> Tuple[Change, ...]:
-        changes = []
-        for name, rules in self.rules.items():
-            after = self.writers[name](self.trees[name])
-            changes.append(Change(name, self.files[name], after, tuple(rules)))
-        return tuple(changes)
-
-    def _run(self, run, rule, name: str):
-        if name not in self.trees:
-            self.trees[name], self.writers[name] = source.parse(name, self.files[name])
-        outcome = run(rule, self.trees[name])
-        self.trees[name] = outcome.tree
-        if outcome.pending:
-            self.rules.setdefault(name, []).append(rule.name)
-        return outcome
-
-
-def _state_by_record(record: Record, root: Path, trainer: Trainer) -> Tuple[str, List[str]]:
+def _state_by_record(record: Record) -> Tuple[str, List[str]]:
     """How a checkout is that has a record: `patched`, or what the record and the files disagree in."""
     states = record.states()
     if set(states.values()) <= {"patched"}:
@@ -269,9 +193,11 @@ def _can_be_finished(planned: Plan) -> bool:
     states = set(planned.record.states().values())
     if states <= {"patched", "original"}:
         return states == {"patched"} or not planned.record.manifest["complete"]
+    from .patch import Patch
+
     trainer = next(trainer for trainer in TRAINERS if trainer.name == planned.verdict.trainer)
     files = {name: _read(planned.root / name) for name in python_files(planned.root)}
-    return "gone" not in states and _Patch(files, trainer).state()[0] == "patched"
+    return "gone" not in states and Patch(files, trainer).state()[0] == "patched"
 
 
 def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:
@@ -286,7 +212,7 @@ def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:
 def _root(path: PathLike) -> Path:
     root = Path(path)
     if not root.is_dir():
-        raise PatchError(f"{root}: is not a folder; the checkout's own is wanted, in which train.py or compress.py lies")
+        raise PatchError(f"{root}: is not a folder; wanted is the checkout's, in which train.py or compress.py lies")
     return root
 
 

@@ -10,8 +10,8 @@ from .trainers import TRAINERS
 
 PATCHED = "imports from " + INTEGRATIONS
 LOOKED_AT = (GR, "scene/gaussian_model.py", "train.py", "render.py")
-BASE_SETTINGS = {"image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
-                 "sh_degree", "campos", "prefiltered", "debug"}
+BASE_SETTINGS = {"image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix",
+                 "projmatrix", "sh_degree", "campos", "prefiltered", "debug"}
 FURTHER_SETTINGS = {"antialiasing", "pixel_weights", "clamp_color", "blend_mode"}
 
 

@@ -60,10 +60,15 @@ class _TorchScatter(_ImportFrom):
     foreign, ours, names = "torch_scatter", f"{INTEGRATIONS}.torch_scatter", ("scatter", "scatter_max")
 
 
+class _WeightedDistance(_ImportFrom):
+    foreign, ours = "weighted_distance._C", f"{INTEGRATIONS}.weighted_distance"
+    names = ("weightedDistance",)
+
+
 class _WeightsOnly(Codemod):
     def leave_Call(self, original_node: cst.Call, updated_node: cst.Call) -> cst.Call:
-        given = {argument.keyword.value for argument in updated_node.args if argument.keyword}
-        if get_full_name_for_node(updated_node.func) != "torch.load" or "weights_only" in given or not updated_node.args:
+        given = [argument.keyword.value if argument.keyword else None for argument in updated_node.args]
+        if get_full_name_for_node(updated_node.func) != "torch.load" or "weights_only" in given or not given:
             return updated_node
         self.pending += 1
         *before, last = updated_node.args
@@ -91,6 +96,13 @@ class _OptionalImport(Codemod):
 
     names = ("lpips", "wandb", "websockets")
 
+    def visit_Try(self, node: cst.Try) -> None:
+        self.within.append(node)  # who tries it expects that it may fail
+
+    def leave_Try(self, original_node: cst.Try, updated_node: cst.Try) -> cst.Try:
+        self.within.pop()
+        return updated_node
+
     def leave_SimpleStatementLine(self, original_node: cst.SimpleStatementLine,
                                   updated_node: cst.SimpleStatementLine):
         only = updated_node.body[0]
@@ -100,9 +112,8 @@ class _OptionalImport(Codemod):
         if name not in self.names or only.names[0].asname or self.within:
             return updated_node
         self.pending += 1
-        helper = statement(f"from {RUNTIME} import optional_import")
-        return cst.FlattenSentinel([helper.with_changes(leading_lines=updated_node.leading_lines), updated_node.with_changes(
-            leading_lines=[], body=statement(f'{name} = optional_import("{name}")').body)])
+        return with_line_before(updated_node, f"from {RUNTIME} import optional_import",
+                                body=statement(f'{name} = optional_import("{name}")').body)
 
 
 class _LpipsWhenUsed(Codemod):
@@ -114,16 +125,16 @@ class _LpipsWhenUsed(Codemod):
         if self.within or len(updated_node.body) != 1 or not isinstance(only, cst.Assign):
             return updated_node
         call = only.value
-        while isinstance(call, cst.Call) and isinstance(call.func, cst.Attribute) and isinstance(call.func.value, cst.Call):
+        while isinstance(call, cst.Call) and isinstance(call.func, cst.Attribute) and get_full_name_for_node(
+                call.func) != "lpips.LPIPS":
             call = call.func.value  # from .to('cuda') or .cuda() inwards
         if not isinstance(call, cst.Call) or get_full_name_for_node(call.func) != "lpips.LPIPS":
             return updated_node
         self.pending += 1
         value = cst.parse_expression("nan_without_network(deferred(lambda: None))")
         value = value.with_deep_changes(value.args[0].value.args[0].value, body=only.value)
-        helper = statement(f"from {RUNTIME} import deferred, nan_without_network")
-        return cst.FlattenSentinel([helper.with_changes(leading_lines=updated_node.leading_lines),
-                                    updated_node.with_changes(leading_lines=[], body=[only.with_changes(value=value)])])
+        return with_line_before(updated_node, f"from {RUNTIME} import deferred, nan_without_network",
+                                body=[only.with_changes(value=value)])
 
 
 class _LpipsOffline(Codemod):
@@ -142,38 +153,44 @@ class _LpipsOffline(Codemod):
 class _CppStandard(Codemod):
     """The flag goes: torch gives the compiler the standard that it needs itself where nobody does."""
 
-    def is_flag(self, element: cst.BaseElement) -> bool:
-        return isinstance(element.value, cst.SimpleString) and element.value.raw_value == "-std=c++14"
-
-    def leave_Element(self, original_node: cst.Element, updated_node: cst.Element):
-        if not self.is_flag(updated_node):
-            return updated_node
-        self.pending += 1
-        return cst.RemoveFromParent()
-
     def leave_List(self, original_node: cst.List, updated_node: cst.List) -> cst.List:
-        if not updated_node.elements or not self.is_flag(original_node.elements[-1]):
-            return updated_node
-        *before, last = updated_node.elements  # it is the last one now, and has the comma, or none, of the one that was
-        return updated_node.with_changes(elements=[*before, last.with_changes(comma=original_node.elements[-1].comma)])
+        kept = []
+        for element in updated_node.elements:
+            if not isinstance(element.value, cst.SimpleString) or element.value.raw_value != "-std=c++14":
+                kept.append(element)
+                continue
+            self.pending += 1
+            if kept:  # what follows the flag, comma and line break, follows the word before it then
+                kept[-1] = kept[-1].with_changes(comma=element.comma)
+        return updated_node.with_changes(elements=kept)
+
+
+def with_line_before(line: cst.SimpleStatementLine, before: str, **changes) -> cst.FlattenSentinel:
+    """Returns two lines for one; the comments above it stay above both."""
+    return cst.FlattenSentinel([statement(before).with_changes(leading_lines=line.leading_lines),
+                                line.with_changes(leading_lines=[], **changes)])
 
 
 RULES = (
-    Rule("checkpoint-load", "torch 2.6 and later load tensors alone unless told otherwise, and the trainers' checkpoints "
-         "hold numpy numbers and optimizer states", _WeightsOnly, ("torch.load",)),
-    Rule("simple-knn", "distCUDA2 is in this package, for CUDA and CPU: one extension less to compile", _SimpleKnn,
-         ("simple_knn",)),
-    Rule("fused-ssim", "fused_ssim is in this package: one extension less to compile", _FusedSsim, ("fused_ssim",)),
-    Rule("torch-scatter", "torch_scatter has no builds for new torch releases; torch itself has what the trainers use of "
-         "it", _TorchScatter, ("torch_scatter",)),
-    Rule("optional-import", "wandb, websockets and lpips are imported by every run, but used by an option or a metric "
-         "alone", _OptionalImport, _OptionalImport.names),
-    Rule("lpips-when-used", "the network of LPIPS is built, and its weights are downloaded, when the script is imported",
+    Rule("checkpoint-load",
+         "torch 2.6 and later load tensors alone unless told otherwise; checkpoints hold numpy numbers too",
+         _WeightsOnly, ("torch.load",)),
+    Rule("simple-knn", "distCUDA2 is in this package, for CUDA and CPU: one extension less to compile",
+         _SimpleKnn, ("simple_knn",)),
+    Rule("fused-ssim", "fused_ssim is in this package: one extension less to compile",
+         _FusedSsim, ("fused_ssim",)),
+    Rule("torch-scatter", "torch_scatter has no builds for new torch releases, and torch has what is used of it",
+         _TorchScatter, ("torch_scatter",)),
+    Rule("weighted-distance", "torch finds the nearest row of a codebook too: one extension less to compile",
+         _WeightedDistance, ("weighted_distance",)),
+    Rule("optional-import", "every run imports wandb, websockets or lpips, but only an option or a metric uses them",
+         _OptionalImport, _OptionalImport.names),
+    Rule("lpips-when-used", "the network of LPIPS was built, and its weights downloaded, when the script was imported",
          _LpipsWhenUsed, ("lpips.LPIPS",)),
-    Rule("lpips-offline", "where the weights of LPIPS cannot be downloaded, a measurement ends the training; it is NaN then, "
-         "with a warning", _LpipsOffline, ("def lpips",)),
-    Rule("blender-images", "new Pillow releases take no signed bytes for a picture, which the reader of Blender scenes makes",
+    Rule("lpips-offline", "where the weights of LPIPS could not be downloaded, a measurement ended the training",
+         _LpipsOffline, ("def lpips",)),
+    Rule("blender-images", "new Pillow releases take no signed bytes for a picture",
          _NumpyByte, ("np.byte", "numpy.byte")),
-    Rule("cpp-standard", "a submodule's setup.py asks for C++14; torch 2.1 needs C++17, 2.13 C++20, and asks for it itself", _CppStandard,
-         ("c++14",)),
+    Rule("cpp-standard", "C++14 was asked for; torch 2.1 needs C++17, 2.13 C++20, and asks for it itself",
+         _CppStandard, ("c++14",)),
 )

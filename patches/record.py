@@ -4,8 +4,8 @@
     .dsmoe_patch/originals/NAME    the file as it was
 
 The last of "after" is what the file became; earlier ones are of a patch that this one took over from, so that whatever
-moment an interruption came at, each file is known to be the original, patched, or changed by someone else. "complete" says
-that the last file was written: else it was an interruption, not the user, that left originals.
+moment an interruption came at, each file is known to be the original, patched, or changed by someone else. "complete"
+says that the last file was written: else it was an interruption, not the user, that left originals.
 """
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ class Record:
                     raise ValueError(f"the original of {name} is not what was recorded")
             return record
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch is damaged ({error}); put the files back "
-                             f"from your version control, then delete {FOLDER}") from None
+            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch is damaged ({error}); put the files "
+                             f"back from your version control, then delete {FOLDER}") from None
 
     @classmethod
     def write(cls, root: Path, originals: Mapping[str, bytes], after: Mapping[str, bytes], notes: Mapping) -> Record:
@@ -116,7 +116,7 @@ def check_writable(root: Path, name: str) -> None:
 
 
 def replace_file(root: Path, path: Path, data: bytes) -> None:
-    """Writes a file at once or not at all. What a link points to is written; a file that was there keeps its mode.
+    """Writes a file at once or not at all. One that was there keeps mode and owner; a link's target is written.
 
     What an interruption leaves of it lies in the record's folder, and goes with it.
     """
@@ -129,6 +129,8 @@ def replace_file(root: Path, path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         if target.exists():
             shutil.copymode(str(target), temporary)
+            if os.geteuid() == 0:  # in a container root patches a user's checkout
+                shutil.chown(temporary, target.stat().st_uid, target.stat().st_gid)
         else:
             os.chmod(temporary, 0o644)
         os.replace(temporary, str(target))

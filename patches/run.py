@@ -6,6 +6,7 @@ that its exit status and signals are the command's own.
 """
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -24,7 +25,8 @@ from .rules import RASTERIZER
 from .trainers import TRAINERS
 
 SHIMS = Path(__file__).resolve().parent / "shims"
-STAND_INS = {"simple_knn": "simple_knn._C", "fused_ssim": "fused_ssim", "torch_scatter": "torch_scatter"}
+STAND_INS = {"simple_knn": "simple_knn._C", "fused_ssim": "fused_ssim", "torch_scatter": "torch_scatter",
+             "weighted_distance": "weighted_distance._C"}
 PROBE = """
 import importlib, importlib.util, json, sys
 def usable(module):
@@ -81,14 +83,14 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str]:
     """Returns the flavour, and for which trainer it was chosen."""
     by_name = {**{name: name for name in flavours()}, **{known.name: known.flavour for known in TRAINERS}}
     if trainer is not None and trainer not in by_name:
-        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(facts.names())}, or for another "
-                         f"trainer the rasterizer whose API it calls: {', '.join(flavours())}")
+        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(facts.names())}, or for "
+                         f"another trainer the rasterizer whose API it calls: {', '.join(flavours())}")
     reasons = []
     for folder in _folders(words):
         found = facts.of_checkout(lambda name: (folder / name).read_bytes() if (folder / name).is_file() else None)
         if facts.PATCHED in found or (folder / FOLDER / "manifest.json").is_file():
-            raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or without "
-                             "(render.py, which reads it from cfg_args)")
+            raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
+                             "without (render.py, which reads it from cfg_args)")
         if (folder / RASTERIZER).exists():
             raise PatchError(f"{folder / RASTERIZER} would be imported before this package's; move it away")
         if trainer is None:
@@ -112,9 +114,9 @@ def _folders(words: Sequence[str]) -> List[Path]:
 def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[Dict, List[str]]:
     """Asks the command's Python what it can import. Raises PatchError where that is not this package."""
     is_python = re.fullmatch(r"python[0-9.]*t?", os.path.basename(words[0])) is not None
-    options = [word for index, word in enumerate(words[1:], 1) if all(before.startswith("-") for before in words[1:index + 1])]
+    options = list(itertools.takewhile(lambda word: word.startswith("-"), words[1:]))
     if is_python and {"-I", "-E"} & set(options):
-        raise PatchError(f"{words[0]} {' '.join(options)}: does not look at PYTHONPATH, by which it would find the rasterizer")
+        raise PatchError(f"{words[0]} {' '.join(options)}: does not look at PYTHONPATH, where the rasterizer is found")
     python = words[0] if is_python else next((name for name in ("python", "python3")
                                               if shutil.which(name, path=environment.get("PATH"))), None)
     if python is None:
@@ -124,7 +126,8 @@ def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[Dict
     try:
         answer = json.loads(asked.stdout.splitlines()[-1])
     except (ValueError, IndexError):
-        raise PatchError(f"{python} cannot be asked what it can import: {asked.stderr.strip() or 'it printed nothing'}") from None
+        said = asked.stderr.strip() or "it printed nothing"
+        raise PatchError(f"{python} cannot be asked what it can import: {said}") from None
     if answer["ours"]:
         return answer, []
     message = (f"{python} (Python {answer['version']}) cannot import diff_smoe_rasterization; install it there: "

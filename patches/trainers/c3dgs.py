@@ -1,6 +1,6 @@
 """Compressed 3DGS (Niedermayr et al. 2024). It trains no model: `run_vq` compresses one and finetunes what is left.
 
-The model's own cfg_args brings the blend mode. Finetuning writes the cfg_args of the result, with the mode that was used.
+The model's own cfg_args brings the blend mode. Finetuning writes the cfg_args of the result, with the mode in use.
 """
 from ..rules import PipeBlendMode, Trainer, shared_rules
 

@@ -298,6 +298,16 @@ def test_modes_links_and_blanks(tmp_path):
     assert snapshot(folder) == before
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes files that stay another user's")
+def test_the_owner_stays(tmp_path):
+    make(tmp_path)
+    os.chown(str(tmp_path / "train.py"), 65534, 65534)
+    for call in (patches.apply, patches.revert):
+        call(tmp_path)
+        owner = (tmp_path / "train.py").stat()
+        assert (owner.st_uid, owner.st_gid) == (65534, 65534)
+
+
 def test_what_may_not_be_written_is_refused(tmp_path):
     folder = make(tmp_path / "checkout")
     (folder / "train.py").chmod(0o444)
@@ -312,11 +322,16 @@ def test_what_may_not_be_written_is_refused(tmp_path):
 def test_scripts_of_the_user(tmp_path):
     """One that renders is named; one that imports the rasterizer gets the trainer's own."""
     folder = make(tmp_path, {"video.py": "from gaussian_renderer import render\n", "utils/score.py": "import math\n",
-                             "viewer.py": "from diff_gaussian_rasterization import GaussianRasterizer\n"})
+                             "viewer.py": "from diff_gaussian_rasterization import GaussianRasterizer\n",
+                             "python2.py": "print 'diff_gaussian_rasterization'\n",
+                             "utils/loss.py": "try:\n    from diff_gaussian_rasterization._C import fusedssim\n"
+                                              "except ImportError:\n    pass\n"})
+    before = snapshot(folder)
     notes = patches.plan(folder).notes
-    assert [note.partition(":")[0] for note in notes] == ["video.py"]
+    assert [note.partition(".py")[0] for note in notes] == ["left as it is: python2", "utils/loss", "video"]
     patches.apply(folder)
     assert "diff_smoe_rasterization.integrations.inria " in (folder / "viewer.py").read_text()
+    assert snapshot(folder)["utils/loss.py"] == before["utils/loss.py"]
 
 
 def test_recognised_by_structure_alone():
@@ -324,7 +339,8 @@ def test_recognised_by_structure_alone():
     for name, signs in (("3dgs-2023", set()), ("3dgs-2024", {"sets antialiasing", "imports SparseGaussianAdam"}),
                         ("taming", {"sets pixel_weights", "imports SparseGaussianAdam"}),
                         ("c3dgs", {"sets clamp_color", "imports GaussianRasterizerIndexed"}),
-                        ("hac", {"calls visible_filter"}), ("hac-plus", {"calls visible_filter", "imports gpcc_utils"})):
+                        ("hac", {"calls visible_filter"}),
+                        ("hac-plus", {"calls visible_filter", "imports gpcc_utils"})):
         assert facts.recognise(base | signs)[0].name == name
     assert facts.recognise({"sets bg"})[0] is None
 
@@ -339,8 +355,9 @@ def test_in_public_checkouts_only_the_statements_change(name):
     removed = [line[1:].strip() for line in lines if line[0] == "-"]
     added = [line[1:].strip() for line in lines if line[0] == "+"]
     assert removed and all(line.startswith("from diff_gaussian_rasterization import") for line in removed)
-    statements = ("from diff_smoe_rasterization.", "blend_mode=pipe.blend_mode,", "self.blend_mode = default_blend_mode()",
-                  "pipe.blend_mode = blend_mode_of(dataset)", "pipeline.blend_mode = blend_mode_of(dataset)",
+    statements = ("from diff_smoe_rasterization.", "blend_mode=pipe.blend_mode,",
+                  "self.blend_mode = default_blend_mode()", "pipe.blend_mode = blend_mode_of(dataset)",
+                  "pipeline.blend_mode = blend_mode_of(dataset)",
                   "pipeline_params.blend_mode = blend_mode_of(model_params)")
     assert all(line.startswith(statements) for line in added)
     assert digest == hashlib.sha256(repr(sorted(snapshot(folder).items())).encode()).hexdigest()

@@ -25,17 +25,24 @@ BEFORE_AND_AFTER = [
     ("torch-scatter", "from torch_scatter import scatter_max\n",
      "from diff_smoe_rasterization.integrations.torch_scatter import scatter_max\n"),
     ("torch-scatter", "from torch_scatter import scatter, segment_csr\n", None),
+    ("weighted-distance", "from weighted_distance._C import weightedDistance\n",
+     "from diff_smoe_rasterization.integrations.weighted_distance import weightedDistance\n"),
     ("optional-import", "# logs\nimport wandb  # online\n",
      f'# logs\nfrom {RUNTIME} import optional_import\nwandb = optional_import("wandb")  # online\n'),
     ("optional-import", "def f():\n    import wandb\n", None),
+    ("optional-import", "try:\n    import wandb\nexcept ImportError:\n    wandb = None\n", None),
     ("lpips-when-used", "f = lpips.LPIPS(net='vgg').to('cuda')\n",
      f"from {RUNTIME} import deferred, nan_without_network\n"
      "f = nan_without_network(deferred(lambda: lpips.LPIPS(net='vgg').to('cuda')))\n"),
+    ("lpips-when-used", "f = lpips.LPIPS()\n", f"from {RUNTIME} import deferred, nan_without_network\n"
+     "f = nan_without_network(deferred(lambda: lpips.LPIPS()))\n"),
     ("lpips-when-used", "def f():\n    g = lpips.LPIPS(net='vgg')\n", None),
     ("lpips-offline", "import torch\n\ndef lpips(x, y):\n    return x\n",
-     f"import torch\nfrom {RUNTIME} import nan_without_network\n\n@nan_without_network\ndef lpips(x, y):\n    return x\n"),
+     f"import torch\nfrom {RUNTIME} import nan_without_network\n\n"
+     "@nan_without_network\ndef lpips(x, y):\n    return x\n"),
     ("blender-images", "np.array(a * 255.0, dtype=np.byte)\n", "np.array(a * 255.0, dtype=np.uint8)\n"),
-    ("cpp-standard", "f = [\n    '-O3', '-std=c++14',\n    '-U',\n]\n", "f = [\n    '-O3', '-U',\n]\n"),
+    ("cpp-standard", "f = [\n    '-O3', '-std=c++14',\n    '-U',\n]\n", "f = [\n    '-O3',\n    '-U',\n]\n"),
+    ("cpp-standard", "f = ['-std=c++14', '-O3']\n", "f = ['-O3']\n"),
     ("cpp-standard", "f = ['-O3', '-std=c++14']\n", "f = ['-O3']\n"),
 ]
 

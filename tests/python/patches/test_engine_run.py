@@ -1,6 +1,7 @@
 """`dsmoe run` and `dsmoe patch` as commands: what the child sees, what is refused, and the exit status."""
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import subprocess
@@ -85,9 +86,9 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path):
 def test_signals_and_status_are_the_commands(tmp_path):
     """dsmoe becomes the command: a signal to the one is a signal to the other."""
     wait = "import signal, sys, time; print('ready', flush=True); time.sleep(600)"
-    process = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization", "run", "--blend-mode", "smoe", "--trainer",
-                                "inria", "--", sys.executable, "-c", wait], cwd=str(tmp_path), env=environment(),
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    words = ["run", "--blend-mode", "smoe", "--trainer", "inria", "--", sys.executable, "-c", wait]
+    process = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization", *words], cwd=str(tmp_path),
+                               env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout.readline() == b"ready\n"
     process.terminate()
     process.communicate()
@@ -175,3 +176,20 @@ def test_the_patch_commands(tmp_path, dsmoe):
 def test_without_libcst_patching_says_what_to_type(tmp_path, monkeypatch, dsmoe):
     monkeypatch.setitem(sys.modules, "libcst", None)  # an import of it fails
     refused(dsmoe("patch", "apply", make(tmp_path / "checkout"), cwd=tmp_path), "pip install libcst")
+
+
+def test_the_package_brings_the_shims_and_nothing_beside_itself():
+    """Not one of the names that the shims stand in for is installed as such."""
+    root = Path(__file__).resolve().parents[3]
+    pytest.importorskip("setuptools")
+    spec = importlib.util.spec_from_file_location("dsmoe_setup", root / "setup.py")
+    setup = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(setup)
+    packages = setup.packages()
+    assert {name.partition(".")[0] for name in packages["packages"]} == {"diff_smoe_rasterization"}
+    assert {"diff_smoe_rasterization.patches", "diff_smoe_rasterization.patches.trainers"} <= set(packages["packages"])
+    brought = {path for pattern in packages["package_data"]["diff_smoe_rasterization.patches"]
+               for path in (root / "patches").glob(pattern)}
+    assert brought == set((root / "patches/shims").rglob("*.py")) != set()
+    names = {folder.name for folder in run.SHIMS.iterdir()}  # of the package that runs here, installed or not
+    assert names == set(run.flavours()) | set(run.STAND_INS)

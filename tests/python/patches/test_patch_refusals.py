@@ -47,21 +47,34 @@ SEVERAL = {
 }
 
 
-@pytest.mark.parametrize("name", ["3dgs-2023", "c3dgs", "hac"])
-@pytest.mark.parametrize("drift", {**NONE, **SEVERAL}.values(), ids={**NONE, **SEVERAL})
-def test_none_or_several_matches_are_refused(drift, name, tmp_path, dsmoe):
+DRIFTS = {**NONE, **SEVERAL}
+DRIFTED = ([("3dgs-2023", drift) for drift in DRIFTS] + [("c3dgs", "no entry"), ("c3dgs", "two entries")]
+           + [("hac", "no settings"), ("hac", "no entry")])
+
+
+@pytest.mark.parametrize("name, drift", DRIFTED)
+def test_none_or_several_matches_are_refused(name, drift, tmp_path, dsmoe):
     last = list(ENTRIES[name])[-1]
-    file, old, new = (words.format(last=last, entry=ENTRIES[name][last][-1]) for words in drift)
+    file, old, new = (words.format(last=last, entry=ENTRIES[name][last][-1]) for words in DRIFTS[drift])
     checkout = make_checkout(name, tmp_path / "checkout")
     replace_once(checkout / file, old, new)
     before = contents(checkout)
     assert refused(dsmoe("patch", "check", checkout), "drifted", file)
     result = dsmoe("patch", "apply", checkout)
     assert refused(result, file) and re.search(r"rule [a-z-]+", result.err), result.err
-    assert refused(dsmoe("patch", "apply", checkout, "--dry-run"), file)
     assert contents(checkout) == before
-    with pytest.raises(patches.PatchError, match=re.escape(file)):
-        patches.apply(checkout)
+
+
+def test_a_refusal_is_the_same_by_every_way(tmp_path, dsmoe):
+    checkout = make_checkout("3dgs-2023", tmp_path / "checkout")
+    file, old, new = NONE["no ModelParams"]
+    replace_once(checkout / file, old, new)
+    before = contents(checkout)
+    for words in (["apply", "--dry-run"], ["apply", "--modernise"], ["diff"]):
+        assert refused(dsmoe("patch", words[0], checkout, *words[1:]), file)
+    for function in (patches.apply, patches.diff):
+        with pytest.raises(patches.PatchError, match=re.escape(file)):
+            function(checkout)
     assert contents(checkout) == before
 
 
@@ -78,7 +91,7 @@ def test_no_settings_are_left_without_the_mode(tmp_path, dsmoe):
         assert text.count("blend_mode=") == text.count("GaussianRasterizationSettings(") == 2
 
 
-@pytest.mark.parametrize("name", TRAINERS)
+@pytest.mark.parametrize("name", ["3dgs-2024", "c3dgs", "hac-plus"])
 def test_a_file_that_is_no_python_is_refused(name, tmp_path, dsmoe):
     checkout = make_checkout(name, tmp_path / "checkout")
     last = list(ENTRIES[name])[-1]

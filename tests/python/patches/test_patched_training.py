@@ -4,7 +4,6 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,52 +12,6 @@ from checkouts import TRAINERS, WITH_RENDER, contents, make_checkout
 from diff_smoe_rasterization import BLEND_MODES, patches
 
 MODES = ("alpha", "smoe")
-
-
-class Runs:
-    """Every trainer, trained in both modes, patched and not; made when a test asks for it first."""
-
-    def __init__(self, folder, scene, processes):
-        self.folder, self.scene, self.processes, self.made = folder, scene, processes, {}
-
-    def __call__(self, name):
-        if name not in self.made:
-            self.made[name] = self._make(name)
-        return self.made[name]
-
-    def script(self, name, mode):
-        """The words that train; c3dgs compresses what the trainer of 2023 has trained."""
-        if name == "c3dgs":
-            return ["compress.py", "-m", self("3dgs-2023").outputs["patched", mode], "--output_vq"]
-        return ["train.py", "-s", self.scene, "--quiet", "-m"]
-
-    def _make(self, name):
-        plain = make_checkout(name, self.folder / name / "plain")
-        patched = make_checkout(name, self.folder / name / "patched")
-        patches.apply(patched)
-        before, started = contents(plain), {}
-        outputs = {(kind, mode): self.folder / name / f"{kind}_{mode}" for kind in ("plain", "patched")
-                   for mode in MODES}
-        for (kind, mode), output in outputs.items():
-            script, *words = self.script(name, mode)
-            if kind == "patched":
-                job = self.processes.start(patched / script, *words, output, "--blend_mode", mode, cwd=patched)
-            elif mode == "alpha":  # in the checkout, as its README says
-                job = self.processes.dsmoe("run", "--blend-mode", mode, "--", "python", script, *words, output,
-                                           cwd=plain)
-            else:  # from somewhere else, with an option of Python's
-                job = self.processes.dsmoe("run", "--blend-mode", mode, "--", "python", "-u", plain / script, *words,
-                                           output, cwd=self.folder)
-            started[kind, mode] = job
-        results = {key: job.result() for key, job in started.items()}
-        for key, result in results.items():
-            assert result.status == 0, f"{name}, {key}: {result.out}\n{result.err}"
-        return SimpleNamespace(plain=plain, patched=patched, outputs=outputs, results=results, before=before)
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory, scene, processes):
-    return Runs(tmp_path_factory.mktemp("runs"), scene, processes)
 
 
 def model(output):
@@ -119,7 +72,6 @@ def test_the_flag_is_saved(name, runs):
     for mode in MODES:
         saved = (runs(name).outputs["patched", mode] / "cfg_args").read_text()
         assert f"blend_mode='{mode}'" in saved
-        assert "blend_mode" not in (runs("3dgs-2023").outputs["plain", mode] / "cfg_args").read_text()
 
 
 def rendered(runs, name, output, *words, **env):
@@ -138,24 +90,19 @@ def rendered(runs, name, output, *words, **env):
 
 
 @with_render
-def test_render_uses_the_trained_mode(name, runs):
+def test_render_uses_the_saved_mode_or_the_flag_or_alpha(name, runs):
     output = runs(name).outputs["patched", "smoe"]
-    jobs = [rendered(runs, name, output, *words) for words in ([], ["--blend_mode", "smoe"], ["--blend_mode", "alpha"])]
-    alone, named, other = (job() for job in jobs)
-    assert len(alone) == 4
-    assert alone == named
-    assert all(alone[picture] != other[picture] for picture in alone)
-
-
-@with_render
-def test_an_old_configuration_means_alpha(name, runs):
-    output = runs(name).outputs["patched", "alpha"]
-    named = rendered(runs, name, output, "--blend_mode", "alpha")
     old = shutil.copytree(output, runs.folder / f"old {name}")
-    text, count = re.subn(r", blend_mode='alpha'|blend_mode='alpha', ", "", (old / "cfg_args").read_text())
+    text, count = re.subn(r", blend_mode='smoe'|blend_mode='smoe', ", "", (old / "cfg_args").read_text())
     assert count == 1
     (old / "cfg_args").write_text(text)
-    assert rendered(runs, name, old)() == named() != {}
+    jobs = [rendered(runs, name, output), rendered(runs, name, output, "--blend_mode", "smoe"),
+            rendered(runs, name, output, "--blend_mode", "alpha"), rendered(runs, name, old)]
+    alone, smoe, alpha, without_the_field = (job() for job in jobs)
+    assert len(alone) == 4
+    assert alone == smoe
+    assert without_the_field == alpha
+    assert all(smoe[picture] != alpha[picture] for picture in smoe)
 
 
 @pytest.mark.parametrize("name", ["hac", "hac-plus"])
@@ -178,7 +125,7 @@ def test_a_wrong_mode_is_refused_before_anything_is_loaded(name, runs, tmp_path)
     if name != "c3dgs":
         words[words.index("-s") + 1] = tmp_path / "no scene"
     jobs = [runs.processes.start(patched / script, *words, tmp_path / "out", "--blend_mode", "smooth", cwd=patched)]
-    if name in WITH_RENDER:
+    if name == "3dgs-2023":
         jobs.append(runs.processes.start(patched / "render.py", "-m", runs("3dgs-2023").outputs["patched", "smoe"],
                                          "--blend_mode", "smooth", cwd=patched))
     for job in jobs:
@@ -252,6 +199,5 @@ def test_scripts_that_build_commands_pass_the_mode_on(runs, tmp_path):
         assert job.result().status == 0, job.result().err
     trained = tmp_path / "eval" / runs.scene.name
     assert same_bits(model(trained), model(runs("3dgs-2023").outputs["patched", "smoe"]))
-    shown = pictures(trained)
-    assert shown == rendered(runs, "3dgs-2023", trained, "--skip_train", "--blend_mode", "smoe")() != {}
+    assert pictures(trained) == rendered(runs, "3dgs-2023", trained, "--skip_train", "--blend_mode", "smoe")() != {}
     assert "blend_mode='smoe'" in (shell / "outputs" / "db" / "chairs" / "0.004" / "cfg_args").read_text()

@@ -1,9 +1,10 @@
 """The part of this package that HAC asks for."""
-import torch
 
 
 def scatter_max(values, index, dim):
     """The largest value of each index along dim 0, and the row that it is in."""
+    import torch
+
     size = [int(index.max()) + 1, *values.shape[1:]]
     largest = torch.full(size, float("-inf")).scatter_reduce(dim, index, values, "amax")
     rows = torch.arange(len(values))[:, None].expand_as(values)

@@ -1,0 +1,31 @@
+"""What c3dgs imports from its extension `weighted_distance`, in plain torch: the nearest row of a codebook."""
+from __future__ import annotations
+
+from typing import Tuple
+
+import torch
+
+__all__ = ["weightedDistance"]
+
+DISTANCES_AT_ONCE = 2 ** 26  # 256 MiB of float32
+
+
+def weightedDistance(coefs: torch.Tensor, codebook: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+    """Returns each row's squared distance [N] to the nearest row of the codebook, and the number [N] of that, int64.
+
+    coefs: [N, K]; codebook: [C, K], C > 0, of the same type and on the same device. No gradient.
+    Raises ValueError where the shapes do not fit.
+    """
+    if coefs.dim() != 2 or codebook.dim() != 2 or coefs.shape[1] != codebook.shape[1] or not len(codebook):
+        raise ValueError(f"weightedDistance: coefs has shape {list(coefs.shape)}, codebook {list(codebook.shape)}; "
+                         "they must be [N, K] and [C, K] with C > 0")
+    distances = coefs.new_empty(len(coefs))
+    indices = torch.empty(len(coefs), dtype=torch.int64, device=coefs.device)
+    rows = max(1, DISTANCES_AT_ONCE // len(codebook))
+    for begin in range(0, len(coefs), rows):
+        part = slice(begin, begin + rows)
+        # By differences: by products of matrices, small distances would lose their digits.
+        nearest = torch.cdist(coefs[part].detach(), codebook.detach(),
+                              compute_mode="donot_use_mm_for_euclid_dist").min(1)
+        distances[part], indices[part] = nearest.values.square(), nearest.indices
+    return distances, indices

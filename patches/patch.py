@@ -1,0 +1,100 @@
+"""The rules of a trainer, applied to its files in memory."""
+from __future__ import annotations
+
+from typing import Dict, List, NamedTuple, Tuple
+
+from . import codemods, modernise, source
+from .errors import PatchError
+from .record import FOLDER
+from .rules import RASTERIZER, ImportRasterizer, Trainer
+
+
+class Change(NamedTuple):
+    """What becomes of one file."""
+
+    name: str  # relative to the checkout
+    before: bytes
+    after: bytes
+    rules: Tuple[str, ...]
+
+
+class Patch:
+    """What the rules of a trainer make of its files; those files that none of them changes are not in it."""
+
+    def __init__(self, files: Dict[str, bytes], trainer: Trainer) -> None:
+        self.files, self.trees, self.writers = files, {}, {}
+        self.rules: Dict[str, List[str]] = {}  # of each file, those that changed it
+        self.problems: List[str] = []  # why it cannot be patched
+        self.pending: List[str] = []
+        self.done: List[str] = []
+        self.notes: List[str] = []
+        for rule in trainer.rules:
+            if rule.file not in files:
+                self.problems.append(f"{rule.file}: rule {rule.name}: there is no such file; expected is {rule.right}")
+                continue
+            try:
+                outcome = self._run(codemods.run, rule, rule.file)
+            except PatchError as error:
+                self.problems.append(str(error))
+                continue
+            found = outcome.pending + outcome.done
+            line = f"{rule.file}: rule {rule.name}"
+            if found != rule.expected or outcome.misfits:
+                misfits = f", and {outcome.misfits} that look alike" if outcome.misfits else ""
+                self.problems.append(f"{line}: {found} matches instead of {rule.expected}{misfits}; right would be "
+                                     f"{rule.right}")
+            if outcome.pending:
+                self.pending.append(line)
+            if outcome.done:
+                self.done.append(line)
+        # A script of the user's that imports the rasterizer must not get another one than the trainer's own files.
+        known = {rule.file for rule in trainer.rules if isinstance(rule, ImportRasterizer)}
+        for name in sorted(set(files) - known):
+            if RASTERIZER.encode() in files[name] and not name.startswith("submodules/"):
+                self._changes(codemods.run, ImportRasterizer(name, trainer.flavour), name)
+                if f"from {RASTERIZER}._C ".encode() in files[name]:
+                    self.notes.append(f"{name}: the import from {RASTERIZER}._C stays; where it fails, the file has to do "
+                                      "without what it names")
+
+    def modernise(self) -> None:
+        """Applies the modernise rules, and notes of each what it changed."""
+        for rule in modernise.RULES:
+            changed = [name for name in sorted(self.files)
+                       if rule.looks_at(self.files[name]) and self._changes(modernise.run, rule, name)]
+            self.notes.append(f"modernise {rule.name}: " + (f"{', '.join(changed)}: {rule.reason}" if changed
+                                                            else "skipped, nothing matches"))
+
+    def _changes(self, run, rule, name: str) -> bool:
+        """Applies a rule that may match or not; a file that cannot be read is left as it is."""
+        try:
+            return self._run(run, rule, name).pending > 0
+        except PatchError as error:
+            note = f"left as it is: {error}"
+            self.notes += [note] if note not in self.notes else []
+            return False
+
+    def state(self) -> Tuple[str, List[str]]:
+        if self.problems:
+            return "drifted", self.problems
+        if self.done and self.pending:
+            return "half-patched", ([f"{line}: is not applied" for line in self.pending]
+                                    + [f"{line}: is applied already" for line in self.done])
+        if self.done:
+            return "patched", [f"every rule is applied; there is no {FOLDER}, so `revert` cannot undo it"]
+        return "patchable", []
+
+    def changes(self) -> Tuple[Change, ...]:
+        changes = []
+        for name, rules in self.rules.items():
+            after = self.writers[name](self.trees[name])
+            changes.append(Change(name, self.files[name], after, tuple(rules)))
+        return tuple(changes)
+
+    def _run(self, run, rule, name: str):
+        if name not in self.trees:
+            self.trees[name], self.writers[name] = source.parse(name, self.files[name])
+        outcome = run(rule, self.trees[name])
+        self.trees[name] = outcome.tree
+        if outcome.pending:
+            self.rules.setdefault(name, []).append(rule.name)
+        return outcome

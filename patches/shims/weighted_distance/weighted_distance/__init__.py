@@ -1,0 +1,1 @@
+"""For `dsmoe run`, where weighted_distance is not installed."""

@@ -1,0 +1,30 @@
+"""weightedDistance against all distances in float64."""
+from __future__ import annotations
+
+import pytest
+import torch
+
+from diff_smoe_rasterization.integrations import weighted_distance
+
+
+@pytest.mark.parametrize("at_once", [2 ** 26, 50, 1])
+def test_the_nearest_row(monkeypatch, at_once):
+    """However many are compared at once. Rows lie close together, far from 0, where products would lose them."""
+    monkeypatch.setattr(weighted_distance, "DISTANCES_AT_ONCE", at_once)
+    torch.manual_seed(0)
+    coefs, codebook = 100 + torch.rand(37, 6), 100 + torch.rand(11, 6)
+    distances, indices = weighted_distance.weightedDistance(coefs, codebook)
+    every = (coefs.double()[:, None] - codebook.double()).square().sum(2)
+    assert distances.dtype == torch.float32 and indices.dtype == torch.int64
+    # Differences of these float32 numbers are exact; six squares, a sum, a root and a square round ten times at most.
+    torch.testing.assert_close(distances.double(), every.min(1).values, rtol=10 * 2 ** -23, atol=0)
+    assert (indices == every.min(1).indices).all()
+
+
+def test_no_rows_and_wrong_shapes():
+    distances, indices = weighted_distance.weightedDistance(torch.zeros(0, 3), torch.zeros(2, 3))
+    assert distances.shape == indices.shape == (0,)
+    for coefs, codebook in ((torch.zeros(4, 3), torch.zeros(2, 4)), (torch.zeros(4, 3), torch.zeros(0, 3)),
+                            (torch.zeros(3), torch.zeros(2, 3))):
+        with pytest.raises(ValueError, match="weightedDistance: coefs has shape"):
+            weighted_distance.weightedDistance(coefs, codebook)
