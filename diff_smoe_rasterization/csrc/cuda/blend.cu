@@ -7,45 +7,32 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// Where the sums of a segment lie until the pixel is made: those of the first one in the image itself.
-template <class S>
-__device__ S& segment_sum(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment, int k, int f) {
-  if (segment > 0) return segment_pixel(arguments.saved, tile, segment, k).sums[f];
-  const int64_t pixels = int64_t(arguments.width) * arguments.height;
-  return feature_image(arguments.config, arguments.images, f, pixels)[tile.pixel_index(arguments, k)];
-}
-
-// Ends the segment in front of `segment` and begins that one.
+// Notes the pixels' state where a segment begins, and that the backward pass has something to do there.
 template <class S, int kSums>
-__device__ void next_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
-                             const PixelState<S> (&state)[kLanePixels], S (&sums)[kLanePixels][kSums]) {
+__device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
+                              const PixelState<S> (&state)[kLanePixels], const S (&sums)[kLanePixels][kSums]) {
 #pragma unroll
   for (int k = 0; k < kLanePixels; ++k) {
-    if (!tile.inside(arguments, k)) continue;
-    segment_pixel(arguments.saved, tile, segment, k).transmittance = abs(state[k].transmittance);
-#pragma unroll
-    for (int f = 0; f < kSums; ++f) {
-      segment_sum(arguments, tile, segment - 1, k, f) = sums[k][f];
-      sums[k][f] = S(0);
-    }
+    SegmentPixel<S> begin = {abs(state[k].transmittance), {}};
+    for (int f = 0; f < kSums; ++f) begin.sums[f] = sums[k][f];
+    segment_pixel(arguments.saved, tile, segment, k) = begin;
   }
   if (tile.lane == 0) {
     segment_queue(arguments.saved).push(tile.tile_y * arguments.tile_columns + tile.tile_x, tile.quarter, segment);
   }
 }
 
-// Ends the last segment, and makes the sums those of the whole list.
+// At the end of the list: from the sums in front of each segment to those behind.
 template <class S, int kSums>
-__device__ void join_segments(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int last,
-                              S (&sums)[kLanePixels][kSums]) {
-#pragma unroll
-  for (int k = 0; k < kLanePixels; ++k) {
-    if (!tile.inside(arguments, k)) continue;
-#pragma unroll
-    for (int f = 0; f < kSums; ++f) {
-      segment_sum(arguments, tile, last, k, f) = sums[k][f];
+__device__ void end_segments(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int last,
+                             const S (&sums)[kLanePixels][kSums]) {
 #pragma unroll 1
-      for (int before = last - 1; before >= 0; --before) sums[k][f] += segment_sum(arguments, tile, before, k, f);
+  for (int segment = 1; segment <= last; ++segment) {
+#pragma unroll
+    for (int k = 0; k < kLanePixels; ++k) {
+      SegmentPixel<S> begin = segment_pixel(arguments.saved, tile, segment, k);
+      for (int f = 0; f < kSums; ++f) begin.sums[f] = sums[k][f] - begin.sums[f];
+      segment_pixel(arguments.saved, tile, segment, k) = begin;
     }
   }
 }
@@ -73,7 +60,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   for (int32_t chunk = 0; chunk < tile.length; chunk += kWarp) {
     if constexpr (kSegments) {
       if (segments && chunk == (segment + 1) * kSegmentLength) {
-        next_segment(arguments, tile, ++segment, state, sums);
+        begin_segment(arguments, tile, ++segment, state, sums);
       }
     }
     const bool meets = meets_pixels(next, tile);
@@ -103,9 +90,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
       if (!__any_sync(kAllLanes, open)) break;
     }
   }
-  if constexpr (kSegments) {
-    if (segment > 0) join_segments(arguments, tile, segment, sums);
-  }
+  if constexpr (kSegments) end_segments(arguments, tile, segment, sums);
 
   const int64_t pixels = int64_t(arguments.width) * arguments.height;
   for (int k = 0; k < kLanePixels; ++k) {
@@ -128,9 +113,8 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   }
 }
 
-// Ten blocks a multiprocessor: what the segments need is kept out of the inner loop's registers.
 template <class S, BlendMode kMode, int kFeatures>
-__global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 ? 10 : 1)
+__global__ void __launch_bounds__(kWarpsPerTile* kWarp)
     blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
   __shared__ StagedGaussian<S> staged[kWarpsPerTile][kWarp];
   const WarpTile<S> tile(arguments);

@@ -175,14 +175,12 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
     if (segment + 1 < segments) {
       for (int k = 0; k < kLanePixels; ++k) {
         if (!tile.inside(arguments, k)) continue;
+        const SegmentPixel<S> next_begin = segment_pixel(arguments.saved, tile, segment + 1, k);
         S behind = S(0);
-        for (int later = segment + 1; later < segments; ++later) {
-          const SegmentPixel<S>& at = segment_pixel(arguments.saved, tile, later, k);
-          for (int f = 0; f < kSegmentFeatures; ++f)
-            behind = fma(scaled.get(arguments, tile, k, f), at.sums[f], behind);
+        for (int f = 0; f < kSegmentFeatures; ++f) {
+          behind = fma(scaled.get(arguments, tile, k, f), next_begin.sums[f], behind);
         }
-        const S transmittance = segment_pixel(arguments.saved, tile, segment + 1, k).transmittance;
-        resume_backward<kMode>(pixel[k], transmittance, behind);
+        resume_backward<kMode>(pixel[k], next_begin.transmittance, behind);
       }
       end = begin + kSegmentLength;
     }

@@ -18,7 +18,7 @@ static_assert(kSegmentRow == kTileSize * kTileSize * (1 + kSegmentFeatures), "a 
 // One pixel where a segment begins.
 template <class S> struct alignas(4 * sizeof(S)) SegmentPixel {
   S transmittance;           // in front of the segment
-  S sums[kSegmentFeatures];  // sum w c over the segment alone
+  S sums[kSegmentFeatures];  // sum w c from there to the end of the list; in front of there until the end is known
 };
 
 // The lane's pixel k in a segment of its tile, the first segment aside.
