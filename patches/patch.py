@@ -87,7 +87,7 @@ class Patch:
         changes = []
         for name, rules in self.rules.items():
             after = self.writers[name](self.trees[name])
-            changes.append(Change(name, self.files[name], after, tuple(rules)))
+            changes.append(Change(name, self.files[name], after, tuple(dict.fromkeys(rules))))
         return tuple(changes)
 
     def _run(self, run, rule, name: str):

@@ -67,7 +67,7 @@ def deferred(make: Callable[[], Callable[..., Any]]) -> Callable[..., Any]:
 
 
 def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns the metric, whose value is NaN, with a warning, where its weights cannot be downloaded.
+    """Returns the metric, whose value is NaN, with a warning, where it is not installed or cannot download its weights.
 
     A measurement then does not end a training of hours. The first failure is remembered: later calls do not wait.
     """
@@ -80,9 +80,9 @@ def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
         if not failed:
             try:
                 return metric(*arguments, **keywords)
-            except OSError as error:  # urllib's URLError is one
+            except (ImportError, OSError) as error:  # urllib's URLError is an OSError
                 failed.append(error)
-                _warn(f"LPIPS is NaN: its weights could not be had ({error})")
+                _warn(f"LPIPS is NaN: it, or its weights, could not be had ({error})")
         return torch.tensor(float("nan"))
 
     return call

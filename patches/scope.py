@@ -45,7 +45,8 @@ def callers_out_of_reach(files: Dict[str, bytes], trainer: Trainer) -> List[str]
     return [f"{name}: renders, but no rule reaches it: before it renders it needs the statement `pipe.blend_mode = "
             "blend_mode_of(dataset)`, or it stops with an AttributeError"
             for name, modules in sorted(imports.items())
-            if name not in reached and RENDERERS & {module.rpartition(":")[2] for module in modules}]
+            if name not in reached and b".blend_mode = " not in files[name]
+            and RENDERERS & {module.rpartition(":")[2] for module in modules}]
 
 
 def _imports(data: bytes) -> Set[str]:

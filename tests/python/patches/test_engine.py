@@ -322,6 +322,7 @@ def test_what_may_not_be_written_is_refused(tmp_path):
 def test_scripts_of_the_user(tmp_path):
     """One that renders is named; one that imports the rasterizer gets the trainer's own."""
     folder = make(tmp_path, {"video.py": "from gaussian_renderer import render\n", "utils/score.py": "import math\n",
+                             "film.py": "from gaussian_renderer import render\npipe.blend_mode = 'smoe'\n",
                              "viewer.py": "from diff_gaussian_rasterization import GaussianRasterizer\n",
                              "python2.py": "print 'diff_gaussian_rasterization'\n",
                              "utils/loss.py": "try:\n    from diff_gaussian_rasterization._C import fusedssim\n"

@@ -105,6 +105,10 @@ def test_a_metric_is_nan_where_its_weights_cannot_be_had():
         assert torch.isnan(metric(2.0))
     assert torch.isnan(metric(1.0)) and calls == [1.0, 2.0]
 
+    absent = runtime.optional_import("there_is_no_such_module")
+    with pytest.warns(UserWarning, match="there_is_no_such_module"):
+        assert torch.isnan(runtime.nan_without_network(runtime.deferred(lambda: absent.LPIPS()))(1.0))
+
     @runtime.nan_without_network
     def wrong(value):
         raise ValueError("a bug is no missing network")
