@@ -63,8 +63,9 @@ class TrainingStep:
 def assert_same(actual, expected):
     torch.testing.assert_close(actual[0], expected[0], rtol=1e-5, atol=1e-5)  # another kernel may sum in another order
     assert torch.equal(actual[1], expected[1])
-    # Long lists are walked in segments, and whole where they are outgrown: T is rounded in other places.
-    assert_same_gradients(actual[2], expected[2], 3e-5)
+    # Long lists are walked in segments, and whole where they are outgrown: T is rounded in other places, thousands of
+    # times, before terms that cancel in part are summed.
+    assert_same_gradients(actual[2], expected[2], 1e-4)
 
 
 def scene_of(mode, seed=0, **options):
