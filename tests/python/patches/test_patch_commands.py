@@ -14,6 +14,8 @@ from checkouts import ENTRIES, RECORD, TRAINERS, changed_files, contents, defini
 
 from diff_smoe_rasterization import patches
 
+pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
+
 
 @pytest.fixture(scope="module", params=TRAINERS)
 def story(request, tmp_path_factory, dsmoe):

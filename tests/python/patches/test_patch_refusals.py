@@ -14,6 +14,8 @@ from checkouts import ENTRIES, RECORD, TRAINERS, changed_files, contents, make_c
 
 from diff_smoe_rasterization import patches
 
+pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
+
 NOBODY = 65534
 
 

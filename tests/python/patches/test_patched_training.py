@@ -1,4 +1,4 @@
-"""Small trainers train: patched, and unmodified under `dsmoe run`, to the same bits; and the mode goes where it must."""
+"""Small trainers train, patched and unmodified under `dsmoe run`, to the same bits; the mode goes where it must."""
 from __future__ import annotations
 
 import re
@@ -10,6 +10,8 @@ import pytest
 from checkouts import TRAINERS, WITH_RENDER, contents, make_checkout
 
 from diff_smoe_rasterization import BLEND_MODES, patches
+
+pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
 MODES = ("alpha", "smoe")
 

@@ -9,6 +9,8 @@ from checkouts import TRAINERS, contents, make_checkout
 
 from diff_smoe_rasterization import patches
 
+pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
+
 
 @pytest.fixture
 def run(processes):

@@ -1,4 +1,4 @@
-"""A distance of the call of the package `lpips`, which downloads a network; this one is the mean difference of edges."""
+"""A distance with the call of the package `lpips`, which downloads a network; here, of edges."""
 import torch
 
 

@@ -22,7 +22,8 @@ def calc_importance(gaussians: GaussianModel, scene, pipeline_params):
     sums = [torch.zeros_like(tensor) for tensor in inputs]
     for view in scene.getTrainCameras():
         black = torch.zeros(3, device=shapes.device)
-        image = render(view, gaussians, pipeline_params, black, clamp_color=False, cov3d=shapes * factors ** 2)["render"]
+        cov3d = shapes * factors ** 2
+        image = render(view, gaussians, pipeline_params, black, clamp_color=False, cov3d=cov3d)["render"]
         for total, gradient in zip(sums, torch.autograd.grad(image.sum(), inputs)):
             total += gradient.abs() / image[0].numel()
     return torch.cat(sums[:2], dim=1).flatten(1), sums[2]

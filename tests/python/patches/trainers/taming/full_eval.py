@@ -16,6 +16,7 @@ flags.add_argument("--skip_rendering", action="store_true")
 args = flags.parse_args()
 
 for name in SCENES:
-    call("python train.py -s " + args.madeup + "/" + name + " -m " + args.output_path + "/" + name + " --eval --mode final_count --budget 400")
+    call("python train.py -s " + args.madeup + "/" + name + " -m " + args.output_path + "/" + name
+         + " --eval --mode final_count --budget 400")
 for name in () if args.skip_rendering else SCENES:
     call("python render.py --skip_train -m " + args.output_path + "/" + name)
