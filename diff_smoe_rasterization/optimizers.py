@@ -107,7 +107,7 @@ class _Launch:
 
     def run(self, visible: Optional[torch.Tensor] = None) -> None:
         # The op takes rows that lie one behind the other. A parameter made from a transposed array, as trainers make
-        # the first means, has other strides, and gives them to its moments.
+        # the first means, has other strides, and so have moments that a trainer made like it.
         updated = self.parameters + self.moments + self.squares
         dense = [tensor.contiguous() for tensor in updated]
         count = len(self.parameters)

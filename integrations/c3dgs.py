@@ -118,4 +118,6 @@ def _check_indices(name, indices, count, codebook_name, codebook):
         raise ValueError(f"{where}: {name}[{first}] is {indices[first].item()}; it must be at least 0 and below "
                          f"{len(codebook)}, the number of rows of {codebook_name}")
     if version is not None:
+        for other in [other for other in _fitting.keys() if other[0] == id(indices) and other[1] != version]:
+            del _fitting[other]  # of before the tensor was changed
         _fitting[case] = indices

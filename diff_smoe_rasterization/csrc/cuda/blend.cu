@@ -52,7 +52,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     last[k] = 0;
   }
   unsigned hits = 0;
-  constexpr bool kSegments = kSums == kSegmentFeatures && sizeof(S) == sizeof(float);
+  constexpr bool kSegments = kWalksSegments<S, kSums>;
   const bool segments = kSegments && has_segments(arguments.saved, tile);
   int segment = 0;
 

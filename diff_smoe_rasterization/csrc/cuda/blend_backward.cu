@@ -168,7 +168,7 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
     end = max_over_lanes(seen);
   }
   int32_t begin = 0;
-  if (has_segments(arguments.saved, tile)) {
+  if (kWalksSegments<S, kFeatures> && has_segments(arguments.saved, tile)) {
     begin = segment * kSegmentLength;
     if (begin >= end) return;
     const int segments = (end + kSegmentLength - 1) / kSegmentLength;
@@ -299,7 +299,7 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
   arguments.slots = slots;
   arguments.num_features = config.num_features();
   arguments.tiles = static_cast<int>(tiles);
-  const int64_t blocks = tiles + (saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0);
+  const int64_t blocks = tiles + (known && saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0);
   const int64_t warps = tiles * kWarpsPerTile;
   if (dL_dbackground != nullptr) arguments.dL_dbackground_rows = allocate<S>(scratch, warps * config.num_channels);
   if (!known) {

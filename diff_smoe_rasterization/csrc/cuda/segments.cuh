@@ -29,6 +29,10 @@ __device__ SegmentPixel<S>& segment_pixel(const SavedForward<S>& saved, const Wa
   return reinterpret_cast<SegmentPixel<S>*>(saved.segments)[row * (kTileSize * kTileSize) + pixel];
 }
 
+// Which kernels know of segments, whatever the memory that they are given.
+template <class S, int kFeatures>
+constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && kFeatures == kSegmentFeatures;
+
 template <class S> __device__ bool has_segments(const SavedForward<S>& saved, const WarpTile<S>& tile) {
   return saved.segments != nullptr && tile.listed && tile.length > kSegmentLength;
 }

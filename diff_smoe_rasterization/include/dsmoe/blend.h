@@ -193,7 +193,7 @@ DSMOE_HD Real add_feature(FeatureRule rule, PixelBackward<Real>& pixel, Real gat
 }
 
 // Continues in front of pairs that another walk has taken: `transmittance` is what they met, `behind` their sum w g'.c.
-// Without a base their weights sum to the transmittance they took.
+// Where u is g'.c - b, their sum w b is b times the transmittance they took: sum w = T in front of them - T behind.
 template <BlendMode kMode, class Real>
 DSMOE_HD void resume_backward(PixelBackward<Real>& pixel, Real transmittance, Real behind) {
   const bool about_base = kMode == BlendMode::kAlpha || kMode == BlendMode::kSmoe;  // u = g'.c - b, else g'.c

@@ -103,7 +103,7 @@ template <class S>
 void count_instances(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
                      const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream);
 
-// Fills saved.num_instances, instances, tile_offsets and slot_ranges.
+// Fills saved.num_instances, instances, tile_offsets and slot_ranges, and empties segment_queue.
 template <class S>
 void bin(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
          const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream);

@@ -5,9 +5,10 @@ import pytest
 import torch
 from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
 from comparison import assert_all_close, assert_close, reference_gradients
-from scenes import camera_settings, gradients, random_scene
+from scenes import camera_settings, gradients, op_arguments, random_scene
 
 from diff_smoe_rasterization import rasterize, reference
+from diff_smoe_rasterization.extension import _C
 from diff_smoe_rasterization.settings import OUTPUTS
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.model import GaussianModel
@@ -163,6 +164,31 @@ def test_a_hundred_thousand_gaussians_in_one_tile(mode, dtype, tolerance, gpu):
     scene = random_scene(mode, 100_000, 16, 16, scale=0.05, opacity=(0.001, 0.02), degree=0, fov_x=0.3)
     rendering = compare(scene, gpu, dtype, ("alpha",), tolerance)
     assert (rendering.radii > 0).sum() > 5000
+
+
+LONG_LISTS = {
+    "faint": lambda mode: random_scene(mode, 6000, 40, 37, scale=0.3, opacity=(0.004, 0.01), degree=1),
+    # A pixel fills up in a later segment than its first.
+    "filling": lambda mode: random_scene(mode, 6000, 40, 37, scale=0.3, opacity=(0.01, 0.06), degree=1),
+    "one_channel_and_depths": lambda mode: random_scene(mode, 6000, 40, 37, scale=0.3, opacity=(0.004, 0.01),
+                                                        channels=1),
+    "deterministic": lambda mode: random_scene(mode, 6000, 40, 37, scale=0.3, opacity=(0.004, 0.03), degree=1,
+                                               deterministic=True),
+}
+
+
+@pytest.mark.sanitize
+@pytest.mark.parametrize("name", LONG_LISTS)
+def test_lists_of_several_segments(mode, name, gpu):
+    """Of float and three features, so that a warp of the backward pass has a part of a list; some tiles are partial."""
+    scene = LONG_LISTS[name](mode)
+    offsets = torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene.to(torch.float32).to(gpu)))[8]
+    assert (offsets[1:-1] - offsets[:-2]).max() > 2 * _C.constants["segment_length"]
+    # Sums of a thousand terms and more, in another order. Of 1480 pixels with a thousand pairs of alpha near 1/255 each,
+    # a few have one that lies within rounding, 1e-6 of itself, of that threshold.
+    rendering = compare(scene, gpu, torch.float32, ("depth", "inverse_depth") if "depths" in name else (),
+                        Tolerance(1e-4, 3e-4, 5e-3))
+    assert (rendering.radii > 0).sum() > 2000
 
 
 @pytest.mark.sanitize

@@ -329,6 +329,10 @@ def test_no_index_tensor_is_kept_alive(indexed):
     indexed.sh_indices = indexed.sh_indices.clone()
     call(indexed)
     assert len(c3dgs._fitting) == count
+    for _ in range(3):
+        indexed.sh_indices[0] = 1
+        call(indexed)
+    assert len(c3dgs._fitting) == count
     with torch.inference_mode():  # its tensors do not say when they change, so they are looked at each time
         indexed.sh_indices = indexed.sh_indices.clone()
         call(indexed)
