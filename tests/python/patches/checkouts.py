@@ -8,8 +8,9 @@ import shutil
 import stat
 from pathlib import Path
 
+import diff_smoe_rasterization
+
 HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[2]
 PACKAGES = HERE / "packages"  # what the trainers import beside the rasterizer
 RECORD = ".dsmoe_patch"
 
@@ -88,4 +89,5 @@ def environment(**more):
     """Of a process of a trainer: this package, what else trainers import, one thread."""
     kept = {name: value for name, value in os.environ.items()
             if name not in ("PYTHONDONTWRITEBYTECODE", "DSMOE_BLEND_MODE")}
-    return {**kept, "PYTHONPATH": os.pathsep.join([str(PACKAGES), str(ROOT)]), "OMP_NUM_THREADS": "1", **more}
+    above = Path(diff_smoe_rasterization.__file__).resolve().parent.parent  # where it is installed, or the source tree
+    return {**kept, "PYTHONPATH": os.pathsep.join([str(PACKAGES), str(above)]), "OMP_NUM_THREADS": "1", **more}
