@@ -82,6 +82,10 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     planned = plan(path, modernise, trainer)
     root, record = planned.root, planned.record
     if planned.verdict == "patched" and record is None:
+        if modernise and planned.changes:
+            raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
+                             f"checkout is patched and has no {FOLDER}: take the patch back by your version control, then "
+                             "apply it with --modernise")
         return planned
     states = record.states() if record else {}
     edited = [name for name, state in states.items() if state == "changed"]

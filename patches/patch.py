@@ -53,8 +53,8 @@ class Patch:
             if RASTERIZER.encode() in files[name] and not name.startswith("submodules/"):
                 self._changes(codemods.run, ImportRasterizer(name, trainer.flavour), name)
                 if f"from {RASTERIZER}._C ".encode() in files[name]:
-                    self.notes.append(f"{name}: the import from {RASTERIZER}._C stays; where it fails, the file has to do "
-                                      "without what it names")
+                    self.notes.append(f"{name}: the import from {RASTERIZER}._C stays; where it fails, the file has to "
+                                      "do without what it names")
 
     def modernise(self) -> None:
         """Applies the modernise rules, and notes of each what it changed."""

@@ -143,8 +143,12 @@ def remove_rest(root: Path) -> bool:
     """Removes what is left of a patch that was interrupted before it changed a file; returns whether there was such."""
     folder = root / FOLDER
     copies = [path for path in (folder / "originals").rglob("*") if path.is_file()]
-    if not folder.is_dir() or any(path.read_bytes() != (root / path.relative_to(folder / "originals")).read_bytes()
-                                  for path in copies):
+
+    def is_original(copy: Path) -> bool:
+        file = root / copy.relative_to(folder / "originals")
+        return file.is_file() and file.read_bytes() == copy.read_bytes()
+
+    if not folder.is_dir() or not all(is_original(copy) for copy in copies):
         return False
     shutil.rmtree(folder)
     return True

@@ -86,12 +86,13 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str]:
         raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(facts.names())}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(flavours())}")
     reasons = []
-    for folder in _folders(words):
+    folders = _folders(words)
+    for folder in folders:
         found = facts.of_checkout(lambda name: (folder / name).read_bytes() if (folder / name).is_file() else None)
         if facts.PATCHED in found or (folder / FOLDER / "manifest.json").is_file():
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
-        if (folder / RASTERIZER).exists():
+        if folder == folders[0] and (folder / RASTERIZER).exists():  # where Python looks first
             raise PatchError(f"{folder / RASTERIZER} would be imported before this package's; move it away")
         if trainer is None:
             known, reason = facts.recognise(found)
@@ -115,7 +116,7 @@ def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[Dict
     """Asks the command's Python what it can import. Raises PatchError where that is not this package."""
     is_python = re.fullmatch(r"python[0-9.]*t?", os.path.basename(words[0])) is not None
     options = list(itertools.takewhile(lambda word: word.startswith("-"), words[1:]))
-    if is_python and {"-I", "-E"} & set(options):
+    if is_python and any(re.match("-[a-zA-Z]*[IE]", option) for option in options):
         raise PatchError(f"{words[0]} {' '.join(options)}: does not look at PYTHONPATH, where the rasterizer is found")
     python = words[0] if is_python else next((name for name in ("python", "python3")
                                               if shutil.which(name, path=environment.get("PATH"))), None)

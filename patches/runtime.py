@@ -98,4 +98,4 @@ class _Absent:
 
 @functools.lru_cache(maxsize=None)
 def _warn(text: str) -> None:
-    warnings.warn("diff_smoe_rasterization: " + text, stacklevel=4)
+    warnings.warn("diff_smoe_rasterization: " + text, stacklevel=3)

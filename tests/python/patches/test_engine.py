@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import stat
 from pathlib import Path
 
@@ -362,3 +363,14 @@ def test_in_public_checkouts_only_the_statements_change(name):
                   "pipeline_params.blend_mode = blend_mode_of(model_params)")
     assert all(line.startswith(statements) for line in added)
     assert digest == hashlib.sha256(repr(sorted(snapshot(folder).items())).encode()).hexdigest()
+
+
+def test_modernise_is_refused_where_only_the_patch_is_there_and_no_record(tmp_path):
+    checkout = make(tmp_path)
+    patches.apply(checkout)
+    shutil.rmtree(checkout / ".dsmoe_patch")
+    before = snapshot(checkout)
+    assert not patches.apply(checkout).written
+    with pytest.raises(patches.PatchError, match="checkpoint-load is not applied"):
+        patches.apply(checkout, modernise=True)
+    assert snapshot(checkout) == before

@@ -121,7 +121,10 @@ def test_what_would_not_use_the_rasterizer_is_refused(tmp_path, dsmoe):
     words = ("run", "--blend-mode", "smoe", "--")
     refused(dsmoe(*words, cwd=checkout), "there is no command")
     refused(dsmoe(*words, "no-such-command", cwd=checkout), "no-such-command")
-    refused(dsmoe(*words, sys.executable, "-I", "train.py", cwd=checkout), "PYTHONPATH")
+    for option in ("-I", "-sE"):
+        refused(dsmoe(*words, sys.executable, option, "train.py", cwd=checkout), "PYTHONPATH")
+    (tmp_path / "diff_gaussian_rasterization").mkdir()  # above the checkout, where no Python looks
+    run.prepare([sys.executable, str(checkout / "train.py")], "smoe", None, environment())
     (checkout / "diff_gaussian_rasterization").mkdir()
     refused(dsmoe(*words, sys.executable, "train.py", cwd=checkout), "diff_gaussian_rasterization would be imported")
     patched = make(tmp_path / "patched", {GR: RENDERER.replace("diff_gaussian_rasterization import",
