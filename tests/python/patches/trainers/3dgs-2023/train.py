@@ -16,7 +16,7 @@ from utils.loss_utils import l1_loss, ssim
 
 
 def training(dataset, opt, pipe, testing_iterations, saving_iterations, checkpoint_iterations, checkpoint, debug_from):
-    prepare_output_and_logger(dataset)
+    make_output_folder(dataset)
     model = GaussianModel(dataset.sh_degree)
     world = Scene(dataset, model)
     model.training_setup(opt)
@@ -61,7 +61,7 @@ def densify(model, result, opt, step, extent):
         model.reset_opacity()
 
 
-def prepare_output_and_logger(args):
+def make_output_folder(args):
     args.model_path = args.model_path or os.path.join("output", uuid.uuid4().hex[:10])
     write_cfg_args(args.model_path, args)
 
@@ -79,7 +79,7 @@ if __name__ == "__main__":
     args = flags.parse_args()
 
     safe_state(args.quiet)
-    network_gui.init(args.ip, args.port)
+    network_gui.init(host=args.ip, port=args.port)
     training(model_flags.extract(args), step_flags.extract(args), pipe_flags.extract(args), args.test_iterations,
              args.save_iterations + [args.iterations], args.checkpoint_iterations, args.start_checkpoint,
              args.debug_from)

@@ -18,8 +18,8 @@ except ImportError:
     HAS_SPARSE_ADAM = False
 
 
-def render_set(model_path, name, iteration, views, gaussians, pipeline, background, train_test_exp, separate_sh):
-    folder = os.path.join(model_path, name, f"ours_{iteration}", "renders")
+def save_pictures(output, views, gaussians, pipeline, background, train_test_exp, separate_sh):
+    folder = os.path.join(output, "renders")
     for index, view in enumerate(views):
         result = render(view, gaussians, pipeline, background, use_trained_exp=train_test_exp, separate_sh=separate_sh)
         save_image(result["render"], os.path.join(folder, f"{index:05d}.png"))
@@ -34,8 +34,8 @@ def render_sets(dataset: ModelParams, iteration: int, pipeline: PipelineParams, 
         if not skip_test:
             sets["test"] = world.getTestCameras()
         for name, views in sets.items():
-            render_set(dataset.model_path, name, world.loaded_iter, views, model, pipeline, background_of(dataset),
-                       dataset.train_test_exp, separate_sh)
+            output = os.path.join(dataset.model_path, name, f"ours_{world.loaded_iter}")
+            save_pictures(output, views, model, pipeline, background_of(dataset), dataset.train_test_exp, separate_sh)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ def training(dataset, opt, pipe, testing_iterations, saving_iterations, checkpoi
     if opt.optimizer_type == "sparse_adam" and not HAS_SPARSE_ADAM:
         sys.exit("this rasterizer brings no sparse Adam")
 
-    prepare_output_and_logger(dataset)
+    make_output_folder(dataset)
     model = GaussianModel(dataset.sh_degree, opt.optimizer_type)
     world = Scene(dataset, model)
     model.training_setup(opt, [view.image_name for view in world.getTrainCameras()])
@@ -90,7 +90,7 @@ def densify(model, result, opt, step, extent):
         model.reset_opacity()
 
 
-def prepare_output_and_logger(args):
+def make_output_folder(args):
     args.model_path = args.model_path or os.path.join("output", uuid.uuid4().hex[:10])
     write_cfg_args(args.model_path, args)
 
@@ -109,7 +109,7 @@ if __name__ == "__main__":
 
     safe_state(args.quiet)
     if not args.disable_viewer:
-        network_gui.init(args.ip, args.port)
+        network_gui.init(host=args.ip, port=args.port)
     training(model_flags.extract(args), step_flags.extract(args), pipe_flags.extract(args), args.test_iterations,
              args.save_iterations + [args.iterations], args.checkpoint_iterations, args.start_checkpoint,
              args.debug_from)

@@ -12,8 +12,8 @@ from utils.image_utils import save_image
 from utils.loops import background_of
 
 
-def render_set(model_path, name, iteration, views, gaussians, pipeline, background):
-    folder = os.path.join(model_path, name, f"ours_{iteration}", "renders")
+def save_pictures(output, views, gaussians, pipeline, background):
+    folder = os.path.join(output, "renders")
     for index, view in enumerate(views):
         image = render(view, gaussians, pipeline, background)["render"]
         save_image(image, os.path.join(folder, f"{index:05d}.png"))
@@ -27,7 +27,8 @@ def render_sets(dataset: ModelParams, iteration: int, pipeline: PipelineParams, 
         if not skip_test:
             sets["test"] = world.getTestCameras()
         for name, views in sets.items():
-            render_set(dataset.model_path, name, world.loaded_iter, views, model, pipeline, background_of(dataset))
+            output = os.path.join(dataset.model_path, name, f"ours_{world.loaded_iter}")
+            save_pictures(output, views, model, pipeline, background_of(dataset))
 
 
 if __name__ == "__main__":

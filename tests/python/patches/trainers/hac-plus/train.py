@@ -10,7 +10,7 @@ from tqdm import tqdm
 from arguments import ModelParams, OptimizationParams, PipelineParams
 from gaussian_renderer import network_gui, prefilter_voxel, render
 from scene import GaussianModel, Scene
-from utils.encodings import get_binary_vxl_size
+from utils.encodings import mask_bits
 from utils.flags import TRAINING, add_flags
 from utils.general_utils import safe_state
 from utils.image_utils import psnr, save_image
@@ -23,12 +23,8 @@ run_codec = True
 
 def training(args_param, dataset, opt, pipe, dataset_name, testing_iterations, saving_iterations,
              checkpoint_iterations, checkpoint, debug_from, wandb=None, logger=None, ply_path=None):
-    prepare_output_and_logger(dataset)
-    is_synthetic_nerf = os.path.exists(os.path.join(dataset.source_path, "transforms_train.json"))
-    model = GaussianModel(dataset.feat_dim, dataset.n_offsets, dataset.voxel_size, dataset.update_depth,
-                          dataset.update_init_factor, dataset.update_hierachy_factor, dataset.use_feat_bank,
-                          n_features_per_level=args_param.n_features, log2_hashmap_size=args_param.log2,
-                          log2_hashmap_size_2D=args_param.log2_2D, is_synthetic_nerf=is_synthetic_nerf)
+    make_output_folder(dataset)
+    model = GaussianModel(dataset)
     world = Scene(dataset, model, ply_path=ply_path)
     model.training_setup(opt)
 
@@ -42,7 +38,7 @@ def training(args_param, dataset, opt, pipe, dataset_name, testing_iterations, s
 
         view = next(views)
         visible = prefilter_voxel(view, model, pipe, fixed)
-        result = render(view, model, pipe, fixed, visible_mask=visible, retain_grad=step < opt.update_until, step=step)
+        result = render(view, model, pipe, fixed, visible_mask=visible, step=step)
         image, target = result["render"], view.original_image
         loss = torch.lerp(l1_loss(image, target), 1 - ssim(image, target), opt.lambda_dssim)
         loss = loss + 0.01 * result["scaling"].prod(dim=1).mean() + args_param.lmbda * model._mask.sigmoid().mean()
@@ -63,7 +59,7 @@ def training(args_param, dataset, opt, pipe, dataset_name, testing_iterations, s
                                         grad_threshold=opt.densify_grad_threshold, min_opacity=opt.min_opacity)
 
 
-def prepare_output_and_logger(args):
+def make_output_folder(args):
     args.model_path = args.model_path or os.path.join("output", uuid.uuid4().hex[:10])
     write_cfg_args(args.model_path, args)
 
@@ -73,7 +69,7 @@ def training_report(tb_writer, dataset_name, step, testing_iterations, world: Sc
     if step not in testing_iterations:
         return
     world.gaussians.eval()
-    logger.info(f"masks: {get_binary_vxl_size(world.gaussians.get_mask)[1]:.9g} bits")
+    logger.info(f"masks: {mask_bits(world.gaussians.get_mask)[1]:.9g} bits")
     for view in world.getTestCameras():
         visible = prefilter_voxel(view, world.gaussians, *renderArgs)
         image = renderFunc(view, world.gaussians, *renderArgs, visible_mask=visible)["render"].clamp(0, 1)
@@ -82,8 +78,8 @@ def training_report(tb_writer, dataset_name, step, testing_iterations, world: Sc
     world.gaussians.train()
 
 
-def render_set(model_path, name, iteration, views, gaussians, pipeline, background):
-    folder = os.path.join(model_path, name, f"ours_{iteration}", "renders")
+def save_pictures(output, views, gaussians, pipeline, background):
+    folder = os.path.join(output, "renders")
     for index, view in enumerate(views):
         visible = prefilter_voxel(view, gaussians, pipeline, background)
         image = render(view, gaussians, pipeline, background, visible_mask=visible)["render"]
@@ -93,34 +89,29 @@ def render_set(model_path, name, iteration, views, gaussians, pipeline, backgrou
 def render_sets(args_param, dataset: ModelParams, iteration: int, pipeline: PipelineParams, skip_train=True,
                 skip_test=False, wandb=None, tb_writer=None, dataset_name=None, logger=None):
     with torch.no_grad():
-        is_synthetic_nerf = os.path.exists(os.path.join(dataset.source_path, "transforms_train.json"))
-        model = GaussianModel(dataset.feat_dim, dataset.n_offsets, dataset.voxel_size, dataset.update_depth,
-                              dataset.update_init_factor, dataset.update_hierachy_factor, dataset.use_feat_bank,
-                              n_features_per_level=args_param.n_features, log2_hashmap_size=args_param.log2,
-                              log2_hashmap_size_2D=args_param.log2_2D, decoded_version=run_codec,
-                              is_synthetic_nerf=is_synthetic_nerf)
+        model = GaussianModel(dataset, decoded=run_codec)
         world = Scene(dataset, model, load_iteration=iteration, shuffle=False)
         model.eval()
         if not skip_test:
-            render_set(dataset.model_path, "test", world.loaded_iter, world.getTestCameras(), model, pipeline,
-                       background_of(dataset))
+            output = os.path.join(dataset.model_path, "test", f"ours_{world.loaded_iter}")
+            save_pictures(output, world.getTestCameras(), model, pipeline, background_of(dataset))
 
 
-def get_logger(path):
-    logger = logging.getLogger("trainer")
-    logger.setLevel(logging.INFO)
-    logger.addHandler(logging.FileHandler(os.path.join(path, "outputs.log")))
-    return logger
+def log_of(folder):
+    os.makedirs(folder, exist_ok=True)
+    made = logging.getLogger("trainer")
+    made.addHandler(logging.FileHandler(os.path.join(folder, "outputs.log")))
+    made.setLevel("INFO")
+    return made
 
 
 if __name__ == "__main__":
     flags = ArgumentParser(description="Trains anchors and their networks for a few steps, and renders the result.")
     model_flags, step_flags, pipe_flags = ModelParams(flags), OptimizationParams(flags), PipelineParams(flags)
-    add_flags(flags, warmup=False, log2=13, log2_2D=15, n_features=4, lmbda=0.001, gpu="-1", **TRAINING)
+    add_flags(flags, warmup=False, lmbda=0.001, gpu="-1", **TRAINING)
     args = flags.parse_args()
 
-    os.makedirs(args.model_path, exist_ok=True)
-    logger = get_logger(args.model_path)
+    logger = log_of(args.model_path)
     experiment = args.model_path.split("/")[-2]
     logger.info(f"experiment {experiment}")
 

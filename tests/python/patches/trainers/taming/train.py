@@ -20,7 +20,7 @@ from utils.taming_utils import compute_gaussian_score, get_count_array, get_edge
 
 def training(dataset, opt, pipe, testing_iterations, saving_iterations, checkpoint_iterations, checkpoint, debug_from,
              websockets, score_coefficients, args):
-    prepare_output_and_logger(dataset)
+    make_output_folder(dataset)
     model = GaussianModel(dataset.sh_degree, opt.optimizer_type)
     world = Scene(dataset, model)
     model.training_setup(opt)
@@ -76,7 +76,7 @@ def densify(world, model, result, opt, pipe, bg, step, args, score_coefficients,
         model.reset_opacity()
 
 
-def prepare_output_and_logger(args):
+def make_output_folder(args):
     args.model_path = args.model_path or os.path.join("output", uuid.uuid4().hex[:10])
     write_cfg_args(args.model_path, args)
 
@@ -96,7 +96,7 @@ if __name__ == "__main__":
 
     safe_state(args.quiet)
     if args.websockets:
-        network_gui_ws.init(args.ip, args.port)
+        network_gui_ws.init(host=args.ip, port=args.port)
     coefficients = dict(gradient=2.0, opacity=3.0, size=2.0, depth=0.5, radius=0.5, distance=4.0, weight=1.0, count=0.1,
                         blend=4.0, error=1.0, edges=1.0)
     training(model_flags.extract(args), step_flags.extract(args), pipe_flags.extract(args), args.test_iterations,

@@ -11,18 +11,17 @@ def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, sc
            override_color=None):
     """One picture of `pc`, with the points on the screen whose gradient densification reads."""
     view, points = viewpoint_camera, points_on_screen(pc.get_xyz)
-    raster_settings = GaussianRasterizationSettings(
+    settings = GaussianRasterizationSettings(
         image_height=int(view.image_height), image_width=int(view.image_width),
         tanfovx=math.tan(view.FoVx / 2), tanfovy=math.tan(view.FoVy / 2),
         bg=bg_color, scale_modifier=scaling_modifier,
         viewmatrix=view.world_view_transform, projmatrix=view.full_proj_transform,
-        sh_degree=pc.active_sh_degree, campos=view.camera_center,
-        prefiltered=False,
+        sh_degree=pc.active_sh_degree, campos=view.camera_center, prefiltered=False,
         debug=pipe.debug
     )
     shape = shape_arguments(pc, pipe, scaling_modifier)
 
-    image, radii = GaussianRasterizer(raster_settings=raster_settings)(
+    image, radii = GaussianRasterizer(raster_settings=settings)(
         means3D=pc.get_xyz, means2D=points, shs=pc.get_features if override_color is None else None,
         colors_precomp=override_color, opacities=pc.get_opacity, scales=shape["scales"],
         rotations=shape["rotations"], cov3D_precomp=shape["cov3D_precomp"])

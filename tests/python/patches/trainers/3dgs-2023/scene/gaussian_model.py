@@ -1,4 +1,3 @@
-import torch
 from scene.points import Points
 from utils.adam import Adam
 

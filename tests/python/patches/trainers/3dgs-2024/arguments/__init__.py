@@ -3,10 +3,6 @@ import sys
 from argparse import ArgumentParser, Namespace
 
 
-class GroupParams:
-    pass
-
-
 class ParamGroup:
     """A group of flags: one for every attribute; a leading underscore asks for a short form too."""
 
@@ -20,23 +16,14 @@ class ParamGroup:
 
     def extract(self, args):
         names = {attribute.lstrip("_") for attribute in vars(self)}
-        taken = GroupParams()
-        vars(taken).update({key: value for key, value in vars(args).items() if key in names})
-        return taken
+        return Namespace(**{key: value for key, value in vars(args).items() if key in names})
 
 
 class ModelParams(ParamGroup):
     def __init__(self, parser, sentinel=False):
-        self.sh_degree = 1
-        self._source_path = ""
-        self._model_path = ""
-        self._images = "images"
-        self._depths = ""
-        self._resolution = -1
-        self._white_background = False
-        self.train_test_exp = False
-        self.data_device = "cpu"
-        self.eval = False
+        self.eval = self.train_test_exp = self._white_background = False
+        self.data_device, self._images, self._model_path, self._source_path = "cpu", "images", "", ""
+        self._resolution, self.sh_degree, self._depths = -1, 1, ""
         super().__init__(parser, "What is loaded", sentinel)
 
     def extract(self, args):

@@ -11,7 +11,7 @@ def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, sc
            override_color=None, use_trained_exp=False):
     """One picture of `pc` and its inverse depth, with the points on the screen whose gradient densification reads."""
     view, points = viewpoint_camera, points_on_screen(pc.get_xyz)
-    raster_settings = GaussianRasterizationSettings(
+    settings = GaussianRasterizationSettings(
         image_height=int(view.image_height), image_width=int(view.image_width),
         tanfovx=math.tan(view.FoVx / 2), tanfovy=math.tan(view.FoVy / 2),
         bg=bg_color, scale_modifier=scaling_modifier,
@@ -19,7 +19,7 @@ def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, sc
         sh_degree=pc.active_sh_degree, campos=view.camera_center,
         prefiltered=False, debug=pipe.debug,
         antialiasing=pipe.antialiasing)
-    rasterizer = GaussianRasterizer(raster_settings=raster_settings)
+    rasterizer = GaussianRasterizer(raster_settings=settings)
     shape = shape_arguments(pc, pipe, scaling_modifier)
 
     if separate_sh:

@@ -3,10 +3,6 @@ import sys
 from argparse import ArgumentParser, Namespace
 
 
-class GroupParams:
-    pass
-
-
 class ParamGroup:
     """A group of flags: one for every attribute; a leading underscore asks for a short form too."""
 
@@ -20,21 +16,14 @@ class ParamGroup:
 
     def extract(self, args):
         names = {attribute.lstrip("_") for attribute in vars(self)}
-        taken = GroupParams()
-        vars(taken).update({key: value for key, value in vars(args).items() if key in names})
-        return taken
+        return Namespace(**{key: value for key, value in vars(args).items() if key in names})
 
 
 class ModelParams(ParamGroup):
     def __init__(self, parser, sentinel=False):
-        self.sh_degree = 1
-        self._source_path = ""
-        self._model_path = ""
-        self._images = "images"
-        self._resolution = -1
-        self._white_background = False
-        self.data_device = "cpu"
-        self.eval = False
+        self.eval = self._white_background = False
+        self.data_device, self._images, self._model_path, self._source_path = "cpu", "images", "", ""
+        self._resolution, self.sh_degree = -1, 1
         super().__init__(parser, "What is loaded", sentinel)
 
     def extract(self, args):
@@ -51,14 +40,12 @@ class PipelineParams(ParamGroup):
 
 class CompressionParams(ParamGroup):
     def __init__(self, parser):
-        self.load_iteration = -1
-        self.finetune_iterations = 4
+        self.finetune_iterations, self.load_iteration = 4, -1
         self.color_codebook_size, self.gaussian_codebook_size = 64, 48
         self.color_cluster_iterations = self.gaussian_cluster_iterations = 4
         self.color_importance_include, self.gaussian_importance_include = 0.6, 0.6
         self.prune_threshold = 0.0
-        self.output_vq = "eval_vq"
-        self.start_checkpoint = ""
+        self.start_checkpoint, self.output_vq = "", "eval_vq"
         super().__init__(parser, "How it is compressed", False)
 
 

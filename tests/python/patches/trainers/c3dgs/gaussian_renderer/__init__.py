@@ -1,40 +1,31 @@
 import math
 
-import torch
 from diff_gaussian_rasterization import (
-    GaussianRasterizationSettings,
-    GaussianRasterizer,
+    GaussianRasterizationSettings, GaussianRasterizer,
     GaussianRasterizerIndexed,
 )
 
-from scene.gaussian_model import ColorMode, GaussianModel
+from scene.gaussian_model import GaussianModel
 from utils.screen import points_on_screen, shape_arguments
 
 
 def render(
-    viewpoint_camera,
-    pc: GaussianModel,
-    pipe,
-    bg_color: torch.Tensor,
-    scaling_modifier=1.0,
-    override_color=None,
-    clamp_color: bool = True,
-    cov3d: torch.Tensor = None,
+    view, pc: GaussianModel, pipe, bg_color, scaling_modifier=1.0, *,
+    override_color=None, cov3d=None, clamp_color=True,
 ):
     """One picture of `pc`, from its codebooks where it has them, or with other covariances."""
-    view, points = viewpoint_camera, points_on_screen(pc.get_xyz)
-    raster_settings = GaussianRasterizationSettings(
+    points = points_on_screen(pc.get_xyz)
+    settings = GaussianRasterizationSettings(
         image_height=int(view.image_height), image_width=int(view.image_width),
         tanfovx=math.tan(view.FoVx / 2), tanfovy=math.tan(view.FoVy / 2),
         bg=bg_color, scale_modifier=scaling_modifier,
         viewmatrix=view.world_view_transform, projmatrix=view.full_proj_transform,
         sh_degree=pc.active_sh_degree, campos=view.camera_center,
-        prefiltered=False,
+        clamp_color=clamp_color, prefiltered=False,
         debug=pipe.debug,
-        clamp_color=clamp_color,
     )
-    if pc.color_index_mode == ColorMode.ALL_INDEXED and pc.is_gaussian_indexed:
-        image, radii = GaussianRasterizerIndexed(raster_settings=raster_settings)(
+    if pc.has_codebooks:
+        image, radii = GaussianRasterizerIndexed(raster_settings=settings)(
             means3D=pc.get_xyz, means2D=points, shs=pc._get_features_raw, sh_indices=pc._feature_indices,
             g_indices=pc._gaussian_indices, colors_precomp=None, opacities=pc.get_opacity,
             scales=pc.get_scaling_normalized, scale_factors=pc.get_scaling_factor,
@@ -44,7 +35,7 @@ def render(
         shape = {"scales": None, "rotations": None, "cov3D_precomp": cov3d}
         if cov3d is None:
             shape = shape_arguments(pc, pipe, scaling_modifier)
-        image, radii = GaussianRasterizer(raster_settings=raster_settings)(
+        image, radii = GaussianRasterizer(raster_settings=settings)(
             means3D=pc.get_xyz, means2D=points, shs=pc.get_features if override_color is None else None,
             colors_precomp=override_color, opacities=pc.get_opacity, scales=shape["scales"],
             rotations=shape["rotations"], cov3D_precomp=shape["cov3D_precomp"],

@@ -1,16 +1,9 @@
-from enum import Enum
-
 import numpy as np
 import torch
 from torch import nn
 from torch.nn.functional import normalize
 from utils.adam import Adam
 from utils.general_utils import build_covariance
-
-
-class ColorMode(Enum):
-    NOT_INDEXED = 0
-    ALL_INDEXED = 1
 
 
 class Rounding(torch.autograd.Function):
@@ -32,15 +25,14 @@ class GaussianModel:
     TENSORS = ("_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_scaling_factor", "_rotation")
 
     def __init__(self, degree, quantization=True):
-        self.active_sh_degree = self.max_sh_degree = degree
+        self.active_sh_degree = self.full_sh_degree = degree
         self.levels = 256 if quantization else None
-        self.color_index_mode = ColorMode.NOT_INDEXED
         self._feature_indices = self._gaussian_indices = None
 
     def rounded(self, tensor):
         return tensor if self.levels is None else Rounding.apply(tensor, self.levels)
 
-    is_gaussian_indexed = property(lambda self: self._gaussian_indices is not None)
+    has_codebooks = property(lambda self: self._gaussian_indices is not None and self._feature_indices is not None)
     get_xyz = property(lambda self: self._xyz)
     get_opacity = property(lambda self: self.rounded(self._opacity.sigmoid()))
     get_scaling_factor = property(lambda self: self.rounded(self._scaling_factor).exp())
@@ -59,12 +51,12 @@ class GaussianModel:
     @property
     def get_scaling(self):
         shapes = self.get_scaling_normalized
-        return self.get_scaling_factor * (shapes if not self.is_gaussian_indexed else shapes[self._gaussian_indices])
+        return self.get_scaling_factor * (shapes if self._gaussian_indices is None else shapes[self._gaussian_indices])
 
     @property
     def get_rotation(self):
         turned = self._rotation_post_activation
-        return turned if not self.is_gaussian_indexed else turned[self._gaussian_indices]
+        return turned if self._gaussian_indices is None else turned[self._gaussian_indices]
 
     def get_covariance(self, scaling_modifier=1.0):
         return build_covariance(scaling_modifier * self.get_scaling, self.get_rotation)
@@ -90,7 +82,7 @@ class GaussianModel:
 
     def save_npz(self, path):
         arrays = {name: getattr(self, name).detach().cpu().numpy() for name in self.TENSORS}
-        if self.is_gaussian_indexed:
+        if self.has_codebooks:
             arrays["_feature_indices"] = self._feature_indices.cpu().numpy()
             arrays["_gaussian_indices"] = self._gaussian_indices.cpu().numpy()
         np.savez(path, **arrays)
@@ -101,7 +93,7 @@ class GaussianModel:
 
     def set_color_indexed(self, dc, rest, indices):
         self._features_dc, self._features_rest = nn.Parameter(dc.detach()), nn.Parameter(rest.detach())
-        self._feature_indices, self.color_index_mode = indices, ColorMode.ALL_INDEXED
+        self._feature_indices = indices
 
     def set_gaussian_indexed(self, rotation, scaling, indices):
         self._rotation, self._scaling = nn.Parameter(rotation.detach()), nn.Parameter(scaling.detach())

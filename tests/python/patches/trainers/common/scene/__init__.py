@@ -4,31 +4,27 @@ from glob import glob
 
 from arguments import ModelParams
 from scene.cameras import Camera
-from scene.dataset_readers import sceneLoadTypeCallbacks
+from scene.dataset_readers import read_made_up_scene
 from scene.gaussian_model import GaussianModel
-from utils.system_utils import searchForMaxIteration
 
 
 class Scene:
-    gaussians: GaussianModel
-
     def __init__(self, args: ModelParams, gaussians: GaussianModel, load_iteration=None, shuffle=True, ply_path=None,
                  override_quantization=False):
-        self.model_path, self.gaussians, self.loaded_iter = args.model_path, gaussians, None
-        info = sceneLoadTypeCallbacks["MadeUp"](args.source_path, args.white_background, args.eval)
+        self.model_path, self.gaussians, self.loaded_iter = args.model_path, gaussians, load_iteration
+        info = read_made_up_scene(args.source_path)
         if shuffle:
-            random.shuffle(info.train_cameras)
-        self.cameras_extent = info.nerf_normalization["radius"]
+            random.shuffle(info.shown)
+        self.cameras_extent = info.radius
         self.train_cameras, self.test_cameras = (
             [Camera(view.R, view.T, view.FovX, view.FovY, view.image, view.image_name, args.data_device)
-             for view in views] for views in (info.train_cameras, info.test_cameras))
+             for view in views] for views in (info.shown, info.hidden))
 
         if load_iteration is None:
             gaussians.create_from_pcd(info.point_cloud, self.cameras_extent, args.data_device)
             return
-        self.loaded_iter = load_iteration
-        if load_iteration == -1:
-            self.loaded_iter = searchForMaxIteration(os.path.join(self.model_path, "point_cloud"))
+        if load_iteration < 0:
+            self.loaded_iter = max(int(folder.rpartition("_")[2]) for folder in glob(self._folder("*")))
         saved, = glob(os.path.join(self._folder(self.loaded_iter), "point_cloud.*"))
         gaussians.load(saved, args.data_device)
 

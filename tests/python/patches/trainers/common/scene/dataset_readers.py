@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from utils.graphics_utils import BasicPointCloud
+from utils.graphics_utils import Cloud
 
 WIDTH, HEIGHT = 32, 24
 FOV_X = 0.9
 FOV_Y = 2 * np.arctan(np.tan(FOV_X / 2) * HEIGHT / WIDTH)
 
 
-class CameraInfo(NamedTuple):
+class View(NamedTuple):
     R: np.ndarray
     T: np.ndarray
     FovX: float
@@ -20,11 +20,11 @@ class CameraInfo(NamedTuple):
     image_name: str
 
 
-class SceneInfo(NamedTuple):
-    point_cloud: BasicPointCloud
-    train_cameras: list
-    test_cameras: list
-    nerf_normalization: dict
+class MadeUpScene(NamedTuple):
+    radius: float
+    hidden: list  # views that are left for tests
+    shown: list  # views to train with
+    point_cloud: Cloud
 
 
 def make_picture(random):
@@ -36,7 +36,7 @@ def make_picture(random):
     return np.where(disc, random.uniform(0, 1, (3, 1, 1)), picture).astype(np.float32)
 
 
-def readMadeUpSceneInfo(path, white_background, eval):
+def read_made_up_scene(path):
     """The scene that path/made_up.json describes: `points`, `views` and `seed`."""
     with open(os.path.join(path, "made_up.json")) as file:
         wanted = json.load(file)
@@ -45,11 +45,8 @@ def readMadeUpSceneInfo(path, white_background, eval):
     for index in range(wanted["views"]):
         angle = 2 * np.pi * index / wanted["views"]
         R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        cameras.append(CameraInfo(R.astype(np.float32), np.array([0, 0, 2], dtype=np.float32), FOV_X, FOV_Y,
-                                  make_picture(random), f"view{index}"))
-    cloud = BasicPointCloud(random.uniform(-1, 1, (wanted["points"], 3)).astype(np.float32),
-                            random.uniform(0, 1, (wanted["points"], 3)).astype(np.float32))
-    return SceneInfo(cloud, cameras[1:], cameras[:1], {"radius": 3.3})
-
-
-sceneLoadTypeCallbacks = {"MadeUp": readMadeUpSceneInfo}
+        cameras.append(View(R.astype(np.float32), np.array([0, 0, 2], dtype=np.float32), FOV_X, FOV_Y,
+                            make_picture(random), f"view{index}"))
+    cloud = Cloud(random.uniform(-1, 1, (wanted["points"], 3)).astype(np.float32),
+                  random.uniform(0, 1, (wanted["points"], 3)).astype(np.float32))
+    return MadeUpScene(3.3, cameras[:1], cameras[1:], cloud)

@@ -2,7 +2,7 @@ import torch
 from simple_knn._C import distCUDA2
 from torch import nn
 from utils.general_utils import build_covariance, build_rotation, get_expon_lr_func, inverse_sigmoid
-from utils.graphics_utils import BasicPointCloud
+from utils.graphics_utils import Cloud
 from utils.growing import GrowingTensors
 from utils.sh_utils import RGB2SH
 
@@ -14,7 +14,7 @@ class Points(GrowingTensors):
               "scaling": "_scaling", "rotation": "_rotation"}
 
     def __init__(self, sh_degree):
-        self.active_sh_degree, self.max_sh_degree = 0, sh_degree
+        self.active_sh_degree, self.full_sh_degree = 0, sh_degree
 
     get_xyz = property(lambda self: self._xyz)
     get_features = property(lambda self: torch.cat([self._features_dc, self._features_rest], dim=1))
@@ -28,16 +28,16 @@ class Points(GrowingTensors):
         return build_covariance(scaling_modifier * self.get_scaling, self._rotation)
 
     def oneupSHdegree(self):
-        self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)
+        self.active_sh_degree = min(self.active_sh_degree + 1, self.full_sh_degree)
 
     def load(self, path, data_device):
         super().load(path, data_device)
-        self.active_sh_degree = self.max_sh_degree
+        self.active_sh_degree = self.full_sh_degree
 
-    def create_from_pcd(self, pcd: BasicPointCloud, spatial_lr_scale, data_device):
+    def create_from_pcd(self, pcd: Cloud, spatial_lr_scale, data_device):
         points = torch.tensor(pcd.points, device=data_device)
         count = len(points)
-        rest = (self.max_sh_degree + 1) ** 2 - 1
+        rest = (self.full_sh_degree + 1) ** 2 - 1
         quaternions = torch.zeros(count, 4, device=data_device)
         quaternions[:, 0] = 1
         scales = distCUDA2(points).clamp_min(1e-7).sqrt().log()

@@ -6,9 +6,8 @@ import torch
 
 def safe_state(silent):
     """Seeds every generator; `silent` is there for the sake of its callers."""
-    random.seed(0)
-    np.random.seed(0)
-    torch.manual_seed(0)
+    for seed in (torch.manual_seed, np.random.seed, random.seed):
+        seed(0)
 
 
 def inverse_sigmoid(y):

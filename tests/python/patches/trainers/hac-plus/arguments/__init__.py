@@ -3,10 +3,6 @@ import sys
 from argparse import ArgumentParser, Namespace
 
 
-class GroupParams:
-    pass
-
-
 class ParamGroup:
     """A group of flags: one for every attribute; a leading underscore asks for a short form too."""
 
@@ -20,29 +16,16 @@ class ParamGroup:
 
     def extract(self, args):
         names = {attribute.lstrip("_") for attribute in vars(self)}
-        taken = GroupParams()
-        vars(taken).update({key: value for key, value in vars(args).items() if key in names})
-        return taken
+        return Namespace(**{key: value for key, value in vars(args).items() if key in names})
 
 
 class ModelParams(ParamGroup):
     def __init__(self, parser, sentinel=False):
-        self.sh_degree = 1
-        self.feat_dim = 12
-        self.n_offsets = 4
-        self.voxel_size = 0.1
-        self.update_depth = 2
-        self.update_init_factor = 4
-        self.update_hierachy_factor = 2
-        self.use_feat_bank = False
-        self._source_path = ""
-        self._model_path = ""
-        self._images = "images"
-        self._resolution = -1
-        self._white_background = False
-        self.data_device = "cpu"
-        self.eval = True
-        self.lod = 0
+        self.use_feat_bank = self._white_background = False
+        self.data_device, self._images, self._model_path, self._source_path = "cpu", "images", "", ""
+        self._resolution, self.sh_degree, self.lod, self.eval = -1, 1, 0, True
+        self.voxel_size, self.n_offsets, self.feat_dim = 0.1, 4, 12
+        self.update_init_factor, self.update_hierarchy_factor, self.update_depth = 4, 2, 2
         super().__init__(parser, "What is loaded", sentinel)
 
     def extract(self, args):

@@ -5,22 +5,22 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianR
 from einops import repeat
 
 from scene.gaussian_model import GaussianModel
-from utils.encodings import STE_multistep
+from utils.encodings import Stepped
 from utils.screen import points_on_screen
 
 
-def generate_neural_gaussians(viewpoint_camera, pc: GaussianModel, visible_mask=None, is_training=False, step=0):
+def gaussians_of_anchors(pc: GaussianModel, center, visible_mask, step):
     """What the networks make of the visible anchors, of positive opacity."""
     if visible_mask is None:
         visible_mask = torch.ones_like(pc.get_anchor[:, 0], dtype=torch.bool)
     anchor, features = pc.get_anchor[visible_mask], pc._anchor_feat[visible_mask]
     scaling, offsets = pc.get_scaling[visible_mask], pc._offset[visible_mask]
-    if is_training and step > 3:
+    if pc.learns and step > 3:
         features = features + 0.01 * (torch.rand_like(features) - 0.5)
-    elif not is_training and not pc.decoded_version:
-        features = STE_multistep.apply(features, 0.01)
+    elif not pc.learns and not pc.decoded:
+        features = Stepped.apply(features, 0.01)
 
-    direction = anchor - viewpoint_camera.camera_center
+    direction = anchor - center
     distance = direction.norm(dim=1, keepdim=True)
     inputs = torch.cat([features, direction / distance, distance], dim=1)
     neural_opacity = pc.get_opacity_mlp(inputs).reshape(-1, 1)
@@ -36,47 +36,40 @@ def generate_neural_gaussians(viewpoint_camera, pc: GaussianModel, visible_mask=
     return xyz, color, neural_opacity[mask] * kept, sizes * kept, rot, neural_opacity, mask
 
 
-def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, scaling_modifier=1.0, visible_mask=None,
-           retain_grad=False, step=0):
+def render(view, pc: GaussianModel, pipe, bg_color, scaling_modifier=1.0, visible_mask=None, step=0):
     """One picture of the neural Gaussians of the visible anchors."""
-    is_training = pc.get_color_mlp.training
-    xyz, color, opacity, scaling, rot, neural_opacity, mask = generate_neural_gaussians(
-        viewpoint_camera, pc, visible_mask, is_training=is_training, step=step)
+    xyz, color, opacity, scaling, rot, neural_opacity, mask = gaussians_of_anchors(
+        pc, view.camera_center, visible_mask, step)
+    points = points_on_screen(xyz)
 
-    view, points = viewpoint_camera, points_on_screen(xyz)
-    raster_settings = GaussianRasterizationSettings(
+    settings = GaussianRasterizationSettings(
         image_height=int(view.image_height), image_width=int(view.image_width),
         tanfovx=math.tan(view.FoVx / 2), tanfovy=math.tan(view.FoVy / 2),
         bg=bg_color, scale_modifier=scaling_modifier,
         viewmatrix=view.world_view_transform, projmatrix=view.full_proj_transform,
-        sh_degree=1, campos=view.camera_center,
-        prefiltered=False,
+        sh_degree=1, campos=view.camera_center, prefiltered=False,
         debug=pipe.debug
     )
-    rasterizer = GaussianRasterizer(raster_settings=raster_settings)
-    image, radii = rasterizer(means3D=xyz, means2D=points, shs=None, colors_precomp=color, opacities=opacity,
-                              scales=scaling, rotations=rot, cov3D_precomp=None)
+    image, radii = GaussianRasterizer(settings)(
+        means3D=xyz, means2D=points, shs=None, colors_precomp=color, opacities=opacity, scales=scaling, rotations=rot,
+        cov3D_precomp=None)
 
     result = {"render": image, "viewspace_points": points, "visibility_filter": radii > 0, "radii": radii}
-    if is_training:
+    if pc.learns:
         result.update(selection_mask=mask, neural_opacity=neural_opacity, scaling=scaling)
     return result
 
 
-def prefilter_voxel(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, scaling_modifier=1.0,
-                    override_color=None):
+def prefilter_voxel(view, pc: GaussianModel, pipe, bg_color, scaling_modifier=1.0):
     """[N] bool: which anchors the view sees."""
-    view = viewpoint_camera
-    raster_settings = GaussianRasterizationSettings(
+    settings = GaussianRasterizationSettings(
         image_height=int(view.image_height), image_width=int(view.image_width),
         tanfovx=math.tan(view.FoVx / 2), tanfovy=math.tan(view.FoVy / 2),
         bg=bg_color, scale_modifier=scaling_modifier,
         viewmatrix=view.world_view_transform, projmatrix=view.full_proj_transform,
-        sh_degree=1, campos=view.camera_center,
-        prefiltered=False,
+        sh_degree=1, campos=view.camera_center, prefiltered=False,
         debug=pipe.debug
     )
-    rasterizer = GaussianRasterizer(raster_settings=raster_settings)
-    radii_pure = rasterizer.visible_filter(
-        means3D=pc.get_anchor, scales=pc.get_scaling[:, :3], rotations=pc.get_rotation, cov3D_precomp=None)
-    return radii_pure > 0
+    radii = GaussianRasterizer(settings).visible_filter(
+        cov3D_precomp=None, rotations=pc.get_rotation, scales=pc.get_scaling[:, :3], means3D=pc.get_anchor)
+    return radii.bool()

@@ -2,10 +2,6 @@ from scene.anchors import Anchors
 
 
 class GaussianModel(Anchors):
-    mask_columns = 1
+    """A mask for each offset, and one for the anchor."""
 
-    def __init__(self, feat_dim, n_offsets, voxel_size, update_depth, update_init_factor, update_hierachy_factor,
-                 use_feat_bank=False, n_features_per_level=2, log2_hashmap_size=13, log2_hashmap_size_2D=15,
-                 decoded_version=False, is_synthetic_nerf=False):
-        super().__init__(feat_dim, n_offsets, voxel_size, update_depth, update_init_factor, update_hierachy_factor)
-        self.decoded_version, self.is_synthetic_nerf = decoded_version, is_synthetic_nerf
+    mask_columns = 1

@@ -6,7 +6,7 @@ from torch import nn
 from torch.nn.functional import normalize
 from torch_scatter import scatter_max
 from utils.adam import Adam
-from utils.encodings import STE_binary
+from utils.encodings import Binary
 from utils.growing import GrowingTensors
 
 
@@ -17,24 +17,27 @@ class Anchors(GrowingTensors):
               "scaling": "_scaling", "rotation": "_rotation"}
     mask_columns = 0  # beyond one for each offset
 
-    def __init__(self, feat_dim, n_offsets, voxel_size, update_depth, update_init_factor, update_hierachy_factor):
-        self.feat_dim, self.n_offsets, self.voxel_size = feat_dim, n_offsets, voxel_size
-        self.update_depth, self.update_init_factor = update_depth, update_init_factor
-        self.update_hierachy_factor = update_hierachy_factor
+    def __init__(self, params, decoded=False):
+        """params: the extracted ModelParams; decoded: whether the features are multiples of a step already."""
+        self.decoded, self.voxel_size, self.n_offsets = decoded, params.voxel_size, params.n_offsets
+        self.feat_dim = feat_dim = params.feat_dim
+        first = params.voxel_size * params.update_init_factor
+        self.cell_sizes = [first / params.update_hierarchy_factor ** depth for depth in range(params.update_depth)]
 
         def network(outputs, *last):
             return nn.Sequential(nn.Linear(feat_dim + 4, feat_dim), nn.ReLU(), nn.Linear(feat_dim, outputs), *last)
 
-        self.networks = {"mlp_opacity": network(n_offsets, nn.Tanh()), "mlp_cov": network(7 * n_offsets),
-                         "mlp_color": network(3 * n_offsets, nn.Sigmoid())}
+        self.networks = {"mlp_opacity": network(self.n_offsets, nn.Tanh()), "mlp_cov": network(7 * self.n_offsets),
+                         "mlp_color": network(3 * self.n_offsets, nn.Sigmoid())}
 
     get_anchor = property(lambda self: self._anchor)
     get_scaling = property(lambda self: self._scaling.exp())
     get_rotation = property(lambda self: normalize(self._rotation))
-    get_mask = property(lambda self: STE_binary.apply(self._mask)[:, :self.n_offsets])
+    get_mask = property(lambda self: Binary.apply(self._mask)[:, :self.n_offsets])
     get_opacity_mlp = property(lambda self: self.networks["mlp_opacity"])
     get_cov_mlp = property(lambda self: self.networks["mlp_cov"])
     get_color_mlp = property(lambda self: self.networks["mlp_color"])
+    learns = property(lambda self: any(network.training for network in self.networks.values()))
 
     def train(self, training=True):
         for network in self.networks.values():
@@ -97,8 +100,7 @@ class Anchors(GrowingTensors):
         """New anchors in the empty cells of ever finer grids where Gaussians want to move."""
         positions = (self._anchor[:, None] + self._offset * self.get_scaling[:, None, :3]).detach().flatten(0, 1)
         features = self._anchor_feat.detach().repeat_interleave(self.n_offsets, dim=0)
-        for depth in range(self.update_depth):
-            size = self.voxel_size * self.update_init_factor / self.update_hierachy_factor ** depth
+        for depth, size in enumerate(self.cell_sizes):
             mask = (steepness >= threshold * 2 ** depth) & (torch.rand_like(steepness) > 0.5 ** (depth + 1))
             if not bool(mask.any()):
                 continue

@@ -1,7 +1,7 @@
 import torch
 
 
-class STE_binary(torch.autograd.Function):
+class Binary(torch.autograd.Function):
     """1 where positive, else 0; the gradient passes."""
 
     @staticmethod
@@ -13,7 +13,7 @@ class STE_binary(torch.autograd.Function):
         return gradient
 
 
-class STE_multistep(torch.autograd.Function):
+class Stepped(torch.autograd.Function):
     """To multiples of `step`; the gradient passes."""
 
     @staticmethod
@@ -25,7 +25,7 @@ class STE_multistep(torch.autograd.Function):
         return gradient, None
 
 
-def get_binary_vxl_size(masks):
+def mask_bits(masks):
     """Share of ones, and the bits that an ideal coder spends on the masks."""
     share = float(masks.mean().clamp(1e-6, 1 - 1e-6))
     entropy = -share * torch.tensor(share).log2() - (1 - share) * torch.tensor(1 - share).log2()

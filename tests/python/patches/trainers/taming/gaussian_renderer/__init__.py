@@ -11,14 +11,14 @@ def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, sc
            override_color=None, pixel_weights=None):
     """One picture of `pc`, and what pixel_weights [H, W] and the blending add up to for every Gaussian."""
     view, points = viewpoint_camera, points_on_screen(pc.get_xyz)
-    raster_settings = GaussianRasterizationSettings(
+    settings = GaussianRasterizationSettings(
         image_height=int(view.image_height), image_width=int(view.image_width),
         tanfovx=math.tan(view.FoVx / 2), tanfovy=math.tan(view.FoVy / 2),
         bg=bg_color, scale_modifier=scaling_modifier,
         viewmatrix=view.world_view_transform, projmatrix=view.full_proj_transform,
         sh_degree=pc.active_sh_degree, campos=view.camera_center,
         prefiltered=False, debug=pipe.debug, pixel_weights=pixel_weights)
-    rasterizer = GaussianRasterizer(raster_settings=raster_settings)
+    rasterizer = GaussianRasterizer(raster_settings=settings)
     shape = shape_arguments(pc, pipe, scaling_modifier)
 
     if pipe.separate_sh:
