@@ -61,9 +61,14 @@ def blend_mode_of(dataset: Any) -> str:
     return mode
 
 
-def say_shim(flavour: str) -> None:
-    """Says on stderr that `dsmoe run` has its effect: the process has imported this package's rasterizer."""
+def say_rasterizer(flavour: str) -> None:
+    """Says on stderr that `dsmoe run` has its effect: this process has imported this package's rasterizer."""
     _say(f"the rasterizer is {flavour} of this package, blend mode {default_blend_mode()}")
+
+
+def say_stand_in(name: str) -> None:
+    """Says on stderr that this process has imported what this package has in place of a package that is missing."""
+    _say(f"{name} could not be imported: this package's own takes its place")
 
 
 def optional_import(name: str) -> Any:
