@@ -65,7 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
                               usage="dsmoe run --blend-mode MODE [--trainer NAME] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", choices=BLEND_MODES, required=True,
+    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
                      help="nothing records it: give the same where a trained model is rendered")
     run.add_argument("--trainer", metavar="NAME",
                      help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
