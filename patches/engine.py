@@ -17,7 +17,7 @@ from . import facts, source
 from .errors import PatchError
 from .record import FOLDER, Record, check_writable, remove_rest, replace_file
 from .rules import Trainer
-from .scope import build_files, callers_out_of_reach, python_files
+from .scope import build_files, notes_on_scripts, other_files, python_files
 from .trainers import TRAINERS
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Plan(NamedTuple):
     root: Path
     verdict: Verdict
     changes: Tuple[Change, ...]
-    notes: Tuple[str, ...]  # which modernise rules are applied or skipped, which scripts render out of reach
+    notes: Tuple[str, ...]  # which modernise rules are applied or skipped, which scripts no rule reaches
     modernise: bool
     record: Optional[Record]
     written: bool = False  # whether `apply` wrote files by this plan
@@ -177,7 +177,7 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
     state, reasons = patch.state()
     if record and not patch.problems:
         state, reasons = _state_by_record(record)
-    notes = (*patch.notes, *callers_out_of_reach(files, chosen))
+    notes = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
     return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), notes, modernise, record)
 
 

@@ -336,6 +336,40 @@ def test_scripts_of_the_user(tmp_path):
     assert snapshot(folder)["utils/loss.py"] == before["utils/loss.py"]
 
 
+SCRIPTS = {
+    "tools/own.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
+    "tools/deep/own.py": ("from diff_gaussian_rasterization._C import mark_visible\n", "imports the original"),
+    "whole.py": ("import diff_gaussian_rasterization as dgr\n", "imports the original"),
+    "settings.py": ("from diff_gaussian_rasterization import GaussianRasterizationSettings\n"
+                    "def show(pipe):\n    return GaussianRasterizationSettings(debug=pipe.debug)\n", "settings"),
+    "film.py": ("import gaussian_renderer\ngaussian_renderer.render(None)\n", "renders"),
+    "tools/film.py": ("from gaussian_renderer import render\n", "renders"),
+    "all.py": ("from gaussian_renderer import *\n", "renders"),
+}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_script_that_keeps_the_original_or_has_no_mode_is_named(tmp_path, name):
+    text, word = SCRIPTS[name]
+    folder = make(tmp_path, {name: text})
+    for _ in range(2):  # before the patch, and when it is there
+        (note,) = patches.plan(folder).notes
+        assert note.startswith(name + ": ") and word in note
+        patches.apply(folder)
+
+
+def test_what_is_no_script_of_the_checkout_is_not_named(tmp_path):
+    """Environments, outputs with a copy of the code, other checkouts; what a script that is reached imports."""
+    text = SCRIPTS["tools/film.py"][0]
+    folder = make(tmp_path, {"env/pyvenv.cfg": "", "env/film.py": text, "out/cfg_args": "", "out/backup/film.py": text,
+                             "submodules/a/film.py": text, ".cache/film.py": text, "lib/film.py": text,
+                             "train.py": "from lib import film\n" + TRAIN, "tools/gui.py":
+                             "from gaussian_renderer import network_gui\n", "tools/mode.py": "from gaussian_renderer "
+                             "import render\npipe.blend_mode = 'smoe'\n"})
+    make(folder / "another")
+    assert patches.plan(folder).notes == ()
+
+
 def test_recognised_by_structure_alone():
     base = {"imports GaussianRasterizationSettings", "sets bg", "sets debug"}
     for name, signs in (("3dgs-2023", set()), ("3dgs-2024", {"sets antialiasing", "imports SparseGaussianAdam"}),
