@@ -102,6 +102,8 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         return planned
     for name in pending:
         check_writable(root, name)
+    if record is None and (root / FOLDER / "manifest.json").exists():  # of a patch of which nothing is left
+        Record.load(root).remove()
     notes = {"version": __version__, "trainer": planned.verdict.trainer, "modernise": planned.modernise,
              "rules": {change.name: change.rules for change in planned.changes}}
     try:
@@ -125,9 +127,9 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
 
 
 def revert(path: PathLike) -> Tuple[str, ...]:
-    """Puts every file back byte for byte and removes the record; returns the files' names.
+    """Puts every file that is patched back byte for byte and removes the record; returns the files' names.
 
-    Raises PatchError, and touches nothing, where a file was changed since or where there is no record.
+    Raises PatchError, and touches nothing, where a patched file was changed since or where there is no record.
     """
     root = _root(path)
     record = Record.load(root)
@@ -135,7 +137,7 @@ def revert(path: PathLike) -> Tuple[str, ...]:
         return ()
     if record is None:
         raise PatchError(f"{root}: there is no {FOLDER}, so nothing can be put back: it was not patched, or by hand")
-    states = record.states()
+    states = record.states() if Record.in_force(root) else {}
     for name, state in states.items():
         if state in ("changed", "gone"):
             raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. The original is in {FOLDER}/originals")
@@ -149,6 +151,7 @@ def revert(path: PathLike) -> Tuple[str, ...]:
 
 
 _SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
+          "replaced": "was changed since, and is not patched any more; `revert` leaves it, and puts back the others",
           "original": "is the original, though the record says that it was patched; `revert` puts back the others too"}
 
 
@@ -157,7 +160,7 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
     from .patch import Patch
 
     root = _root(path)
-    record = Record.load(root)
+    record = Record.in_force(root)
     modernise = modernise or bool(record and record.manifest["modernise"])
 
     def read(name: str) -> Optional[bytes]:
@@ -177,6 +180,8 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
     state, reasons = patch.state()
     if record and not patch.problems:
         state, reasons = _state_by_record(record)
+    elif state == "patchable" and (root / FOLDER / "manifest.json").exists():
+        reasons = [f"no file is patched any more: `apply` replaces the {FOLDER} that is there, `revert` removes it"]
     notes = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
     return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), notes, modernise, record)
 

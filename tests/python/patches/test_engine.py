@@ -5,6 +5,7 @@ import hashlib
 import os
 import shutil
 import stat
+import sys
 from pathlib import Path
 
 import pytest
@@ -276,6 +277,48 @@ def test_a_file_that_changed_since_is_not_overwritten(tmp_path):
     refused(tmp_path, "train.py", "changed", modernise=True)
     (tmp_path / "train.py").write_text(TRAIN + "# mine\n")  # the edit is kept, the patch is not
     refused(tmp_path, "train.py", "changed")
+
+
+def another_commit(folder):
+    """Replaces every file by that of a later version, as `git checkout` does."""
+    for name, text in CHECKOUT.items():
+        (folder / name).write_text("# a later version\n" + text)
+
+
+@pytest.mark.parametrize("come_back", [make, another_commit])
+def test_a_record_of_which_no_file_is_patched_any_more_is_no_hindrance(tmp_path, come_back):
+    patches.apply(make(tmp_path / "checkout"))
+    come_back(tmp_path / "checkout")
+    shutil.copytree(str(tmp_path / "checkout"), str(tmp_path / "reverted"))
+    verdict = patches.check(tmp_path / "checkout")
+    assert verdict == "patchable" and "no file is patched any more" in verdict.reasons[0]
+    assert prepared(tmp_path / "checkout")
+    assert patches.apply(tmp_path / "checkout").written and patches.check(tmp_path / "checkout") == "patched"
+    with pytest.raises(patches.PatchError, match="patched already"):
+        prepared(tmp_path / "checkout")
+    patches.revert(tmp_path / "checkout")
+    assert patches.revert(tmp_path / "reverted") == ()
+    assert snapshot(tmp_path / "checkout") == snapshot(tmp_path / "reverted")
+
+
+def prepared(folder):
+    from diff_smoe_rasterization.patches.run import prepare
+
+    return prepare([sys.executable, str(folder / "train.py")], "smoe", None, dict(os.environ))
+
+
+def test_what_is_patched_beside_replaced_files_is_put_back(tmp_path):
+    """git replaces the trainer's files, and leaves those of its submodules."""
+    setup = "submodules/grid/setup.py"
+    make(tmp_path, {setup: "flags = ['-O2', '-std=c++14']\n"})
+    patches.apply(tmp_path, modernise=True)
+    another_commit(tmp_path)
+    verdict = patches.check(tmp_path)
+    assert verdict == "half-patched" and any("train.py" in reason and "`revert`" in reason for reason in verdict.reasons)
+    refused(tmp_path, "train.py")
+    assert patches.revert(tmp_path) == (setup,)
+    assert "c++14" in (tmp_path / setup).read_text() and "a later version" in (tmp_path / "train.py").read_text()
+    assert patches.check(tmp_path) == "patchable" and not (tmp_path / ".dsmoe_patch").exists()
 
 
 def test_a_damaged_record_is_no_ground_to_write(tmp_path):
