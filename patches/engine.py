@@ -58,7 +58,7 @@ def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None)
     planned = _inspect(path, modernise, trainer)
     if planned.verdict in ("patchable", "patched"):
         return planned
-    if planned.verdict == "half-patched" and planned.record and _can_be_finished(planned):
+    if planned.verdict == "half-patched" and planned.record and planned.record.can_be_finished():
         return planned
     raise PatchError(refusal(planned.verdict))
 
@@ -140,7 +140,8 @@ def revert(path: PathLike) -> Tuple[str, ...]:
     states = record.states() if Record.in_force(root) else {}
     for name, state in states.items():
         if state in ("changed", "gone"):
-            raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. The original is in {FOLDER}/originals")
+            raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. Undo your edit; or copy what lies in {FOLDER}"
+                             f"/originals over the checkout, by which your edit is lost, and delete {FOLDER}")
     patched = [name for name, state in states.items() if state == "patched"]
     for name in patched:
         check_writable(root, name)
@@ -179,34 +180,29 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
         patch.modernise()
     state, reasons = patch.state()
     if record and not patch.problems:
-        state, reasons = _state_by_record(record)
+        state, reasons = _state_by_record(root, record, chosen)
     elif state == "patchable" and (root / FOLDER / "manifest.json").exists():
         reasons = [f"no file is patched any more: `apply` replaces the {FOLDER} that is there, `revert` removes it"]
     notes = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
     return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), notes, modernise, record)
 
 
-def _state_by_record(record: Record) -> Tuple[str, List[str]]:
+def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str, List[str]]:
     """How a checkout is that has a record: `patched`, or what the record and the files disagree in."""
-    states = record.states()
-    if set(states.values()) <= {"patched"}:
-        return "patched", [f"by version {record.manifest['version']}"
-                           + (", with --modernise" if record.manifest["modernise"] else "")]
-    if not record.manifest["complete"] and set(states.values()) <= {"patched", "original"}:
-        return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
-    return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
-
-
-def _can_be_finished(planned: Plan) -> bool:
-    """Whether an interrupted patch can be finished, or what was edited since still has every rule applied."""
-    states = set(planned.record.states().values())
-    if states <= {"patched", "original"}:
-        return states == {"patched"} or not planned.record.manifest["complete"]
     from .patch import Patch
 
-    trainer = next(trainer for trainer in TRAINERS if trainer.name == planned.verdict.trainer)
-    files = {name: _read(planned.root / name) for name in python_files(planned.root)}
-    return "gone" not in states and Patch(files, trainer).state()[0] == "patched"
+    states = record.states()
+    by = [f"by version {record.manifest['version']}" + (", with --modernise" if record.manifest["modernise"] else "")]
+    if set(states.values()) <= {"patched"}:
+        return "patched", by
+    if record.can_be_finished():
+        return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
+    if set(states.values()) <= {"patched", "changed"}:
+        files = {name: _read(root / name) for name in python_files(root)}
+        if Patch(files, trainer).state()[0] == "patched":
+            return "patched", by + [f"{name}: was edited since; every rule is still applied"
+                                    for name, state in states.items() if state == "changed"]
+    return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
 
 
 def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:

@@ -101,6 +101,10 @@ class Record:
         """Returns of each file whether it is "original", "patched", or "changed", "replaced" or "gone" since."""
         return {name: self._state(name, hashes) for name, hashes in self.files.items()}
 
+    def can_be_finished(self) -> bool:
+        """Whether it is of a patch that was interrupted, and nobody has changed a file since."""
+        return not self.manifest["complete"] and set(self.states().values()) <= {"patched", "original"}
+
     def _state(self, name: str, hashes: Mapping) -> str:
         try:
             data = (self.root / name).read_bytes()

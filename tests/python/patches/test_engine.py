@@ -271,12 +271,25 @@ def test_a_file_that_changed_since_is_not_overwritten(tmp_path):
     patches.apply(make(tmp_path))
     with open(str(tmp_path / "train.py"), "a") as file:
         file.write("# mine\n")
-    assert patches.check(tmp_path) == "half-patched"
-    assert not patches.apply(tmp_path).written  # every rule is applied
-    refused(tmp_path, "train.py", "changed", call=patches.revert)
+    verdict = patches.check(tmp_path)  # every rule is applied
+    assert verdict == "patched" and verdict.reasons[1].startswith("train.py: was edited since")
+    assert not patches.apply(tmp_path).written
+    refused(tmp_path, "train.py", "changed", "Undo your edit", "delete .dsmoe_patch", call=patches.revert)
     refused(tmp_path, "train.py", "changed", modernise=True)
     (tmp_path / "train.py").write_text(TRAIN + "# mine\n")  # the edit is kept, the patch is not
     refused(tmp_path, "train.py", "changed")
+
+
+def test_the_way_out_of_an_edit_is_the_one_that_is_named(tmp_path):
+    original = snapshot(make(tmp_path))
+    patches.apply(tmp_path)
+    (tmp_path / "train.py").write_text((tmp_path / "train.py").read_text() + "# mine\n")
+    with pytest.raises(patches.PatchError, match="copy what lies in .dsmoe_patch/originals over the checkout"):
+        patches.revert(tmp_path)
+    for copy in (tmp_path / ".dsmoe_patch/originals").rglob("*.py"):
+        shutil.copy(str(copy), str(tmp_path / copy.relative_to(tmp_path / ".dsmoe_patch/originals")))
+    shutil.rmtree(str(tmp_path / ".dsmoe_patch"))
+    assert snapshot(tmp_path) == original
 
 
 def another_commit(folder):
