@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import io
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, List, NamedTuple, Optional, Tuple, Union
 
@@ -16,7 +17,7 @@ from diff_smoe_rasterization._version import __version__
 from . import facts, source
 from .errors import PatchError
 from .record import FOLDER, Record, check_writable, remove_rest, replace_file
-from .rules import Trainer
+from .rules import GR, Trainer
 from .scope import build_files, notes_on_scripts, other_files, python_files
 from .trainers import TRAINERS
 
@@ -169,6 +170,8 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
             return record.original(name)
         return _read(root / name)
 
+    if read(GR) is None:
+        return Plan(root, Verdict("unknown", None, [_no_renderer(root)]), (), (), modernise, record)
     chosen, reason = _trainer(read, trainer or (record.manifest["trainer"] if record else None))
     if chosen is None:
         return Plan(root, Verdict("unknown", None, [reason]), (), (), modernise, record)
@@ -183,6 +186,10 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
         state, reasons = _state_by_record(root, record, chosen)
     elif state == "patchable" and (root / FOLDER / "manifest.json").exists():
         reasons = [f"no file is patched any more: `apply` replaces the {FOLDER} that is there, `revert` removes it"]
+    looks_like = _trainer(read, None)[0] if trainer else None
+    if looks_like and looks_like.flavour != chosen.flavour:
+        patch.notes.insert(0, f"--trainer {trainer}: by what it imports and calls this is {looks_like.name}, whose "
+                              f"rasterizer has another API ({looks_like.flavour}, not {chosen.flavour})")
     notes = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
     return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), notes, modernise, record)
 
@@ -212,6 +219,13 @@ def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:
         if trainer.name == name:
             return trainer, ""
     raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(facts.names())}")
+
+
+def _no_renderer(root: Path) -> str:
+    """Says that a folder is no checkout, and which one beside it is."""
+    above = root.resolve()
+    near = [folder for folder in (*above.parents, *sorted(above.glob("*/"))) if os.path.isfile(str(folder / GR))]
+    return f"there is no {GR} in {root}; wanted is the checkout's folder" + (f", such as {near[0]}" if near else "")
 
 
 def _root(path: PathLike) -> Path:

@@ -203,6 +203,24 @@ def test_what_is_no_trainer_is_unknown(tmp_path):
         patches.apply(tmp_path / "nowhere")
 
 
+def test_a_folder_beside_the_checkout_is_said_to_be_none(tmp_path):
+    checkout = make(tmp_path / "checkout")
+    (tmp_path / "else").mkdir()
+    for folder in (tmp_path, checkout / "arguments"):
+        refused(folder, "unknown", f"there is no {GR} in {folder}", f"such as {checkout}")
+        refused(folder, f"there is no {GR} in {folder}", trainer="3dgs-2023")
+    refused(tmp_path / "else", f"there is no {GR} in {tmp_path / 'else'}")
+
+
+def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
+    antialiasing = {GR: RENDERER.replace("prefiltered", "antialiasing")}
+    (note,) = patches.plan(make(tmp_path / "2024", antialiasing), trainer="3dgs-2023").notes
+    assert "--trainer 3dgs-2023" in note and "3dgs-2024" in note and "another API" in note
+    assert patches.plan(make(tmp_path / "2023"), trainer="3dgs-2023").notes == ()
+    patches.apply(tmp_path / "2024", trainer="3dgs-2023")
+    assert patches.plan(tmp_path / "2024").notes == ()  # it was said when it was chosen
+
+
 def test_a_patch_by_hand_is_half_or_whole(tmp_path):
     whole = make(tmp_path / "whole", PATCHED)
     assert patches.check(whole) == "patched"
