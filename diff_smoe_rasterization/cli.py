@@ -65,7 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
                               usage="dsmoe run --blend-mode MODE [--trainer NAME] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", choices=BLEND_MODES, required=True,
+    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
                      help="nothing records it: give the same where a trained model is rendered")
     run.add_argument("--trainer", metavar="NAME",
                      help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
@@ -75,12 +75,17 @@ def build_parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
     info.set_defaults(run=_info)
+    for command in (train, evaluate, render, run, info):
+        command.set_defaults(command_parser=command)
     return parser
 
 
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 when interrupted."""
-    arguments = build_parser().parse_args(argv)
+    parser = build_parser()
+    arguments, unknown = parser.parse_known_args(argv)
+    if unknown:  # argparse would show the usage of `dsmoe` alone
+        getattr(arguments, "command_parser", parser).error("unrecognized arguments: " + " ".join(unknown))
     try:
         return arguments.run(arguments) or 0
     except (TrainerError, PatchError, ImportError, OSError) as error:
@@ -104,13 +109,13 @@ def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
                        ("diff", "show what the patch changes"), ("revert", "put every file back byte for byte")):
         action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         action.add_argument("path", metavar="PATH", help="the checkout's folder")
-        if name in ("apply", "diff"):
+        if name != "revert":
             action.add_argument("--modernise", action="store_true",
                                 help="also what the trainer needs to start on today's torch, CUDA and Python")
             action.add_argument("--trainer", metavar="NAME", help="which trainer it is (default: found out)")
         if name == "apply":
             action.add_argument("--dry-run", action="store_true", help="show the changes, write nothing")
-        action.set_defaults(run=_patch)
+        action.set_defaults(run=_patch, command_parser=action)
 
 
 def _patch(arguments: argparse.Namespace) -> int:

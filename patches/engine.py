@@ -10,7 +10,7 @@ import difflib
 import io
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, List, NamedTuple, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Dict, List, NamedTuple, Optional, Tuple, Union
 
 from diff_smoe_rasterization._version import __version__
 
@@ -56,7 +56,7 @@ class Plan(NamedTuple):
 
 def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
     """Plans the patch of a checkout, also of one that is patched. Raises PatchError where it is refused."""
-    planned = _inspect(path, modernise, trainer)
+    planned = inspect(path, modernise, trainer)
     if planned.verdict in ("patchable", "patched"):
         return planned
     if planned.verdict == "half-patched" and planned.record and planned.record.can_be_finished():
@@ -64,14 +64,14 @@ def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None)
     raise PatchError(refusal(planned.verdict))
 
 
-def check(path: PathLike) -> Verdict:
+def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Verdict:
     """Says how a checkout is: unknown, patchable, patched, half-patched or drifted, with `.trainer` and `.reasons`."""
-    return _inspect(path).verdict
+    return inspect(path, modernise, trainer).verdict
 
 
 def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> str:
     """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
-    return "".join(diff_of(change) for change in plan(path, modernise, trainer).changes)
+    return "".join(diff_of(change.name, change.before, change.after) for change in plan(path, modernise, trainer).changes)
 
 
 def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
@@ -81,27 +81,13 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     Raises PatchError where it is refused, and then every file is as it was.
     """
     planned = plan(path, modernise, trainer)
-    root, record = planned.root, planned.record
-    if planned.verdict == "patched" and record is None:
-        if modernise and planned.changes:
-            raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
-                             f"checkout is patched and has no {FOLDER}: take the patch back by your version control, then "
-                             "apply it with --modernise")
+    root, record, todo = planned.root, planned.record, pending(planned)
+    if not todo:
+        if record and not record.manifest["complete"]:
+            record.completed()
         return planned
-    states = record.states() if record else {}
-    edited = [name for name, state in states.items() if state == "changed"]
-    if edited and planned.modernise == record.manifest["modernise"]:
-        return planned  # every rule is applied
-    if edited:
-        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise belongs to the first patch")
-    before = {change.name: change.before for change in planned.changes}
-    after = {change.name: change.after for change in planned.changes}
-    for name in set(states) - set(after):  # of an earlier version's rules
-        before[name] = after[name] = record.original(name)
-    pending = {name: data for name, data in after.items() if (root / name).read_bytes() != data}
-    if record and not pending and record.manifest["complete"]:
-        return planned
-    for name in pending:
+    before, after = ({name: made[state] for name, made in _outcome(planned).items()} for state in (0, 1))
+    for name in todo:
         check_writable(root, name)
     if record is None and (root / FOLDER / "manifest.json").exists():  # of a patch of which nothing is left
         Record.load(root).remove()
@@ -112,9 +98,9 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     except OSError as error:
         remove_rest(root)
         raise PatchError(f"{FOLDER}: the originals cannot be kept, so nothing was changed: {error}") from None
-    undo = {name: (root / name).read_bytes() for name in pending}
+    undo = {name: (root / name).read_bytes() for name in todo}
     try:
-        for name, data in pending.items():
+        for name, data in todo.items():
             replace_file(root, root / name, data)
         begun.completed()
     except OSError as error:
@@ -125,6 +111,32 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
             begun.remove()
         raise PatchError(f"{name}: cannot be written, so all was put back: {error}") from None
     return planned._replace(written=True)
+
+
+def pending(planned: Plan) -> Dict[str, bytes]:
+    """Returns what `apply` would write, by the files' names. Raises PatchError where it refuses."""
+    record = planned.record
+    if planned.verdict == "patched" and record is None:
+        if planned.modernise and planned.changes:
+            raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
+                             f"checkout is patched and has no {FOLDER}: take the patch back by your version control, then "
+                             "apply it with --modernise")
+        return {}
+    edited = [name for name, state in record.states().items() if state == "changed"] if record else []
+    if edited and planned.modernise == record.manifest["modernise"]:
+        return {}  # every rule is applied
+    if edited:
+        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise belongs to the first patch")
+    return {name: after for name, (_, after) in _outcome(planned).items()
+            if (planned.root / name).read_bytes() != after}
+
+
+def _outcome(planned: Plan) -> Dict[str, Tuple[bytes, bytes]]:
+    """Returns what each file was before any patch, and what it becomes."""
+    made = {change.name: (change.before, change.after) for change in planned.changes}
+    for name in set(planned.record.files if planned.record else ()) - set(made):  # of an earlier version's rules
+        made[name] = (planned.record.original(name),) * 2
+    return made
 
 
 def revert(path: PathLike) -> Tuple[str, ...]:
@@ -157,7 +169,8 @@ _SINCE = {"changed": "was changed since it was patched", "gone": "was removed si
           "original": "is the original, though the record says that it was patched; `revert` puts back the others too"}
 
 
-def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+    """Plans the patch of a checkout in whatever state it is."""
     source.have_libcst()
     from .patch import Patch
 
@@ -248,9 +261,8 @@ def refusal(verdict: Verdict) -> str:
     return "\n".join([f"the checkout is {verdict}{trainer}:", *("  " + reason for reason in verdict.reasons)])
 
 
-def diff_of(change: Change) -> str:
+def diff_of(name: str, before: bytes, after: bytes) -> str:
     """Returns the unified diff of one file."""
-    before, after = (io.StringIO(source.decode(change.name, data)[0], newline="\n").readlines()
-                     for data in (change.before, change.after))
-    lines = difflib.unified_diff(before, after, "a/" + change.name, "b/" + change.name)
+    old, new = (io.StringIO(source.decode(name, data)[0], newline="\n").readlines() for data in (before, after))
+    lines = difflib.unified_diff(old, new, "a/" + name, "b/" + name)
     return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in lines)

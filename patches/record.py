@@ -55,6 +55,8 @@ class Record:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
             return None
+        except OSError as error:
+            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch cannot be read: {error.strerror}") from None
         try:
             manifest = json.loads(text)
             if manifest["format"] != FORMAT:
