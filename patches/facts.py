@@ -16,7 +16,7 @@ FURTHER_SETTINGS = {"antialiasing", "pixel_weights", "clamp_color", "blend_mode"
 
 
 def of_checkout(read: Callable[[str], Optional[bytes]]) -> Set[str]:
-    """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "calls visible_filter".
+    """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "unpacks 2 results".
 
     read: the bytes of a file of the checkout, or None where there is no such file.
     """
@@ -30,8 +30,9 @@ def of_checkout(read: Callable[[str], Optional[bytes]]) -> Set[str]:
                     tree = ast.parse(data)
             except (SyntaxError, ValueError):
                 continue  # a rule that needs the file will say so
+            rasterizers = {"rasterizer", *_assigned_rasterizers(tree)}
             for node in ast.walk(tree):
-                facts |= _of_node(node)
+                facts |= _of_node(node) | _of_results(node, rasterizers)
     return facts
 
 
@@ -49,7 +50,30 @@ def _of_node(node: ast.AST) -> Set[str]:
             return {f"sets {keyword.arg}" for keyword in node.keywords}
         if called == "visible_filter":
             return {"calls visible_filter"}
-    return set()
+    return {"reads invdepthmap"} if isinstance(node, ast.Attribute) and node.attr == "invdepthmap" else set()
+
+
+def _assigned_rasterizers(tree: ast.AST) -> Set[str]:
+    """Returns the names to which a GaussianRasterizer is assigned."""
+    return {target.id for node in ast.walk(tree)
+            if isinstance(node, ast.Assign) and _is_rasterizer(node.value)
+            for target in node.targets if isinstance(target, ast.Name)}
+
+
+def _of_results(node: ast.AST, rasterizers: Set[str]) -> Set[str]:
+    """Says into how many variables the results of a rasterizer are unpacked: a, b = rasterizer(...)."""
+    if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Call):
+        return set()
+    called, target = node.value.func, node.targets[0]
+    if not (_is_rasterizer(called) or isinstance(called, ast.Name) and called.id in rasterizers):
+        return set()
+    if not isinstance(target, ast.Tuple) or any(isinstance(one, ast.Starred) for one in target.elts):
+        return set()
+    return {f"unpacks {len(target.elts)} results"}
+
+
+def _is_rasterizer(node: ast.AST) -> bool:
+    return isinstance(node, ast.Call) and getattr(node.func, "id", "") == "GaussianRasterizer"
 
 
 def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
@@ -61,8 +85,13 @@ def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
     if foreign:
         return None, (f"its GaussianRasterizationSettings have {', '.join(foreign)}, which no trainer has that is "
                       f"known here ({', '.join(names())})")
-    return next(trainer for trainer in TRAINERS
-                if any(facts.issuperset(sign.split(" and ")) for sign in trainer.signs)), ""
+    nearest = next(trainer for trainer in TRAINERS
+                   if any(facts.issuperset(sign.split(" and ")) for sign in trainer.signs))
+    results = {int(fact.split()[1]) for fact in facts if fact.startswith("unpacks ")} - {nearest.results}
+    if results:
+        return None, (f"its rasterizer returns {min(results)} results; that of {nearest.name}, which it resembles, "
+                      f"returns {nearest.results}")
+    return nearest, ""
 
 
 def names() -> Tuple[str, ...]:

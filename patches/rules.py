@@ -17,6 +17,7 @@ class ImportRasterizer(NamedTuple):
     file: str
     flavour: str
     expected: int = 1
+    least: int = 1  # 0 where some of the trainer's versions have no such import
     name = "import-rasterizer"
 
     @property
@@ -74,6 +75,7 @@ class Trainer(NamedTuple):
     flavour: str  # module of integrations whose API it calls
     signs: Tuple[str, ...]  # it shows one of these ("... and ..."), as facts.py says it, and none of those before it
     rules: Tuple[NamedTuple, ...]
+    results: int = 2  # how many its rasterizer returns
 
 
 GR = "gaussian_renderer/__init__.py"

@@ -6,7 +6,6 @@ that its exit status and signals are the command's own.
 """
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import re
@@ -14,7 +13,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
+from typing import Dict, Iterator, List, NoReturn, Optional, Sequence, Tuple
 
 from diff_smoe_rasterization.settings import BLEND_MODE_VARIABLE
 
@@ -59,7 +58,9 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     if not words:
         raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
     if shutil.which(words[0], path=environment.get("PATH")) is None:
-        raise PatchError(f"{words[0]}: there is no such command")
+        is_script = words[0].endswith(".py") and Path(words[0]).is_file()
+        raise PatchError(f"{words[0]}: " + (f"is not executable; type: python {words[0]}" if is_script else
+                                            "there is no such command"))
     flavour, found = _flavour(words, trainer)
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode}
     if "PYTHONPYCACHEPREFIX" not in environment:
@@ -68,9 +69,8 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     absent = [name for name, module in STAND_INS.items() if module not in answer["usable"]]
     folders = [str(SHIMS / name) for name in [flavour, *absent]]
     environment["PYTHONPATH"] = os.pathsep.join(folders + [path for path in [environment.get("PYTHONPATH")] if path])
-    lines.insert(0, f"{found}: {RASTERIZER} is {flavour} of this package, blend mode {blend_mode}")
-    if absent:
-        lines.append(f"{', '.join(absent)} cannot be imported there: this package's own take their place")
+    lines.insert(0, f"{found}: {RASTERIZER} will be {flavour} of this package, blend mode {blend_mode}; each process "
+                    "that imports it says so")
     return environment, lines
 
 
@@ -92,8 +92,9 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str]:
         if facts.PATCHED in found or Record.in_force(folder):
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
-        if folder == folders[0] and (folder / RASTERIZER).exists():  # where Python looks first
-            raise PatchError(f"{folder / RASTERIZER} would be imported before this package's; move it away")
+        for path in (folder / RASTERIZER, folder / f"{RASTERIZER}.py"):
+            if folder == folders[0] and path.exists():  # where Python looks first
+                raise PatchError(f"{path} would be imported before this package's; move it away")
         if trainer is None:
             known, reason = facts.recognise(found)
             if known:
@@ -112,12 +113,30 @@ def _folders(words: Sequence[str]) -> List[Path]:
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
+def _python_options(words: Sequence[str]) -> Iterator[str]:
+    """Yields the letters of Python's own options, which come before the script: -uE, -W ignore -E, -Xdev."""
+    rest = iter(words)
+    for word in rest:
+        if not word.startswith("-") or word in ("-", "--"):
+            return
+        if word == "--check-hash-based-pycs":
+            next(rest, None)
+        for place, letter in enumerate(word[1:] if not word.startswith("--") else "", start=2):
+            if letter in "cm":  # what follows is the program's
+                return
+            yield letter
+            if letter in "WX":  # with a value, which is the rest of the word or the next one
+                if place == len(word):
+                    next(rest, None)
+                break
+
+
 def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[Dict, List[str]]:
     """Asks the command's Python what it can import. Raises PatchError where that is not this package."""
     is_python = re.fullmatch(r"python[0-9.]*t?", os.path.basename(words[0])) is not None
-    options = list(itertools.takewhile(lambda word: word.startswith("-"), words[1:]))
-    if is_python and any(re.match("-[a-zA-Z]*[IE]", option) for option in options):
-        raise PatchError(f"{words[0]} {' '.join(options)}: does not look at PYTHONPATH, where the rasterizer is found")
+    for option in _python_options(words[1:]) if is_python else ():
+        if option in "IE":
+            raise PatchError(f"{words[0]} -{option}: does not look at PYTHONPATH, where the rasterizer is found")
     python = words[0] if is_python else next((name for name in ("python", "python3")
                                               if shutil.which(name, path=environment.get("PATH"))), None)
     if python is None:

@@ -1,12 +1,14 @@
 """What a patched trainer calls while it runs: where its blend mode comes from, and stand-ins for what may be absent."""
 from __future__ import annotations
 
+import ast
 import functools
 import importlib
 import os
 import sys
 import warnings
-from typing import Any, Callable
+from pathlib import Path
+from typing import Any, Callable, Optional
 
 from diff_smoe_rasterization.settings import BLEND_MODE_VARIABLE, BLEND_MODES, resolve_blend_mode
 
@@ -24,17 +26,29 @@ def blend_mode_of(dataset: Any) -> str:
     """Returns the blend mode of a run, and notes it in `dataset`, of which the trainer saves what it holds as cfg_args.
 
     dataset: the trainer's extracted ModelParams. Without a `blend_mode` (a cfg_args of before the patch): "alpha".
-    Warns, once, where the mode may not be the one that was meant or where it changes what the background does.
-    Raises ValueError where the mode is not one of BLEND_MODES.
+    Says on stderr which mode it is, and whence. Warns, once, where the mode may not be the one that was meant or where
+    it changes what the background does.
+    Raises ValueError where the mode is not one of BLEND_MODES, RuntimeError where the renderer has another rasterizer.
     """
-    recorded = getattr(dataset, "blend_mode", None)
-    mode = recorded or "alpha"
+    _check_renderer()
+    given = getattr(dataset, "blend_mode", None)
+    mode = given or "alpha"
+    cfg_args = Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
+    saved = _saved_mode(cfg_args) if getattr(dataset, "model_path", "") else None
+    variable = os.environ.get(BLEND_MODE_VARIABLE)
+    is_flag = any(word.startswith("--bl") and "--blend_mode".startswith(word.partition("=")[0]) for word in sys.argv)
+    agreeing = [name for name, value in ((BLEND_MODE_VARIABLE, variable), (str(cfg_args), saved)) if value == mode]
+    source = "as --blend_mode says" if is_flag else f"as in {' and '.join(agreeing)}" if agreeing else "the default"
     if mode not in BLEND_MODES:
-        raise ValueError(f"--blend_mode is {mode!r}; it must be one of {', '.join(BLEND_MODES)}")
-    if not recorded:
+        raise ValueError(f"the blend mode is {mode!r}, {source}; it must be one of {', '.join(BLEND_MODES)}")
+    _say(f"blend mode {mode}, {source}")
+    if not given:
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
               "the patch); --blend_mode says otherwise")
-    variable = os.environ.get(BLEND_MODE_VARIABLE)
+    # Rendering without the flag never comes here: it has the mode of cfg_args.
+    if saved not in (None, mode):
+        _warn(f"{cfg_args} records blend mode {saved}, but this run has {mode}, {source}; a training overwrites it. "
+              f"To go on as before, give --blend_mode {saved}")
     if variable and variable != mode:
         _warn(f"{BLEND_MODE_VARIABLE} is {variable}, but the blend mode is {mode}: --blend_mode and cfg_args win")
     # The option lies in the trainers' OptimizationParams, which are not at hand where a model is rendered.
@@ -45,6 +59,16 @@ def blend_mode_of(dataset: Any) -> str:
               "does not penalise transparent Gaussians as it does in alpha mode")
     dataset.blend_mode = mode
     return mode
+
+
+def say_rasterizer(flavour: str) -> None:
+    """Says on stderr that `dsmoe run` has its effect: this process has imported this package's rasterizer."""
+    _say(f"the rasterizer is {flavour} of this package, blend mode {default_blend_mode()}")
+
+
+def say_stand_in(name: str) -> None:
+    """Says on stderr that this process has imported what this package has in place of a package that is missing."""
+    _say(f"{name} could not be imported: this package's own takes its place")
 
 
 def optional_import(name: str) -> Any:
@@ -94,6 +118,33 @@ class _Absent:
 
     def __getattr__(self, name: str) -> Any:
         raise self._error
+
+
+def _check_renderer() -> None:
+    """Raises RuntimeError where the trainer's renderer is not, or no longer, patched: it would ignore the mode."""
+    renderer = sys.modules.get("gaussian_renderer")
+    settings = getattr(renderer, "GaussianRasterizationSettings", None)
+    if settings is not None and "blend_mode" not in getattr(settings, "_fields", ()):
+        checkout = Path(getattr(renderer, "__file__", None) or "PATH/x").parent.parent
+        raise RuntimeError("gaussian_renderer uses another rasterizer, which has no blend modes: was it restored after "
+                           f"the patch? type: dsmoe patch check {checkout}")
+
+
+def _saved_mode(cfg_args: Path) -> Optional[str]:
+    """Returns the blend mode in the text of a Namespace, or None where there is none. Evaluates nothing."""
+    try:
+        call = ast.parse(cfg_args.read_text(), mode="eval").body
+    except (OSError, ValueError, SyntaxError):
+        return None
+    for keyword in getattr(call, "keywords", ()):
+        if keyword.arg == "blend_mode" and isinstance(keyword.value, ast.Constant):
+            return keyword.value.value
+    return None
+
+
+@functools.lru_cache(maxsize=None)
+def _say(text: str) -> None:
+    print("diff_smoe_rasterization: " + text, file=sys.stderr, flush=True)
 
 
 @functools.lru_cache(maxsize=None)

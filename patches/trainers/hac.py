@@ -7,4 +7,4 @@ RULES = shared_rules(FLAVOUR, settings_calls=2) + (  # render and prefilter_voxe
     PipeBlendMode("train.py", "render_sets", pipe="pipeline"),
 )
 
-HAC = Trainer(name="hac", flavour=FLAVOUR, signs=("calls visible_filter",), rules=RULES)
+HAC = Trainer(name="hac", flavour=FLAVOUR, signs=("calls visible_filter and imports encodings",), rules=RULES)

@@ -5,6 +5,6 @@ from .hac import FLAVOUR, RULES
 HAC_PLUS = Trainer(
     name="hac-plus",
     flavour=FLAVOUR,
-    signs=("imports gpcc_utils", "calls visible_filter and imports lpips"),
+    signs=("imports gpcc_utils", "calls visible_filter and imports encodings and imports lpips"),
     rules=RULES,
 )

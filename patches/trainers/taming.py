@@ -7,6 +7,7 @@ TAMING = Trainer(
     name="taming",
     flavour=FLAVOUR,
     signs=("sets pixel_weights",),
+    results=13,
     rules=shared_rules(FLAVOUR, imports=(GR, "scene/gaussian_model.py")) + (
         PipeBlendMode("train.py", "training"),
         PipeBlendMode("render.py", "render_sets", pipe="pipeline"),

@@ -449,8 +449,9 @@ def test_recognised_by_structure_alone():
     for name, signs in (("3dgs-2023", set()), ("3dgs-2024", {"sets antialiasing", "imports SparseGaussianAdam"}),
                         ("taming", {"sets pixel_weights", "imports SparseGaussianAdam"}),
                         ("c3dgs", {"sets clamp_color", "imports GaussianRasterizerIndexed"}),
-                        ("hac", {"calls visible_filter"}),
-                        ("hac-plus", {"calls visible_filter", "imports gpcc_utils"})):
+                        ("hac", {"calls visible_filter", "imports encodings"}),
+                        ("hac-plus", {"calls visible_filter", "imports gpcc_utils"}),
+                        ("scaffold-gs", {"calls visible_filter", "imports lpips"})):
         assert facts.recognise(base | signs)[0].name == name
     assert facts.recognise({"sets bg"})[0] is None
 
@@ -460,6 +461,8 @@ def test_recognised_by_structure_alone():
 def test_in_public_checkouts_only_the_statements_change(name):
     """Densification, optimizers, losses: no line of them is touched."""
     folder = Path(os.environ["DSMOE_TRAINERS"]) / name
+    if not folder.is_dir():
+        pytest.skip(f"DSMOE_TRAINERS has no {name}")
     digest = hashlib.sha256(repr(sorted(snapshot(folder).items())).encode()).hexdigest()
     lines = [line for line in patches.diff(folder).splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")]
     removed = [line[1:].strip() for line in lines if line[0] == "-"]

@@ -79,8 +79,20 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path):
     result = dsmoe_alone("run", "--blend-mode", "smoe_tn", "--", sys.executable, checkout / "parent.py", cwd=tmp_path)
     assert result.returncode == 7, result.stderr
     assert result.stdout.splitlines() == ["diff_smoe_rasterization.rasterizer smoe_tn", "no _C"]
-    assert "3dgs-2023" in result.stderr
+    announced, *said = result.stderr.splitlines()
+    assert "3dgs-2023" in announced and "will be inria of this package, blend mode smoe_tn" in announced
+    assert said == ["diff_smoe_rasterization: the rasterizer is inria of this package, blend mode smoe_tn"]
     assert snapshot(tmp_path) == before
+
+
+def test_a_command_that_takes_the_path_away_says_nothing(tmp_path):
+    """What the first line announces has come true where a process says so itself."""
+    checkout = make(tmp_path, {"show.py": "import importlib.util\n"
+                               "assert importlib.util.find_spec('diff_gaussian_rasterization') is None\n",
+                               "go.sh": f'PYTHONPATH=. "{sys.executable}" show.py\n'})
+    result = dsmoe_alone("run", "--blend-mode", "smoe", "--", "bash", "go.sh", cwd=checkout)
+    assert result.returncode == 0, result.stderr
+    assert "will be inria" in result.stderr and "the rasterizer is" not in result.stderr
 
 
 def test_signals_and_status_are_the_commands(tmp_path):
@@ -100,6 +112,18 @@ def test_every_shim_has_its_module():
     for flavour in run.flavours():
         text = (run.SHIMS / flavour / "diff_gaussian_rasterization/__init__.py").read_text()
         assert f"from diff_smoe_rasterization.integrations.{flavour} import *" in text
+        assert f'say_rasterizer("{flavour}")' in text
+
+
+def test_a_stand_in_says_that_it_is_used(tmp_path):
+    """Each that is used, and no other."""
+    code = "from simple_knn._C import distCUDA2; import fused_ssim; fused_ssim.fused_ssim"
+    shims = [str(run.SHIMS / name) for name in ("simple_knn", "fused_ssim", "weighted_distance")]
+    variables = {**environment(), "PYTHONPATH": os.pathsep.join([*shims, environment()["PYTHONPATH"]])}
+    result = subprocess.run([sys.executable, "-c", code], env=variables, stderr=subprocess.PIPE,
+                            universal_newlines=True)
+    assert result.returncode == 0, result.stderr
+    assert [line.split()[1] for line in result.stderr.splitlines()] == ["simple_knn", "fused_ssim"]
 
 
 def test_another_trainer_runs_by_the_name_of_its_rasterizer(tmp_path, dsmoe):
@@ -114,6 +138,8 @@ def test_another_trainer_runs_by_the_name_of_its_rasterizer(tmp_path, dsmoe):
 def test_the_blend_mode_has_to_be_said(tmp_path, dsmoe):
     result = dsmoe("run", "--", sys.executable, "train.py", cwd=make(tmp_path))
     assert result.returncode == 2 and "--blend-mode" in result.stderr
+    for spelling in ("--blend-mode", "--blend_mode"):  # the second is a patched trainer's
+        refused(dsmoe("run", spelling, "smoe", "--", cwd=tmp_path), "there is no command")
 
 
 def test_what_would_not_use_the_rasterizer_is_refused(tmp_path, dsmoe):
@@ -121,10 +147,17 @@ def test_what_would_not_use_the_rasterizer_is_refused(tmp_path, dsmoe):
     words = ("run", "--blend-mode", "smoe", "--")
     refused(dsmoe(*words, cwd=checkout), "there is no command")
     refused(dsmoe(*words, "no-such-command", cwd=checkout), "no-such-command")
-    for option in ("-I", "-sE"):
-        refused(dsmoe(*words, sys.executable, option, "train.py", cwd=checkout), "PYTHONPATH")
+    (checkout / "tool.py").write_text("")
+    refused(dsmoe(*words, "./tool.py", cwd=checkout), "./tool.py: is not executable; type: python ./tool.py")
+    for options in ("-I", "-sE", "-W ignore -E", "-uX dev -E", "-Wignore -Es", "--check-hash-based-pycs always -I"):
+        refused(dsmoe(*words, sys.executable, *options.split(), "train.py", cwd=checkout), "PYTHONPATH")
+    for options in ("-WIgnore", "-W Ignore", "-X E", "-cE", "-m E", "train.py -E", "- -E", "-u -- train.py -I"):
+        assert not set("IE") & set(run._python_options(options.split()))  # of the program, or values
     (tmp_path / "diff_gaussian_rasterization").mkdir()  # above the checkout, where no Python looks
     run.prepare([sys.executable, str(checkout / "train.py")], "smoe", None, environment())
+    (checkout / "diff_gaussian_rasterization.py").write_text("")
+    refused(dsmoe(*words, sys.executable, "train.py", cwd=checkout), "diff_gaussian_rasterization.py would be imported")
+    (checkout / "diff_gaussian_rasterization.py").unlink()
     (checkout / "diff_gaussian_rasterization").mkdir()
     refused(dsmoe(*words, sys.executable, "train.py", cwd=checkout), "diff_gaussian_rasterization would be imported")
     patched = make(tmp_path / "patched", {GR: RENDERER.replace("diff_gaussian_rasterization import",
