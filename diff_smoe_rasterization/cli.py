@@ -57,8 +57,8 @@ def build_parser() -> argparse.ArgumentParser:
     render.set_defaults(run=_render)
 
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
-                                description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, HAC or "
-                                            "HAC++, which then knows the option --blend_mode.")
+                                description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, "
+                                            "Scaffold-GS, HAC or HAC++, which then knows the option --blend_mode.")
     _add_patch_arguments(patch)
 
     run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
