@@ -52,8 +52,8 @@ def diff(arguments: argparse.Namespace) -> int:
     for change in planned.changes:
         sys.stdout.write(engine.diff_of(change.name, change.before, change.after))
     if planned.verdict == "patched" and planned.record is None:
-        print(f"{arguments.path}: is patched, but what it was before is not known without .dsmoe_patch: this is no diff "
-              "of the patch", file=sys.stderr)
+        print(f"{arguments.path}: is patched, but what it was before is not known without .dsmoe_patch: this is no "
+              "diff of the patch", file=sys.stderr)
     _print_notes(planned)
     return 0
 

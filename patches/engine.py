@@ -71,7 +71,8 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
 
 def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> str:
     """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
-    return "".join(diff_of(change.name, change.before, change.after) for change in plan(path, modernise, trainer).changes)
+    changes = plan(path, modernise, trainer).changes
+    return "".join(diff_of(change.name, change.before, change.after) for change in changes)
 
 
 def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
@@ -119,8 +120,8 @@ def pending(planned: Plan) -> Dict[str, bytes]:
     if planned.verdict == "patched" and record is None:
         if planned.modernise and planned.changes:
             raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
-                             f"checkout is patched and has no {FOLDER}: take the patch back by your version control, then "
-                             "apply it with --modernise")
+                             f"checkout is patched and has no {FOLDER}: take the patch back by your version control, "
+                             "then apply it with --modernise")
         return {}
     edited = [name for name, state in record.states().items() if state == "changed"] if record else []
     if edited and planned.modernise == record.manifest["modernise"]:
@@ -153,8 +154,8 @@ def revert(path: PathLike) -> Tuple[str, ...]:
     states = record.states() if Record.in_force(root) else {}
     for name, state in states.items():
         if state in ("changed", "gone"):
-            raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. Undo your edit; or copy what lies in {FOLDER}"
-                             f"/originals over the checkout, by which your edit is lost, and delete {FOLDER}")
+            raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. Undo your edit; or copy what lies in "
+                             f"{FOLDER}/originals over the checkout, by which your edit is lost, and delete {FOLDER}")
     patched = [name for name, state in states.items() if state == "patched"]
     for name in patched:
         check_writable(root, name)

@@ -4,8 +4,8 @@
     .dsmoe_patch/originals/NAME    the file as it was
 
 The last of "after" is what the file became; earlier ones are of a patch that this one took over from, so that whatever
-moment an interruption came at, each file is known to be the original, patched, or changed by someone else. "imports_ours"
-says that it imports this package then: one that no longer does was replaced, as by the checkout of another commit.
+moment an interruption came at, each file is known to be the original, patched, or changed by someone else.
+"imports_ours" says that it then imports this package: one that no longer does was replaced, as by git checkout.
 "complete" says that the last file was written: else it was an interruption, not the user, that left originals.
 """
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Record:
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch cannot be read: {error.strerror}") from None
+            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch cannot be read: {error}") from None
         try:
             manifest = json.loads(text)
             if manifest["format"] != FORMAT:

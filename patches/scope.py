@@ -82,7 +82,7 @@ def notes_on_scripts(files: Dict[str, bytes], others: Dict[str, bytes], trainer:
 
 
 def _reached(scripts: Dict[str, bytes], trainer: Trainer) -> Set[str]:
-    """A script is reached where a rule works in it, or where one that is reached imports it (the pipeline is passed)."""
+    """A script is reached where a rule works in it, or where one that is reached imports it."""
     reached = {rule.file for rule in trainer.rules if isinstance(rule, PipeBlendMode)}
     frontier = list(reached)
     while frontier:

@@ -66,4 +66,4 @@ def test_a_record_that_may_not_be_read_is_named(tmp_path, monkeypatch, dsmoe):
 
     monkeypatch.setattr(record_module.Path, "read_text", forbidden)  # root reads everything
     said = dsmoe("patch", "check", checkout)
-    assert said.status == 1 and "the record of the patch cannot be read: Permission denied" in said.err
+    assert said.status == 1 and "the record of the patch cannot be read: [Errno 13] Permission denied" in said.err
