@@ -57,8 +57,8 @@ def build_parser() -> argparse.ArgumentParser:
     render.set_defaults(run=_render)
 
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
-                                description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, HAC or "
-                                            "HAC++, which then knows the option --blend_mode.")
+                                description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, "
+                                            "Scaffold-GS, HAC or HAC++, which then knows the option --blend_mode.")
     _add_patch_arguments(patch)
 
     run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
@@ -75,12 +75,17 @@ def build_parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
     info.set_defaults(run=_info)
+    for command in (train, evaluate, render, run, info):
+        command.set_defaults(command_parser=command)
     return parser
 
 
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 when interrupted."""
-    arguments = build_parser().parse_args(argv)
+    parser = build_parser()
+    arguments, unknown = parser.parse_known_args(argv)
+    if unknown:  # argparse would show the usage of `dsmoe` alone
+        getattr(arguments, "command_parser", parser).error("unrecognized arguments: " + " ".join(unknown))
     try:
         return arguments.run(arguments) or 0
     except (TrainerError, PatchError, ImportError, OSError) as error:
@@ -104,13 +109,13 @@ def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
                        ("diff", "show what the patch changes"), ("revert", "put every file back byte for byte")):
         action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         action.add_argument("path", metavar="PATH", help="the checkout's folder")
-        if name in ("apply", "diff"):
+        if name != "revert":
             action.add_argument("--modernise", action="store_true",
                                 help="also what the trainer needs to start on today's torch, CUDA and Python")
             action.add_argument("--trainer", metavar="NAME", help="which trainer it is (default: found out)")
         if name == "apply":
             action.add_argument("--dry-run", action="store_true", help="show the changes, write nothing")
-        action.set_defaults(run=_patch)
+        action.set_defaults(run=_patch, command_parser=action)
 
 
 def _patch(arguments: argparse.Namespace) -> int:

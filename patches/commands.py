@@ -10,8 +10,15 @@ from . import engine
 def apply(arguments: argparse.Namespace) -> int:
     """Patches, or with --dry-run shows what a patch would change."""
     if arguments.dry_run:
-        return diff(arguments)
-    planned = engine.apply(arguments.path, arguments.modernise, arguments.trainer)
+        planned = engine.plan(arguments.path, arguments.modernise, arguments.trainer)
+        todo = engine.pending(planned)
+        for name, data in todo.items():
+            sys.stdout.write(engine.diff_of(name, (planned.root / name).read_bytes(), data))
+        if todo:
+            _print_notes(planned)
+            return 0
+    else:
+        planned = engine.apply(arguments.path, arguments.modernise, arguments.trainer)
     verdict = planned.verdict
     if planned.written:
         print(f"{arguments.path}: patched ({verdict.trainer})")
@@ -19,7 +26,8 @@ def apply(arguments: argparse.Namespace) -> int:
             print(f"  {change.name}: {', '.join(change.rules)}")
         print("It knows --blend_mode now, and saves it in cfg_args; `dsmoe patch revert` takes the patch back.")
     else:
-        print(f"{arguments.path}: already patched ({verdict.trainer}); nothing was written")
+        written = "would be" if arguments.dry_run else "was"
+        print(f"{arguments.path}: already patched ({verdict.trainer}); nothing {written} written")
         _print_lines(verdict.reasons)
     _print_lines(planned.notes)
     return 0
@@ -27,11 +35,12 @@ def apply(arguments: argparse.Namespace) -> int:
 
 def check(arguments: argparse.Namespace) -> int:
     """Says in one word how the checkout is, and why."""
-    verdict = engine.check(arguments.path)
+    planned = engine.inspect(arguments.path, arguments.modernise, arguments.trainer)
+    verdict = planned.verdict
     trainer = f" ({verdict.trainer})" if verdict.trainer else ""
     print(f"{arguments.path}: {verdict}{trainer}")
     if verdict in ("patchable", "patched"):
-        _print_lines(verdict.reasons)
+        _print_lines((*verdict.reasons, *planned.notes))
         return 0
     print(f"dsmoe patch: error: {engine.refusal(verdict)}", file=sys.stderr)
     return 1
@@ -40,9 +49,12 @@ def check(arguments: argparse.Namespace) -> int:
 def diff(arguments: argparse.Namespace) -> int:
     """Shows what the patch changes, against the files as they were before any patch."""
     planned = engine.plan(arguments.path, arguments.modernise, arguments.trainer)
-    sys.stdout.write("".join(engine.diff_of(change) for change in planned.changes))
-    for note in planned.notes:
-        print(note, file=sys.stderr)
+    for change in planned.changes:
+        sys.stdout.write(engine.diff_of(change.name, change.before, change.after))
+    if planned.verdict == "patched" and planned.record is None:
+        print(f"{arguments.path}: is patched, but what it was before is not known without .dsmoe_patch: this is no "
+              "diff of the patch", file=sys.stderr)
+    _print_notes(planned)
     return 0
 
 
@@ -56,3 +68,8 @@ def revert(arguments: argparse.Namespace) -> int:
 def _print_lines(lines) -> None:
     for line in lines:
         print("  " + line)
+
+
+def _print_notes(planned: engine.Plan) -> None:
+    for note in planned.notes:
+        print(note, file=sys.stderr)

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import difflib
 import io
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, List, NamedTuple, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Dict, List, NamedTuple, Optional, Tuple, Union
 
 from diff_smoe_rasterization._version import __version__
 
 from . import facts, source
 from .errors import PatchError
 from .record import FOLDER, Record, check_writable, remove_rest, replace_file
-from .rules import Trainer
-from .scope import build_files, callers_out_of_reach, python_files
+from .rules import GR, Trainer
+from .scope import build_files, notes_on_scripts, other_files, python_files
 from .trainers import TRAINERS
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class Plan(NamedTuple):
     root: Path
     verdict: Verdict
     changes: Tuple[Change, ...]
-    notes: Tuple[str, ...]  # which modernise rules are applied or skipped, which scripts render out of reach
+    notes: Tuple[str, ...]  # which modernise rules are applied or skipped, which scripts no rule reaches
     modernise: bool
     record: Optional[Record]
     written: bool = False  # whether `apply` wrote files by this plan
@@ -55,22 +56,23 @@ class Plan(NamedTuple):
 
 def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
     """Plans the patch of a checkout, also of one that is patched. Raises PatchError where it is refused."""
-    planned = _inspect(path, modernise, trainer)
+    planned = inspect(path, modernise, trainer)
     if planned.verdict in ("patchable", "patched"):
         return planned
-    if planned.verdict == "half-patched" and planned.record and _can_be_finished(planned):
+    if planned.verdict == "half-patched" and planned.record and planned.record.can_be_finished():
         return planned
     raise PatchError(refusal(planned.verdict))
 
 
-def check(path: PathLike) -> Verdict:
+def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Verdict:
     """Says how a checkout is: unknown, patchable, patched, half-patched or drifted, with `.trainer` and `.reasons`."""
-    return _inspect(path).verdict
+    return inspect(path, modernise, trainer).verdict
 
 
 def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> str:
     """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
-    return "".join(diff_of(change) for change in plan(path, modernise, trainer).changes)
+    changes = plan(path, modernise, trainer).changes
+    return "".join(diff_of(change.name, change.before, change.after) for change in changes)
 
 
 def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
@@ -80,28 +82,16 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     Raises PatchError where it is refused, and then every file is as it was.
     """
     planned = plan(path, modernise, trainer)
-    root, record = planned.root, planned.record
-    if planned.verdict == "patched" and record is None:
-        if modernise and planned.changes:
-            raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
-                             f"checkout is patched and has no {FOLDER}: take the patch back by your version control, then "
-                             "apply it with --modernise")
+    root, record, todo = planned.root, planned.record, pending(planned)
+    if not todo:
+        if record and not record.manifest["complete"]:
+            record.completed()
         return planned
-    states = record.states() if record else {}
-    edited = [name for name, state in states.items() if state == "changed"]
-    if edited and planned.modernise == record.manifest["modernise"]:
-        return planned  # every rule is applied
-    if edited:
-        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise belongs to the first patch")
-    before = {change.name: change.before for change in planned.changes}
-    after = {change.name: change.after for change in planned.changes}
-    for name in set(states) - set(after):  # of an earlier version's rules
-        before[name] = after[name] = record.original(name)
-    pending = {name: data for name, data in after.items() if (root / name).read_bytes() != data}
-    if record and not pending and record.manifest["complete"]:
-        return planned
-    for name in pending:
+    before, after = ({name: made[state] for name, made in _outcome(planned).items()} for state in (0, 1))
+    for name in todo:
         check_writable(root, name)
+    if record is None and (root / FOLDER / "manifest.json").exists():  # of a patch of which nothing is left
+        Record.load(root).remove()
     notes = {"version": __version__, "trainer": planned.verdict.trainer, "modernise": planned.modernise,
              "rules": {change.name: change.rules for change in planned.changes}}
     try:
@@ -109,9 +99,9 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     except OSError as error:
         remove_rest(root)
         raise PatchError(f"{FOLDER}: the originals cannot be kept, so nothing was changed: {error}") from None
-    undo = {name: (root / name).read_bytes() for name in pending}
+    undo = {name: (root / name).read_bytes() for name in todo}
     try:
-        for name, data in pending.items():
+        for name, data in todo.items():
             replace_file(root, root / name, data)
         begun.completed()
     except OSError as error:
@@ -124,10 +114,36 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     return planned._replace(written=True)
 
 
-def revert(path: PathLike) -> Tuple[str, ...]:
-    """Puts every file back byte for byte and removes the record; returns the files' names.
+def pending(planned: Plan) -> Dict[str, bytes]:
+    """Returns what `apply` would write, by the files' names. Raises PatchError where it refuses."""
+    record = planned.record
+    if planned.verdict == "patched" and record is None:
+        if planned.modernise and planned.changes:
+            raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
+                             f"checkout is patched and has no {FOLDER}: take the patch back by your version control, "
+                             "then apply it with --modernise")
+        return {}
+    edited = [name for name, state in record.states().items() if state == "changed"] if record else []
+    if edited and planned.modernise == record.manifest["modernise"]:
+        return {}  # every rule is applied
+    if edited:
+        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise belongs to the first patch")
+    return {name: after for name, (_, after) in _outcome(planned).items()
+            if (planned.root / name).read_bytes() != after}
 
-    Raises PatchError, and touches nothing, where a file was changed since or where there is no record.
+
+def _outcome(planned: Plan) -> Dict[str, Tuple[bytes, bytes]]:
+    """Returns what each file was before any patch, and what it becomes."""
+    made = {change.name: (change.before, change.after) for change in planned.changes}
+    for name in set(planned.record.files if planned.record else ()) - set(made):  # of an earlier version's rules
+        made[name] = (planned.record.original(name),) * 2
+    return made
+
+
+def revert(path: PathLike) -> Tuple[str, ...]:
+    """Puts every file that is patched back byte for byte and removes the record; returns the files' names.
+
+    Raises PatchError, and touches nothing, where a patched file was changed since or where there is no record.
     """
     root = _root(path)
     record = Record.load(root)
@@ -135,10 +151,11 @@ def revert(path: PathLike) -> Tuple[str, ...]:
         return ()
     if record is None:
         raise PatchError(f"{root}: there is no {FOLDER}, so nothing can be put back: it was not patched, or by hand")
-    states = record.states()
+    states = record.states() if Record.in_force(root) else {}
     for name, state in states.items():
         if state in ("changed", "gone"):
-            raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. The original is in {FOLDER}/originals")
+            raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. Undo your edit; or copy what lies in "
+                             f"{FOLDER}/originals over the checkout, by which your edit is lost, and delete {FOLDER}")
     patched = [name for name, state in states.items() if state == "patched"]
     for name in patched:
         check_writable(root, name)
@@ -149,15 +166,17 @@ def revert(path: PathLike) -> Tuple[str, ...]:
 
 
 _SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
+          "replaced": "was changed since, and is not patched any more; `revert` leaves it, and puts back the others",
           "original": "is the original, though the record says that it was patched; `revert` puts back the others too"}
 
 
-def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+    """Plans the patch of a checkout in whatever state it is."""
     source.have_libcst()
     from .patch import Patch
 
     root = _root(path)
-    record = Record.load(root)
+    record = Record.in_force(root)
     modernise = modernise or bool(record and record.manifest["modernise"])
 
     def read(name: str) -> Optional[bytes]:
@@ -165,6 +184,8 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
             return record.original(name)
         return _read(root / name)
 
+    if read(GR) is None:
+        return Plan(root, Verdict("unknown", None, [_no_renderer(root)]), (), (), modernise, record)
     chosen, reason = _trainer(read, trainer or (record.manifest["trainer"] if record else None))
     if chosen is None:
         return Plan(root, Verdict("unknown", None, [reason]), (), (), modernise, record)
@@ -176,32 +197,33 @@ def _inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = N
         patch.modernise()
     state, reasons = patch.state()
     if record and not patch.problems:
-        state, reasons = _state_by_record(record)
-    notes = (*patch.notes, *callers_out_of_reach(files, chosen))
+        state, reasons = _state_by_record(root, record, chosen)
+    elif state == "patchable" and (root / FOLDER / "manifest.json").exists():
+        reasons = [f"no file is patched any more: `apply` replaces the {FOLDER} that is there, `revert` removes it"]
+    looks_like = _trainer(read, None)[0] if trainer else None
+    if looks_like and looks_like.flavour != chosen.flavour:
+        patch.notes.insert(0, f"--trainer {trainer}: by what it imports and calls this is {looks_like.name}, whose "
+                              f"rasterizer has another API ({looks_like.flavour}, not {chosen.flavour})")
+    notes = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
     return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), notes, modernise, record)
 
 
-def _state_by_record(record: Record) -> Tuple[str, List[str]]:
+def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str, List[str]]:
     """How a checkout is that has a record: `patched`, or what the record and the files disagree in."""
-    states = record.states()
-    if set(states.values()) <= {"patched"}:
-        return "patched", [f"by version {record.manifest['version']}"
-                           + (", with --modernise" if record.manifest["modernise"] else "")]
-    if not record.manifest["complete"] and set(states.values()) <= {"patched", "original"}:
-        return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
-    return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
-
-
-def _can_be_finished(planned: Plan) -> bool:
-    """Whether an interrupted patch can be finished, or what was edited since still has every rule applied."""
-    states = set(planned.record.states().values())
-    if states <= {"patched", "original"}:
-        return states == {"patched"} or not planned.record.manifest["complete"]
     from .patch import Patch
 
-    trainer = next(trainer for trainer in TRAINERS if trainer.name == planned.verdict.trainer)
-    files = {name: _read(planned.root / name) for name in python_files(planned.root)}
-    return "gone" not in states and Patch(files, trainer).state()[0] == "patched"
+    states = record.states()
+    by = [f"by version {record.manifest['version']}" + (", with --modernise" if record.manifest["modernise"] else "")]
+    if set(states.values()) <= {"patched"}:
+        return "patched", by
+    if record.can_be_finished():
+        return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
+    if set(states.values()) <= {"patched", "changed"}:
+        files = {name: _read(root / name) for name in python_files(root)}
+        if Patch(files, trainer).state()[0] == "patched":
+            return "patched", by + [f"{name}: was edited since; every rule is still applied"
+                                    for name, state in states.items() if state == "changed"]
+    return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
 
 
 def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:
@@ -211,6 +233,13 @@ def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:
         if trainer.name == name:
             return trainer, ""
     raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(facts.names())}")
+
+
+def _no_renderer(root: Path) -> str:
+    """Says that a folder is no checkout, and which one beside it is."""
+    above = root.resolve()
+    near = [folder for folder in (*above.parents, *sorted(above.glob("*/"))) if os.path.isfile(str(folder / GR))]
+    return f"there is no {GR} in {root}; wanted is the checkout's folder" + (f", such as {near[0]}" if near else "")
 
 
 def _root(path: PathLike) -> Path:
@@ -233,9 +262,8 @@ def refusal(verdict: Verdict) -> str:
     return "\n".join([f"the checkout is {verdict}{trainer}:", *("  " + reason for reason in verdict.reasons)])
 
 
-def diff_of(change: Change) -> str:
+def diff_of(name: str, before: bytes, after: bytes) -> str:
     """Returns the unified diff of one file."""
-    before, after = (io.StringIO(source.decode(change.name, data)[0], newline="\n").readlines()
-                     for data in (change.before, change.after))
-    lines = difflib.unified_diff(before, after, "a/" + change.name, "b/" + change.name)
+    old, new = (io.StringIO(source.decode(name, data)[0], newline="\n").readlines() for data in (before, after))
+    lines = difflib.unified_diff(old, new, "a/" + name, "b/" + name)
     return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in lines)

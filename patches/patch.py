@@ -58,11 +58,16 @@ class Patch:
 
     def modernise(self) -> None:
         """Applies the modernise rules, and notes of each what it changed."""
+        skipped = []
         for rule in modernise.RULES:
             changed = [name for name in sorted(self.files)
                        if rule.looks_at(self.files[name]) and self._changes(modernise.run, rule, name)]
-            self.notes.append(f"modernise {rule.name}: " + (f"{', '.join(changed)}: {rule.reason}" if changed
-                                                            else "skipped, nothing matches"))
+            if changed:
+                self.notes.append(f"modernise {rule.name}: {', '.join(changed)}: {rule.reason}")
+            else:
+                skipped.append(rule.name)
+        if skipped:
+            self.notes.append(f"modernise: skipped, nothing matches: {', '.join(skipped)}")
 
     def _changes(self, run, rule, name: str) -> bool:
         """Applies a rule that may match or not; a file that cannot be read is left as it is."""

@@ -1,11 +1,12 @@
 """PATH/.dsmoe_patch: the originals, byte for byte, and a manifest of what was changed. Written before any file is.
 
-    .dsmoe_patch/manifest.json     {"files": {name: {"before": sha256, "after": [sha256, ...]}}, "trainer": ..., ...}
+    .dsmoe_patch/manifest.json     {"files": {name: {"before": sha256, "after": [...], ...}}, "trainer": ..., ...}
     .dsmoe_patch/originals/NAME    the file as it was
 
 The last of "after" is what the file became; earlier ones are of a patch that this one took over from, so that whatever
-moment an interruption came at, each file is known to be the original, patched, or changed by someone else. "complete"
-says that the last file was written: else it was an interruption, not the user, that left originals.
+moment an interruption came at, each file is known to be the original, patched, or changed by someone else.
+"imports_ours" says that it then imports this package: one that no longer does was replaced, as by git checkout.
+"complete" says that the last file was written: else it was an interruption, not the user, that left originals.
 """
 from __future__ import annotations
 
@@ -22,6 +23,7 @@ from .errors import PatchError
 
 FOLDER = ".dsmoe_patch"
 FORMAT = 1
+PACKAGE = b"diff_smoe_rasterization"  # what a patched file imports from
 
 
 def sha256(data: bytes) -> str:
@@ -36,6 +38,16 @@ class Record:
         self.root, self.files = root, manifest["files"]
 
     @classmethod
+    def in_force(cls, root: Path) -> Optional[Record]:
+        """Returns the record, or None where the checkout has none or none of its files is patched any more."""
+        record = cls.load(root)
+        if record is None:
+            return None
+        states = set(record.states().values())
+        is_pending = not record.manifest["complete"] and states == {"original"}
+        return record if is_pending or states & {"patched", "changed"} else None
+
+    @classmethod
     def load(cls, root: Path) -> Optional[Record]:
         """Returns the record, or None where the checkout has none. Raises PatchError where it cannot be read."""
         path = root / FOLDER / "manifest.json"
@@ -43,6 +55,8 @@ class Record:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
             return None
+        except OSError as error:
+            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch cannot be read: {error}") from None
         try:
             manifest = json.loads(text)
             if manifest["format"] != FORMAT:
@@ -64,7 +78,8 @@ class Record:
         for name, data in originals.items():
             before = earlier.files[name]["after"] if earlier and name in earlier.files else []
             new = sha256(after[name])
-            files[name] = {"before": sha256(data), "after": [known for known in before if known != new] + [new]}
+            files[name] = {"before": sha256(data), "after": [known for known in before if known != new] + [new],
+                           "imports_ours": PACKAGE in after[name]}
             copy = root / FOLDER / "originals" / name
             copy.parent.mkdir(parents=True, exist_ok=True)
             replace_file(root, copy, data)
@@ -85,17 +100,24 @@ class Record:
         return (self.folder / "originals" / name).read_bytes()
 
     def states(self) -> Dict[str, str]:
-        """Returns of each file whether it is "original", "patched", or "changed" (or gone) since."""
+        """Returns of each file whether it is "original", "patched", or "changed", "replaced" or "gone" since."""
         return {name: self._state(name, hashes) for name, hashes in self.files.items()}
+
+    def can_be_finished(self) -> bool:
+        """Whether it is of a patch that was interrupted, and nobody has changed a file since."""
+        return not self.manifest["complete"] and set(self.states().values()) <= {"patched", "original"}
 
     def _state(self, name: str, hashes: Mapping) -> str:
         try:
-            now = sha256((self.root / name).read_bytes())
+            data = (self.root / name).read_bytes()
         except FileNotFoundError:
             return "gone"
+        now = sha256(data)
         if now == hashes["before"]:
             return "original"
-        return "patched" if now in hashes["after"] else "changed"
+        if now in hashes["after"]:
+            return "patched"
+        return "replaced" if hashes.get("imports_ours") and PACKAGE not in data else "changed"
 
     def remove(self) -> None:
         """Removes the record; the manifest first, without which the rest means nothing."""

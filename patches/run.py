@@ -19,7 +19,7 @@ from diff_smoe_rasterization.settings import BLEND_MODE_VARIABLE
 
 from . import facts
 from .errors import PatchError
-from .record import FOLDER
+from .record import Record
 from .rules import RASTERIZER
 from .trainers import TRAINERS
 
@@ -89,7 +89,7 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str]:
     folders = _folders(words)
     for folder in folders:
         found = facts.of_checkout(lambda name: (folder / name).read_bytes() if (folder / name).is_file() else None)
-        if facts.PATCHED in found or (folder / FOLDER / "manifest.json").is_file():
+        if facts.PATCHED in found or Record.in_force(folder):
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
         for path in (folder / RASTERIZER, folder / f"{RASTERIZER}.py"):

@@ -2,15 +2,18 @@
 from __future__ import annotations
 
 import ast
+import os
+import re
 import warnings
 from pathlib import Path
 from typing import Dict, Iterator, List, Set
 
-from .rules import PipeBlendMode, Trainer
+from .rules import GR, INTEGRATIONS, RASTERIZER, PipeBlendMode, SettingsBlendMode, Trainer
 
 # Not all folders: outputs hold copies of the code, environments whole packages.
 FOLDERS = ("", "arguments", "compression", "gaussian_renderer", "lpipsPyTorch", "scene", "utils")
-RENDERERS = {"render", "prefilter_voxel"}
+RENDERERS = {"render", "prefilter_voxel", "*"}
+SETTINGS = "GaussianRasterizationSettings"
 
 
 def python_files(root: Path) -> Iterator[str]:
@@ -28,41 +31,104 @@ def build_files(root: Path) -> Iterator[str]:
             yield path.relative_to(root).as_posix()
 
 
-def callers_out_of_reach(files: Dict[str, bytes], trainer: Trainer) -> List[str]:
-    """Says which scripts render with a pipeline that no rule gives a blend mode.
+def other_files(root: Path) -> Dict[str, bytes]:
+    """Returns the Python files elsewhere in the checkout, which no rule changes: scripts of the user's own."""
+    found = {}
+    for above, folders, names in os.walk(str(root)):
+        folders[:] = [folder for folder in folders if not _is_foreign(os.path.join(above, folder))]
+        folder = Path(above).relative_to(root)
+        if folder.as_posix() in (".", *FOLDERS):
+            continue
+        for name in names:
+            if name.endswith(".py"):
+                try:
+                    found[(folder / name).as_posix()] = Path(above, name).read_bytes()
+                except OSError:
+                    continue  # such as a link to nothing
+    return found
 
-    A script is reached where a rule works in it, or where one that is reached imports it (the pipeline is passed on).
+
+def _is_foreign(folder: str) -> bool:
+    """Whether a folder holds no scripts of this checkout: submodules, an environment, a run's output, a checkout."""
+    name = os.path.basename(folder)
+    return (name.startswith(".") or name in ("submodules", "site-packages", "__pycache__")
+            or any(os.path.exists(os.path.join(folder, sign)) for sign in ("pyvenv.cfg", "conda-meta", "cfg_args", GR)))
+
+
+def notes_on_scripts(files: Dict[str, bytes], others: Dict[str, bytes], trainer: Trainer) -> List[str]:
+    """Says which scripts keep the original rasterizer, make settings without a blend mode, or render without one.
+
+    files: those that rules look at; others: the rest of the checkout's.
     """
+    files = {name: data for name, data in files.items() if not name.startswith("submodules/")}
+    scripts = {**files, **others}
+    ruled = {rule.file for rule in trainer.rules if isinstance(rule, SettingsBlendMode)}
+    reached = _reached(scripts, trainer)
+    notes = []
+    for name, data in sorted(scripts.items()):
+        if RASTERIZER.encode() not in data and b"gaussian_renderer" not in data and SETTINGS.encode() not in data:
+            continue
+        nodes = list(ast.walk(_tree(data)))
+        if any(_imports_original(node, name in files) for node in nodes):
+            notes.append(f"{name}: imports the original rasterizer, which no rule changes there; this package's is "
+                         f"`from {INTEGRATIONS}.{trainer.flavour} import ...`")
+        elif name not in ruled and any(_makes_settings(node) for node in nodes):
+            notes.append(f"{name}: makes {SETTINGS} of its own without a blend mode, which no rule gives it: without "
+                         f"`blend_mode=...` it is $DSMOE_BLEND_MODE, else alpha")
+        if name not in reached and not re.search(rb"\.blend_mode\s*=[^=]", data) and any(map(_renders, nodes)):
+            notes.append(f"{name}: renders, but no rule reaches it: before it renders it needs the statement "
+                         "`pipe.blend_mode = blend_mode_of(dataset)`, or it stops with an AttributeError")
+    return notes
+
+
+def _reached(scripts: Dict[str, bytes], trainer: Trainer) -> Set[str]:
+    """A script is reached where a rule works in it, or where one that is reached imports it."""
     reached = {rule.file for rule in trainer.rules if isinstance(rule, PipeBlendMode)}
-    imports = {name: _imports(data) for name, data in files.items() if not name.startswith("submodules/")}
     frontier = list(reached)
     while frontier:
-        for module in imports.get(frontier.pop(), ()):
+        for module in _imports(scripts.get(frontier.pop(), b"")):
             for name in (module.replace(".", "/") + ".py", module.replace(".", "/") + "/__init__.py"):
-                if name in files and name not in reached:
+                if name in scripts and name not in reached:
                     reached.add(name)
                     frontier.append(name)
-    return [f"{name}: renders, but no rule reaches it: before it renders it needs the statement `pipe.blend_mode = "
-            "blend_mode_of(dataset)`, or it stops with an AttributeError"
-            for name, modules in sorted(imports.items())
-            if name not in reached and b".blend_mode = " not in files[name]
-            and RENDERERS & {module.rpartition(":")[2] for module in modules}]
+    return reached
+
+
+def _renders(node: ast.AST) -> bool:
+    """Whether it takes what renders from the renderer."""
+    if isinstance(node, ast.ImportFrom):
+        return node.module == "gaussian_renderer" and any(alias.name in RENDERERS for alias in node.names)
+    return isinstance(node, ast.Import) and any(alias.name == "gaussian_renderer" for alias in node.names)
+
+
+def _imports_original(node: ast.AST, is_looked_at: bool) -> bool:
+    """Whether it imports the rasterizer; `from ... import` is a rule's (patch.py) in the files that are looked at."""
+    if isinstance(node, ast.ImportFrom):
+        return not is_looked_at and not node.level and (node.module or "").partition(".")[0] == RASTERIZER
+    return isinstance(node, ast.Import) and any(alias.name.partition(".")[0] == RASTERIZER for alias in node.names)
+
+
+def _makes_settings(node: ast.AST) -> bool:
+    return (isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) == SETTINGS
+            and not {"blend_mode", None} & {keyword.arg for keyword in node.keywords})  # None: **settings
 
 
 def _imports(data: bytes) -> Set[str]:
-    """Returns the modules that a file imports, and "gaussian_renderer:NAME" of what it takes from the renderer."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            tree = ast.parse(data)
-    except (SyntaxError, ValueError):
-        return set()
+    """Returns the modules that a file imports, and what it imports from them: that may be a module too."""
     modules: Set[str] = set()
-    for node in ast.walk(tree):
+    for node in ast.walk(_tree(data)):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             modules |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-            if node.module == "gaussian_renderer":
-                modules |= {f"{node.module}:{alias.name}" for alias in node.names}
     return modules
+
+
+def _tree(data: bytes) -> ast.AST:
+    """Returns the syntax tree of a file, of one that cannot be parsed an empty one."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return ast.parse(data)
+    except (SyntaxError, ValueError):
+        return ast.parse("")

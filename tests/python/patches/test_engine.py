@@ -5,6 +5,7 @@ import hashlib
 import os
 import shutil
 import stat
+import sys
 from pathlib import Path
 
 import pytest
@@ -202,6 +203,24 @@ def test_what_is_no_trainer_is_unknown(tmp_path):
         patches.apply(tmp_path / "nowhere")
 
 
+def test_a_folder_beside_the_checkout_is_said_to_be_none(tmp_path):
+    checkout = make(tmp_path / "checkout")
+    (tmp_path / "else").mkdir()
+    for folder in (tmp_path, checkout / "arguments"):
+        refused(folder, "unknown", f"there is no {GR} in {folder}", f"such as {checkout}")
+        refused(folder, f"there is no {GR} in {folder}", trainer="3dgs-2023")
+    refused(tmp_path / "else", f"there is no {GR} in {tmp_path / 'else'}")
+
+
+def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
+    antialiasing = {GR: RENDERER.replace("prefiltered", "antialiasing")}
+    (note,) = patches.plan(make(tmp_path / "2024", antialiasing), trainer="3dgs-2023").notes
+    assert "--trainer 3dgs-2023" in note and "3dgs-2024" in note and "another API" in note
+    assert patches.plan(make(tmp_path / "2023"), trainer="3dgs-2023").notes == ()
+    patches.apply(tmp_path / "2024", trainer="3dgs-2023")
+    assert patches.plan(tmp_path / "2024").notes == ()  # it was said when it was chosen
+
+
 def test_a_patch_by_hand_is_half_or_whole(tmp_path):
     whole = make(tmp_path / "whole", PATCHED)
     assert patches.check(whole) == "patched"
@@ -270,12 +289,68 @@ def test_a_file_that_changed_since_is_not_overwritten(tmp_path):
     patches.apply(make(tmp_path))
     with open(str(tmp_path / "train.py"), "a") as file:
         file.write("# mine\n")
-    assert patches.check(tmp_path) == "half-patched"
-    assert not patches.apply(tmp_path).written  # every rule is applied
-    refused(tmp_path, "train.py", "changed", call=patches.revert)
+    verdict = patches.check(tmp_path)  # every rule is applied
+    assert verdict == "patched" and verdict.reasons[1].startswith("train.py: was edited since")
+    assert not patches.apply(tmp_path).written
+    refused(tmp_path, "train.py", "changed", "Undo your edit", "delete .dsmoe_patch", call=patches.revert)
     refused(tmp_path, "train.py", "changed", modernise=True)
     (tmp_path / "train.py").write_text(TRAIN + "# mine\n")  # the edit is kept, the patch is not
     refused(tmp_path, "train.py", "changed")
+
+
+def test_the_way_out_of_an_edit_is_the_one_that_is_named(tmp_path):
+    original = snapshot(make(tmp_path))
+    patches.apply(tmp_path)
+    (tmp_path / "train.py").write_text((tmp_path / "train.py").read_text() + "# mine\n")
+    with pytest.raises(patches.PatchError, match="copy what lies in .dsmoe_patch/originals over the checkout"):
+        patches.revert(tmp_path)
+    for copy in (tmp_path / ".dsmoe_patch/originals").rglob("*.py"):
+        shutil.copy(str(copy), str(tmp_path / copy.relative_to(tmp_path / ".dsmoe_patch/originals")))
+    shutil.rmtree(str(tmp_path / ".dsmoe_patch"))
+    assert snapshot(tmp_path) == original
+
+
+def another_commit(folder):
+    """Replaces every file by that of a later version, as `git checkout` does."""
+    for name, text in CHECKOUT.items():
+        (folder / name).write_text("# a later version\n" + text)
+
+
+@pytest.mark.parametrize("come_back", [make, another_commit])
+def test_a_record_of_which_no_file_is_patched_any_more_is_no_hindrance(tmp_path, come_back):
+    patches.apply(make(tmp_path / "checkout"))
+    come_back(tmp_path / "checkout")
+    shutil.copytree(str(tmp_path / "checkout"), str(tmp_path / "reverted"))
+    verdict = patches.check(tmp_path / "checkout")
+    assert verdict == "patchable" and "no file is patched any more" in verdict.reasons[0]
+    assert prepared(tmp_path / "checkout")
+    assert patches.apply(tmp_path / "checkout").written and patches.check(tmp_path / "checkout") == "patched"
+    with pytest.raises(patches.PatchError, match="patched already"):
+        prepared(tmp_path / "checkout")
+    patches.revert(tmp_path / "checkout")
+    assert patches.revert(tmp_path / "reverted") == ()
+    assert snapshot(tmp_path / "checkout") == snapshot(tmp_path / "reverted")
+
+
+def prepared(folder):
+    from diff_smoe_rasterization.patches.run import prepare
+
+    return prepare([sys.executable, str(folder / "train.py")], "smoe", None, dict(os.environ))
+
+
+def test_what_is_patched_beside_replaced_files_is_put_back(tmp_path):
+    """git replaces the trainer's files, and leaves those of its submodules."""
+    setup = "submodules/grid/setup.py"
+    make(tmp_path, {setup: "flags = ['-O2', '-std=c++14']\n"})
+    patches.apply(tmp_path, modernise=True)
+    another_commit(tmp_path)
+    verdict = patches.check(tmp_path)
+    assert verdict == "half-patched"
+    assert any("train.py" in reason and "`revert`" in reason for reason in verdict.reasons)
+    refused(tmp_path, "train.py")
+    assert patches.revert(tmp_path) == (setup,)
+    assert "c++14" in (tmp_path / setup).read_text() and "a later version" in (tmp_path / "train.py").read_text()
+    assert patches.check(tmp_path) == "patchable" and not (tmp_path / ".dsmoe_patch").exists()
 
 
 def test_a_damaged_record_is_no_ground_to_write(tmp_path):
@@ -334,6 +409,40 @@ def test_scripts_of_the_user(tmp_path):
     patches.apply(folder)
     assert "diff_smoe_rasterization.integrations.inria " in (folder / "viewer.py").read_text()
     assert snapshot(folder)["utils/loss.py"] == before["utils/loss.py"]
+
+
+SCRIPTS = {
+    "tools/own.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
+    "tools/deep/own.py": ("from diff_gaussian_rasterization._C import mark_visible\n", "imports the original"),
+    "whole.py": ("import diff_gaussian_rasterization as dgr\n", "imports the original"),
+    "settings.py": ("from diff_gaussian_rasterization import GaussianRasterizationSettings\n"
+                    "def show(pipe):\n    return GaussianRasterizationSettings(debug=pipe.debug)\n", "settings"),
+    "film.py": ("import gaussian_renderer\ngaussian_renderer.render(None)\n", "renders"),
+    "tools/film.py": ("from gaussian_renderer import render\n", "renders"),
+    "all.py": ("from gaussian_renderer import *\n", "renders"),
+}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_script_that_keeps_the_original_or_has_no_mode_is_named(tmp_path, name):
+    text, word = SCRIPTS[name]
+    folder = make(tmp_path, {name: text})
+    for _ in range(2):  # before the patch, and when it is there
+        (note,) = patches.plan(folder).notes
+        assert note.startswith(name + ": ") and word in note
+        patches.apply(folder)
+
+
+def test_what_is_no_script_of_the_checkout_is_not_named(tmp_path):
+    """Environments, outputs with a copy of the code, other checkouts; what a script that is reached imports."""
+    text = SCRIPTS["tools/film.py"][0]
+    folder = make(tmp_path, {"env/pyvenv.cfg": "", "env/film.py": text, "out/cfg_args": "", "out/backup/film.py": text,
+                             "submodules/a/film.py": text, ".cache/film.py": text, "lib/film.py": text,
+                             "train.py": "from lib import film\n" + TRAIN, "tools/gui.py":
+                             "from gaussian_renderer import network_gui\n", "tools/mode.py": "from gaussian_renderer "
+                             "import render\npipe.blend_mode = 'smoe'\n"})
+    make(folder / "another")
+    assert patches.plan(folder).notes == ()
 
 
 def test_recognised_by_structure_alone():

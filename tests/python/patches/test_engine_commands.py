@@ -1,0 +1,69 @@
+"""What `dsmoe patch` says: with its options, where there is nothing to do, and where it is typed wrongly."""
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
+
+from diff_smoe_rasterization import patches  # noqa: E402
+from diff_smoe_rasterization.patches import record as record_module  # noqa: E402
+from test_engine import make, snapshot  # noqa: E402
+
+
+def test_a_dry_run_shows_what_is_still_to_be_done(tmp_path, dsmoe):
+    checkout = make(tmp_path)
+    assert "+++ b/train.py" in dsmoe("patch", "apply", checkout, "--dry-run").out
+    patches.apply(checkout)
+    before = snapshot(checkout)
+    said = dsmoe("patch", "apply", checkout, "--dry-run")
+    assert said.status == 0 and "already patched" in said.out and "would be written" in said.out
+    assert "+++" not in said.out
+    said = dsmoe("patch", "apply", checkout, "--dry-run", "--modernise")
+    assert "+++ b/train.py" in said.out and "weights_only" in said.out and "blend_mode_of" not in "".join(
+        line for line in said.out.splitlines() if line[0] == "+")
+    assert snapshot(checkout) == before
+
+
+def test_a_diff_without_the_originals_says_so(tmp_path, dsmoe):
+    checkout = make(tmp_path)
+    patches.apply(checkout)
+    assert dsmoe("patch", "diff", checkout).err == ""
+    shutil.rmtree(str(checkout / ".dsmoe_patch"))
+    said = dsmoe("patch", "diff", checkout)
+    assert said.status == 0 and said.out == "" and "not known without .dsmoe_patch" in said.err
+
+
+def test_check_has_the_options_of_apply_and_names_what_it_would(tmp_path, dsmoe):
+    checkout = make(tmp_path, {"film.py": "from gaussian_renderer import render\n"})
+    before = snapshot(checkout)
+    said = dsmoe("patch", "check", checkout, "--modernise")
+    assert said.status == 0 and "modernise checkpoint-load: train.py" in said.out and "film.py: renders" in said.out
+    assert ": patchable (3dgs-2023)" in dsmoe("patch", "check", checkout, "--trainer", "3dgs-2023").out
+    assert dsmoe("patch", "check", checkout, "--trainer", "hac").status == 1
+    assert snapshot(checkout) == before
+
+
+@pytest.mark.parametrize("words, usage", [(["patch", "apply"], "usage: dsmoe patch apply "),
+                                          (["patch", "revert"], "usage: dsmoe patch revert "),
+                                          (["eval"], "usage: dsmoe eval ")])
+def test_an_option_that_there_is_not_shows_the_usage_of_the_command(tmp_path, dsmoe, words, usage):
+    said = dsmoe(*words, tmp_path, "--modernize")
+    assert said.status == 2 and usage in said.err and "--modernize" in said.err
+
+
+def test_run_takes_both_spellings_of_the_mode(dsmoe):
+    assert "there is no command" in dsmoe("run", "--blend_mode", "smoe").err
+
+
+def test_a_record_that_may_not_be_read_is_named(tmp_path, monkeypatch, dsmoe):
+    checkout = make(tmp_path)
+    patches.apply(checkout)
+
+    def forbidden(path, **options):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(record_module.Path, "read_text", forbidden)  # root reads everything
+    said = dsmoe("patch", "check", checkout)
+    assert said.status == 1 and "the record of the patch cannot be read: [Errno 13] Permission denied" in said.err
