@@ -7,12 +7,14 @@ paper.json holds the paper's printed figures.
 from __future__ import annotations
 
 import os
-from typing import Any, Dict, List, Sequence
+import shutil
+from typing import Any, Callable, Dict, List, Sequence
 
 from .rows import ReportError, Row, grouped, read_rows, safe_name
 
 __all__ = ["ReportError", "report"]
 
+FOLDERS = ("tables", "figures", "images", "survey")
 TABLE_FORMS = {"md": "to_markdown", "csv": "to_csv", "tex": "to_latex"}
 NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations")
 
@@ -20,8 +22,9 @@ NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "ve
 def report(results: str, output: str) -> str:
     """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT.
 
-    OUTPUT/index.html, tables/, figures/, images/, survey/. Returns the page's path. Raises ReportError where there are
-    no rows, where a row is damaged or where rows cannot be compared, and ImportError where a library is missing.
+    OUTPUT/index.html, report.md, tables/, figures/, images/, survey/; an earlier report there is replaced. Returns the
+    page's path. Raises ReportError where there are no rows, where a row is damaged, where rows cannot be compared or
+    where OUTPUT/index.html is someone else's, and ImportError where a library is missing.
     """
     try:
         import jinja2  # noqa: F401
@@ -36,7 +39,7 @@ def report(results: str, output: str) -> str:
     from .survey import write_survey
 
     rows, paper = read_rows(results), read_paper()
-    os.makedirs(output, exist_ok=True)
+    _clear(output)
     sections = []
     for suite in sorted({row["suite"] for row in rows}):
         members = [row for row in rows if row["suite"] == suite]
@@ -48,7 +51,32 @@ def report(results: str, output: str) -> str:
         scenes = collect(results, suite, members, output)
         write_survey(members, paper["datasets"], os.path.join(output, "survey", suite))
         sections.append(Section(suite, safe_name(suite), _counts(members), made, pictures, scenes, _protocols(members)))
+    _write(os.path.join(output, "report.md"), _markdown(sections, tables.to_markdown))
     return write_page(output, sections, commits(rows))
+
+
+def _clear(output: str) -> None:
+    """Removes an earlier report, so that no figure of it stands among the new ones."""
+    from .page import GENERATOR, PAGE_NAME
+
+    page = os.path.join(output, PAGE_NAME)
+    if os.path.isfile(page):
+        with open(page, encoding="utf-8", errors="replace") as file:
+            if f'content="{GENERATOR}"' not in file.read():
+                raise ReportError(f"{page} is no report; name another folder")
+        for folder in FOLDERS:
+            shutil.rmtree(os.path.join(output, folder), ignore_errors=True)
+    os.makedirs(output, exist_ok=True)
+
+
+def _markdown(sections: Sequence[Any], to_markdown: Callable[[Any], str]) -> str:
+    """All tables and figures as one page for code hosts."""
+    parts = ["# Benchmark report\n"]
+    for section in sections:
+        parts.append(f"## {section.suite}\n\n{section.counts}.\n")
+        parts += [to_markdown(table) for table in section.tables]
+        parts += [f"![{picture.alt}](figures/{picture.name}.png)\n" for picture in section.pictures]
+    return "\n".join(parts)
 
 
 def _write(path: str, text: str) -> None:
@@ -73,9 +101,15 @@ def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
         if row["ok"]:
             for name, value in (row.get("protocol") or {}).items():
                 if name not in NOT_PROTOCOL:
-                    text = "×".join(map(str, value)) if name == "image_size" else str(value)
+                    text = _plain(name, value)
                     values = found.setdefault(row["scene"], {}).setdefault(name.replace("_", " "), [])
                     if text not in values:
                         values.append(text)
     return [{"scene": scene, "rules": {name: "; ".join(values) for name, values in sorted(rules.items())}}
             for scene, rules in sorted(found.items())]
+
+
+def _plain(name: str, value: Any) -> str:
+    if name == "image_size":
+        return "×".join(map(str, value))
+    return "; ".join(f"{key}: {entry}" for key, entry in value.items()) if isinstance(value, dict) else str(value)

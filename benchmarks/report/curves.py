@@ -53,7 +53,7 @@ def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
                     files[theme] = _save(drawn, folder, safe_name(f"{suite}-{scene}-{kind}"), theme)
             if files:
                 modes = ", ".join(dict.fromkeys(group.setting.label() for group in shown))
-                pictures.append(Picture(f"{suite}-{scene}-{kind}", f"{scene}: {title}",
+                pictures.append(Picture(safe_name(f"{suite}-{scene}-{kind}"), f"{scene}: {title}",
                                         f"{scene}: {title} of {modes}; the figures are in the tables", files))
     return pictures
 
@@ -73,7 +73,8 @@ def rate_distortion(groups: Sequence[Group]):
             for series, (color, (mark, dash, _)) in styles.items():
                 members = [group for group in groups if group.setting.series == series
                            and group.by_seed(quality) and group.by_seed(amount)]
-                points = sorted((group.measured(amount)[0], *group.measured(quality)) for group in members)
+                points = sorted(((group.measured(amount).mean, *group.measured(quality)) for group in members),
+                                key=lambda point: point[0])
                 if points:
                     xs, ys, spreads = zip(*points)
                     axis.errorbar(xs, ys, yerr=[spread or 0 for spread in spreads], color=color, marker=mark,

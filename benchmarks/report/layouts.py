@@ -184,7 +184,9 @@ def _average(by_scene: Dict[str, Group], scenes: Sequence[str], name: str) -> Ce
     failed = [scene for scene in scenes if scene in by_scene and not by_scene[scene].rows]
     absent = [scene for scene in scenes if scene not in by_scene]
     if failed or absent:
-        text = f"failed: {', '.join(failed)}" if failed else f"not run: {', '.join(absent)}"
+        text = "failed" if failed else "not run"
+        if len(scenes) > 1:
+            text += ": " + ", ".join(failed or absent)
         return Cell(text=text if name == "psnr" else "")
     return cell(over_scenes([by_scene[scene] for scene in scenes], name))
 

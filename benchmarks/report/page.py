@@ -7,12 +7,14 @@ from typing import Any, Dict, List, NamedTuple, Sequence
 
 import jinja2
 from matplotlib import colormaps
+from matplotlib.colors import to_hex
 
 from .curves import Picture
 from .sliders import ERROR_COLORS, ERROR_FULL_SCALE
 from .tables import Table
 
 PAGE_NAME = "index.html"
+GENERATOR = "dsmoe bench report"  # written into the page, so that a later report knows it as its own
 
 
 class Section(NamedTuple):
@@ -33,10 +35,9 @@ def write_page(output: str, sections: Sequence[Section], commits: Sequence[str])
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True, trim_blocks=True,
                                      lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     environment.filters["data_url"] = _data_url
-    scale = ", ".join("rgb({:.0f},{:.0f},{:.0f})".format(*(255 * value for value in colormaps[ERROR_COLORS](step / 8)[:3]))
-                      for step in range(9))
+    scale = ", ".join(to_hex(colormaps[ERROR_COLORS](step / 8)) for step in range(9))
     text = environment.get_template("page.html").render(
-        sections=sections, commits=commits, error_scale=scale, error_full=f"{ERROR_FULL_SCALE:g}")
+        generator=GENERATOR, sections=sections, commits=commits, error_scale=scale, error_full=f"{ERROR_FULL_SCALE:g}")
     path = os.path.join(output, PAGE_NAME)
     with open(path, "w", encoding="utf-8") as file:
         file.write(text)

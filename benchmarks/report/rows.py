@@ -50,11 +50,15 @@ class Setting(NamedTuple):
         """The setting without the blend mode: what alpha and smoe are compared in."""
         return self._replace(blend_mode="")
 
+    @property
+    def source(self) -> str:
+        """The method's label, which says where a checkout is unpatched."""
+        told = self.variant != "unpatched" or "unpatched" in self.name
+        return self.name if told else f"{self.name}-unpatched"
+
     def label(self, blend_mode: bool = True) -> str:
         """Such as "native, smoe, steady"."""
-        words = [self.name]
-        if self.variant == "unpatched":
-            words[0] += " (unpatched)"
+        words = [self.source]
         if blend_mode:
             words.append(self.blend_mode)
         if self.schedule not in (None, "3dgs"):
@@ -185,8 +189,9 @@ def _lpips(row: Row) -> List[Row]:
 
 def setting_of(row: Row, end_of: Callable[[Row], Optional[str]]) -> Setting:
     """The setting of a row; end_of says to which end of the paper's tables a row belongs."""
-    return Setting(row["method"], row.get("label") or row["method"], row.get("variant"), row["blend_mode"], row.get("schedule"),
-                   row.get("densify_grad_threshold"), row.get("budget"), row.get("iterations"), end_of(row))
+    return Setting(row["method"], row.get("label") or row["method"], row.get("variant"), row["blend_mode"],
+                   row.get("schedule"), row.get("densify_grad_threshold"), row.get("budget"), row.get("iterations"),
+                   end_of(row))
 
 
 def grouped(rows: Iterable[Row], end_of: Callable[[Row], Optional[str]]) -> List[Group]:
@@ -208,8 +213,8 @@ def order(setting: Setting) -> Tuple:
     modes = ("alpha", "smoe", "smoe_tn", "smoe_std")
     mode = modes.index(setting.blend_mode) if setting.blend_mode in modes else len(modes)
     return (setting.method != "native", setting.method, setting.name, setting.variant or "", setting.schedule or "",
-            setting.budget is not None, setting.budget or 0, setting.iterations or 0, setting.end != "sparse", -(setting.threshold or 0),
-            mode, setting.blend_mode)
+            setting.budget is not None, setting.budget or 0, setting.iterations or 0, setting.end != "sparse",
+            -(setting.threshold or 0), mode, setting.blend_mode)
 
 
 def safe_name(name: str) -> str:

@@ -25,10 +25,7 @@ def folder_of(scene: str, datasets: Dict[str, Sequence[str]]) -> str:
 
 def submethod(group: Group) -> str:
     """The survey shows rows with a submethod in its table, others in its plots only; it appends the name to ours."""
-    words = [group.setting.name]
-    if group.setting.variant == "unpatched":
-        words.append("unpatched")
-    words.append(group.setting.blend_mode)
+    words = [group.setting.source, group.setting.blend_mode]
     if group.setting.schedule not in (None, UNTOUCHED):
         words.append(group.setting.schedule)
     if group.setting.budget is not None:
