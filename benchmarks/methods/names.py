@@ -1,0 +1,8 @@
+"""The names of the methods a suite may ask for; what they are is in the modules beside this one."""
+from __future__ import annotations
+
+NATIVE = "native"
+VARIANTS = ("native", "unpatched", "patched")
+# Of each public trainer, whether it can be patched to this package's rasterizer (patches/).
+CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
+             "2dgs": False}

@@ -1,0 +1,173 @@
+"""Runs a script of a public trainer and writes down what it does, without changing a file of it.
+
+    python observer.py RECORD.json --seed N --iterations N [--renders FOLDER] [--stub NAMES] -- SCRIPT ARGUMENT...
+
+It runs in the trainer's own Python and imports nothing of this project. What it relies on is the interface that the
+trainers have in common: they seed with constants, show their loop as a tqdm bar over the iterations, and render by
+`gaussian_renderer.render(view, model, ...)["render"]` (HAC after `prefilter_voxel`).
+
+RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, views [{name, milliseconds, file, truth}]. The files of the
+renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
+"""
+import argparse
+import json
+import os
+import random
+import runpy
+import sys
+import time
+import types
+
+WARM_UPS = 2
+
+
+def main(argv=None):
+    words = list(sys.argv[1:] if argv is None else argv)
+    split = words.index("--")
+    parser = argparse.ArgumentParser()
+    parser.add_argument("record")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--iterations", type=int, required=True)
+    parser.add_argument("--renders")
+    parser.add_argument("--stub", default="")
+    options = parser.parse_args(words[:split])
+    script, arguments = words[split + 1], words[split + 2:]
+    sys.argv = [script] + arguments
+    sys.path[0] = os.path.dirname(os.path.abspath(script))
+    for name in filter(None, options.stub.split(",")):
+        stub(name)
+    import torch
+
+    shift_seeds(options.seed)
+    bar = watch_loop(options.iterations)
+    views = watch_renderings(options.renders) if options.renders else {}
+    try:
+        runpy.run_path(script, run_name="__main__")
+    finally:
+        peak = torch.cuda.max_memory_allocated() / 2 ** 20 if torch.cuda.is_available() else None
+        record = {"loop_seconds": bar.get("seconds"), "peak_gpu_mib": bar.get("peak", peak),
+                  "num_gaussians": views.pop("num_gaussians", None), "views": list(views.values())}
+        with open(options.record, "w") as file:
+            json.dump(record, file)
+
+
+def synchronise():
+    import torch
+
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def shift_seeds(seed):
+    """Every seed that the script sets becomes the seed plus this one: the trainers fix theirs to 0."""
+    import numpy
+    import torch
+
+    for module, name in ((random, "seed"), (numpy.random, "seed"), (torch, "manual_seed")):
+        def shifted(value, *rest, original=getattr(module, name)):
+            return original(int(value) + seed, *rest)
+        setattr(module, name, shifted)
+
+
+def watch_loop(iterations):
+    """Times the bar over so many iterations, from where it is made to where it is closed; returns where that goes."""
+    import torch
+    import tqdm
+
+    found = {}
+
+    class Bar(tqdm.tqdm):
+        def __init__(self, *arguments, **keywords):
+            super().__init__(*arguments, **keywords)
+            self.counted = self.total == iterations
+            if self.counted and torch.cuda.is_available():
+                torch.cuda.reset_peak_memory_stats()
+            synchronise()
+            self.began = time.perf_counter()
+
+        def close(self):
+            if getattr(self, "counted", False) and "seconds" not in found:
+                synchronise()
+                found["seconds"] = time.perf_counter() - self.began
+                if torch.cuda.is_available():
+                    found["peak"] = torch.cuda.max_memory_allocated() / 2 ** 20
+            super().close()
+
+    tqdm.tqdm = Bar
+    return found
+
+
+def watch_renderings(folder):
+    """Times and keeps what is rendered without gradients, the last rendering of each view; returns where that goes."""
+    import gaussian_renderer
+    import numpy
+    import torch
+
+    os.makedirs(folder, exist_ok=True)
+    found, pending = {}, {"seconds": 0.0, "warm": False}
+    render = gaussian_renderer.render
+
+    def timed(function, arguments, keywords):
+        synchronise()
+        began = time.perf_counter()
+        result = function(*arguments, **keywords)
+        synchronise()
+        return result, time.perf_counter() - began
+
+    def watched(view, model, *arguments, **keywords):
+        if torch.is_grad_enabled():
+            return render(view, model, *arguments, **keywords)
+        for _ in range(0 if pending["warm"] else WARM_UPS):
+            render(view, model, *arguments, **keywords)
+        pending["warm"] = True
+        result, seconds = timed(render, (view, model) + arguments, keywords)
+        files = [os.path.join(folder, "%s_%d.npy" % (kind, len(found))) for kind in ("render", "truth")]
+        if view.image_name in found:
+            files = [found[view.image_name][key] for key in ("file", "truth")]
+        for path, image in zip(files, (result["render"], view.original_image[:3])):
+            numpy.save(path, image.detach().float().cpu().numpy())
+        found[view.image_name] = {"name": view.image_name, "milliseconds": 1000 * (seconds + pending["seconds"]),
+                                  "file": files[0], "truth": files[1]}
+        pending["seconds"] = 0.0
+        found["num_gaussians"] = len(model.get_anchor if hasattr(model, "get_anchor") else model.get_xyz)
+        return result
+
+    gaussian_renderer.render = watched
+    if hasattr(gaussian_renderer, "prefilter_voxel"):
+        prefilter = gaussian_renderer.prefilter_voxel
+
+        def prefiltered(*arguments, **keywords):
+            if torch.is_grad_enabled():
+                return prefilter(*arguments, **keywords)
+            if not pending["warm"]:
+                prefilter(*arguments, **keywords)
+            result, pending["seconds"] = timed(prefilter, arguments, keywords)
+            return result
+
+        gaussian_renderer.prefilter_voxel = prefiltered
+    return found
+
+
+class Absent(types.ModuleType):
+    """Stands for a module that is imported and not used; anything may be asked of it, nothing called."""
+
+    __path__ = []
+
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return Absent(self.__name__ + "." + name)
+
+
+def stub(name):
+    """Puts an Absent in the place of a module that this Python lacks."""
+    import importlib
+
+    try:
+        importlib.import_module(name)
+    except ImportError:
+        sys.modules[name] = Absent(name)
+
+
+if __name__ == "__main__":
+    main()
