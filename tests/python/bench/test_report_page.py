@@ -224,6 +224,15 @@ def test_layers_views_and_settings_are_chosen(page):
     assert colors_of(page)[0] == TRUTH
 
 
+def test_a_fitted_image_is_seen_whole(page):
+    page.get_by_label("Zoom", exact=True).select_option("3")
+    page.get_by_label("Zoom", exact=True).select_option("fit")
+    assert page.locator(".stage").bounding_box()["width"] > 800
+    page.set_viewport_size({"width": 1000, "height": 300})
+    box = page.locator(".stage").bounding_box()
+    assert box["height"] == pytest.approx(0.8 * 300, abs=1) and box["width"] == pytest.approx(1.5 * 240, abs=1)
+
+
 def test_zoom_shows_pixels(page):
     assert page.locator(".stage").bounding_box()["width"] > 48
     page.get_by_label("Zoom", exact=True).select_option("1")
