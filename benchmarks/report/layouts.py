@@ -48,25 +48,23 @@ def table1(groups: Sequence[Group], paper: Paper) -> Table:
 
     Columns for each of the paper's data sets that some scene at hand is of, then for each other scene.
     """
-    at_hand = sorted({group.scene for group in groups})
-    places = {dataset: scenes for dataset, scenes in paper["datasets"].items() if set(scenes) & set(at_hand)}
-    if not places:
+    ours = _by_dataset(groups, paper)
+    if not ours:
         return Table("table1", "", (), (), ())
-    known = [scene for scenes in places.values() for scene in scenes]
-    places.update({scene: [scene] for scene in at_hand if scene not in known})
+    known = [scene for scenes in ours.values() for scene in scenes]
+    ours.update({scene: [scene] for scene in sorted({group.scene for group in groups}) if scene not in known})
     names = ["psnr", "ssim", "lpips:paper", *lpips_figures(_rows(groups)), "num_gaussians_m", "size_own_mb"]
-    ours = {place: [scene for scene in at_hand if scene in scenes] for place, scenes in places.items()}
-    headings = {place: place if len(ours[place]) == len(scenes) else f"{place} (ours: {', '.join(ours[place])})"
-                for place, scenes in places.items()}
-    columns = tuple(column(name, headings[place]) for place in places for name in names)
+    columns = tuple(column(name, place if scenes in ([place], sorted(paper["datasets"].get(place, [])))
+                           else f"{place} (ours: {', '.join(scenes)})")
+                    for place, scenes in ours.items() for name in names)
     rows: List[TableRow] = []
     for end in END_NAMES:
         for method, averages in paper["table1"][end].items():
             cells_ = tuple(_printed(paper["table1"]["columns"], averages.get(place), name)
-                           for place in places for name in names)
+                           for place in ours for name in names)
             rows.append(TableRow((end, method), cells_, PAPER))
         for setting, by_scene in _settings(groups, end, paper, "table1"):
-            cells_ = tuple(_average(by_scene, ours[place], name) for place in places for name in names)
+            cells_ = tuple(_average(by_scene, scenes, name) for scenes in ours.values() for name in names)
             rows.append(TableRow((end, setting.label()), cells_))
     notes = [paper["source"] + ".", *_scene_notes(groups, paper), *_notes(groups)]
     return without_empty_columns(Table("table1", "Quality, number of Gaussians and size (the paper's Table 1)",
@@ -199,15 +197,19 @@ def _printed(names: Sequence[str], values: Optional[Sequence[str]], name: str) -
     return printed(values[names.index(name)]) if values and name in names else Cell()
 
 
+def _by_dataset(groups: Sequence[Group], paper: Paper) -> Dict[str, List[str]]:
+    """The scenes at hand of each of the paper's data sets that has some."""
+    found = {dataset: sorted({group.scene for group in groups if group.dataset(paper["datasets"]) == dataset})
+             for dataset in paper["datasets"]}
+    return {dataset: scenes for dataset, scenes in found.items() if scenes}
+
+
 def _scene_notes(groups: Sequence[Group], paper: Paper) -> List[str]:
     """Which scenes our averages are of, where the paper's are of more; which of its data sets are left out."""
-    at_hand = sorted({group.scene for group in groups})
-    notes = []
-    for dataset, scenes in paper["datasets"].items():
-        ours = [scene for scene in at_hand if scene in scenes]
-        if ours and len(ours) < len(scenes):
-            notes.append(f"{dataset}: ours is of {', '.join(ours)} alone; the paper averages {len(scenes)} scenes.")
-    absent = [dataset for dataset, scenes in paper["datasets"].items() if not set(scenes) & set(at_hand)]
+    ours = _by_dataset(groups, paper)
+    notes = [f"{dataset}: ours is of {', '.join(ours[dataset])} alone; the paper averages {len(scenes)} scenes."
+             for dataset, scenes in paper["datasets"].items() if dataset in ours and ours[dataset] != sorted(scenes)]
+    absent = [dataset for dataset in paper["datasets"] if dataset not in ours]
     if absent:
         notes.append(f"The paper's {' and '.join(absent)} are left out: no scene of theirs was run.")
     return notes

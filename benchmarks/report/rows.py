@@ -91,6 +91,13 @@ class Group:
         self.rows = [row for row in rows if row["ok"]]
         self.failed = [row for row in rows if not row["ok"]]
 
+    def dataset(self, datasets: Dict[str, Sequence[str]]) -> Optional[str]:
+        """The data set that the scene is of: as its rows say, else the one that has a scene of this name."""
+        row = (self.rows + self.failed)[0]
+        if "dataset" in row:
+            return row["dataset"]
+        return next((dataset for dataset, scenes in datasets.items() if self.scene in scenes), None)
+
     def by_seed(self, name: str) -> Dict[int, float]:
         """{seed: figure} of the seeds that have it."""
         figures = {row["seed"]: figure(row, name) for row in self.rows}

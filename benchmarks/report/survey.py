@@ -10,17 +10,15 @@ from .rows import Group, Row, grouped, safe_name
 
 HEADER = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
 LPIPS_FIGURE = "lpips:lpips_vgg_inria"  # the survey's tables hold 3DGS's own LPIPS, and no other may stand there
-FOLDERS = {"Deep Blending": "DeepBlending", "Tanks and Temples": "TanksAndTemples", "Mip-NeRF 360": "MipNeRF360"}
-SYNTHETIC = ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship")
+FOLDERS = {"Deep Blending": "DeepBlending", "Tanks and Temples": "TanksAndTemples", "Mip-NeRF 360": "MipNeRF360",
+           "NeRF synthetic": "SyntheticNeRF"}
+SYNTHETIC = {"NeRF synthetic": ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship")}
 OTHER = "other"  # scenes of no data set of the survey
 
 
-def folder_of(scene: str, datasets: Dict[str, Sequence[str]]) -> str:
+def folder_of(group: Group, datasets: Dict[str, Sequence[str]]) -> str:
     """The survey's folder for a scene."""
-    for dataset, scenes in datasets.items():
-        if scene in scenes:
-            return FOLDERS[dataset]
-    return "SyntheticNeRF" if scene in SYNTHETIC else OTHER
+    return FOLDERS.get(group.dataset({**datasets, **SYNTHETIC}) or "", OTHER)
 
 
 def submethod(group: Group) -> str:
@@ -48,7 +46,7 @@ def write_survey(rows: Sequence[Row], datasets: Dict[str, Sequence[str]], folder
     by_path: Dict[str, List[List[str]]] = {}
     for group in grouped(rows, end_of):
         if group.rows:
-            path = os.path.join(folder, folder_of(group.scene, datasets), f"{safe_name(group.scene)}.csv")
+            path = os.path.join(folder, folder_of(group, datasets), f"{safe_name(group.scene)}.csv")
             by_path.setdefault(path, []).append(survey_row(group))
     for path, lines in by_path.items():
         os.makedirs(os.path.dirname(path), exist_ok=True)

@@ -71,6 +71,17 @@ def test_the_papers_figures_stand_beside_ours_and_are_marked():
     assert any("Deep Blending and Tanks and Temples are left out" in note for note in table.notes)
 
 
+def test_a_scene_is_of_the_data_set_that_its_row_names(tmp_path):
+    """A made-up scene may have the name of one of the paper's."""
+    assert table_of([row("room", dataset=None)], "table1") is None
+    line = shown(table_of([row("my_truck", dataset="Tanks and Temples")], "table1"), end="sparse")
+    assert line["Tanks and Temples (ours: my_truck) PSNR [dB]"] == "20.00"
+    entries = [row("room", dataset=None), row("my_truck", dataset="Tanks and Temples")]
+    survey.write_survey(entries, layouts.read_paper()["datasets"], str(tmp_path))
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.csv")} == {
+        "other/room.csv", "TanksAndTemples/my_truck.csv"}
+
+
 def test_the_papers_sizes_fit_its_numbers_of_gaussians():
     """59 floats a Gaussian (58 in 2DGS, 30 in DBS); 4 %: both figures are printed rounded."""
     paper = layouts.read_paper()["table1"]
