@@ -16,7 +16,8 @@ __all__ = ["ReportError", "report"]
 
 FOLDERS = ("tables", "figures", "images", "survey")
 TABLE_FORMS = {"md": "to_markdown", "csv": "to_csv", "tex": "to_latex"}
-NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations")
+NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
+                "continued")
 
 
 def report(results: str, output: str) -> str:

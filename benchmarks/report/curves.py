@@ -25,7 +25,8 @@ OTHER_MARK = ("D", "-", "\\\\")
 THEMES = {"light": {"background": "#ffffff", "ink": "#1c1c1e", "grid": "#d8d8dc"},
           "dark": {"background": "#1b1c20", "ink": "#e8e8ea", "grid": "#3c3d44"}}
 AMOUNTS = ("num_gaussians", "size_own_mb", "size_common_mb")
-PANEL = (4.2, 2.9)  # inches
+PANEL = (4.2, 2.9)  # inches, as the next two
+LEGEND_MARK, LEGEND_LETTER = 0.85, 0.082  # what a mark, and a letter of its label, take at most
 
 
 class Picture(NamedTuple):
@@ -153,7 +154,8 @@ def _style(theme: str) -> Dict[str, object]:
 
 
 def _legend(drawn: Figure, handles: Sequence[object]) -> None:
-    columns = max(1, min(len(handles), int(drawn.get_figwidth() // 2.6)))
+    widest = LEGEND_MARK + LEGEND_LETTER * max(len(handle.get_label()) for handle in handles)
+    columns = max(1, min(len(handles), int(drawn.get_figwidth() // widest)))
     lines = -(-len(handles) // columns)
     height = 0.12 + 0.24 * lines
     drawn.set_figheight(drawn.get_figheight() + height)

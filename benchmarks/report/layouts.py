@@ -221,7 +221,7 @@ def _notes(groups: Sequence[Group]) -> List[str]:
     notes = [SPREAD_NOTE]
     if any(figure(row, "size_own_mb") is not None or figure(row, "size_common_mb") is not None for row in rows):
         notes.append("1 MB is 1,000,000 bytes. Own size: the method's own container; common size: one for all methods.")
-    notes += [f"Not measured, {reason}." for reason in lpips_reasons(rows)]
+    notes += [f"Not measured, {reason.rstrip('.')}." for reason in lpips_reasons(rows)]
     if lpips_figures(rows):
         notes.append("LPIPS of different nets or normalisations cannot be compared.")
     machines = sorted({_machine(row) for row in rows if _machine(row)})

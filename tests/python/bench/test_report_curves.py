@@ -43,6 +43,19 @@ def test_bars_are_the_means():
     assert colors[0] == colors[2] != colors[1]
 
 
+@pytest.mark.parametrize("draw", [curves.rate_distortion, curves.bars])
+@pytest.mark.parametrize("methods", [1, 4])
+def test_the_legend_lies_inside_and_above_the_panels(draw, methods):
+    entries = [row(blend_mode=mode, label=f"{'a long name of method ' * 2}{method}", schedule="steady",
+                   threshold=threshold)
+               for mode in ("alpha", "smoe") for method in range(methods) for threshold in (0.005, 0.0002)]
+    drawn = draw(groups_of(entries))
+    drawn.canvas.draw()
+    box = drawn.legends[0].get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= drawn.bbox.x1 and box.y1 <= drawn.bbox.y1
+    assert box.y0 >= max(axis.get_window_extent().y1 for axis in drawn.axes)
+
+
 def test_blend_modes_differ_by_more_than_colour():
     entries = [row(blend_mode=mode) for mode in curves.MARKS]
     styles = curves._styles(groups_of(entries))
