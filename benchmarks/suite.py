@@ -16,7 +16,7 @@ from typing import Any, Dict, List, Optional, Sequence
 
 from ..trainer.errors import ConfigError
 from .errors import BenchError
-from .methods.names import CHECKOUTS, NATIVE
+from .methods.names import CHECKOUTS, NATIVE, WITHOUT_SCHEDULE
 from .protocol import RECIPE, config_of
 from .schema import SUITE
 
@@ -165,6 +165,10 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
         if axes.get("blend_modes", ["alpha"]) != ["alpha"]:
             raise BenchError(f"{where}.blend_modes: an unpatched checkout has its own blending alone, which is `alpha`")
         axes["blend_modes"] = ["alpha"]
+    if name in WITHOUT_SCHEDULE:
+        if "schedules" in axes:
+            raise BenchError(f"{where}.schedules: {name} has none of the schedules; leave them out")
+        axes["schedules"] = [None]
     if protocol["principal_point"] != "centre":
         raise BenchError(f"protocol.principal_point: is 'scene', but the loader of {name} ({where}) moves it to the "
                          "image centre; it must be 'centre', or the figures would not be comparable")
@@ -224,7 +228,7 @@ def _cell(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, An
             "images": content.get("images", 0), "keep_models": content.get("keep_models", False)}
     headline = content.get("headline")
     cell["headline"] = headline is not None and all(
-        values[AXIS_OF[axis]] in wanted for axis, wanted in headline.items())
+        values[AXIS_OF[axis]] in (*wanted, None) for axis, wanted in headline.items())
     return {"id": cell_id(cell), **cell}
 
 
@@ -235,8 +239,8 @@ def cell_id(cell: Dict[str, Any]) -> str:
         identity[key] = {name: value for name, value in cell[key].items() if name not in NOT_IN_THE_IDENTITY}
     checksum = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:6]
     threshold = re.sub(r"\.?0+$", "", f"{cell['densify_grad_threshold']:.7f}")
-    return "_".join([cell["method"]["label"], cell["scene"]["name"], cell["blend_mode"], cell["schedule"], threshold,
-                     f"s{cell['seed']}", checksum])
+    return "_".join([cell["method"]["label"], cell["scene"]["name"], cell["blend_mode"], cell["schedule"] or "own",
+                     threshold, f"s{cell['seed']}", checksum])
 
 
 def _path(text: str, where: str, folder: str) -> str:

@@ -105,7 +105,7 @@ class ThreeDGS:
                                      stdin=subprocess.DEVNULL, env=self.environment())
         if status != 0:
             raise BenchError(f"{script} of {self.method['label']} ended with status {status}: {last_line(log)} "
-                             f"(all of it: {log})")
+                             f"(all of it is in {os.path.basename(log)})")
         with open(record, encoding="utf-8") as file:
             return json.load(file)
 
@@ -144,10 +144,12 @@ class C3DGS(ThreeDGS):
         return words[:len(words) - len(own)]
 
     def train_seconds(self, trained: Dict[str, Any]) -> Optional[float]:
-        """Training, and what compress.py says of sensitivity, clustering, finetuning and encoding."""
-        with open(os.path.join(self.model, "times.json"), encoding="utf-8") as file:
-            compression = json.load(file)["total"]
-        return None if trained["loop_seconds"] is None else trained["loop_seconds"] + compression
+        """Training, and what compress.py says of sensitivity, clustering, finetuning and encoding; None if it does not."""
+        path = os.path.join(self.model, "times.json")
+        if trained["loop_seconds"] is None or not os.path.isfile(path):
+            return None
+        with open(path, encoding="utf-8") as file:
+            return trained["loop_seconds"] + json.load(file)["total"]
 
     def own_bytes(self) -> int:
         folder = os.path.join(self.model, "point_cloud")
@@ -166,7 +168,7 @@ class HAC(ThreeDGS):
 
     def train_arguments(self) -> List[str]:
         words = super().train_arguments()
-        test = words.index("--test_iterations")
+        test = words.index("--test_iterations")  # the model is encoded where it is tested last
         words[test + 1] = str(self.config.iterations)
         return words
 

@@ -6,3 +6,4 @@ VARIANTS = ("native", "unpatched", "patched")
 # Of each public trainer, whether it can be patched to this package's rasterizer (patches/).
 CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
              "2dgs": False}
+WITHOUT_SCHEDULE = ("hac", "hac-plus")  # they grow and prune anchors by rules of their own

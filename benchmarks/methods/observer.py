@@ -10,6 +10,9 @@ RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, views [{name, millisecon
 renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
 """
 import argparse
+import importlib.abc
+import importlib.machinery
+import importlib.util
 import json
 import os
 import random
@@ -39,8 +42,8 @@ def main(argv=None):
     import torch
 
     shift_seeds(options.seed)
-    bar = watch_loop(options.iterations)
     views = watch_renderings(options.renders) if options.renders else {}
+    bar = watch_loop(options.iterations, views)
     try:
         runpy.run_path(script, run_name="__main__")
     finally:
@@ -69,8 +72,11 @@ def shift_seeds(seed):
         setattr(module, name, shifted)
 
 
-def watch_loop(iterations):
-    """Times the bar over so many iterations, from where it is made to where it is closed; returns where that goes."""
+def watch_loop(iterations, views):
+    """Times the bar over so many iterations, from where it is made to where it is closed; returns where that goes.
+
+    Where the bar of the final rendering begins, earlier entries of `views` go: HAC also renders training views on the way.
+    """
     import torch
     import tqdm
 
@@ -79,6 +85,8 @@ def watch_loop(iterations):
     class Bar(tqdm.tqdm):
         def __init__(self, *arguments, **keywords):
             super().__init__(*arguments, **keywords)
+            if self.desc and self.desc.startswith("Rendering progress"):
+                views.clear()
             self.counted = self.total == iterations
             if self.counted and torch.cuda.is_available():
                 torch.cuda.reset_peak_memory_stats()
@@ -159,14 +167,28 @@ class Absent(types.ModuleType):
         return Absent(self.__name__ + "." + name)
 
 
-def stub(name):
-    """Puts an Absent in the place of a module that this Python lacks."""
-    import importlib
+class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Finds one module and all below it, as Absents."""
 
-    try:
-        importlib.import_module(name)
-    except ImportError:
-        sys.modules[name] = Absent(name)
+    def __init__(self, name):
+        self.name = name
+
+    def find_spec(self, fullname, path=None, target=None):
+        if fullname.partition(".")[0] == self.name:
+            return importlib.machinery.ModuleSpec(fullname, self, is_package=True)
+        return None
+
+    def create_module(self, spec):
+        return Absent(spec.name)
+
+    def exec_module(self, module):
+        pass
+
+
+def stub(name):
+    """Lets a module that this Python lacks be imported."""
+    if importlib.util.find_spec(name) is None:
+        sys.meta_path.append(AbsentFinder(name))
 
 
 if __name__ == "__main__":
