@@ -199,7 +199,8 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
         raise BenchError(f"--jobs is {jobs}; it must be at least 1")
     at_once = jobs or (len(cells) if slurm is not None else max(1, len(gpus)))
     words = [sys.executable, "-m", "snakemake", "all", "--snakefile", SNAKEFILE, "--directory", results, "--nolock",
-             "--quiet", "host", "reason", "rules", "--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "--scheduler", "greedy",
+             "--quiet", "host", "reason", "rules", "--keep-going", "--rerun-incomplete",
+             "--rerun-triggers", "mtime", "--scheduler", "greedy",
              "--config", f"cells={json.dumps([cell['id'] for cell in cells])}", f"python={sys.executable}",
              f"device={suite.protocol['device']}", f"gpus={','.join(gpus)}"]
     if slurm is not None:

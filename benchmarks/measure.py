@@ -15,7 +15,7 @@ from ..trainer.metrics import image_metrics, psnr, quantised
 from .errors import BenchError
 
 LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
-ALEX_VARIABLE = "DSMOE_LPIPS_ALEX"  # path of AlexNet's LPIPS weights as .npz: conv1.weight, conv1.bias, ..., lin4.weight
+ALEX_VARIABLE = "DSMOE_LPIPS_ALEX"  # AlexNet's LPIPS weights as .npz: conv1.weight, ..., lin4.weight
 
 STRONG_GRADIENT = 0.05  # of luminance in [0, 1], per pixel: 13 grey levels from one pixel to the next
 EDGE_REACH = 3  # pixels in x and y
@@ -29,7 +29,7 @@ def edge_mask(target: torch.Tensor) -> torch.Tensor:
     """[H, W] bool: pixels near the strong gradients of a ground truth [3, H, W] in [0, 1]; see EDGE_RULE."""
     luminance = (target * target.new_tensor(LUMINANCE)[:, None, None]).sum(dim=0)
     padded = F.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate")
-    sobel = target.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8  # a ramp of 1 per pixel gives 1
+    sobel = target.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8  # of a ramp: its slope
     gradient = F.conv2d(padded, torch.stack([sobel, sobel.T])[:, None])[0]
     strong = (gradient.norm(dim=0) >= STRONG_GRADIENT).to(target.dtype)
     return F.max_pool2d(strong[None, None], 2 * EDGE_REACH + 1, stride=1, padding=EDGE_REACH)[0, 0] > 0

@@ -16,7 +16,7 @@ from typing import Any, Dict, List, Optional, Sequence
 
 from ..trainer.errors import ConfigError
 from .errors import BenchError
-from .methods.names import CHECKOUTS, NATIVE, WITHOUT_SCHEDULE
+from .methods.names import CHECKOUTS, NATIVE, NEEDS, WITHOUT_SCHEDULE
 from .protocol import RECIPE, config_of
 from .schema import SUITE
 
@@ -118,7 +118,8 @@ def check_schema(content: Any) -> None:
         import jsonschema
     except ImportError as error:
         raise BenchError(missing("jsonschema", error)) from error
-    errors = sorted(jsonschema.Draft7Validator(SUITE).iter_errors(content), key=lambda error: list(map(str, error.path)))
+    errors = sorted(jsonschema.Draft7Validator(SUITE).iter_errors(content),
+                    key=lambda error: list(map(str, error.path)))
     if errors:
         error = errors[0]
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error.absolute_path)
@@ -157,6 +158,8 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     if (name == "c3dgs") != ("base" in given):
         raise BenchError(f"{where}.base: c3dgs, and nothing else, needs it: a 3DGS checkout that trains what it "
                          "compresses")
+    arguments = [str(word) for word in given.get("arguments", [])]
+    _no_protocol_among(arguments, where)
     variant = given.setdefault("variant", "patched" if CHECKOUTS[name] else "unpatched")
     if variant == "native" or (variant == "patched" and not CHECKOUTS[name]):
         raise BenchError(f"{where}.variant: is {variant!r}; {name} can be "
@@ -165,6 +168,8 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
         if axes.get("blend_modes", ["alpha"]) != ["alpha"]:
             raise BenchError(f"{where}.blend_modes: an unpatched checkout has its own blending alone, which is `alpha`")
         axes["blend_modes"] = ["alpha"]
+    if name in NEEDS and NEEDS[name] not in arguments:
+        raise BenchError(f"{where}.arguments: {name} needs {NEEDS[name]} N in place of a threshold")
     if name in WITHOUT_SCHEDULE:
         if "schedules" in axes:
             raise BenchError(f"{where}.schedules: {name} has none of the schedules; leave them out")
@@ -179,9 +184,8 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
                          "scale_recipe and options.sh_degree_interval are for the native trainer alone")
     paths = {key: _path(given[key], f"{where}.{key}", folder) for key in ("path", "base") if key in given}
     given["pythonpath"] = [_path(item, f"{where}.pythonpath", folder) for item in given.get("pythonpath", [])]
-    arguments = [str(word) for word in given.get("arguments", [])]
-    _no_protocol_among(arguments, where)
-    return {"label": name if variant == "patched" else f"{name}-unpatched", "python": None, **given, **paths,
+    python = os.path.expanduser(given["python"]) if "python" in given else None
+    return {"label": name if variant == "patched" else f"{name}-unpatched", **given, **paths, "python": python,
             "arguments": arguments, "axes": axes}
 
 

@@ -122,14 +122,15 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run = actions.add_parser("run", help="run what is not done yet of a suite",
                              description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
                                          "becomes a row with its reason.")
-    run.add_argument("suite", metavar="SUITE", help="a .yaml file, or the name of a shipped one: smoke, table1, table2, "
-                                                    "table3, fig4, fig5, captures")
+    run.add_argument("suite", metavar="SUITE", help="a .yaml file, or a shipped one: smoke, table1, table2, table3, "
+                                                    "fig4, fig5, captures, captures_ablation")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
     run.add_argument("--jobs", type=int, metavar="N", help="cells at once (default: one per GPU; one on the CPU)")
     run.add_argument("--slurm", nargs="*", metavar="KEY=VALUE",
                      help="submit cells to Slurm; resources of each, such as slurm_partition=gpu runtime=120")
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
-                     help="only such cells: method, scene, blend_mode, schedule, densify_grad_threshold, seed, headline")
+                     help="only such cells; fields: method, scene, blend_mode, schedule, densify_grad_threshold, "
+                          "seed, headline")
     run.add_argument("--retry-failed", action="store_true", help="run failed cells again")
     run.add_argument("--dry-run", action="store_true", help="say which cells are done and which are not")
     run.set_defaults(run=_bench_run)

@@ -38,6 +38,7 @@ class ThreeDGS:
     """train.py -s SCENE -m MODEL, then render.py -m MODEL: 3DGS of 2023 and of 2024, Taming 3DGS."""
 
     stubs: Tuple[str, ...] = ()  # modules that are imported for what is not done here
+    observed: Tuple[str, ...] = ()  # further arguments of the observer
     render_arguments: Tuple[str, ...] = ()
     container = "point_cloud.ply"
 
@@ -95,7 +96,7 @@ class ThreeDGS:
         """Runs a script in the checkout; returns the observer's record. Raises BenchError with how it ended."""
         record = os.path.join(self.output, name + ".json")
         line = [self.method["python"] or sys.executable, OBSERVER, record, "--seed", str(self.config.seed),
-                "--iterations", str(iterations or self.config.iterations), "--stub", ",".join(self.stubs)]
+                "--iterations", str(iterations or self.config.iterations), "--stub", ",".join(self.stubs), *self.observed]
         line += (["--renders", renders] if renders else []) + ["--", os.path.join(folder, script), *words]
         if not os.path.isfile(os.path.join(folder, script)):
             raise BenchError(f"{folder}: there is no {script} in it; {self.method['name']} is run by it")
@@ -144,7 +145,7 @@ class C3DGS(ThreeDGS):
         return words[:len(words) - len(own)]
 
     def train_seconds(self, trained: Dict[str, Any]) -> Optional[float]:
-        """Training, and what compress.py says of sensitivity, clustering, finetuning and encoding; None if it does not."""
+        """Training, and what compress.py says of its own stages; None where it says nothing."""
         path = os.path.join(self.model, "times.json")
         if trained["loop_seconds"] is None or not os.path.isfile(path):
             return None
@@ -176,8 +177,33 @@ class HAC(ThreeDGS):
         return size_of(os.path.join(self.model, "bitstreams"))
 
 
+class DBS(ThreeDGS):
+    """Deformable Beta Splatting: train.py alone; the number of primitives is given (`--cap_max`), no threshold.
+
+    Its own `--eval` trains until the test views are best, and keeps that model. Here views are held out, and that is
+    all: the protocol's iterations, the last model.
+    """
+
+    stubs = ("viser", "nerfview")  # its viewer
+    observed = ("--hold-out", "--model-renders", "beta_model")
+
+    def train(self) -> Dict[str, Any]:
+        return self.command("train", self.method["path"], "train.py", *self.train_arguments(), renders=self.renders)
+
+    def render(self) -> Dict[str, Any]:
+        with open(os.path.join(self.output, "train.json"), encoding="utf-8") as file:
+            return json.load(file)
+
+    def train_arguments(self) -> List[str]:
+        words = super().train_arguments()
+        for word, values in (("--eval", 0), ("--densify_grad_threshold", 1), ("--test_iterations", 1)):
+            at = words.index(word)
+            del words[at:at + 1 + values]
+        return words + ["--disable_viewer", "--no-compress"]
+
+
 SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDGS, "taming": ThreeDGS, "2dgs": TwoDGS,
-                                     "c3dgs": C3DGS, "hac": HAC, "hac-plus": HAC}
+                                     "dbs": DBS, "c3dgs": C3DGS, "hac": HAC, "hac-plus": HAC}
 
 
 def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
@@ -231,8 +257,8 @@ def measured(pairs: List[Tuple[View, Dict[str, Any]]], measures: Measures, devic
         per_view.append({"name": view.camera.name, "milliseconds": seen["milliseconds"],
                          **measures(color, truth.to(device))})
     if largest > MAX_TRUTH_DIFFERENCE:
-        raise BenchError(f"the trainer's ground truth differs from the protocol's by {255 * largest:.2f} grey levels on "
-                         "average: another downscaler or background gives other figures")
+        raise BenchError(f"the trainer's ground truth differs from the protocol's by {255 * largest:.2f} grey levels "
+                         "on average: another downscaler or background gives other figures")
     return largest, summary(per_view)
 
 

@@ -5,5 +5,6 @@ NATIVE = "native"
 VARIANTS = ("native", "unpatched", "patched")
 # Of each public trainer, whether it can be patched to this package's rasterizer (patches/).
 CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
-             "2dgs": False}
-WITHOUT_SCHEDULE = ("hac", "hac-plus")  # they grow and prune anchors by rules of their own
+             "2dgs": False, "dbs": False}
+WITHOUT_SCHEDULE = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
+NEEDS = {"dbs": "--cap_max"}  # an argument without which a method has no size

@@ -1,10 +1,10 @@
 """Runs a script of a public trainer and writes down what it does, without changing a file of it.
 
-    python observer.py RECORD.json --seed N --iterations N [--renders FOLDER] [--stub NAMES] -- SCRIPT ARGUMENT...
+    python observer.py RECORD.json --seed N --iterations N [--renders FOLDER] ... -- SCRIPT ARGUMENT...
 
 It runs in the trainer's own Python and imports nothing of this project. What it relies on is the interface that the
 trainers have in common: they seed with constants, show their loop as a tqdm bar over the iterations, and render by
-`gaussian_renderer.render(view, model, ...)["render"]` (HAC after `prefilter_voxel`).
+`gaussian_renderer.render(view, model, ...)["render"]` (HAC after `prefilter_voxel`) or `model.render(view)["render"]`.
 
 RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, views [{name, milliseconds, file, truth}]. The files of the
 renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
@@ -33,6 +33,8 @@ def main(argv=None):
     parser.add_argument("--iterations", type=int, required=True)
     parser.add_argument("--renders")
     parser.add_argument("--stub", default="")
+    parser.add_argument("--hold-out", action="store_true")
+    parser.add_argument("--model-renders", metavar="ATTRIBUTE")
     options = parser.parse_args(words[:split])
     script, arguments = words[split + 1], words[split + 2:]
     sys.argv = [script] + arguments
@@ -42,10 +44,13 @@ def main(argv=None):
     import torch
 
     shift_seeds(options.seed)
-    views = watch_renderings(options.renders) if options.renders else {}
+    views = watch_renderings(options.renders) if options.renders and not options.model_renders else {}
+    scenes = watch_scenes(options.hold_out) if options.model_renders else []
     bar = watch_loop(options.iterations, views)
     try:
         runpy.run_path(script, run_name="__main__")
+        if options.model_renders:
+            views.update(renderings_of(scenes[-1], options.model_renders, options.renders))
     finally:
         peak = torch.cuda.max_memory_allocated() / 2 ** 20 if torch.cuda.is_available() else None
         record = {"loop_seconds": bar.get("seconds"), "peak_gpu_mib": bar.get("peak", peak),
@@ -75,7 +80,7 @@ def shift_seeds(seed):
 def watch_loop(iterations, views):
     """Times the bar over so many iterations, from where it is made to where it is closed; returns where that goes.
 
-    Where the bar of the final rendering begins, earlier entries of `views` go: HAC also renders training views on the way.
+    Where the bar of the final rendering begins, earlier entries of `views` go: HAC renders training views on the way.
     """
     import torch
     import tqdm
@@ -105,22 +110,71 @@ def watch_loop(iterations, views):
     return found
 
 
+def timed(function, arguments, keywords):
+    """(result, seconds)"""
+    synchronise()
+    began = time.perf_counter()
+    result = function(*arguments, **keywords)
+    synchronise()
+    return result, time.perf_counter() - began
+
+
+def keep(folder, number, view, image, seconds):
+    """Writes a rendering and its ground truth; returns the record's entry."""
+    import numpy
+
+    os.makedirs(folder, exist_ok=True)
+    files = [os.path.join(folder, "%s_%d.npy" % (kind, number)) for kind in ("render", "truth")]
+    for path, kept in zip(files, (image, view.original_image[:3])):
+        numpy.save(path, kept.detach().float().cpu().numpy())
+    return {"name": view.image_name, "milliseconds": 1000 * seconds, "file": files[0], "truth": files[1]}
+
+
+def watch_scenes(hold_out):
+    """Keeps every scene.Scene that is made; with hold_out the split is made as `--eval` makes it, and only that.
+
+    Where `--eval` does more (Deformable Beta Splatting then chooses its model and its last iteration on the test
+    views), the split is wanted without the rest.
+    """
+    import scene
+
+    made, original = [], scene.Scene.__init__
+
+    def init(self, args, *arguments, **keywords):
+        before = args.eval
+        args.eval = before or hold_out
+        try:
+            original(self, args, *arguments, **keywords)
+        finally:
+            args.eval = before
+        made.append(self)
+
+    scene.Scene.__init__ = init
+    return made
+
+
+def renderings_of(scene, attribute, folder):
+    """The record's entries of the test views, rendered by the scene's model itself: model.render(view)["render"]."""
+    import torch
+
+    model, views, found = getattr(scene, attribute), scene.getTestCameras(), {}
+    with torch.no_grad():
+        for view in views[:WARM_UPS]:
+            model.render(view)
+        for number, view in enumerate(views):
+            result, seconds = timed(model.render, (view,), {})
+            found[view.image_name] = keep(folder, number, view, result["render"], seconds)
+    found["num_gaussians"] = len(model.get_xyz)
+    return found
+
+
 def watch_renderings(folder):
     """Times and keeps what is rendered without gradients, the last rendering of each view; returns where that goes."""
     import gaussian_renderer
-    import numpy
     import torch
 
-    os.makedirs(folder, exist_ok=True)
-    found, pending = {}, {"seconds": 0.0, "warm": False}
+    found, pending, numbers = {}, {"seconds": 0.0, "warm": False}, {}
     render = gaussian_renderer.render
-
-    def timed(function, arguments, keywords):
-        synchronise()
-        began = time.perf_counter()
-        result = function(*arguments, **keywords)
-        synchronise()
-        return result, time.perf_counter() - began
 
     def watched(view, model, *arguments, **keywords):
         if torch.is_grad_enabled():
@@ -129,13 +183,8 @@ def watch_renderings(folder):
             render(view, model, *arguments, **keywords)
         pending["warm"] = True
         result, seconds = timed(render, (view, model) + arguments, keywords)
-        files = [os.path.join(folder, "%s_%d.npy" % (kind, len(found))) for kind in ("render", "truth")]
-        if view.image_name in found:
-            files = [found[view.image_name][key] for key in ("file", "truth")]
-        for path, image in zip(files, (result["render"], view.original_image[:3])):
-            numpy.save(path, image.detach().float().cpu().numpy())
-        found[view.image_name] = {"name": view.image_name, "milliseconds": 1000 * (seconds + pending["seconds"]),
-                                  "file": files[0], "truth": files[1]}
+        number = numbers.setdefault(view.image_name, len(numbers))
+        found[view.image_name] = keep(folder, number, view, result["render"], seconds + pending["seconds"])
         pending["seconds"] = 0.0
         found["num_gaussians"] = len(model.get_anchor if hasattr(model, "get_anchor") else model.get_xyz)
         return result
@@ -160,6 +209,9 @@ class Absent(types.ModuleType):
     """Stands for a module that is imported and not used; anything may be asked of it, nothing called."""
 
     __path__ = []
+
+    def __mro_entries__(self, bases):
+        return (object,)  # so that a class may be derived from it
 
     def __getattr__(self, name):
         if name.startswith("__"):

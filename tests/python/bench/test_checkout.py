@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import small_dbs
 import torch
 from PIL import Image
 
@@ -86,8 +87,10 @@ class SmallTrainers:
 
     def cell(self, name, variant="patched", scene=None, seed=0, blend_mode="smoe", **method):
         """A suite refuses checkouts on the CPU, as the public ones cannot train there: it is set afterwards."""
-        method = {"name": name, "path": self.checkout(name), "variant": variant,
-                  "pythonpath": [str(small_trainers().PACKAGES)], "blend_modes": [blend_mode], **method}
+        method = {"name": name, "variant": variant, "pythonpath": [str(small_trainers().PACKAGES)],
+                  "blend_modes": [blend_mode], **method}
+        if "path" not in method:
+            method["path"] = self.checkout(name)
         if name == "c3dgs":
             method["base"] = self.checkout("3dgs-2023")
         content = {"name": "checkouts", "protocol": {"iterations": ITERATIONS, "lpips": []},
@@ -140,6 +143,21 @@ def test_a_patched_checkout_gives_a_row(name, small):
     assert row["protocol"]["test_views"] == len(row["per_view"]) == 1
     assert (output / "images" / "render" / "view0.png").is_file()
     assert not (output / "renders").exists() and not (output / "run").exists()
+
+
+def test_a_trainer_that_would_choose_on_the_test_views_is_kept_from_it(small, tmp_path):
+    """Of Deformable Beta Splatting's --eval the split alone is taken; the mean of the training views is its model."""
+    with np.load(small.scene.parent / "views.npz") as file:
+        views = {name: file[name] for name in file.files}
+    checkout = small_dbs.write(tmp_path / "dbs", views)
+    row = row_of(small.cell("dbs", variant="unpatched", blend_mode="alpha", path=str(checkout),
+                            arguments=["--cap_max", 12]), tmp_path / "out")
+    assert row["ok"], row["reason"]
+    assert row["num_gaussians"] == 12 and row["train_seconds"] > 0 and row["fps"] > 0 and row["schedule"] is None
+    level = np.mean([views[name].mean() for name in sorted(views)[1:]])
+    truth = np.asarray(Image.open(small.scene / "images" / "view0.png"), np.float64) / 255
+    # float32 sums of some thousand values
+    assert row["psnr_float"] == pytest.approx(-10 * np.log10(((truth - level) ** 2).mean()), abs=1e-4)
 
 
 def test_the_figures_are_those_of_the_pictures(small):

@@ -30,8 +30,8 @@ def on_cuda(content, **fields):
 
 
 def test_cells_are_every_combination(content):
-    suite = expand(changed(content, densify_grad_thresholds=[0.005, 0.0002], seeds=[0, 1], schedules=["3dgs", "steady"]),
-                   "")
+    suite = expand(changed(content, densify_grad_thresholds=[0.005, 0.0002], seeds=[0, 1],
+                           schedules=["3dgs", "steady"]), "")
     found = {(cell["blend_mode"], cell["densify_grad_threshold"], cell["seed"], cell["schedule"])
              for cell in suite.cells}
     assert len(suite.cells) == len(found) == len({cell["id"] for cell in suite.cells}) == 16
@@ -164,6 +164,18 @@ def test_an_unpatched_checkout_has_its_own_blending_alone(content):
         expand(on_cuda(content, methods=[{"name": "2dgs", "path": "p", "variant": "patched"}]), "")
 
 
+def test_a_method_without_a_threshold_needs_its_size(content):
+    with pytest.raises(BenchError, match=r"methods\[0\].arguments: dbs needs --cap_max"):
+        expand(on_cuda(content, methods=[{"name": "dbs", "path": "p"}]), "")
+
+
+def test_a_method_with_a_schedule_of_its_own_has_none_of_ours(content):
+    methods = [{"name": "hac", "path": "p"}]
+    assert {cell["schedule"] for cell in expand(on_cuda(content, methods=methods), "").cells} == {None}
+    with pytest.raises(BenchError, match=r"methods\[0\].schedules"):
+        expand(on_cuda(content, methods=[dict(methods[0], schedules=["steady"])]), "")
+
+
 def test_every_checkout_that_a_suite_may_name_can_be_run():
     assert set(SHAPES) == set(CHECKOUTS)
 
@@ -177,6 +189,15 @@ def test_shipped_suites_are_valid(name, monkeypatch):
     if name == "fig4":
         assert {cell["densify_grad_threshold"] for cell in suite.cells} == set(THRESHOLDS)
         assert len({cell["scene"]["name"] for cell in suite.cells}) == 13
+
+
+def test_the_suite_of_the_readme_is_valid(monkeypatch):
+    monkeypatch.setenv("DSMOE_DATA", "/somewhere")
+    with open(os.path.join(os.path.dirname(SHIPPED), "README.md"), encoding="utf-8") as file:
+        text = file.read().partition("```yaml")[2].partition("```")[0]
+    cells = expand(yaml.safe_load(text), "").cells
+    assert {cell["method"]["label"] for cell in cells} == {"native", "3dgs-2023", "3dgs-2023-unpatched", "c3dgs"}
+    assert {cell["seed"] for cell in cells if cell["headline"]} == {0, 1, 2}
 
 
 def test_every_shipped_suite_is_listed_here():
