@@ -91,12 +91,12 @@ class ThreeDGS:
         """Seconds of the loop."""
         return trained["loop_seconds"]
 
-    def command(self, name: str, folder: str, script: str, *words: str, renders: Optional[str] = None,
-                iterations: Optional[int] = None) -> Dict[str, Any]:
+    def command(self, name: str, folder: str, script: str, *words: str,
+                renders: Optional[str] = None) -> Dict[str, Any]:
         """Runs a script in the checkout; returns the observer's record. Raises BenchError with how it ended."""
         record = os.path.join(self.output, name + ".json")
         line = [self.method["python"] or sys.executable, OBSERVER, record, "--seed", str(self.config.seed),
-                "--iterations", str(iterations or self.config.iterations), "--stub", ",".join(self.stubs), *self.observed]
+                "--iterations", str(self.config.iterations), "--stub", ",".join(self.stubs), *self.observed]
         line += (["--renders", renders] if renders else []) + ["--", os.path.join(folder, script), *words]
         if not os.path.isfile(os.path.join(folder, script)):
             raise BenchError(f"{folder}: there is no {script} in it; {self.method['name']} is run by it")
