@@ -1,4 +1,4 @@
-"""The `dsmoe` command: train, eval, render, patch, run, info; a few lines each over the trainer library or patches."""
+"""The `dsmoe` command: train, eval, render, patch, run, bench, info; a few lines each over what does the work."""
 from __future__ import annotations
 
 import argparse
@@ -73,6 +73,10 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("words", metavar="COMMAND", nargs=argparse.REMAINDER, help="such as: python train.py -s DATA")
     run.set_defaults(run=_run)
 
+    bench = commands.add_parser("bench", help="compare blend modes and trainers over a suite of scenes",
+                                description="Runs suites of training runs, measured alike, and reports on them.")
+    _add_bench_arguments(bench)
+
     info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
     info.set_defaults(run=_info)
     for command in (train, evaluate, render, run, info):
@@ -116,6 +120,49 @@ def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
         if name == "apply":
             action.add_argument("--dry-run", action="store_true", help="show the changes, write nothing")
         action.set_defaults(run=_patch, command_parser=action)
+
+
+def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
+    actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION")
+    run = actions.add_parser("run", help="run what is not done yet of a suite",
+                             description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
+                                         "becomes a row with its reason.")
+    run.add_argument("suite", metavar="SUITE", help="a .yaml file, or a shipped one: smoke, table1, table2, table3, "
+                                                    "fig4, fig5, captures, captures_ablation")
+    run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
+    run.add_argument("--jobs", type=int, metavar="N", help="cells at once (default: one per GPU; one on the CPU)")
+    run.add_argument("--slurm", nargs="*", metavar="KEY=VALUE",
+                     help="submit cells to Slurm; resources of each, such as slurm_partition=gpu runtime=120")
+    run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
+                     help="only such cells; fields: method, scene, blend_mode, schedule, densify_grad_threshold, "
+                          "seed, headline")
+    run.add_argument("--retry-failed", action="store_true", help="run failed cells again")
+    run.add_argument("--dry-run", action="store_true", help="say which cells are done and which are not")
+    run.set_defaults(run=_bench_run)
+    report = actions.add_parser("report", help="tables, curves and a page of results",
+                                description="Writes tables, curves and a page that works offline.")
+    report.add_argument("results", metavar="RESULTS", help="folder of `dsmoe bench run`, or a file rows.jsonl")
+    report.add_argument("-o", "--output", metavar="DIR", default="report", help="folder to write (default: report)")
+    report.set_defaults(run=_bench_report)
+
+
+def _bench_run(arguments: argparse.Namespace) -> int:
+    from .benchmarks.engine import rows_table, run_suite
+
+    rows = run_suite(arguments.suite, arguments.output, arguments.jobs, arguments.slurm, arguments.retry_failed,
+                     arguments.dry_run, arguments.only)
+    if rows:
+        print(rows_table(rows))
+    failed = sum(not row["ok"] for row in rows)
+    if failed:
+        print(f"{failed} of {len(rows)} cells failed; their rows say why, --retry-failed runs them again")
+    return 0
+
+
+def _bench_report(arguments: argparse.Namespace) -> None:
+    from .benchmarks.report import report
+
+    print(report(arguments.results, arguments.output))
 
 
 def _patch(arguments: argparse.Namespace) -> int:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, List, Optional, Sequence
+from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence
 
 import torch
 from tqdm import tqdm
@@ -13,21 +13,26 @@ from .rendering import Renderer
 from .stopwatch import synchronised_time
 
 WARM_UP_VIEWS = 2  # rendered untimed before the first timed one
+Measure = Callable[[torch.Tensor, torch.Tensor], Mapping[str, Optional[float]]]
+METRICS = ("psnr", "ssim", "psnr_float")  # what image_metrics gives
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """Means over views, each view counting once."""
 
-    metrics: Dict[str, Optional[float]]  # psnr, ssim, psnr_float; None where there are no views
+    metrics: Dict[str, Optional[float]]  # psnr, ssim, psnr_float and what else was measured; None where there are none
     fps: Optional[float]  # 1 / mean seconds per view, images rendered and nothing else
     per_view: List[Dict[str, object]]  # name, metrics and milliseconds of each view
 
 
-def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: bool = False) -> Evaluation:
-    """Renders every view; times rendering alone, synchronised, without loading, metrics or disk."""
+def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: bool = False,
+             measure: Measure = image_metrics) -> Evaluation:
+    """Renders every view; times rendering alone, synchronised, without loading, metrics or disk.
+
+    measure: from a rendering and its ground truth, [3, H, W], to metrics by name.
+    """
     per_view: List[Dict[str, object]] = []
-    seconds = 0.0
     with torch.no_grad():
         for view in views[:WARM_UP_VIEWS]:
             renderer(view.camera)
@@ -35,12 +40,18 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
             started = synchronised_time(device)
             color = renderer(view.camera).color
             elapsed = synchronised_time(device) - started
-            seconds += elapsed
-            row: Dict[str, object] = {"name": view.camera.name, "milliseconds": elapsed * 1000}
-            row.update(image_metrics(color, view.image_float()))
-            per_view.append(row)
+            per_view.append({"name": view.camera.name, "milliseconds": elapsed * 1000,
+                             **measure(color, view.image_float())})
+    return summary(per_view)
+
+
+def summary(per_view: List[Dict[str, Any]]) -> Evaluation:
+    """Means of what was measured of each view. A metric that is None for some views is the mean over the others."""
+    names = list(METRICS) + [name for name in (per_view[0] if per_view else ())
+                             if name not in (*METRICS, "name", "milliseconds")]
     metrics: Dict[str, Optional[float]] = {}
-    for name in ("psnr", "ssim", "psnr_float"):
-        values = [float(row[name]) for row in per_view]  # type: ignore[arg-type]
+    for name in names:
+        values = [float(row[name]) for row in per_view if row[name] is not None]
         metrics[name] = sum(values) / len(values) if values else None
-    return Evaluation(metrics, len(views) / seconds if views else None, per_view)
+    seconds = sum(row["milliseconds"] for row in per_view) / 1000
+    return Evaluation(metrics, len(per_view) / seconds if per_view else None, per_view)

@@ -1,0 +1,193 @@
+"""One cell: one training and its measurement, from a file of plain values to a row.
+
+    python -m diff_smoe_rasterization.benchmarks.cell CELL.json OUT [--gpus 0,1 --locks FOLDER]
+
+OUT/row.json is written in any case but one: where this command itself is killed, so that whoever started it starts it
+again. The work is done in a process of its own, whose end, a crash or a lack of memory included, becomes a row with the
+reason. OUT/log.txt is what it printed.
+"""
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from typing import Any, Dict, List, Optional
+
+from ..trainer.errors import TrainerError
+from ..trainer.files import write_json_atomically
+
+ROW_NAME, LOG_NAME = "row.json", "log.txt"
+
+
+def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
+    """What a row says of its cell, whether it was measured or failed."""
+    method, scene = cell["method"], cell["scene"]
+    return {"cell": cell["id"], "suite": cell["suite"], "method": method["name"], "label": method["label"],
+            "variant": method["variant"], "blend_mode": cell["blend_mode"], "schedule": cell["schedule"],
+            "densify_grad_threshold": cell["densify_grad_threshold"], "scene": scene["name"],
+            "dataset": scene["dataset"], "seed": cell["seed"], "iterations": cell["protocol"]["iterations"],
+            "headline": cell["headline"], "end": method.get("end"), "budget": method.get("budget")}
+
+
+def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float]) -> Dict[str, Any]:
+    """The row of a cell that gave no figures."""
+    return {**identity(cell), "ok": False, "reason": reason, "psnr": None, "psnr_float": None, "ssim": None,
+            "lpips": {"value": None, "kind": next(iter(cell["protocol"]["lpips"]), None), "reason": "the cell failed"},
+            "lpips_all": [], "psnr_edge": None, "num_gaussians": None, "size_bytes": {"own": None, "common": None},
+            "train_seconds": None, "wall_seconds": wall_seconds, "fps": None, "peak_gpu_mib": None, "protocol": {},
+            "commit": {"project": None, "trainer": None}, "machine": {}, "history": [], "per_view": []}
+
+
+def measured_row(cell: Dict[str, Any], output: str, started: float) -> Dict[str, Any]:
+    """Trains and measures. Raises what goes wrong."""
+    from ..trainer.results import result_row
+    from . import methods, protocol
+    from .measure import headline_lpips
+
+    outcome = methods.run(cell, output)
+    config = protocol.config_of(cell, output)
+    metrics = outcome.evaluation.metrics
+    trained = result_row(config, outcome.scene, outcome.num_gaussians, outcome.train_seconds, outcome.evaluation)
+    rules = protocol.protocol_of(trained["protocol"], config, outcome.lpips)
+    write_images(output, outcome)
+    return {**identity(cell), "ok": True, "reason": None, "psnr": metrics["psnr"], "psnr_float": metrics["psnr_float"],
+            "ssim": metrics["ssim"], "lpips": headline_lpips(outcome.lpips), "lpips_all": outcome.lpips,
+            "psnr_edge": metrics.get("psnr_edge"), "num_gaussians": outcome.num_gaussians,
+            "size_bytes": {"own": outcome.own_bytes, "common": protocol.common_bytes(outcome.num_gaussians)},
+            "train_seconds": outcome.train_seconds, "wall_seconds": time.time() - started,
+            "fps": outcome.evaluation.fps, "peak_gpu_mib": outcome.peak_gpu_mib,
+            "protocol": {**rules, **outcome.notes},
+            "commit": {"project": protocol.project_commit(), "trainer": outcome.commit},
+            "machine": protocol.machine_of(config.device), "history": outcome.history,
+            "per_view": outcome.evaluation.per_view}
+
+
+def write_images(output: str, outcome: Any) -> None:
+    """OUT/images/{gt,render}/NAME.png of the views whose renderings were kept."""
+    from ..trainer.inspection import to_image
+    from ..trainer.pictures import file_names
+
+    views = {view.camera.name: view for view in outcome.scene.test}
+    names = dict(zip(views, file_names(list(views))))
+    for kind, image_of in (("gt", lambda name: views[name].image_float()), ("render", outcome.renders.get)):
+        folder = os.path.join(output, "images", kind)
+        for name in outcome.renders:
+            os.makedirs(folder, exist_ok=True)
+            to_image(image_of(name)).save(os.path.join(folder, names[name] + ".png"))
+
+
+def work(cell: Dict[str, Any], output: str, started: float) -> None:
+    """The inner process: writes the row, and removes what is no longer needed. Raises nothing but what kills it."""
+    path = os.path.join(output, ROW_NAME)
+    try:
+        row = measured_row(cell, output, started)
+    except Exception as error:  # whatever it is, it is the row's reason; KeyboardInterrupt and SystemExit are not
+        if not isinstance(error, TrainerError):
+            traceback.print_exc()
+        text = str(error) if isinstance(error, TrainerError) else f"{type(error).__name__}: {error}"
+        write_json_atomically(path, failed_row(cell, text, time.time() - started))
+        return
+    if not cell["keep_models"]:
+        shutil.rmtree(os.path.join(output, "run"), ignore_errors=True)
+    write_json_atomically(path, row)
+
+
+def supervise(cell_path: str, output: str, gpu: Optional[str] = None) -> Dict[str, Any]:
+    """Runs `work` in a process of its own and returns the row that is in OUT then."""
+    with open(cell_path, encoding="utf-8") as file:
+        cell = json.load(file)
+    os.makedirs(output, exist_ok=True)
+    row_path, log_path = os.path.join(output, ROW_NAME), os.path.join(output, LOG_NAME)
+    if os.path.isfile(row_path):
+        os.remove(row_path)
+    environment = dict(os.environ, PYTHONUNBUFFERED="1")
+    if gpu is not None:
+        environment["CUDA_VISIBLE_DEVICES"] = gpu
+    started = time.time()
+    command = [sys.executable, "-m", __spec__.name if __spec__ else __name__, cell_path, output, "--inside"]
+    with open(log_path, "ab") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+                                   env=environment, preexec_fn=die_with_parent)
+        handlers = {number: signal.signal(number, lambda *_: (process.terminate(), sys.exit(143)))
+                    for number in (signal.SIGTERM, signal.SIGHUP)}
+        try:
+            status = process.wait()
+        finally:
+            process.terminate()
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    if not os.path.isfile(row_path):
+        write_json_atomically(row_path, failed_row(cell, how_it_ended(status, log_path), time.time() - started))
+    with open(row_path, encoding="utf-8") as file:
+        return json.load(file)
+
+
+def die_with_parent() -> None:
+    """Ends the process with the one that started it, however that ends (Linux)."""
+    import ctypes
+
+    try:
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)  # 1 is PR_SET_PDEATHSIG
+    except (AttributeError, OSError):
+        pass
+
+
+def how_it_ended(status: int, log_path: str) -> str:
+    """The reason for a row where a process left none."""
+    with open(log_path, encoding="utf-8", errors="replace") as file:
+        lines = [line.strip() for line in file if line.strip()]
+    how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+    memory = "; the system may have been out of memory" if status == -signal.SIGKILL else ""
+    return f"the process {how}{memory}" + (f"; its last line: {lines[-1][:300]}" if lines else "")
+
+
+def claim_gpu(gpus: List[str], folder: str, poll_seconds: float = 1.0) -> Any:
+    """Waits for a GPU that no other cell of these locks has; returns (its name, the lock, which is to be kept open)."""
+    import fcntl
+
+    os.makedirs(folder, exist_ok=True)
+    while True:
+        for gpu in gpus:
+            lock = open(os.path.join(folder, f"gpu_{gpu}.lock"), "w")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return gpu, lock
+            except OSError:
+                lock.close()
+        time.sleep(poll_seconds)
+
+
+def main(argv: Optional[List[str]] = None) -> int:
+    """Runs the command; 0 where there is a row, whatever it says."""
+    parser = argparse.ArgumentParser(prog="python -m diff_smoe_rasterization.benchmarks.cell",
+                                     description="Trains and measures one cell of a suite.")
+    parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
+    parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
+    parser.add_argument("--gpus", metavar="N,N", default="", help="take one of these GPUs that no other cell has")
+    parser.add_argument("--locks", metavar="FOLDER", help="where cells tell each other which GPU they have")
+    parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args(argv)
+    if arguments.inside:
+        with open(arguments.cell, encoding="utf-8") as file:
+            work(json.load(file), arguments.output, time.time())
+        return 0
+    gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output) if arguments.gpus else (None,
+                                                                                                                 None)
+    try:
+        row = supervise(arguments.cell, arguments.output, gpu)
+    finally:
+        if lock:
+            lock.close()
+    print(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {row['psnr']}" if row["ok"]
+                                else f"failed: {row['reason']}"), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,283 @@
+"""Public trainers' checkouts as methods: one class for each shape of commands.
+
+Each command runs in the checkout's folder and Python, observed by observer.py. Renderings come back as floats and are
+measured here, against this project's own ground truth, as the native trainer's are: one split, one downscaler, one set
+of metrics for all. A checkout that renders other views, or was trained on other images, is refused.
+"""
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import fields
+from typing import Any, Dict, List, Optional, Tuple, Type
+
+import numpy as np
+import torch
+
+from ...trainer.config import TrainConfig
+from ...trainer.evaluation import Evaluation, summary
+from ...trainer.images import View
+from ...trainer.pictures import evenly_spaced
+from ...trainer.scene import Scene, load_scene
+from ..errors import BenchError
+from ..measure import Measures
+from ..protocol import RECIPE, commit_of, config_of
+from . import Outcome, require_test_views
+
+OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py")
+# Mean difference between the trainer's ground truth and ours: rounding leaves half a grey level at the most, another
+# downscaler or background leaves several.
+MAX_TRUTH_DIFFERENCE = 1 / 255
+SET_OTHERWISE = ("sh_degree_interval", "antialiasing", "opacity_reset_interval")
+
+
+class ThreeDGS:
+    """train.py -s SCENE -m MODEL, then render.py -m MODEL: 3DGS of 2023 and of 2024, Taming 3DGS."""
+
+    stubs: Tuple[str, ...] = ()  # modules that are imported for what is not done here
+    observed: Tuple[str, ...] = ()  # further arguments of the observer
+    render_arguments: Tuple[str, ...] = ()
+    container = "point_cloud.ply"
+
+    def __init__(self, cell: Dict[str, Any], config: TrainConfig, output: str) -> None:
+        self.cell, self.config, self.output = cell, config, os.path.abspath(output)
+        self.method = cell["method"]
+        self.model = os.path.join(self.output, "run")
+        self.renders = os.path.join(self.output, "renders")
+
+    def train(self) -> Dict[str, Any]:
+        """Trains; returns the observer's record."""
+        return self.command("train", self.method["path"], "train.py", *self.train_arguments())
+
+    def render(self) -> Dict[str, Any]:
+        """Renders the test views; returns the observer's record."""
+        return self.command("render", self.method["path"], "render.py", "-m", self.model, "--skip_train", "--quiet",
+                            *self.render_arguments, renders=self.renders)
+
+    def train_arguments(self) -> List[str]:
+        """What the protocol and the axes are in the trainer's words."""
+        config = self.config
+        words = ["-s", os.path.abspath(config.scene), "-m", self.model, "--eval", "--iterations", config.iterations,
+                 "--densify_grad_threshold", config.densify_grad_threshold, "--test_iterations", -1,
+                 "--save_iterations", config.iterations, "--port", 0]  # 0: a free one, since cells run side by side
+        if config.resolution != -1:
+            words += ["-r", config.resolution]
+        if config.images != "images":
+            words += ["--images", config.images]
+        if config.white_background:
+            words.append("--white_background")
+        # Size prune and reset both wait for the interval: beyond the last iteration there is neither.
+        reset = config.iterations + 1 if config.schedule == "steady" else config.opacity_reset_interval
+        defaults = {option.name: option.default for option in fields(TrainConfig)}
+        for name in RECIPE:
+            if name not in SET_OTHERWISE and getattr(config, name) != defaults[name]:
+                words += ["--" + name, getattr(config, name)]
+        if reset != defaults["opacity_reset_interval"]:
+            words += ["--opacity_reset_interval", reset]
+        if config.antialiasing:
+            words.append("--antialiasing")
+        if self.method["variant"] == "patched":
+            words += ["--blend_mode", config.blend_mode]
+        return [str(word) for word in words] + list(self.method["arguments"])
+
+    def own_bytes(self) -> int:
+        """Size of what the method calls its model."""
+        return size_of(os.path.join(self.model, "point_cloud", f"iteration_{self.config.iterations}", self.container))
+
+    def train_seconds(self, trained: Dict[str, Any]) -> Optional[float]:
+        """Seconds of the loop."""
+        return trained["loop_seconds"]
+
+    def command(self, name: str, folder: str, script: str, *words: str,
+                renders: Optional[str] = None) -> Dict[str, Any]:
+        """Runs a script in the checkout; returns the observer's record. Raises BenchError with how it ended."""
+        record = os.path.join(self.output, name + ".json")
+        line = [self.method["python"] or sys.executable, OBSERVER, record, "--seed", str(self.config.seed),
+                "--iterations", str(self.config.iterations), "--stub", ",".join(self.stubs), *self.observed]
+        line += (["--renders", renders] if renders else []) + ["--", os.path.join(folder, script), *words]
+        if not os.path.isfile(os.path.join(folder, script)):
+            raise BenchError(f"{folder}: there is no {script} in it; {self.method['name']} is run by it")
+        log = os.path.join(self.output, name + ".log")
+        with open(log, "w", encoding="utf-8") as file:
+            status = subprocess.call(line, cwd=folder, stdout=file, stderr=subprocess.STDOUT,
+                                     stdin=subprocess.DEVNULL, env=self.environment())
+        if status != 0:
+            raise BenchError(f"{script} of {self.method['label']} ended with status {status}: {last_line(log)} "
+                             f"(all of it is in {os.path.basename(log)})")
+        with open(record, encoding="utf-8") as file:
+            return json.load(file)
+
+    def environment(self) -> Dict[str, str]:
+        """Of the commands: a patched checkout needs this package; nothing is left in the checkout's folders."""
+        ours = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+        path = [item for item in [*self.method["pythonpath"], *ours] if item]
+        environment = {name: value for name, value in os.environ.items() if name != "DSMOE_BLEND_MODE"}
+        return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+class TwoDGS(ThreeDGS):
+    """2D Gaussian Splatting: the same commands; render.py also extracts meshes, with libraries that are not needed."""
+
+    stubs = ("open3d", "trimesh", "mediapy")
+    render_arguments = ("--skip_mesh",)
+
+
+class C3DGS(ThreeDGS):
+    """Compressed 3DGS: a 3DGS checkout (`base`) trains, compress.py compresses and finetunes, render.py renders."""
+
+    container = "point_cloud.npz"
+
+    def train(self) -> Dict[str, Any]:
+        self.model = os.path.join(self.output, "run", "base")
+        trained = self.command("train", self.method["base"], "train.py", *self.train_arguments())
+        compressed = os.path.join(self.output, "run", "compressed")
+        self.command("compress", self.method["path"], "compress.py", "--model_path", self.model, "--output_vq",
+                     compressed, "--load_iteration", str(self.config.iterations), *self.method["arguments"])
+        self.model = compressed
+        return trained
+
+    def train_arguments(self) -> List[str]:
+        own = list(self.method["arguments"])  # which are those of compress.py
+        words = super().train_arguments()
+        return words[:len(words) - len(own)]
+
+    def train_seconds(self, trained: Dict[str, Any]) -> Optional[float]:
+        """Training, and what compress.py says of its own stages; None where it says nothing."""
+        path = os.path.join(self.model, "times.json")
+        if trained["loop_seconds"] is None or not os.path.isfile(path):
+            return None
+        with open(path, encoding="utf-8") as file:
+            return trained["loop_seconds"] + json.load(file)["total"]
+
+    def own_bytes(self) -> int:
+        folder = os.path.join(self.model, "point_cloud")
+        return sum(size_of(os.path.join(folder, name, self.container)) for name in os.listdir(folder))
+
+
+class HAC(ThreeDGS):
+    """HAC and HAC++: train.py trains, encodes, decodes and renders in one process."""
+
+    def train(self) -> Dict[str, Any]:
+        return self.command("train", self.method["path"], "train.py", *self.train_arguments(), renders=self.renders)
+
+    def render(self) -> Dict[str, Any]:
+        with open(os.path.join(self.output, "train.json"), encoding="utf-8") as file:
+            return json.load(file)
+
+    def train_arguments(self) -> List[str]:
+        words = super().train_arguments()
+        test = words.index("--test_iterations")  # the model is encoded where it is tested last
+        words[test + 1] = str(self.config.iterations)
+        return words
+
+    def own_bytes(self) -> int:
+        return size_of(os.path.join(self.model, "bitstreams"))
+
+
+class DBS(ThreeDGS):
+    """Deformable Beta Splatting: train.py alone; the number of primitives is given (`--cap_max`), no threshold.
+
+    Its own `--eval` trains until the test views are best, and keeps that model. Here views are held out, and that is
+    all: the protocol's iterations, the last model.
+    """
+
+    stubs = ("viser", "nerfview")  # its viewer
+    observed = ("--hold-out", "--model-renders", "beta_model")
+
+    def train(self) -> Dict[str, Any]:
+        return self.command("train", self.method["path"], "train.py", *self.train_arguments(), renders=self.renders)
+
+    def render(self) -> Dict[str, Any]:
+        with open(os.path.join(self.output, "train.json"), encoding="utf-8") as file:
+            return json.load(file)
+
+    def train_arguments(self) -> List[str]:
+        words = super().train_arguments()
+        for word, values in (("--eval", 0), ("--densify_grad_threshold", 1), ("--test_iterations", 1)):
+            at = words.index(word)
+            del words[at:at + 1 + values]
+        return words + ["--disable_viewer", "--no-compress"]
+
+
+SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDGS, "taming": ThreeDGS, "2dgs": TwoDGS,
+                                     "dbs": DBS, "c3dgs": C3DGS, "hac": HAC, "hac-plus": HAC}
+
+
+def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
+    """Trains, renders and measures. Raises TrainerError."""
+    if cell["method"].get("refused"):
+        raise BenchError(cell["method"]["refused"])
+    config = config_of(cell, output)
+    scene = require_test_views(load_scene(config, progress=False), config)
+    shape = SHAPES[cell["method"]["name"]](cell, config, output)
+    for left in (shape.model, shape.renders):  # of an earlier attempt; these trainers do not continue one
+        shutil.rmtree(left, ignore_errors=True)
+    trained = shape.train()
+    rendered = shape.render()
+    try:
+        pairs = matched(scene, rendered["views"], shape.method["label"])
+        measures = Measures(config.device, cell["protocol"]["lpips"])
+        difference, evaluation = measured(pairs, measures, config.device)
+        kept = [pairs[index] for index in evenly_spaced(len(pairs), cell["images"])]
+        renders = {view.camera.name: torch.from_numpy(np.load(seen["file"])) for view, seen in kept}
+    finally:
+        shutil.rmtree(shape.renders, ignore_errors=True)
+    return Outcome(scene=scene, evaluation=evaluation, lpips=measures.lpips_of(evaluation.metrics),
+                   num_gaussians=rendered["num_gaussians"], own_bytes=shape.own_bytes(),
+                   train_seconds=shape.train_seconds(trained), peak_gpu_mib=trained["peak_gpu_mib"],
+                   commit=shape.method.get("commit") or commit_of(shape.method["path"]), renders=renders,
+                   notes={"ground_truth_difference": difference, "arguments": shape.train_arguments()})
+
+
+def matched(scene: Scene, seen: List[Dict[str, Any]], label: str) -> List[Tuple[View, Dict[str, Any]]]:
+    """Our test views with the trainer's renderings. Raises BenchError where the split is not the same."""
+    by_name = {stem(row["name"]): row for row in seen}
+    expected = {stem(view.camera.name) for view in scene.test}
+    if set(by_name) != expected:
+        wrong = sorted(expected ^ set(by_name))
+        raise BenchError(f"{label} rendered {len(by_name)} test views, the split has {len(expected)} "
+                         f"({', '.join(wrong[:3])}, ... are in one of them alone): another split gives other figures")
+    return [(view, by_name[stem(view.camera.name)]) for view in scene.test]
+
+
+def measured(pairs: List[Tuple[View, Dict[str, Any]]], measures: Measures, device: str) -> Tuple[float, Evaluation]:
+    """The largest mean difference between both ground truths, and the figures. Raises BenchError beyond the limit."""
+    per_view: List[Dict[str, Any]] = []
+    largest = 0.0
+    for view, seen in pairs:
+        truth, theirs = view.image_float(), torch.from_numpy(np.load(seen["truth"]))
+        if theirs.shape != truth.shape:
+            raise BenchError(f"{view.camera.name}: the trainer's image is {tuple(theirs.shape)}, the protocol's "
+                             f"{tuple(truth.shape)}: another resolution gives other figures")
+        largest = max(largest, float((theirs - truth).abs().mean()))
+        color = torch.from_numpy(np.load(seen["file"])).to(device)
+        per_view.append({"name": view.camera.name, "milliseconds": seen["milliseconds"],
+                         **measures(color, truth.to(device))})
+    if largest > MAX_TRUTH_DIFFERENCE:
+        raise BenchError(f"the trainer's ground truth differs from the protocol's by {255 * largest:.2f} grey levels "
+                         "on average: another downscaler or background gives other figures")
+    return largest, summary(per_view)
+
+
+def stem(name: str) -> str:
+    """An image's name without folder and extension, which trainers keep or drop."""
+    return os.path.splitext(os.path.basename(name))[0]
+
+
+def size_of(path: str) -> int:
+    """Bytes of a file, or of all files in a folder. Raises BenchError where it is absent."""
+    if os.path.isfile(path):
+        return os.path.getsize(path)
+    if not os.path.isdir(path):
+        raise BenchError(f"{path}: no such file; the trainer left no model there")
+    return sum(os.path.getsize(os.path.join(folder, name)) for folder, _, names in os.walk(path) for name in names)
+
+
+def last_line(path: str) -> str:
+    """The last line of a log that says something."""
+    with open(path, encoding="utf-8", errors="replace") as file:
+        lines = [line.strip() for line in file.read().replace("\r", "\n").splitlines() if line.strip()]
+    return lines[-1][:300] if lines else "it printed nothing"

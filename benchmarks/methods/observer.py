@@ -1,0 +1,247 @@
+"""Runs a script of a public trainer and writes down what it does, without changing a file of it.
+
+    python observer.py RECORD.json --seed N --iterations N [--renders FOLDER] ... -- SCRIPT ARGUMENT...
+
+It runs in the trainer's own Python and imports nothing of this project. What it relies on is the interface that the
+trainers have in common: they seed with constants, show their loop as a tqdm bar over the iterations, and render by
+`gaussian_renderer.render(view, model, ...)["render"]` (HAC after `prefilter_voxel`) or `model.render(view)["render"]`.
+
+RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, views [{name, milliseconds, file, truth}]. The files of the
+renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
+"""
+import argparse
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import json
+import os
+import random
+import runpy
+import sys
+import time
+import types
+
+WARM_UPS = 2
+
+
+def main(argv=None):
+    words = list(sys.argv[1:] if argv is None else argv)
+    split = words.index("--")
+    parser = argparse.ArgumentParser()
+    parser.add_argument("record")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--iterations", type=int, required=True)
+    parser.add_argument("--renders")
+    parser.add_argument("--stub", default="")
+    parser.add_argument("--hold-out", action="store_true")
+    parser.add_argument("--model-renders", metavar="ATTRIBUTE")
+    options = parser.parse_args(words[:split])
+    script, arguments = words[split + 1], words[split + 2:]
+    sys.argv = [script] + arguments
+    sys.path[0] = os.path.dirname(os.path.abspath(script))
+    for name in filter(None, options.stub.split(",")):
+        stub(name)
+    import torch
+
+    shift_seeds(options.seed)
+    views = watch_renderings(options.renders) if options.renders and not options.model_renders else {}
+    scenes = watch_scenes(options.hold_out) if options.model_renders else []
+    bar = watch_loop(options.iterations, views)
+    try:
+        runpy.run_path(script, run_name="__main__")
+        if options.model_renders:
+            views.update(renderings_of(scenes[-1], options.model_renders, options.renders))
+    finally:
+        peak = torch.cuda.max_memory_allocated() / 2 ** 20 if torch.cuda.is_available() else None
+        record = {"loop_seconds": bar.get("seconds"), "peak_gpu_mib": bar.get("peak", peak),
+                  "num_gaussians": views.pop("num_gaussians", None), "views": list(views.values())}
+        with open(options.record, "w") as file:
+            json.dump(record, file)
+
+
+def synchronise():
+    import torch
+
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def shift_seeds(seed):
+    """Every seed that the script sets becomes the seed plus this one: the trainers fix theirs to 0."""
+    import numpy
+    import torch
+
+    for module, name in ((random, "seed"), (numpy.random, "seed"), (torch, "manual_seed")):
+        def shifted(value, *rest, original=getattr(module, name)):
+            return original(int(value) + seed, *rest)
+        setattr(module, name, shifted)
+
+
+def watch_loop(iterations, views):
+    """Times the bar over so many iterations, from where it is made to where it is closed; returns where that goes.
+
+    Where the bar of the final rendering begins, earlier entries of `views` go: HAC renders training views on the way.
+    """
+    import torch
+    import tqdm
+
+    found = {}
+
+    class Bar(tqdm.tqdm):
+        def __init__(self, *arguments, **keywords):
+            super().__init__(*arguments, **keywords)
+            if self.desc and self.desc.startswith("Rendering progress"):
+                views.clear()
+            self.counted = self.total == iterations
+            if self.counted and torch.cuda.is_available():
+                torch.cuda.reset_peak_memory_stats()
+            synchronise()
+            self.began = time.perf_counter()
+
+        def close(self):
+            if getattr(self, "counted", False) and "seconds" not in found:
+                synchronise()
+                found["seconds"] = time.perf_counter() - self.began
+                if torch.cuda.is_available():
+                    found["peak"] = torch.cuda.max_memory_allocated() / 2 ** 20
+            super().close()
+
+    tqdm.tqdm = Bar
+    return found
+
+
+def timed(function, arguments, keywords):
+    """(result, seconds)"""
+    synchronise()
+    began = time.perf_counter()
+    result = function(*arguments, **keywords)
+    synchronise()
+    return result, time.perf_counter() - began
+
+
+def keep(folder, number, view, image, seconds):
+    """Writes a rendering and its ground truth; returns the record's entry."""
+    import numpy
+
+    os.makedirs(folder, exist_ok=True)
+    files = [os.path.join(folder, "%s_%d.npy" % (kind, number)) for kind in ("render", "truth")]
+    for path, kept in zip(files, (image, view.original_image[:3])):
+        numpy.save(path, kept.detach().float().cpu().numpy())
+    return {"name": view.image_name, "milliseconds": 1000 * seconds, "file": files[0], "truth": files[1]}
+
+
+def watch_scenes(hold_out):
+    """Keeps every scene.Scene that is made; with hold_out the split is made as `--eval` makes it, and only that.
+
+    Where `--eval` does more (Deformable Beta Splatting then chooses its model and its last iteration on the test
+    views), the split is wanted without the rest.
+    """
+    import scene
+
+    made, original = [], scene.Scene.__init__
+
+    def init(self, args, *arguments, **keywords):
+        before = args.eval
+        args.eval = before or hold_out
+        try:
+            original(self, args, *arguments, **keywords)
+        finally:
+            args.eval = before
+        made.append(self)
+
+    scene.Scene.__init__ = init
+    return made
+
+
+def renderings_of(scene, attribute, folder):
+    """The record's entries of the test views, rendered by the scene's model itself: model.render(view)["render"]."""
+    import torch
+
+    model, views, found = getattr(scene, attribute), scene.getTestCameras(), {}
+    with torch.no_grad():
+        for view in views[:WARM_UPS]:
+            model.render(view)
+        for number, view in enumerate(views):
+            result, seconds = timed(model.render, (view,), {})
+            found[view.image_name] = keep(folder, number, view, result["render"], seconds)
+    found["num_gaussians"] = len(model.get_xyz)
+    return found
+
+
+def watch_renderings(folder):
+    """Times and keeps what is rendered without gradients, the last rendering of each view; returns where that goes."""
+    import gaussian_renderer
+    import torch
+
+    found, pending, numbers = {}, {"seconds": 0.0, "warm": False}, {}
+    render = gaussian_renderer.render
+
+    def watched(view, model, *arguments, **keywords):
+        if torch.is_grad_enabled():
+            return render(view, model, *arguments, **keywords)
+        for _ in range(0 if pending["warm"] else WARM_UPS):
+            render(view, model, *arguments, **keywords)
+        pending["warm"] = True
+        result, seconds = timed(render, (view, model) + arguments, keywords)
+        number = numbers.setdefault(view.image_name, len(numbers))
+        found[view.image_name] = keep(folder, number, view, result["render"], seconds + pending["seconds"])
+        pending["seconds"] = 0.0
+        found["num_gaussians"] = len(model.get_anchor if hasattr(model, "get_anchor") else model.get_xyz)
+        return result
+
+    gaussian_renderer.render = watched
+    if hasattr(gaussian_renderer, "prefilter_voxel"):
+        prefilter = gaussian_renderer.prefilter_voxel
+
+        def prefiltered(*arguments, **keywords):
+            if torch.is_grad_enabled():
+                return prefilter(*arguments, **keywords)
+            if not pending["warm"]:
+                prefilter(*arguments, **keywords)
+            result, pending["seconds"] = timed(prefilter, arguments, keywords)
+            return result
+
+        gaussian_renderer.prefilter_voxel = prefiltered
+    return found
+
+
+class Absent(types.ModuleType):
+    """Stands for a module that is imported and not used; anything may be asked of it, nothing called."""
+
+    __path__ = []
+
+    def __mro_entries__(self, bases):
+        return (object,)  # so that a class may be derived from it
+
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return Absent(self.__name__ + "." + name)
+
+
+class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Finds one module and all below it, as Absents."""
+
+    def __init__(self, name):
+        self.name = name
+
+    def find_spec(self, fullname, path=None, target=None):
+        if fullname.partition(".")[0] == self.name:
+            return importlib.machinery.ModuleSpec(fullname, self, is_package=True)
+        return None
+
+    def create_module(self, spec):
+        return Absent(spec.name)
+
+    def exec_module(self, module):
+        pass
+
+
+def stub(name):
+    """Lets a module that this Python lacks be imported."""
+    if importlib.util.find_spec(name) is None:
+        sys.meta_path.append(AbsentFinder(name))
+
+
+if __name__ == "__main__":
+    main()

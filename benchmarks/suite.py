@@ -1,0 +1,277 @@
+"""Suites: a YAML file that says what is trained on what, checked and expanded to cells.
+
+A cell is one training and its measurement, as plain values: `python -m diff_smoe_rasterization.benchmarks.cell` needs
+nothing else. What makes two figures comparable stands once in a suite (`protocol`, and each scene's images), never in a
+method, so that a suite cannot mix protocols; what would mix them nevertheless is refused here.
+"""
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import os
+import re
+from dataclasses import dataclass
+from typing import Any, Dict, List, Optional, Sequence
+
+from ..trainer.errors import ConfigError
+from .errors import BenchError
+from .methods.names import CHECKOUTS, NATIVE, NEEDS, WITHOUT_SCHEDULE
+from .protocol import RECIPE, config_of
+from .schema import SUITE
+
+SHIPPED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "suites")
+# The paper prints that its first of six thresholds is 0.005 and its fifth 0.0002.
+THRESHOLDS = (0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
+PROTOCOL = {"iterations": 30_000, "device": "cuda", "background": "black", "principal_point": "centre",
+            "lpips": ["lpips_vgg_inria", "lpips_vgg_std", "lpips_alex"], "evaluate_every": 0, "checkpoint_every": 1000,
+            "scale_recipe": False, "options": {}}
+AXES = {"blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": list(THRESHOLDS), "schedules": ["3dgs"],
+        "seeds": [0]}
+AXIS_OF = {"blend_modes": "blend_mode", "densify_grad_thresholds": "densify_grad_threshold", "schedules": "schedule",
+           "seeds": "seed"}
+NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit")  # where things lie changes no figure
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A checked suite."""
+
+    name: str
+    protocol: Dict[str, Any]
+    scenes: List[Dict[str, Any]]
+    methods: List[Dict[str, Any]]
+    cells: List[Dict[str, Any]]
+
+
+def find_suite(name: str) -> str:
+    """The path of a suite: a file, or the name of one that is shipped. Raises BenchError."""
+    if os.path.isfile(name):
+        return name
+    shipped = os.path.join(SHIPPED, name + ".yaml")
+    if os.path.isfile(shipped):
+        return shipped
+    names = sorted(os.path.splitext(file)[0] for file in os.listdir(SHIPPED) if file.endswith(".yaml"))
+    raise BenchError(f"{name}: no such file, and no suite that is shipped ({', '.join(names)})")
+
+
+def load_suite(path: str) -> Suite:
+    """Reads, checks and expands a suite. Raises BenchError naming the file, the field and what it must be."""
+    content = read_yaml(path)
+    try:
+        return expand(content, os.path.dirname(os.path.abspath(path)))
+    except BenchError as error:
+        raise BenchError(f"{path}: {error}") from error
+
+
+def expand(content: Any, folder: str) -> Suite:
+    """A suite from what its file says; relative paths are taken from `folder`. Raises BenchError."""
+    content = with_scenes_of_a_file(content, folder)
+    check_schema(content)
+    protocol = {**PROTOCOL, **content.get("protocol", {})}
+    scenes = [_scene(scene, index, protocol, folder) for index, scene in enumerate(content["scenes"])]
+    methods = [_method(method, index, protocol, folder) for index, method in enumerate(content["methods"])]
+    _names_are_unique(scenes, "scenes", "name")
+    _names_are_unique(methods, "methods", "label")
+    _one_downscaler(scenes)
+    cells: List[Dict[str, Any]] = []
+    for scene, method in itertools.product(scenes, methods):
+        schedules = _values("schedules", content, scene, method)
+        if scene["background"] == "white" and "steady" in schedules and method["name"] != NATIVE:
+            raise BenchError(f"scenes: {scene['name']} is white, where 3DGS resets opacities once more: a checkout's "
+                             "schedule cannot be `steady` there")
+        cells += _cells(content, protocol, scene, method)
+    for cell in cells:
+        try:
+            config_of(cell)
+        except (ConfigError, TypeError) as error:
+            raise BenchError(f"cell {cell['id']}: {error}") from error
+    return Suite(content["name"], protocol, scenes, methods, cells)
+
+
+def with_scenes_of_a_file(content: Any, folder: str) -> Any:
+    """The content with its list of scenes, where `scenes` names a file that has it. Raises BenchError."""
+    if not isinstance(content, dict) or not isinstance(content.get("scenes"), str):
+        return content
+    path = os.path.join(folder, content["scenes"])
+    if not os.path.isfile(path):
+        raise BenchError(f"scenes: {path}: no such file")
+    return {**content, "scenes": read_yaml(path)}
+
+
+def read_yaml(path: str) -> Any:
+    """What a YAML file says. Raises BenchError."""
+    try:
+        import yaml
+    except ImportError as error:
+        raise BenchError(missing("pyyaml", error)) from error
+    try:
+        with open(path, encoding="utf-8") as file:
+            return yaml.safe_load(file)
+    except yaml.YAMLError as error:
+        raise BenchError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+
+
+def check_schema(content: Any) -> None:
+    """Raises BenchError naming the first field that is wrong, and how."""
+    try:
+        import jsonschema
+    except ImportError as error:
+        raise BenchError(missing("jsonschema", error)) from error
+    errors = sorted(jsonschema.Draft7Validator(SUITE).iter_errors(content),
+                    key=lambda error: list(map(str, error.path)))
+    if errors:
+        error = errors[0]
+        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error.absolute_path)
+        raise BenchError(f"{where.lstrip('.') or 'the suite'}: {error.message}")
+
+
+def missing(package: str, error: ImportError) -> str:
+    """What a user types where a package of the extra is not installed."""
+    return f"{package} is not installed ({error}); pip install 'diff_smoe_rasterization[bench]' brings it"
+
+
+def _scene(scene: Dict[str, Any], index: int, protocol: Dict[str, Any], folder: str) -> Dict[str, Any]:
+    where = f"scenes[{index}]"
+    if ("path" in scene) == ("synthetic" in scene):
+        raise BenchError(f"{where}: give either `path` or `synthetic`")
+    given = dict(scene, path=_path(scene["path"], f"{where}.path", folder)) if "path" in scene else dict(scene)
+    axes = {axis: given.pop(axis) for axis in AXES if axis in given}
+    return {"dataset": None, "images": "images", "resolution": -1, "background": protocol["background"],
+            "init_points": 0, "path": None, **given, "axes": axes}
+
+
+def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder: str) -> Dict[str, Any]:
+    """The method with its defaults, and under `axes` the axes that it has values of its own for."""
+    where, name = f"methods[{index}]", method["name"]
+    given = {key: value for key, value in method.items() if key not in AXES}
+    axes = {axis: method[axis] for axis in AXES if axis in method}
+    if name == NATIVE:
+        wrong = [key for key in ("variant", "path", "base", "python", "pythonpath", "arguments")
+                 if key in given and given[key] != "native"]
+        if wrong:
+            raise BenchError(f"{where}.{wrong[0]}: is for checkouts; the native trainer's recipe stands in "
+                             "protocol.options")
+        return {"label": NATIVE, "variant": "native", **given, "axes": axes}
+    if "path" not in given:
+        raise BenchError(f"{where}.path: is missing; it names the checkout's folder")
+    if (name == "c3dgs") != ("base" in given):
+        raise BenchError(f"{where}.base: c3dgs, and nothing else, needs it: a 3DGS checkout that trains what it "
+                         "compresses")
+    arguments = [str(word) for word in given.get("arguments", [])]
+    _no_protocol_among(arguments, where)
+    variant = given.setdefault("variant", "patched" if CHECKOUTS[name] else "unpatched")
+    if variant == "native" or (variant == "patched" and not CHECKOUTS[name]):
+        raise BenchError(f"{where}.variant: is {variant!r}; {name} can be "
+                         + ("unpatched or patched" if CHECKOUTS[name] else "unpatched only"))
+    if variant == "unpatched":
+        if axes.get("blend_modes", ["alpha"]) != ["alpha"]:
+            raise BenchError(f"{where}.blend_modes: an unpatched checkout has its own blending alone, which is `alpha`")
+        axes["blend_modes"] = ["alpha"]
+    if name in NEEDS and NEEDS[name] not in arguments:
+        raise BenchError(f"{where}.arguments: {name} needs {NEEDS[name]} N in place of a threshold")
+    if name in WITHOUT_SCHEDULE:
+        if "schedules" in axes:
+            raise BenchError(f"{where}.schedules: {name} has none of the schedules; leave them out")
+        axes["schedules"] = [None]
+    if protocol["principal_point"] != "centre":
+        raise BenchError(f"protocol.principal_point: is 'scene', but the loader of {name} ({where}) moves it to the "
+                         "image centre; it must be 'centre', or the figures would not be comparable")
+    if protocol["device"] != "cuda":
+        raise BenchError(f"protocol.device: is {protocol['device']!r}, but {name} ({where}) trains on CUDA alone")
+    if protocol["options"].get("sh_degree_interval", 1000) != 1000 or protocol["scale_recipe"]:
+        raise BenchError(f"protocol: {name} ({where}) raises the SH degree every 1000 steps, whatever the recipe: "
+                         "scale_recipe and options.sh_degree_interval are for the native trainer alone")
+    paths = {key: _path(given[key], f"{where}.{key}", folder) for key in ("path", "base") if key in given}
+    given["pythonpath"] = [_path(item, f"{where}.pythonpath", folder) for item in given.get("pythonpath", [])]
+    python = os.path.expanduser(given["python"]) if "python" in given else None
+    return {"label": name if variant == "patched" else f"{name}-unpatched", **given, **paths, "python": python,
+            "arguments": arguments, "axes": axes}
+
+
+# Flags of the public trainers that the harness sets itself from protocol, scene and axes.
+SET_BY_THE_HARNESS = ("-s", "--source_path", "-m", "--model_path", "-r", "--resolution", "-i", "--images", "--eval",
+                      "-w", "--white_background", "--iterations", "--blend_mode", "--densify_grad_threshold",
+                      "--test_iterations", "--save_iterations", *(f"--{name}" for name in RECIPE))
+
+
+def _no_protocol_among(arguments: Sequence[str], where: str) -> None:
+    own = {"--densification_interval"}  # Taming's published recipe sets it; it is a part of the method there
+    for word in arguments:
+        if word.partition("=")[0] in SET_BY_THE_HARNESS and word not in own:
+            raise BenchError(f"{where}.arguments: {word} is the same for all methods of a suite, which would mix "
+                             "protocols otherwise; it belongs to protocol, scenes or the axes")
+
+
+def _values(axis: str, content: Dict[str, Any], scene: Dict[str, Any], method: Dict[str, Any]) -> List[Any]:
+    """The values of an axis: the method's own, else the scene's, else the suite's."""
+    for source in (method["axes"], scene["axes"], content):
+        if axis in source:
+            return source[axis]
+    return AXES[axis]
+
+
+def _cells(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, Any],
+           method: Dict[str, Any]) -> List[Dict[str, Any]]:
+    """Every combination of the axes; headline cells also with `headline_seeds`."""
+    values = [_values(axis, content, scene, method) for axis in AXIS_OF]
+    made = [_cell(content, protocol, scene, method, dict(zip(AXIS_OF.values(), chosen)))
+            for chosen in itertools.product(*values)]
+    for cell in [cell for cell in made if cell["headline"] and cell["seed"] == values[-1][0]]:
+        chosen = {name: cell[name] for name in AXIS_OF.values()}
+        made += [_cell(content, protocol, scene, method, {**chosen, "seed": seed})
+                 for seed in content.get("headline_seeds", []) if seed not in values[-1]]
+    return made
+
+
+def _cell(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, Any], method: Dict[str, Any],
+          values: Dict[str, Any]) -> Dict[str, Any]:
+    plain_method, plain_scene = ({key: value for key, value in item.items() if key != "axes"}
+                                 for item in (method, scene))
+    cell = {"suite": content["name"], "method": plain_method, "scene": plain_scene, **values, "protocol": protocol,
+            "images": content.get("images", 0), "keep_models": content.get("keep_models", False)}
+    headline = content.get("headline")
+    cell["headline"] = headline is not None and all(
+        values[AXIS_OF[axis]] in (*wanted, None) for axis, wanted in headline.items())
+    return {"id": cell_id(cell), **cell}
+
+
+def cell_id(cell: Dict[str, Any]) -> str:
+    """A readable name, and a checksum of everything that decides the figures: another protocol is another cell."""
+    identity = {key: cell[key] for key in ("blend_mode", "densify_grad_threshold", "schedule", "seed", "protocol")}
+    for key in ("method", "scene"):
+        identity[key] = {name: value for name, value in cell[key].items() if name not in NOT_IN_THE_IDENTITY}
+    checksum = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:6]
+    threshold = re.sub(r"\.?0+$", "", f"{cell['densify_grad_threshold']:.7f}")
+    return "_".join([cell["method"]["label"], cell["scene"]["name"], cell["blend_mode"], cell["schedule"] or "own",
+                     threshold, f"s{cell['seed']}", checksum])
+
+
+def _path(text: str, where: str, folder: str) -> str:
+    """An absolute path with environment variables put in."""
+    path = os.path.expanduser(os.path.expandvars(text))
+    unset = re.search(r"\$\{?(\w+)", path)
+    if unset:
+        raise BenchError(f"{where}: ${unset.group(1)} is not set; it is a part of {text!r}")
+    return os.path.normpath(os.path.join(folder, path))
+
+
+def _names_are_unique(items: List[Dict[str, Any]], field: str, key: str) -> None:
+    names = [item[key] for item in items]
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise BenchError(f"{field}[{index}].{key}: {name!r} is there already")
+
+
+def _one_downscaler(scenes: List[Dict[str, Any]]) -> None:
+    """Supplied reductions (images_4) and reductions by the loader give figures that differ by half a decibel."""
+    supplied: Optional[str] = None
+    resized: Optional[str] = None
+    for scene in scenes:
+        if re.search(r"_\d+$", scene["images"]):
+            supplied = scene["name"]
+        if scene["resolution"] not in (-1, 1):
+            resized = scene["name"]
+    if supplied and resized:
+        raise BenchError(f"scenes: {supplied} takes images as they were reduced by others, {resized} is reduced by the "
+                         "loader: two downscalers in one suite, whose figures do not compare")

@@ -1,0 +1,263 @@
+"""Checkouts of public trainers as methods: small trainers of the same structure, patched, trained and measured.
+
+The small trainers are those of the patches' tests; they make up their scene, which is written here as images too.
+"""
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_dbs
+import torch
+from PIL import Image
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.benchmarks import engine
+from diff_smoe_rasterization.benchmarks.cell import work
+from diff_smoe_rasterization.benchmarks.methods import checkout as shapes
+from diff_smoe_rasterization.benchmarks.suite import expand
+
+pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
+pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
+
+PATCHES = Path(__file__).resolve().parents[1] / "patches"
+ROOT = PATCHES.parents[2]
+ITERATIONS = 7
+
+
+def small_trainers():
+    """The modules of the patches' tests that make checkouts."""
+    sys.path.insert(0, str(PATCHES))
+    try:
+        return importlib.import_module("checkouts")
+    finally:
+        sys.path.remove(str(PATCHES))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Written by a process of its own: the small trainers' modules have everyday names."""
+    folder = tmp_path_factory.mktemp("bench") / "scene"
+    small_trainers().make_scene(folder)
+    program = ("import numpy, sys; from scene.dataset_readers import readMadeUpSceneInfo as read; "
+               "info = read(sys.argv[1], False, True); "
+               "numpy.savez(sys.argv[2], **{v.image_name: v.image for v in info.test_cameras + info.train_cameras})")
+    stored = folder.parent / "views.npz"
+    made = folder.parent / "checkout"
+    small_trainers().make_checkout("3dgs-2023", made)
+    subprocess.run([sys.executable, "-c", program, str(folder), str(stored)], check=True, cwd=str(made),
+                   env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, [made, PATCHES / "packages", ROOT]))})
+    with np.load(stored) as views:
+        write_views(folder, {name: views[name] for name in views.files})
+    return folder
+
+
+def write_views(folder, views):
+    """A COLMAP model whose images are these; the cameras are of no importance where a checkout has its own."""
+    (folder / "images").mkdir()
+    images = []
+    for index, (name, view) in enumerate(sorted(views.items()), start=1):
+        pixels = (np.clip(view, 0, 1) * 255).round().astype(np.uint8).transpose(1, 2, 0)
+        Image.fromarray(pixels).save(folder / "images" / (name + ".png"))
+        images.append(io.ColmapImage(index, name + ".png", 1, np.array([1.0, 0, 0, 0]), np.array([0.0, 0, index])))
+    height, width = pixels.shape[:2]
+    camera = io.ColmapCamera(1, "PINHOLE", width, height, np.array([30.0, 30.0, width / 2, height / 2]))
+    points = io.Points(np.random.RandomState(0).rand(20, 3), np.zeros((20, 3), np.uint8))
+    io.write_colmap(str(folder / "sparse" / "0"), io.ColmapModel({1: camera}, images, points), text=True)
+
+
+class SmallTrainers:
+    """Cells of small trainers, and their rows, each trained once."""
+
+    def __init__(self, scene, folder):
+        self.scene, self.folder = scene, folder
+        self.rows = {}
+
+    def checkout(self, name):
+        path = self.folder / f"checkout-{name}"
+        return str(path if path.is_dir() else small_trainers().make_checkout(name, path))
+
+    def cell(self, name, variant="patched", scene=None, seed=0, blend_mode="smoe", **method):
+        """A suite refuses checkouts on the CPU, as the public ones cannot train there: it is set afterwards."""
+        method = {"name": name, "variant": variant, "pythonpath": [str(small_trainers().PACKAGES)],
+                  "blend_modes": [blend_mode], **method}
+        if "path" not in method:
+            method["path"] = self.checkout(name)
+        if name == "c3dgs":
+            method["base"] = self.checkout("3dgs-2023")
+        content = {"name": "checkouts", "protocol": {"iterations": ITERATIONS, "lpips": []},
+                   "scenes": [{"name": "made-up", "path": str(scene or self.scene)}], "methods": [method],
+                   "seeds": [seed], "densify_grad_thresholds": [0.0001], "images": 1}
+        cell, = expand(content, "").cells
+        cell["protocol"] = {**cell["protocol"], "device": "cpu"}
+        return dict(cell, method=engine.prepared_method(cell["method"], str(self.folder / "results")))
+
+    def run(self, *words, **options):
+        """(row, output folder) of a cell with these arguments of `cell`."""
+        key = json.dumps([words, options], default=str, sort_keys=True)
+        if key not in self.rows:
+            output = self.folder / f"out {len(self.rows)}"
+            self.rows[key] = row_of(self.cell(*words, **options), output), output
+        return self.rows[key]
+
+
+def row_of(cell, output):
+    output.mkdir()
+    work(cell, str(output), 0.0)
+    return json.loads((output / "row.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def small(scene, tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(ROOT))
+        patch.setenv("OMP_NUM_THREADS", "1")
+        patch.delenv("DSMOE_BLEND_MODE", raising=False)
+        patch.setattr(shapes.ThreeDGS, "container", "point_cloud.npz")  # the small trainers write no .ply,
+        patch.setattr(shapes.HAC, "own_bytes", shapes.ThreeDGS.own_bytes)  # and no bitstreams
+        yield SmallTrainers(scene, tmp_path_factory.mktemp("small"))
+
+
+@pytest.mark.parametrize("name", ["3dgs-2023", "c3dgs", "hac"])
+def test_a_patched_checkout_gives_a_row(name, small):
+    row, output = small.run(name)
+    assert row["ok"], row["reason"]
+    assert (row["method"], row["variant"], row["blend_mode"]) == (name, "patched", "smoe")
+    assert row["schedule"] == (None if name == "hac" else "3dgs")
+    for figure in ("psnr", "psnr_float", "ssim", "fps", "num_gaussians"):
+        assert row[figure] > 0, figure
+    if name == "c3dgs":
+        assert row["train_seconds"] is None  # the small one does not say how long compression took
+    else:
+        assert 0 < row["train_seconds"] < row["wall_seconds"]
+    # The ground truth was rounded to 8 bits on its way here: a quarter of a grey level on average.
+    assert 0 < row["protocol"]["ground_truth_difference"] < 0.5 / 255
+    assert row["protocol"]["test_views"] == len(row["per_view"]) == 1
+    assert (output / "images" / "render" / "view0.png").is_file()
+    assert not (output / "renders").exists() and not (output / "run").exists()
+
+
+def test_a_trainer_that_would_choose_on_the_test_views_is_kept_from_it(small, tmp_path):
+    """Of Deformable Beta Splatting's --eval the split alone is taken; the mean of the training views is its model."""
+    with np.load(small.scene.parent / "views.npz") as file:
+        views = {name: file[name] for name in file.files}
+    checkout = small_dbs.write(tmp_path / "dbs", views)
+    row = row_of(small.cell("dbs", variant="unpatched", blend_mode="alpha", path=str(checkout),
+                            arguments=["--cap_max", 12]), tmp_path / "out")
+    assert row["ok"], row["reason"]
+    assert row["num_gaussians"] == 12 and row["train_seconds"] > 0 and row["fps"] > 0 and row["schedule"] is None
+    level = np.mean([views[name].mean() for name in sorted(views)[1:]])
+    truth = np.asarray(Image.open(small.scene / "images" / "view0.png"), np.float64) / 255
+    # float32 sums of some thousand values
+    assert row["psnr_float"] == pytest.approx(-10 * np.log10(((truth - level) ** 2).mean()), abs=1e-4)
+
+
+def test_the_figures_are_those_of_the_pictures(small):
+    row, output = small.run("3dgs-2023")
+    gt, render = (np.asarray(Image.open(output / "images" / kind / "view0.png"), np.float64) / 255
+                  for kind in ("gt", "render"))
+    # The definition, in float64; images are float32 in the program.
+    assert row["psnr"] == pytest.approx(-10 * np.log10(((gt - render) ** 2).mean()), abs=1e-3)
+
+
+@pytest.mark.parametrize("other", [{"seed": 1}, {"blend_mode": "alpha"}])
+def test_mode_and_seed_reach_the_trainer(other, small):
+    (one, _), (changed, _) = small.run("3dgs-2023"), small.run("3dgs-2023", **other)
+    assert one["ok"] and changed["ok"] and one["psnr"] != changed["psnr"]
+
+
+def test_steady_means_neither_reset_nor_size_prune(small):
+    cell = small.cell("3dgs-2023", schedules=["steady"])
+    words = shapes.ThreeDGS(cell, shapes.config_of(cell), "out").train_arguments()
+    assert words[words.index("--opacity_reset_interval") + 1] == str(ITERATIONS + 1)
+    cell = small.cell("3dgs-2023")
+    assert "--opacity_reset_interval" not in shapes.ThreeDGS(cell, shapes.config_of(cell), "out").train_arguments()
+
+
+def test_a_checkout_that_was_trained_on_other_images_is_refused(small, scene, tmp_path):
+    other = tmp_path / "other scene"
+    shutil.copytree(scene, other)
+    path = other / "images" / "view0.png"
+    Image.fromarray(255 - np.asarray(Image.open(path))).save(path)
+    row = row_of(small.cell("3dgs-2023", scene=other), tmp_path / "out")
+    assert not row["ok"] and "ground truth differs" in row["reason"]
+
+
+def test_a_checkout_with_another_split_is_refused(small, scene, tmp_path):
+    other = tmp_path / "other scene"
+    shutil.copytree(scene, other)
+    shutil.rmtree(other / "sparse")
+    shutil.rmtree(other / "images")
+    write_views(other, {f"a_view{index}": np.zeros((3, 24, 32)) for index in range(4)})
+    row = row_of(small.cell("3dgs-2023", scene=other), tmp_path / "out")
+    assert not row["ok"] and "split" in row["reason"] and "view0" in row["reason"]
+
+
+def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
+    row = row_of(small.cell("3dgs-2023", arguments=["--no_such_flag"]), tmp_path / "out")
+    assert not row["ok"] and "train.py of 3dgs-2023 ended with status 2" in row["reason"]
+    assert "--no_such_flag" in row["reason"]
+
+
+def test_a_patched_checkout_is_a_copy(small, tmp_path):
+    cell = small.cell("3dgs-2023")
+    original = small.folder / "checkout-3dgs-2023"
+    assert cell["method"]["path"] == str(small.folder / "results" / "checkouts" / "3dgs-2023-path")
+    assert engine.patches.check(original) == "patchable"
+    assert engine.patches.check(cell["method"]["path"]) == "patched"
+
+
+def test_an_unpatched_checkout_must_be_one(small, tmp_path):
+    cell = small.cell("3dgs-2023", variant="unpatched", blend_mode="alpha")
+    assert "refused" not in cell["method"]
+    patched = small.cell("3dgs-2023")["method"]["path"]
+    method = engine.prepared_method(dict(cell["method"], path=patched), str(tmp_path / "results"))
+    assert "is patched" in method["refused"]
+    row = row_of(dict(cell, method=method), tmp_path / "out")
+    assert not row["ok"] and row["reason"] == method["refused"]
+
+
+def test_a_checkout_that_is_not_there_is_a_row(small, tmp_path):
+    cell = small.cell("3dgs-2023")
+    method = engine.prepared_method(dict(cell["method"], path=str(tmp_path / "nowhere")), str(tmp_path))
+    row = row_of(dict(cell, method=method), tmp_path / "out")
+    assert not row["ok"] and "nowhere: no such folder" in row["reason"]
+
+
+def test_modules_that_are_imported_and_not_used_may_be_absent():
+    """2DGS imports what extracts meshes."""
+    from diff_smoe_rasterization.benchmarks.methods import observer
+
+    observer.stub("a_module_that_nobody_has")
+    try:
+        from a_module_that_nobody_has import part
+
+        import a_module_that_nobody_has.other as other
+        with pytest.raises(TypeError):
+            part()
+        assert other is not None
+    finally:
+        for name in [name for name in sys.modules if name.startswith("a_module_that_nobody_has")]:
+            del sys.modules[name]
+    observer.stub("json")
+    assert sys.modules["json"] is json
+
+
+def test_seeds_are_shifted_by_the_cells():
+    """In a process of its own: the functions stay replaced."""
+    program = ("import sys; sys.path.insert(0, sys.argv[1]); import observer, random, numpy, torch; "
+               "observer.shift_seeds(5); random.seed(0); numpy.random.seed(0); torch.manual_seed(0); "
+               "print(random.random(), numpy.random.rand(), torch.rand(1).item())")
+    folder = os.path.dirname(shapes.OBSERVER)
+    printed = subprocess.run([sys.executable, "-c", program, folder], stdout=subprocess.PIPE, check=True).stdout
+    expected = (random.Random(5).random(), np.random.RandomState(5).rand(),
+                torch.rand(1, generator=torch.Generator().manual_seed(5)).item())
+    assert [float(word) for word in printed.split()] == list(expected)

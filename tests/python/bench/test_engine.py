@@ -1,0 +1,244 @@
+"""From a suite to rows: what is done is not done again, what fails is a row, what is killed continues."""
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from diff_smoe_rasterization.benchmarks import cell as cells
+from diff_smoe_rasterization.benchmarks import engine
+from diff_smoe_rasterization.benchmarks.errors import BenchError
+from diff_smoe_rasterization.benchmarks.suite import expand
+from diff_smoe_rasterization.cli import main
+
+yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
+pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
+snakemake = pytest.importorskip("snakemake", reason="the engine is Snakemake: pip install snakemake")
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def write_suite(content, folder):
+    path = Path(folder) / "suite.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+def rows_of(results):
+    lines = (Path(results) / "rows.jsonl").read_text().splitlines()
+    return {row["cell"]: row for row in map(json.loads, lines)}
+
+
+def command(*words):
+    return [sys.executable, "-m", "diff_smoe_rasterization", *words]
+
+
+def environment(**more):
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")])),
+            "OMP_NUM_THREADS": "1", **more}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, tiny_scene):
+    """A suite of one cell that works and one that cannot."""
+    folder = tmp_path_factory.mktemp("bench")
+    content = {"name": "two", "protocol": {"iterations": 12, "device": "cpu", "principal_point": "scene", "lpips": [],
+                                           "evaluate_every": 6},
+               "scenes": [{"name": "tiny", "path": tiny_scene}, {"name": "absent", "path": "nowhere"}],
+               "methods": [{"name": "native"}], "blend_modes": ["smoe"], "densify_grad_thresholds": [0.005],
+               "images": 1}
+    suite = write_suite(content, folder)
+    assert main(["bench", "run", suite, "-o", str(folder / "results")]) == 0
+    return content, suite, folder / "results"
+
+
+def test_a_row_says_what_was_measured_and_how(finished):
+    row, = [row for row in rows_of(finished[2]).values() if row["ok"]]
+    for name in ("psnr", "psnr_float", "ssim", "psnr_edge", "train_seconds", "wall_seconds", "fps"):
+        assert row[name] > 0, name
+    assert (row["method"], row["variant"], row["blend_mode"], row["schedule"]) == ("native", "native", "smoe", "3dgs")
+    assert row["size_bytes"]["common"] == row["num_gaussians"] * 236  # 59 numbers of 4 bytes
+    assert row["size_bytes"]["own"] > row["size_bytes"]["common"]  # the file has normals and a header beside them
+    protocol = row["protocol"]
+    assert protocol["image_size"] == [32, 24] and protocol["test_views"] == len(row["per_view"]) == 2
+    assert protocol["downscaler"] == "none: files of images as supplied"
+    for name in ("split", "background", "principal_point", "psnr", "ssim", "fps", "size", "psnr_edge", "seed"):
+        assert protocol[name] is not None, name
+    assert [point["iteration"] for point in row["history"]] == [6]
+    assert row["lpips"]["value"] is None and row["lpips"]["reason"]
+    assert row["train_seconds"] < row["wall_seconds"]
+
+
+def test_a_failed_cell_is_a_row_with_its_reason(finished):
+    row, = [row for row in rows_of(finished[2]).values() if not row["ok"]]
+    assert row["scene"] == "absent" and "nowhere: no such folder" in row["reason"]
+    assert row["psnr"] is None and row["num_gaussians"] is None and row["lpips"]["value"] is None
+
+
+def test_both_kinds_of_rows_have_the_same_fields(finished):
+    one, other = rows_of(finished[2]).values()
+    assert set(one) == set(other)
+
+
+def test_images_that_were_asked_for_are_there_and_the_model_is_not(finished):
+    row, = [row for row in rows_of(finished[2]).values() if row["ok"]]
+    folder = finished[2] / "cells" / row["cell"]
+    gt, render = (sorted(path.name for path in (folder / "images" / kind).iterdir()) for kind in ("gt", "render"))
+    assert gt == render == ["view_000.png"]
+    assert not (folder / "run").exists()
+
+
+def test_what_is_done_is_not_done_again(finished, capsys):
+    _, suite, results = finished
+    before = {path: path.read_text() for path in results.glob("cells/*/log.txt")}
+    assert len(before) == 2
+    assert main(["bench", "run", suite, "-o", str(results)]) == 0
+    assert {path: path.read_text() for path in before} == before
+    assert main(["bench", "run", suite, "-o", str(results), "--dry-run", "--retry-failed"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(("done ", "to do "))]
+    assert [line.split()[0] for line in lines] == ["done", "to"]
+
+
+def test_a_failed_cell_can_be_tried_again(finished, tmp_path):
+    """The reason is gone, and only the cell that failed is run."""
+    content, _, results = finished
+    there, absent = content["scenes"]
+    moved = {**content, "scenes": [there, {**absent, "path": there["path"]}]}
+    suite = write_suite(moved, tmp_path)
+    copied = tmp_path / "results"
+    subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
+    logs = {path.parent.name: path.read_text() for path in copied.glob("cells/*/log.txt")}
+    assert main(["bench", "run", suite, "-o", str(copied), "--retry-failed"]) == 0
+    rows = rows_of(copied)
+    assert set(rows) == set(logs) and all(row["ok"] for row in rows.values())
+    changed = {name for name in logs if (copied / "cells" / name / "log.txt").read_text() != logs[name]}
+    assert changed == {name for name, row in rows.items() if row["scene"] == "absent"}
+
+
+def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, capsys):
+    content, _, results = finished
+    longer = {**content, "protocol": {**content["protocol"], "iterations": 13}}
+    assert main(["bench", "run", write_suite(longer, tmp_path), "-o", str(results)]) == 1
+    assert "another protocol" in capsys.readouterr().err
+
+
+def test_a_killed_run_continues_where_it_was(content, tmp_path):
+    """Killed without warning in the middle of a cell: its process ends too; it goes on from its checkpoint."""
+    content["protocol"].update(iterations=1000, checkpoint_every=50, evaluate_every=0)
+    content["protocol"]["options"] = {"densify_until_iter": 0}
+    content["blend_modes"] = ["alpha"]
+    suite, results = write_suite(content, tmp_path), tmp_path / "results"
+    run = subprocess.Popen(command("bench", "run", suite, "-o", str(results)), env=environment(), cwd=str(tmp_path),
+                           start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_for(lambda: list(results.glob("cells/*/run/checkpoint.pt")), 120)
+    os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    folder, = results.glob("cells/*")
+    assert not (folder / "row.json").exists()
+    wait_for(lambda: stands_still(folder / "run" / "checkpoint.pt"), 60)
+
+    assert main(["bench", "run", suite, "-o", str(results)]) == 0
+    row, = rows_of(results).values()
+    assert row["ok"] and row["protocol"]["continued"]
+    assert "resumed at iteration" in (folder / "log.txt").read_text()
+
+
+def wait_for(condition, seconds):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "waited too long"
+        time.sleep(0.05)
+
+
+def stands_still(path):
+    """Whether a file that is written some times a second is written no more."""
+    before = path.stat().st_mtime_ns
+    time.sleep(2)
+    return path.stat().st_mtime_ns == before
+
+
+@pytest.fixture
+def cell_file(content, tmp_path):
+    cell = expand(content, "").cells[0]
+    path = tmp_path / "cell.json"
+    path.write_text(json.dumps(cell))
+    return cell, path
+
+
+def test_one_cell_is_one_command(cell_file, tmp_path):
+    cell, path = cell_file
+    done = subprocess.run([sys.executable, "-m", "diff_smoe_rasterization.benchmarks.cell", str(path),
+                           str(tmp_path / "out")], env=environment(), cwd=str(tmp_path), stdout=subprocess.PIPE)
+    assert done.returncode == 0 and cell["id"].encode() in done.stdout
+    assert json.loads((tmp_path / "out" / "row.json").read_text())["ok"]
+
+
+def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatch):
+    """As the system does where memory is short."""
+    cell, path = cell_file
+    killer = tmp_path / "python"
+    killer.write_text("#!/bin/sh\necho the last words\nkill -9 $$\n")
+    killer.chmod(0o755)
+    monkeypatch.setattr(cells.sys, "executable", str(killer))
+    row = cells.supervise(str(path), str(tmp_path / "out"))
+    assert not row["ok"] and row["cell"] == cell["id"]
+    assert "signal 9" in row["reason"] and "memory" in row["reason"] and "the last words" in row["reason"]
+
+
+def test_two_cells_never_have_one_gpu(tmp_path):
+    one, first = cells.claim_gpu(["3", "5"], str(tmp_path))
+    other, second = cells.claim_gpu(["3", "5"], str(tmp_path))
+    assert (one, other) == ("3", "5")
+    first.close()
+    again, third = cells.claim_gpu(["3", "5"], str(tmp_path))
+    assert again == "3"
+    second.close(), third.close()
+
+
+def test_a_second_run_on_the_same_results_is_refused(tmp_path):
+    with engine.only_one(str(tmp_path)):
+        with pytest.raises(BenchError, match="another run"):
+            with engine.only_one(str(tmp_path)):
+                pass
+
+
+def test_cells_are_chosen_by_their_fields(content):
+    suite = expand({**content, "seeds": [0, 1], "headline": {"seeds": [1]}}, "")
+    found = engine.chosen(suite.cells, ["blend_mode=smoe", "seed=0", "seed=1", "densify_grad_threshold=5e-3"])
+    assert [(cell["blend_mode"], cell["seed"]) for cell in found] == [("smoe", 0), ("smoe", 1)]
+    assert len(engine.chosen(suite.cells, ["headline=true"])) == 2
+    for wrong in ("blend_mode", "mode=alpha", "blend_mode=smoe_std"):
+        with pytest.raises(BenchError, match="--only " + wrong):
+            engine.chosen(suite.cells, [wrong])
+
+
+def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
+    content["protocol"].update(device="cuda", principal_point="centre")
+    suite = expand({**content, "headline": {"blend_modes": ["smoe"]}}, "")
+    with monkeypatch.context() as patch:
+        patch.setattr(engine, "visible_gpus", lambda: ["0", "2", "3"])
+        words = engine.command(suite, suite.cells, "out", None, None)
+        assert words[words.index("--cores") + 1] == "3" and "gpu=3" in words and "gpus=0,2,3" in words
+        assert words[words.index("--prioritize") + 1:] == [f"cells/{suite.cells[1]['id']}/row.json"]
+        assert "--executor" not in words
+        patch.setattr(engine, "visible_gpus", list)
+        with pytest.raises(BenchError, match="no CUDA device"):
+            engine.command(suite, suite.cells, "out", None, None)
+        patch.setattr(engine.importlib.util, "find_spec", lambda name: object())
+        words = engine.command(suite, suite.cells, "out", None, ["slurm_partition=gpu", "runtime=60"])
+        assert words[words.index("--executor") + 1] == "slurm" and "gpus=" in words
+        assert words[words.index("--default-resources") + 1:][:2] == ["slurm_partition=gpu", "runtime=60"]
+        patch.setattr(engine.importlib.util, "find_spec", lambda name: None)
+        with pytest.raises(BenchError, match="snakemake-executor-plugin-slurm"):
+            engine.command(suite, suite.cells, "out", None, [])
+
+
+def test_without_snakemake_the_message_says_what_to_install(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
+    assert main(["bench", "run", finished[1], "-o", str(tmp_path / "results")]) == 1
+    assert "diff_smoe_rasterization[bench]" in capsys.readouterr().err

@@ -1,0 +1,262 @@
+"""The benchmark's report: averages, tables beside the paper's, deltas, failures, survey rows, refusals."""
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+from report_rows import PROTOCOL, failed, row, write_rows
+
+from diff_smoe_rasterization.benchmarks.report import ReportError, layouts, rows, survey, tables
+
+
+def table_of(entries, name, suite="table1"):
+    """The table NAME of rows; None where the suite has none."""
+    made = layouts.tables_of(suite, entries, layouts.read_paper())
+    return next((table for table in made if table.name == f"{suite}_{name}"), None)
+
+
+def shown(table, **labels):
+    """{column: text} of the only row of ours with these labels."""
+    wanted = {table.labels.index(name): value for name, value in labels.items()}
+    found = [line for line in table.rows if line.source == tables.OURS
+             and all(line.labels[index] == value for index, value in wanted.items())]
+    assert len(found) == 1, [line.labels for line in table.rows]
+    return {column.full_name: cell.shown(column) for column, cell in zip(table.columns, found[0].cells)}
+
+
+def test_a_cell_is_the_mean_over_seeds_with_its_spread():
+    entries = [row(seed=seed, psnr=psnr) for seed, psnr in enumerate((23.0, 24.0, 25.0))]
+    line = shown(table_of(entries, "cells"), scene="bonsai")
+    assert line["PSNR [dB]"] == "24.00 ± 1.00"
+    assert line["PSNR at edges [dB]"] == "22.00 ± 1.00"
+    assert line["own size [MB]"] == "2.0 ± 0.0"
+    assert line["LPIPS Alex"] == "0.250 ± 0.000"
+    assert "GPU peak [MiB]" not in line  # no row has it
+    assert shown(table_of(entries[:1], "cells"), scene="bonsai")["PSNR [dB]"] == "23.00"  # one seed has no spread
+
+
+def test_a_scene_counts_once_however_many_seeds_it_has():
+    entries = [row("truck", seed=0, psnr=20.0), row("truck", seed=1, psnr=22.0), row("train", seed=0, psnr=31.0)]
+    line = shown(table_of(entries, "table1"), end="sparse")
+    assert line["Tanks and Temples PSNR [dB]"] == "26.00"  # ((20 + 22) / 2 + 31) / 2; only seed 0 is common: no spread
+    entries.append(row("train", seed=1, psnr=33.0))
+    line = shown(table_of(entries, "table1"), end="sparse")
+    assert line["Tanks and Temples PSNR [dB]"] == "26.50 ± 1.41"  # 25.5 and 27.5
+
+
+def test_an_average_leaves_no_scene_out():
+    entries = [row("truck"), row("train"), row("truck", "smoe"), row("truck", method="3dgs-2023"),
+               failed(scene="train", method="3dgs-2023")]
+    table = table_of(entries, "table1")
+    name = "Tanks and Temples PSNR [dB]"
+    assert shown(table, method="native, alpha")[name] == "20.00"
+    assert shown(table, method="native, smoe")[name] == "not run: train"
+    assert shown(table, method="3dgs-2023, alpha")[name] == "failed: train"
+
+
+def test_the_papers_figures_stand_beside_ours_and_are_marked():
+    table = table_of([row(), row(threshold=0.0002, psnr=30.0), row("fox")], "table1")
+    heading = "Mip-NeRF 360 (ours: bonsai)"
+    printed = {line.labels: line for line in table.rows if line.source == tables.PAPER}
+    columns = [column.full_name for column in table.columns]
+    gated = printed["sparse", "3DSMoES"].cells
+    figures = [gated[columns.index(f"{heading} {name}")].shown(None)
+               for name in ("PSNR [dB]", "SSIM", "LPIPS, paper's", "#G [M]", "own size [MB]")]
+    assert figures == ["24.43", "0.69", "0.39", "0.064", "15.4"]
+    assert printed["dense", "2DGS"].cells[0].shown(None) == "26.88"
+    assert gated[columns.index("fox PSNR [dB]")].value is None
+    assert any("bonsai alone; the paper averages 9 scenes" in note for note in table.notes)
+    assert any("Deep Blending and Tanks and Temples are left out" in note for note in table.notes)
+
+
+def test_a_scene_is_of_the_data_set_that_its_row_names(tmp_path):
+    """A made-up scene may have the name of one of the paper's."""
+    assert table_of([row("room", dataset=None)], "table1") is None
+    line = shown(table_of([row("my_truck", dataset="Tanks and Temples")], "table1"), end="sparse")
+    assert line["Tanks and Temples (ours: my_truck) PSNR [dB]"] == "20.00"
+    entries = [row("room", dataset=None), row("my_truck", dataset="Tanks and Temples")]
+    survey.write_survey(entries, layouts.read_paper()["datasets"], str(tmp_path))
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.csv")} == {
+        "other/room.csv", "TanksAndTemples/my_truck.csv"}
+
+
+def test_the_papers_sizes_fit_its_numbers_of_gaussians():
+    """59 floats a Gaussian (58 in 2DGS, 30 in DBS); 4 %: both figures are printed rounded."""
+    paper = layouts.read_paper()["table1"]
+    names = paper["columns"]
+    for end in ("sparse", "dense"):
+        for method, floats in (("3DGS", 59), ("3DSMoES", 59), ("2DGS", 58), ("DBS", 30)):
+            for figures in paper[end][method].values():
+                count, size = (float(figures[names.index(name)]) for name in ("num_gaussians_m", "size_own_mb"))
+                assert size == pytest.approx(count * floats * 4, rel=0.04)
+
+
+def test_every_printed_row_is_complete():
+    paper = layouts.read_paper()
+    for end in paper["ends"]:
+        for averages in paper["table1"][end].values():
+            assert {len(figures) for figures in averages.values()} == {len(paper["table1"]["columns"])}
+            assert list(averages) == list(paper["datasets"])
+        assert {len(figures) for figures in paper["table2"][end].values()} == {len(paper["table2"]["columns"])}
+    for names in paper["names"].values():
+        assert all(name in {**paper["table1"]["sparse"], **paper["table2"]["sparse"]} for name in names.values())
+
+
+def test_other_trainers_stand_in_table_2():
+    entries = [row("truck", method="taming", variant="patched", fps=100.0),
+               row("truck", "smoe", method="taming", variant="patched", psnr=21.0)]
+    table = table_of(entries, "table2")
+    assert shown(table, method="taming, smoe")["PSNR [dB]"] == "21.00"
+    assert shown(table, method="taming, alpha")["FPS"] == "100"
+    printed = next(line for line in table.rows if line.labels == ("sparse", "3DSMoES-Taming"))
+    assert printed.source == tables.PAPER and [cell.printed for cell in printed.cells][-2:] == ["280", "194"]
+    assert table_of([row()], "table2") is None
+
+
+def test_the_ablation_stands_in_table_3():
+    entries = [row(blend_mode=mode, psnr=psnr)
+               for mode, psnr in (("alpha", 20.0), ("smoe", 23.0), ("smoe_tn", 22.0), ("smoe_std", 21.0))]
+    table = table_of(entries, "table3")
+    assert [(line.labels[2], line.cells[0].value) for line in table.rows if line.source == tables.OURS] == [
+        ("smoe: full", 23.0), ("smoe_tn: without T_d", 22.0), ("smoe_std: without T_n,d", 21.0)]
+    assert [line.cells[0].printed for line in table.rows if line.source == tables.PAPER] == ["23.81", "22.71", "22.33"]
+    assert table_of(entries[:2], "table3") is None
+
+
+def test_deltas_are_of_the_seeds_that_both_modes_have():
+    entries = [row(seed=0, psnr=20.0), row(seed=1, psnr=22.0), row(seed=2, psnr=50.0),
+               row(blend_mode="smoe", seed=0, psnr=23.0, num_gaussians=20000),
+               row(blend_mode="smoe", seed=1, psnr=24.0, num_gaussians=30000)]
+    line = shown(table_of(entries, "deltas"), seeds="2")
+    assert line["Δ PSNR [dB]"] == "+2.50 ± 0.71"  # 3 and 2
+    assert line["#Gaussians ratio"] == "0.62 ± 0.18"  # 0.5 and 0.75: 0.625, to even
+    worse = [row(psnr=20.0), row(blend_mode="smoe", psnr=19.0)]
+    assert shown(table_of(worse, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "-1.00"
+    same = [row(psnr=20.001), row(blend_mode="smoe", psnr=20.0)]
+    assert shown(table_of(same, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "0.00"
+
+
+def test_deltas_hold_all_else_equal():
+    entries = [row(), row(blend_mode="smoe", threshold=0.001), row(blend_mode="smoe", schedule="steady"),
+               row("fox", blend_mode="smoe"), row(blend_mode="smoe", label="native, capped")]
+    assert table_of(entries, "deltas") is None
+
+
+def test_deltas_beside_what_the_paper_prints():
+    table = table_of([row(), row(blend_mode="smoe")], "deltas")
+    printed = {line.labels: line.cells for line in table.rows if line.source == tables.PAPER}
+    cells = printed["Mip-NeRF 360", "3DGS", "0.005 (sparse)", ""]
+    names = [column.name for column in table.columns]
+    assert cells[names.index("Δ PSNR [dB]")].value == pytest.approx(24.43 - 23.32)
+    assert cells[names.index("#Gaussians ratio")].value == pytest.approx(0.064 / 0.088)
+
+
+def test_a_failed_cell_is_a_row_with_its_reason():
+    entries = [row(), failed("out of memory | 12 GiB", blend_mode="smoe"), row("fox", seed=0),
+               failed("killed", scene="fox", seed=1)]
+    table = table_of(entries, "failures")
+    assert {line.labels[1] for line in table.rows} == {"out of memory | 12 GiB", "killed"}
+    assert "out of memory \\| 12 GiB" in tables.to_markdown(table)
+    assert shown(table_of(entries, "cells"), method="native, smoe")["PSNR [dB]"] == "failed"
+    assert shown(table_of(entries, "cells"), scene="fox", seeds="1 of 2")["PSNR [dB]"] == "20.00"
+    assert shown(table_of(entries, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "smoe failed"
+
+
+def test_lpips_of_different_kinds_have_columns_of_their_own():
+    kinds = [{"value": 0.3, "kind": "lpips_alex", "reason": None},
+             {"value": 0.4, "kind": "lpips_vgg_inria", "reason": None},
+             {"value": None, "kind": "lpips_vgg_std", "reason": "no weights at hand"}]
+    table = table_of([row(lpips=kinds[0], lpips_all=kinds)], "cells")
+    line = shown(table, scene="bonsai")
+    assert (line["LPIPS Alex"], line["LPIPS VGG as 3DGS"]) == ("0.300", "0.400")
+    assert "LPIPS VGG" not in line
+    assert any("lpips_vgg_std: no weights at hand" in note for note in table.notes)
+
+
+def test_short_runs_and_unpatched_checkouts_say_so():
+    entries = [row(iterations=7000), row(method="3dgs-2023", variant="unpatched"),
+               row("fox", method="3dgs-2023", label="3dgs-2023-unpatched", variant="unpatched")]
+    table = table_of(entries, "cells")
+    assert {line.labels[1] for line in table.rows} == {"native, alpha, 7,000 iterations",
+                                                       "3dgs-2023-unpatched, alpha"}
+
+
+def test_csv_is_unrounded_and_complete():
+    psnr = 24.123456789
+    table = table_of([row(psnr=psnr), row(seed=1, psnr=psnr), row("fox, the \"red\" one")], "cells")
+    lines = list(csv.DictReader(io.StringIO(tables.to_csv(table))))
+    assert len(lines) == 2 and {line["source"] for line in lines} == {"ours"}
+    bonsai = next(line for line in lines if line["scene"] == "bonsai")
+    assert float(bonsai["PSNR [dB]"]) == psnr and float(bonsai["PSNR [dB] sd"]) == 0
+    fox = next(line for line in lines if line["scene"] == "fox, the \"red\" one")
+    assert fox["PSNR [dB] sd"] == ""
+
+
+@pytest.mark.parametrize("name", ["table1", "table3", "deltas", "cells", "failures"])
+def test_every_line_of_latex_and_markdown_has_all_columns(name):
+    entries = [row(blend_mode=mode, seed=seed) for mode in ("alpha", "smoe", "smoe_tn") for seed in (0, 1)]
+    entries.append(failed("50 % of a_b & c\\d #1", scene="fox"))
+    table = table_of(entries, name)
+    width = 1 + len(table.labels) + len(table.columns)
+    body = [line for line in tables.to_latex(table).split("\n") if line.endswith(r"\\") and "multicolumn" not in line]
+    assert len(body) == len(table.rows) + 1
+    assert {line.replace(r"\&", "").count("&") for line in body} == {width - 1}
+    if name == "failures":
+        assert r"50 \% of a\_b \& c\textbackslash{}d \#1" in body[-1]
+    lines = [line for line in tables.to_markdown(table).split("\n") if line.startswith("|")]
+    assert {line.count("|") for line in lines} == {width + 1} and len(lines) == len(table.rows) + 2
+
+
+def test_survey_rows(tmp_path):
+    inria = {"value": 0.2, "kind": "lpips_vgg_inria", "reason": None}
+    entries = [row(psnr=31.25, lpips=inria), row(seed=1, psnr=31.75, lpips=inria, num_gaussians=40001),
+               row(blend_mode="smoe", schedule="steady", threshold=0.0002), row("lego"), row("my room"),
+               failed(scene="truck")]
+    survey.write_survey(entries, layouts.read_paper()["datasets"], str(tmp_path))
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.csv")) == [
+        "MipNeRF360/bonsai.csv", "SyntheticNeRF/lego.csv", "other/my_room.csv"]
+    lines = (tmp_path / "MipNeRF360" / "bonsai.csv").read_text(encoding="utf-8").split("\n")
+    assert lines == ["Submethod,PSNR,SSIM,LPIPS,Size [Bytes],#Gaussians",
+                     "-native-alpha-t0.005,31.5,0.75,0.2,2000000,40000",  # 40000.5, to even
+                     "-native-smoe-steady-t0.0002,20.0,0.75,,2000000,40000", ""]  # Alex's LPIPS may not stand there
+
+
+def test_a_cells_own_row_wins_over_the_list(tmp_path):
+    entry = row(psnr=20.0)
+    results = write_rows(tmp_path, [row(psnr=10.0), {**entry, "psnr": 15.0}, row("fox")])
+    assert [found["psnr"] for found in rows.read_rows(results)] == [15.0, 20.0]  # the last line of a cell
+    folder = tmp_path / "cells" / entry["cell"]
+    folder.mkdir(parents=True)
+    (folder / "row.json").write_text(json.dumps(entry), encoding="utf-8")
+    assert [found["psnr"] for found in rows.read_rows(results)] == [20.0, 20.0]
+    assert len(rows.read_rows(str(tmp_path / "rows.jsonl"))) == 2
+
+
+@pytest.mark.parametrize("name, value", [("background", "white"), ("image_size", [96, 64]), ("split", "none"),
+                                         ("downscaler", "box"), ("psnr", "floats")])
+def test_mixed_protocols_are_refused(tmp_path, name, value):
+    other = row(blend_mode="smoe", protocol={**PROTOCOL, name: value})
+    with pytest.raises(ReportError, match=name) as caught:
+        rows.read_rows(write_rows(tmp_path, [row(), other]))
+    assert other["cell"] in str(caught.value) and row()["cell"] in str(caught.value)
+
+
+def test_scenes_and_suites_may_differ_in_protocol(tmp_path):
+    white = {**PROTOCOL, "background": "white"}
+    entries = [row(), row("lego", protocol=white), row(suite="smoke", protocol=white), failed(seed=1, protocol={})]
+    assert len(rows.read_rows(write_rows(tmp_path, entries))) == 4
+
+
+@pytest.mark.parametrize("text, reason", [("{", "line 1: not valid json"), ("[]", "line 1: expected one object"),
+                                          ('{"cell": "a"}', "lacks suite, ok, method"), ("", "no rows")])
+def test_damaged_results_are_refused(tmp_path, text, reason):
+    (tmp_path / "rows.jsonl").write_text(text, encoding="utf-8")
+    with pytest.raises(ReportError, match=reason):
+        rows.read_rows(str(tmp_path))
+
+
+def test_one_setting_twice_is_refused():
+    with pytest.raises(ReportError, match="same setting, scene and seed 0"):
+        table_of([row(), {**row(), "cell": "again"}], "cells")

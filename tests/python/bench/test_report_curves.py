@@ -1,0 +1,71 @@
+"""The report's figures show the means and spreads of the rows."""
+from __future__ import annotations
+
+import pytest
+from report_rows import failed, row
+
+pytest.importorskip("matplotlib", reason="figures need matplotlib")
+from diff_smoe_rasterization.benchmarks.report import curves, layouts, rows  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def closed_figures():
+    yield
+    curves.plt.close("all")
+
+
+def groups_of(entries):
+    return rows.grouped(entries, layouts.end_of)
+
+
+def test_a_curve_goes_through_the_means_from_few_gaussians_to_many():
+    entries = [row(threshold=0.0002, psnr=30.0, num_gaussians=900),
+               row(threshold=0.005, psnr=20.0, num_gaussians=100), row(seed=1, psnr=22.0, num_gaussians=300),
+               row(blend_mode="smoe", psnr=25.0, num_gaussians=50)]
+    axes = curves.rate_distortion(groups_of(entries)).axes
+    # Rows: PSNR, SSIM, LPIPS; columns: number, own size, common size.
+    assert [axis.get_ylabel() for axis in axes[::3]] == ["PSNR [dB]", "SSIM", "LPIPS Alex (lower is better)"]
+    assert [axis.get_xlabel() for axis in axes[-3:]] == ["#Gaussians", "own size [MB]", "common size [MB]"]
+    alpha, smoe = (container.lines[0].get_xydata().tolist() for container in axes[0].containers)
+    assert alpha == [[200, 21], [900, 30]] and smoe == [[50, 25]]
+    whisker = axes[0].containers[0].lines[2][0].get_segments()[0]
+    assert whisker[1, 1] - whisker[0, 1] == pytest.approx(2 * 2 ** 0.5)  # seeds 20 and 22: sd is the root of 2
+
+
+def test_bars_are_the_means():
+    entries = [row(train_seconds=100.0), row(seed=1, train_seconds=140.0), row(blend_mode="smoe", train_seconds=90.0),
+               row(threshold=0.0002, fps=50.0), failed(blend_mode="smoe", threshold=0.0002)]
+    train, fps = curves.bars([group for group in groups_of(entries) if group.rows]).axes
+    assert [bar.get_height() for bar in train.patches] == [120, 90, 100]
+    assert [bar.get_height() for bar in fps.patches] == [200, 200, 50]
+    assert [label.get_text() for label in fps.get_xticklabels()] == ["0.005", "0.0002"]
+    colors = [bar.get_facecolor() for bar in train.patches]
+    assert colors[0] == colors[2] != colors[1]
+
+
+@pytest.mark.parametrize("draw", [curves.rate_distortion, curves.bars])
+@pytest.mark.parametrize("methods", [1, 4])
+def test_the_legend_lies_inside_and_above_the_panels(draw, methods):
+    entries = [row(blend_mode=mode, label=f"{'a long name of method ' * 2}{method}", schedule="steady",
+                   threshold=threshold)
+               for mode in ("alpha", "smoe") for method in range(methods) for threshold in (0.005, 0.0002)]
+    drawn = draw(groups_of(entries))
+    drawn.canvas.draw()
+    box = drawn.legends[0].get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= drawn.bbox.x1 and box.y1 <= drawn.bbox.y1
+    assert box.y0 >= max(axis.get_window_extent().y1 for axis in drawn.axes)
+
+
+def test_blend_modes_differ_by_more_than_colour():
+    entries = [row(blend_mode=mode) for mode in curves.MARKS]
+    styles = curves._styles(groups_of(entries))
+    for part in range(3):
+        assert len({marks[part] for _, marks in styles.values()}) == 4
+    assert len({color for color, _ in styles.values()}) == 4
+
+
+def test_what_was_not_measured_is_not_drawn(tmp_path):
+    nothing = row(psnr=None, ssim=None, lpips=None, train_seconds=None, fps=None)
+    assert curves.rate_distortion(groups_of([nothing])) is None
+    assert curves.bars(groups_of([nothing])) is None
+    assert curves.draw_all("table1", groups_of([nothing, failed(scene="fox")]), str(tmp_path)) == []

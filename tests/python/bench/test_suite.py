@@ -1,0 +1,207 @@
+"""Suites: what they expand to, and which mistakes are refused with the name of the field."""
+from __future__ import annotations
+
+import copy
+import os
+
+import pytest
+
+from diff_smoe_rasterization.benchmarks.errors import BenchError
+from diff_smoe_rasterization.benchmarks.methods.checkout import SHAPES
+from diff_smoe_rasterization.benchmarks.methods.names import CHECKOUTS
+from diff_smoe_rasterization.benchmarks.protocol import config_of
+from diff_smoe_rasterization.benchmarks.suite import SHIPPED, THRESHOLDS, expand, find_suite, load_suite
+from diff_smoe_rasterization.trainer.config import TrainConfig
+
+pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
+yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
+
+SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "captures", "captures_ablation")
+
+
+def changed(content, **fields):
+    return {**copy.deepcopy(content), **fields}
+
+
+def on_cuda(content, **fields):
+    """The suite with what a checkout needs: CUDA and a centred principal point."""
+    protocol = {"device": "cuda", "principal_point": "centre", **fields.pop("protocol", {})}
+    return changed(content, protocol=protocol, **fields)
+
+
+def test_cells_are_every_combination(content):
+    suite = expand(changed(content, densify_grad_thresholds=[0.005, 0.0002], seeds=[0, 1],
+                           schedules=["3dgs", "steady"]), "")
+    found = {(cell["blend_mode"], cell["densify_grad_threshold"], cell["seed"], cell["schedule"])
+             for cell in suite.cells}
+    assert len(suite.cells) == len(found) == len({cell["id"] for cell in suite.cells}) == 16
+
+
+def test_a_cell_has_all_options_of_its_training(content):
+    cell = expand(content, "").cells[1]
+    config = config_of(cell, "out")
+    assert (config.blend_mode, config.iterations, config.densify_grad_threshold) == ("smoe", 12, 0.005)
+    assert (config.densification_interval, config.eval_every, config.principal_point) == (4, 6, "scene")
+
+
+def test_a_scaled_recipe_is_that_of_the_trainer(content):
+    content["protocol"].update(scale_recipe=True, options={}, iterations=300)
+    config = config_of(expand(content, "").cells[0])
+    shortened = TrainConfig(iterations=300, blend_mode="alpha").shortened()
+    assert config.densify_until_iter == shortened.densify_until_iter == 150
+    assert config.opacity_reset_interval == shortened.opacity_reset_interval
+
+
+def test_an_axis_of_a_method_wins_over_the_scenes_over_the_suites(content, tiny_scene):
+    scenes = [{"name": "one", "path": tiny_scene},
+              {"name": "two", "path": tiny_scene, "densify_grad_thresholds": [0.001]}]
+    methods = [{"name": "native"}, {"name": "native", "label": "other", "densify_grad_thresholds": [0.0001]}]
+    suite = expand(changed(content, scenes=scenes, methods=methods, blend_modes=["smoe"]), "")
+    found = {(cell["scene"]["name"], cell["method"]["label"]): cell["densify_grad_threshold"] for cell in suite.cells}
+    assert found == {("one", "native"): 0.005, ("two", "native"): 0.001, ("one", "other"): 0.0001,
+                     ("two", "other"): 0.0001}
+
+
+def test_headline_cells_get_more_seeds(content):
+    suite = expand(changed(content, densify_grad_thresholds=[0.005, 0.001], blend_modes=["smoe"],
+                           headline={"densify_grad_thresholds": [0.005]}, headline_seeds=[1, 2]), "")
+    assert sorted((cell["densify_grad_threshold"], cell["seed"], cell["headline"]) for cell in suite.cells) == [
+        (0.001, 0, False), (0.005, 0, True), (0.005, 1, True), (0.005, 2, True)]
+
+
+def test_the_name_of_a_cell_is_that_of_its_figures(content, tiny_scene, tmp_path):
+    """Another protocol is another cell; another place of the same data is not."""
+    one = expand(content, "").cells[0]["id"]
+    longer = changed(content, protocol={**content["protocol"], "iterations": 13})
+    assert expand(longer, "").cells[0]["id"] != one
+    moved = changed(content, scenes=[{"name": "tiny", "path": str(tmp_path)}])
+    assert expand(moved, "").cells[0]["id"] == one
+    white = changed(content, scenes=[{"name": "tiny", "path": tiny_scene, "background": "white"}])
+    assert expand(white, "").cells[0]["id"] != one
+
+
+@pytest.mark.parametrize("change, words", [
+    ({"blend_mode": ["alpha"]}, ["blend_mode"]),
+    ({"blend_modes": ["smooth"]}, ["blend_modes[0]", "smooth"]),
+    ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
+    ({"seeds": []}, ["seeds"]),
+    ({"name": "../x"}, ["name"]),
+    ({"scenes": [{"name": "a"}]}, ["scenes[0]", "path", "synthetic"]),
+    ({"scenes": [{"name": "a", "path": "p", "resolution": 0}]}, ["scenes[0].resolution"]),
+    ({"scenes": [{"name": "a", "path": "p"}, {"name": "a", "path": "q"}]}, ["scenes[1].name", "'a'"]),
+    ({"scenes": "nowhere.yaml"}, ["scenes", "nowhere.yaml"]),
+    ({"methods": [{"name": "4dgs"}]}, ["methods[0].name", "4dgs"]),
+    ({"methods": [{"name": "native"}, {"name": "native"}]}, ["methods[1].label", "native"]),
+    ({"methods": [{"name": "native", "path": "p"}]}, ["methods[0].path"]),
+    ({"methods": [{"name": "native", "iterations": 7}]}, ["methods[0]", "iterations"]),
+    ({"protocol": {"iterations": 0}}, ["protocol.iterations"]),
+    ({"protocol": {"options": {"densify_until": 1}}}, ["protocol.options", "densify_until"]),
+    ({"protocol": {"options": {"lambda_dssim": 2}}}, ["--lambda-dssim", "2"]),
+    ({"protocol": {"options": {"densify_from_iter": "x"}}}, ["protocol.options.densify_from_iter"]),
+])
+def test_a_mistake_names_its_field(content, change, words):
+    with pytest.raises(BenchError) as error:
+        expand(changed(content, **change), "")
+    for word in words:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "a: [", "", "name: x"])
+def test_a_file_that_is_no_suite_is_named(tmp_path, text):
+    path = tmp_path / "suite.yaml"
+    path.write_text(text)
+    with pytest.raises(BenchError, match="suite.yaml"):
+        load_suite(str(path))
+
+
+def test_a_variable_that_is_not_set_is_named(content, monkeypatch):
+    monkeypatch.delenv("NOT_THERE", raising=False)
+    with pytest.raises(BenchError, match=r"scenes\[0\].path: \$NOT_THERE"):
+        expand(changed(content, scenes=[{"name": "a", "path": "${NOT_THERE}/a"}]), "")
+
+
+# What would put figures of two protocols into one table.
+
+def test_a_checkout_whose_loader_moves_the_principal_point_is_not_compared_with_one_that_keeps_it(content):
+    checkout = {"name": "3dgs-2023", "path": "p"}
+    with pytest.raises(BenchError, match="principal_point"):
+        expand(on_cuda(content, methods=[checkout], protocol={"principal_point": "scene"}), "")
+    assert len(expand(on_cuda(content, methods=[checkout]), "").cells) == 2
+
+
+@pytest.mark.parametrize("words", [["-r", 4], ["--images", "images_2"], ["--white_background"], ["--iterations", 7000],
+                                   ["--resolution=2"], ["--densify_grad_threshold", 0.1]])
+def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
+    with pytest.raises(BenchError, match=r"methods\[0\].arguments: " + words[0].partition("=")[0]):
+        expand(on_cuda(content, methods=[{"name": "taming", "path": "p", "arguments": words}]), "")
+
+
+def test_two_downscalers_are_refused(content):
+    scenes = [{"name": "a", "path": "p", "images": "images_4"}, {"name": "b", "path": "q", "resolution": 2}]
+    with pytest.raises(BenchError, match="two downscalers"):
+        expand(changed(content, scenes=scenes), "")
+    scenes[1]["resolution"] = 1
+    assert expand(changed(content, scenes=scenes), "").cells
+
+
+def test_recipes_that_a_checkout_cannot_follow_are_refused(content):
+    methods = [{"name": "3dgs-2023", "path": "p"}]
+    for protocol in ({"scale_recipe": True}, {"options": {"sh_degree_interval": 500}}, {"device": "cpu"}):
+        with pytest.raises(BenchError, match="protocol"):
+            expand(on_cuda(content, methods=methods, protocol=protocol), "")
+    white = [{"name": "lego", "path": "p", "background": "white"}]
+    with pytest.raises(BenchError, match="lego is white"):
+        expand(on_cuda(content, methods=methods, scenes=white, schedules=["steady"]), "")
+
+
+def test_an_unpatched_checkout_has_its_own_blending_alone(content):
+    methods = [{"name": "3dgs-2023", "path": "p", "variant": "unpatched"}]
+    cells = expand(on_cuda(content, methods=methods), "").cells
+    assert [(cell["blend_mode"], cell["method"]["label"]) for cell in cells] == [("alpha", "3dgs-2023-unpatched")]
+    with pytest.raises(BenchError, match=r"methods\[0\].blend_modes"):
+        expand(on_cuda(content, methods=[dict(methods[0], blend_modes=["smoe"])]), "")
+    with pytest.raises(BenchError, match=r"methods\[0\].variant"):
+        expand(on_cuda(content, methods=[{"name": "2dgs", "path": "p", "variant": "patched"}]), "")
+
+
+def test_a_method_without_a_threshold_needs_its_size(content):
+    with pytest.raises(BenchError, match=r"methods\[0\].arguments: dbs needs --cap_max"):
+        expand(on_cuda(content, methods=[{"name": "dbs", "path": "p"}]), "")
+
+
+def test_a_method_with_a_schedule_of_its_own_has_none_of_ours(content):
+    methods = [{"name": "hac", "path": "p"}]
+    assert {cell["schedule"] for cell in expand(on_cuda(content, methods=methods), "").cells} == {None}
+    with pytest.raises(BenchError, match=r"methods\[0\].schedules"):
+        expand(on_cuda(content, methods=[dict(methods[0], schedules=["steady"])]), "")
+
+
+def test_every_checkout_that_a_suite_may_name_can_be_run():
+    assert set(SHAPES) == set(CHECKOUTS)
+
+
+@pytest.mark.parametrize("name", SHIPPED_NAMES)
+def test_shipped_suites_are_valid(name, monkeypatch):
+    for variable in ("DSMOE_SCENES", "DSMOE_TRAINERS", "DSMOE_DATA"):
+        monkeypatch.setenv(variable, "/somewhere")
+    suite = load_suite(find_suite(name))
+    assert suite.name == name and suite.cells
+    if name == "fig4":
+        assert {cell["densify_grad_threshold"] for cell in suite.cells} == set(THRESHOLDS)
+        assert len({cell["scene"]["name"] for cell in suite.cells}) == 13
+
+
+def test_the_suite_of_the_readme_is_valid(monkeypatch):
+    monkeypatch.setenv("DSMOE_DATA", "/somewhere")
+    with open(os.path.join(os.path.dirname(SHIPPED), "README.md"), encoding="utf-8") as file:
+        text = file.read().partition("```yaml")[2].partition("```")[0]
+    cells = expand(yaml.safe_load(text), "").cells
+    assert {cell["method"]["label"] for cell in cells} == {"native", "3dgs-2023", "3dgs-2023-unpatched", "c3dgs"}
+    assert {cell["seed"] for cell in cells if cell["headline"]} == {0, 1, 2}
+
+
+def test_every_shipped_suite_is_listed_here():
+    found = {os.path.splitext(file)[0] for file in os.listdir(SHIPPED) if file.endswith(".yaml")}
+    assert found == set(SHIPPED_NAMES)
+    with pytest.raises(BenchError, match="smoke"):
+        find_suite("nothing")
