@@ -184,8 +184,8 @@ def test_lists_of_several_segments(mode, name, gpu):
     scene = LONG_LISTS[name](mode)
     offsets = torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene.to(torch.float32).to(gpu)))[8]
     assert (offsets[1:-1] - offsets[:-2]).max() > 2 * _C.constants["segment_length"]
-    # Sums of a thousand terms and more, in another order. Of 1480 pixels with a thousand pairs of alpha near 1/255 each,
-    # a few have one that lies within rounding, 1e-6 of itself, of that threshold.
+    # Sums of a thousand terms and more, in another order. Of 1480 pixels with a thousand pairs of alpha near 1/255
+    # each, a few have one that lies within rounding, 1e-6 of itself, of that threshold.
     rendering = compare(scene, gpu, torch.float32, ("depth", "inverse_depth") if "depths" in name else (),
                         Tolerance(1e-4, 3e-4, 5e-3))
     assert (rendering.radii > 0).sum() > 2000

@@ -49,7 +49,8 @@ def test_an_old_model_is_alpha_and_says_so_once(dataset):
 
 def test_a_wrong_mode_is_refused_by_name(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py", "--blend_mode=Smoe"])
-    with pytest.raises(ValueError, match="'Smoe', as --blend_mode says; it must be one of alpha, smoe, smoe_tn, smoe_std"):
+    message = "'Smoe', as --blend_mode says; it must be one of alpha, smoe, smoe_tn, smoe_std"
+    with pytest.raises(ValueError, match=message):
         runtime.blend_mode_of(SimpleNamespace(blend_mode="Smoe"))
 
 

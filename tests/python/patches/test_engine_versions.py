@@ -14,7 +14,11 @@ pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst"
 
 ONE_LINE = "    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)\n"
 BY_NAME = "    draw = GaussianRasterizer(raster_settings=settings)\n    {} = draw(means3D=pc.get_xyz)\n"
-DEPTH_LOSS = TRAIN + "\n\ndef depth_loss(view, inverse_depth):\n    return abs(inverse_depth - view.invdepthmap).mean()\n"
+DEPTH_LOSS = TRAIN + """
+
+def depth_loss(view, inverse_depth):
+    return abs(inverse_depth - view.invdepthmap).mean()
+"""
 VISIBLE = '''
 
 def prefilter_voxel(camera, pc, pipe):
