@@ -35,9 +35,9 @@ SET_OTHERWISE = ("sh_degree_interval", "antialiasing", "opacity_reset_interval")
 
 
 class ThreeDGS:
-    """train.py -s SCENE -m MODEL, then render.py -m MODEL: 3DGS of 2023 and of 2024, Taming 3DGS."""
+    """train.py -s SCENE -m MODEL, then render.py -m MODEL: 3DGS of 2023 and of 2024."""
 
-    stubs: Tuple[str, ...] = ()  # modules that are imported for what is not done here
+    stubs: Tuple[str, ...] = ("torchvision",)  # modules that are imported for what is not done here
     observed: Tuple[str, ...] = ()  # further arguments of the observer
     render_arguments: Tuple[str, ...] = ()
     container = "point_cloud.ply"
@@ -55,7 +55,7 @@ class ThreeDGS:
     def render(self) -> Dict[str, Any]:
         """Renders the test views; returns the observer's record."""
         return self.command("render", self.method["path"], "render.py", "-m", self.model, "--skip_train", "--quiet",
-                            *self.render_arguments, renders=self.renders)
+                            *self.render_arguments, renders=self.renders, observed=("--no-pictures",))
 
     def train_arguments(self) -> List[str]:
         """What the protocol and the axes are in the trainer's words."""
@@ -92,11 +92,13 @@ class ThreeDGS:
         return trained["loop_seconds"]
 
     def command(self, name: str, folder: str, script: str, *words: str,
-                renders: Optional[str] = None) -> Dict[str, Any]:
+                renders: Optional[str] = None,
+                observed: Tuple[str, ...] = ()) -> Dict[str, Any]:
         """Runs a script in the checkout; returns the observer's record. Raises BenchError with how it ended."""
         record = os.path.join(self.output, name + ".json")
         line = [self.method["python"] or sys.executable, OBSERVER, record, "--seed", str(self.config.seed),
-                "--iterations", str(self.config.iterations), "--stub", ",".join(self.stubs), *self.observed]
+                "--iterations", str(self.config.iterations), "--stub", ",".join(self.stubs), *self.observed,
+                *observed]
         line += (["--renders", renders] if renders else []) + ["--", os.path.join(folder, script), *words]
         if not os.path.isfile(os.path.join(folder, script)):
             raise BenchError(f"{folder}: there is no {script} in it; {self.method['name']} is run by it")
@@ -118,16 +120,23 @@ class ThreeDGS:
         return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
+class Taming(ThreeDGS):
+    """Taming 3DGS: the same commands; it finds edges with torchvision while it trains."""
+
+    stubs = ()
+
+
 class TwoDGS(ThreeDGS):
     """2D Gaussian Splatting: the same commands; render.py also extracts meshes, with libraries that are not needed."""
 
-    stubs = ("open3d", "trimesh", "mediapy")
+    stubs = (*ThreeDGS.stubs, "open3d", "trimesh", "mediapy")
     render_arguments = ("--skip_mesh",)
 
 
 class C3DGS(ThreeDGS):
     """Compressed 3DGS: a 3DGS checkout (`base`) trains, compress.py compresses and finetunes, render.py renders."""
 
+    stubs = ()  # compress.py measures LPIPS
     container = "point_cloud.npz"
 
     def train(self) -> Dict[str, Any]:
@@ -160,6 +169,8 @@ class C3DGS(ThreeDGS):
 class HAC(ThreeDGS):
     """HAC and HAC++: train.py trains, encodes, decodes and renders in one process."""
 
+    stubs = ()  # it reads its pictures again with torchvision, at the end
+
     def train(self) -> Dict[str, Any]:
         return self.command("train", self.method["path"], "train.py", *self.train_arguments(), renders=self.renders)
 
@@ -184,7 +195,7 @@ class DBS(ThreeDGS):
     all: the protocol's iterations, the last model.
     """
 
-    stubs = ("viser", "nerfview")  # its viewer
+    stubs = (*ThreeDGS.stubs, "viser", "nerfview")  # its viewer
     observed = ("--hold-out", "--model-renders", "beta_model")
 
     def train(self) -> Dict[str, Any]:
@@ -202,7 +213,7 @@ class DBS(ThreeDGS):
         return words + ["--disable_viewer", "--no-compress"]
 
 
-SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDGS, "taming": ThreeDGS, "2dgs": TwoDGS,
+SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDGS, "taming": Taming, "2dgs": TwoDGS,
                                      "dbs": DBS, "c3dgs": C3DGS, "hac": HAC, "hac-plus": HAC}
 
 

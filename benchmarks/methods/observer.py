@@ -33,6 +33,7 @@ def main(argv=None):
     parser.add_argument("--iterations", type=int, required=True)
     parser.add_argument("--renders")
     parser.add_argument("--stub", default="")
+    parser.add_argument("--no-pictures", action="store_true")
     parser.add_argument("--hold-out", action="store_true")
     parser.add_argument("--model-renders", metavar="ATTRIBUTE")
     options = parser.parse_args(words[:split])
@@ -41,6 +42,8 @@ def main(argv=None):
     sys.path[0] = os.path.dirname(os.path.abspath(script))
     for name in filter(None, options.stub.split(",")):
         stub(name)
+    if options.no_pictures:
+        write_no_pictures()
     import torch
 
     shift_seeds(options.seed)
@@ -203,6 +206,14 @@ def watch_renderings(folder):
 
         gaussian_renderer.prefilter_voxel = prefiltered
     return found
+
+
+def write_no_pictures():
+    """torchvision's save_image does nothing: what is rendered is kept as floats, and torchvision may be absent."""
+    stub("torchvision")
+    import torchvision.utils
+
+    torchvision.utils.save_image = lambda *arguments, **keywords: None
 
 
 class Absent(types.ModuleType):

@@ -251,6 +251,15 @@ def test_modules_that_are_imported_and_not_used_may_be_absent():
     assert sys.modules["json"] is json
 
 
+def test_no_picture_is_written_where_renderings_are_kept(tmp_path):
+    """With torchvision or without; in a process of its own, where it stays so."""
+    program = ("import sys; sys.path.insert(0, sys.argv[1]); import observer; "
+               "observer.write_no_pictures(); import torchvision; torchvision.utils.save_image(None, sys.argv[2])")
+    subprocess.run([sys.executable, "-c", program, os.path.dirname(shapes.OBSERVER), str(tmp_path / "a.png")],
+                   check=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_seeds_are_shifted_by_the_cells():
     """In a process of its own: the functions stay replaced."""
     program = ("import sys; sys.path.insert(0, sys.argv[1]); import observer, random, numpy, torch; "
