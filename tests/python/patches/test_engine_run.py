@@ -120,7 +120,7 @@ def test_a_stand_in_says_that_it_is_used(tmp_path):
     code = "from simple_knn._C import distCUDA2; import fused_ssim; fused_ssim.fused_ssim"
     shims = [str(run.SHIMS / name) for name in ("simple_knn", "fused_ssim", "weighted_distance")]
     variables = {**environment(), "PYTHONPATH": os.pathsep.join([*shims, environment()["PYTHONPATH"]])}
-    result = subprocess.run([sys.executable, "-c", code], env=variables, stderr=subprocess.PIPE,
+    result = subprocess.run([sys.executable, "-c", code], env=variables, cwd=str(tmp_path), stderr=subprocess.PIPE,
                             universal_newlines=True)
     assert result.returncode == 0, result.stderr
     assert [line.split()[1] for line in result.stderr.splitlines()] == ["simple_knn", "fused_ssim"]
