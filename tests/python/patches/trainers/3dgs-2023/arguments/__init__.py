@@ -1,22 +1,6 @@
 import os
-import sys
-from argparse import ArgumentParser, Namespace
 
-
-class ParamGroup:
-    """A group of flags: one for every attribute; a leading underscore asks for a short form too."""
-
-    def __init__(self, parser: ArgumentParser, title, no_defaults):
-        flags = parser.add_argument_group(title)
-        for attribute, default in vars(self).items():
-            name = attribute.lstrip("_")
-            spellings = ["--" + name] + ["-" + name[0]] * attribute.startswith("_")
-            kind = {"action": "store_true"} if isinstance(default, bool) else {"type": type(default)}
-            flags.add_argument(*spellings, default=None if no_defaults else default, **kind)
-
-    def extract(self, args):
-        names = {attribute.lstrip("_") for attribute in vars(self)}
-        return Namespace(**{key: value for key, value in vars(args).items() if key in names})
+from utils.groups import ParamGroup, get_combined_args  # noqa: F401  (callers take it from here)
 
 
 class ModelParams(ParamGroup):
@@ -49,11 +33,3 @@ class OptimizationParams(ParamGroup):
         self.densify_from_iter, self.densify_until_iter = 1, 6
         self.random_background = False
         super().__init__(parser, "How it is trained", False)
-
-
-def get_combined_args(parser: ArgumentParser):
-    """The flags of the command line over those of the model's cfg_args."""
-    typed = parser.parse_args(sys.argv[1:])
-    with open(os.path.join(typed.model_path, "cfg_args")) as file:
-        saved = eval(file.read())
-    return Namespace(**{**vars(saved), **{key: value for key, value in vars(typed).items() if value is not None}})
