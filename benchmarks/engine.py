@@ -157,7 +157,7 @@ def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
         paths = {key: prepared_checkout(method, key, results) for key in ("path", "base") if key in method}
     except (patches.PatchError, BenchError, OSError) as error:
         return {**method, "refused": " ".join(str(error).split())}
-    return {**method, **paths, "commit": commit_of(method["path"])}
+    return {**method, **paths, "commit": commit_of(method["path"]) or method.get("commit")}
 
 
 def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
