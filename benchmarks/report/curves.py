@@ -47,11 +47,11 @@ def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
                                   ("time", "training time and frame rate", bars)):
             files = {}
             for theme in THEMES:
-                with plt.rc_context(_style(theme)):
+                with plt.rc_context(style(theme)):
                     drawn = draw(shown)
                     if drawn is None:
                         break
-                    files[theme] = _save(drawn, folder, safe_name(f"{suite}-{scene}-{kind}"), theme)
+                    files[theme] = save(drawn, folder, safe_name(f"{suite}-{scene}-{kind}"), theme)
             if files:
                 modes = ", ".join(dict.fromkeys(group.setting.label() for group in shown))
                 pictures.append(Picture(safe_name(f"{suite}-{scene}-{kind}"), f"{scene}: {title}",
@@ -86,7 +86,7 @@ def rate_distortion(groups: Sequence[Group]):
         axis.set_xlabel(column(amount).name)
     handles = [Line2D([], [], color=color, marker=mark, linestyle=dash, label=series.label())
                for series, (color, (mark, dash, _)) in styles.items()]
-    _legend(drawn, handles)
+    legend(drawn, handles)
     return drawn
 
 
@@ -123,7 +123,7 @@ def bars(groups: Sequence[Group]):
                            else "densification threshold, or fixed number")
     handles = [matplotlib.patches.Patch(facecolor=color, hatch=hatch, edgecolor=plt.rcParams["figure.facecolor"],
                                         label=series.label()) for series, (color, (_, _, hatch)) in styles.items()]
-    _legend(drawn, handles)
+    legend(drawn, handles)
     return drawn
 
 
@@ -144,7 +144,7 @@ def _styles(groups: Sequence[Group]) -> Dict[Setting, Tuple[str, Tuple[str, str,
     return styles
 
 
-def _style(theme: str) -> Dict[str, object]:
+def style(theme: str) -> Dict[str, object]:
     colors = THEMES[theme]
     return {"figure.facecolor": colors["background"], "axes.facecolor": colors["background"],
             "savefig.facecolor": colors["background"], "text.color": colors["ink"], "axes.labelcolor": colors["ink"],
@@ -153,7 +153,7 @@ def _style(theme: str) -> Dict[str, object]:
             "axes.spines.right": False, "legend.frameon": False, "font.size": 10, "svg.hashsalt": "dsmoe"}
 
 
-def _legend(drawn: Figure, handles: Sequence[object]) -> None:
+def legend(drawn: Figure, handles: Sequence[object]) -> None:
     widest = LEGEND_MARK + LEGEND_LETTER * max(len(handle.get_label()) for handle in handles)
     columns = max(1, min(len(handles), int(drawn.get_figwidth() // widest)))
     lines = -(-len(handles) // columns)
@@ -163,7 +163,7 @@ def _legend(drawn: Figure, handles: Sequence[object]) -> None:
     drawn.legend(handles=handles, loc="upper center", ncols=columns, handlelength=3)
 
 
-def _save(drawn: Figure, folder: str, name: str, theme: str) -> str:
+def save(drawn: Figure, folder: str, name: str, theme: str) -> str:
     os.makedirs(folder, exist_ok=True)
     path = os.path.join(folder, f"{name}-{theme}.svg")
     drawn.savefig(path, metadata={"Date": None})
