@@ -8,9 +8,13 @@ OUT/mechanism.json then holds three series and a summary:
 
     states          every 100 steps, and every 10 steps after an opacity reset: opacities, their gradient, test PSNR
     resets          test PSNR on both sides of each opacity reset
-    densifications  what was cloned, split and pruned, what the pruned carried, and where the cloned and split lie
+    densifications  what was cloned, split and pruned, what the pruned carried, where the cloned and split lie, and how
+                    large they are: sizes are largest standard deviations in world units
 
-A state is that of the model as its step begins.
+A state is that of the model as its step begins. Its net pull sums minus the gradient of the loss by the opacity logits,
+over Gaussians and over the steps since the state or the reset before, and divides by the sum of absolute values: 1
+where every opacity is to rise, 0 where a common shift of all logits would leave the loss as it is. mechanism_probe.py
+says what the other numbers are.
 """
 from __future__ import annotations
 
@@ -54,6 +58,10 @@ class Recorder:
         self.states: List[Dict[str, Any]] = []
         self.resets: List[Dict[str, Any]] = []
         self.densifications: List[Dict[str, Any]] = []
+        self.pull = self._no_pull()
+
+    def _no_pull(self) -> torch.Tensor:
+        return torch.zeros(2, dtype=torch.double, device=self.trainer.config.device)
 
     @contextlib.contextmanager
     def aside(self) -> Iterator[None]:
@@ -66,16 +74,20 @@ class Recorder:
 
     def before_change(self, step: Step) -> None:
         """Gradients are known and nothing has changed: the time for a state, where one is due."""
+        gradient = self.trainer.model.raw["opacities"].grad
+        self.pull += torch.stack([-gradient.sum(), gradient.abs().sum()])
         since_reset = step.iteration - self.resets[-1]["iteration"] if self.resets else math.inf
-        if step.iteration % EVERY and (since_reset > AFTER_RESET or since_reset > 1 and since_reset % EVERY_AFTER_RESET):
+        dense = since_reset == 1 or since_reset <= AFTER_RESET and since_reset % EVERY_AFTER_RESET == 0
+        if step.iteration % EVERY and not dense:
             return
         with self.aside():
-            model = self.trainer.model
+            model, (net, total) = self.trainer.model, self.pull.tolist()
             self.states.append({
                 "iteration": step.iteration, "num_gaussians": model.num_gaussians, **self.probe.look(),
                 "opacities": quantiles(model.opacities.squeeze(1)),
-                "opacity_gradient": opacity_gradient(model.raw["opacities"].grad.squeeze(1)),
+                "opacity_gradient": opacity_gradient(gradient.squeeze(1)), "net_pull": net / total if total else None,
             })
+            self.pull = self._no_pull()
 
     def before_densification(self, gradients: torch.Tensor, seen: torch.Tensor) -> None:
         """gradients: [N] as the strategy compares them; seen: [N] bool, whether they are of any view."""
@@ -120,6 +132,7 @@ class Recorder:
         """They are lowered."""
         with self.aside():
             self.resets[-1]["after"] = self.probe.look()
+            self.pull = self._no_pull()
 
 
 def watched(strategy: ThreeDGSStrategy, recorder: Recorder) -> ThreeDGSStrategy:
@@ -180,37 +193,35 @@ def summary(record: Dict[str, Any]) -> Dict[str, Any]:
     """The numbers that say most, from the series of a record; None, 0 or an empty list where a run has no such thing.
 
     resets: PSNR [dB] on both sides of each and 100 steps later, before the next prune. settled_opacity: the median 1000
-    steps after the last reset. net_pull: means over the states within 300 steps after a reset, and over the others.
-    pruned: how many; the sum over prunes of the fraction of the picture's colour that they made; dB gained by pruning,
-    in all and by the first prune after each reset. densified: how many times likelier than any Gaussian a parent lies
-    near an edge, and its size over the median size; means over parents.
+    steps after the last reset. net_pull: means over the states within 100 steps after a reset, and over the others.
+    pruned: how many; color: the fraction of the picture that they made; psnr: dB gained; both summed over prunes, and
+    of the first prune after each reset. densified: how many times likelier than any Gaussian a parent lies near an
+    edge, and its size over the median size; means over parents.
     """
     states, resets, steps = record["states"], record["resets"], record["densifications"]
     at = {state["iteration"]: state for state in states}
     begins = [reset["iteration"] for reset in resets]
 
-    def later(begin: int, after: int) -> Optional[float]:
-        return at[begin + after]["psnr"] if begin + after in at else None
-
     def pulls(shaken: bool) -> List[float]:
-        return [state["opacity_gradient"]["net_pull"] for state in states
-                if any(0 < state["iteration"] - begin <= AFTER_RESET for begin in begins) == shaken
-                and state["opacity_gradient"]["net_pull"] is not None]
+        return [state["net_pull"] for state in states
+                if any(0 < state["iteration"] - begin <= LATER for begin in begins) == shaken
+                and state["net_pull"] is not None]
 
     settled = [state for state in states if begins and state["iteration"] >= begins[-1] + SETTLED]
-    prunes = {step["iteration"]: step["after_prune"]["psnr"] - step["before_prune"]["psnr"] for step in steps}
-    first_prunes = [min((iteration for iteration in prunes if iteration > begin), default=None) for begin in begins]
+    prunes = [{"iteration": step["iteration"], "color": step["pruned_colors"],
+               "psnr": step["after_prune"]["psnr"] - step["before_prune"]["psnr"]} for step in steps]
     return {
         **record["result"],
         "resets": [{"iteration": reset["iteration"], "before": reset["before"]["psnr"],
-                    "after": reset["after"]["psnr"], "later": later(reset["iteration"], LATER)} for reset in resets],
+                    "after": reset["after"]["psnr"], "later": at.get(reset["iteration"] + LATER, {}).get("psnr")}
+                   for reset in resets],
         "settled_opacity": settled[0]["opacities"][QUANTILES.index(0.5)] if settled else None,
         "net_pull": {"after_resets": _mean(pulls(True)), "otherwise": _mean(pulls(False))},
         "pruned": {
             **{name: sum(step[name] for step in steps) for name in ("faint", "large")},
-            "color": {name: sum(step["pruned_colors"][name] or 0 for step in steps) for name in ("faint", "large")},
-            "psnr": sum(prunes.values()),
-            "psnr_after_resets": [prunes.get(iteration) for iteration in first_prunes],
+            "color": {name: sum(prune["color"][name] or 0 for prune in prunes) for name in ("faint", "large")},
+            "psnr": sum(prune["psnr"] for prune in prunes),
+            "after_resets": [next((prune for prune in prunes if prune["iteration"] > begin), None) for begin in begins],
         },
         "densified": {
             "parents": sum(step["cloned"] + step["split"] for step in steps),

@@ -1,4 +1,4 @@
-"""What a model in training is asked: how it looks, how opaque it is, which Gaussians carry the picture and where they lie.
+"""What a model in training is asked: how it looks, how opaque it is, who carries the picture, who lies near edges.
 
 Nothing here changes the model, its gradients or a generator of random numbers.
 """
@@ -103,16 +103,12 @@ def median(values: torch.Tensor) -> Optional[float]:
 
 
 def opacity_gradient(gradient: torch.Tensor) -> Dict[str, Any]:
-    """What the gradient of one view's loss by opacity logits [N] asks for, over the Gaussians that it reaches.
+    """The gradient of one view's loss by opacity logits [N], over those Gaussians that it reaches.
 
-    mean, mean_absolute, median_absolute: per logit. raised: the fraction of them whose opacity it raises. net_pull:
-    from -1 to 1; 1 where it raises all, 0 where a common shift of all logits would leave the loss as it is.
+    raised: the fraction of them whose opacity a step against the gradient raises.
     """
     reached = gradient[gradient != 0].double()
     if not len(reached):
-        return {"reached": 0, "mean": None, "mean_absolute": None, "median_absolute": None, "raised": None,
-                "net_pull": None}
-    mean, absolute = float(reached.mean()), float(reached.abs().mean())
-    return {"reached": len(reached), "mean": mean, "mean_absolute": absolute,
-            "median_absolute": median(reached.abs()), "raised": float((reached < 0).double().mean()),
-            "net_pull": -mean / absolute}
+        return {"reached": 0, "mean": None, "mean_absolute": None, "median_absolute": None, "raised": None}
+    return {"reached": len(reached), "mean": float(reached.mean()), "mean_absolute": float(reached.abs().mean()),
+            "median_absolute": median(reached.abs()), "raised": float((reached < 0).double().mean())}

@@ -145,6 +145,7 @@ def _styles(groups: Sequence[Group]) -> Dict[Setting, Tuple[str, Tuple[str, str,
 
 
 def style(theme: str) -> Dict[str, object]:
+    """Matplotlib's settings for one of THEMES."""
     colors = THEMES[theme]
     return {"figure.facecolor": colors["background"], "axes.facecolor": colors["background"],
             "savefig.facecolor": colors["background"], "text.color": colors["ink"], "axes.labelcolor": colors["ink"],
@@ -154,6 +155,7 @@ def style(theme: str) -> Dict[str, object]:
 
 
 def legend(drawn: Figure, handles: Sequence[object]) -> None:
+    """Puts a legend above the panels, in a strip that makes the figure higher."""
     widest = LEGEND_MARK + LEGEND_LETTER * max(len(handle.get_label()) for handle in handles)
     columns = max(1, min(len(handles), int(drawn.get_figwidth() // widest)))
     lines = -(-len(handles) // columns)
@@ -164,6 +166,7 @@ def legend(drawn: Figure, handles: Sequence[object]) -> None:
 
 
 def save(drawn: Figure, folder: str, name: str, theme: str) -> str:
+    """Writes NAME-THEME.svg, in the light theme NAME.png too, and closes the figure; returns the SVG's path."""
     os.makedirs(folder, exist_ok=True)
     path = os.path.join(folder, f"{name}-{theme}.svg")
     drawn.savefig(path, metadata={"Date": None})
