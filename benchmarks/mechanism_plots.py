@@ -60,8 +60,7 @@ def opacity(runs: Sequence[Run]):
         low, high = (_series(states, lambda state, q=q: _quantile(state, "opacities", q)) for q in (0.1, 0.9))
         axes[0, 0].fill_between(low[0], low[1], high[1], color=run.color, alpha=0.15, linewidth=0)
         _mark_resets(axes[:, 0], run)
-    for axis in axes[0]:
-        axis.set_yscale("log")
+    _logarithmic(axes[0])
     for axis in axes[1]:
         axis.axhline(0, color=plt.rcParams["text.color"], linewidth=0.8)
     return drawn
@@ -80,8 +79,7 @@ def pruning(runs: Sequence[Run]):
             _points(axes[1, column], run, pruned, lambda step: step[name])
             _points(axes[2, column], run, pruned, lambda step: max(step["pruned_colors"][name] or 0, LEAST_SHARE))
         _mark_resets(axes.flat, run)
-    for axis in axes[1:].flat:
-        axis.set_yscale("log")
+    _logarithmic(axes[1:].flat)
     return drawn
 
 
@@ -101,8 +99,7 @@ def densification(runs: Sequence[Run]):
             _line(axis, run, steps, lambda step: step[name]["all"])
         _line(axes[1, 0], run, steps, lambda step: step["edges"]["area"], alpha=0.35)
         _mark_resets(axes.flat, run)
-    for axis in (axes[0, 0], axes[0, 1], axes[1, 1]):
-        axis.set_yscale("log")
+    _logarithmic((axes[0, 0], axes[0, 1], axes[1, 1]))
     return drawn
 
 
@@ -127,7 +124,7 @@ def _panels(titles: Sequence[Sequence[str]], below: Sequence[str] = ("step", "st
 
 
 def _after_resets(record: Record) -> List[List[Dict[str, Any]]]:
-    """For each reset the states from the last before it on, up to the next one; iterations count from it."""
+    """For each reset the states from its own step on, before it, to the next reset; iterations count from it."""
     begins = [reset["iteration"] for reset in record["resets"]]
     return [[dict(state, iteration=state["iteration"] - begin) for state in record["states"]
              if begin <= state["iteration"] <= min(begin + SHOWN_AFTER_RESET, end)]
@@ -151,6 +148,13 @@ def _points(axis, run: Run, rows: Sequence[Dict[str, Any]], value: Value) -> Non
 
 def _quantile(row: Dict[str, Any], name: str, level: float) -> Optional[float]:
     return row[name][QUANTILES.index(level)] if row[name] else None
+
+
+def _logarithmic(axes) -> None:
+    """Where something is drawn: no logarithm shows an empty panel."""
+    for axis in axes:
+        if np.isfinite(axis.dataLim.y0) and axis.dataLim.y1 > 0:
+            axis.set_yscale("log")
 
 
 def _mark_resets(axes, run: Run) -> None:

@@ -45,6 +45,13 @@ def watched_run(request, runs):
     return runs[request.param]
 
 
+@pytest.fixture(scope="module")
+def steady(tiny_scene, tmp_path_factory):
+    """The record of a short run without resets."""
+    config = config_of(tiny_scene, tmp_path_factory.mktemp("steady") / "out", "smoe", schedule="steady", iterations=101)
+    return mechanism.run(config, progress=False)
+
+
 def same(one, other):
     """Whether two nests of plain values and tensors are equal, tensors bit for bit."""
     if isinstance(one, torch.Tensor):
@@ -149,12 +156,21 @@ def test_the_record_is_what_was_written(watched_run):
     assert record["probe_seconds"] > 0 and record["train_seconds"] > 0
 
 
-def test_a_run_without_resets(tiny_scene, tmp_path):
-    record = mechanism.run(config_of(tiny_scene, tmp_path / "out", "smoe", schedule="steady", iterations=101),
-                           progress=False)
-    assert record["resets"] == [] and [state["iteration"] for state in record["states"]] == [100]
-    assert record["summary"]["net_pull"]["after_resets"] is None and record["summary"]["settled_opacity"] is None
-    assert record["summary"]["pruned"]["large"] == 0
+def test_a_run_without_resets(steady):
+    assert steady["resets"] == [] and [state["iteration"] for state in steady["states"]] == [100]
+    assert steady["summary"]["net_pull"]["after_resets"] is None and steady["summary"]["settled_opacity"] is None
+    assert steady["summary"]["pruned"]["large"] == 0
+
+
+def test_what_never_happened_leaves_a_panel_empty(steady):
+    pytest.importorskip("matplotlib", reason="figures need matplotlib")
+    from diff_smoe_rasterization.benchmarks import mechanism_plots
+
+    nothing = {**steady, "densifications": []}
+    for draw in (mechanism_plots.opacity, mechanism_plots.pruning, mechanism_plots.densification):
+        for record in (steady, nothing):
+            draw(mechanism_plots.named([record])).canvas.draw()
+    mechanism_plots.plt.close("all")
 
 
 @pytest.fixture
