@@ -47,11 +47,11 @@ def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
                                   ("time", "training time and frame rate", bars)):
             files = {}
             for theme in THEMES:
-                with plt.rc_context(_style(theme)):
+                with plt.rc_context(style(theme)):
                     drawn = draw(shown)
                     if drawn is None:
                         break
-                    files[theme] = _save(drawn, folder, safe_name(f"{suite}-{scene}-{kind}"), theme)
+                    files[theme] = save(drawn, folder, safe_name(f"{suite}-{scene}-{kind}"), theme)
             if files:
                 modes = ", ".join(dict.fromkeys(group.setting.label() for group in shown))
                 pictures.append(Picture(safe_name(f"{suite}-{scene}-{kind}"), f"{scene}: {title}",
@@ -86,7 +86,7 @@ def rate_distortion(groups: Sequence[Group]):
         axis.set_xlabel(column(amount).name)
     handles = [Line2D([], [], color=color, marker=mark, linestyle=dash, label=series.label())
                for series, (color, (mark, dash, _)) in styles.items()]
-    _legend(drawn, handles)
+    legend(drawn, handles)
     return drawn
 
 
@@ -127,7 +127,7 @@ def bars(groups: Sequence[Group]):
                            else "densification threshold, or fixed number")
     handles = [matplotlib.patches.Patch(facecolor=color, hatch=hatch, edgecolor=plt.rcParams["figure.facecolor"],
                                         label=series.label()) for series, (color, (_, _, hatch)) in styles.items()]
-    _legend(drawn, handles)
+    legend(drawn, handles)
     return drawn
 
 
@@ -148,7 +148,8 @@ def _styles(groups: Sequence[Group]) -> Dict[Setting, Tuple[str, Tuple[str, str,
     return styles
 
 
-def _style(theme: str) -> Dict[str, object]:
+def style(theme: str) -> Dict[str, object]:
+    """Matplotlib's settings for one of THEMES."""
     colors = THEMES[theme]
     return {"figure.facecolor": colors["background"], "axes.facecolor": colors["background"],
             "savefig.facecolor": colors["background"], "text.color": colors["ink"], "axes.labelcolor": colors["ink"],
@@ -157,7 +158,8 @@ def _style(theme: str) -> Dict[str, object]:
             "axes.spines.right": False, "legend.frameon": False, "font.size": 10, "svg.hashsalt": "dsmoe"}
 
 
-def _legend(drawn: Figure, handles: Sequence[object]) -> None:
+def legend(drawn: Figure, handles: Sequence[object]) -> None:
+    """Puts a legend above the panels, in a strip that makes the figure higher."""
     widest = LEGEND_MARK + LEGEND_LETTER * max(len(handle.get_label()) for handle in handles)
     columns = max(1, min(len(handles), int(drawn.get_figwidth() // widest)))
     lines = -(-len(handles) // columns)
@@ -167,7 +169,8 @@ def _legend(drawn: Figure, handles: Sequence[object]) -> None:
     drawn.legend(handles=handles, loc="upper center", ncols=columns, handlelength=3)
 
 
-def _save(drawn: Figure, folder: str, name: str, theme: str) -> str:
+def save(drawn: Figure, folder: str, name: str, theme: str) -> str:
+    """Writes NAME-THEME.svg, in the light theme NAME.png too, and closes the figure; returns the SVG's path."""
     os.makedirs(folder, exist_ok=True)
     path = os.path.join(folder, f"{name}-{theme}.svg")
     drawn.savefig(path, metadata={"Date": None})

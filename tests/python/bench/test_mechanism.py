@@ -1,0 +1,293 @@
+"""A watched training is the same training, and its record says what happened in it."""
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from diff_smoe_rasterization.benchmarks import mechanism
+from diff_smoe_rasterization.benchmarks.mechanism_probe import Probe, median, opacity_gradient, quantiles
+from diff_smoe_rasterization.trainer.checkpoint import CHECKPOINT_NAME, load_checkpoint
+from diff_smoe_rasterization.trainer.config import TrainConfig
+from diff_smoe_rasterization.trainer.errors import TrainerError
+from diff_smoe_rasterization.trainer.loop import Trainer, train
+from diff_smoe_rasterization.trainer.modelfile import model_path
+from diff_smoe_rasterization.trainer.scene import load_scene
+from diff_smoe_rasterization.trainer.strategy import Step
+
+RESETS = [60, 120, 180]
+DENSIFICATIONS = list(range(40, 200, 20))
+
+
+def config_of(scene, output, blend_mode, **options):
+    """300 steps with densifications and resets as above, in which Gaussians are cloned, split and pruned."""
+    return TrainConfig(**{**dict(
+        scene=scene, output=str(output), blend_mode=blend_mode, iterations=300, sh_degree_interval=100,
+        densify_from_iter=20, densify_until_iter=200, densification_interval=20, opacity_reset_interval=60,
+        densify_grad_threshold=0.002, percent_dense=0.05), **options})
+
+
+@pytest.fixture(scope="module")
+def runs(tiny_scene, tmp_path_factory):
+    """By blend mode: the config of a watched run, and its record."""
+    found = {}
+    for mode in ("alpha", "smoe"):
+        config = config_of(tiny_scene, tmp_path_factory.mktemp("runs") / mode, mode)
+        found[mode] = (config, mechanism.run(config, progress=False))
+    return found
+
+
+@pytest.fixture(params=["alpha", "smoe"])
+def watched_run(request, runs):
+    return runs[request.param]
+
+
+@pytest.fixture(scope="module")
+def steady(tiny_scene, tmp_path_factory):
+    """The record of a short run without resets."""
+    config = config_of(tiny_scene, tmp_path_factory.mktemp("steady") / "out", "smoe", schedule="steady", iterations=101)
+    return mechanism.run(config, progress=False)
+
+
+def same(one, other):
+    """Whether two nests of plain values and tensors are equal, tensors bit for bit."""
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(same, one, other))
+    return one == other
+
+
+def test_a_watched_training_is_bit_equal_to_a_plain_one(watched_run, tmp_path):
+    config, _ = watched_run
+    plain = config.changed(output=str(tmp_path / "plain"))
+    train(plain, progress=False)
+    models = []
+    for folder in (config.output, plain.output):
+        with open(model_path(folder, config.iterations), "rb") as file:
+            models.append(file.read())
+    assert models[0] == models[1]
+    watched, unwatched = (load_checkpoint(os.path.join(folder, CHECKPOINT_NAME), "cpu")
+                          for folder in (config.output, plain.output))
+    for part in ("raw", "optimizer", "strategy", "order", "random", "active_sh_degree"):
+        assert same(watched[part], unwatched[part]), part
+
+
+def test_counts_agree_with_the_sizes_of_the_model(watched_run):
+    _, record = watched_run
+    steps = record["densifications"]
+    assert [step["iteration"] for step in steps] == DENSIFICATIONS
+    for step, following in zip(steps, [*steps[1:], None]):
+        # A clone adds one; a split puts two in the place of one.
+        assert step["grown"] == step["before"] + step["cloned"] + step["split"]
+        assert step["after"] == step["grown"] - step["faint"] - step["large"]
+        assert step["after"] == (following["before"] if following else record["result"]["num_gaussians"])
+    sizes = {step["iteration"]: step["before"] for step in steps}
+    assert any(state["iteration"] in sizes for state in record["states"])
+    for state in record["states"]:
+        assert state["num_gaussians"] == sizes.get(state["iteration"], state["num_gaussians"])
+    for name in ("cloned", "split", "large"):
+        assert sum(step[name] for step in steps) > 0, f"nothing was shown of {name}"
+
+
+def test_states_are_dense_after_a_reset(watched_run):
+    _, record = watched_run
+    assert [reset["iteration"] for reset in record["resets"]] == RESETS
+    # Every 100; one step and every ten after a reset, up to the end: nothing is as far as 300 from the last reset.
+    expected = {100, 200, *(reset + 1 for reset in RESETS), *range(70, 300, 10)}
+    assert [state["iteration"] for state in record["states"]] == sorted(expected)
+
+
+def test_opacities_after_a_reset(runs):
+    """Nothing is above 0.01. In alpha all colours have become dark, and more opacity makes them brighter. In smoe a
+    common factor of all opacities cancels but for T, which is nearly 1 where opacities are 0.01."""
+    for mode, (_, record) in runs.items():
+        first = [state for state in record["states"] if state["iteration"] - 1 in RESETS]
+        for state, reset in zip(first, record["resets"]):
+            assert state["opacities"][-1] == pytest.approx(0.01, rel=1e-4)  # a sigmoid of a logarithm in float32
+            assert state["psnr"] == pytest.approx(reset["after"]["psnr"], abs=0.5)  # one step of all but opacities
+            drop = reset["before"]["psnr"] - reset["after"]["psnr"]
+            pull = state["net_pull"]
+            assert (drop > 1 and pull > 0.9) if mode == "alpha" else (abs(drop) < 1 and abs(pull) < 0.1)
+
+
+def test_fullness_falls_with_opacities(watched_run):
+    _, record = watched_run
+    for reset in record["resets"]:
+        assert 0 < reset["after"]["fullness"] < reset["before"]["fullness"] < 1
+
+
+def test_the_pruned_have_a_share_of_the_picture(runs):
+    for mode, (_, record) in runs.items():
+        for step in record["densifications"]:
+            for name in ("faint", "large"):
+                share = step["pruned_colors"][name]
+                assert (share == 0) if step[name] == 0 else (0 <= share <= 1)
+                if mode == "alpha":  # Eq. 3 divides by no gate sum; the sums are float32, over 300 pixels of views
+                    assert share == pytest.approx(step["pruned_weights"][name], rel=1e-3, abs=1e-6)
+
+
+def test_the_summary_adds_up(watched_run):
+    _, record = watched_run
+    steps, found = record["densifications"], record["summary"]
+    assert found["pruned"]["faint"] == sum(step["faint"] for step in steps)
+    assert found["densified"]["parents"] == sum(step["cloned"] + step["split"] for step in steps)
+    later = next(state["psnr"] for state in record["states"] if state["iteration"] == RESETS[0] + 100)
+    assert found["resets"][0]["later"] == later
+    # The prune at step 60 itself came before the reset.
+    after = next(step for step in steps if step["iteration"] == 80)
+    gained = after["after_prune"]["psnr"] - after["before_prune"]["psnr"]
+    first, _, last = found["pruned"]["after_resets"]
+    assert first["psnr"] == pytest.approx(gained, abs=1e-4)  # six digits are kept
+    assert first["iteration"] == 80 and first["color"] == after["pruned_colors"]
+    assert last is None  # densification ends with the last reset
+    assert found["settled_opacity"] is None  # the run ends before
+
+
+def test_the_record_is_what_was_written(watched_run):
+    config, record = watched_run
+    assert mechanism.read_record(config.output) == json.loads(json.dumps(record))
+    assert record["config"]["scene"] == os.path.basename(config.scene) and record["config"]["output"] is None
+    assert record["probe_seconds"] > 0 and record["train_seconds"] > 0
+
+
+def test_a_run_without_resets(steady):
+    assert steady["resets"] == [] and [state["iteration"] for state in steady["states"]] == [100]
+    assert steady["summary"]["net_pull"]["after_resets"] is None and steady["summary"]["settled_opacity"] is None
+    assert steady["summary"]["pruned"]["large"] == 0
+
+
+def test_what_never_happened_leaves_a_panel_empty(steady):
+    pytest.importorskip("matplotlib", reason="figures need matplotlib")
+    from diff_smoe_rasterization.benchmarks import mechanism_plots
+
+    nothing = {**steady, "densifications": []}
+    for draw in (mechanism_plots.opacity, mechanism_plots.pruning, mechanism_plots.densification):
+        for record in (steady, nothing):
+            draw(mechanism_plots.named([record])).canvas.draw()
+    mechanism_plots.plt.close("all")
+
+
+@pytest.fixture
+def probe_of(tiny_scene, tmp_path):
+    """From a blend mode to the probe of an untrained model."""
+    def made(mode):
+        config = config_of(tiny_scene, tmp_path, mode)
+        trainer = Trainer(config, load_scene(config, progress=False))
+        return Probe(trainer.renderer, trainer.scene)
+    return made
+
+
+def test_a_share_is_what_a_gaussian_alone_lights_up(probe_of, mode):
+    probe = probe_of(mode)
+    shares = probe.shares()
+    for index in range(0, probe.model.num_gaussians, 40):
+        lit = torch.zeros(probe.model.num_gaussians, 3)
+        lit[index] = 1
+        with torch.no_grad():
+            total = sum(float(probe.renderer(camera, colors_precomp=lit)[0].color[1].sum())
+                        for camera, _ in probe.train)
+        assert float(shares.colors[index]) == pytest.approx(total, rel=1e-3, abs=1e-6)  # float32 sums
+    if mode == "alpha":
+        torch.testing.assert_close(shares.colors, shares.weights, rtol=1e-4, atol=1e-5)  # sums in another order
+    else:  # a gate sum below 1 raises a share, and smoe_std's may be above
+        assert not torch.allclose(shares.colors, shares.weights, rtol=0.01)
+    assert all(tensor.grad is None for tensor in probe.model.raw.values())
+
+
+def test_near_edges_are_those_that_the_camera_projects_there(probe_of):
+    probe = probe_of("alpha")
+    generator = torch.Generator().manual_seed(0)
+    chosen = torch.rand(probe.model.num_gaussians, generator=generator) < 0.3
+    means = probe.model.raw["means3D"].detach().double().numpy()
+    near, seen = [], []
+    for camera, mask in probe.train:
+        x, y, z = camera.rotation @ means.T + camera.translation[:, None]
+        column, row = (np.floor(value).astype(int) for value in (camera.fx * x / z + camera.cx,
+                                                                 camera.fy * y / z + camera.cy))
+        inside = (z > 0.2) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        near.append(inside & mask.numpy()[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)])
+        seen.append(inside)
+    near, seen = np.stack(near), np.stack(seen)
+    found = probe.edges(chosen)
+    # A centre within rounding of a pixel's border may fall on either side: one of the seen.
+    assert found["all"] == pytest.approx(near.sum() / seen.sum(), abs=1.5 / seen.sum())
+    only = seen[:, chosen.numpy()].sum()
+    assert found["chosen"] == pytest.approx(near[:, chosen.numpy()].sum() / only, abs=1.5 / only)
+    assert 0 < found["area"] < 1 and found["chosen"] != found["all"]
+    assert probe.edges(torch.zeros_like(chosen))["chosen"] is None
+
+
+def test_quantiles_are_values():
+    values = torch.arange(101.0).flip(0)
+    assert quantiles(values) == [1, 10, 25, 50, 75, 90, 99]
+    assert median(torch.tensor([3.0, 1.0, 2.0])) == 2
+    assert quantiles(values[:0]) is None and median(values[:0]) is None
+
+
+def test_an_opacity_gradient_is_of_the_gaussians_that_it_reaches():
+    found = opacity_gradient(torch.tensor([-1.0, 0.0, 3.0, -5.0, 0.0]))
+    assert found == {"reached": 3, "mean": -1, "mean_absolute": 3, "median_absolute": 3, "raised": 2 / 3}
+    assert opacity_gradient(torch.zeros(3))["reached"] == 0
+
+
+def test_the_net_pull_is_over_the_steps_since_the_last_state(tiny_scene, tmp_path):
+    config = config_of(tiny_scene, tmp_path / "out", "alpha")
+    trainer = Trainer(config, load_scene(config, progress=False))
+    recorder = mechanism.Recorder(trainer)
+    logits = trainer.model.raw["opacities"]
+    for iteration, value in ((99, -1.0), (100, 0.5), (200, 2.0)):
+        logits.grad = torch.full_like(logits, value)
+        recorder.before_change(Step(iteration, None, None, None, None))
+    assert [state["net_pull"] for state in recorder.states] == pytest.approx([(1 - 0.5) / (1 + 0.5), -1])
+
+
+def test_a_folder_with_a_run_is_not_overwritten(watched_run):
+    with pytest.raises(TrainerError, match="already holds"):
+        mechanism.run(watched_run[0], progress=False)
+
+
+def test_the_command_trains_and_explains_its_errors(tiny_scene, tmp_path, capsys):
+    out = str(tmp_path / "out")
+    assert mechanism.main(["run", tiny_scene, out, "--blend-mode", "smoe", "--iterations", "100", "--scale-recipe",
+                           "--quiet"]) == 0
+    assert json.loads(capsys.readouterr().out)["num_gaussians"] > 0
+    assert TrainConfig.load(out).opacity_reset_interval == 10
+    assert mechanism.main(["run", tiny_scene, out, "--quiet"]) == 1
+    assert "already holds" in capsys.readouterr().err
+
+
+def test_three_figures_show_the_series_of_all_runs(runs, tmp_path, capsys):
+    pytest.importorskip("matplotlib", reason="figures need matplotlib")
+    from diff_smoe_rasterization.benchmarks import mechanism_plots
+
+    folders, records = [config.output for config, _ in runs.values()], [record for _, record in runs.values()]
+    assert mechanism.main(["plot", str(tmp_path), "-o", str(tmp_path)]) == 1
+    assert "mechanism.json" in capsys.readouterr().err
+    assert mechanism.main(["plot", *folders, "-o", str(tmp_path)]) == 0
+    assert sorted(os.listdir(tmp_path)) == sorted(
+        f"mechanism-{name}{end}" for name in ("opacity", "pruning", "densification")
+        for end in (".png", "-light.svg", "-dark.svg"))
+    named = mechanism_plots.named(records)
+    assert [run.label for run in named] == ["alpha", "smoe"]
+    drawn = mechanism_plots.opacity(named)
+    psnr, after = drawn.axes[4:6]
+    for line, record in zip([line for line in psnr.lines if len(line.get_xdata()) > 2], records):
+        assert line.get_ydata().tolist() == [state["psnr"] for state in record["states"]]
+    # The last reset first; each from the state before it, where there is one, to the next reset.
+    assert [line.get_xdata()[[0, 1, -1]].tolist() for line in after.lines[:3]] == [[0, 1, 110], [0, 1, 60], [1, 10, 60]]
+    mechanism_plots.plt.close("all")
+
+
+def test_runs_are_named_by_what_tells_them_apart(runs):
+    pytest.importorskip("matplotlib", reason="figures need matplotlib")
+    from diff_smoe_rasterization.benchmarks import mechanism_plots
+
+    record = runs["alpha"][1]
+    other = {**record, "config": {**record["config"], "densify_grad_threshold": 0.005}}
+    assert [run.label for run in mechanism_plots.named([record, other])] == ["alpha 0.002", "alpha 0.005"]
