@@ -195,7 +195,8 @@ class DBS(ThreeDGS):
     all: the protocol's iterations, the last model.
     """
 
-    stubs = (*ThreeDGS.stubs, "viser", "nerfview")  # its viewer
+    # Of its viewer, of its compression, and one that its rasterizer imports and does not use.
+    stubs = (*ThreeDGS.stubs, "viser", "nerfview", "plas", "turtle")
     observed = ("--hold-out", "--model-renders", "beta_model")
 
     def train(self) -> Dict[str, Any]:
