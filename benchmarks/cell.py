@@ -1,6 +1,6 @@
 """One cell: one training and its measurement, from a file of plain values to a row.
 
-    python -m diff_smoe_rasterization.benchmarks.cell CELL.json OUT [--gpus 0,1 --locks FOLDER]
+    python -m diff_smoe_rasterization.benchmarks.cell CELL.json OUT [--gpus 0,1 --per-gpu 2 --locks FOLDER]
 
 OUT/row.json is written in any case but one: where this command itself is killed, so that whoever started it starts it
 again. The work is done in a process of its own, whose end, a crash or a lack of memory included, becomes a row with the
@@ -9,6 +9,7 @@ reason. OUT/log.txt is what it printed.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import shutil
@@ -23,6 +24,7 @@ from ..trainer.errors import TrainerError
 from ..trainer.files import write_json_atomically
 
 ROW_NAME, LOG_NAME = "row.json", "log.txt"
+SHARING_NAME = "cells_per_gpu.json"  # beside a checkpoint: its seconds were counted beside so many cells
 
 
 def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
@@ -44,13 +46,17 @@ def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float])
             "commit": {"project": None, "trainer": None}, "machine": {}, "history": [], "per_view": []}
 
 
-def measured_row(cell: Dict[str, Any], output: str, started: float) -> Dict[str, Any]:
-    """Trains and measures. Raises what goes wrong."""
+def measured_row(cell: Dict[str, Any], output: str, started: float,
+                 cells_per_gpu: Optional[int] = None) -> Dict[str, Any]:
+    """Trains and measures. cells_per_gpu: as `supervise` has it. Raises what goes wrong."""
     from ..trainer.results import result_row
     from . import methods, protocol
     from .measure import headline_lpips
 
+    earlier = note_sharing(output, cells_per_gpu)
     outcome = methods.run(cell, output)
+    if outcome.notes.get("continued"):  # train_seconds goes on from what the earlier attempt counted
+        cells_per_gpu = max(filter(None, (cells_per_gpu, earlier)), default=None)
     config = protocol.config_of(cell, output)
     metrics = outcome.evaluation.metrics
     trained = result_row(config, outcome.scene, outcome.num_gaussians, outcome.train_seconds, outcome.evaluation)
@@ -64,8 +70,20 @@ def measured_row(cell: Dict[str, Any], output: str, started: float) -> Dict[str,
             "fps": outcome.evaluation.fps, "peak_gpu_mib": outcome.peak_gpu_mib,
             "protocol": {**rules, **outcome.notes},
             "commit": {"project": protocol.project_commit(), "trainer": outcome.commit},
-            "machine": protocol.machine_of(config.device), "history": outcome.history,
+            "machine": protocol.machine_of(config.device, cells_per_gpu), "history": outcome.history,
             "per_view": outcome.evaluation.per_view}
+
+
+def note_sharing(output: str, cells_per_gpu: Optional[int]) -> Optional[int]:
+    """Writes beside the checkpoint how many cells may have this one's GPU; returns the most of earlier attempts."""
+    path, earlier = os.path.join(output, "run", SHARING_NAME), None
+    if os.path.isfile(path):
+        with open(path, encoding="utf-8") as file:
+            earlier = json.load(file)
+    if (cells_per_gpu or 0) > (earlier or 0):
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        write_json_atomically(path, cells_per_gpu)
+    return earlier
 
 
 def write_images(output: str, outcome: Any) -> None:
@@ -82,11 +100,11 @@ def write_images(output: str, outcome: Any) -> None:
             to_image(image_of(name)).save(os.path.join(folder, names[name] + ".png"))
 
 
-def work(cell: Dict[str, Any], output: str, started: float) -> None:
+def work(cell: Dict[str, Any], output: str, started: float, cells_per_gpu: Optional[int] = None) -> None:
     """The inner process: writes the row, and removes what is no longer needed. Raises nothing but what kills it."""
     path = os.path.join(output, ROW_NAME)
     try:
-        row = measured_row(cell, output, started)
+        row = measured_row(cell, output, started, cells_per_gpu)
     except Exception as error:  # whatever it is, it is the row's reason; KeyboardInterrupt and SystemExit are not
         if not isinstance(error, TrainerError):
             traceback.print_exc()
@@ -98,8 +116,11 @@ def work(cell: Dict[str, Any], output: str, started: float) -> None:
     write_json_atomically(path, row)
 
 
-def supervise(cell_path: str, output: str, gpu: Optional[str] = None) -> Dict[str, Any]:
-    """Runs `work` in a process of its own and returns the row that is in OUT then."""
+def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_gpu: int = 1) -> Dict[str, Any]:
+    """Runs `work` in a process of its own and returns the row that is in OUT then.
+
+    gpu: the one that the process is given, together with other cells up to per_gpu in all; None: as the machine has it.
+    """
     with open(cell_path, encoding="utf-8") as file:
         cell = json.load(file)
     os.makedirs(output, exist_ok=True)
@@ -111,6 +132,7 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None) -> Dict[st
         environment["CUDA_VISIBLE_DEVICES"] = gpu
     started = time.time()
     command = [sys.executable, "-m", __spec__.name if __spec__ else __name__, cell_path, output, "--inside"]
+    command += ["--per-gpu", str(per_gpu)] if gpu is not None else []
     with open(log_path, "ab") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                                    env=environment, preexec_fn=die_with_parent)
@@ -147,14 +169,17 @@ def how_it_ended(status: int, log_path: str) -> str:
     return f"the process {how}{memory}" + (f"; its last line: {lines[-1][:300]}" if lines else "")
 
 
-def claim_gpu(gpus: List[str], folder: str, poll_seconds: float = 1.0) -> Any:
-    """Waits for a GPU that no other cell of these locks has; returns (its name, the lock, which is to be kept open)."""
+def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Any:
+    """Waits for a GPU that fewer than per_gpu cells of these locks have: one that none has, where there is one.
+
+    Returns (its name, the lock, which is to be kept open).
+    """
     import fcntl
 
     os.makedirs(folder, exist_ok=True)
     while True:
-        for gpu in gpus:
-            lock = open(os.path.join(folder, f"gpu_{gpu}.lock"), "w")
+        for slot, gpu in itertools.product(range(per_gpu), gpus):
+            lock = open(os.path.join(folder, f"gpu_{gpu}_{slot}.lock"), "w")
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return gpu, lock
@@ -169,18 +194,20 @@ def main(argv: Optional[List[str]] = None) -> int:
                                      description="Trains and measures one cell of a suite.")
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
     parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
-    parser.add_argument("--gpus", metavar="N,N", default="", help="take one of these GPUs that no other cell has")
+    parser.add_argument("--gpus", metavar="N,N", default="", help="take one of these GPUs")
+    parser.add_argument("--per-gpu", metavar="K", type=int, help="cells that may have one GPU at once (default: 1)")
     parser.add_argument("--locks", metavar="FOLDER", help="where cells tell each other which GPU they have")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
     if arguments.inside:
         with open(arguments.cell, encoding="utf-8") as file:
-            work(json.load(file), arguments.output, time.time())
+            work(json.load(file), arguments.output, time.time(), arguments.per_gpu)
         return 0
-    gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output) if arguments.gpus else (None,
-                                                                                                                 None)
+    gpu, lock, per_gpu = None, None, arguments.per_gpu or 1
+    if arguments.gpus:
+        gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_gpu)
     try:
-        row = supervise(arguments.cell, arguments.output, gpu)
+        row = supervise(arguments.cell, arguments.output, gpu, per_gpu)
     finally:
         if lock:
             lock.close()

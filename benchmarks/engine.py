@@ -30,12 +30,13 @@ NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", 
 
 def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = None,
               slurm: Optional[Sequence[str]] = None, retry_failed: bool = False, dry_run: bool = False,
-              only: Sequence[str] = ()) -> List[Dict[str, Any]]:
+              only: Sequence[str] = (), per_gpu: int = 1) -> List[Dict[str, Any]]:
     """Runs what is not done of a suite; returns the rows of its cells, failed ones included.
 
-    name: a file or a shipped suite. results: by default bench_results/NAME. jobs: cells at once, by default one per
-    GPU, or one on the CPU. slurm: None, or Snakemake's default resources ("slurm_partition=gpu"). only: "field=value"
-    of cells that are run. Raises BenchError.
+    name: a file or a shipped suite. results: by default bench_results/NAME. jobs: cells at once, by default per_gpu
+    on each GPU, or one on the CPU. slurm: None, or Snakemake's default resources ("slurm_partition=gpu"). only:
+    "field=value" of cells that are run. per_gpu: cells that one GPU is given at once; beyond 1 their times are not the
+    GPU's own, and rows say so. Raises BenchError.
     """
     suite = load_suite(find_suite(name))
     cells = chosen(suite.cells, only)
@@ -49,7 +50,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     os.makedirs(results, exist_ok=True)
     with only_one(results):
         write_cells(suite, cells, results, retry_failed)
-        status = subprocess.call(command(suite, cells, results, jobs, slurm), env=environment())
+        status = subprocess.call(command(suite, cells, results, jobs, slurm, per_gpu), env=environment())
         rows = collect(results)
     here = [rows[cell["id"]] for cell in cells if cell["id"] in rows]
     lacking = len(cells) - len(here)
@@ -156,7 +157,7 @@ def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
         paths = {key: prepared_checkout(method, key, results) for key in ("path", "base") if key in method}
     except (patches.PatchError, BenchError, OSError) as error:
         return {**method, "refused": " ".join(str(error).split())}
-    return {**method, **paths, "commit": commit_of(method["path"])}
+    return {**method, **paths, "commit": commit_of(method["path"]) or method.get("commit")}
 
 
 def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
@@ -189,7 +190,7 @@ def patched_copy(path: str, folder: str) -> str:
 
 
 def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optional[int],
-            slurm: Optional[Sequence[str]]) -> List[str]:
+            slurm: Optional[Sequence[str]], per_gpu: int = 1) -> List[str]:
     """Snakemake's command line. Raises BenchError."""
     on_gpu = suite.protocol["device"] == "cuda"
     gpus = visible_gpus() if on_gpu and slurm is None else []
@@ -197,19 +198,24 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
         raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine")
     if jobs is not None and jobs < 1:
         raise BenchError(f"--jobs is {jobs}; it must be at least 1")
-    at_once = jobs or (len(cells) if slurm is not None else max(1, len(gpus)))
+    if per_gpu < 1:
+        raise BenchError(f"--per-gpu is {per_gpu}; it must be at least 1")
+    if per_gpu > 1 and not gpus:
+        raise BenchError(f"--per-gpu is {per_gpu}; it is for protocol.device cuda, without --slurm")
+    at_once = jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus)))
     words = [sys.executable, "-m", "snakemake", "all", "--snakefile", SNAKEFILE, "--directory", results, "--nolock",
              "--quiet", "host", "reason", "rules", "--keep-going", "--rerun-incomplete",
              "--rerun-triggers", "mtime", "--scheduler", "greedy",
              "--config", f"cells={json.dumps([cell['id'] for cell in cells])}", f"python={sys.executable}",
-             f"device={suite.protocol['device']}", f"gpus={','.join(gpus)}"]
+             f"device={suite.protocol['device']}", f"per_gpu={per_gpu}",
+             f"gpus={json.dumps(gpus)}"]  # a list: Snakemake takes a bare 0 for a number
     if slurm is not None:
         if importlib.util.find_spec("snakemake_executor_plugin_slurm") is None:
             raise BenchError("--slurm needs Snakemake's plugin: pip install snakemake-executor-plugin-slurm")
         words += ["--executor", "slurm", "--jobs", str(at_once)]
         words += ["--default-resources", *slurm] if slurm else []
     else:
-        words += ["--cores", str(at_once)] + (["--resources", f"gpu={len(gpus)}"] if on_gpu else [])
+        words += ["--cores", str(at_once)] + (["--resources", f"gpu={per_gpu * len(gpus)}"] if on_gpu else [])
     headline = [f"cells/{cell['id']}/{ROW_NAME}" for cell in cells if cell["headline"]]
     return words + (["--prioritize", *headline] if headline else [])
 
@@ -260,10 +266,11 @@ def rows_table(rows: List[Dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         name = f"{row['label']}  {row['scene']}  {row['blend_mode']}  {row['densify_grad_threshold']:g}  s{row['seed']}"
+        at_once = row["machine"].get("cells_per_gpu") or 1
         if row["ok"]:
             lines.append(f"{name}:  {_shown(row['psnr'], '.2f')} dB  SSIM {_shown(row['ssim'], '.4f')}  "
                          f"{row['num_gaussians']:,} Gaussians  {_shown(row['train_seconds'], '.1f')} s  "
-                         f"{_shown(row['fps'], '.1f')} FPS")
+                         f"{_shown(row['fps'], '.1f')} FPS" + (f" ({at_once} cells on a GPU)" if at_once > 1 else ""))
         else:
             lines.append(f"{name}:  FAILED: {row['reason']}")
     return "\n".join(lines)

@@ -78,9 +78,10 @@ def common_bytes(num_gaussians: int) -> int:
     return num_gaussians * FLOATS_PER_GAUSSIAN * 4
 
 
-def machine_of(device: str) -> Dict[str, Any]:
-    """What a cell ran on."""
-    return {"device": machine(device), "versions": versions()}
+def machine_of(device: str, cells_per_gpu: Optional[int] = None) -> Dict[str, Any]:
+    """What a cell ran on. cells_per_gpu: how many may have had its GPU at once; None where nobody counted."""
+    shared = {} if cells_per_gpu is None else {"cells_per_gpu": cells_per_gpu}
+    return {"device": machine(device), **shared, "versions": versions()}
 
 
 def project_commit() -> Optional[str]:

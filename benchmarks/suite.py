@@ -147,7 +147,7 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     given = {key: value for key, value in method.items() if key not in AXES}
     axes = {axis: method[axis] for axis in AXES if axis in method}
     if name == NATIVE:
-        wrong = [key for key in ("variant", "path", "base", "python", "pythonpath", "arguments")
+        wrong = [key for key in ("variant", "path", "base", "python", "pythonpath", "arguments", "commit")
                  if key in given and given[key] != "native"]
         if wrong:
             raise BenchError(f"{where}.{wrong[0]}: is for checkouts; the native trainer's recipe stands in "

@@ -16,7 +16,6 @@ _OPS = torch.ops.diff_smoe_rasterization
 _CAN_REGISTER = hasattr(torch.library, "register_autograd")
 _NUM_INPUTS = 13  # tensors before the options
 _NUM_OPTIONS = 15  # options that the backward op takes too
-_NUM_CHECKS = 2  # strict, prefiltered
 _NUM_IMAGES = 5  # results that are the caller's: color, radii, gate_sum, depth, inverse_depth
 _RADII, _DEPTH = 1, 3
 _BLEND_MODE = _NUM_INPUTS + 8  # among the op's arguments
@@ -48,7 +47,8 @@ def _input_gradients(ctx, gradients, outputs, inputs, op):
     wanted = list(ctx.needs_input_grad[:_NUM_INPUTS])
     image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
     results = iter(op(*image_gradients, inputs, ctx.present, outputs, *ctx.options, wanted))
-    return tuple(next(results) if want else None for want in wanted) + (None,) * (_NUM_OPTIONS + _NUM_CHECKS)
+    no_tensors = len(ctx.needs_input_grad) - _NUM_INPUTS
+    return tuple(next(results) if want else None for want in wanted) + (None,) * no_tensors
 
 
 def _backward(ctx, *gradients):
@@ -95,13 +95,13 @@ def rasterize_op(*inputs):
     if torch.is_grad_enabled() and any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs):
         return _Rasterize.apply(*inputs)
     with _below_autograd():
-        return _OPS.rasterize.default(*inputs)
+        return _OPS.rasterize.default(*inputs, for_backward=False)
 
 
 def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
                     viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier, near,
                     alpha_min, sh_degree, blend_mode, antialiasing, depth, inverse_depth, deterministic,
-                    debug, clamp_color, strict, prefiltered):
+                    debug, clamp_color, strict, prefiltered, for_backward=True):
     """The results' shapes and types, as csrc/torch/tensors.cpp allocates them."""
     count = means3D.shape[0]
     channels = 3 if colors_precomp is None else colors_precomp.shape[1]
@@ -113,8 +113,8 @@ def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales
         feature_row, num_tile_offsets, instance_row, in_order = (num_features + 3) // 4 * 4, tiles + 2, 1, count
         instance_offsets, segments, segment_queue = (0,), (0,), (0,)
         if means3D.dtype == torch.float32 and num_features == 3:
-            rows = num_instances // _C.constants["segment_length"] + 1
-            segments, segment_queue = (rows, 4 * tile * tile), (1 + 4 * rows, 2)
+            rows = num_instances // _C.constants["segment_length"] + 1 if for_backward else 0
+            segments, segment_queue = (rows, 4 * tile * tile), (1 + 4 * rows if for_backward else 0, 2)
         if deterministic:
             instance_row, instance_offsets = 2, (count, 2)
     else:

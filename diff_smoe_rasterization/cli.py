@@ -131,6 +131,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                                                     "fig4, fig5, captures, captures_ablation")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
     run.add_argument("--jobs", type=int, metavar="N", help="cells at once (default: one per GPU; one on the CPU)")
+    run.add_argument("--per-gpu", type=int, default=1, metavar="K",
+                     help="cells that share a GPU (default: 1); beyond 1 their times and FPS stay out of the report")
     run.add_argument("--slurm", nargs="*", metavar="KEY=VALUE",
                      help="submit cells to Slurm; resources of each, such as slurm_partition=gpu runtime=120")
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
@@ -150,7 +152,7 @@ def _bench_run(arguments: argparse.Namespace) -> int:
     from .benchmarks.engine import rows_table, run_suite
 
     rows = run_suite(arguments.suite, arguments.output, arguments.jobs, arguments.slurm, arguments.retry_failed,
-                     arguments.dry_run, arguments.only)
+                     arguments.dry_run, arguments.only, arguments.per_gpu)
     if rows:
         print(rows_table(rows))
     failed = sum(not row["ok"] for row in rows)

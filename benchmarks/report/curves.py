@@ -91,11 +91,15 @@ def rate_distortion(groups: Sequence[Group]):
 
 
 def bars(groups: Sequence[Group]):
-    """Training seconds and frames per second, a bar for each setting; whiskers are the spread over seeds."""
+    """Training seconds and frames per second, a bar for each setting; whiskers are the spread over seeds.
+
+    Settings without either, such as those whose cells shared a GPU, are left out.
+    """
     rows = [row for group in groups for row in group.rows]
     figures = [name for name in ("train_seconds", "fps") if _measured(rows, name)]
     if not figures:
         return None
+    groups = [group for group in groups if any(group.by_seed(name) for name in figures)]
     styles = _styles(groups)
     amounts = list(dict.fromkeys(group.setting.amount() for group in
                                  sorted(groups, key=lambda group: (group.setting.budget or 0,

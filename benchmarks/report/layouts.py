@@ -6,14 +6,17 @@ import json
 import os
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
-from .rows import (Group, Row, Setting, figure, grouped, lpips_figures, lpips_reasons, order,
-                   over_scenes, paired, safe_name)
+from .rows import (Group, Measured, Row, Setting, figure, grouped, lpips_figures, lpips_reasons, order,
+                   over_scenes, paired, safe_name, shared_gpu)
 from .tables import (OURS, PAPER, Cell, Column, Table, TableRow, cell, column, printed, without_empty_columns)
 
 Paper = Dict[str, Any]
 END_NAMES = ("sparse", "dense")
 UNTOUCHED = "3dgs"  # the schedule of the paper's protocol
 ABLATION = {"smoe": "full", "smoe_tn": "without T_d", "smoe_std": "without T_n,d"}
+SHARED = "shared"  # stands for a time or FPS where there is none for this reason
+SHARED_NOTE = ("Times and FPS are of cells that had their GPU alone. shared: several cells had one GPU at once, so "
+               "theirs are not the GPU's; the rows have them.")
 SPREAD_NOTE = "± is the sample standard deviation over seeds; figures without it are of one seed."
 
 
@@ -130,8 +133,8 @@ def deltas(groups: Sequence[Group], paper: Paper) -> Table:
             continue
         failed = [f"{mode.setting.blend_mode} failed" for mode in (group, gated) if not mode.rows]
         cells_ = [cell(paired(group, gated, name, lambda new, old: new - old)) for name in differences]
-        cells_ += [cell(paired(group, gated, name, lambda new, old: new / old if old else float("nan")))
-                   for name in ratios]
+        cells_ += [_or_shared(paired(group, gated, name, lambda new, old: new / old if old else float("nan")),
+                              (group, gated), name) for name in ratios]
         if failed:
             cells_[0] = Cell(text=", ".join(failed))
         seeds = len(set(group.by_seed("psnr")) & set(gated.by_seed("psnr")))
@@ -140,7 +143,7 @@ def deltas(groups: Sequence[Group], paper: Paper) -> Table:
     columns = [column(name, difference=True) for name in differences]
     columns += [Column(f"{column(name).name.partition(' [')[0]} ratio", 2) for name in ratios]
     notes = ("Δ: smoe less alpha; ratio: smoe over alpha; of seeds that both have. The paper's are of its printed "
-             "averages over a data set.", SPREAD_NOTE)
+             "averages over a data set.", SPREAD_NOTE, *_shared_notes(_rows(groups)))
     return without_empty_columns(Table("deltas", "smoe against alpha, all else equal",
                                        ("scene", "method", "threshold", "seeds"), tuple(columns), tuple(rows), notes))
 
@@ -186,11 +189,21 @@ def _average(by_scene: Dict[str, Group], scenes: Sequence[str], name: str) -> Ce
         if len(scenes) > 1:
             text += ": " + ", ".join(failed or absent)
         return Cell(text=text if name == "psnr" else "")
-    return cell(over_scenes([by_scene[scene] for scene in scenes], name))
+    groups = [by_scene[scene] for scene in scenes]
+    return _or_shared(over_scenes(groups, name), groups, name)
 
 
 def _seeds_cell(group: Group, name: str) -> Cell:
-    return Cell(text="failed") if name == "psnr" and group.failed and not group.rows else cell(group.measured(name))
+    if name == "psnr" and group.failed and not group.rows:
+        return Cell(text="failed")
+    return _or_shared(group.measured(name), [group], name)
+
+
+def _or_shared(measured: Measured, groups: Sequence[Group], name: str) -> Cell:
+    """The figure; where it is absent because cells of a group shared their GPU, that."""
+    if measured.mean is None and any(group.shared(name) for group in groups):
+        return Cell(text=SHARED)
+    return cell(measured)
 
 
 def _printed(names: Sequence[str], values: Optional[Sequence[str]], name: str) -> Cell:
@@ -228,7 +241,11 @@ def _notes(groups: Sequence[Group]) -> List[str]:
     if machines:
         notes.append(f"Measured on {', '.join(machines)}; times and FPS compare on one machine only.")
     notes += sorted({row["fps_note"] for row in rows if row.get("fps_note")})
-    return notes
+    return notes + _shared_notes(rows)
+
+
+def _shared_notes(rows: Sequence[Row]) -> List[str]:
+    return [SHARED_NOTE] if any(map(shared_gpu, rows)) else []
 
 
 def _machine(row: Row) -> str:

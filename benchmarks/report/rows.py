@@ -20,6 +20,7 @@ RULES = ("split", "resolution", "image_size", "downscaler", "background", "princ
 RULE_PREFIXES = ("psnr", "ssim", "lpips", "edge", "fps", "size", "quantisation")
 PAPER_ITERATIONS = 30000
 MEGABYTE = 1e6
+TIMES = ("train_seconds", "wall_seconds", "fps")  # of cells that shared their GPU these are not the GPU's own
 LPIPS = "lpips:"  # the figure's name goes on with its kind, such as lpips_alex
 
 
@@ -107,6 +108,10 @@ class Group:
         """The figure's mean and spread over seeds."""
         return measured(self.by_seed(name).values())
 
+    def shared(self, name: str) -> bool:
+        """Whether the figure is left out because every cell shared its GPU."""
+        return name in TIMES and bool(self.rows) and all(map(shared_gpu, self.rows))
+
     def seeds(self) -> str:
         """How many seeds the figures are of, such as "3", or "2 of 3" where one failed."""
         return str(len(self.rows)) if not self.failed else f"{len(self.rows)} of {len(self.rows) + len(self.failed)}"
@@ -166,7 +171,12 @@ def _refuse_mixed_protocols(rows: Iterable[Row]) -> None:
 
 
 def figure(row: Row, name: str) -> Optional[float]:
-    """A figure of a row by its name: a field; size_own_mb, size_common_mb, num_gaussians_m; lpips:KIND."""
+    """A figure of a row by its name: a field; size_own_mb, size_common_mb, num_gaussians_m; lpips:KIND.
+
+    None where it was not measured, and for times of a cell that shared its GPU.
+    """
+    if name in TIMES and shared_gpu(row):
+        return None
     if name.startswith(LPIPS):
         return next((lpips["value"] for lpips in _lpips(row) if lpips["kind"] == name[len(LPIPS):]), None)
     if name in ("size_own_mb", "size_common_mb"):
@@ -176,6 +186,12 @@ def figure(row: Row, name: str) -> Optional[float]:
         count = row.get("num_gaussians")
         return None if count is None else count / 1e6
     return row.get(name)
+
+
+def shared_gpu(row: Row) -> bool:
+    """Whether other cells may have been at work on the row's GPU."""
+    machine = row.get("machine")
+    return isinstance(machine, dict) and (machine.get("cells_per_gpu") or 1) > 1
 
 
 def lpips_figures(rows: Iterable[Row]) -> List[str]:

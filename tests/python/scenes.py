@@ -150,6 +150,6 @@ def gradients(function, scene, outputs=(), camera=True):
 def op_arguments(scene, op="rasterize", **others):
     """Returns the arguments of an op for a scene and all optional images, by the op's schema; others: by name."""
     values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(scene.settings.blend_mode), "depth": True,
-              "inverse_depth": True, **scene.inputs, **others}
+              "inverse_depth": True, "for_backward": True, **scene.inputs, **others}
     schema = getattr(torch.ops.diff_smoe_rasterization, op).default._schema
     return tuple(values.get(argument.name) for argument in schema.arguments)

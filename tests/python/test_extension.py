@@ -33,6 +33,9 @@ def copied_package(tmp_path, monkeypatch):
     folder = tmp_path / name
     shutil.copytree(Path(diff_smoe_rasterization.__file__).parent, folder,
                     ignore=shutil.ignore_patterns("_C*", "_build_info.py", "__pycache__", "csrc", "include"))
+    for beside in ("integrations", "patches", "benchmarks"):  # in a source tree; they are parts of an installed package
+        if not (folder / beside).exists():
+            shutil.copytree(WHERE_THE_PACKAGE_LIES / beside, folder / beside)
     monkeypatch.syspath_prepend(tmp_path)
     yield folder, lambda submodule="": importlib.import_module(name + submodule)
     for module in [module for module in sys.modules if module.split(".")[0] == name]:

@@ -68,6 +68,17 @@ def test_opcheck_of_rasterize(mode, case):
     opcheck_rasterize(scene)
 
 
+def test_rasterize_without_a_backward_pass_to_come(mode):
+    """The fake kernel says the shapes of that too, and the images are the same."""
+    scene = random_scene(mode, 20, 20, 18, dtype=torch.float32, degree=1)
+    op, arguments = (torch.ops.diff_smoe_rasterization.rasterize.default,
+                     {wanted: op_arguments(scene, depth=False, inverse_depth=False, for_backward=wanted)
+                      for wanted in (True, False)})
+    torch.library.opcheck(op, arguments[False], test_utils=("test_schema", "test_faketensor"))
+    for kept, lean in zip(op(*arguments[True])[:NUM_IMAGES], op(*arguments[False])[:NUM_IMAGES]):
+        assert torch.equal(kept, lean)
+
+
 def test_opcheck_of_rasterize_on_no_gaussians(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32).rows(slice(0, 0)).requiring_grad()
     opcheck_rasterize(scene)

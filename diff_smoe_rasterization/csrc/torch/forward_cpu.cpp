@@ -13,13 +13,13 @@ namespace dsmoe {
 namespace binding {
 namespace {
 
-template <class S> Outputs forward(const Inputs& inputs, const Options& options, ForwardChecks checks) {
+template <class S> Outputs forward(const Inputs& inputs, const Options& options, ForwardOptions own) {
   const auto gaussians = gaussian_inputs<S>(inputs, options);
   const auto view = camera<S>(inputs, options);
   auto config = raster_config<S>(inputs, options);
   config.num_threads = at::get_num_threads();
-  if (checks.strict) refuse_non_finite(inputs, cpu::first_non_finite(gaussians, config.num_channels));
-  if (checks.prefiltered) {
+  if (own.strict) refuse_non_finite(inputs, cpu::first_non_finite(gaussians, config.num_channels));
+  if (own.prefiltered) {
     const at::Tensor visible = at::empty({gaussians.num_gaussians}, at::kBool);
     cpu::mark_visible(gaussians.num_gaussians, gaussians.means3D, view, visible.data_ptr<bool>());
     refuse_culled(inputs, visible);
@@ -41,10 +41,10 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options,
   return outputs;
 }
 
-Outputs forward_any(const Inputs& inputs, const Options& options, ForwardChecks checks) {
+Outputs forward_any(const Inputs& inputs, const Options& options, ForwardOptions own) {
   Outputs outputs;
   AT_DISPATCH_FLOATING_TYPES(inputs[kMeans3D].scalar_type(), "rasterize",
-                             [&] { outputs = forward<scalar_t>(inputs, options, checks); });
+                             [&] { outputs = forward<scalar_t>(inputs, options, own); });
   return outputs;
 }
 

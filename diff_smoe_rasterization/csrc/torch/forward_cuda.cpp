@@ -50,7 +50,7 @@ int64_t counted_instances(const cuda::DeviceCamera<S>& camera, const RasterConfi
   return count;
 }
 
-template <class S> Outputs forward(const Inputs& inputs, const Options& options) {
+template <class S> Outputs forward(const Inputs& inputs, const Options& options, bool for_backward) {
   const cudaStream_t stream = at::cuda::getCurrentCUDAStream();
   const auto gaussians = gaussian_inputs<S>(inputs, options);
   const auto camera = device_camera<S>(inputs, options);
@@ -87,8 +87,10 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options)
               " tile instances; with deterministic=True the most is ", std::numeric_limits<uint32_t>::max());
   outputs[kInstances] = at::empty({capacity, saved.instance_width}, like.options().dtype(at::kInt));
   if (!outputs[kSegments].defined()) {
-    outputs[kSegments] = at::empty({cuda::num_segment_rows(capacity), cuda::kSegmentRow}, like.options());
-    outputs[kSegmentQueue] = at::empty({cuda::num_queue_entries(capacity), 2}, like.options().dtype(at::kInt));
+    const int64_t rows = for_backward ? cuda::num_segment_rows(capacity) : 0;
+    const int64_t entries = for_backward ? cuda::num_queue_entries(capacity) : 0;
+    outputs[kSegments] = at::empty({rows, cuda::kSegmentRow}, like.options());
+    outputs[kSegmentQueue] = at::empty({entries, 2}, like.options().dtype(at::kInt));
   }
   saved = saved_on_device<S>(outputs, options);
   {
@@ -108,15 +110,15 @@ template <class S> Outputs forward(const Inputs& inputs, const Options& options)
   return outputs;
 }
 
-Outputs forward_any(const Inputs& inputs, const Options& options, ForwardChecks checks) {
+Outputs forward_any(const Inputs& inputs, const Options& options, ForwardOptions own) {
   const c10::cuda::CUDAGuard guard(inputs[kMeans3D].device());
-  if (checks.strict) refuse_non_finite(inputs, first_non_finite(inputs));
-  if (checks.prefiltered) {
+  if (own.strict) refuse_non_finite(inputs, first_non_finite(inputs));
+  if (own.prefiltered) {
     refuse_culled(inputs, visible_positions(inputs[kMeans3D], inputs[kViewMatrix], options.near));
   }
   Outputs outputs;
   AT_DISPATCH_FLOATING_TYPES(inputs[kMeans3D].scalar_type(), "rasterize",
-                             [&] { outputs = forward<scalar_t>(inputs, options); });
+                             [&] { outputs = forward<scalar_t>(inputs, options, own.for_backward); });
   return outputs;
 }
 

@@ -13,12 +13,12 @@
 namespace dsmoe {
 namespace binding {
 
-// What happens besides the rendering itself.
-struct ForwardChecks {
-  bool strict, prefiltered;
+// What the forward pass alone is told: what it refuses, and whether a backward pass may follow.
+struct ForwardOptions {
+  bool strict, prefiltered, for_backward;
 };
 
-using ForwardFunction = Outputs (*)(const Inputs&, const Options&, ForwardChecks);
+using ForwardFunction = Outputs (*)(const Inputs&, const Options&, ForwardOptions);
 using BackwardFunction = void (*)(const Inputs&, const Options&, const Outputs&, const ImageGradientTensors&,
                                   const Inputs& gradients);
 
@@ -30,7 +30,7 @@ auto rasterize(const at::Tensor& means3D, const OptionalTensor& means2D, const a
                const at::Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
                double scale_modifier, double near, double alpha_min, int64_t sh_degree, int64_t blend_mode,
                bool antialiasing, bool depth, bool inverse_depth, bool deterministic, bool debug, bool clamp_color,
-               bool strict, bool prefiltered) {
+               bool strict, bool prefiltered, bool for_backward) {
   const auto given = [](const OptionalTensor& tensor) { return tensor.has_value() ? *tensor : at::Tensor(); };
   // clang-format off
   const Inputs inputs = {
@@ -44,7 +44,7 @@ auto rasterize(const at::Tensor& means3D, const OptionalTensor& means2D, const a
   if (debug) {
     for (int i = kBackground; i <= kCampos; ++i) refuse_nan(std::string("rasterize: ") + kInputNames[i], inputs[i]);
   }
-  const Outputs outputs = kForward(contiguous(inputs), options, {strict, prefiltered});
+  const Outputs outputs = kForward(contiguous(inputs), options, {strict, prefiltered, for_backward});
   if (debug) {
     for (Output image : kImageOfGradient) refuse_nan(std::string("rasterize: ") + kOutputNames[image], outputs[image]);
   }

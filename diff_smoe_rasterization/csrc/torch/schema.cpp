@@ -1,5 +1,6 @@
 // What torch knows of the ops. `alpha` and every other image but the colour is optional; what is made for the backward
-// pass are ordinary typed tensors among the results, so that torch accounts for their memory.
+// pass are ordinary typed tensors among the results, so that torch accounts for their memory. Without `for_backward`,
+// what only makes that pass faster is left out.
 #include <torch/library.h>
 
 #include <string>
@@ -16,11 +17,10 @@ const std::string kRasterize =
     "Tensor? scales, Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, "
     "Tensor campos, " +
     kOptions +
-    ", bool strict, bool prefiltered) -> "
+    ", bool strict, bool prefiltered, bool for_backward=True) -> "
     "(Tensor color, Tensor radii, Tensor gate_sum, Tensor depth, Tensor inverse_depth, Tensor projected, "
     "Tensor features, Tensor instance_offsets, Tensor tile_offsets, Tensor instances, Tensor final_transmittance, "
-    "Tensor last_contributor, Tensor order, Tensor segments, "
-    "Tensor segment_queue)";
+    "Tensor last_contributor, Tensor order, Tensor segments, Tensor segment_queue)";
 
 // inputs: the present ones of the 13 tensors of rasterize; outputs: all its results. Returned are the gradients of the
 // wanted inputs, in their order. The lists hold no None, or torch would not see that they require a gradient.

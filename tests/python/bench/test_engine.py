@@ -200,6 +200,66 @@ def test_two_cells_never_have_one_gpu(tmp_path):
     second.close(), third.close()
 
 
+def test_cells_that_share_gpus_are_spread_over_them_first(tmp_path):
+    claims = [cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2) for _ in range(4)]
+    assert [gpu for gpu, _ in claims] == ["3", "5", "3", "5"]
+    with pytest.raises(TimeoutError):  # a fifth waits
+        cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2, poll_seconds=Raises())
+    claims.pop(1)[1].close()
+    again, lock = cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2)
+    assert again == "5"
+    lock.close()
+    for _, lock in claims:
+        lock.close()
+
+
+class Raises:
+    """A number of seconds that is never waited."""
+
+    def __index__(self):
+        raise TimeoutError
+
+
+@pytest.fixture
+def worked(content, tmp_path):
+    """A function of an attempt's folder and its number of cells per GPU to its row."""
+    cell = expand({**content, "keep_models": True}, "").cells[0]
+
+    def row(name, cells_per_gpu):
+        (tmp_path / name).mkdir(exist_ok=True)
+        cells.work(cell, str(tmp_path / name), time.time(), cells_per_gpu)
+        return json.loads((tmp_path / name / "row.json").read_text())
+
+    return row
+
+
+def test_a_row_says_that_its_cell_shared_its_gpu(worked):
+    alone, shared, uncounted = worked("one", 1), worked("two", 2), worked("three", None)
+    assert (alone["machine"].pop("cells_per_gpu"), shared["machine"].pop("cells_per_gpu")) == (1, 2)
+    assert alone["machine"] == shared["machine"] == uncounted["machine"]
+    for row in (alone, shared):
+        assert row["ok"] and row["train_seconds"] > 0 and row["fps"] > 0
+    assert alone["cell"] == shared["cell"] and alone["protocol"] == shared["protocol"]
+
+
+def test_a_training_that_goes_on_from_one_that_shared_its_gpu_shared_it_too(worked):
+    """Its seconds hold those of the attempt that was not alone."""
+    worked("out", 3)
+    again = worked("out", 1)
+    assert again["protocol"]["continued"] and again["machine"]["cells_per_gpu"] == 3
+
+
+def test_the_process_of_a_cell_is_told_its_gpu_and_how_many_have_it(cell_file, tmp_path, monkeypatch):
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho $CUDA_VISIBLE_DEVICES $*\n")
+    python.chmod(0o755)
+    monkeypatch.setattr(cells.sys, "executable", str(python))
+    assert cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-gpu", "2",
+                       "--locks", str(tmp_path / "locks")]) == 0
+    said = (tmp_path / "out" / "log.txt").read_text().split()
+    assert said[0] == "7" and said[-3:] == ["--inside", "--per-gpu", "2"]
+
+
 def test_a_second_run_on_the_same_results_is_refused(tmp_path):
     with engine.only_one(str(tmp_path)):
         with pytest.raises(BenchError, match="another run"):
@@ -223,19 +283,43 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(engine, "visible_gpus", lambda: ["0", "2", "3"])
         words = engine.command(suite, suite.cells, "out", None, None)
-        assert words[words.index("--cores") + 1] == "3" and "gpu=3" in words and "gpus=0,2,3" in words
+        assert words[words.index("--cores") + 1] == "3" and "gpu=3" in words and 'gpus=["0", "2", "3"]' in words
         assert words[words.index("--prioritize") + 1:] == [f"cells/{suite.cells[1]['id']}/row.json"]
-        assert "--executor" not in words
+        assert "--executor" not in words and "per_gpu=1" in words
+        words = engine.command(suite, suite.cells, "out", None, None, per_gpu=4)
+        assert words[words.index("--cores") + 1] == "12" and "gpu=12" in words and "per_gpu=4" in words
+        words = engine.command(suite, suite.cells, "out", 5, None, per_gpu=4)
+        assert words[words.index("--cores") + 1] == "5" and "gpu=12" in words
+        with pytest.raises(BenchError, match="--per-gpu is 0"):
+            engine.command(suite, suite.cells, "out", None, None, per_gpu=0)
+        with pytest.raises(BenchError, match="--per-gpu is 2; it is for"):
+            engine.command(suite, suite.cells, "out", None, ["slurm_partition=gpu"], per_gpu=2)
         patch.setattr(engine, "visible_gpus", list)
         with pytest.raises(BenchError, match="no CUDA device"):
             engine.command(suite, suite.cells, "out", None, None)
         patch.setattr(engine.importlib.util, "find_spec", lambda name: object())
         words = engine.command(suite, suite.cells, "out", None, ["slurm_partition=gpu", "runtime=60"])
-        assert words[words.index("--executor") + 1] == "slurm" and "gpus=" in words
+        assert words[words.index("--executor") + 1] == "slurm" and "gpus=[]" in words
         assert words[words.index("--default-resources") + 1:][:2] == ["slurm_partition=gpu", "runtime=60"]
         patch.setattr(engine.importlib.util, "find_spec", lambda name: None)
         with pytest.raises(BenchError, match="snakemake-executor-plugin-slurm"):
             engine.command(suite, suite.cells, "out", None, [])
+
+
+def test_cells_are_told_the_gpus(content, tmp_path, monkeypatch):
+    """One GPU, called 0, which Snakemake would take for a number, and for none."""
+    content["protocol"].update(device="cuda", principal_point="centre")
+    suite, results, python = expand(content, ""), tmp_path / "results", tmp_path / "python"
+    python.write_text('#!/bin/sh\necho "$*" >"$4/row.json"\n')
+    python.chmod(0o755)
+    monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
+    engine.write_cells(suite, suite.cells, str(results), False)
+    with monkeypatch.context() as patch:
+        patch.setattr(engine.sys, "executable", str(python))
+        words = engine.command(suite, suite.cells, str(results), None, None, per_gpu=2)
+    subprocess.run([sys.executable, *words[1:]], env=environment(), check=True)
+    said = [path.read_text() for path in results.glob("cells/*/row.json")]
+    assert len(said) == 2 and all("--gpus 0 --per-gpu 2 --locks .locks" in line for line in said)
 
 
 def test_without_snakemake_the_message_says_what_to_install(finished, tmp_path, monkeypatch, capsys):

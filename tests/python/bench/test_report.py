@@ -153,6 +153,39 @@ def test_deltas_beside_what_the_paper_prints():
     assert cells[names.index("#Gaussians ratio")].value == pytest.approx(0.064 / 0.088)
 
 
+def shared(cells_per_gpu=2, **changes):
+    """A row of a cell that shared its GPU: its times are far from those of `row`."""
+    return row(**{"train_seconds": 7000.0, "wall_seconds": 8000.0, "fps": 3.0, **changes,
+                  "machine": {"device": "Card X", "cells_per_gpu": cells_per_gpu}})
+
+
+def test_times_of_cells_that_shared_their_gpu_are_left_out():
+    entries = [shared(), shared(blend_mode="smoe", psnr=21.0), shared(1, threshold=0.0002),
+               row(threshold=0.0002, seed=1, train_seconds=9000.0), shared(threshold=0.0002, seed=2)]
+    table = table_of(entries, "cells")
+    line = shown(table, method="native, smoe")
+    assert [line[name] for name in ("train [s]", "wall [s]", "FPS", "PSNR [dB]")] == ["shared"] * 3 + ["21.00"]
+    line = shown(table, threshold="0.0002")  # of the seeds that were alone: 7000 and 9000
+    assert line["train [s]"] == "8,000 ± 1,414"
+    assert layouts.SHARED_NOTE in table.notes
+    delta = table_of(entries, "deltas")
+    line = shown(delta, scene="bonsai")
+    assert (line["Δ PSNR [dB]"], line["train ratio"], line["FPS ratio"]) == ("+1.00", "shared", "shared")
+    assert layouts.SHARED_NOTE in delta.notes and "shared" in tables.to_latex(delta)
+
+
+def test_an_average_over_scenes_has_no_time_where_one_of_them_shared_its_gpu():
+    entries = [row("truck", method="taming", variant="patched"), shared(scene="train", method="taming",
+                                                                        variant="patched", psnr=22.0)]
+    line = shown(table_of(entries, "table2"), method="taming, alpha")
+    assert (line["PSNR [dB]"], line["train [s]"], line["FPS"]) == ("21.00", "shared", "shared")
+
+
+def test_cells_that_were_alone_are_not_marked():
+    table = table_of([shared(1), row("fox"), row("lego", machine="Card X")], "cells")
+    assert shown(table, scene="bonsai")["FPS"] == "3" and layouts.SHARED_NOTE not in table.notes
+
+
 def test_a_failed_cell_is_a_row_with_its_reason():
     entries = [row(), failed("out of memory | 12 GiB", blend_mode="smoe"), row("fox", seed=0),
                failed("killed", scene="fox", seed=1)]

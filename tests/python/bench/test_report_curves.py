@@ -43,6 +43,18 @@ def test_bars_are_the_means():
     assert colors[0] == colors[2] != colors[1]
 
 
+def test_bars_are_of_cells_that_had_their_gpu_alone():
+    two = {"gpu": "Card X", "cells_per_gpu": 2}
+    entries = [row(), row(seed=1, train_seconds=900.0, machine=two), row(blend_mode="smoe", fps=1.0, machine=two)]
+    drawn = curves.bars(groups_of(entries))
+    train, fps = drawn.axes
+    assert [bar.get_height() for bar in train.patches] == [100] and [bar.get_height() for bar in fps.patches] == [200]
+    assert [text.get_text() for text in drawn.legends[0].get_texts()] == ["native, alpha"]
+    assert curves.bars(groups_of(entries[2:])) is None
+    curve = curves.rate_distortion(groups_of(entries)).axes[0]
+    assert len(curve.containers) == 2  # quality is as it is
+
+
 @pytest.mark.parametrize("draw", [curves.rate_distortion, curves.bars])
 @pytest.mark.parametrize("methods", [1, 4])
 def test_the_legend_lies_inside_and_above_the_panels(draw, methods):

@@ -192,6 +192,30 @@ def test_lists_of_several_segments(mode, name, gpu):
 
 
 @pytest.mark.sanitize
+def test_renderings_without_gradients_keep_no_segments(mode, gpu):
+    """They have no use for them. Images are the same bit for bit, and a backward pass would be right nevertheless."""
+    scene = LONG_LISTS["faint"](mode).to(torch.float32).to(gpu)
+    colour_alone = {"depth": False, "inverse_depth": False}
+    op = torch.ops.diff_smoe_rasterization.rasterize
+    kept, lean = (op(*op_arguments(scene, **colour_alone, for_backward=wanted)) for wanted in (True, False))
+    assert lean[-2].numel() == lean[-1].numel() == 0 < kept[-2].numel()
+    with torch.no_grad():
+        rendering = rasterize(settings=scene.settings, **scene.inputs)
+    for image in (lean[0], rendering.color):
+        assert torch.equal(image, kept[0])
+
+    names = [argument.name for argument in op.default._schema.arguments[:13]]  # the tensors
+    inputs = {name: value for name, value in zip(names, op_arguments(scene)) if value is not None}
+    present = [name in inputs for name in names]
+    gradient = torch.randn(kept[0].shape, generator=torch.Generator().manual_seed(1)).to(gpu)
+    first, second = (torch.ops.diff_smoe_rasterization.rasterize_backward(
+        *op_arguments(scene, "rasterize_backward", **colour_alone, dL_dcolor=gradient, inputs=list(inputs.values()),
+                      present=present, wanted=present, outputs=list(outputs))) for outputs in (kept, lean))
+    # The same sums of a thousand float32 terms and more, added in another order.
+    assert_all_close(dict(zip(inputs, first)), dict(zip(inputs, second)), 1e-4)
+
+
+@pytest.mark.sanitize
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", ["no_gaussians", "behind_the_camera", "without_opacity", "beside_the_image"])
 def test_nothing_is_drawn(mode, kind, dtype, gpu):
