@@ -207,6 +207,16 @@ def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
     assert "--no_such_flag" in row["reason"]
 
 
+def test_the_last_words_are_not_a_progress_bars(tmp_path):
+    """tqdm draws a bar that was left open once more, after the error."""
+    program = "import tqdm; bar = tqdm.tqdm(range(3), desc='Training progress'); raise KeyError('why')"
+    log = tmp_path / "log"
+    with open(log, "w") as file:
+        subprocess.call([sys.executable, "-c", program], stderr=file)
+    assert "Training progress" in log.read_text().splitlines()[-1]
+    assert shapes.last_line(str(log)) == "KeyError: 'why'"
+
+
 def test_a_patched_checkout_is_a_copy(small, tmp_path):
     cell = small.cell("3dgs-2023")
     original = small.folder / "checkout-3dgs-2023"
