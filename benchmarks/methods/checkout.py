@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -31,6 +32,7 @@ OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py
 # Mean difference between the trainer's ground truth and ours: rounding leaves half a grey level at the most, another
 # downscaler or background leaves several.
 MAX_TRUTH_DIFFERENCE = 1 / 255
+PROGRESS_BAR = re.compile(r"\|.*\| \d+/\d+ \[")  # tqdm's
 SET_OTHERWISE = ("sh_degree_interval", "antialiasing", "opacity_reset_interval")
 
 
@@ -195,7 +197,8 @@ class DBS(ThreeDGS):
     all: the protocol's iterations, the last model.
     """
 
-    stubs = (*ThreeDGS.stubs, "viser", "nerfview")  # its viewer
+    # Of its viewer, of its compression, and one that its rasterizer imports and does not use.
+    stubs = (*ThreeDGS.stubs, "viser", "nerfview", "plas", "turtle")
     observed = ("--hold-out", "--model-renders", "beta_model")
 
     def train(self) -> Dict[str, Any]:
@@ -288,7 +291,8 @@ def size_of(path: str) -> int:
 
 
 def last_line(path: str) -> str:
-    """The last line of a log that says something."""
+    """The last line of a log that says something; a progress bar, drawn once more at the end, does not."""
     with open(path, encoding="utf-8", errors="replace") as file:
         lines = [line.strip() for line in file.read().replace("\r", "\n").splitlines() if line.strip()]
+    lines = [line for line in lines if not PROGRESS_BAR.search(line)] or lines
     return lines[-1][:300] if lines else "it printed nothing"

@@ -12,7 +12,6 @@ renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
 import argparse
 import importlib.abc
 import importlib.machinery
-import importlib.util
 import json
 import os
 import random
@@ -40,12 +39,12 @@ def main(argv=None):
     script, arguments = words[split + 1], words[split + 2:]
     sys.argv = [script] + arguments
     sys.path[0] = os.path.dirname(os.path.abspath(script))
-    for name in filter(None, options.stub.split(",")):
+    import torch
+
+    for name in filter(None, options.stub.split(",")):  # after torch, as the trainers import them
         stub(name)
     if options.no_pictures:
         write_no_pictures()
-    import torch
-
     shift_seeds(options.seed)
     views = watch_renderings(options.renders) if options.renders and not options.model_renders else {}
     scenes = watch_scenes(options.hold_out) if options.model_renders else []
@@ -249,9 +248,13 @@ class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def stub(name):
-    """Lets a module that this Python lacks be imported."""
-    if importlib.util.find_spec(name) is None:
-        sys.meta_path.append(AbsentFinder(name))
+    """Lets a module be imported that this Python lacks, or has and cannot import: turtle without tkinter is one."""
+    try:
+        importlib.import_module(name)
+    except Exception:  # of whatever kind: the module is not needed
+        for loaded in [loaded for loaded in sys.modules if loaded.partition(".")[0] == name]:
+            del sys.modules[loaded]
+        sys.meta_path.insert(0, AbsentFinder(name))  # before the finder of the one that cannot be imported
 
 
 if __name__ == "__main__":

@@ -73,6 +73,8 @@ class Scene:
 VIEWER = '''
 import viser
 from nerfview import Viewer
+from plas import sort_with_plas
+from turtle import color
 
 
 class Shown(Viewer):
@@ -81,11 +83,17 @@ class Shown(Viewer):
 '''
 
 
+TURTLE = '''
+raise ImportError("a Python of a server: there is no tkinter")
+'''
+
+
 def write(folder, views):
     """Makes the checkout in `folder`. views: images [3, H, W] by name."""
     (folder / "scene").mkdir(parents=True)
     (folder / "train.py").write_text(TRAIN)
     (folder / "viewer.py").write_text(VIEWER)
+    (folder / "turtle.py").write_text(TURTLE)
     (folder / "scene" / "__init__.py").write_text(SCENE)
     np.savez(folder / "scene" / "views.npz", **views)
     return folder

@@ -47,9 +47,9 @@ def scene(tmp_path_factory):
     """Written by a process of its own: the small trainers' modules have everyday names."""
     folder = tmp_path_factory.mktemp("bench") / "scene"
     small_trainers().make_scene(folder)
-    program = ("import numpy, sys; from scene.dataset_readers import readMadeUpSceneInfo as read; "
-               "info = read(sys.argv[1], False, True); "
-               "numpy.savez(sys.argv[2], **{v.image_name: v.image for v in info.test_cameras + info.train_cameras})")
+    program = ("import numpy, sys; from scene.dataset_readers import read_made_up_scene as read; "
+               "made_up = read(sys.argv[1]); "
+               "numpy.savez(sys.argv[2], **{v.image_name: v.image for v in made_up.hidden + made_up.shown})")
     stored = folder.parent / "views.npz"
     made = folder.parent / "checkout"
     small_trainers().make_checkout("3dgs-2023", made)
@@ -205,6 +205,16 @@ def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
     row = row_of(small.cell("3dgs-2023", arguments=["--no_such_flag"]), tmp_path / "out")
     assert not row["ok"] and "train.py of 3dgs-2023 ended with status 2" in row["reason"]
     assert "--no_such_flag" in row["reason"]
+
+
+def test_the_last_words_are_not_a_progress_bars(tmp_path):
+    """tqdm draws a bar that was left open once more, after the error."""
+    program = "import tqdm; bar = tqdm.tqdm(range(3), desc='Training progress'); raise KeyError('why')"
+    log = tmp_path / "log"
+    with open(log, "w") as file:
+        subprocess.call([sys.executable, "-c", program], stderr=file)
+    assert "Training progress" in log.read_text().splitlines()[-1]
+    assert shapes.last_line(str(log)) == "KeyError: 'why'"
 
 
 def test_a_patched_checkout_is_a_copy(small, tmp_path):
