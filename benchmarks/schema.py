@@ -47,7 +47,8 @@ SCENE = _object(
 METHOD = _object(
     ("name",), name={"enum": [NATIVE, *CHECKOUTS]}, label=NAME, variant={"enum": list(VARIANTS)}, path=TEXT, base=TEXT,
     commit=TEXT, python=TEXT, pythonpath=_list(TEXT, 0),
-    arguments={"type": "array", "items": {"type": ["string", "number"]}}, end={"enum": ["sparse", "dense"]}, budget=POSITIVE, **AXES)
+    arguments={"type": "array", "items": {"type": ["string", "number"]}}, end={"enum": ["sparse", "dense"]},
+    budget=POSITIVE, **AXES)
 SUITE = _object(
     ("name", "scenes", "methods"), name=NAME, protocol=PROTOCOL, scenes=_list(SCENE), methods=_list(METHOD),
     images=COUNT, keep_models=FLAG, headline=_object((), **AXES),

@@ -49,6 +49,7 @@ class ThreeDGS:
         self.method = cell["method"]
         self.model = os.path.join(self.output, "run")
         self.renders = os.path.join(self.output, "renders")
+        self.scene = os.path.join(self.output, "scene")
 
     def train(self) -> Dict[str, Any]:
         """Trains; returns the observer's record."""
@@ -62,7 +63,7 @@ class ThreeDGS:
     def train_arguments(self) -> List[str]:
         """What the protocol and the axes are in the trainer's words."""
         config = self.config
-        words = ["-s", os.path.abspath(config.scene), "-m", self.model, "--eval", "--iterations", config.iterations,
+        words = ["-s", self.scene, "-m", self.model, "--eval", "--iterations", config.iterations,
                  "--densify_grad_threshold", config.densify_grad_threshold, "--test_iterations", -1,
                  "--save_iterations", config.iterations, "--port", 0]  # 0: a free one, since cells run side by side
         if config.resolution != -1:
@@ -227,11 +228,12 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
     config = config_of(cell, output)
     scene = require_test_views(load_scene(config, progress=False), config)
     shape = SHAPES[cell["method"]["name"]](cell, config, output)
-    for left in (shape.model, shape.renders):  # of an earlier attempt; these trainers do not continue one
+    for left in (shape.model, shape.renders, shape.scene):  # of an earlier attempt; these trainers do not continue one
         shutil.rmtree(left, ignore_errors=True)
-    trained = shape.train()
-    rendered = shape.render()
+    linked_scene(config.scene, shape.scene)
     try:
+        trained = shape.train()
+        rendered = shape.render()
         pairs = matched(scene, rendered["views"], shape.method["label"])
         measures = Measures(config.device, cell["protocol"]["lpips"])
         difference, evaluation = measured(pairs, measures, config.device)
@@ -239,11 +241,26 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
         renders = {view.camera.name: torch.from_numpy(np.load(seen["file"])) for view, seen in kept}
     finally:
         shutil.rmtree(shape.renders, ignore_errors=True)
+        shutil.rmtree(shape.scene, ignore_errors=True)
     return Outcome(scene=scene, evaluation=evaluation, lpips=measures.lpips_of(evaluation.metrics),
                    num_gaussians=rendered["num_gaussians"], own_bytes=shape.own_bytes(),
                    train_seconds=shape.train_seconds(trained), peak_gpu_mib=trained["peak_gpu_mib"],
                    commit=shape.method.get("commit") or commit_of(shape.method["path"]), renders=renders,
                    notes={"ground_truth_difference": difference, "arguments": shape.train_arguments()})
+
+
+def linked_scene(source: str, folder: str) -> None:
+    """Makes a folder that holds a scene by links: trainers write point clouds beside what they read.
+
+    The scene stays as it is, and cells side by side do not write the same file.
+    """
+    os.makedirs(folder)
+    for name in os.listdir(source):
+        path, link = os.path.abspath(os.path.join(source, name)), os.path.join(folder, name)
+        if os.path.isdir(path) and name in ("sparse", "0"):
+            linked_scene(path, link)
+        else:
+            os.symlink(path, link)
 
 
 def matched(scene: Scene, seen: List[Dict[str, Any]], label: str) -> List[Tuple[View, Dict[str, Any]]]:

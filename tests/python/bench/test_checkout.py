@@ -242,6 +242,21 @@ def test_a_checkout_that_is_not_there_is_a_row(small, tmp_path):
     assert not row["ok"] and "nowhere: no such folder" in row["reason"]
 
 
+def test_what_a_trainer_writes_beside_its_scene_stays_its_own(tmp_path):
+    source, linked = tmp_path / "scene", tmp_path / "linked"
+    for file in ("images/0.png", "sparse/0/points3D.bin", "transforms_train.json"):
+        (source / file).parent.mkdir(parents=True, exist_ok=True)
+        (source / file).write_text(file)
+    before = sorted(source.rglob("*"))
+    shapes.linked_scene(str(source), str(linked))
+    for file in ("sparse/0/points3D.ply", "points3d.ply"):
+        (linked / file).write_text("made")
+    assert (linked / "images/0.png").read_text() == "images/0.png"
+    assert (linked / "sparse/0/points3D.bin").read_text() == "sparse/0/points3D.bin"
+    shutil.rmtree(linked)
+    assert sorted(source.rglob("*")) == before
+
+
 def test_modules_that_are_imported_and_not_used_may_be_absent():
     """2DGS imports what extracts meshes."""
     from diff_smoe_rasterization.benchmarks.methods import observer
