@@ -47,9 +47,9 @@ def scene(tmp_path_factory):
     """Written by a process of its own: the small trainers' modules have everyday names."""
     folder = tmp_path_factory.mktemp("bench") / "scene"
     small_trainers().make_scene(folder)
-    program = ("import numpy, sys; from scene.dataset_readers import readMadeUpSceneInfo as read; "
-               "info = read(sys.argv[1], False, True); "
-               "numpy.savez(sys.argv[2], **{v.image_name: v.image for v in info.test_cameras + info.train_cameras})")
+    program = ("import numpy, sys; from scene.dataset_readers import read_made_up_scene; "
+               "made = read_made_up_scene(sys.argv[1]); "
+               "numpy.savez(sys.argv[2], **{view.image_name: view.image for view in made.hidden + made.shown})")
     stored = folder.parent / "views.npz"
     made = folder.parent / "checkout"
     small_trainers().make_checkout("3dgs-2023", made)
