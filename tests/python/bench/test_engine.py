@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from bench_commands import command, environment, rows_of
 
 from diff_smoe_rasterization.benchmarks import cell as cells
 from diff_smoe_rasterization.benchmarks import engine
@@ -20,27 +21,12 @@ from diff_smoe_rasterization.cli import main
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
 snakemake = pytest.importorskip("snakemake", reason="the engine is Snakemake: pip install snakemake")
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def write_suite(content, folder):
     path = Path(folder) / "suite.yaml"
     path.write_text(yaml.safe_dump(content))
     return str(path)
-
-
-def rows_of(results):
-    lines = (Path(results) / "rows.jsonl").read_text().splitlines()
-    return {row["cell"]: row for row in map(json.loads, lines)}
-
-
-def command(*words):
-    return [sys.executable, "-m", "diff_smoe_rasterization", *words]
-
-
-def environment(**more):
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")])),
-            "OMP_NUM_THREADS": "1", **more}
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +39,7 @@ def finished(tmp_path_factory, tiny_scene):
                "methods": [{"name": "native"}], "blend_modes": ["smoe"], "densify_grad_thresholds": [0.005],
                "images": 1}
     suite = write_suite(content, folder)
-    assert main(["bench", "run", suite, "-o", str(folder / "results")]) == 0
+    assert main(["bench", "run", suite, "-o", str(folder / "results"), "--jobs", "2"]) == 0
     return content, suite, folder / "results"
 
 
@@ -129,7 +115,7 @@ def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, capsys
 
 def test_a_killed_run_continues_where_it_was(content, tmp_path):
     """Killed without warning in the middle of a cell: its process ends too; it goes on from its checkpoint."""
-    content["protocol"].update(iterations=1000, checkpoint_every=50, evaluate_every=0)
+    content["protocol"].update(iterations=500, checkpoint_every=20, evaluate_every=0)
     content["protocol"]["options"] = {"densify_until_iter": 0}
     content["blend_modes"] = ["alpha"]
     suite, results = write_suite(content, tmp_path), tmp_path / "results"
@@ -140,7 +126,7 @@ def test_a_killed_run_continues_where_it_was(content, tmp_path):
     run.wait()
     folder, = results.glob("cells/*")
     assert not (folder / "row.json").exists()
-    wait_for(lambda: stands_still(folder / "run" / "checkpoint.pt"), 60)
+    wait_for(lambda: not processes_with(f"cells/{folder.name}"), 60)
 
     assert main(["bench", "run", suite, "-o", str(results)]) == 0
     row, = rows_of(results).values()
@@ -155,11 +141,15 @@ def wait_for(condition, seconds):
         time.sleep(0.05)
 
 
-def stands_still(path):
-    """Whether a file that is written some times a second is written no more."""
-    before = path.stat().st_mtime_ns
-    time.sleep(2)
-    return path.stat().st_mtime_ns == before
+def processes_with(words):
+    """The processes whose command line has these words (Linux)."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            found += [path] if words in path.read_text().replace("\0", " ") else []
+        except OSError:  # it has ended meanwhile
+            pass
+    return found
 
 
 @pytest.fixture
