@@ -146,7 +146,7 @@ def processes_with(words):
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
-            found += [path] if words in path.read_text().replace("\0", " ") else []
+            found += [path] if words in path.read_text(errors="replace").replace("\0", " ") else []
         except OSError:  # it has ended meanwhile
             pass
     return found
@@ -296,20 +296,30 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
             engine.command(suite, suite.cells, "out", None, [])
 
 
+ECHO = """#!/bin/sh
+case "$*" in *snakemake*) exec "{python}" "$@" ;; esac
+echo '{{"ok": false, "label": "native", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1,' \\
+     '"seed": 0, "machine": {{}}, "reason": "'"$*"'"}}' >"$4/row.json"
+"""
+
+
 def test_cells_are_told_the_gpus(content, tmp_path, monkeypatch):
-    """One GPU, called 0, which Snakemake would take for a number, and for none."""
+    """One GPU, called 0, which Snakemake would take for a number; each cell fails, with its command as the reason."""
     content["protocol"].update(device="cuda", principal_point="centre")
-    suite, results, python = expand(content, ""), tmp_path / "results", tmp_path / "python"
-    python.write_text('#!/bin/sh\necho "$*" >"$4/row.json"\n')
+    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
+    python = tmp_path / "python"
+    python.write_text(ECHO.format(python=sys.executable))
     python.chmod(0o755)
     monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
-    engine.write_cells(suite, suite.cells, str(results), False)
-    with monkeypatch.context() as patch:
-        patch.setattr(engine.sys, "executable", str(python))
-        words = engine.command(suite, suite.cells, str(results), None, None, per_gpu=2)
-    subprocess.run([sys.executable, *words[1:]], env=environment(), check=True)
-    said = [path.read_text() for path in results.glob("cells/*/row.json")]
-    assert len(said) == 2 and all("--gpus 0 --per-gpu 2 --locks .locks" in line for line in said)
+    monkeypatch.setattr(engine.sys, "executable", str(python))
+
+    def reasons():
+        lines = (tmp_path / "results" / "rows.jsonl").read_text().splitlines()
+        return [json.loads(line)["reason"].partition(" --gpus ")[2] for line in lines]
+
+    assert main([*words, "--per-gpu", "2"]) == 0 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2
+    assert main(words) == 0 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2  # what is done is not done again
+    assert main([*words, "--retry-failed"]) == 0 and reasons() == ["0 --per-gpu 1 --locks .locks"] * 2
 
 
 def test_without_snakemake_the_message_says_what_to_install(finished, tmp_path, monkeypatch, capsys):
