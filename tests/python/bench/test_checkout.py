@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import small_dbs
 import torch
+from bench_commands import ABOVE
 from PIL import Image
 
 from diff_smoe_rasterization import io
@@ -29,7 +30,6 @@ pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip 
 pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
 PATCHES = Path(__file__).resolve().parents[1] / "patches"
-ROOT = PATCHES.parents[2]
 ITERATIONS = 7
 
 
@@ -47,14 +47,14 @@ def scene(tmp_path_factory):
     """Written by a process of its own: the small trainers' modules have everyday names."""
     folder = tmp_path_factory.mktemp("bench") / "scene"
     small_trainers().make_scene(folder)
-    program = ("import numpy, sys; from scene.dataset_readers import read_made_up_scene as read; "
-               "made_up = read(sys.argv[1]); "
-               "numpy.savez(sys.argv[2], **{v.image_name: v.image for v in made_up.hidden + made_up.shown})")
+    program = ("import numpy, sys; from scene.dataset_readers import read_made_up_scene; "
+               "made = read_made_up_scene(sys.argv[1]); "
+               "numpy.savez(sys.argv[2], **{view.image_name: view.image for view in made.hidden + made.shown})")
     stored = folder.parent / "views.npz"
     made = folder.parent / "checkout"
     small_trainers().make_checkout("3dgs-2023", made)
     subprocess.run([sys.executable, "-c", program, str(folder), str(stored)], check=True, cwd=str(made),
-                   env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, [made, PATCHES / "packages", ROOT]))})
+                   env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, [made, PATCHES / "packages", ABOVE]))})
     with np.load(stored) as views:
         write_views(folder, {name: views[name] for name in views.files})
     return folder
@@ -118,7 +118,7 @@ def row_of(cell, output):
 @pytest.fixture(scope="module")
 def small(scene, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(ROOT))
+        patch.setenv("PYTHONPATH", ABOVE)
         patch.setenv("OMP_NUM_THREADS", "1")
         patch.delenv("DSMOE_BLEND_MODE", raising=False)
         patch.setattr(shapes.ThreeDGS, "container", "point_cloud.npz")  # the small trainers write no .ply,

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from bench_commands import command, environment, rows_of
 
 from diff_smoe_rasterization.benchmarks import cell as cells
 from diff_smoe_rasterization.benchmarks import engine
@@ -20,27 +21,12 @@ from diff_smoe_rasterization.cli import main
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
 snakemake = pytest.importorskip("snakemake", reason="the engine is Snakemake: pip install snakemake")
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def write_suite(content, folder):
     path = Path(folder) / "suite.yaml"
     path.write_text(yaml.safe_dump(content))
     return str(path)
-
-
-def rows_of(results):
-    lines = (Path(results) / "rows.jsonl").read_text().splitlines()
-    return {row["cell"]: row for row in map(json.loads, lines)}
-
-
-def command(*words):
-    return [sys.executable, "-m", "diff_smoe_rasterization", *words]
-
-
-def environment(**more):
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")])),
-            "OMP_NUM_THREADS": "1", **more}
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +39,7 @@ def finished(tmp_path_factory, tiny_scene):
                "methods": [{"name": "native"}], "blend_modes": ["smoe"], "densify_grad_thresholds": [0.005],
                "images": 1}
     suite = write_suite(content, folder)
-    assert main(["bench", "run", suite, "-o", str(folder / "results")]) == 0
+    assert main(["bench", "run", suite, "-o", str(folder / "results"), "--jobs", "2"]) == 0
     return content, suite, folder / "results"
 
 
@@ -129,7 +115,7 @@ def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, capsys
 
 def test_a_killed_run_continues_where_it_was(content, tmp_path):
     """Killed without warning in the middle of a cell: its process ends too; it goes on from its checkpoint."""
-    content["protocol"].update(iterations=1000, checkpoint_every=50, evaluate_every=0)
+    content["protocol"].update(iterations=500, checkpoint_every=20, evaluate_every=0)
     content["protocol"]["options"] = {"densify_until_iter": 0}
     content["blend_modes"] = ["alpha"]
     suite, results = write_suite(content, tmp_path), tmp_path / "results"
@@ -140,7 +126,7 @@ def test_a_killed_run_continues_where_it_was(content, tmp_path):
     run.wait()
     folder, = results.glob("cells/*")
     assert not (folder / "row.json").exists()
-    wait_for(lambda: stands_still(folder / "run" / "checkpoint.pt"), 60)
+    wait_for(lambda: not processes_with(f"cells/{folder.name}"), 60)
 
     assert main(["bench", "run", suite, "-o", str(results)]) == 0
     row, = rows_of(results).values()
@@ -155,11 +141,15 @@ def wait_for(condition, seconds):
         time.sleep(0.05)
 
 
-def stands_still(path):
-    """Whether a file that is written some times a second is written no more."""
-    before = path.stat().st_mtime_ns
-    time.sleep(2)
-    return path.stat().st_mtime_ns == before
+def processes_with(words):
+    """The processes whose command line has these words (Linux)."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            found += [path] if words in path.read_text(errors="replace").replace("\0", " ") else []
+        except OSError:  # it has ended meanwhile
+            pass
+    return found
 
 
 @pytest.fixture
@@ -306,20 +296,30 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
             engine.command(suite, suite.cells, "out", None, [])
 
 
+ECHO = """#!/bin/sh
+case "$*" in *snakemake*) exec "{python}" "$@" ;; esac
+echo '{{"ok": false, "label": "native", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1,' \\
+     '"seed": 0, "machine": {{}}, "reason": "'"$*"'"}}' >"$4/row.json"
+"""
+
+
 def test_cells_are_told_the_gpus(content, tmp_path, monkeypatch):
-    """One GPU, called 0, which Snakemake would take for a number, and for none."""
+    """One GPU, called 0, which Snakemake would take for a number; each cell fails, with its command as the reason."""
     content["protocol"].update(device="cuda", principal_point="centre")
-    suite, results, python = expand(content, ""), tmp_path / "results", tmp_path / "python"
-    python.write_text('#!/bin/sh\necho "$*" >"$4/row.json"\n')
+    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
+    python = tmp_path / "python"
+    python.write_text(ECHO.format(python=sys.executable))
     python.chmod(0o755)
     monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
-    engine.write_cells(suite, suite.cells, str(results), False)
-    with monkeypatch.context() as patch:
-        patch.setattr(engine.sys, "executable", str(python))
-        words = engine.command(suite, suite.cells, str(results), None, None, per_gpu=2)
-    subprocess.run([sys.executable, *words[1:]], env=environment(), check=True)
-    said = [path.read_text() for path in results.glob("cells/*/row.json")]
-    assert len(said) == 2 and all("--gpus 0 --per-gpu 2 --locks .locks" in line for line in said)
+    monkeypatch.setattr(engine.sys, "executable", str(python))
+
+    def reasons():
+        lines = (tmp_path / "results" / "rows.jsonl").read_text().splitlines()
+        return [json.loads(line)["reason"].partition(" --gpus ")[2] for line in lines]
+
+    assert main([*words, "--per-gpu", "2"]) == 0 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2
+    assert main(words) == 0 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2  # what is done is not done again
+    assert main([*words, "--retry-failed"]) == 0 and reasons() == ["0 --per-gpu 1 --locks .locks"] * 2
 
 
 def test_without_snakemake_the_message_says_what_to_install(finished, tmp_path, monkeypatch, capsys):
