@@ -12,7 +12,8 @@ import shutil
 import subprocess
 import sys
 from contextlib import contextmanager
-from typing import Any, Dict, Iterator, List, Optional, Sequence
+from types import MappingProxyType
+from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence
 
 from .. import patches
 from ..trainer.files import write_json_atomically, write_text_atomically
@@ -21,6 +22,7 @@ from .cell import ROW_NAME
 from .errors import BenchError
 from .methods.names import CHECKOUTS, NATIVE
 from .protocol import COMMIT_VARIABLE, ROOT, commit_of, project_commit
+from .report.rows import read_rows
 from .suite import Suite, find_suite, load_suite, missing
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
@@ -30,29 +32,32 @@ NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", 
 
 def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = None,
               slurm: Optional[Sequence[str]] = None, retry_failed: bool = False, dry_run: bool = False,
-              only: Sequence[str] = (), per_gpu: int = 1) -> List[Dict[str, Any]]:
+              only: Sequence[str] = (), per_gpu: int = 1, rows: Optional[str] = None) -> List[Dict[str, Any]]:
     """Runs what is not done of a suite; returns the rows of its cells, failed ones included.
 
     name: a file or a shipped suite. results: by default bench_results/NAME. jobs: cells at once, by default per_gpu
     on each GPU, or one on the CPU. slurm: None, or Snakemake's default resources ("slurm_partition=gpu"). only:
     "field=value" of cells that are run. per_gpu: cells that one GPU is given at once; beyond 1 their times are not the
-    GPU's own, and rows say so. Raises BenchError.
+    GPU's own, and rows say so. rows: a file of rows, or a folder of results, whose cells are not run again. Raises
+    BenchError.
     """
     suite = load_suite(find_suite(name))
     cells = chosen(suite.cells, only)
+    earlier = {row["cell"]: row for row in (read_rows(rows) if rows else []) if row["ok"] or not retry_failed}
     results = os.path.abspath(results or os.path.join("bench_results", suite.name))
     if dry_run:
         for cell in cells:
-            print(f"{'done' if is_done(results, cell, retry_failed) else 'to do'}  {cell['id']}")
+            done = cell["id"] in earlier or is_done(results, cell, retry_failed)
+            print(f"{'done' if done else 'to do'}  {cell['id']}")
         return []
     if importlib.util.find_spec("snakemake") is None:
         raise BenchError(missing("snakemake", ImportError("needs Python 3.11 or later")))
     os.makedirs(results, exist_ok=True)
     with only_one(results):
-        write_cells(suite, cells, results, retry_failed)
+        write_cells(suite, cells, results, retry_failed, earlier)
         status = subprocess.call(command(suite, cells, results, jobs, slurm, per_gpu), env=environment())
-        rows = collect(results)
-    here = [rows[cell["id"]] for cell in cells if cell["id"] in rows]
+        measured = collect(results)
+    here = [measured[cell["id"]] for cell in cells if cell["id"] in measured]
     lacking = len(cells) - len(here)
     if status != 0 or lacking:
         raise BenchError(f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The "
@@ -103,12 +108,16 @@ def only_one(results: str) -> Iterator[None]:
         yield
 
 
-def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_failed: bool) -> None:
-    """Writes RESULTS/suite.json and each cell's file, with scenes made and checkouts patched. Raises BenchError."""
+def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_failed: bool,
+                earlier: Mapping[str, Dict[str, Any]] = MappingProxyType({})) -> None:
+    """Writes RESULTS/suite.json and each cell's file, with scenes made and checkouts patched. Raises BenchError.
+
+    earlier: rows by their cell's name, for cells that have none here.
+    """
     path = os.path.join(results, SUITE_NAME)
-    earlier = read_json(path)
-    if earlier is not None and (earlier["name"], earlier["protocol"]) != (suite.name, suite.protocol):
-        raise BenchError(f"{results}: holds rows of the suite {earlier['name']!r} under another protocol; figures of "
+    here = read_json(path)
+    if here is not None and (here["name"], here["protocol"]) != (suite.name, suite.protocol):
+        raise BenchError(f"{results}: holds rows of the suite {here['name']!r} under another protocol; figures of "
                          "two protocols are not put together: choose another folder")
     scenes: Dict[str, Dict[str, Any]] = {}
     methods: Dict[str, Dict[str, Any]] = {}
@@ -123,6 +132,8 @@ def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_f
         file, row = os.path.join(folder, "cell.json"), os.path.join(folder, ROW_NAME)
         if read_json(file) != cell:
             write_json_atomically(file, cell)
+        if cell["id"] in earlier and not is_done(results, cell, retry_failed):
+            write_json_atomically(row, earlier[cell["id"]])
         if is_done(results, cell, retry_failed):
             os.utime(row)  # a path that has changed changes no figure: the row stays newer than its cell's file
         elif os.path.isfile(row):

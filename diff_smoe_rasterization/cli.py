@@ -138,6 +138,7 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
                      help="only such cells; fields: method, scene, blend_mode, schedule, densify_grad_threshold, "
                           "seed, headline")
+    run.add_argument("--rows", metavar="FILE", help="rows of earlier runs (.jsonl), whose cells are not run again")
     run.add_argument("--retry-failed", action="store_true", help="run failed cells again")
     run.add_argument("--dry-run", action="store_true", help="say which cells are done and which are not")
     run.set_defaults(run=_bench_run)
@@ -152,7 +153,7 @@ def _bench_run(arguments: argparse.Namespace) -> int:
     from .benchmarks.engine import rows_table, run_suite
 
     rows = run_suite(arguments.suite, arguments.output, arguments.jobs, arguments.slurm, arguments.retry_failed,
-                     arguments.dry_run, arguments.only, arguments.per_gpu)
+                     arguments.dry_run, arguments.only, arguments.per_gpu, arguments.rows)
     if rows:
         print(rows_table(rows))
     failed = sum(not row["ok"] for row in rows)

@@ -106,6 +106,18 @@ def test_a_failed_cell_can_be_tried_again(finished, tmp_path):
     assert changed == {name for name, row in rows.items() if row["scene"] == "absent"}
 
 
+def test_rows_of_an_earlier_run_elsewhere_are_not_run_again(finished, tmp_path, capsys):
+    _, suite, results = finished
+    rows = ["--rows", str(results / "rows.jsonl")]
+    assert main(["bench", "run", suite, "-o", str(tmp_path / "dry"), "--dry-run", *rows]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["done", "done"]
+    assert main(["bench", "run", suite, "-o", str(tmp_path / "new"), *rows]) == 0
+    assert rows_of(tmp_path / "new") == rows_of(results)
+    assert not list((tmp_path / "new").glob("cells/*/log.txt"))
+    assert main(["bench", "run", suite, "-o", str(tmp_path / "none"), "--rows", str(tmp_path / "absent.jsonl")]) == 1
+    assert "absent.jsonl" in capsys.readouterr().err
+
+
 def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, capsys):
     content, _, results = finished
     longer = {**content, "protocol": {**content["protocol"], "iterations": 13}}
