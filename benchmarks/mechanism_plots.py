@@ -120,6 +120,7 @@ def _panels(titles: Sequence[Sequence[str]], below: Sequence[str] = ("step", "st
         axis.set_title(title, loc="left", fontsize=10)
     for axis, label in zip(axes[-1], below):
         axis.set_xlabel(label)
+        axis.xaxis.set_major_locator(plt.MaxNLocator(6))
     return drawn, axes
 
 

@@ -246,7 +246,12 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
                    num_gaussians=rendered["num_gaussians"], own_bytes=shape.own_bytes(),
                    train_seconds=shape.train_seconds(trained), peak_gpu_mib=trained["peak_gpu_mib"],
                    commit=shape.method.get("commit") or commit_of(shape.method["path"]), renders=renders,
-                   notes={"ground_truth_difference": difference, "arguments": shape.train_arguments()})
+                   notes={"ground_truth_difference": difference, "arguments": portable(shape.train_arguments())})
+
+
+def portable(words: List[str]) -> List[str]:
+    """The words of a command without the folders in which things lie here."""
+    return [os.path.basename(word) if os.path.isabs(word) else word for word in words]
 
 
 def linked_scene(source: str, folder: str) -> None:
