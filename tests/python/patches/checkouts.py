@@ -18,6 +18,24 @@ RECORD = ".dsmoe_patch"
 LAYERS = {"3dgs-2023": ("common", "3dgs-2023"), "3dgs-2024": ("common", "3dgs-2023", "3dgs-2024"),
           "taming": ("common", "3dgs-2023", "taming"), "c3dgs": ("common", "c3dgs"), "hac": ("common", "hac"),
           "hac-plus": ("common", "hac", "hac-plus")}
+# HAC++ grew out of HAC: these lines of HAC's files are others in it.
+EDITS = {"hac-plus": {
+    "train.py": {
+        "import torch\n": "import lpips\nimport torch\n",
+        "run_codec = True\n": "lpips_fn = lpips.LPIPS(net=\"vgg\").to(\"cpu\")\nrun_codec = True\n",
+        """PSNR {psnr(image, view.original_image).item():.9g}")\n    world.gaussians.train()""":
+            """PSNR {psnr(image, view.original_image).item():.9g}")
+        logger.info(f"step {step}: LPIPS {lpips_fn(image, view.original_image).item():.9g}")
+    world.gaussians.train()"""},
+    "gaussian_renderer/__init__.py": {
+        "(pc.get_opacity_mlp(inputs) * pc.get_mask[visible_mask][..., 0])": "pc.get_opacity_mlp(inputs)",
+        "    return xyz, color, neural_opacity[mask], sizes, rot, neural_opacity, mask":
+            """    kept = pc.get_mask[visible_mask].view(-1, 1)[mask]
+    return xyz, color, neural_opacity[mask] * kept, sizes * kept, rot, neural_opacity, mask"""},
+    "arguments/__init__.py": {
+        "        self.lambda_dssim = 0.25\n":
+            """        self.mlp_hyp_lr_init, self.mlp_hyp_lr_final, self.mlp_hyp_lr_delay_mult = 0.005, 0.001, 0.01
+        self.mask_lr_final, self.lambda_dssim = 0.001, 0.25\n"""}}}
 TRAINERS = tuple(LAYERS)
 WITH_RENDER = ("3dgs-2023", "3dgs-2024", "taming", "c3dgs")
 
@@ -34,6 +52,12 @@ def make_checkout(name, folder):
     for layer in LAYERS[name]:
         shutil.copytree(HERE / "trainers" / layer, folder, dirs_exist_ok=True,
                         ignore=shutil.ignore_patterns("__pycache__"))
+    for file, lines in EDITS.get(name, {}).items():
+        text = (Path(folder) / file).read_text()
+        for before, after in lines.items():
+            assert text.count(before) == 1, (file, before)
+            text = text.replace(before, after)
+        (Path(folder) / file).write_text(text)
     return Path(folder)
 
 
