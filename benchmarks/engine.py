@@ -18,7 +18,7 @@ from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence
 from .. import patches
 from ..trainer.files import write_json_atomically, write_text_atomically
 from ..trainer.synthetic import write_synthetic_scene
-from .cell import ROW_NAME
+from .cell import ROW_NAME, identity
 from .errors import BenchError
 from .methods.names import CHECKOUTS, NATIVE
 from .protocol import COMMIT_VARIABLE, ROOT, commit_of, project_commit
@@ -133,7 +133,7 @@ def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_f
         if read_json(file) != cell:
             write_json_atomically(file, cell)
         if cell["id"] in earlier and not is_done(results, cell, retry_failed):
-            write_json_atomically(row, earlier[cell["id"]])
+            write_json_atomically(row, {**earlier[cell["id"]], **identity(cell)})  # another suite may have had the cell
         if is_done(results, cell, retry_failed):
             os.utime(row)  # a path that has changed changes no figure: the row stays newer than its cell's file
         elif os.path.isfile(row):

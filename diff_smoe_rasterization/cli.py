@@ -128,7 +128,7 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                              description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
                                          "becomes a row with its reason.")
     run.add_argument("suite", metavar="SUITE", help="a .yaml file, or a shipped one: smoke, table1, table2, table3, "
-                                                    "fig4, fig5, captures, captures_ablation")
+                                                    "fig4, fig5, captures, captures_ablation, captures_baselines")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
     run.add_argument("--jobs", type=int, metavar="N", help="cells at once (default: one per GPU; one on the CPU)")
     run.add_argument("--per-gpu", type=int, default=1, metavar="K",

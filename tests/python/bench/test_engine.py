@@ -114,6 +114,9 @@ def test_rows_of_an_earlier_run_elsewhere_are_not_run_again(finished, tmp_path, 
     assert main(["bench", "run", suite, "-o", str(tmp_path / "new"), *rows]) == 0
     assert rows_of(tmp_path / "new") == rows_of(results)
     assert not list((tmp_path / "new").glob("cells/*/log.txt"))
+    other = write_suite({**finished[0], "name": "other"}, tmp_path)
+    assert main(["bench", "run", other, "-o", str(tmp_path / "other"), *rows]) == 0
+    assert {row["suite"] for row in rows_of(tmp_path / "other").values()} == {"other"}
     assert main(["bench", "run", suite, "-o", str(tmp_path / "none"), "--rows", str(tmp_path / "absent.jsonl")]) == 1
     assert "absent.jsonl" in capsys.readouterr().err
 

@@ -17,7 +17,8 @@ from diff_smoe_rasterization.trainer.config import TrainConfig
 pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 
-SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "captures", "captures_ablation")
+SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "captures", "captures_ablation",
+                 "captures_baselines")
 
 
 def changed(content, **fields):
