@@ -150,6 +150,20 @@ class _LpipsOffline(Codemod):
         return with_import(updated_node, RUNTIME, "nan_without_network") if self.pending else updated_node
 
 
+class _EighInParts(Codemod):
+    """`torch.linalg.eigh(...)` becomes `eigh_in_parts(...)`."""
+
+    def leave_Call(self, original_node: cst.Call, updated_node: cst.Call) -> cst.Call:
+        given = {argument.keyword.value if argument.keyword else None for argument in updated_node.args}
+        if get_full_name_for_node(updated_node.func) != "torch.linalg.eigh" or not given <= {None, "UPLO"}:
+            return updated_node
+        self.pending += 1
+        return updated_node.with_changes(func=cst.Name("eigh_in_parts"))
+
+    def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
+        return with_import(updated_node, RUNTIME, "eigh_in_parts") if self.pending else updated_node
+
+
 class _CppStandard(Codemod):
     """The flag goes: torch gives the compiler the standard that it needs itself where nobody does."""
 
@@ -191,6 +205,8 @@ RULES = (
          _LpipsOffline, ("def lpips",)),
     Rule("blender-images", "new Pillow releases take no signed bytes for a picture",
          _NumpyByte, ("np.byte", "numpy.byte")),
+    Rule("eigh-in-parts", "cuSOLVER of CUDA 12.8 and later fails on the many covariances that c3dgs gives it at once",
+         _EighInParts, ("linalg.eigh",)),
     Rule("cpp-standard", "C++14 was asked for; torch 2.1 needs C++17, 2.13 C++20, and asks for it itself",
          _CppStandard, ("c++14",)),
 )

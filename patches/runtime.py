@@ -112,6 +112,24 @@ def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+EIGH_AT_ONCE = 16_384  # cuSOLVER's batched solver of CUDA 12.8 and later fails on batches somewhere above 32,000
+
+
+def eigh_in_parts(matrices: Any, UPLO: str = "L") -> Any:
+    """Returns what torch.linalg.eigh returns, computed for so many matrices at once as its CUDA solver can take.
+
+    matrices: [..., n, n]. Has the gradient that torch.linalg.eigh has.
+    """
+    import torch
+
+    flat = matrices.reshape(-1, *matrices.shape[-2:])
+    if len(flat) <= EIGH_AT_ONCE:
+        return torch.linalg.eigh(matrices, UPLO=UPLO)
+    parts = [torch.linalg.eigh(part, UPLO=UPLO) for part in flat.split(EIGH_AT_ONCE)]
+    values, vectors = (torch.cat(results) for results in zip(*parts))
+    return type(parts[0])((values.reshape(matrices.shape[:-1]), vectors.reshape(matrices.shape)))
+
+
 class _Absent:
     def __init__(self, error: ImportError) -> None:
         self._error = error

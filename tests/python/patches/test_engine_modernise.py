@@ -41,6 +41,9 @@ BEFORE_AND_AFTER = [
      f"import torch\nfrom {RUNTIME} import nan_without_network\n\n"
      "@nan_without_network\ndef lpips(x, y):\n    return x\n"),
     ("blender-images", "np.array(a * 255.0, dtype=np.byte)\n", "np.array(a * 255.0, dtype=np.uint8)\n"),
+    ("eigh-in-parts", "import torch\nS, R = torch.linalg.eigh(cov, UPLO='U')\n",
+     f"import torch\nfrom {RUNTIME} import eigh_in_parts\nS, R = eigh_in_parts(cov, UPLO='U')\n"),
+    ("eigh-in-parts", "torch.linalg.eigh(cov, out=both)\n", None),
     ("cpp-standard", "f = [\n    '-O3', '-std=c++14',\n    '-U',\n]\n", "f = [\n    '-O3',\n    '-U',\n]\n"),
     ("cpp-standard", "f = ['-std=c++14', '-O3']\n", "f = ['-O3']\n"),
     ("cpp-standard", "f = ['-O3', '-std=c++14']\n", "f = ['-O3']\n"),
@@ -89,6 +92,19 @@ def test_what_is_deferred_is_made_once():
     made = []
     call = runtime.deferred(lambda: made.append(1) or (lambda value: 2 * value))
     assert made == [] and call(3) == 6 and call(4) == 8 and made == [1]
+
+
+@pytest.mark.parametrize("shape, at_once", [((7, 3, 3), 3), ((2, 4, 3, 3), 3), ((7, 3, 3), 7), ((3, 3), 1),
+                                            ((0, 3, 3), 3)])
+def test_eigenvectors_in_parts_are_those_of_all_at_once(monkeypatch, shape, at_once):
+    monkeypatch.setattr(runtime, "EIGH_AT_ONCE", at_once)
+    matrices = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    found, expected = runtime.eigh_in_parts(matrices, UPLO="U"), torch.linalg.eigh(matrices, UPLO="U")
+    assert torch.equal(found.eigenvalues, expected.eigenvalues)
+    assert torch.equal(found.eigenvectors, expected.eigenvectors)
+    gradient, expected_gradient = (torch.autograd.grad((result[0] ** 2).sum(), matrices)[0]
+                                   for result in (found, expected))
+    torch.testing.assert_close(gradient, expected_gradient)
 
 
 def test_a_metric_is_nan_where_its_weights_cannot_be_had():
