@@ -128,6 +128,7 @@ def extension():
         "TORCH_VERSION": torch.__version__,
         "CUDA_VERSION": None if without_cuda else torch.version.cuda,
         "WITHOUT_CUDA_BECAUSE": "; ".join(without_cuda),
+        "COMMIT": commit(),
     }
 
     class BuildExtension(cpp_extension.BuildExtension):
@@ -138,6 +139,20 @@ def extension():
             Path(self.get_ext_fullpath(module.name)).with_name("_build_info.py").write_text("\n".join(lines) + "\n")
 
     return {"ext_modules": [module], "cmdclass": {"build_ext": BuildExtension}}
+
+
+def commit():
+    """The commit of the source folder, "+" behind it where tracked files were changed; None where git does not say."""
+    def git(*words):
+        return subprocess.run(["git", "-C", str(ROOT), *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                              check=True).stdout.decode().strip()
+
+    try:
+        if not os.path.samefile(git("rev-parse", "--show-toplevel"), ROOT):
+            return None
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
 
 
 def packages():

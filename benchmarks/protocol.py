@@ -86,7 +86,15 @@ def machine_of(device: str, cells_per_gpu: Optional[int] = None) -> Dict[str, An
 
 def project_commit() -> Optional[str]:
     """The commit of this project's files, "+" behind it where they were changed since; None where nothing says it."""
-    return os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT)
+    return os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT) or _commit_of_the_build()
+
+
+def _commit_of_the_build() -> Optional[str]:
+    try:
+        from .._build_info import COMMIT
+    except ImportError:
+        return None
+    return COMMIT
 
 
 def commit_of(folder: str) -> Optional[str]:

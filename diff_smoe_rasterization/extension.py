@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from typing import Any, Dict, NoReturn, Optional
 
 import torch
@@ -37,7 +38,10 @@ def _load() -> Any:
     except ModuleNotFoundError as error:
         if error.name != f"{__package__}._C":
             raise
-        _fail("its extension _C is not built for this Python; in the source folder type: "
+        folder = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+        elsewhere = (f" ({folder} was imported; a package installed elsewhere is found from another folder, or by "
+                     "python -I)") if os.path.isfile(os.path.join(folder, "sources.txt")) else ""
+        _fail(f"its extension _C is not built for this Python{elsewhere}; in the source folder type: "
               "pip install --no-build-isolation .", error)
     except ImportError as error:
         _fail((f"its extension does not load ({error}); it was built against torch {built_against or 'of another build'}"

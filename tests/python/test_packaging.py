@@ -40,6 +40,7 @@ def test_the_build_wrote_down_its_torch():
     info = pytest.importorskip("diff_smoe_rasterization._build_info", reason="not built by setup.py")
     assert info.TORCH_VERSION == torch.__version__
     assert info.WITHOUT_CUDA_BECAUSE or "cuda" in extension.BACKENDS
+    assert info.COMMIT is None or re.fullmatch("[0-9a-f]{40}[+]?", info.COMMIT)
 
 
 def load_setup():
@@ -49,6 +50,27 @@ def load_setup():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def test_the_build_knows_its_commit(tmp_path, monkeypatch):
+    setup = load_setup()
+    monkeypatch.setattr(setup, "ROOT", tmp_path)
+    assert setup.commit() is None
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    file = tmp_path / "file"
+    file.write_text("1")
+    try:
+        for words in (["init", "-q"], ["add", "file"], ["commit", "-q", "-m", "first"]):
+            subprocess.run(git + words, check=True)
+    except OSError:
+        pytest.skip("git is not installed")
+    commit = setup.commit()
+    assert re.fullmatch("[0-9a-f]{40}", commit)
+    file.write_text("2")
+    assert setup.commit() == commit + "+"
+    (tmp_path / "inside").mkdir()
+    monkeypatch.setattr(setup, "ROOT", tmp_path / "inside")
+    assert setup.commit() is None
 
 
 def toolkit(folder, release, *architectures):
