@@ -203,6 +203,9 @@ def test_renderings_without_gradients_keep_no_segments(mode, gpu):
         rendering = rasterize(settings=scene.settings, **scene.inputs)
     for image in (lean[0], rendering.color):
         assert torch.equal(image, kept[0])
+    if hasattr(torch.library, "opcheck"):  # the fake kernel says these shapes too
+        torch.library.opcheck(op.default, op_arguments(scene, **colour_alone, for_backward=False),
+                              test_utils=("test_schema", "test_faketensor"))
 
     names = [argument.name for argument in op.default._schema.arguments[:13]]  # the tensors
     inputs = {name: value for name, value in zip(names, op_arguments(scene)) if value is not None}
