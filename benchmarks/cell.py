@@ -22,6 +22,7 @@ from typing import Any, Dict, List, Optional
 
 from ..trainer.errors import TrainerError
 from ..trainer.files import write_json_atomically
+from .log import last_line
 
 ROW_NAME, LOG_NAME = "row.json", "log.txt"
 SHARING_NAME = "cells_per_gpu.json"  # beside a checkpoint: its seconds were counted beside so many cells
@@ -162,11 +163,10 @@ def die_with_parent() -> None:
 
 def how_it_ended(status: int, log_path: str) -> str:
     """The reason for a row where a process left none."""
-    with open(log_path, encoding="utf-8", errors="replace") as file:
-        lines = [line.strip() for line in file if line.strip()]
+    words = last_line(log_path)
     how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
     memory = "; the system may have been out of memory" if status == -signal.SIGKILL else ""
-    return f"the process {how}{memory}" + (f"; its last line: {lines[-1][:300]}" if lines else "")
+    return f"the process {how}{memory}" + (f"; its last line: {words}" if words else "")
 
 
 def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Any:
@@ -188,6 +188,14 @@ def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: floa
         time.sleep(poll_seconds)
 
 
+def at_least_one(text: str) -> int:
+    """The number that a word of the command is. Raises ArgumentTypeError."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"is {number}; it must be at least 1")
+    return number
+
+
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; 0 where there is a row, whatever it says."""
     parser = argparse.ArgumentParser(prog="python -m diff_smoe_rasterization.benchmarks.cell",
@@ -195,7 +203,8 @@ def main(argv: Optional[List[str]] = None) -> int:
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
     parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
     parser.add_argument("--gpus", metavar="N,N", default="", help="take one of these GPUs")
-    parser.add_argument("--per-gpu", metavar="K", type=int, help="cells that may have one GPU at once (default: 1)")
+    parser.add_argument("--per-gpu", metavar="K", type=at_least_one,
+                        help="cells that may have one GPU at once (default: 1)")
     parser.add_argument("--locks", metavar="FOLDER", help="where cells tell each other which GPU they have")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)

@@ -27,6 +27,8 @@ from .suite import Suite, find_suite, load_suite, missing
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 SUITE_NAME, ROWS_NAME = "suite.json", "rows.jsonl"
+SAID_BY_THE_ID = ("method", "variant", "blend_mode", "schedule", "densify_grad_threshold", "scene", "seed",
+                  "iterations")  # fields of a row
 NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", "build")
 
 
@@ -38,13 +40,18 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     name: a file or a shipped suite. results: by default bench_results/NAME. jobs: cells at once, by default per_gpu
     on each GPU, or one on the CPU. slurm: None, or Snakemake's default resources ("slurm_partition=gpu"). only:
     "field=value" of cells that are run. per_gpu: cells that one GPU is given at once; beyond 1 their times are not the
-    GPU's own, and rows say so. rows: a file of rows, or a folder of results, whose cells are not run again. Raises
-    BenchError.
+    GPU's own, and rows say so. rows: a file of rows, or a folder of results, whose cells are not run again, failed ones
+    neither unless retry_failed. Raises BenchError.
     """
     suite = load_suite(find_suite(name))
+    check_sharing(suite, jobs, slurm, per_gpu)
     cells = chosen(suite.cells, only)
-    earlier = {row["cell"]: row for row in (read_rows(rows) if rows else []) if row["ok"] or not retry_failed}
     results = os.path.abspath(results or os.path.join("bench_results", suite.name))
+    found = earlier_rows(rows, suite.cells) if rows else {}
+    earlier = {name: row for name, row in found.items() if row["ok"] or not retry_failed}
+    if rows:
+        taken = [cell for cell in cells if cell["id"] in earlier and not is_done(results, cell, retry_failed)]
+        print(f"{len(taken)} of {len(cells)} cells taken from {rows}")
     if dry_run:
         for cell in cells:
             done = cell["id"] in earlier or is_done(results, cell, retry_failed)
@@ -52,10 +59,11 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         return []
     if importlib.util.find_spec("snakemake") is None:
         raise BenchError(missing("snakemake", ImportError("needs Python 3.11 or later")))
+    words = command(suite, cells, results, jobs, slurm, per_gpu)
     os.makedirs(results, exist_ok=True)
     with only_one(results):
         write_cells(suite, cells, results, retry_failed, earlier)
-        status = subprocess.call(command(suite, cells, results, jobs, slurm, per_gpu), env=environment())
+        status = subprocess.call(words, env=environment())
         measured = collect(results)
     here = [measured[cell["id"]] for cell in cells if cell["id"] in measured]
     lacking = len(cells) - len(here)
@@ -63,6 +71,24 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         raise BenchError(f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The "
                          f"same command continues; {os.path.join(results, '.snakemake', 'log')} says what happened")
     return here
+
+
+def earlier_rows(path: str, cells: List[Dict[str, Any]]) -> Dict[str, Dict[str, Any]]:
+    """The rows of a file, or of a folder of results, that are of these cells, by the cells' names.
+
+    Raises BenchError where none is, or where a row says something else of its cell than the cell does.
+    """
+    rows = {row["cell"]: row for row in read_rows(path)}
+    found = [cell for cell in cells if cell["id"] in rows]
+    if not found:
+        raise BenchError(f"--rows {path}: none of its {len(rows)} rows is of a cell of this suite")
+    for cell in found:
+        row, expected = rows[cell["id"]], identity(cell)
+        for field in SAID_BY_THE_ID:
+            if row.get(field) != expected[field]:
+                raise BenchError(f"--rows {path}: the row of cell {cell['id']}: {field} is {row.get(field)!r}; it must "
+                                 f"be {expected[field]!r}, as the suite has it")
+    return {cell["id"]: rows[cell["id"]] for cell in found}
 
 
 def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, Any]]:
@@ -200,6 +226,16 @@ def patched_copy(path: str, folder: str) -> str:
     return folder
 
 
+def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[str]], per_gpu: int) -> None:
+    """Raises BenchError where --jobs, --slurm and --per-gpu are out of range or do not go together."""
+    if jobs is not None and jobs < 1:
+        raise BenchError(f"--jobs is {jobs}; it must be at least 1")
+    if per_gpu < 1:
+        raise BenchError(f"--per-gpu is {per_gpu}; it must be at least 1")
+    if per_gpu > 1 and (suite.protocol["device"] != "cuda" or slurm is not None):
+        raise BenchError(f"--per-gpu is {per_gpu}; it is for protocol.device cuda, without --slurm")
+
+
 def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optional[int],
             slurm: Optional[Sequence[str]], per_gpu: int = 1) -> List[str]:
     """Snakemake's command line. Raises BenchError."""
@@ -207,13 +243,9 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
     gpus = visible_gpus() if on_gpu and slurm is None else []
     if on_gpu and slurm is None and not gpus:
         raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine")
-    if jobs is not None and jobs < 1:
-        raise BenchError(f"--jobs is {jobs}; it must be at least 1")
-    if per_gpu < 1:
-        raise BenchError(f"--per-gpu is {per_gpu}; it must be at least 1")
-    if per_gpu > 1 and not gpus:
-        raise BenchError(f"--per-gpu is {per_gpu}; it is for protocol.device cuda, without --slurm")
     at_once = jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus)))
+    if gpus:
+        per_gpu = min(per_gpu, -(-at_once // len(gpus)))  # cells spread over the GPUs first: no more of them share one
     words = [sys.executable, "-m", "snakemake", "all", "--snakefile", SNAKEFILE, "--directory", results, "--nolock",
              "--quiet", "host", "reason", "rules", "--keep-going", "--rerun-incomplete",
              "--rerun-triggers", "mtime", "--scheduler", "greedy",

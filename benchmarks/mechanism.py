@@ -6,7 +6,7 @@
 `run` takes the options of `dsmoe train` and trains as it does: watching draws no random number and changes no tensor.
 OUT/mechanism.json then holds three series and a summary:
 
-    states          every 100 steps, and every 10 steps after an opacity reset: opacities, their gradient, test PSNR
+    states          every 100 steps, and every 10 steps after an opacity reset: opacities, the pull on them, test PSNR
     resets          test PSNR on both sides of each opacity reset
     densifications  what was cloned, split and pruned, what the pruned carried, where the cloned and split lie, and how
                     large they are: sizes are largest standard deviations in world units
@@ -37,7 +37,8 @@ from ..trainer.memory import keep_freed_memory
 from ..trainer.scene import Scene, load_scene
 from ..trainer.stopwatch import Stopwatch
 from ..trainer.strategy import MAX_SCALE, MIN_OPACITY, Step, ThreeDGSStrategy
-from .mechanism_probe import QUANTILES, Probe, median, opacity_gradient, quantiles
+from .errors import BenchError
+from .mechanism_probe import QUANTILES, Probe, median, quantiles
 from .methods import require_test_views
 from .protocol import machine_of, project_commit
 
@@ -46,6 +47,12 @@ EVERY = 100  # steps between two states,
 EVERY_AFTER_RESET, AFTER_RESET = 10, 300  # and so many for so many steps after an opacity reset
 LATER, SETTLED = 100, 1000  # steps after a reset at which the summary looks at PSNR, and at opacities
 DIGITS = 6  # of the numbers in the record
+FIELDS = {  # of a record, those that figures are drawn of
+    "config": ("blend_mode", "scene", "schedule", "densify_grad_threshold", "iterations", "seed"),
+    "states": ("iteration", "opacities", "net_pull", "psnr", "fullness"), "resets": ("iteration",),
+    "densifications": ("iteration", "after", "faint", "large", "pruned_colors", "before_prune", "after_prune", "cloned",
+                       "split", "gradients", "edges", "size"),
+}
 
 
 class Recorder:
@@ -85,7 +92,7 @@ class Recorder:
             self.states.append({
                 "iteration": step.iteration, "num_gaussians": model.num_gaussians, **self.probe.look(),
                 "opacities": quantiles(model.opacities.squeeze(1)),
-                "opacity_gradient": opacity_gradient(gradient.squeeze(1)), "net_pull": net / total if total else None,
+                "net_pull": net / total if total else None,
             })
             self.pull = self._no_pull()
 
@@ -112,10 +119,10 @@ class Recorder:
             large = ~faint & (model.scales.detach().max(dim=1).values > MAX_SCALE * self.trainer.scene.extent)
             doomed = {"faint": faint, "large": large & large_too}
             row.update({"grown": model.num_gaussians, **{name: int(mask.sum()) for name, mask in doomed.items()}})
-            for kind, shares in self.probe.shares()._asdict().items():
-                total = float(shares.double().sum())
-                row[f"pruned_{kind}"] = {name: float(shares[mask].double().sum()) / total if total else None
-                                         for name, mask in doomed.items()}
+            shares = self.probe.shares().double()
+            total = float(shares.sum())
+            row["pruned_colors"] = {name: float(shares[mask].sum()) / total if total else None
+                                    for name, mask in doomed.items()}
             row["before_prune"] = self.probe.look()
 
     def after_prune(self) -> None:
@@ -163,9 +170,12 @@ def watched(strategy: ThreeDGSStrategy, recorder: Recorder) -> ThreeDGSStrategy:
 def run(config: TrainConfig, progress: bool = True, scene: Optional[Scene] = None) -> Dict[str, Any]:
     """Trains a scene into config.output, watched; writes the record there and returns it.
 
-    scene: a loaded scene, where one is at hand. Raises TrainerError where the options or the scene do not fit, or where
-    config.output already holds a training run.
+    scene: a loaded scene, where one is at hand. Raises TrainerError where the options or the scene do not fit, where
+    config.output already holds a training run, or where it lies in the scene's folder.
     """
+    if inside(config.output, config.scene):
+        raise BenchError(f"{config.output} lies in the scene's folder {config.scene}, which stays as it is; choose "
+                         "another folder")
     config = config.changed(checkpoint_every=0)  # a record cannot be continued
     check_device(config.device)
     if os.path.isfile(os.path.join(config.output, CONFIG_NAME)):
@@ -187,6 +197,12 @@ def run(config: TrainConfig, progress: bool = True, scene: Optional[Scene] = Non
     record = _plain({**record, "summary": summary(record)})
     write_text_atomically(os.path.join(config.output, RECORD_NAME), json.dumps(record) + "\n")
     return record
+
+
+def inside(path: str, folder: str) -> bool:
+    """Whether a path is a folder, or below it."""
+    path, folder = os.path.realpath(path), os.path.realpath(folder)
+    return os.path.commonpath([path, folder]) == folder
 
 
 def summary(record: Dict[str, Any]) -> Dict[str, Any]:
@@ -254,15 +270,22 @@ def _plain(value: Any) -> Any:
 
 
 def read_record(folder: str) -> Dict[str, Any]:
-    """The record of a watched run's folder. Raises TrainerError where there is none, or a damaged one."""
+    """The record of a watched run's folder. Raises BenchError where there is none, or a damaged one."""
     path = os.path.join(folder, RECORD_NAME)
     try:
         with open(path, encoding="utf-8") as file:
-            return json.load(file)
+            record = json.load(file)
     except FileNotFoundError as error:
-        raise TrainerError(f"{folder} holds no {RECORD_NAME}: no watched run has ended there") from error
+        raise BenchError(f"{folder} holds no {RECORD_NAME}: no watched run has ended there") from error
     except ValueError as error:
-        raise TrainerError(f"{path}: not valid json ({error})") from error
+        raise BenchError(f"{path}: not valid json ({error})") from error
+    for name, fields in FIELDS.items():
+        part = record.get(name) if isinstance(record, dict) else None
+        for row in part if isinstance(part, list) and name != "config" else [part]:
+            lacking = [field for field in fields if not isinstance(row, dict) or field not in row]
+            if lacking:
+                raise BenchError(f"{path}: not the record of a watched run: {name} lacks {', '.join(lacking)}")
+    return record
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:

@@ -45,11 +45,12 @@ def draw_all(records: Sequence[Record], folder: str) -> List[str]:
 def opacity(runs: Sequence[Run]):
     """Opacities, the pull on them, PSNR and fullness: over the training, and in the steps after each reset."""
     quantities: Tuple[Tuple[str, Value], ...] = (
-        ("opacity: median, 10 to 90 %", lambda state: _quantile(state, "opacities", 0.5)),
+        ("opacity: median", lambda state: _quantile(state, "opacities", 0.5)),
         ("net pull on opacities", lambda state: state["net_pull"]),
         ("test PSNR [dB]", lambda state: state["psnr"]),
         ("fullness: sum of a pixel's weights", lambda state: state["fullness"]))
     titles = [[label, label] for label, _ in quantities]
+    titles[0][0] += "; 10 and 90 % (thin)"
     drawn, axes = _panels(titles, ("step", "steps after a reset, early ones pale"))
     for run in runs:
         states = run.record["states"]
@@ -57,8 +58,8 @@ def opacity(runs: Sequence[Run]):
             _line(whole, run, states, value)
             for age, near in enumerate(reversed(_after_resets(run.record))):
                 _line(after, run, near, value, alpha=0.55 ** age)
-        low, high = (_series(states, lambda state, q=q: _quantile(state, "opacities", q)) for q in (0.1, 0.9))
-        axes[0, 0].fill_between(low[0], low[1], high[1], color=run.color, alpha=0.15, linewidth=0)
+        for level in (0.1, 0.9):
+            _line(axes[0, 0], run, states, lambda state: _quantile(state, "opacities", level), alpha=0.5, width=0.7)
         _mark_resets(axes[:, 0], run)
     _logarithmic(axes[0])
     for axis in axes[1]:
@@ -138,8 +139,9 @@ def _series(rows: Sequence[Dict[str, Any]], value: Value) -> Tuple[np.ndarray, n
             np.array([value(row) for row in rows], float))
 
 
-def _line(axis, run: Run, rows: Sequence[Dict[str, Any]], value: Value, alpha: float = 1.0) -> None:
-    axis.plot(*_series(rows, value), color=run.color, alpha=alpha, linestyle=run.dash, linewidth=1.4)
+def _line(axis, run: Run, rows: Sequence[Dict[str, Any]], value: Value, alpha: float = 1.0,
+          width: float = 1.4) -> None:
+    axis.plot(*_series(rows, value), color=run.color, alpha=alpha, linestyle=run.dash, linewidth=width)
 
 
 def _points(axis, run: Run, rows: Sequence[Dict[str, Any]], value: Value) -> None:

@@ -4,7 +4,7 @@ Nothing here changes the model, its gradients or a generator of random numbers.
 """
 from __future__ import annotations
 
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence
+from typing import Dict, List, Optional, Sequence
 
 import torch
 
@@ -17,13 +17,6 @@ from .measure import edge_mask
 
 VIEWS = 4  # evenly spaced test views, and as many training views
 QUANTILES = (0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
-
-
-class Shares(NamedTuple):
-    """How much each of N Gaussians gives to the probe's training views; sums over their pixels."""
-
-    weights: torch.Tensor  # [N] of the weight in the blend's numerator: alpha T, in smoe_std alpha
-    colors: torch.Tensor  # [N] of the factor of its colour in the pixel: in SMoE modes the weight over the gate sum
 
 
 class Probe:
@@ -52,18 +45,21 @@ class Probe:
             values["fullness"].append(float(rendering.alpha.mean()))
         return {name: sum(found) / len(found) if found else None for name, found in values.items()}
 
-    def shares(self) -> Shares:
-        """Which Gaussians carry the picture; one rendering and its backward pass for each training view."""
-        weights = colors = self.model.raw["means3D"].detach().new_zeros(self.model.num_gaussians)
+    def shares(self) -> torch.Tensor:
+        """How much each of N Gaussians gives to the training views: [N], the factor of its colour, summed over pixels.
+
+        The factor is the weight in the blend's numerator, in SMoE modes over the gate sum. One rendering and its
+        backward pass for each view.
+        """
+        found = self.model.raw["means3D"].detach().new_zeros(self.model.num_gaussians)
         for camera, _ in self.train:
             # A pixel is linear in the colours: the gradient of the sum of all pixels by a colour is its share.
-            leaf = weights.new_zeros(len(weights), 3).requires_grad_()
+            leaf = found.new_zeros(len(found), 3).requires_grad_()
             with torch.enable_grad():
-                rendering, splats = self.renderer(camera, colors_precomp=leaf)
+                rendering, _ = self.renderer(camera, colors_precomp=leaf)
                 share, = torch.autograd.grad(rendering.color[0].sum(), leaf)
-            colors = colors + share[:, 0]
-            weights = weights + splats.contributions(weights.new_ones(camera.height, camera.width)).blend_weights
-        return Shares(weights, colors)
+            found = found + share[:, 0]
+        return found
 
     @torch.no_grad()
     def edges(self, chosen: torch.Tensor) -> Dict[str, Optional[float]]:
@@ -100,15 +96,3 @@ def median(values: torch.Tensor) -> Optional[float]:
     """The median of values [N]; None where there are no values."""
     found = quantiles(values, (0.5,))
     return found[0] if found else None
-
-
-def opacity_gradient(gradient: torch.Tensor) -> Dict[str, Any]:
-    """The gradient of one view's loss by opacity logits [N], over those Gaussians that it reaches.
-
-    raised: the fraction of them whose opacity a step against the gradient raises.
-    """
-    reached = gradient[gradient != 0].double()
-    if not len(reached):
-        return {"reached": 0, "mean": None, "mean_absolute": None, "median_absolute": None, "raised": None}
-    return {"reached": len(reached), "mean": float(reached.mean()), "mean_absolute": float(reached.abs().mean()),
-            "median_absolute": median(reached.abs()), "raised": float((reached < 0).double().mean())}

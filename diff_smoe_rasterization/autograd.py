@@ -91,7 +91,7 @@ class _Rasterize(torch.autograd.Function):
 def rasterize_op(*inputs):
     """Calls the op `rasterize` differentiably. Arguments and results: csrc/torch/schema.cpp."""
     if _CAN_REGISTER and torch.compiler.is_compiling():
-        return _OPS.rasterize(*inputs)
+        return _OPS.rasterize(*inputs, torch.is_grad_enabled())  # for_backward
     if torch.is_grad_enabled() and any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs):
         return _Rasterize.apply(*inputs)
     with _below_autograd():

@@ -130,7 +130,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run.add_argument("suite", metavar="SUITE", help="a .yaml file, or a shipped one: smoke, table1, table2, table3, "
                                                     "fig4, fig5, captures, captures_ablation, captures_baselines")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
-    run.add_argument("--jobs", type=int, metavar="N", help="cells at once (default: one per GPU; one on the CPU)")
+    run.add_argument("--jobs", type=int, metavar="N",
+                     help="cells at once (default: --per-gpu on each GPU, one on the CPU)")
     run.add_argument("--per-gpu", type=int, default=1, metavar="K",
                      help="cells that share a GPU (default: 1); beyond 1 their times and FPS stay out of the report")
     run.add_argument("--slurm", nargs="*", metavar="KEY=VALUE",
@@ -138,7 +139,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
                      help="only such cells; fields: method, scene, blend_mode, schedule, densify_grad_threshold, "
                           "seed, headline")
-    run.add_argument("--rows", metavar="FILE", help="rows of earlier runs (.jsonl), whose cells are not run again")
+    run.add_argument("--rows", metavar="FILE",
+                     help="rows of earlier runs (.jsonl), or a folder of results, whose cells are not run again")
     run.add_argument("--retry-failed", action="store_true", help="run failed cells again")
     run.add_argument("--dry-run", action="store_true", help="say which cells are done and which are not")
     run.set_defaults(run=_bench_run)
@@ -152,8 +154,9 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
 def _bench_run(arguments: argparse.Namespace) -> int:
     from .benchmarks.engine import rows_table, run_suite
 
-    rows = run_suite(arguments.suite, arguments.output, arguments.jobs, arguments.slurm, arguments.retry_failed,
-                     arguments.dry_run, arguments.only, arguments.per_gpu, arguments.rows)
+    rows = run_suite(arguments.suite, results=arguments.output, jobs=arguments.jobs, slurm=arguments.slurm,
+                     retry_failed=arguments.retry_failed, dry_run=arguments.dry_run, only=arguments.only,
+                     per_gpu=arguments.per_gpu, rows=arguments.rows)
     if rows:
         print(rows_table(rows))
     failed = sum(not row["ok"] for row in rows)

@@ -44,8 +44,9 @@ def _load() -> Any:
         _fail(f"its extension _C is not built for this Python{elsewhere}; in the source folder type: "
               "pip install --no-build-isolation .", error)
     except ImportError as error:
-        _fail((f"its extension does not load ({error}); it was built against torch {built_against or 'of another build'}"
-               f", and torch {torch.__version__} is running; ") + _BUILD_AGAIN, error)
+        _fail((f"its extension does not load ({error}); it was built against torch "
+               f"{built_against or 'of another build'}, and torch {torch.__version__} is running; ") + _BUILD_AGAIN,
+              error)
 
 
 def _built_with_cuda() -> bool:

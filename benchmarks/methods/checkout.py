@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from ...trainer.images import View
 from ...trainer.pictures import evenly_spaced
 from ...trainer.scene import Scene, load_scene
 from ..errors import BenchError
+from ..log import last_line
 from ..measure import Measures
 from ..protocol import RECIPE, commit_of, config_of
 from . import Outcome, require_test_views
@@ -32,7 +32,6 @@ OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py
 # Mean difference between the trainer's ground truth and ours: rounding leaves half a grey level at the most, another
 # downscaler or background leaves several.
 MAX_TRUTH_DIFFERENCE = 1 / 255
-PROGRESS_BAR = re.compile(r"\|.*\| \d+/\d+ \[")  # tqdm's
 SET_OTHERWISE = ("sh_degree_interval", "antialiasing", "opacity_reset_interval")
 
 
@@ -110,8 +109,8 @@ class ThreeDGS:
             status = subprocess.call(line, cwd=folder, stdout=file, stderr=subprocess.STDOUT,
                                      stdin=subprocess.DEVNULL, env=self.environment())
         if status != 0:
-            raise BenchError(f"{script} of {self.method['label']} ended with status {status}: {last_line(log)} "
-                             f"(all of it is in {os.path.basename(log)})")
+            raise BenchError(f"{script} of {self.method['label']} ended with status {status}: "
+                             f"{last_line(log) or 'it printed nothing'} (all of it is in {os.path.basename(log)})")
         with open(record, encoding="utf-8") as file:
             return json.load(file)
 
@@ -241,7 +240,8 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
         renders = {view.camera.name: torch.from_numpy(np.load(seen["file"])) for view, seen in kept}
     finally:
         shutil.rmtree(shape.renders, ignore_errors=True)
-        shutil.rmtree(shape.scene, ignore_errors=True)
+        if not cell["keep_models"]:  # a model that is kept names its scene, as the path that was trained on
+            shutil.rmtree(shape.scene, ignore_errors=True)
     return Outcome(scene=scene, evaluation=evaluation, lpips=measures.lpips_of(evaluation.metrics),
                    num_gaussians=rendered["num_gaussians"], own_bytes=shape.own_bytes(),
                    train_seconds=shape.train_seconds(trained), peak_gpu_mib=trained["peak_gpu_mib"],
@@ -250,20 +250,27 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
 
 
 def portable(words: List[str]) -> List[str]:
-    """The words of a command without the folders in which things lie here."""
-    return [os.path.basename(word) if os.path.isabs(word) else word for word in words]
+    """The words of a command without the folders in which things lie here: /a/b and --data=/a/b are b, --data=b."""
+    shown = []
+    for word in words:
+        option, equals, value = ("", "", word) if os.path.isabs(word) else word.partition("=")
+        shown.append(option + equals + (os.path.basename(os.path.normpath(value)) if os.path.isabs(value) else value))
+    return shown
 
 
 def linked_scene(source: str, folder: str) -> None:
-    """Makes a folder that holds a scene by links: trainers write point clouds beside what they read.
+    """Makes a folder that holds a scene: trainers write point clouds beside what they read, or over it.
 
-    The scene stays as it is, and cells side by side do not write the same file.
+    Point clouds (.ply) are copied, all else is linked. So the scene stays as it is, and cells side by side do not write
+    the same file.
     """
     os.makedirs(folder)
     for name in os.listdir(source):
         path, link = os.path.abspath(os.path.join(source, name)), os.path.join(folder, name)
         if os.path.isdir(path) and name in ("sparse", "0"):
             linked_scene(path, link)
+        elif os.path.isfile(path) and name.endswith(".ply"):
+            shutil.copyfile(path, link)
         else:
             os.symlink(path, link)
 
@@ -310,11 +317,3 @@ def size_of(path: str) -> int:
     if not os.path.isdir(path):
         raise BenchError(f"{path}: no such file; the trainer left no model there")
     return sum(os.path.getsize(os.path.join(folder, name)) for folder, _, names in os.walk(path) for name in names)
-
-
-def last_line(path: str) -> str:
-    """The last line of a log that says something; a progress bar, drawn once more at the end, does not."""
-    with open(path, encoding="utf-8", errors="replace") as file:
-        lines = [line.strip() for line in file.read().replace("\r", "\n").splitlines() if line.strip()]
-    lines = [line for line in lines if not PROGRESS_BAR.search(line)] or lines
-    return lines[-1][:300] if lines else "it printed nothing"

@@ -248,10 +248,13 @@ class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def stub(name):
-    """Lets a module be imported that this Python lacks, or has and cannot import: turtle without tkinter is one."""
+    """Lets a module be imported that this Python lacks, or has and cannot import: turtle without tkinter is one.
+
+    It is imported here, if it is there: nothing else tells whether it can be.
+    """
     try:
         importlib.import_module(name)
-    except Exception:  # of whatever kind: the module is not needed
+    except (Exception, SystemExit):  # of whatever kind: the module is not needed
         for loaded in [loaded for loaded in sys.modules if loaded.partition(".")[0] == name]:
             del sys.modules[loaded]
         sys.meta_path.insert(0, AbsentFinder(name))  # before the finder of the one that cannot be imported

@@ -4,6 +4,7 @@ Each is drawn twice, for light and for dark pages, as SVG; the light one also as
 """
 from __future__ import annotations
 
+import math
 import os
 from typing import Dict, List, NamedTuple, Sequence, Tuple
 
@@ -25,6 +26,7 @@ OTHER_MARK = ("D", "-", "\\\\")
 THEMES = {"light": {"background": "#ffffff", "ink": "#1c1c1e", "grid": "#d8d8dc"},
           "dark": {"background": "#1b1c20", "ink": "#e8e8ea", "grid": "#3c3d44"}}
 AMOUNTS = ("num_gaussians", "size_own_mb", "size_common_mb")
+MARK, LARGEST_MARK = 6, 12  # points
 PANEL = (4.2, 2.9)  # inches, as the next two
 LEGEND_MARK, LEGEND_LETTER = 0.85, 0.082  # what a mark, and a letter of its label, take at most
 
@@ -68,26 +70,43 @@ def rate_distortion(groups: Sequence[Group]):
         return None
     drawn, axes = plt.subplots(len(qualities), len(amounts), squeeze=False, sharey="row", sharex="col",
                                figsize=(PANEL[0] * len(amounts), PANEL[1] * len(qualities) + 0.8))
-    styles = _styles(groups)
+    looks = _looks(groups)
     for line, quality in zip(axes, qualities):
         for axis, amount in zip(line, amounts):
-            for series, (color, (mark, dash, _)) in styles.items():
+            for series, look in looks.items():
                 members = [group for group in groups if group.setting.series == series
                            and group.by_seed(quality) and group.by_seed(amount)]
                 points = sorted(((group.measured(amount).mean, *group.measured(quality)) for group in members),
                                 key=lambda point: point[0])
                 if points:
                     xs, ys, spreads = zip(*points)
-                    axis.errorbar(xs, ys, yerr=[spread or 0 for spread in spreads], color=color, marker=mark,
-                                  linestyle=dash, linewidth=1.6, markersize=6, capsize=3)
+                    axis.errorbar(xs, ys, yerr=[math.nan if spread is None else spread for spread in spreads],
+                                  linewidth=1.6, capsize=3, **look)
             axis.set_xscale("log")
         line[0].set_ylabel(column(quality).name + (" (lower is better)" if quality.startswith(LPIPS) else ""))
     for axis, amount in zip(axes[-1], amounts):
         axis.set_xlabel(column(amount).name)
-    handles = [Line2D([], [], color=color, marker=mark, linestyle=dash, label=series.label())
-               for series, (color, (mark, dash, _)) in styles.items()]
-    legend(drawn, handles)
+    legend(drawn, [Line2D([], [], label=series.label(), **look) for series, look in looks.items()])
     return drawn
+
+
+def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
+    """How each series is drawn: lines through three points and more, since two are no curve.
+
+    Marks in one place are all seen: those of each next method and schedule are smaller and in front, and those of
+    alpha, in front of the other blend modes', are hollow.
+    """
+    looks: Dict[Setting, Dict[str, object]] = {}
+    styles = _styles(groups)
+    kinds = list(dict.fromkeys(series.pair for series in styles))
+    smaller = min(2, (LARGEST_MARK - MARK) / max(1, len(kinds) - 1))
+    for series, (color, (mark, dash, _)) in styles.items():
+        points = sum(group.setting.series == series for group in groups)
+        hollow, place = series.blend_mode == "alpha", kinds.index(series.pair)
+        looks[series] = {"color": color, "marker": mark, "markersize": MARK + smaller * (len(kinds) - 1 - place),
+                         "markerfacecolor": "none" if hollow else color, "markeredgewidth": 1.5,
+                         "linestyle": dash if points > 2 else "", "zorder": 3 + place + 0.5 * hollow}
+    return looks
 
 
 def bars(groups: Sequence[Group]):

@@ -14,7 +14,7 @@ Row = Dict[str, Any]
 ROWS_NAME = "rows.jsonl"
 CELLS_FOLDER = "cells"
 ROW_NAME = "row.json"
-NEEDED = ("cell", "suite", "ok", "method", "blend_mode", "scene", "seed")
+NEEDED = {"cell": str, "suite": str, "ok": bool, "method": str, "blend_mode": str, "scene": str, "seed": int}
 # What two rows of one scene must share to be comparable, where both say it.
 RULES = ("split", "resolution", "image_size", "downscaler", "background", "principal_point")
 RULE_PREFIXES = ("psnr", "ssim", "lpips", "edge", "fps", "size", "quantisation")
@@ -126,23 +126,29 @@ def read_rows(results: str) -> List[Row]:
     rows: Dict[str, Row] = {}
     listed = results if os.path.isfile(results) else os.path.join(results, ROWS_NAME)
     if os.path.isfile(listed):
-        with open(listed, encoding="utf-8") as file:
-            for number, line in enumerate(file, 1):
-                if line.strip():
-                    row = _parsed(line, f"{listed}, line {number}")
-                    rows[row["cell"]] = row
+        for number, line in enumerate(_text(listed).split("\n"), 1):
+            if line.strip():
+                row = _parsed(line, f"{listed}, line {number}")
+                rows[row["cell"]] = row
     cells = os.path.join(results, CELLS_FOLDER)
     for cell in sorted(os.listdir(cells)) if os.path.isdir(cells) else []:
         path = os.path.join(cells, cell, ROW_NAME)
         if os.path.isfile(path):
-            with open(path, encoding="utf-8") as file:
-                row = _parsed(file.read(), path)
+            row = _parsed(_text(path), path)
             rows[row["cell"]] = row
     if not rows:
         raise ReportError(f"{results}: no rows: neither {CELLS_FOLDER}/*/{ROW_NAME} nor {ROWS_NAME}")
     found = [rows[cell] for cell in sorted(rows)]
     _refuse_mixed_protocols(found)
     return found
+
+
+def _text(path: str) -> str:
+    try:
+        with open(path, encoding="utf-8") as file:
+            return file.read()
+    except UnicodeDecodeError as error:
+        raise ReportError(f"{path}: not text in UTF-8 ({error})") from error
 
 
 def _parsed(text: str, place: str) -> Row:
@@ -155,6 +161,9 @@ def _parsed(text: str, place: str) -> Row:
     missing = [name for name in NEEDED if name not in row]
     if missing:
         raise ReportError(f"{place}: the row lacks {', '.join(missing)}")
+    for name, kind in NEEDED.items():
+        if not isinstance(row[name], kind):
+            raise ReportError(f"{place}: {name} is {row[name]!r}; it must be of type {kind.__name__}")
     return row
 
 

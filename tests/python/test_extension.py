@@ -1,4 +1,4 @@
-"""The compiled extension: what it says when it cannot be loaded, and what its ops refuse when they are called directly."""
+"""The compiled extension: what it says when it cannot be loaded, and what its ops refuse when called directly."""
 from __future__ import annotations
 
 import importlib
@@ -197,7 +197,8 @@ def test_the_backward_op_refuses_lists_of_the_wrong_length():
 
 
 @on_every_device
-@pytest.mark.parametrize("row, name", [(0, "means3D"), (1, "opacities"), (-4, "bg"), (-3, "viewmatrix"), (-1, "campos")])
+@pytest.mark.parametrize("row, name", [(0, "means3D"), (1, "opacities"), (-4, "bg"), (-3, "viewmatrix"),
+                                       (-1, "campos")])
 def test_the_backward_op_refuses_absent_inputs(row, name):
     arguments = backward_arguments("smoe")
     inputs, present = list(arguments[4]), list(arguments[5])

@@ -68,17 +68,6 @@ def test_opcheck_of_rasterize(mode, case):
     opcheck_rasterize(scene)
 
 
-def test_rasterize_without_a_backward_pass_to_come(mode):
-    """The fake kernel says the shapes of that too, and the images are the same."""
-    scene = random_scene(mode, 20, 20, 18, dtype=torch.float32, degree=1)
-    op, arguments = (torch.ops.diff_smoe_rasterization.rasterize.default,
-                     {wanted: op_arguments(scene, depth=False, inverse_depth=False, for_backward=wanted)
-                      for wanted in (True, False)})
-    torch.library.opcheck(op, arguments[False], test_utils=("test_schema", "test_faketensor"))
-    for kept, lean in zip(op(*arguments[True])[:NUM_IMAGES], op(*arguments[False])[:NUM_IMAGES]):
-        assert torch.equal(kept, lean)
-
-
 def test_opcheck_of_rasterize_on_no_gaussians(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32).rows(slice(0, 0)).requiring_grad()
     opcheck_rasterize(scene)
@@ -115,6 +104,25 @@ def test_compiled_contributions_equal_eager(mode):
                                 score(scene.settings, pixel_weights, **scene.inputs)):
         # Positive numbers: a GPU adds them in any order, each rounded by 6e-8.
         torch.testing.assert_close(actual, expected, rtol=0 if actual.device.type == "cpu" else 1e-5, atol=0)
+
+
+def test_compiled_renderings_without_gradients_have_no_backward_pass_to_come():
+    """The op's last argument, in the graphs that torch.compile makes with gradients and without them."""
+    scene, wanted = random_scene("smoe", 60, 40, 30, dtype=torch.float32, degree=1), []
+    op = torch.ops.diff_smoe_rasterization.rasterize
+
+    def backend(graph, inputs):
+        calls = [node for node in graph.graph.nodes if node.target in (op, op.default)]
+        wanted.extend(node.args[len(op.default._schema.arguments) - 1] for node in calls)
+        return graph
+
+    torch._dynamo.reset()
+    compiled = torch.compile(diff_smoe_rasterization.rasterize, fullgraph=True, backend=backend)
+    expected = diff_smoe_rasterization.rasterize(settings=scene.settings, **scene.inputs).color
+    for with_gradients in (True, False, True):
+        with torch.set_grad_enabled(with_gradients):
+            assert torch.equal(compiled(settings=scene.settings, **scene.inputs).color, expected)
+    assert wanted == [True, False]
 
 
 @pytest.mark.parametrize("backend", ["eager", "aot_eager"])

@@ -23,6 +23,7 @@ from PIL import Image
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.benchmarks import engine
 from diff_smoe_rasterization.benchmarks.cell import work
+from diff_smoe_rasterization.benchmarks.log import last_line
 from diff_smoe_rasterization.benchmarks.methods import checkout as shapes
 from diff_smoe_rasterization.benchmarks.suite import expand
 
@@ -214,7 +215,7 @@ def test_the_last_words_are_not_a_progress_bars(tmp_path):
     with open(log, "w") as file:
         subprocess.call([sys.executable, "-c", program], stderr=file)
     assert "Training progress" in log.read_text().splitlines()[-1]
-    assert shapes.last_line(str(log)) == "KeyError: 'why'"
+    assert last_line(str(log)) == "KeyError: 'why'"
 
 
 def test_a_patched_checkout_is_a_copy(small, tmp_path):
@@ -244,17 +245,34 @@ def test_a_checkout_that_is_not_there_is_a_row(small, tmp_path):
 
 def test_what_a_trainer_writes_beside_its_scene_stays_its_own(tmp_path):
     source, linked = tmp_path / "scene", tmp_path / "linked"
-    for file in ("images/0.png", "sparse/0/points3D.bin", "transforms_train.json"):
+    read_over = ("sparse/0/points3D.ply", "points3d.ply")
+    for file in ("images/0.png", "sparse/0/points3D.bin", "transforms_train.json", *read_over):
         (source / file).parent.mkdir(parents=True, exist_ok=True)
         (source / file).write_text(file)
+    (source / read_over[0]).chmod(0o444)
     before = sorted(source.rglob("*"))
     shapes.linked_scene(str(source), str(linked))
-    for file in ("sparse/0/points3D.ply", "points3d.ply"):
+    for file in ("sparse/0/points3D.ply", "points3d.ply", "input.ply"):
         (linked / file).write_text("made")
     assert (linked / "images/0.png").read_text() == "images/0.png"
     assert (linked / "sparse/0/points3D.bin").read_text() == "sparse/0/points3D.bin"
     shutil.rmtree(linked)
     assert sorted(source.rglob("*")) == before
+    assert [(source / file).read_text() for file in read_over] == list(read_over)
+
+
+def test_a_model_that_is_kept_names_a_scene_that_is_there(small, tmp_path):
+    cell = {**small.cell("3dgs-2023"), "keep_models": True}
+    assert row_of(cell, tmp_path / "out")["ok"]
+    linked = tmp_path / "out" / "scene"
+    assert f"source_path='{linked}'" in (tmp_path / "out" / "run" / "cfg_args").read_text()
+    assert (linked / "images" / "view0.png").is_file()
+    assert not (small.run("3dgs-2023")[1] / "scene").exists()
+
+
+def test_a_row_says_the_arguments_without_the_folders_of_this_machine():
+    words = ["-s", "/a/scene", "--model", "/a/b/", "--data=/a/c/", "--ratio=1/2", "--flag", "a/b", "/d=e/f"]
+    assert shapes.portable(words) == ["-s", "scene", "--model", "b", "--data=c", "--ratio=1/2", "--flag", "a/b", "f"]
 
 
 def test_modules_that_are_imported_and_not_used_may_be_absent():
@@ -274,6 +292,14 @@ def test_modules_that_are_imported_and_not_used_may_be_absent():
             del sys.modules[name]
     observer.stub("json")
     assert sys.modules["json"] is json
+
+
+def test_modules_that_end_the_process_are_stood_in_for(tmp_path):
+    """In a process of its own, where they stay so."""
+    (tmp_path / "leaver.py").write_text("raise SystemExit('no display')")
+    program = ("import sys; sys.path[:0] = sys.argv[1:]; import observer; "
+               "observer.stub('leaver'); import leaver; print(leaver.window)")
+    subprocess.run([sys.executable, "-c", program, os.path.dirname(shapes.OBSERVER), str(tmp_path)], check=True)
 
 
 def test_no_picture_is_written_where_renderings_are_kept(tmp_path):

@@ -110,7 +110,11 @@ def test_rows_of_an_earlier_run_elsewhere_are_not_run_again(finished, tmp_path, 
     _, suite, results = finished
     rows = ["--rows", str(results / "rows.jsonl")]
     assert main(["bench", "run", suite, "-o", str(tmp_path / "dry"), "--dry-run", *rows]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["done", "done"]
+    assert capsys.readouterr().out.splitlines()[0] == f"2 of 2 cells taken from {rows[1]}"
+    assert not (tmp_path / "dry").exists()
+    assert main(["bench", "run", suite, "-o", str(tmp_path / "dry"), "--dry-run", "--retry-failed", *rows]) == 0
+    counted, *lines = capsys.readouterr().out.splitlines()
+    assert counted.startswith("1 of 2 cells") and [line.split()[0] for line in lines] == ["done", "to"]
     assert main(["bench", "run", suite, "-o", str(tmp_path / "new"), *rows]) == 0
     assert rows_of(tmp_path / "new") == rows_of(results)
     assert not list((tmp_path / "new").glob("cells/*/log.txt"))
@@ -119,6 +123,43 @@ def test_rows_of_an_earlier_run_elsewhere_are_not_run_again(finished, tmp_path, 
     assert {row["suite"] for row in rows_of(tmp_path / "other").values()} == {"other"}
     assert main(["bench", "run", suite, "-o", str(tmp_path / "none"), "--rows", str(tmp_path / "absent.jsonl")]) == 1
     assert "absent.jsonl" in capsys.readouterr().err
+
+
+def test_rows_must_be_of_the_suites_cells(finished, tmp_path, capsys):
+    content, suite, results = finished
+    longer = write_suite({**content, "protocol": {**content["protocol"], "iterations": 13}}, tmp_path)
+    words = ["-o", str(tmp_path / "results"), "--rows"]
+    assert main(["bench", "run", longer, *words, str(results)]) == 1
+    assert "none of its 2 rows is of a cell" in capsys.readouterr().err
+    rows = list(rows_of(results).values())
+    for field in engine.SAID_BY_THE_ID:
+        changed, value = tmp_path / f"{field}.jsonl", rows[1][field]
+        other = {**rows[1], field: "other" if isinstance(value, str) else value + 1}
+        changed.write_text(json.dumps(rows[0]) + "\n" + json.dumps(other) + "\n")
+        assert main(["bench", "run", suite, *words, str(changed)]) == 1
+        told = capsys.readouterr().err
+        assert str(changed) in told and rows[1]["cell"] in told and f": {field} is " in told
+    assert not (tmp_path / "results").exists()
+
+
+def test_options_that_do_not_go_together_are_refused_before_anything_is_written(content, tmp_path, capsys):
+    suite, results = write_suite(content, tmp_path), tmp_path / "results"
+    for words, told in ((["--jobs", "0"], "--jobs is 0"), (["--per-gpu", "-1"], "--per-gpu is -1"),
+                        (["--per-gpu", "2"], "protocol.device cuda"),
+                        (["--per-gpu", "2", "--slurm"], "without --slurm")):
+        for more in ([], ["--dry-run"]):
+            assert main(["bench", "run", suite, "-o", str(results), *words, *more]) == 1
+            assert told in capsys.readouterr().err
+    assert not results.exists()
+
+
+def test_a_suite_for_gpus_leaves_nothing_where_there_is_none(content, tmp_path, monkeypatch, capsys):
+    content["protocol"].update(device="cuda", principal_point="centre")
+    suite, results = write_suite(content, tmp_path), tmp_path / "results"
+    monkeypatch.setattr(engine, "visible_gpus", list)
+    assert main(["bench", "run", suite, "-o", str(results), "--dry-run"]) == 0
+    assert main(["bench", "run", suite, "-o", str(results)]) == 1
+    assert "no CUDA device" in capsys.readouterr().err and not results.exists()
 
 
 def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, capsys):
@@ -187,12 +228,13 @@ def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatc
     """As the system does where memory is short."""
     cell, path = cell_file
     killer = tmp_path / "python"
-    killer.write_text("#!/bin/sh\necho the last words\nkill -9 $$\n")
+    killer.write_text("#!/bin/sh\necho the last words\n"
+                      "printf 'Training:  50%%|#### | 5/10 [00:01<00:01, 5.0it/s]'\nkill -9 $$\n")
     killer.chmod(0o755)
     monkeypatch.setattr(cells.sys, "executable", str(killer))
     row = cells.supervise(str(path), str(tmp_path / "out"))
     assert not row["ok"] and row["cell"] == cell["id"]
-    assert "signal 9" in row["reason"] and "memory" in row["reason"] and "the last words" in row["reason"]
+    assert "signal 9" in row["reason"] and "memory" in row["reason"] and row["reason"].endswith(": the last words")
 
 
 def test_two_cells_never_have_one_gpu(tmp_path):
@@ -265,6 +307,14 @@ def test_the_process_of_a_cell_is_told_its_gpu_and_how_many_have_it(cell_file, t
     assert said[0] == "7" and said[-3:] == ["--inside", "--per-gpu", "2"]
 
 
+@pytest.mark.parametrize("number", ["0", "-1"])
+def test_a_gpu_is_given_to_one_cell_at_least(number, cell_file, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-gpu", number])
+    assert f"--per-gpu: is {number}; it must be at least 1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_second_run_on_the_same_results_is_refused(tmp_path):
     with engine.only_one(str(tmp_path)):
         with pytest.raises(BenchError, match="another run"):
@@ -294,11 +344,14 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
         words = engine.command(suite, suite.cells, "out", None, None, per_gpu=4)
         assert words[words.index("--cores") + 1] == "12" and "gpu=12" in words and "per_gpu=4" in words
         words = engine.command(suite, suite.cells, "out", 5, None, per_gpu=4)
-        assert words[words.index("--cores") + 1] == "5" and "gpu=12" in words
+        # Five cells on three GPUs: two share one at the most.
+        assert words[words.index("--cores") + 1] == "5" and "gpu=6" in words and "per_gpu=2" in words
+        words = engine.command(suite, suite.cells, "out", 3, None, per_gpu=2)
+        assert "gpu=3" in words and "per_gpu=1" in words
         with pytest.raises(BenchError, match="--per-gpu is 0"):
-            engine.command(suite, suite.cells, "out", None, None, per_gpu=0)
+            engine.check_sharing(suite, None, None, per_gpu=0)
         with pytest.raises(BenchError, match="--per-gpu is 2; it is for"):
-            engine.command(suite, suite.cells, "out", None, ["slurm_partition=gpu"], per_gpu=2)
+            engine.check_sharing(suite, None, ["slurm_partition=gpu"], per_gpu=2)
         patch.setattr(engine, "visible_gpus", list)
         with pytest.raises(BenchError, match="no CUDA device"):
             engine.command(suite, suite.cells, "out", None, None)

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from diff_smoe_rasterization.benchmarks import mechanism
-from diff_smoe_rasterization.benchmarks.mechanism_probe import Probe, median, opacity_gradient, quantiles
+from diff_smoe_rasterization.benchmarks.errors import BenchError
+from diff_smoe_rasterization.benchmarks.mechanism_probe import Probe, median, quantiles
 from diff_smoe_rasterization.trainer.checkpoint import CHECKPOINT_NAME, load_checkpoint
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import TrainerError
@@ -123,13 +124,13 @@ def test_fullness_falls_with_opacities(watched_run):
 
 
 def test_the_pruned_have_a_share_of_the_picture(runs):
-    for mode, (_, record) in runs.items():
+    shares = []
+    for _, record in runs.values():
         for step in record["densifications"]:
             for name in ("faint", "large"):
-                share = step["pruned_colors"][name]
-                assert (share == 0) if step[name] == 0 else (0 <= share <= 1)
-                if mode == "alpha":  # Eq. 3 divides by no gate sum; the sums are float32, over 300 pixels of views
-                    assert share == pytest.approx(step["pruned_weights"][name], rel=1e-3, abs=1e-6)
+                shares.append(step["pruned_colors"][name])
+                assert (shares[-1] == 0) if step[name] == 0 else (0 <= shares[-1] <= 1)
+    assert max(shares) > 0
 
 
 def test_the_summary_adds_up(watched_run):
@@ -192,11 +193,7 @@ def test_a_share_is_what_a_gaussian_alone_lights_up(probe_of, mode):
         with torch.no_grad():
             total = sum(float(probe.renderer(camera, colors_precomp=lit)[0].color[1].sum())
                         for camera, _ in probe.train)
-        assert float(shares.colors[index]) == pytest.approx(total, rel=1e-3, abs=1e-6)  # float32 sums
-    if mode == "alpha":
-        torch.testing.assert_close(shares.colors, shares.weights, rtol=1e-4, atol=1e-5)  # sums in another order
-    else:  # a gate sum below 1 raises a share, and smoe_std's may be above
-        assert not torch.allclose(shares.colors, shares.weights, rtol=0.01)
+        assert float(shares[index]) == pytest.approx(total, rel=1e-3, abs=1e-6)  # float32 sums
     assert all(tensor.grad is None for tensor in probe.model.raw.values())
 
 
@@ -230,12 +227,6 @@ def test_quantiles_are_values():
     assert quantiles(values[:0]) is None and median(values[:0]) is None
 
 
-def test_an_opacity_gradient_is_of_the_gaussians_that_it_reaches():
-    found = opacity_gradient(torch.tensor([-1.0, 0.0, 3.0, -5.0, 0.0]))
-    assert found == {"reached": 3, "mean": -1, "mean_absolute": 3, "median_absolute": 3, "raised": 2 / 3}
-    assert opacity_gradient(torch.zeros(3))["reached"] == 0
-
-
 def test_the_net_pull_is_over_the_steps_since_the_last_state(tiny_scene, tmp_path):
     config = config_of(tiny_scene, tmp_path / "out", "alpha")
     trainer = Trainer(config, load_scene(config, progress=False))
@@ -250,6 +241,26 @@ def test_the_net_pull_is_over_the_steps_since_the_last_state(tiny_scene, tmp_pat
 def test_a_folder_with_a_run_is_not_overwritten(watched_run):
     with pytest.raises(TrainerError, match="already holds"):
         mechanism.run(watched_run[0], progress=False)
+
+
+@pytest.mark.parametrize("below", ["", "out"])
+def test_a_scene_is_not_written_into(tiny_scene, below, capsys):
+    before = sorted(os.listdir(tiny_scene))
+    assert mechanism.main(["run", tiny_scene, os.path.join(tiny_scene, below), "--quiet"]) == 1
+    assert "lies in the scene's folder" in capsys.readouterr().err
+    assert sorted(os.listdir(tiny_scene)) == before
+
+
+@pytest.mark.parametrize("text, told", [
+    ("{", "not valid json"), ("{}", "config lacks blend_mode"), ("[]", "config lacks blend_mode"),
+    ("densifications", "densifications lacks size"), ("states", "states lacks iteration")])
+def test_a_damaged_record_is_named(watched_run, tmp_path, text, told):
+    record = json.loads(json.dumps(watched_run[1]))
+    del record["densifications"][-1]["size"]
+    damaged = {"densifications": record, "states": {**record, "states": None}}
+    (tmp_path / mechanism.RECORD_NAME).write_text(json.dumps(damaged[text]) if text in damaged else text)
+    with pytest.raises(BenchError, match=f"mechanism.json.*{told}"):
+        mechanism.read_record(str(tmp_path))
 
 
 def test_the_command_trains_and_explains_its_errors(tiny_scene, tmp_path, capsys):

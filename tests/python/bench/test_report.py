@@ -283,9 +283,11 @@ def test_scenes_and_suites_may_differ_in_protocol(tmp_path):
 
 
 @pytest.mark.parametrize("text, reason", [("{", "line 1: not valid json"), ("[]", "line 1: expected one object"),
-                                          ('{"cell": "a"}', "lacks suite, ok, method"), ("", "no rows")])
+                                          ('{"cell": "a"}', "lacks suite, ok, method"), ("", "no rows"),
+                                          (json.dumps({**row(), "cell": ["a"]}), r"line 1: cell is \['a'\]"),
+                                          ("\xff", "rows.jsonl: not text in UTF-8")])
 def test_damaged_results_are_refused(tmp_path, text, reason):
-    (tmp_path / "rows.jsonl").write_text(text, encoding="utf-8")
+    (tmp_path / "rows.jsonl").write_text(text, encoding="latin-1")
     with pytest.raises(ReportError, match=reason):
         rows.read_rows(str(tmp_path))
 

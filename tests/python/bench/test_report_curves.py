@@ -32,6 +32,25 @@ def test_a_curve_goes_through_the_means_from_few_gaussians_to_many():
     assert whisker[1, 1] - whisker[0, 1] == pytest.approx(2 * 2 ** 0.5)  # seeds 20 and 22: sd is the root of 2
 
 
+def test_two_points_are_no_curve():
+    entries = [row(threshold=threshold, num_gaussians=number) for threshold, number in ((0.005, 10), (0.0002, 90))]
+    entries += [row(blend_mode="smoe", threshold=threshold) for threshold in (0.005, 0.001, 0.0002)]
+    drawn = curves.rate_distortion(groups_of(entries))
+    for lines in ([container.lines[0] for container in drawn.axes[0].containers], drawn.legends[0].get_lines()):
+        assert [line.get_linestyle() for line in lines] == ["None", "-"]
+
+
+def test_marks_in_one_place_are_all_seen():
+    """The smaller in front of the larger, and what is hollow in front of what is not."""
+    entries = [row(blend_mode=mode, schedule=schedule) for schedule in ("3dgs", "steady") for mode in ("alpha", "smoe")]
+    drawn = curves.rate_distortion(groups_of(entries + [row(label="other"), row(label="other", blend_mode="smoe")]))
+    marks = sorted((container.lines[0] for container in drawn.axes[0].containers), key=lambda line: line.get_zorder())
+    for behind, before in zip(marks, marks[1:]):
+        hollow = before.get_markerfacecolor() == "none" and behind.get_markerfacecolor() != "none"
+        assert before.get_markersize() < behind.get_markersize() or hollow
+    assert len(marks) == 6
+
+
 def test_bars_are_the_means():
     entries = [row(train_seconds=100.0), row(seed=1, train_seconds=140.0), row(blend_mode="smoe", train_seconds=90.0),
                row(threshold=0.0002, fps=50.0), failed(blend_mode="smoe", threshold=0.0002)]

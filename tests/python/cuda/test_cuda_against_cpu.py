@@ -215,6 +215,15 @@ def test_renderings_without_gradients_keep_no_segments(mode, gpu):
     assert_all_close(dict(zip(inputs, first)), dict(zip(inputs, second)), 1e-4)
 
 
+@pytest.mark.skipif(not hasattr(torch.library, "opcheck"),
+                    reason=f"torch {torch.__version__} has no torch.library.opcheck, so no fake kernels")
+def test_the_fake_kernel_knows_that_no_segments_are_kept(mode, gpu):
+    scene = random_scene(mode, 20, 20, 18, dtype=torch.float32, degree=1).to(gpu)
+    torch.library.opcheck(torch.ops.diff_smoe_rasterization.rasterize.default,
+                          op_arguments(scene, depth=False, inverse_depth=False, for_backward=False),
+                          test_utils=("test_schema", "test_faketensor"))
+
+
 @pytest.mark.sanitize
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", ["no_gaussians", "behind_the_camera", "without_opacity", "beside_the_image"])
