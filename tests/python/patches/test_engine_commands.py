@@ -9,7 +9,7 @@ pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst"
 
 from diff_smoe_rasterization import patches  # noqa: E402
 from diff_smoe_rasterization.patches import record as record_module  # noqa: E402
-from test_engine import make, snapshot  # noqa: E402
+from test_patch_engine import make, snapshot  # noqa: E402
 
 
 def test_a_dry_run_shows_what_is_still_to_be_done(tmp_path, dsmoe):

@@ -11,7 +11,7 @@ cst = pytest.importorskip("libcst", reason="patching needs LibCST: pip install l
 from diff_smoe_rasterization import patches  # noqa: E402
 from diff_smoe_rasterization.patches import modernise, runtime  # noqa: E402
 from diff_smoe_rasterization.patches.rules import RUNTIME  # noqa: E402
-from test_engine import TRAIN, make, snapshot  # noqa: E402
+from test_patch_engine import TRAIN, make, snapshot  # noqa: E402
 
 RULES = {rule.name: rule for rule in modernise.RULES}
 BEFORE_AND_AFTER = [

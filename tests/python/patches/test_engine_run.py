@@ -14,7 +14,7 @@ import pytest
 import diff_smoe_rasterization
 from diff_smoe_rasterization import cli, patches
 from diff_smoe_rasterization.patches import run
-from test_engine import GR, RENDERER, make, snapshot
+from test_patch_engine import GR, RENDERER, make, snapshot
 
 SHOW = """import importlib, os, sys
 sys.path.insert(0, "")

@@ -7,7 +7,7 @@ import pytest
 
 from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.patches import PatchError, run
-from test_engine import GR, RENDER, RENDERER, TRAIN, make, refused
+from test_patch_engine import GR, RENDER, RENDERER, TRAIN, make, refused
 from test_engine_run import environment
 
 pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
