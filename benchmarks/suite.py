@@ -30,7 +30,7 @@ AXES = {"blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": list(THRESH
         "seeds": [0]}
 AXIS_OF = {"blend_modes": "blend_mode", "densify_grad_thresholds": "densify_grad_threshold", "schedules": "schedule",
            "seeds": "seed"}
-NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit")  # where things lie changes no figure
+NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "unset")  # where things lie changes no figure
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _scene(scene: Dict[str, Any], index: int, protocol: Dict[str, Any], folder: 
     where = f"scenes[{index}]"
     if ("path" in scene) == ("synthetic" in scene):
         raise BenchError(f"{where}: give either `path` or `synthetic`")
-    given = dict(scene, path=_path(scene["path"], f"{where}.path", folder)) if "path" in scene else dict(scene)
+    given = {**scene, **_paths({key: scene[key] for key in ("path",) if key in scene}, where, folder)}
     axes = {axis: given.pop(axis) for axis in AXES if axis in given}
     return {"dataset": None, "images": "images", "resolution": -1, "background": protocol["background"],
             "init_points": 0, "path": None, **given, "axes": axes}
@@ -182,8 +182,8 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     if protocol["options"].get("sh_degree_interval", 1000) != 1000 or protocol["scale_recipe"]:
         raise BenchError(f"protocol: {name} ({where}) raises the SH degree every 1000 steps, whatever the recipe: "
                          "scale_recipe and options.sh_degree_interval are for the native trainer alone")
-    paths = {key: _path(given[key], f"{where}.{key}", folder) for key in ("path", "base") if key in given}
-    given["pythonpath"] = [_path(item, f"{where}.pythonpath", folder) for item in given.get("pythonpath", [])]
+    given.setdefault("pythonpath", [])
+    paths = _paths({key: given[key] for key in ("path", "base", "pythonpath") if key in given}, where, folder)
     python = os.path.expanduser(given["python"]) if "python" in given else None
     return {"label": name if variant == "patched" else f"{name}-unpatched", **given, **paths, "python": python,
             "arguments": arguments, "axes": axes}
@@ -247,13 +247,21 @@ def cell_id(cell: Dict[str, Any]) -> str:
                      threshold, f"s{cell['seed']}", checksum])
 
 
-def _path(text: str, where: str, folder: str) -> str:
-    """An absolute path with environment variables put in."""
-    path = os.path.expanduser(os.path.expandvars(text))
-    unset = re.search(r"\$\{?(\w+)", path)
-    if unset:
-        raise BenchError(f"{where}: ${unset.group(1)} is not set; it is a part of {text!r}")
-    return os.path.normpath(os.path.join(folder, path))
+def _paths(given: Dict[str, Any], where: str, folder: str) -> Dict[str, Any]:
+    """The paths of a scene or a method as absolute ones, with environment variables put in.
+
+    Where a variable is not set, `unset` says which: it matters to those who run a cell that needs it.
+    """
+    found: Dict[str, Any] = {}
+    for field, value in given.items():
+        paths = [os.path.expanduser(os.path.expandvars(text)) for text in ([value] if isinstance(value, str) else value)]
+        for path in paths:
+            variable = re.search(r"\$\{?(\w+)", path)
+            if variable and "unset" not in found:
+                found["unset"] = f"{where}.{field}: ${variable.group(1)} is not set; it is a part of {path!r}"
+        absolute = [path if "$" in path else os.path.normpath(os.path.join(folder, path)) for path in paths]
+        found[field] = absolute[0] if isinstance(value, str) else absolute
+    return found
 
 
 def _names_are_unique(items: List[Dict[str, Any]], field: str, key: str) -> None:

@@ -118,8 +118,11 @@ def test_a_file_that_is_no_suite_is_named(tmp_path, text):
 
 def test_a_variable_that_is_not_set_is_named(content, monkeypatch):
     monkeypatch.delenv("NOT_THERE", raising=False)
-    with pytest.raises(BenchError, match=r"scenes\[0\].path: \$NOT_THERE"):
-        expand(changed(content, scenes=[{"name": "a", "path": "${NOT_THERE}/a"}]), "")
+    one, = {cell["id"] for cell in expand(changed(content, blend_modes=["alpha"]), "").cells}
+    scenes = [{"name": "tiny", "path": "${NOT_THERE}/a"}]
+    cell, = expand(changed(content, blend_modes=["alpha"], scenes=scenes), "").cells
+    assert cell["scene"]["unset"] == "scenes[0].path: $NOT_THERE is not set; it is a part of '${NOT_THERE}/a'"
+    assert cell["id"] == one
 
 
 # What would put figures of two protocols into one table.
