@@ -1,7 +1,7 @@
 """Suites: a YAML file that says what is trained on what, checked and expanded to cells.
 
-A cell is one training and its measurement, as plain values: `python -m diff_smoe_rasterization.benchmarks.cell` needs
-nothing else. What makes two figures comparable stands once in a suite (`protocol`, and each scene's images), never in a
+A cell is one training and its measurement, as plain values: `python -I -m diff_smoe_rasterization.benchmarks.cell`
+needs nothing else. What makes two figures comparable stands once in a suite (`protocol`, and each scene's images), never in a
 method, so that a suite cannot mix protocols; what would mix them nevertheless is refused here.
 """
 from __future__ import annotations
@@ -128,7 +128,7 @@ def check_schema(content: Any) -> None:
 
 def missing(package: str, error: ImportError) -> str:
     """What a user types where a package of the extra is not installed."""
-    return f"{package} is not installed ({error}); pip install 'diff_smoe_rasterization[bench]' brings it"
+    return f"{package} is not installed ({error}); pip install '.[bench]' in the source folder brings it"
 
 
 def _scene(scene: Dict[str, Any], index: int, protocol: Dict[str, Any], folder: str) -> Dict[str, Any]:

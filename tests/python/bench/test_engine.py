@@ -34,6 +34,9 @@ def finished(tmp_path_factory, tiny_scene):
     """A suite of one cell that works and one that cannot."""
     folder = tmp_path_factory.mktemp("bench")
     (folder / "nothing").mkdir()
+    shadow = folder / "results" / "diff_smoe_rasterization" / "__init__.py"  # is not what cells import
+    shadow.parent.mkdir(parents=True)
+    shadow.write_text("raise ImportError('of the folder in which cells are run')\n")
     content = {"name": "two", "protocol": {"iterations": 12, "device": "cpu", "principal_point": "scene", "lpips": [],
                                            "evaluate_every": 6},
                "scenes": [{"name": "tiny", "path": tiny_scene}, {"name": "absent", "path": str(folder / "nothing")}],
@@ -471,4 +474,4 @@ def test_cells_are_told_the_gpus(content, tmp_path, monkeypatch):
 def test_without_snakemake_the_message_says_what_to_install(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
     assert main(["bench", "run", finished[1], "-o", str(tmp_path / "results")]) == 1
-    assert "diff_smoe_rasterization[bench]" in capsys.readouterr().err
+    assert "pip install '.[bench]' in the source folder" in capsys.readouterr().err
