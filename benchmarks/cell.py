@@ -136,7 +136,8 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_gpu: i
     if gpu is not None:
         environment["CUDA_VISIBLE_DEVICES"] = gpu
     started = time.time()
-    command = [sys.executable, *["-I"] * sys.flags.isolated, "-m", __spec__.name if __spec__ else __name__, cell_path, output, "--inside"]
+    command = [sys.executable, *["-I"] * sys.flags.isolated, "-m", __spec__.name if __spec__ else __name__]
+    command += [cell_path, output, "--inside"]
     command += ["--per-gpu", str(per_gpu)] if gpu is not None else []
     with open(log_path, "ab") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,

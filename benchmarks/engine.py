@@ -23,6 +23,7 @@ from ..trainer.files import write_json_atomically, write_text_atomically
 from ..trainer.synthetic import write_synthetic_scene
 from .cell import ROW_NAME, identity
 from .errors import BenchError
+from .measure import ALEX_VARIABLE
 from .methods.names import CHECKOUTS, NATIVE
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, commit_of, project_commit
@@ -370,9 +371,11 @@ def environment() -> Dict[str, str]:
     """Of Snakemake and its cells: this package is found from any folder, and its commit is known."""
     path = [ROOT if os.path.isfile(os.path.join(ROOT, "sources.txt")) else os.path.dirname(ROOT)]
     path += [os.path.abspath(item) for item in os.environ.get("PYTHONPATH", "").split(os.pathsep) if item]
-    commit = project_commit()
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(path), "PYTHONSAFEPATH": "1",  # of no file in that folder
-            **({COMMIT_VARIABLE: commit} if commit else {})}
+    known = {COMMIT_VARIABLE: project_commit()}
+    if os.environ.get(ALEX_VARIABLE):
+        known[ALEX_VARIABLE] = os.path.abspath(os.environ[ALEX_VARIABLE])  # cells run in another folder,
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path), "PYTHONSAFEPATH": "1",  # and import nothing from there
+            **{name: value for name, value in known.items() if value}}
 
 
 def collect(results: str) -> Dict[str, Dict[str, Any]]:

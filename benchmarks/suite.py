@@ -1,8 +1,8 @@
 """Suites: a YAML file that says what is trained on what, checked and expanded to cells.
 
 A cell is one training and its measurement, as plain values: `python -I -m diff_smoe_rasterization.benchmarks.cell`
-needs nothing else. What makes two figures comparable stands once in a suite (`protocol`, and each scene's images), never in a
-method, so that a suite cannot mix protocols; what would mix them nevertheless is refused here.
+needs nothing else. What makes two figures comparable stands once in a suite (`protocol`, and each scene's images),
+never in a method, so that a suite cannot mix protocols; what would mix them nevertheless is refused here.
 """
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import os
 import re
 from dataclasses import dataclass
 from typing import Any, Dict, List, Optional, Sequence
+
+import numpy as np
 
 from ..trainer.errors import ConfigError
 from .errors import BenchError
@@ -120,10 +122,26 @@ def check_schema(content: Any) -> None:
         raise BenchError(missing("jsonschema", error)) from error
     errors = sorted(jsonschema.Draft7Validator(SUITE).iter_errors(content),
                     key=lambda error: list(map(str, error.path)))
+    if errors and content is None:
+        raise BenchError("the file is empty")
     if errors:
         error = errors[0]
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error.absolute_path)
-        raise BenchError(f"{where.lstrip('.') or 'the suite'}: {error.message}")
+        raise BenchError(f"{where.lstrip('.') or 'the suite'}: {error.message}{_hint(error)}")
+
+
+def _hint(error: Any) -> str:
+    """What may have been meant, by the kind of a jsonschema error."""
+    if error.validator == "additionalProperties":
+        return f"; allowed are {', '.join(sorted(error.schema['properties']))}"
+    if error.validator == "type" and error.validator_value == "array":
+        return f"; it must be a list, such as [{error.instance}]"
+    if error.validator == "type" and error.validator_value == "number" and isinstance(error.instance, str):
+        try:
+            return f"; YAML takes it for text: write {np.format_float_positional(float(error.instance))}"
+        except ValueError:
+            return ""
+    return ""
 
 
 def missing(package: str, error: ImportError) -> str:
@@ -254,13 +272,16 @@ def _paths(given: Dict[str, Any], where: str, folder: str) -> Dict[str, Any]:
     """
     found: Dict[str, Any] = {}
     for field, value in given.items():
-        paths = [os.path.expanduser(os.path.expandvars(text)) for text in ([value] if isinstance(value, str) else value)]
-        for path in paths:
+        paths = []
+        for text in [value] if isinstance(value, str) else value:
+            path = os.path.expanduser(os.path.expandvars(text))
             variable = re.search(r"\$\{?(\w+)", path)
-            if variable and "unset" not in found:
-                found["unset"] = f"{where}.{field}: ${variable.group(1)} is not set; it is a part of {path!r}"
-        absolute = [path if "$" in path else os.path.normpath(os.path.join(folder, path)) for path in paths]
-        found[field] = absolute[0] if isinstance(value, str) else absolute
+            if variable:
+                found.setdefault("unset", f"{where}.{field}: ${variable.group(1)} is not set; it is a part of {text!r}")
+            else:  # a variable is of the shell, in the folder at hand
+                path = os.path.normpath(os.path.join(os.getcwd() if text.startswith("$") else folder, path))
+            paths.append(path)
+        found[field] = paths[0] if isinstance(value, str) else paths
     return found
 
 

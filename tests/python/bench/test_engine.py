@@ -150,6 +150,14 @@ def test_rows_must_be_of_the_suites_cells(finished, tmp_path, capsys):
     assert not (tmp_path / "results").exists()
 
 
+def test_a_reader_that_has_enough_is_no_error(content, tmp_path):
+    run = subprocess.Popen(command("bench", "run", write_suite(content, tmp_path), "--dry-run"), env=environment(),
+                           cwd=str(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    run.stdout.close()
+    assert run.wait() == 0 and run.stderr.read() == b""
+    run.stderr.close()
+
+
 def test_options_that_do_not_go_together_are_refused_before_anything_is_written(content, tmp_path, capsys):
     suite, results = write_suite(content, tmp_path), tmp_path / "results"
     for words, told in ((["--jobs", "0"], "--jobs is 0"), (["--per-gpu", "-1"], "--per-gpu is -1"),
@@ -399,6 +407,12 @@ def test_a_second_run_on_the_same_results_is_refused(tmp_path):
         with pytest.raises(BenchError, match="another run"):
             with engine.only_one(str(tmp_path)):
                 pass
+
+
+def test_a_file_of_weights_is_found_from_the_folder_of_cells(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DSMOE_LPIPS_ALEX", "weights.npz")
+    assert engine.environment()["DSMOE_LPIPS_ALEX"] == str(tmp_path / "weights.npz")
 
 
 def test_cells_are_chosen_by_their_fields(content):
