@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from bench_commands import command, environment, rows_of
+from bench_commands import command, environment, rows_of, wait_for
 
 from diff_smoe_rasterization.benchmarks import cell as cells
 from diff_smoe_rasterization.benchmarks import engine
@@ -267,13 +267,6 @@ def test_what_a_run_has_started_ends_with_it_and_keeps_others_away_till_then(num
         assert "interrupted; the same command continues" in told
     if number != signal.SIGKILL:
         assert (results / "rows.jsonl").read_text() == ""
-
-
-def wait_for(condition, seconds):
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "waited too long"
-        time.sleep(0.05)
 
 
 def is_free(results):
