@@ -1,6 +1,6 @@
 """One cell: one training and its measurement, from a file of plain values to a row.
 
-    python -m diff_smoe_rasterization.benchmarks.cell CELL.json OUT [--gpus 0,1 --per-gpu 2 --locks FOLDER]
+    python -I -m diff_smoe_rasterization.benchmarks.cell CELL.json OUT [--gpus 0,1 --per-gpu 2 --locks FOLDER]
 
 OUT/row.json is written in any case but one: where this command itself is killed, so that whoever started it starts it
 again. The work is done in a process of its own, whose end, a crash or a lack of memory included, becomes a row with the
@@ -18,11 +18,13 @@ import subprocess
 import sys
 import time
 import traceback
-from typing import Any, Dict, List, Optional
+from typing import IO, Any, Dict, List, Optional
 
 from ..trainer.errors import TrainerError
 from ..trainer.files import write_json_atomically
+from .errors import BenchError
 from .log import last_line
+from .processes import die_with_parent
 
 ROW_NAME, LOG_NAME = "row.json", "log.txt"
 SHARING_NAME = "cells_per_gpu.json"  # beside a checkpoint: its seconds were counted beside so many cells
@@ -117,10 +119,12 @@ def work(cell: Dict[str, Any], output: str, started: float, cells_per_gpu: Optio
     write_json_atomically(path, row)
 
 
-def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_gpu: int = 1) -> Dict[str, Any]:
+def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_gpu: int = 1,
+              held: Optional[IO[str]] = None) -> Dict[str, Any]:
     """Runs `work` in a process of its own and returns the row that is in OUT then.
 
     gpu: the one that the process is given, together with other cells up to per_gpu in all; None: as the machine has it.
+    held: a lock that the process has too.
     """
     with open(cell_path, encoding="utf-8") as file:
         cell = json.load(file)
@@ -132,11 +136,13 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_gpu: i
     if gpu is not None:
         environment["CUDA_VISIBLE_DEVICES"] = gpu
     started = time.time()
-    command = [sys.executable, "-m", __spec__.name if __spec__ else __name__, cell_path, output, "--inside"]
+    command = [sys.executable, *["-I"] * sys.flags.isolated, "-m", __spec__.name if __spec__ else __name__]
+    command += [cell_path, output, "--inside"]
     command += ["--per-gpu", str(per_gpu)] if gpu is not None else []
     with open(log_path, "ab") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-                                   env=environment, preexec_fn=die_with_parent)
+                                   env=environment, preexec_fn=die_with_parent,
+                                   pass_fds=[held.fileno()] if held else [])
         handlers = {number: signal.signal(number, lambda *_: (process.terminate(), sys.exit(143)))
                     for number in (signal.SIGTERM, signal.SIGHUP)}
         try:
@@ -149,16 +155,6 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_gpu: i
         write_json_atomically(row_path, failed_row(cell, how_it_ended(status, log_path), time.time() - started))
     with open(row_path, encoding="utf-8") as file:
         return json.load(file)
-
-
-def die_with_parent() -> None:
-    """Ends the process with the one that started it, however that ends (Linux)."""
-    import ctypes
-
-    try:
-        ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)  # 1 is PR_SET_PDEATHSIG
-    except (AttributeError, OSError):
-        pass
 
 
 def how_it_ended(status: int, log_path: str) -> str:
@@ -188,6 +184,19 @@ def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: floa
         time.sleep(poll_seconds)
 
 
+def hold(path: str) -> IO[str]:
+    """The file, locked together with whoever else holds it. Raises BenchError where somebody has it alone."""
+    import fcntl
+
+    file = open(path, "a+")
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise BenchError(f"{path}: another run is at work there") from error
+    return file
+
+
 def at_least_one(text: str) -> int:
     """The number that a word of the command is. Raises ArgumentTypeError."""
     number = int(text)
@@ -198,7 +207,7 @@ def at_least_one(text: str) -> int:
 
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; 0 where there is a row, whatever it says."""
-    parser = argparse.ArgumentParser(prog="python -m diff_smoe_rasterization.benchmarks.cell",
+    parser = argparse.ArgumentParser(prog="python -I -m diff_smoe_rasterization.benchmarks.cell",
                                      description="Trains and measures one cell of a suite.")
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
     parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
@@ -206,21 +215,31 @@ def main(argv: Optional[List[str]] = None) -> int:
     parser.add_argument("--per-gpu", metavar="K", type=at_least_one,
                         help="cells that may have one GPU at once (default: 1)")
     parser.add_argument("--locks", metavar="FOLDER", help="where cells tell each other which GPU they have")
+    parser.add_argument("--hold", metavar="FILE",
+                        help="a lock that is held, together with other cells; ends with what started this command")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
     if arguments.inside:
         with open(arguments.cell, encoding="utf-8") as file:
             work(json.load(file), arguments.output, time.time(), arguments.per_gpu)
         return 0
-    gpu, lock, per_gpu = None, None, arguments.per_gpu or 1
-    if arguments.gpus:
-        gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_gpu)
+    gpu, lock, held, per_gpu = None, None, None, arguments.per_gpu or 1
     try:
-        row = supervise(arguments.cell, arguments.output, gpu, per_gpu)
+        if arguments.hold:
+            die_with_parent()
+            held = hold(arguments.hold)
+        if arguments.gpus:
+            gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_gpu)
+        row = supervise(arguments.cell, arguments.output, gpu, per_gpu, held)
+    except BenchError as error:
+        print(f"{arguments.cell}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
     finally:
-        if lock:
-            lock.close()
-    print(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {row['psnr']}" if row["ok"]
+        for file in filter(None, (lock, held)):
+            file.close()
+    print(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {row['psnr']:.2f} dB" if row["ok"]
                                 else f"failed: {row['reason']}"), flush=True)
     return 0
 

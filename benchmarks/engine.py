@@ -5,28 +5,33 @@ concatenation of the rows.
 """
 from __future__ import annotations
 
+import glob
 import importlib.util
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from functools import partial
 from types import MappingProxyType
-from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence
+from typing import IO, Any, Dict, Iterator, List, Mapping, Optional, Sequence
 
 from .. import patches
 from ..trainer.files import write_json_atomically, write_text_atomically
 from ..trainer.synthetic import write_synthetic_scene
 from .cell import ROW_NAME, identity
 from .errors import BenchError
+from .measure import ALEX_VARIABLE
 from .methods.names import CHECKOUTS, NATIVE
+from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, commit_of, project_commit
 from .report.rows import read_rows
-from .suite import Suite, find_suite, load_suite, missing
+from .suite import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, missing
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
-SUITE_NAME, ROWS_NAME = "suite.json", "rows.jsonl"
+SUITE_NAME, ROWS_NAME, LOCK_NAME = "suite.json", "rows.jsonl", ".lock"
 SAID_BY_THE_ID = ("method", "variant", "blend_mode", "schedule", "densify_grad_threshold", "scene", "seed",
                   "iterations")  # fields of a row
 NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", "build")
@@ -49,22 +54,29 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     results = os.path.abspath(results or os.path.join("bench_results", suite.name))
     found = earlier_rows(rows, suite.cells) if rows else {}
     earlier = {name: row for name, row in found.items() if row["ok"] or not retry_failed}
+    check_folder(suite, results)
+    done = {cell["id"]: row for cell in cells
+            for row in [row_of(results, cell, retry_failed) or earlier.get(cell["id"])] if row is not None}
     if rows:
-        taken = [cell for cell in cells if cell["id"] in earlier and not is_done(results, cell, retry_failed)]
+        taken = [cell for cell in cells if cell["id"] in earlier and row_of(results, cell, retry_failed) is None]
         print(f"{len(taken)} of {len(cells)} cells taken from {rows}")
+    absent = missing_scenes([cell for cell in cells if cell["id"] not in done])
     if dry_run:
-        for cell in cells:
-            done = cell["id"] in earlier or is_done(results, cell, retry_failed)
-            print(f"{'done' if done else 'to do'}  {cell['id']}")
+        print(plan(cells, done, absent))
         return []
+    check_paths([cell for cell in cells if cell["id"] not in done])
+    if absent:
+        raise BenchError(f"{absent[0]}; name its folder, or leave it out with --only")
     if importlib.util.find_spec("snakemake") is None:
         raise BenchError(missing("snakemake", ImportError("needs Python 3.11 or later")))
     words = command(suite, cells, results, jobs, slurm, per_gpu)
     os.makedirs(results, exist_ok=True)
-    with only_one(results):
+    with only_one(results) as lock:
         write_cells(suite, cells, results, retry_failed, earlier)
-        status = subprocess.call(words, env=environment())
-        measured = collect(results)
+        try:
+            status = run_snakemake(words, lock, signal.SIGKILL if slurm is None else signal.SIGINT)
+        finally:
+            measured = collect(results)
     here = [measured[cell["id"]] for cell in cells if cell["id"] in measured]
     lacking = len(cells) - len(here)
     if status != 0 or lacking:
@@ -99,6 +111,12 @@ def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, A
         if not equals or field not in SELECTORS:
             raise BenchError(f"--only {text}: must be FIELD=VALUE with a field of {', '.join(SELECTORS)}")
         wanted.setdefault(field, []).append(value)
+    for field, values in wanted.items():
+        there = [SELECTORS[field](cell) for cell in cells]
+        for value in values:
+            if not any(_same(entry, value) for entry in there):
+                raise BenchError(f"--only {field}={value}: no cell of the suite is so; its cells have "
+                                 + ", ".join(dict.fromkeys(map(str, there))))
     found = [cell for cell in cells
              if all(any(_same(SELECTORS[field](cell), value) for value in values) for field, values in wanted.items())]
     if not found:
@@ -121,17 +139,78 @@ def _same(value: Any, text: str) -> bool:
     return str(value).lower() == text.lower()
 
 
+def plan(cells: List[Dict[str, Any]], done: Mapping[str, Dict[str, Any]], absent: Sequence[str]) -> str:
+    """What --dry-run prints: a line for each cell, what is not there yet, and how many cells are how far."""
+    states = ["to do" if cell["id"] not in done else "done" if done[cell["id"]]["ok"] else "failed" for cell in cells]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in ("done", "to do", "failed"))
+    return "\n".join([*(f"{state}  {cell['id']}" for state, cell in zip(states, cells)), *absent, counts])
+
+
+def check_paths(cells: List[Dict[str, Any]]) -> None:
+    """Raises BenchError where a path of these cells has a variable that is not set."""
+    for cell in cells:
+        for part in (cell["scene"], cell["method"]):
+            if "unset" in part:
+                raise BenchError(f"{part['unset']}; set it, or leave it out with --only")
+
+
+def missing_scenes(cells: List[Dict[str, Any]]) -> List[str]:
+    """Which folders of these cells' scenes do not exist, in words."""
+    scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
+    return [f"scene {name}: {scene['path']}: no such folder" for name, scene in scenes.items()
+            if scene["path"] is not None and "unset" not in scene and not os.path.isdir(scene["path"])]
+
+
+def check_folder(suite: Suite, results: str) -> None:
+    """Raises BenchError where the folder has rows of another suite or of another protocol."""
+    here = read_json(os.path.join(results, SUITE_NAME))
+    if here is None or not glob.glob(os.path.join(glob.escape(results), "cells", "*", ROW_NAME)):
+        return
+    differ = [] if here["name"] == suite.name else [f"name is {here['name']!r} there and {suite.name!r} here"]
+    differ += [f"protocol.{field} is {here['protocol'].get(field)!r} there and {suite.protocol.get(field)!r} here"
+               for field in sorted({*here["protocol"], *suite.protocol})
+               if here["protocol"].get(field) != suite.protocol.get(field)]
+    if differ:
+        raise BenchError(f"{results}: holds rows of another suite or of another protocol, which are not put together: "
+                         f"{'; '.join(differ)}. Choose another folder")
+
+
 @contextmanager
-def only_one(results: str) -> Iterator[None]:
-    """Keeps a second run away from the same results. The lock ends with the process, however that ends."""
+def only_one(results: str) -> Iterator[IO[str]]:
+    """Keeps a second run away from the same results, until Snakemake and its cells have ended too.
+
+    The lock that is yielded is for Snakemake to inherit; cells share it (cell.py, --hold).
+    """
     import fcntl
 
-    with open(os.path.join(results, ".lock"), "w") as file:
+    with open(os.path.join(results, LOCK_NAME), "a+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise BenchError(f"{results}: another run is at work there") from error
-        yield
+        yield file
+
+
+def run_snakemake(words: List[str], lock: IO[str], end: int) -> int:
+    """Runs Snakemake, which shares the lock with its cells; returns its status.
+
+    end: the signal that it gets where this process is interrupted or ends, however it ends. On a signal that it can
+    catch Snakemake waits for the cells that run here; those of a queue it cancels.
+    """
+    import fcntl
+
+    fcntl.flock(lock, fcntl.LOCK_SH)
+    process = subprocess.Popen(words, env=environment(), pass_fds=[lock.fileno()],
+                               preexec_fn=partial(die_with_parent, end))
+    handler = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        return process.wait()
+    except BaseException:
+        process.send_signal(end)
+        process.wait()
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, handler)
 
 
 def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_failed: bool,
@@ -140,37 +219,52 @@ def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_f
 
     earlier: rows by their cell's name, for cells that have none here.
     """
-    path = os.path.join(results, SUITE_NAME)
-    here = read_json(path)
-    if here is not None and (here["name"], here["protocol"]) != (suite.name, suite.protocol):
-        raise BenchError(f"{results}: holds rows of the suite {here['name']!r} under another protocol; figures of "
-                         "two protocols are not put together: choose another folder")
+    check_folder(suite, results)  # again: another run may have been at work there
     scenes: Dict[str, Dict[str, Any]] = {}
     methods: Dict[str, Dict[str, Any]] = {}
-    for cell in cells:  # what no chosen cell needs is not prepared
-        scene, method = cell["scene"]["name"], cell["method"]["label"]
+    for cell in cells:
+        folder = os.path.join(results, "cells", cell["id"])
+        file, row = os.path.join(folder, "cell.json"), os.path.join(folder, ROW_NAME)
+        done = row_of(results, cell, retry_failed)
+        if done is None and cell["id"] in earlier:  # another suite may have had the cell
+            done = {**earlier[cell["id"]], **identity(cell)}
+            write_json_atomically(row, done)
+        if done is not None:
+            if not os.path.isfile(file):
+                write_json_atomically(file, {**cell, "given": given(cell)})
+            os.utime(row)  # newer than its cell's file
+            continue
+        scene, method = cell["scene"]["name"], cell["method"]["label"]  # what no cell needs is not prepared
         if scene not in scenes:
             scenes[scene] = made_scene(cell["scene"], results)
         if method not in methods:
             methods[method] = prepared_method(cell["method"], results)
-        folder = os.path.join(results, "cells", cell["id"])
-        cell = dict(cell, scene=scenes[scene], method=methods[method])
-        file, row = os.path.join(folder, "cell.json"), os.path.join(folder, ROW_NAME)
-        if read_json(file) != cell:
-            write_json_atomically(file, cell)
-        if cell["id"] in earlier and not is_done(results, cell, retry_failed):
-            write_json_atomically(row, {**earlier[cell["id"]], **identity(cell)})  # another suite may have had the cell
-        if is_done(results, cell, retry_failed):
-            os.utime(row)  # a path that has changed changes no figure: the row stays newer than its cell's file
-        elif os.path.isfile(row):
+        prepared = {**cell, "scene": scenes[scene], "method": methods[method], "given": given(cell)}
+        if read_json(file) != prepared:
+            write_json_atomically(file, prepared)
+        if os.path.isfile(row):
             os.remove(row)
-    write_json_atomically(path, {"name": suite.name, "protocol": suite.protocol, "cells": [c["id"] for c in cells]})
+    write_json_atomically(os.path.join(results, SUITE_NAME),
+                          {"name": suite.name, "protocol": suite.protocol, "cells": [cell["id"] for cell in cells]})
 
 
-def is_done(results: str, cell: Dict[str, Any], retry_failed: bool) -> bool:
-    """Whether a cell has a row; with retry_failed, one with figures."""
-    row = read_json(os.path.join(results, "cells", cell["id"], ROW_NAME))
-    return row is not None and (row["ok"] or not retry_failed)
+def row_of(results: str, cell: Dict[str, Any], retry_failed: bool) -> Optional[Dict[str, Any]]:
+    """The row of a cell that is done; None where it is to be run.
+
+    That is a failed one too with retry_failed, or where its paths have changed.
+    """
+    folder = os.path.join(results, "cells", cell["id"])
+    row = read_json(os.path.join(folder, ROW_NAME))
+    if row is None or row["ok"]:
+        return row
+    before = read_json(os.path.join(folder, "cell.json")) or {}
+    return None if retry_failed or before.get("given", given(cell)) != given(cell) else row
+
+
+def given(cell: Dict[str, Any]) -> Dict[str, Any]:
+    """Where things lie, as the suite says it; a path that has changed changes no figure."""
+    return {part: {key: cell[part][key] for key in NOT_IN_THE_IDENTITY if key in cell[part]}
+            for part in ("scene", "method")}
 
 
 def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
@@ -242,7 +336,8 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
     on_gpu = suite.protocol["device"] == "cuda"
     gpus = visible_gpus() if on_gpu and slurm is None else []
     if on_gpu and slurm is None and not gpus:
-        raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine")
+        raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine; for the "
+                         "CPU set protocol.device: cpu")
     at_once = jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus)))
     if gpus:
         per_gpu = min(per_gpu, -(-at_once // len(gpus)))  # cells spread over the GPUs first: no more of them share one
@@ -276,8 +371,11 @@ def environment() -> Dict[str, str]:
     """Of Snakemake and its cells: this package is found from any folder, and its commit is known."""
     path = [ROOT if os.path.isfile(os.path.join(ROOT, "sources.txt")) else os.path.dirname(ROOT)]
     path += [os.path.abspath(item) for item in os.environ.get("PYTHONPATH", "").split(os.pathsep) if item]
-    commit = project_commit()
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(path), **({COMMIT_VARIABLE: commit} if commit else {})}
+    known = {COMMIT_VARIABLE: project_commit()}
+    if os.environ.get(ALEX_VARIABLE):
+        known[ALEX_VARIABLE] = os.path.abspath(os.environ[ALEX_VARIABLE])  # cells run in another folder,
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path), "PYTHONSAFEPATH": "1",  # and import nothing from there
+            **{name: value for name, value in known.items() if value}}
 
 
 def collect(results: str) -> Dict[str, Dict[str, Any]]:
@@ -308,7 +406,8 @@ def rows_table(rows: List[Dict[str, Any]]) -> str:
     """A line for each row: what a terminal shows at the end."""
     lines = []
     for row in rows:
-        name = f"{row['label']}  {row['scene']}  {row['blend_mode']}  {row['densify_grad_threshold']:g}  s{row['seed']}"
+        name = "  ".join([row["label"], row["scene"], row["blend_mode"], row.get("schedule") or "own schedule",
+                          f"{row['densify_grad_threshold']:g}", f"s{row['seed']}"])
         at_once = row["machine"].get("cells_per_gpu") or 1
         if row["ok"]:
             lines.append(f"{name}:  {_shown(row['psnr'], '.2f')} dB  SSIM {_shown(row['ssim'], '.4f')}  "

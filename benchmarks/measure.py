@@ -55,7 +55,9 @@ class Measures:
                 self._networks[kind] = lpips_network(kind, device)
                 self.reasons[kind] = None
             except (ImportError, OSError, KeyError, ValueError, RuntimeError) as error:
-                self.reasons[kind] = f"no weights at hand: {type(error).__name__}: {error}".splitlines()[0]
+                first, *_ = f"no weights at hand: {type(error).__name__}: {error}".splitlines()
+                hint = f" (${ALEX_VARIABLE} may name a file of them)" if kind == "lpips_alex" else ""
+                self.reasons[kind] = first + hint
 
     def __call__(self, color: torch.Tensor, target: torch.Tensor) -> Dict[str, Optional[float]]:
         """color: a rendering [3, H, W]; target: its ground truth in [0, 1]."""
@@ -92,9 +94,8 @@ def lpips_network(kind: str, device: str) -> Callable[[torch.Tensor, torch.Tenso
     try:
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     except ImportError as error:
-        hint = f", or set {ALEX_VARIABLE} to AlexNet's weights" if kind == "lpips_alex" else ""
-        raise ImportError(f"torchmetrics with torchvision is not installed (pip install torchmetrics "
-                          f"torchvision){hint}") from error
+        raise ImportError("torchmetrics with torchvision is not installed (pip install torchmetrics "
+                          "torchvision)") from error
     net = "alex" if kind == "lpips_alex" else "vgg"
     network = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=kind != "lpips_vgg_inria").to(device)
 

@@ -1,7 +1,7 @@
 """What one recipe does to the Gaussians of each blend mode: a training, watched, and figures of what was seen.
 
-    python -m diff_smoe_rasterization.benchmarks.mechanism run SCENE OUT --blend-mode smoe --device cuda ...
-    python -m diff_smoe_rasterization.benchmarks.mechanism plot OUT [OUT ...] -o FOLDER
+    python -I -m diff_smoe_rasterization.benchmarks.mechanism run SCENE OUT --blend-mode smoe --device cuda ...
+    python -I -m diff_smoe_rasterization.benchmarks.mechanism plot OUT [OUT ...] -o FOLDER
 
 `run` takes the options of `dsmoe train` and trains as it does: watching draws no random number and changes no tensor.
 OUT/mechanism.json then holds three series and a summary:
@@ -270,8 +270,8 @@ def _plain(value: Any) -> Any:
 
 
 def read_record(folder: str) -> Dict[str, Any]:
-    """The record of a watched run's folder. Raises BenchError where there is none, or a damaged one."""
-    path = os.path.join(folder, RECORD_NAME)
+    """The record of a watched run, its folder's or a file. Raises BenchError where there is none, or a damaged one."""
+    path = folder if os.path.isfile(folder) else os.path.join(folder, RECORD_NAME)
     try:
         with open(path, encoding="utf-8") as file:
             record = json.load(file)
@@ -290,7 +290,7 @@ def read_record(folder: str) -> Dict[str, Any]:
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
     """Runs the command; returns its exit status: 0, or 1 on an error that its text explains."""
-    parser = argparse.ArgumentParser(prog="python -m diff_smoe_rasterization.benchmarks.mechanism",
+    parser = argparse.ArgumentParser(prog="python -I -m diff_smoe_rasterization.benchmarks.mechanism",
                                      description="Watches what a recipe does to the Gaussians of each blend mode.")
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     watch = actions.add_parser("run", help="train, and record what happens to the Gaussians")
@@ -299,14 +299,14 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     watch.add_argument("--scale-recipe", action="store_true", help="squeeze the recipe into --iterations")
     watch.add_argument("--quiet", action="store_true", help="no progress bars")
     plot = actions.add_parser("plot", help="draw the records of some runs into the same three figures")
-    plot.add_argument("runs", metavar="OUT", nargs="+", help="folders of watched runs")
+    plot.add_argument("runs", metavar="OUT", nargs="+", help="folders of watched runs, or their mechanism.json")
     plot.add_argument("-o", "--output", metavar="FOLDER", required=True, help="folder to write")
     arguments = parser.parse_args(argv)
     try:
         if arguments.action == "plot":
             from .mechanism_plots import draw_all
 
-            draw_all([read_record(folder) for folder in arguments.runs], arguments.output)
+            print(*draw_all([read_record(folder) for folder in arguments.runs], arguments.output), sep="\n")
         else:
             _run(arguments)
     except (TrainerError, ImportError, OSError) as error:
@@ -324,6 +324,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if config.device == "cuda":
         torch.set_num_threads(1)  # as `dsmoe train` does
     print(json.dumps(run(config, progress=not arguments.quiet)["summary"], indent=2))
+    print(f"written: {os.path.join(config.output, RECORD_NAME)}", file=sys.stderr)
 
 
 if __name__ == "__main__":

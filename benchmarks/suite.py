@@ -1,8 +1,8 @@
 """Suites: a YAML file that says what is trained on what, checked and expanded to cells.
 
-A cell is one training and its measurement, as plain values: `python -m diff_smoe_rasterization.benchmarks.cell` needs
-nothing else. What makes two figures comparable stands once in a suite (`protocol`, and each scene's images), never in a
-method, so that a suite cannot mix protocols; what would mix them nevertheless is refused here.
+A cell is one training and its measurement, as plain values: `python -I -m diff_smoe_rasterization.benchmarks.cell`
+needs nothing else. What makes two figures comparable stands once in a suite (`protocol`, and each scene's images),
+never in a method, so that a suite cannot mix protocols; what would mix them nevertheless is refused here.
 """
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import os
 import re
 from dataclasses import dataclass
 from typing import Any, Dict, List, Optional, Sequence
+
+import numpy as np
 
 from ..trainer.errors import ConfigError
 from .errors import BenchError
@@ -30,7 +32,7 @@ AXES = {"blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": list(THRESH
         "seeds": [0]}
 AXIS_OF = {"blend_modes": "blend_mode", "densify_grad_thresholds": "densify_grad_threshold", "schedules": "schedule",
            "seeds": "seed"}
-NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit")  # where things lie changes no figure
+NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "unset")  # where things lie changes no figure
 
 
 @dataclass(frozen=True)
@@ -120,22 +122,38 @@ def check_schema(content: Any) -> None:
         raise BenchError(missing("jsonschema", error)) from error
     errors = sorted(jsonschema.Draft7Validator(SUITE).iter_errors(content),
                     key=lambda error: list(map(str, error.path)))
+    if errors and content is None:
+        raise BenchError("the file is empty")
     if errors:
         error = errors[0]
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error.absolute_path)
-        raise BenchError(f"{where.lstrip('.') or 'the suite'}: {error.message}")
+        raise BenchError(f"{where.lstrip('.') or 'the suite'}: {error.message}{_hint(error)}")
+
+
+def _hint(error: Any) -> str:
+    """What may have been meant, by the kind of a jsonschema error."""
+    if error.validator == "additionalProperties":
+        return f"; allowed are {', '.join(sorted(error.schema['properties']))}"
+    if error.validator == "type" and error.validator_value == "array":
+        return f"; it must be a list, such as [{error.instance}]"
+    if error.validator == "type" and error.validator_value == "number" and isinstance(error.instance, str):
+        try:
+            return f"; YAML takes it for text: write {np.format_float_positional(float(error.instance))}"
+        except ValueError:
+            return ""
+    return ""
 
 
 def missing(package: str, error: ImportError) -> str:
     """What a user types where a package of the extra is not installed."""
-    return f"{package} is not installed ({error}); pip install 'diff_smoe_rasterization[bench]' brings it"
+    return f"{package} is not installed ({error}); pip install '.[bench]' in the source folder brings it"
 
 
 def _scene(scene: Dict[str, Any], index: int, protocol: Dict[str, Any], folder: str) -> Dict[str, Any]:
     where = f"scenes[{index}]"
     if ("path" in scene) == ("synthetic" in scene):
         raise BenchError(f"{where}: give either `path` or `synthetic`")
-    given = dict(scene, path=_path(scene["path"], f"{where}.path", folder)) if "path" in scene else dict(scene)
+    given = {**scene, **_paths({key: scene[key] for key in ("path",) if key in scene}, where, folder)}
     axes = {axis: given.pop(axis) for axis in AXES if axis in given}
     return {"dataset": None, "images": "images", "resolution": -1, "background": protocol["background"],
             "init_points": 0, "path": None, **given, "axes": axes}
@@ -182,8 +200,8 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     if protocol["options"].get("sh_degree_interval", 1000) != 1000 or protocol["scale_recipe"]:
         raise BenchError(f"protocol: {name} ({where}) raises the SH degree every 1000 steps, whatever the recipe: "
                          "scale_recipe and options.sh_degree_interval are for the native trainer alone")
-    paths = {key: _path(given[key], f"{where}.{key}", folder) for key in ("path", "base") if key in given}
-    given["pythonpath"] = [_path(item, f"{where}.pythonpath", folder) for item in given.get("pythonpath", [])]
+    given.setdefault("pythonpath", [])
+    paths = _paths({key: given[key] for key in ("path", "base", "pythonpath") if key in given}, where, folder)
     python = os.path.expanduser(given["python"]) if "python" in given else None
     return {"label": name if variant == "patched" else f"{name}-unpatched", **given, **paths, "python": python,
             "arguments": arguments, "axes": axes}
@@ -247,13 +265,24 @@ def cell_id(cell: Dict[str, Any]) -> str:
                      threshold, f"s{cell['seed']}", checksum])
 
 
-def _path(text: str, where: str, folder: str) -> str:
-    """An absolute path with environment variables put in."""
-    path = os.path.expanduser(os.path.expandvars(text))
-    unset = re.search(r"\$\{?(\w+)", path)
-    if unset:
-        raise BenchError(f"{where}: ${unset.group(1)} is not set; it is a part of {text!r}")
-    return os.path.normpath(os.path.join(folder, path))
+def _paths(given: Dict[str, Any], where: str, folder: str) -> Dict[str, Any]:
+    """The paths of a scene or a method as absolute ones, with environment variables put in.
+
+    Where a variable is not set, `unset` says which: it matters to those who run a cell that needs it.
+    """
+    found: Dict[str, Any] = {}
+    for field, value in given.items():
+        paths = []
+        for text in [value] if isinstance(value, str) else value:
+            path = os.path.expanduser(os.path.expandvars(text))
+            variable = re.search(r"\$\{?(\w+)", path)
+            if variable:
+                found.setdefault("unset", f"{where}.{field}: ${variable.group(1)} is not set; it is a part of {text!r}")
+            else:  # a variable is of the shell, in the folder at hand
+                path = os.path.normpath(os.path.join(os.getcwd() if text.startswith("$") else folder, path))
+            paths.append(path)
+        found[field] = paths[0] if isinstance(value, str) else paths
+    return found
 
 
 def _names_are_unique(items: List[Dict[str, Any]], field: str, key: str) -> None:

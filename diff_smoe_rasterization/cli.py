@@ -91,13 +91,20 @@ def main(argv: Optional[List[str]] = None) -> int:
     if unknown:  # argparse would show the usage of `dsmoe` alone
         getattr(arguments, "command_parser", parser).error("unrecognized arguments: " + " ".join(unknown))
     try:
-        return arguments.run(arguments) or 0
+        status = arguments.run(arguments) or 0
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # whoever read the output, such as `head`, has enough of it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except (TrainerError, PatchError, ImportError, OSError) as error:
         print(f"dsmoe {arguments.command}: error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = "; continue it with --resume" if continues else ""
+        if arguments.command == "bench" and arguments.action == "run":
+            hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return 130
 
@@ -126,7 +133,7 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION")
     run = actions.add_parser("run", help="run what is not done yet of a suite",
                              description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
-                                         "becomes a row with its reason.")
+                                         "becomes a row with its reason, and the command returns 1.")
     run.add_argument("suite", metavar="SUITE", help="a .yaml file, or a shipped one: smoke, table1, table2, table3, "
                                                     "fig4, fig5, captures, captures_ablation, captures_baselines")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
@@ -139,8 +146,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
                      help="only such cells; fields: method, scene, blend_mode, schedule, densify_grad_threshold, "
                           "seed, headline")
-    run.add_argument("--rows", metavar="FILE",
-                     help="rows of earlier runs (.jsonl), or a folder of results, whose cells are not run again")
+    run.add_argument("--rows", metavar="FILE|RESULTS",
+                     help="a file of rows (.jsonl), or a folder of results, whose cells are not run again")
     run.add_argument("--retry-failed", action="store_true", help="run failed cells again")
     run.add_argument("--dry-run", action="store_true", help="say which cells are done and which are not")
     run.set_defaults(run=_bench_run)
@@ -162,7 +169,7 @@ def _bench_run(arguments: argparse.Namespace) -> int:
     failed = sum(not row["ok"] for row in rows)
     if failed:
         print(f"{failed} of {len(rows)} cells failed; their rows say why, --retry-failed runs them again")
-    return 0
+    return 1 if failed else 0
 
 
 def _bench_report(arguments: argparse.Namespace) -> None:

@@ -25,6 +25,7 @@ from ...trainer.scene import Scene, load_scene
 from ..errors import BenchError
 from ..log import last_line
 from ..measure import Measures
+from ..processes import die_with_parent
 from ..protocol import RECIPE, commit_of, config_of
 from . import Outcome, require_test_views
 
@@ -107,7 +108,7 @@ class ThreeDGS:
         log = os.path.join(self.output, name + ".log")
         with open(log, "w", encoding="utf-8") as file:
             status = subprocess.call(line, cwd=folder, stdout=file, stderr=subprocess.STDOUT,
-                                     stdin=subprocess.DEVNULL, env=self.environment())
+                                     stdin=subprocess.DEVNULL, env=self.environment(), preexec_fn=die_with_parent)
         if status != 0:
             raise BenchError(f"{script} of {self.method['label']} ended with status {status}: "
                              f"{last_line(log) or 'it printed nothing'} (all of it is in {os.path.basename(log)})")
@@ -118,7 +119,8 @@ class ThreeDGS:
         """Of the commands: a patched checkout needs this package; nothing is left in the checkout's folders."""
         ours = os.environ.get("PYTHONPATH", "").split(os.pathsep)
         path = [item for item in [*self.method["pythonpath"], *ours] if item]
-        environment = {name: value for name, value in os.environ.items() if name != "DSMOE_BLEND_MODE"}
+        environment = {name: value for name, value in os.environ.items()
+                       if name not in ("DSMOE_BLEND_MODE", "PYTHONSAFEPATH")}
         return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
 
 

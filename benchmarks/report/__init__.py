@@ -10,14 +10,14 @@ import os
 import shutil
 from typing import Any, Callable, Dict, List, Sequence
 
-from .rows import ReportError, Row, grouped, read_rows, safe_name
+from .rows import CELLS_FOLDER, ReportError, Row, grouped, read_rows, safe_name, shared_gpu
 
 __all__ = ["ReportError", "report"]
 
 FOLDERS = ("tables", "figures", "images", "survey")
 TABLE_FORMS = {"md": "to_markdown", "csv": "to_csv", "tex": "to_latex"}
 NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
-                "continued")
+                "continued", "arguments")  # of one cell, or said otherwise
 
 
 def report(results: str, output: str) -> str:
@@ -31,7 +31,7 @@ def report(results: str, output: str) -> str:
         import jinja2  # noqa: F401
         import matplotlib  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"a report needs {error.name}; type: pip install 'diff_smoe_rasterization[bench]'") from error
+        raise ImportError(f"a report needs {error.name}; type: pip install '.[bench]' in the source folder") from error
     from . import tables
     from .curves import draw_all
     from .layouts import commits, end_of, read_paper, tables_of
@@ -51,7 +51,8 @@ def report(results: str, output: str) -> str:
         pictures = draw_all(suite, grouped(members, end_of), os.path.join(output, "figures"))
         scenes = collect(results, suite, members, output)
         write_survey(members, paper["datasets"], os.path.join(output, "survey", suite))
-        sections.append(Section(suite, safe_name(suite), _counts(members), made, pictures, scenes, _protocols(members)))
+        sections.append(Section(suite, safe_name(suite), _counts(members), made, pictures, scenes,
+                                _no_images(results, members), _protocols(members)))
     _write(os.path.join(output, "report.md"), _markdown(sections, tables.to_markdown))
     return write_page(output, sections, commits(rows))
 
@@ -95,17 +96,29 @@ def _counts(rows: Sequence[Row]) -> str:
     return text + (f"; {failed} failed" if failed else "; none failed")
 
 
+def _no_images(results: str, rows: Sequence[Row]) -> str:
+    """Why there would be none."""
+    here = any(os.path.isdir(os.path.join(results, CELLS_FOLDER, row["cell"])) for row in rows)
+    return "No images: the suite asked for none." if here else "No images: rows of another folder."
+
+
 def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
     """Of every scene: what its rows say of their protocol, once."""
     found: Dict[str, Dict[str, Any]] = {}
-    for row in rows:
-        if row["ok"]:
-            for name, value in (row.get("protocol") or {}).items():
-                if name not in NOT_PROTOCOL:
-                    text = _plain(name, value)
-                    values = found.setdefault(row["scene"], {}).setdefault(name.replace("_", " "), [])
-                    if text not in values:
-                        values.append(text)
+    measured = [row for row in rows if row["ok"]]
+    for row in measured:
+        said = {name: value for name, value in (row.get("protocol") or {}).items() if name not in NOT_PROTOCOL}
+        said.update(iterations=row.get("iterations"), schedules=row.get("schedule") or "the method's own")
+        for name, value in said.items():
+            values = found.setdefault(row["scene"], {}).setdefault(name.replace("_", " "), [])
+            if value is not None and _plain(name, value) not in values:
+                values.append(_plain(name, value))
+    for scene, rules in found.items():
+        shared = [row for row in measured if row["scene"] == scene and shared_gpu(row)]
+        if shared:
+            cells = sum(row["scene"] == scene for row in measured)
+            rules["cells that shared a GPU"] = [f"{len(shared)} of {cells}, up to "
+                                                f"{max(row['machine']['cells_per_gpu'] for row in shared)} at once"]
     return [{"scene": scene, "rules": {name: "; ".join(values) for name, values in sorted(rules.items())}}
             for scene, rules in sorted(found.items())]
 

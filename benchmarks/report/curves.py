@@ -26,6 +26,7 @@ OTHER_MARK = ("D", "-", "\\\\")
 THEMES = {"light": {"background": "#ffffff", "ink": "#1c1c1e", "grid": "#d8d8dc"},
           "dark": {"background": "#1b1c20", "ink": "#e8e8ea", "grid": "#3c3d44"}}
 AMOUNTS = ("num_gaussians", "size_own_mb", "size_common_mb")
+NARROW = 1.5  # the ratio of the largest x value to the smallest, up to which the axis is plain
 MARK, LARGEST_MARK = 6, 12  # points
 PANEL = (4.2, 2.9)  # inches, as the next two
 LEGEND_MARK, LEGEND_LETTER = 0.85, 0.082  # what a mark, and a letter of its label, take at most
@@ -82,12 +83,22 @@ def rate_distortion(groups: Sequence[Group]):
                     xs, ys, spreads = zip(*points)
                     axis.errorbar(xs, ys, yerr=[math.nan if spread is None else spread for spread in spreads],
                                   linewidth=1.6, capsize=3, **look)
-            axis.set_xscale("log")
         line[0].set_ylabel(column(quality).name + (" (lower is better)" if quality.startswith(LPIPS) else ""))
     for axis, amount in zip(axes[-1], amounts):
         axis.set_xlabel(column(amount).name)
+        _amounts(axis, [group.measured(amount).mean for group in groups if group.by_seed(amount)])
     legend(drawn, [Line2D([], [], label=series.label(), **look) for series, look in looks.items()])
     return drawn
+
+
+def _amounts(axis, values: Sequence[float]) -> None:
+    """The x axis: logarithmic, but for values so close that a logarithm has no ticks between them."""
+    if max(values) > NARROW * min(values):
+        axis.set_xscale("log")
+        return
+    axis.set_xlim(min(values) / NARROW, max(values) * NARROW)
+    axis.xaxis.set_major_locator(plt.MaxNLocator(4))
+    axis.ticklabel_format(axis="x", style="plain", useOffset=False)
 
 
 def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:

@@ -26,6 +26,7 @@ class Section(NamedTuple):
     tables: List[Table]
     pictures: List[Picture]
     scenes: List[Dict[str, Any]]
+    no_images: str  # why, where there are no scenes
     protocols: List[Dict[str, Any]]
 
 

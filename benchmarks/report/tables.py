@@ -132,11 +132,16 @@ def to_csv(table: Table) -> str:
     for row in table.rows:
         line: List[Any] = [row.source, *row.labels]
         for entry, spread in zip(row.cells, with_spread):
-            line.append(entry.printed or (entry.text if entry.value is None else repr(entry.value)))
+            line.append(entry.printed or (entry.text if entry.value is None else _unrounded(entry.value)))
             if spread:
                 line.append("" if entry.spread is None else repr(entry.spread))
         writer.writerow(line)
     return text.getvalue()
+
+
+def _unrounded(value: float) -> str:
+    """The number; a whole one without ".0"."""
+    return str(int(value)) if value == int(value) else repr(value)
 
 
 def to_latex(table: Table) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import small_dbs
 import torch
-from bench_commands import ABOVE
+from bench_commands import ABOVE, wait_for
 from PIL import Image
 
 from diff_smoe_rasterization import io
@@ -206,6 +206,22 @@ def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
     row = row_of(small.cell("3dgs-2023", arguments=["--no_such_flag"]), tmp_path / "out")
     assert not row["ok"] and "train.py of 3dgs-2023 ended with status 2" in row["reason"]
     assert "--no_such_flag" in row["reason"]
+
+
+def test_a_trainer_ends_with_its_cell(small, tmp_path):
+    (tmp_path / "2dgs").mkdir()
+    (tmp_path / "2dgs" / "train.py").write_text(
+        "import os, time\nopen('pid.part', 'w').write(str(os.getpid()))\nos.rename('pid.part', 'pid')\n"
+        "time.sleep(600)\n")
+    cell, pid = tmp_path / "cell.json", tmp_path / "2dgs" / "pid"
+    cell.write_text(json.dumps(small.cell("2dgs", variant="unpatched", blend_mode="alpha",
+                                          path=str(tmp_path / "2dgs"))))
+    run = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization.benchmarks.cell", str(cell),
+                            str(tmp_path / "out")])
+    wait_for(pid.is_file, 60)
+    run.terminate()
+    assert run.wait() == 143
+    wait_for(lambda: not Path("/proc", pid.read_text()).exists(), 60)
 
 
 def test_the_last_words_are_not_a_progress_bars(tmp_path):

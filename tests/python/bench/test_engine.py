@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from bench_commands import command, environment, rows_of
+from bench_commands import command, environment, rows_of, wait_for
 
 from diff_smoe_rasterization.benchmarks import cell as cells
 from diff_smoe_rasterization.benchmarks import engine
@@ -33,13 +33,17 @@ def write_suite(content, folder):
 def finished(tmp_path_factory, tiny_scene):
     """A suite of one cell that works and one that cannot."""
     folder = tmp_path_factory.mktemp("bench")
+    (folder / "nothing").mkdir()
+    shadow = folder / "results" / "diff_smoe_rasterization" / "__init__.py"  # is not what cells import
+    shadow.parent.mkdir(parents=True)
+    shadow.write_text("raise ImportError('of the folder in which cells are run')\n")
     content = {"name": "two", "protocol": {"iterations": 12, "device": "cpu", "principal_point": "scene", "lpips": [],
                                            "evaluate_every": 6},
-               "scenes": [{"name": "tiny", "path": tiny_scene}, {"name": "absent", "path": "nowhere"}],
+               "scenes": [{"name": "tiny", "path": tiny_scene}, {"name": "absent", "path": str(folder / "nothing")}],
                "methods": [{"name": "native"}], "blend_modes": ["smoe"], "densify_grad_thresholds": [0.005],
                "images": 1}
     suite = write_suite(content, folder)
-    assert main(["bench", "run", suite, "-o", str(folder / "results"), "--jobs", "2"]) == 0
+    assert main(["bench", "run", suite, "-o", str(folder / "results"), "--jobs", "2"]) == 1
     return content, suite, folder / "results"
 
 
@@ -62,7 +66,7 @@ def test_a_row_says_what_was_measured_and_how(finished):
 
 def test_a_failed_cell_is_a_row_with_its_reason(finished):
     row, = [row for row in rows_of(finished[2]).values() if not row["ok"]]
-    assert row["scene"] == "absent" and "nowhere: no such folder" in row["reason"]
+    assert row["scene"] == "absent" and "nothing: neither a folder `sparse`" in row["reason"]
     assert row["psnr"] is None and row["num_gaussians"] is None and row["lpips"]["value"] is None
 
 
@@ -83,14 +87,18 @@ def test_what_is_done_is_not_done_again(finished, capsys):
     _, suite, results = finished
     before = {path: path.read_text() for path in results.glob("cells/*/log.txt")}
     assert len(before) == 2
-    assert main(["bench", "run", suite, "-o", str(results)]) == 0
+    assert main(["bench", "run", suite, "-o", str(results)]) == 1
     assert {path: path.read_text() for path in before} == before
-    assert main(["bench", "run", suite, "-o", str(results), "--dry-run", "--retry-failed"]) == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(("done ", "to do "))]
-    assert [line.split()[0] for line in lines] == ["done", "to"]
+    capsys.readouterr()
+    for words, states, counts in (([], ["done", "failed"], "1 done, 0 to do, 1 failed"),
+                                  (["--retry-failed"], ["done", "to"], "1 done, 1 to do, 0 failed")):
+        assert main(["bench", "run", suite, "-o", str(results), "--dry-run", *words]) == 0
+        *lines, summary = capsys.readouterr().out.splitlines()
+        assert [line.split()[0] for line in lines] == states and summary == counts
 
 
-def test_a_failed_cell_can_be_tried_again(finished, tmp_path):
+@pytest.mark.parametrize("words", [[], ["--retry-failed"]])
+def test_a_failed_cell_is_tried_again_where_its_path_has_changed(words, finished, tmp_path):
     """The reason is gone, and only the cell that failed is run."""
     content, _, results = finished
     there, absent = content["scenes"]
@@ -99,7 +107,7 @@ def test_a_failed_cell_can_be_tried_again(finished, tmp_path):
     copied = tmp_path / "results"
     subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
     logs = {path.parent.name: path.read_text() for path in copied.glob("cells/*/log.txt")}
-    assert main(["bench", "run", suite, "-o", str(copied), "--retry-failed"]) == 0
+    assert main(["bench", "run", suite, "-o", str(copied), *words]) == 0
     rows = rows_of(copied)
     assert set(rows) == set(logs) and all(row["ok"] for row in rows.values())
     changed = {name for name in logs if (copied / "cells" / name / "log.txt").read_text() != logs[name]}
@@ -113,13 +121,13 @@ def test_rows_of_an_earlier_run_elsewhere_are_not_run_again(finished, tmp_path, 
     assert capsys.readouterr().out.splitlines()[0] == f"2 of 2 cells taken from {rows[1]}"
     assert not (tmp_path / "dry").exists()
     assert main(["bench", "run", suite, "-o", str(tmp_path / "dry"), "--dry-run", "--retry-failed", *rows]) == 0
-    counted, *lines = capsys.readouterr().out.splitlines()
+    counted, *lines, _ = capsys.readouterr().out.splitlines()
     assert counted.startswith("1 of 2 cells") and [line.split()[0] for line in lines] == ["done", "to"]
-    assert main(["bench", "run", suite, "-o", str(tmp_path / "new"), *rows]) == 0
+    assert main(["bench", "run", suite, "-o", str(tmp_path / "new"), *rows]) == 1  # one failed
     assert rows_of(tmp_path / "new") == rows_of(results)
     assert not list((tmp_path / "new").glob("cells/*/log.txt"))
     other = write_suite({**finished[0], "name": "other"}, tmp_path)
-    assert main(["bench", "run", other, "-o", str(tmp_path / "other"), *rows]) == 0
+    assert main(["bench", "run", other, "-o", str(tmp_path / "other"), *rows]) == 1
     assert {row["suite"] for row in rows_of(tmp_path / "other").values()} == {"other"}
     assert main(["bench", "run", suite, "-o", str(tmp_path / "none"), "--rows", str(tmp_path / "absent.jsonl")]) == 1
     assert "absent.jsonl" in capsys.readouterr().err
@@ -142,6 +150,14 @@ def test_rows_must_be_of_the_suites_cells(finished, tmp_path, capsys):
     assert not (tmp_path / "results").exists()
 
 
+def test_a_reader_that_has_enough_is_no_error(content, tmp_path):
+    run = subprocess.Popen(command("bench", "run", write_suite(content, tmp_path), "--dry-run"), env=environment(),
+                           cwd=str(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    run.stdout.close()
+    assert run.wait() == 0 and run.stderr.read() == b""
+    run.stderr.close()
+
+
 def test_options_that_do_not_go_together_are_refused_before_anything_is_written(content, tmp_path, capsys):
     suite, results = write_suite(content, tmp_path), tmp_path / "results"
     for words, told in ((["--jobs", "0"], "--jobs is 0"), (["--per-gpu", "-1"], "--per-gpu is -1"),
@@ -159,42 +175,106 @@ def test_a_suite_for_gpus_leaves_nothing_where_there_is_none(content, tmp_path, 
     monkeypatch.setattr(engine, "visible_gpus", list)
     assert main(["bench", "run", suite, "-o", str(results), "--dry-run"]) == 0
     assert main(["bench", "run", suite, "-o", str(results)]) == 1
-    assert "no CUDA device" in capsys.readouterr().err and not results.exists()
+    told = capsys.readouterr().err
+    assert "no CUDA device" in told and "protocol.device: cpu" in told and not results.exists()
 
 
-def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, capsys):
+@pytest.mark.parametrize("words", [[], ["--dry-run"]])
+def test_results_of_another_protocol_are_not_added_to(words, finished, tmp_path, capsys):
     content, _, results = finished
     longer = {**content, "protocol": {**content["protocol"], "iterations": 13}}
-    assert main(["bench", "run", write_suite(longer, tmp_path), "-o", str(results)]) == 1
-    assert "another protocol" in capsys.readouterr().err
+    words = ["bench", "run", write_suite(longer, tmp_path), *words, "--only", "scene=tiny", "-o"]
+    assert main([*words, str(results)]) == 1
+    told = capsys.readouterr().err
+    assert "another protocol" in told and "protocol.iterations is 12 there and 13 here" in told
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "suite.json").write_text((results / "suite.json").read_text())
+    assert main([*words, str(tmp_path / "empty")]) == 0  # which has no row
 
 
-def test_a_killed_run_continues_where_it_was(content, tmp_path):
-    """Killed without warning in the middle of a cell: its process ends too; it goes on from its checkpoint."""
+def test_scenes_that_are_not_there_are_named_before_anything_is_run(content, tmp_path, capsys):
+    content["scenes"].append({"name": "absent", "path": "nowhere"})
+    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
+    line = f"scene absent: {tmp_path / 'nowhere'}: no such folder"
+    assert main([*words, "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [line, "0 done, 4 to do, 0 failed"]
+    assert main([*words, "--dry-run", "--only", "scene=tiny"]) == 0
+    assert "absent" not in capsys.readouterr().out
+    assert main(words) == 1 and line in capsys.readouterr().err
+    assert not (tmp_path / "results").exists()
+
+
+def test_variables_are_needed_for_cells_that_are_run(content, tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("NOT_THERE", raising=False)
+    content["protocol"].update(device="cuda", principal_point="centre")
+    content["methods"].append({"name": "3dgs-2023", "path": "${NOT_THERE}/3dgs"})
+    monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
+    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
+    assert main([*words, "--dry-run"]) == 0
+    assert capsys.readouterr().out.endswith("0 done, 4 to do, 0 failed\n")
+    assert main(words) == 1
+    told = capsys.readouterr().err
+    assert "methods[1].path: $NOT_THERE is not set" in told and "set it, or leave it out with --only" in told
+    assert not (tmp_path / "results").exists()
+    engine.check_paths([cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"])
+
+
+@pytest.fixture
+def running(content, tmp_path):
+    """A run in the middle of its only cell: the suite, the results, the process, the cell's folder."""
     content["protocol"].update(iterations=500, checkpoint_every=20, evaluate_every=0)
     content["protocol"]["options"] = {"densify_until_iter": 0}
     content["blend_modes"] = ["alpha"]
     suite, results = write_suite(content, tmp_path), tmp_path / "results"
     run = subprocess.Popen(command("bench", "run", suite, "-o", str(results)), env=environment(), cwd=str(tmp_path),
-                           start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+                           start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     wait_for(lambda: list(results.glob("cells/*/run/checkpoint.pt")), 120)
+    folder, = results.glob("cells/*")
+    yield suite, results, run, folder
+    run.stderr.close()
+
+
+def test_a_killed_run_continues_where_it_was(running):
+    """Killed without warning in the middle of a cell, all of it: it goes on from its checkpoint."""
+    suite, results, run, folder = running
     os.killpg(run.pid, signal.SIGKILL)
     run.wait()
-    folder, = results.glob("cells/*")
     assert not (folder / "row.json").exists()
-    wait_for(lambda: not processes_with(f"cells/{folder.name}"), 60)
-
+    wait_for(lambda: is_free(results), 60)
     assert main(["bench", "run", suite, "-o", str(results)]) == 0
     row, = rows_of(results).values()
     assert row["ok"] and row["protocol"]["continued"]
     assert "resumed at iteration" in (folder / "log.txt").read_text()
 
 
-def wait_for(condition, seconds):
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "waited too long"
-        time.sleep(0.05)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_what_a_run_has_started_ends_with_it_and_keeps_others_away_till_then(number, running, capsys):
+    suite, results, run, folder = running
+    inner = int(processes_with(f"cells/{folder.name} --inside")[0].parent.name)
+    os.kill(inner, signal.SIGSTOP)  # it cannot end until it goes on
+    assert main(["bench", "run", suite, "-o", str(results)]) == 1
+    os.kill(run.pid, number)
+    assert run.wait(timeout=60) == {signal.SIGKILL: -9, signal.SIGTERM: 143, signal.SIGINT: 130}[number]
+    wait_for(lambda: not processes_with(str(results)), 60)  # Snakemake
+    assert main(["bench", "run", suite, "-o", str(results)]) == 1
+    assert capsys.readouterr().err.count("another run is at work there") == 2
+    os.kill(inner, signal.SIGCONT)
+    wait_for(lambda: is_free(results) and not processes_with(f"cells/{folder.name}"), 60)
+    assert not (folder / "row.json").exists()
+    told = run.stderr.read().decode()
+    assert "Traceback" not in told
+    if number == signal.SIGINT:
+        assert "interrupted; the same command continues" in told
+    if number != signal.SIGKILL:
+        assert (results / "rows.jsonl").read_text() == ""
+
+
+def is_free(results):
+    try:
+        with engine.only_one(str(results)):
+            return True
+    except BenchError:
+        return False
 
 
 def processes_with(words):
@@ -322,12 +402,20 @@ def test_a_second_run_on_the_same_results_is_refused(tmp_path):
                 pass
 
 
+def test_a_file_of_weights_is_found_from_the_folder_of_cells(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DSMOE_LPIPS_ALEX", "weights.npz")
+    assert engine.environment()["DSMOE_LPIPS_ALEX"] == str(tmp_path / "weights.npz")
+
+
 def test_cells_are_chosen_by_their_fields(content):
     suite = expand({**content, "seeds": [0, 1], "headline": {"seeds": [1]}}, "")
     found = engine.chosen(suite.cells, ["blend_mode=smoe", "seed=0", "seed=1", "densify_grad_threshold=5e-3"])
     assert [(cell["blend_mode"], cell["seed"]) for cell in found] == [("smoe", 0), ("smoe", 1)]
     assert len(engine.chosen(suite.cells, ["headline=true"])) == 2
-    for wrong in ("blend_mode", "mode=alpha", "blend_mode=smoe_std"):
+    with pytest.raises(BenchError, match="--only blend_mode=smoe_std: .* alpha, smoe"):
+        engine.chosen(suite.cells, ["blend_mode=smoe_std"])
+    for wrong in ("blend_mode", "mode=alpha"):
         with pytest.raises(BenchError, match="--only " + wrong):
             engine.chosen(suite.cells, [wrong])
 
@@ -385,12 +473,12 @@ def test_cells_are_told_the_gpus(content, tmp_path, monkeypatch):
         lines = (tmp_path / "results" / "rows.jsonl").read_text().splitlines()
         return [json.loads(line)["reason"].partition(" --gpus ")[2] for line in lines]
 
-    assert main([*words, "--per-gpu", "2"]) == 0 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2
-    assert main(words) == 0 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2  # what is done is not done again
-    assert main([*words, "--retry-failed"]) == 0 and reasons() == ["0 --per-gpu 1 --locks .locks"] * 2
+    assert main([*words, "--per-gpu", "2"]) == 1 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2
+    assert main(words) == 1 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2  # what is done is not done again
+    assert main([*words, "--retry-failed"]) == 1 and reasons() == ["0 --per-gpu 1 --locks .locks"] * 2
 
 
 def test_without_snakemake_the_message_says_what_to_install(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
     assert main(["bench", "run", finished[1], "-o", str(tmp_path / "results")]) == 1
-    assert "diff_smoe_rasterization[bench]" in capsys.readouterr().err
+    assert "pip install '.[bench]' in the source folder" in capsys.readouterr().err

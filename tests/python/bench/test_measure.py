@@ -162,6 +162,16 @@ def test_an_image_too_small_for_the_network_has_no_lpips(monkeypatch, tmp_path):
     assert "RuntimeError" in measures.lpips_of(found)[0]["reason"]
 
 
+def test_where_alexnets_weights_may_be_is_said(monkeypatch):
+    def offline(kind, device):
+        raise OSError("no network")
+
+    monkeypatch.setattr(measure, "lpips_network", offline)
+    alex, vgg = Measures("cpu", ["lpips_alex", "lpips_vgg_std"]).lpips_of({})
+    assert alex["reason"] == "no weights at hand: OSError: no network ($DSMOE_LPIPS_ALEX may name a file of them)"
+    assert vgg["reason"] == "no weights at hand: OSError: no network"
+
+
 def test_means_count_each_view_once_and_fps_is_the_inverse_of_the_mean_time():
     rows = [{"name": "a", "milliseconds": 10.0, "psnr": 20.0, "ssim": 0.5, "psnr_float": 21.0, "psnr_edge": None},
             {"name": "b", "milliseconds": 30.0, "psnr": 30.0, "ssim": 0.7, "psnr_float": 31.0, "psnr_edge": 15.0}]

@@ -267,7 +267,9 @@ def test_the_command_trains_and_explains_its_errors(tiny_scene, tmp_path, capsys
     out = str(tmp_path / "out")
     assert mechanism.main(["run", tiny_scene, out, "--blend-mode", "smoe", "--iterations", "100", "--scale-recipe",
                            "--quiet"]) == 0
-    assert json.loads(capsys.readouterr().out)["num_gaussians"] > 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["num_gaussians"] > 0
+    assert f"written: {os.path.join(out, 'mechanism.json')}" in printed.err
     assert TrainConfig.load(out).opacity_reset_interval == 10
     assert mechanism.main(["run", tiny_scene, out, "--quiet"]) == 1
     assert "already holds" in capsys.readouterr().err
@@ -280,7 +282,10 @@ def test_three_figures_show_the_series_of_all_runs(runs, tmp_path, capsys):
     folders, records = [config.output for config, _ in runs.values()], [record for _, record in runs.values()]
     assert mechanism.main(["plot", str(tmp_path), "-o", str(tmp_path)]) == 1
     assert "mechanism.json" in capsys.readouterr().err
-    assert mechanism.main(["plot", *folders, "-o", str(tmp_path)]) == 0
+    words = [folders[0], os.path.join(folders[1], "mechanism.json")]
+    assert mechanism.main(["plot", *words, "-o", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == 6 and all(map(os.path.isfile, printed))
     assert sorted(os.listdir(tmp_path)) == sorted(
         f"mechanism-{name}{end}" for name in ("opacity", "pruning", "densification")
         for end in (".png", "-light.svg", "-dark.svg"))

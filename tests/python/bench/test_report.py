@@ -224,7 +224,7 @@ def test_csv_is_unrounded_and_complete():
     bonsai = next(line for line in lines if line["scene"] == "bonsai")
     assert float(bonsai["PSNR [dB]"]) == psnr and float(bonsai["PSNR [dB] sd"]) == 0
     fox = next(line for line in lines if line["scene"] == "fox, the \"red\" one")
-    assert fox["PSNR [dB] sd"] == ""
+    assert fox["PSNR [dB] sd"] == "" and fox["#Gaussians"] == "40000"
 
 
 @pytest.mark.parametrize("name", ["table1", "table3", "deltas", "cells", "failures"])

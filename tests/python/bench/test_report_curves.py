@@ -32,6 +32,17 @@ def test_a_curve_goes_through_the_means_from_few_gaussians_to_many():
     assert whisker[1, 1] - whisker[0, 1] == pytest.approx(2 * 2 ** 0.5)  # seeds 20 and 22: sd is the root of 2
 
 
+def test_amounts_that_are_nearly_equal_have_a_plain_axis():
+    """A logarithm has no ticks between them, and equal ones no width."""
+    entries = [row(threshold=threshold, num_gaussians=105145, size_bytes={"own": size, "common": size * size})
+               for threshold, size in ((0.005, 2_000_000), (0.0002, 2_900_000))]
+    number, own, common = curves.rate_distortion(groups_of(entries)).axes[:3]
+    assert [axis.get_xscale() for axis in (number, own, common)] == ["linear", "linear", "log"]
+    for axis, least, most in ((number, 105145, 105145), (own, 2.0, 2.9)):
+        low, high = axis.get_xlim()
+        assert low < 0.75 * least and high > 1.25 * most
+
+
 def test_two_points_are_no_curve():
     entries = [row(threshold=threshold, num_gaussians=number) for threshold, number in ((0.005, 10), (0.0002, 90))]
     entries += [row(blend_mode="smoe", threshold=threshold) for threshold in (0.005, 0.001, 0.0002)]

@@ -10,7 +10,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from PIL import Image
-from report_rows import ALPHA, SMOE, TRUTH, failed, row, write_images, write_rows
+from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images, write_rows
 
 pytest.importorskip("matplotlib", reason="a report needs matplotlib")
 pytest.importorskip("jinja2", reason="a report needs jinja2")
@@ -81,6 +81,29 @@ def test_files_of_others_are_left_alone(tmp_path):
     with pytest.raises(ReportError, match="index.html is no report"):
         report(write_rows(tmp_path / "results", [row()]), str(tmp_path / "report"))
     assert (tmp_path / "report" / "images" / "mine.png").is_file()
+
+
+def test_a_page_without_images_says_why(written, tmp_path):
+    def page(results):
+        report(results, str(tmp_path / "report"))
+        return (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+
+    results = write_rows(tmp_path / "results", [row()])
+    assert "No images: rows of another folder." in page(results)
+    (tmp_path / "results" / "cells" / row()["cell"]).mkdir(parents=True)
+    assert "No images: the suite asked for none." in page(results)
+    assert "No images" not in (written / "index.html").read_text(encoding="utf-8")
+
+
+def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path):
+    said = {**PROTOCOL, "arguments": ["--port", "0"]}
+    entries = [row(protocol=said), row(blend_mode="smoe", schedule="steady", protocol=said,
+                                       machine={"cells_per_gpu": 3}), failed(seed=1, iterations=7)]
+    report(write_rows(tmp_path / "results", entries), str(tmp_path / "report"))
+    text = (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+    rules = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
+    assert rules["iterations"] == "30000" and rules["schedules"] == "3dgs; steady"
+    assert rules["cells that shared a GPU"] == "1 of 2, up to 3 at once" and "arguments" not in rules
 
 
 def test_text_of_rows_is_text(written):

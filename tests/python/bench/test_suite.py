@@ -83,10 +83,12 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tiny_scene, tmp_path
 
 
 @pytest.mark.parametrize("change, words", [
-    ({"blend_mode": ["alpha"]}, ["blend_mode"]),
+    ({"blend_mode": ["alpha"]}, ["blend_mode", "allowed are blend_modes, densify_grad_thresholds"]),
     ({"blend_modes": ["smooth"]}, ["blend_modes[0]", "smooth"]),
     ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
+    ({"densify_grad_thresholds": ["5e-3"]}, ["densify_grad_thresholds[0]", "write 0.005"]),
     ({"seeds": []}, ["seeds"]),
+    ({"seeds": 0}, ["seeds", "a list, such as [0]"]),
     ({"name": "../x"}, ["name"]),
     ({"scenes": [{"name": "a"}]}, ["scenes[0]", "path", "synthetic"]),
     ({"scenes": [{"name": "a", "path": "p", "resolution": 0}]}, ["scenes[0].resolution"]),
@@ -118,8 +120,20 @@ def test_a_file_that_is_no_suite_is_named(tmp_path, text):
 
 def test_a_variable_that_is_not_set_is_named(content, monkeypatch):
     monkeypatch.delenv("NOT_THERE", raising=False)
-    with pytest.raises(BenchError, match=r"scenes\[0\].path: \$NOT_THERE"):
-        expand(changed(content, scenes=[{"name": "a", "path": "${NOT_THERE}/a"}]), "")
+    one, = {cell["id"] for cell in expand(changed(content, blend_modes=["alpha"]), "").cells}
+    scenes = [{"name": "tiny", "path": "${NOT_THERE}/a"}]
+    cell, = expand(changed(content, blend_modes=["alpha"], scenes=scenes), "").cells
+    assert cell["scene"]["unset"] == "scenes[0].path: $NOT_THERE is not set; it is a part of '${NOT_THERE}/a'"
+    assert cell["id"] == one
+
+
+def test_a_relative_path_is_from_the_suites_folder_and_one_in_a_variable_from_the_folder_at_hand(
+        content, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DATA", "data")
+    scenes = [{"name": "a", "path": "data/a"}, {"name": "b", "path": "${DATA}/b"}]
+    suite = expand(changed(content, scenes=scenes), "/suites")
+    assert [scene["path"] for scene in suite.scenes] == ["/suites/data/a", str(tmp_path / "data" / "b")]
 
 
 # What would put figures of two protocols into one table.
