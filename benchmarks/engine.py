@@ -1,4 +1,4 @@
-"""Runs a suite with Snakemake: which cells are still to be done, how many at once, on which GPUs or in which queue.
+"""Runs a suite with Snakemake: what is still to be done, how many cells at once, on which GPUs or in which queue.
 
 What is done is what has a row, so that a run that was killed continues where it was. RESULTS/rows.jsonl is the
 concatenation of the rows.
@@ -9,7 +9,6 @@ import glob
 import importlib.util
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,23 +17,18 @@ from functools import partial
 from types import MappingProxyType
 from typing import IO, Any, Dict, Iterator, List, Mapping, Optional, Sequence
 
-from .. import patches
 from ..trainer.files import write_json_atomically, write_text_atomically
-from ..trainer.synthetic import write_synthetic_scene
 from .cell import ROW_NAME, identity
 from .errors import BenchError
 from .measure import ALEX_VARIABLE
-from .methods.names import CHECKOUTS, NATIVE
+from .preparation import check_paths, given, made_scene, missing_scenes, prepared_method
 from .processes import die_with_parent
-from .protocol import COMMIT_VARIABLE, ROOT, commit_of, project_commit
-from .report.rows import read_rows
-from .suite import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, missing
+from .protocol import COMMIT_VARIABLE, ROOT, project_commit
+from .selection import chosen, earlier_rows, plan
+from .suite import Suite, find_suite, load_suite, missing
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 SUITE_NAME, ROWS_NAME, LOCK_NAME = "suite.json", "rows.jsonl", ".lock"
-SAID_BY_THE_ID = ("method", "variant", "blend_mode", "schedule", "densify_grad_threshold", "scene", "seed",
-                  "iterations")  # fields of a row
-NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", "build")
 
 
 def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = None,
@@ -83,82 +77,6 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         raise BenchError(f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The "
                          f"same command continues; {os.path.join(results, '.snakemake', 'log')} says what happened")
     return here
-
-
-def earlier_rows(path: str, cells: List[Dict[str, Any]]) -> Dict[str, Dict[str, Any]]:
-    """The rows of a file, or of a folder of results, that are of these cells, by the cells' names.
-
-    Raises BenchError where none is, or where a row says something else of its cell than the cell does.
-    """
-    rows = {row["cell"]: row for row in read_rows(path)}
-    found = [cell for cell in cells if cell["id"] in rows]
-    if not found:
-        raise BenchError(f"--rows {path}: none of its {len(rows)} rows is of a cell of this suite")
-    for cell in found:
-        row, expected = rows[cell["id"]], identity(cell)
-        for field in SAID_BY_THE_ID:
-            if row.get(field) != expected[field]:
-                raise BenchError(f"--rows {path}: the row of cell {cell['id']}: {field} is {row.get(field)!r}; it must "
-                                 f"be {expected[field]!r}, as the suite has it")
-    return {cell["id"]: rows[cell["id"]] for cell in found}
-
-
-def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, Any]]:
-    """The cells for which every "field=value" holds; several values of one field may be given. Raises BenchError."""
-    wanted: Dict[str, List[str]] = {}
-    for text in only:
-        field, equals, value = text.partition("=")
-        if not equals or field not in SELECTORS:
-            raise BenchError(f"--only {text}: must be FIELD=VALUE with a field of {', '.join(SELECTORS)}")
-        wanted.setdefault(field, []).append(value)
-    for field, values in wanted.items():
-        there = [SELECTORS[field](cell) for cell in cells]
-        for value in values:
-            if not any(_same(entry, value) for entry in there):
-                raise BenchError(f"--only {field}={value}: no cell of the suite is so; its cells have "
-                                 + ", ".join(dict.fromkeys(map(str, there))))
-    found = [cell for cell in cells
-             if all(any(_same(SELECTORS[field](cell), value) for value in values) for field, values in wanted.items())]
-    if not found:
-        raise BenchError(f"--only {' '.join(only)}: no cell of the suite is so")
-    return found
-
-
-SELECTORS = {"method": lambda cell: cell["method"]["label"], "scene": lambda cell: cell["scene"]["name"],
-             "blend_mode": lambda cell: cell["blend_mode"], "schedule": lambda cell: cell["schedule"],
-             "densify_grad_threshold": lambda cell: cell["densify_grad_threshold"], "seed": lambda cell: cell["seed"],
-             "headline": lambda cell: cell["headline"]}
-
-
-def _same(value: Any, text: str) -> bool:
-    if isinstance(value, float):
-        try:
-            return value == float(text)
-        except ValueError:
-            return False
-    return str(value).lower() == text.lower()
-
-
-def plan(cells: List[Dict[str, Any]], done: Mapping[str, Dict[str, Any]], absent: Sequence[str]) -> str:
-    """What --dry-run prints: a line for each cell, what is not there yet, and how many cells are how far."""
-    states = ["to do" if cell["id"] not in done else "done" if done[cell["id"]]["ok"] else "failed" for cell in cells]
-    counts = ", ".join(f"{states.count(state)} {state}" for state in ("done", "to do", "failed"))
-    return "\n".join([*(f"{state}  {cell['id']}" for state, cell in zip(states, cells)), *absent, counts])
-
-
-def check_paths(cells: List[Dict[str, Any]]) -> None:
-    """Raises BenchError where a path of these cells has a variable that is not set."""
-    for cell in cells:
-        for part in (cell["scene"], cell["method"]):
-            if "unset" in part:
-                raise BenchError(f"{part['unset']}; set it, or leave it out with --only")
-
-
-def missing_scenes(cells: List[Dict[str, Any]]) -> List[str]:
-    """Which folders of these cells' scenes do not exist, in words."""
-    scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
-    return [f"scene {name}: {scene['path']}: no such folder" for name, scene in scenes.items()
-            if scene["path"] is not None and "unset" not in scene and not os.path.isdir(scene["path"])]
 
 
 def check_folder(suite: Suite, results: str) -> None:
@@ -259,65 +177,6 @@ def row_of(results: str, cell: Dict[str, Any], retry_failed: bool) -> Optional[D
         return row
     before = read_json(os.path.join(folder, "cell.json")) or {}
     return None if retry_failed or before.get("given", given(cell)) != given(cell) else row
-
-
-def given(cell: Dict[str, Any]) -> Dict[str, Any]:
-    """Where things lie, as the suite says it; a path that has changed changes no figure."""
-    return {part: {key: cell[part][key] for key in NOT_IN_THE_IDENTITY if key in cell[part]}
-            for part in ("scene", "method")}
-
-
-def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
-    """The scene with its path; a synthetic one is made where it is not there yet."""
-    if scene["path"] is not None:
-        return scene
-    folder = os.path.join(results, "scenes", scene["name"])
-    if not os.path.isfile(os.path.join(folder, "sparse", "0", "cameras.txt")):
-        write_synthetic_scene(folder, **scene["synthetic"])
-    return dict(scene, path=folder)
-
-
-def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
-    """The method with its checkouts as they are run: patched ones are copies in RESULTS/checkouts.
-
-    Where a checkout cannot be used, `refused` says why: that is what its cells' rows will say.
-    """
-    if method["name"] == NATIVE:
-        return method
-    try:
-        paths = {key: prepared_checkout(method, key, results) for key in ("path", "base") if key in method}
-    except (patches.PatchError, BenchError, OSError) as error:
-        return {**method, "refused": " ".join(str(error).split())}
-    return {**method, **paths, "commit": commit_of(method["path"]) or method.get("commit")}
-
-
-def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
-    """The folder of a checkout as it is run. Raises BenchError or PatchError."""
-    path = method[key]
-    if not os.path.isdir(path):
-        raise BenchError(f"{path}: no such folder; {method['label']} is a checkout there")
-    if not CHECKOUTS[method["name"]]:
-        return path
-    verdict = patches.check(path)
-    if method["variant"] == "unpatched" and verdict != "patchable":
-        raise BenchError(f"{path} is {verdict}, and the suite says it is an unpatched checkout (`dsmoe patch revert` "
-                         "takes a patch back)")
-    if method["variant"] == "unpatched" or verdict == "patched":
-        return path
-    return patched_copy(path, os.path.join(results, "checkouts", f"{method['label']}-{key}"))
-
-
-def patched_copy(path: str, folder: str) -> str:
-    """A patched copy of a checkout, which itself stays as it is; made once. Raises PatchError."""
-    if os.path.isdir(folder):
-        patches.apply(folder, modernise=True)  # what an interruption left is finished; else nothing is written
-        return folder
-    part = folder + ".part"
-    shutil.rmtree(part, ignore_errors=True)
-    shutil.copytree(path, part, ignore=NOT_COPIED)
-    patches.apply(part, modernise=True)
-    os.rename(part, folder)
-    return folder
 
 
 def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[str]], per_gpu: int) -> None:

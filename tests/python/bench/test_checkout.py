@@ -21,7 +21,7 @@ from bench_commands import ABOVE, wait_for
 from PIL import Image
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.benchmarks import engine
+from diff_smoe_rasterization.benchmarks import preparation
 from diff_smoe_rasterization.benchmarks.cell import work
 from diff_smoe_rasterization.benchmarks.log import last_line
 from diff_smoe_rasterization.benchmarks.methods import checkout as shapes
@@ -99,7 +99,7 @@ class SmallTrainers:
                    "seeds": [seed], "densify_grad_thresholds": [0.0001], "images": 1}
         cell, = expand(content, "").cells
         cell["protocol"] = {**cell["protocol"], "device": "cpu"}
-        return dict(cell, method=engine.prepared_method(cell["method"], str(self.folder / "results")))
+        return dict(cell, method=preparation.prepared_method(cell["method"], str(self.folder / "results")))
 
     def run(self, *words, **options):
         """(row, output folder) of a cell with these arguments of `cell`."""
@@ -238,15 +238,15 @@ def test_a_patched_checkout_is_a_copy(small, tmp_path):
     cell = small.cell("3dgs-2023")
     original = small.folder / "checkout-3dgs-2023"
     assert cell["method"]["path"] == str(small.folder / "results" / "checkouts" / "3dgs-2023-path")
-    assert engine.patches.check(original) == "patchable"
-    assert engine.patches.check(cell["method"]["path"]) == "patched"
+    assert preparation.patches.check(original) == "patchable"
+    assert preparation.patches.check(cell["method"]["path"]) == "patched"
 
 
 def test_an_unpatched_checkout_must_be_one(small, tmp_path):
     cell = small.cell("3dgs-2023", variant="unpatched", blend_mode="alpha")
     assert "refused" not in cell["method"]
     patched = small.cell("3dgs-2023")["method"]["path"]
-    method = engine.prepared_method(dict(cell["method"], path=patched), str(tmp_path / "results"))
+    method = preparation.prepared_method(dict(cell["method"], path=patched), str(tmp_path / "results"))
     assert "is patched" in method["refused"]
     row = row_of(dict(cell, method=method), tmp_path / "out")
     assert not row["ok"] and row["reason"] == method["refused"]
@@ -254,7 +254,7 @@ def test_an_unpatched_checkout_must_be_one(small, tmp_path):
 
 def test_a_checkout_that_is_not_there_is_a_row(small, tmp_path):
     cell = small.cell("3dgs-2023")
-    method = engine.prepared_method(dict(cell["method"], path=str(tmp_path / "nowhere")), str(tmp_path))
+    method = preparation.prepared_method(dict(cell["method"], path=str(tmp_path / "nowhere")), str(tmp_path))
     row = row_of(dict(cell, method=method), tmp_path / "out")
     assert not row["ok"] and "nowhere: no such folder" in row["reason"]
 

@@ -13,7 +13,7 @@ import pytest
 from bench_commands import command, environment, rows_of, wait_for
 
 from diff_smoe_rasterization.benchmarks import cell as cells
-from diff_smoe_rasterization.benchmarks import engine
+from diff_smoe_rasterization.benchmarks import engine, preparation, selection
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import expand
 from diff_smoe_rasterization.cli import main
@@ -140,7 +140,7 @@ def test_rows_must_be_of_the_suites_cells(finished, tmp_path, capsys):
     assert main(["bench", "run", longer, *words, str(results)]) == 1
     assert "none of its 2 rows is of a cell" in capsys.readouterr().err
     rows = list(rows_of(results).values())
-    for field in engine.SAID_BY_THE_ID:
+    for field in selection.SAID_BY_THE_ID:
         changed, value = tmp_path / f"{field}.jsonl", rows[1][field]
         other = {**rows[1], field: "other" if isinstance(value, str) else value + 1}
         changed.write_text(json.dumps(rows[0]) + "\n" + json.dumps(other) + "\n")
@@ -216,7 +216,7 @@ def test_variables_are_needed_for_cells_that_are_run(content, tmp_path, monkeypa
     told = capsys.readouterr().err
     assert "methods[1].path: $NOT_THERE is not set" in told and "set it, or leave it out with --only" in told
     assert not (tmp_path / "results").exists()
-    engine.check_paths([cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"])
+    preparation.check_paths([cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"])
 
 
 @pytest.fixture
@@ -410,14 +410,14 @@ def test_a_file_of_weights_is_found_from_the_folder_of_cells(monkeypatch, tmp_pa
 
 def test_cells_are_chosen_by_their_fields(content):
     suite = expand({**content, "seeds": [0, 1], "headline": {"seeds": [1]}}, "")
-    found = engine.chosen(suite.cells, ["blend_mode=smoe", "seed=0", "seed=1", "densify_grad_threshold=5e-3"])
+    found = selection.chosen(suite.cells, ["blend_mode=smoe", "seed=0", "seed=1", "densify_grad_threshold=5e-3"])
     assert [(cell["blend_mode"], cell["seed"]) for cell in found] == [("smoe", 0), ("smoe", 1)]
-    assert len(engine.chosen(suite.cells, ["headline=true"])) == 2
+    assert len(selection.chosen(suite.cells, ["headline=true"])) == 2
     with pytest.raises(BenchError, match="--only blend_mode=smoe_std: .* alpha, smoe"):
-        engine.chosen(suite.cells, ["blend_mode=smoe_std"])
+        selection.chosen(suite.cells, ["blend_mode=smoe_std"])
     for wrong in ("blend_mode", "mode=alpha"):
         with pytest.raises(BenchError, match="--only " + wrong):
-            engine.chosen(suite.cells, [wrong])
+            selection.chosen(suite.cells, [wrong])
 
 
 def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):

@@ -1,0 +1,89 @@
+"""What cells need before they can run: scenes that are there or made up, checkouts that are there and patched."""
+from __future__ import annotations
+
+import os
+import shutil
+from typing import Any, Dict, List
+
+from .. import patches
+from ..trainer.synthetic import write_synthetic_scene
+from .errors import BenchError
+from .methods.names import CHECKOUTS, NATIVE
+from .protocol import commit_of
+from .suite import NOT_IN_THE_IDENTITY
+
+NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", "build")
+
+
+def check_paths(cells: List[Dict[str, Any]]) -> None:
+    """Raises BenchError where a path of these cells has a variable that is not set."""
+    for cell in cells:
+        for part in (cell["scene"], cell["method"]):
+            if "unset" in part:
+                raise BenchError(f"{part['unset']}; set it, or leave it out with --only")
+
+
+def missing_scenes(cells: List[Dict[str, Any]]) -> List[str]:
+    """Which folders of these cells' scenes do not exist, in words."""
+    scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
+    return [f"scene {name}: {scene['path']}: no such folder" for name, scene in scenes.items()
+            if scene["path"] is not None and "unset" not in scene and not os.path.isdir(scene["path"])]
+
+
+def given(cell: Dict[str, Any]) -> Dict[str, Any]:
+    """Where things lie, as the suite says it; a path that has changed changes no figure."""
+    return {part: {key: cell[part][key] for key in NOT_IN_THE_IDENTITY if key in cell[part]}
+            for part in ("scene", "method")}
+
+
+def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
+    """The scene with its path; a synthetic one is made where it is not there yet."""
+    if scene["path"] is not None:
+        return scene
+    folder = os.path.join(results, "scenes", scene["name"])
+    if not os.path.isfile(os.path.join(folder, "sparse", "0", "cameras.txt")):
+        write_synthetic_scene(folder, **scene["synthetic"])
+    return dict(scene, path=folder)
+
+
+def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
+    """The method with its checkouts as they are run: patched ones are copies in RESULTS/checkouts.
+
+    Where a checkout cannot be used, `refused` says why: that is what its cells' rows will say.
+    """
+    if method["name"] == NATIVE:
+        return method
+    try:
+        paths = {key: prepared_checkout(method, key, results) for key in ("path", "base") if key in method}
+    except (patches.PatchError, BenchError, OSError) as error:
+        return {**method, "refused": " ".join(str(error).split())}
+    return {**method, **paths, "commit": commit_of(method["path"]) or method.get("commit")}
+
+
+def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
+    """The folder of a checkout as it is run. Raises BenchError or PatchError."""
+    path = method[key]
+    if not os.path.isdir(path):
+        raise BenchError(f"{path}: no such folder; {method['label']} is a checkout there")
+    if not CHECKOUTS[method["name"]]:
+        return path
+    verdict = patches.check(path)
+    if method["variant"] == "unpatched" and verdict != "patchable":
+        raise BenchError(f"{path} is {verdict}, and the suite says it is an unpatched checkout (`dsmoe patch revert` "
+                         "takes a patch back)")
+    if method["variant"] == "unpatched" or verdict == "patched":
+        return path
+    return patched_copy(path, os.path.join(results, "checkouts", f"{method['label']}-{key}"))
+
+
+def patched_copy(path: str, folder: str) -> str:
+    """A patched copy of a checkout, which itself stays as it is; made once. Raises PatchError."""
+    if os.path.isdir(folder):
+        patches.apply(folder, modernise=True)  # what an interruption left is finished; else nothing is written
+        return folder
+    part = folder + ".part"
+    shutil.rmtree(part, ignore_errors=True)
+    shutil.copytree(path, part, ignore=NOT_COPIED)
+    patches.apply(part, modernise=True)
+    os.rename(part, folder)
+    return folder

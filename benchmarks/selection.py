@@ -1,0 +1,72 @@
+"""Which cells of a suite are run: those that --only leaves, less those that --rows brings; and the plan of a dry run."""
+from __future__ import annotations
+
+from typing import Any, Dict, List, Mapping, Sequence
+
+from .cell import identity
+from .errors import BenchError
+from .report.rows import read_rows
+
+SAID_BY_THE_ID = ("method", "variant", "blend_mode", "schedule", "densify_grad_threshold", "scene", "seed",
+                  "iterations")  # fields of a row
+
+
+def earlier_rows(path: str, cells: List[Dict[str, Any]]) -> Dict[str, Dict[str, Any]]:
+    """The rows of a file, or of a folder of results, that are of these cells, by the cells' names.
+
+    Raises BenchError where none is, or where a row says something else of its cell than the cell does.
+    """
+    rows = {row["cell"]: row for row in read_rows(path)}
+    found = [cell for cell in cells if cell["id"] in rows]
+    if not found:
+        raise BenchError(f"--rows {path}: none of its {len(rows)} rows is of a cell of this suite")
+    for cell in found:
+        row, expected = rows[cell["id"]], identity(cell)
+        for field in SAID_BY_THE_ID:
+            if row.get(field) != expected[field]:
+                raise BenchError(f"--rows {path}: the row of cell {cell['id']}: {field} is {row.get(field)!r}; it must "
+                                 f"be {expected[field]!r}, as the suite has it")
+    return {cell["id"]: rows[cell["id"]] for cell in found}
+
+
+def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, Any]]:
+    """The cells for which every "field=value" holds; several values of one field may be given. Raises BenchError."""
+    wanted: Dict[str, List[str]] = {}
+    for text in only:
+        field, equals, value = text.partition("=")
+        if not equals or field not in SELECTORS:
+            raise BenchError(f"--only {text}: must be FIELD=VALUE with a field of {', '.join(SELECTORS)}")
+        wanted.setdefault(field, []).append(value)
+    for field, values in wanted.items():
+        there = [SELECTORS[field](cell) for cell in cells]
+        for value in values:
+            if not any(_same(entry, value) for entry in there):
+                raise BenchError(f"--only {field}={value}: no cell of the suite is so; its cells have "
+                                 + ", ".join(dict.fromkeys(map(str, there))))
+    found = [cell for cell in cells
+             if all(any(_same(SELECTORS[field](cell), value) for value in values) for field, values in wanted.items())]
+    if not found:
+        raise BenchError(f"--only {' '.join(only)}: no cell of the suite is so")
+    return found
+
+
+SELECTORS = {"method": lambda cell: cell["method"]["label"], "scene": lambda cell: cell["scene"]["name"],
+             "blend_mode": lambda cell: cell["blend_mode"], "schedule": lambda cell: cell["schedule"],
+             "densify_grad_threshold": lambda cell: cell["densify_grad_threshold"], "seed": lambda cell: cell["seed"],
+             "headline": lambda cell: cell["headline"]}
+
+
+def _same(value: Any, text: str) -> bool:
+    if isinstance(value, float):
+        try:
+            return value == float(text)
+        except ValueError:
+            return False
+    return str(value).lower() == text.lower()
+
+
+def plan(cells: List[Dict[str, Any]], done: Mapping[str, Dict[str, Any]], absent: Sequence[str]) -> str:
+    """What --dry-run prints: a line for each cell, what is not there yet, and how many cells are how far."""
+    states = ["to do" if cell["id"] not in done else "done" if done[cell["id"]]["ok"] else "failed" for cell in cells]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in ("done", "to do", "failed"))
+    return "\n".join([*(f"{state}  {cell['id']}" for state, cell in zip(states, cells)), *absent, counts])
