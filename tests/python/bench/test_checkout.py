@@ -217,7 +217,7 @@ def test_a_trainer_ends_with_its_cell(small, tmp_path):
     cell.write_text(json.dumps(small.cell("2dgs", variant="unpatched", blend_mode="alpha",
                                           path=str(tmp_path / "2dgs"))))
     run = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization.benchmarks.cell", str(cell),
-                            str(tmp_path / "out")])
+                            str(tmp_path / "out")], cwd=str(tmp_path))
     wait_for(pid.is_file, 60)
     run.terminate()
     assert run.wait() == 143
