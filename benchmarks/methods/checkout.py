@@ -170,10 +170,8 @@ class C3DGS(ThreeDGS):
         return sum(size_of(os.path.join(folder, name, self.container)) for name in os.listdir(folder))
 
 
-class HAC(ThreeDGS):
-    """HAC and HAC++: train.py trains, encodes, decodes and renders in one process."""
-
-    stubs = ()  # it reads its pictures again with torchvision, at the end
+class InOneProcess(ThreeDGS):
+    """train.py alone: it also renders the test views, or the observer does when it is done."""
 
     def train(self) -> Dict[str, Any]:
         return self.command("train", self.method["path"], "train.py", *self.train_arguments(), renders=self.renders)
@@ -181,6 +179,12 @@ class HAC(ThreeDGS):
     def render(self) -> Dict[str, Any]:
         with open(os.path.join(self.output, "train.json"), encoding="utf-8") as file:
             return json.load(file)
+
+
+class HAC(InOneProcess):
+    """HAC and HAC++: train.py trains, encodes, decodes and renders in one process."""
+
+    stubs = ()  # it reads its pictures again with torchvision, at the end
 
     def train_arguments(self) -> List[str]:
         words = super().train_arguments()
@@ -192,7 +196,7 @@ class HAC(ThreeDGS):
         return size_of(os.path.join(self.model, "bitstreams"))
 
 
-class DBS(ThreeDGS):
+class DBS(InOneProcess):
     """Deformable Beta Splatting: train.py alone; the number of primitives is given (`--cap_max`), no threshold.
 
     Its own `--eval` trains until the test views are best, and keeps that model. Here views are held out, and that is
@@ -202,13 +206,6 @@ class DBS(ThreeDGS):
     # Of its viewer, of its compression, and one that its rasterizer imports and does not use.
     stubs = (*ThreeDGS.stubs, "viser", "nerfview", "plas", "turtle")
     observed = ("--hold-out", "--model-renders", "beta_model")
-
-    def train(self) -> Dict[str, Any]:
-        return self.command("train", self.method["path"], "train.py", *self.train_arguments(), renders=self.renders)
-
-    def render(self) -> Dict[str, Any]:
-        with open(os.path.join(self.output, "train.json"), encoding="utf-8") as file:
-            return json.load(file)
 
     def train_arguments(self) -> List[str]:
         words = super().train_arguments()
