@@ -227,7 +227,9 @@ def running(content, tmp_path):
     content["blend_modes"] = ["alpha"]
     suite, results = write_suite(content, tmp_path), tmp_path / "results"
     run = subprocess.Popen(command("bench", "run", suite, "-o", str(results)), env=environment(), cwd=str(tmp_path),
-                           start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+                           start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                           # Shells start what they put in the background deaf to it.
+                           preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     wait_for(lambda: list(results.glob("cells/*/run/checkpoint.pt")), 120)
     folder, = results.glob("cells/*")
     yield suite, results, run, folder
