@@ -49,11 +49,11 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     found = earlier_rows(rows, suite.cells) if rows else {}
     earlier = {name: row for name, row in found.items() if row["ok"] or not retry_failed}
     check_folder(suite, results)
-    done = {cell["id"]: row for cell in cells
-            for row in [row_of(results, cell, retry_failed) or earlier.get(cell["id"])] if row is not None}
+    there = {cell["id"]: row_of(results, cell, retry_failed) for cell in cells}
+    taken = {name: earlier[name] for name, row in there.items() if row is None and name in earlier}
     if rows:
-        taken = [cell for cell in cells if cell["id"] in earlier and row_of(results, cell, retry_failed) is None]
         print(f"{len(taken)} of {len(cells)} cells taken from {rows}")
+    done = {**{name: row for name, row in there.items() if row is not None}, **taken}
     absent = missing_scenes([cell for cell in cells if cell["id"] not in done])
     if dry_run:
         print(plan(cells, done, absent))

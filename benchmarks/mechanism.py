@@ -29,7 +29,7 @@ from typing import Any, Dict, Iterator, List, Optional, Sequence
 
 import torch
 
-from ..trainer.config import CONFIG_NAME, TrainConfig, add_arguments, given_options
+from ..trainer.config import CONFIG_NAME, TrainConfig, add_arguments, config_from_arguments
 from ..trainer.errors import TrainerError
 from ..trainer.files import write_text_atomically
 from ..trainer.loop import Run, Trainer, check_device
@@ -316,10 +316,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    options = given_options(arguments)
-    config = TrainConfig(**options)
-    if arguments.scale_recipe:
-        config = config.shortened().changed(**options)
+    config = config_from_arguments(arguments)
     keep_freed_memory()
     if config.device == "cuda":
         torch.set_num_threads(1)  # as `dsmoe train` does

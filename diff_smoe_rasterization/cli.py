@@ -9,7 +9,7 @@ from typing import List, Optional
 from .patches.errors import PatchError
 from .settings import BLEND_MODES
 from .trainer.checkpoint import CHECKPOINT_NAME
-from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options
+from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments
 from .trainer.errors import TrainerError
 
 
@@ -199,8 +199,6 @@ def _train(arguments: argparse.Namespace) -> None:
     from .trainer.results import results_table
 
     config = config_from_arguments(arguments)
-    if arguments.scale_recipe:
-        config = config.shortened().changed(**given_options(arguments))
     keep_freed_memory()
     if config.device == "cuda":
         torch.set_num_threads(1)  # the host only launches kernels; several runs may share its cores

@@ -211,5 +211,10 @@ def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
 
 
 def config_from_arguments(arguments: argparse.Namespace) -> TrainConfig:
-    """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults."""
-    return TrainConfig(**given_options(arguments)).validate()
+    """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
+
+    With --scale-recipe the milestones that are not given keep their share of the iterations.
+    """
+    options = given_options(arguments)
+    config = TrainConfig(**options).validate()
+    return config.shortened().changed(**options) if getattr(arguments, "scale_recipe", False) else config
