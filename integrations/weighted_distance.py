@@ -13,19 +13,22 @@ DISTANCES_AT_ONCE = 2 ** 26  # 256 MiB of float32
 def weightedDistance(coefs: torch.Tensor, codebook: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
     """Returns each row's squared distance [N] to the nearest row of the codebook, and the number [N] of that, int64.
 
+    Of rows whose distances differ by no more than rounding, either may be taken; the distance is of the one taken.
     coefs: [N, K]; codebook: [C, K], C > 0, of the same type and on the same device. No gradient.
     Raises ValueError where the shapes do not fit.
     """
     if coefs.dim() != 2 or codebook.dim() != 2 or coefs.shape[1] != codebook.shape[1] or not len(codebook):
         raise ValueError(f"weightedDistance: coefs has shape {list(coefs.shape)}, codebook {list(codebook.shape)}; "
                          "they must be [N, K] and [C, K] with C > 0")
-    distances = coefs.new_empty(len(coefs))
+    coefs, codebook = coefs.detach(), codebook.detach()
+    center = codebook.mean(0)  # products lose fewer digits of what is near the origin
+    centred = codebook - center
+    half_squares = 0.5 * centred.square().sum(1)
     indices = torch.empty(len(coefs), dtype=torch.int64, device=coefs.device)
     rows = max(1, DISTANCES_AT_ONCE // len(codebook))
     for begin in range(0, len(coefs), rows):
         part = slice(begin, begin + rows)
-        # By differences: by products of matrices, small distances would lose their digits.
-        nearest = torch.cdist(coefs[part].detach(), codebook.detach(),
-                              compute_mode="donot_use_mm_for_euclid_dist").min(1)
-        distances[part], indices[part] = nearest.values.square(), nearest.indices
-    return distances, indices
+        # |x - c|^2 = |x|^2 + 2 (|c|^2 / 2 - x c), whose first term is the same for all c.
+        indices[part] = torch.addmm(half_squares, coefs[part] - center, centred.T, alpha=-1).argmin(1)
+    # By differences: by products, small distances would lose their digits.
+    return (coefs - codebook[indices]).square_().sum(1), indices
