@@ -21,7 +21,7 @@ from ..trainer.files import write_json_atomically, write_text_atomically
 from .cell import ROW_NAME, identity
 from .errors import BenchError
 from .measure import ALEX_VARIABLE
-from .preparation import check_paths, given, made_scene, missing_scenes, prepared_method
+from .preparation import check_paths, given, made_scene, missing_folders, prepared_method
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .selection import chosen, earlier_rows, plan
@@ -54,7 +54,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     if rows:
         print(f"{len(taken)} of {len(cells)} cells taken from {rows}")
     done = {**{name: row for name, row in there.items() if row is not None}, **taken}
-    absent = missing_scenes([cell for cell in cells if cell["id"] not in done])
+    absent = missing_folders([cell for cell in cells if cell["id"] not in done])
     if dry_run:
         print(plan(cells, done, absent))
         return []

@@ -23,11 +23,27 @@ def check_paths(cells: List[Dict[str, Any]]) -> None:
                 raise BenchError(f"{part['unset']}; set it, or leave it out with --only")
 
 
-def missing_scenes(cells: List[Dict[str, Any]]) -> List[str]:
-    """Which folders of these cells' scenes do not exist, in words."""
+def missing_folders(cells: List[Dict[str, Any]]) -> List[str]:
+    """Which folders of these cells' scenes and checkouts do not exist, in words."""
     scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
-    return [f"scene {name}: {scene['path']}: no such folder" for name, scene in scenes.items()
-            if scene["path"] is not None and "unset" not in scene and not os.path.isdir(scene["path"])]
+    methods = {cell["method"]["label"]: cell["method"] for cell in cells}
+    absent = [f"scene {name}: {scene['path']}: no such folder" for name, scene in scenes.items()
+              if scene["path"] is not None and is_missing(scene, "path")]
+    return absent + [f"method {label}: {key}: {method[key]}: no such folder, where {wanted}"
+                     for label, method in methods.items() for key, wanted in wanted_checkouts(method).items()
+                     if is_missing(method, key)]
+
+
+def is_missing(part: Dict[str, Any], key: str) -> bool:
+    """Whether a path of a scene or a method is no folder; one with a variable that is not set is no path yet."""
+    return "unset" not in part and not os.path.isdir(part[key])
+
+
+def wanted_checkouts(method: Dict[str, Any]) -> Dict[str, str]:
+    """The fields of a method that name checkouts, and what is wanted there, in words."""
+    wanted = {"path": f"a checkout of {method['name']} must be",
+              "base": f"the 3DGS checkout must be that trains what {method['name']} compresses"}
+    return {key: words for key, words in wanted.items() if key in method}
 
 
 def given(cell: Dict[str, Any]) -> Dict[str, Any]:
@@ -54,7 +70,7 @@ def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
     if method["name"] == NATIVE:
         return method
     try:
-        paths = {key: prepared_checkout(method, key, results) for key in ("path", "base") if key in method}
+        paths = {key: prepared_checkout(method, key, results) for key in wanted_checkouts(method)}
     except (patches.PatchError, BenchError, OSError) as error:
         return {**method, "refused": " ".join(str(error).split())}
     return {**method, **paths, "commit": commit_of(method["path"]) or method.get("commit")}
@@ -63,8 +79,6 @@ def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
 def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
     """The folder of a checkout as it is run. Raises BenchError or PatchError."""
     path = method[key]
-    if not os.path.isdir(path):
-        raise BenchError(f"{path}: no such folder; {method['label']} is a checkout there")
     if not CHECKOUTS[method["name"]]:
         return path
     verdict = patches.check(path)

@@ -252,11 +252,12 @@ def test_an_unpatched_checkout_must_be_one(small, tmp_path):
     assert not row["ok"] and row["reason"] == method["refused"]
 
 
-def test_a_checkout_that_is_not_there_is_a_row(small, tmp_path):
+def test_a_checkout_that_cannot_be_patched_is_a_row(small, tmp_path):
     cell = small.cell("3dgs-2023")
-    method = preparation.prepared_method(dict(cell["method"], path=str(tmp_path / "nowhere")), str(tmp_path))
+    (tmp_path / "empty").mkdir()
+    method = preparation.prepared_method(dict(cell["method"], path=str(tmp_path / "empty")), str(tmp_path))
     row = row_of(dict(cell, method=method), tmp_path / "out")
-    assert not row["ok"] and "nowhere: no such folder" in row["reason"]
+    assert not row["ok"] and "the checkout is unknown: there is no gaussian_renderer" in row["reason"]
 
 
 def test_what_a_trainer_writes_beside_its_scene_stays_its_own(tmp_path):

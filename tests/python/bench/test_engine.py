@@ -204,6 +204,26 @@ def test_scenes_that_are_not_there_are_named_before_anything_is_run(content, tmp
     assert not (tmp_path / "results").exists()
 
 
+def test_checkouts_that_are_not_there_are_named_before_anything_is_run(content, tmp_path, capsys):
+    (tmp_path / "there").mkdir()
+    content["protocol"].update(device="cuda", principal_point="centre")
+    content["methods"] += [{"name": "taming", "path": "nowhere"},
+                           {"name": "2dgs", "label": "other", "path": "there"},  # that is enough beforehand
+                           {"name": "c3dgs", "path": "there", "base": "neither"}]
+    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
+    lines = [f"method taming: path: {tmp_path / 'nowhere'}: no such folder, where a checkout of taming must be",
+             f"method c3dgs: base: {tmp_path / 'neither'}: no such folder, where the 3DGS checkout must be that "
+             "trains what c3dgs compresses"]
+    assert main([*words, "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines()[7:] == [*lines, "0 done, 7 to do, 0 failed"]
+    assert main([*words, "--dry-run", "--only", "method=native"]) == 0
+    assert "no such folder" not in capsys.readouterr().out
+    for line, only in ((lines[0], []), (lines[1], ["--only", "method=c3dgs"])):
+        assert main([*words, *only]) == 1
+        assert f"{line}; name its folder, or leave it out with --only" in capsys.readouterr().err
+    assert not (tmp_path / "results").exists()
+
+
 def test_variables_are_needed_for_cells_that_are_run(content, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("NOT_THERE", raising=False)
     content["protocol"].update(device="cuda", principal_point="centre")
