@@ -2,9 +2,11 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 
 from . import engine
+from .errors import PatchError
 
 
 def apply(arguments: argparse.Namespace) -> int:
@@ -41,9 +43,23 @@ def check(arguments: argparse.Namespace) -> int:
     print(f"{arguments.path}: {verdict}{trainer}")
     if verdict in ("patchable", "patched"):
         _print_lines((*verdict.reasons, *planned.notes))
+        if any(rule.pending for rule in planned.modernised):
+            _print_lines([_how_to_modernise(planned, arguments)])
         return 0
     print(f"dsmoe patch: error: {engine.refusal(verdict)}", file=sys.stderr)
     return 1
+
+
+def _how_to_modernise(planned: engine.Plan, arguments: argparse.Namespace) -> str:
+    """Says what to type for rules of --modernise that are not applied, or why they cannot be."""
+    try:
+        is_written = bool(engine.pending(planned))
+    except PatchError as error:
+        return f"modernise: cannot be applied as it is: {error}"
+    trainer = ["--trainer", arguments.trainer] if arguments.trainer else []
+    command = " ".join(map(shlex.quote, ["dsmoe", "patch", "apply", "--modernise", *trainer, str(arguments.path)]))
+    before = "" if is_written else "undo your edit of patched files, then "
+    return f"modernise: to apply what is not, {before}type: {command}"
 
 
 def diff(arguments: argparse.Namespace) -> int:

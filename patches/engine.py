@@ -22,7 +22,7 @@ from .scope import build_files, notes_on_scripts, other_files, python_files
 from .trainers import TRAINERS
 
 if TYPE_CHECKING:
-    from .patch import Change  # which needs LibCST
+    from .patch import Change, Modernised  # which need LibCST
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
 PathLike = Union[str, Path]
@@ -48,10 +48,19 @@ class Plan(NamedTuple):
     root: Path
     verdict: Verdict
     changes: Tuple[Change, ...]
-    notes: Tuple[str, ...]  # which modernise rules are applied or skipped, which scripts no rule reaches
+    remarks: Tuple[str, ...]  # which scripts no rule reaches, which files are left as they are
     modernise: bool
     record: Optional[Record]
+    modernised: Tuple[Modernised, ...] = ()  # every rule of --modernise, where it is asked for
     written: bool = False  # whether `apply` wrote files by this plan
+
+    @property
+    def notes(self) -> Tuple[str, ...]:
+        """The remarks, and of each rule of --modernise where it is applied, or that it is skipped."""
+        matching = [rule.note(self.written) for rule in self.modernised if rule.files]
+        skipped = [rule.rule for rule in self.modernised if not rule.files]
+        rest = [f"modernise: skipped, nothing matches: {', '.join(skipped)}"] if skipped else []
+        return (*self.remarks, *matching, *rest)
 
 
 def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
@@ -127,7 +136,8 @@ def pending(planned: Plan) -> Dict[str, bytes]:
     if edited and planned.modernise == record.manifest["modernise"]:
         return {}  # every rule is applied
     if edited:
-        raise PatchError(f"{edited[0]}: was changed since it was patched; --modernise belongs to the first patch")
+        raise PatchError(f"{edited[0]}: was changed since it was patched: undo your edit, then apply it with "
+                         "--modernise")
     return {name: after for name, (_, after) in _outcome(planned).items()
             if (planned.root / name).read_bytes() != after}
 
@@ -193,8 +203,7 @@ def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = No
     if modernise:
         files.update((name, read(name)) for name in build_files(root))
     patch = Patch(files, chosen)
-    if modernise:
-        patch.modernise()
+    modernised = patch.modernise(lambda name: _read(root / name)) if modernise else ()
     state, reasons = patch.state()
     if record and not patch.problems:
         state, reasons = _state_by_record(root, record, chosen)
@@ -204,8 +213,8 @@ def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = No
     if looks_like and looks_like.flavour != chosen.flavour:
         patch.notes.insert(0, f"--trainer {trainer}: by what it imports and calls this is {looks_like.name}, whose "
                               f"rasterizer has another API ({looks_like.flavour}, not {chosen.flavour})")
-    notes = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
-    return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), notes, modernise, record)
+    remarks = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
+    return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), remarks, modernise, record, modernised)
 
 
 def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str, List[str]]:

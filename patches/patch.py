@@ -1,7 +1,7 @@
 """The rules of a trainer, applied to its files in memory."""
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Tuple
+from typing import Callable, Dict, List, NamedTuple, Optional, Tuple
 
 from . import codemods, modernise, source
 from .errors import PatchError
@@ -16,6 +16,22 @@ class Change(NamedTuple):
     before: bytes
     after: bytes
     rules: Tuple[str, ...]
+
+
+class Modernised(NamedTuple):
+    """What becomes of a rule of --modernise; without files nothing matches it."""
+
+    rule: str
+    reason: str
+    files: Tuple[str, ...]  # that it changes, as they were before any patch
+    pending: Tuple[str, ...]  # those of them in which it is not applied, as they are now
+
+    def note(self, written: bool) -> str:
+        """Says where it is applied and where not. written: whether the patch was, since this was found."""
+        todo = () if written else self.pending
+        states = {"applied in": [name for name in self.files if name not in todo], "not applied in": todo}
+        said = ", ".join(f"{state} {', '.join(names)}" for state, names in states.items() if names)
+        return f"modernise {self.rule}: {said}: {self.reason}"
 
 
 class Patch:
@@ -56,18 +72,27 @@ class Patch:
                     self.notes.append(f"{name}: the import from {RASTERIZER}._C stays; where it fails, the file has to "
                                       "do without what it names")
 
-    def modernise(self) -> None:
-        """Applies the modernise rules, and notes of each what it changed."""
-        skipped = []
+    def modernise(self, read_now: Callable[[str], Optional[bytes]]) -> Tuple[Modernised, ...]:
+        """Applies the rules of --modernise; returns what becomes of each.
+
+        read_now: the bytes of a file as it is now, patched or not; None where it is gone.
+        """
+        modernised = []
         for rule in modernise.RULES:
-            changed = [name for name in sorted(self.files)
-                       if rule.looks_at(self.files[name]) and self._changes(modernise.run, rule, name)]
-            if changed:
-                self.notes.append(f"modernise {rule.name}: {', '.join(changed)}: {rule.reason}")
-            else:
-                skipped.append(rule.name)
-        if skipped:
-            self.notes.append(f"modernise: skipped, nothing matches: {', '.join(skipped)}")
+            changed = tuple(name for name in sorted(self.files)
+                            if rule.looks_at(self.files[name]) and self._changes(modernise.run, rule, name))
+            pending = tuple(name for name in changed if self._is_pending(rule, name, read_now(name)))
+            modernised.append(Modernised(rule.name, rule.reason, changed, pending))
+        return tuple(modernised)
+
+    def _is_pending(self, rule: modernise.Rule, name: str, now: Optional[bytes]) -> bool:
+        """Whether a rule that changes a file is still to be applied to what the file is now."""
+        if now is None or now == self.files[name]:
+            return True
+        try:
+            return rule.looks_at(now) and modernise.run(rule, source.parse(name, now)[0]).pending > 0
+        except PatchError:  # an edit that cannot be read
+            return True
 
     def _changes(self, run, rule, name: str) -> bool:
         """Applies a rule that may match or not; a file that cannot be read is left as it is."""

@@ -1,6 +1,7 @@
 """What `dsmoe patch` says: with its options, where there is nothing to do, and where it is typed wrongly."""
 from __future__ import annotations
 
+import shlex
 import shutil
 
 import pytest
@@ -39,10 +40,49 @@ def test_check_has_the_options_of_apply_and_names_what_it_would(tmp_path, dsmoe)
     checkout = make(tmp_path, {"film.py": "from gaussian_renderer import render\n"})
     before = snapshot(checkout)
     said = dsmoe("patch", "check", checkout, "--modernise")
-    assert said.status == 0 and "modernise checkpoint-load: train.py" in said.out and "film.py: renders" in said.out
+    assert said.status == 0 and "modernise checkpoint-load: not applied in train.py: " in said.out and "film.py: renders" in said.out
     assert ": patchable (3dgs-2023)" in dsmoe("patch", "check", checkout, "--trainer", "3dgs-2023").out
     assert dsmoe("patch", "check", checkout, "--trainer", "hac").status == 1
     assert snapshot(checkout) == before
+
+
+LOAD = "checkpoint = torch.load(path)\n"
+
+
+def test_check_says_of_each_modernising_rule_whether_it_is_applied_and_what_to_type(tmp_path, dsmoe):
+    checkout = make(tmp_path / "a checkout", {"utils/loading.py": LOAD})
+    patches.apply(checkout)
+    assert "modernise" not in dsmoe("patch", "check", checkout).out
+    said = dsmoe("patch", "check", checkout, "--modernise")
+    assert said.status == 0 and ": patched (3dgs-2023)" in said.out
+    assert "modernise checkpoint-load: not applied in train.py, utils/loading.py: torch 2.6" in said.out
+    typed = shlex.split(said.out.splitlines()[-1].partition("type: ")[2])
+    assert typed[0] == "dsmoe" and dsmoe(*typed[1:]).status == 0
+    for words in ([], ["--modernise"]):
+        said = dsmoe("patch", "check", checkout, *words)
+        assert "modernise checkpoint-load: applied in train.py, utils/loading.py: torch 2.6" in said.out
+        assert "not applied" not in said.out and "type: " not in said.out
+    (checkout / "film.py").write_text(LOAD)
+    said = dsmoe("patch", "check", checkout)
+    assert "applied in train.py, utils/loading.py, not applied in film.py: " in said.out and "type: " in said.out
+
+
+def test_check_says_that_an_edit_keeps_a_rule_from_being_applied(tmp_path, dsmoe):
+    checkout = make(tmp_path, {"utils/loading.py": LOAD})
+    patches.apply(checkout, modernise=True)
+    modernised = (checkout / "utils/loading.py").read_text()
+    (checkout / "utils/loading.py").write_text("from diff_smoe_rasterization import io\n" + LOAD)
+    said = dsmoe("patch", "check", checkout)
+    assert "modernise checkpoint-load: applied in train.py, not applied in utils/loading.py: " in said.out
+    assert "undo your edit of patched files, then type: dsmoe patch apply --modernise" in said.out
+    (checkout / "utils/loading.py").write_text(modernised)
+    patches.revert(checkout)
+    patches.apply(checkout)
+    with open(str(checkout / "train.py"), "a") as file:
+        file.write("# mine\n")
+    said = dsmoe("patch", "check", checkout, "--modernise")
+    assert said.status == 0 and "not applied in train.py" in said.out
+    assert "cannot be applied as it is: train.py: was changed since it was patched: undo your edit" in said.out
 
 
 @pytest.mark.parametrize("words, usage", [(["patch", "apply"], "usage: dsmoe patch apply "),

@@ -56,6 +56,7 @@ def test_what_a_rule_changes(name, before, after):
     outcome = modernise.run(RULES[name], cst.parse_module(before))
     assert outcome.tree.code == (before if after is None else after)
     assert outcome.pending == (after is not None)
+    assert modernise.run(RULES[name], outcome.tree).pending == 0  # by which it is seen that a rule is applied
 
 
 def test_every_rule_is_tried_above():
@@ -72,7 +73,7 @@ def test_rules_are_applied_on_request_and_reported(tmp_path):
     applied = [rule for rule in modernise.RULES if rule.name in ("checkpoint-load", "cpp-standard")]
     assert len(notes) == len(applied) + 1
     for note, rule in zip(notes, applied):
-        assert note.startswith(f"modernise {rule.name}: ") and rule.reason in note
+        assert note.startswith(f"modernise {rule.name}: applied in ") and rule.reason in note
     assert notes[-1].startswith("modernise: skipped, nothing matches: simple-knn, ")
     assert notes[-1].count(", ") == len(RULES) - len(applied)
     assert (tmp_path / "submodules/grid/setup.py").read_text() == "flags = ['-O2']\n"
