@@ -33,7 +33,7 @@ from ..trainer.config import CONFIG_NAME, TrainConfig, add_arguments, config_fro
 from ..trainer.errors import TrainerError
 from ..trainer.files import write_text_atomically
 from ..trainer.loop import Run, Trainer, check_device
-from ..trainer.memory import keep_freed_memory
+from ..trainer.process import set_up_process
 from ..trainer.scene import Scene, load_scene
 from ..trainer.stopwatch import Stopwatch
 from ..trainer.strategy import MAX_SCALE, MIN_OPACITY, Step, ThreeDGSStrategy
@@ -317,9 +317,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> None:
     config = config_from_arguments(arguments)
-    keep_freed_memory()
-    if config.device == "cuda":
-        torch.set_num_threads(1)  # as `dsmoe train` does
+    set_up_process(config.device)
     print(json.dumps(run(config, progress=not arguments.quiet)["summary"], indent=2))
     print(f"written: {os.path.join(config.output, RECORD_NAME)}", file=sys.stderr)
 

@@ -192,16 +192,12 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    import torch
-
     from .trainer.loop import train
-    from .trainer.memory import keep_freed_memory
+    from .trainer.process import set_up_process
     from .trainer.results import results_table
 
     config = config_from_arguments(arguments)
-    keep_freed_memory()
-    if config.device == "cuda":
-        torch.set_num_threads(1)  # the host only launches kernels; several runs may share its cores
+    set_up_process(config.device)
     print(f"{config.scene} -> {config.output}: blend mode {config.blend_mode}, schedule {config.schedule}, "
           f"{config.iterations} iterations, seed {config.seed}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)

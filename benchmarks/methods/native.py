@@ -11,9 +11,9 @@ from ...trainer.checkpoint import CHECKPOINT_NAME
 from ...trainer.evaluation import evaluate
 from ...trainer.inspection import open_renderer
 from ...trainer.loop import HISTORY_NAME, train
-from ...trainer.memory import keep_freed_memory
 from ...trainer.modelfile import model_path
 from ...trainer.pictures import evenly_spaced
+from ...trainer.process import set_up_process
 from ...trainer.scene import load_scene
 from ..measure import Measures
 from ..protocol import config_of
@@ -25,10 +25,9 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     folder = os.path.join(output, "run")
     config = config_of(cell, folder)
     measures = Measures(config.device, cell["protocol"]["lpips"])
-    keep_freed_memory()
-    on_gpu = config.device != "cpu"
+    set_up_process(config.device)
+    on_gpu = config.device == "cuda"
     if on_gpu:
-        torch.set_num_threads(1)  # as `dsmoe train` does: several cells may share the host's cores
         torch.cuda.reset_peak_memory_stats()
     continued = os.path.isfile(os.path.join(folder, CHECKPOINT_NAME))
     scene = require_test_views(load_scene(config, progress=False), config).to(config.device)

@@ -18,10 +18,10 @@ from .errors import TrainerError
 from .images import image_size
 from .inspection import open_renderer, to_image
 from .loop import train
-from .memory import keep_freed_memory
 from .metrics import psnr, quantised
 from .modelfile import model_path
 from .pictures import comparison, evenly_spaced, file_names
+from .process import keep_freed_memory
 from .results import results_table, write_results
 from .scene import Scene, load_scene, read_layout
 from .synthetic import write_synthetic_scene

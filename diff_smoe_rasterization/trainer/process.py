@@ -1,0 +1,34 @@
+"""What holds for the whole process of a training: commands set it, the library does not."""
+from __future__ import annotations
+
+import ctypes
+
+import torch
+
+# glibc's parameters of mallopt(3) and the largest values that make sense here.
+M_TRIM_THRESHOLD, TRIM_BYTES = -1, 1 << 30
+M_MMAP_THRESHOLD, MMAP_BYTES = -3, 1 << 25  # glibc accepts no more
+
+
+def set_up_process(device: str) -> None:
+    """Readies the process for a training on the device, "cpu" or "cuda": its memory, and how many threads torch has.
+
+    On a GPU that is one: the host only launches kernels, and several runs may share its cores.
+    """
+    keep_freed_memory()
+    if device == "cuda":
+        torch.set_num_threads(1)
+
+
+def keep_freed_memory() -> None:
+    """Tells glibc to reuse freed memory instead of returning it to the system after every operation.
+
+    A step frees and allocates the same tensors again, and fresh pages cost time. Does nothing where the C library is
+    another one.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return
+    mallopt(M_MMAP_THRESHOLD, MMAP_BYTES)
+    mallopt(M_TRIM_THRESHOLD, TRIM_BYTES)
