@@ -5,23 +5,18 @@ An index says which row of a codebook a Gaussian has; the gradient of a row is t
 from __future__ import annotations
 
 import weakref
-from collections import namedtuple
 
 import torch
 
-import diff_smoe_rasterization
 from diff_smoe_rasterization import GaussianRasterizer, rasterize_gaussians
 from diff_smoe_rasterization.rasterizer import _checks
+
+from ._settings import settings_with
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "GaussianRasterizerIndexed", "rasterize_gaussians",
            "rasterize_gaussians_indexed"]
 
-_fields = [name for name in diff_smoe_rasterization.GaussianRasterizationSettings._fields if name != "clamp_color"]
-_fields.insert(_fields.index("debug") + 1, "clamp_color")
-_defaults = diff_smoe_rasterization.GaussianRasterizationSettings._field_defaults
-
-GaussianRasterizationSettings = namedtuple(
-    "GaussianRasterizationSettings", _fields, defaults=[_defaults[name] for name in _fields if name in _defaults])
+GaussianRasterizationSettings = settings_with("clamp_color", __name__)
 GaussianRasterizationSettings.__doc__ = """The package's settings, with `clamp_color` as the thirteenth.
 
 clamp_color=False: colours from shs may be negative, and the gradient reaches their coefficients all the same.

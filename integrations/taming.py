@@ -5,22 +5,17 @@ SparseGaussianAdam and `fused_ssim` are here.
 """
 from __future__ import annotations
 
-from collections import namedtuple
-
 import torch
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import SparseGaussianAdam, fused_ssim, rasterize_with_splats
 
+from ._settings import settings_with
+
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "fused_ssim",
            "rasterize_gaussians"]
 
-_fields = list(diff_smoe_rasterization.GaussianRasterizationSettings._fields)
-_fields.insert(_fields.index("debug") + 1, "pixel_weights")
-_defaults = {**diff_smoe_rasterization.GaussianRasterizationSettings._field_defaults, "pixel_weights": None}
-
-GaussianRasterizationSettings = namedtuple(
-    "GaussianRasterizationSettings", _fields, defaults=[_defaults[name] for name in _fields if name in _defaults])
+GaussianRasterizationSettings = settings_with("pixel_weights", __name__)
 GaussianRasterizationSettings.__doc__ = """The package's settings, with `pixel_weights` as the thirteenth.
 
 pixel_weights: [H, W], what to sum over the pixels of each Gaussian; None, or a tensor without elements, for no sums.
