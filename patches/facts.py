@@ -2,10 +2,10 @@
 from __future__ import annotations
 
 import ast
-import warnings
 from typing import Callable, Optional, Set, Tuple
 
 from .rules import GR, INTEGRATIONS, RASTERIZER, Trainer
+from .source import called_name, python_tree
 from .trainers import TRAINERS
 
 PATCHED = "imports from " + INTEGRATIONS
@@ -24,12 +24,7 @@ def of_checkout(read: Callable[[str], Optional[bytes]]) -> Set[str]:
     for name in LOOKED_AT:
         data = read(name)
         if data is not None:
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # such as of invalid escapes in a string
-                    tree = ast.parse(data)
-            except (SyntaxError, ValueError):
-                continue  # a rule that needs the file will say so
+            tree = python_tree(data)  # where it is not Python, a rule that needs the file will say so
             rasterizers = {"rasterizer", *_assigned_rasterizers(tree)}
             for node in ast.walk(tree):
                 facts |= _of_node(node) | _of_results(node, rasterizers)
@@ -45,7 +40,7 @@ def _of_node(node: ast.AST) -> Set[str]:
     if isinstance(node, ast.Import):
         return {"imports " + alias.name.rpartition(".")[2] for alias in node.names}
     if isinstance(node, ast.Call):
-        called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        called = called_name(node)
         if called == "GaussianRasterizationSettings":
             return {f"sets {keyword.arg}" for keyword in node.keywords}
         if called == "visible_filter":

@@ -4,11 +4,11 @@ from __future__ import annotations
 import ast
 import os
 import re
-import warnings
 from pathlib import Path
 from typing import Dict, Iterator, List, Set
 
 from .rules import GR, INTEGRATIONS, RASTERIZER, PipeBlendMode, SettingsBlendMode, Trainer
+from .source import called_name, python_tree
 
 # Not all folders: outputs hold copies of the code, environments whole packages.
 FOLDERS = ("", "arguments", "compression", "gaussian_renderer", "lpipsPyTorch", "scene", "utils")
@@ -68,7 +68,7 @@ def notes_on_scripts(files: Dict[str, bytes], others: Dict[str, bytes], trainer:
     for name, data in sorted(scripts.items()):
         if RASTERIZER.encode() not in data and b"gaussian_renderer" not in data and SETTINGS.encode() not in data:
             continue
-        nodes = list(ast.walk(_tree(data)))
+        nodes = list(ast.walk(python_tree(data)))
         if any(_imports_original(node, name in files) for node in nodes):
             notes.append(f"{name}: imports the original rasterizer, which no rule changes there; this package's is "
                          f"`from {INTEGRATIONS}.{trainer.flavour} import ...`")
@@ -109,26 +109,16 @@ def _imports_original(node: ast.AST, is_looked_at: bool) -> bool:
 
 
 def _makes_settings(node: ast.AST) -> bool:
-    return (isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) == SETTINGS
+    return (isinstance(node, ast.Call) and called_name(node) == SETTINGS
             and not {"blend_mode", None} & {keyword.arg for keyword in node.keywords})  # None: **settings
 
 
 def _imports(data: bytes) -> Set[str]:
     """Returns the modules that a file imports, and what it imports from them: that may be a module too."""
     modules: Set[str] = set()
-    for node in ast.walk(_tree(data)):
+    for node in ast.walk(python_tree(data)):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             modules |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
     return modules
-
-
-def _tree(data: bytes) -> ast.AST:
-    """Returns the syntax tree of a file, of one that cannot be parsed an empty one."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return ast.parse(data)
-    except (SyntaxError, ValueError):
-        return ast.parse("")

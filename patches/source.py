@@ -4,6 +4,7 @@ from __future__ import annotations
 import ast
 import io
 import tokenize
+import warnings
 from typing import Tuple
 
 from .errors import PatchError
@@ -48,6 +49,21 @@ def _where(data: bytes) -> str:
     except SyntaxError as error:
         return f"line {error.lineno}: {error.msg}"
     return ""
+
+
+def python_tree(data: bytes) -> ast.AST:
+    """Returns the syntax tree of a file as Python's own parser has it; of one that cannot be parsed an empty one."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # such as of invalid escapes in a string
+            return ast.parse(data)
+    except (SyntaxError, ValueError):
+        return ast.Module(body=[], type_ignores=[])
+
+
+def called_name(call: ast.Call) -> str:
+    """Returns the last part of the name that is called: c of a.b.c(...)."""
+    return getattr(call.func, "attr", getattr(call.func, "id", ""))
 
 
 def have_libcst() -> None:
