@@ -19,14 +19,12 @@ class Outcome(NamedTuple):
     tree: cst.Module  # with the rule applied
     pending: int  # matches that were not patched yet
     done: int  # matches that were
-    misfits: int = 0  # what has to be patched, but has another form than the rule knows
+    misfits: int  # what has to be patched, but has another form than the rule knows
 
 
 def run(rule, tree: cst.Module) -> Outcome:
     """Applies a rule to a tree."""
-    codemod = CODEMODS[type(rule)](rule)
-    changed = tree.visit(codemod)
-    return Outcome(changed, codemod.pending, codemod.done, codemod.misfits)
+    return CODEMODS[type(rule)](rule).applied_to(tree)
 
 
 def statement(text: str) -> cst.SimpleStatementLine:
@@ -39,6 +37,11 @@ class Codemod(cst.CSTTransformer):
         super().__init__()
         self.rule, self.pending, self.done, self.misfits = rule, 0, 0, 0
         self.within: List[cst.CSTNode] = []  # the classes and functions around the node, outermost first
+
+    def applied_to(self, tree: cst.Module) -> Outcome:
+        """Walks the tree, once in this object's life."""
+        changed = tree.visit(self)
+        return Outcome(changed, self.pending, self.done, self.misfits)
 
     def visit_ClassDef(self, node: cst.ClassDef) -> None:
         self.within.append(node)
@@ -58,7 +61,7 @@ class Codemod(cst.CSTTransformer):
         return function
 
     def insert(self, block, index: int, line: str):
-        """Returns the block, or the module, with one more statement, and counts it."""
+        """Returns the block with one more statement, and counts it."""
         self.pending += 1
         return block.with_changes(body=[*block.body[:index], statement(line), *block.body[index:]])
 

@@ -31,14 +31,13 @@ PathLike = Union[str, Path]
 class Verdict(str):
     """One of STATES, as a string, with `trainer` (a name or None) and `reasons` (lines)."""
 
-    state: str
     trainer: Optional[str]
     reasons: Tuple[str, ...]
 
     def __new__(cls, state: str, trainer: Optional[str], reasons: List[str]) -> Verdict:
         assert state in STATES
         verdict = super().__new__(cls, state)
-        verdict.state, verdict.trainer, verdict.reasons = state, trainer, tuple(reasons)
+        verdict.trainer, verdict.reasons = trainer, tuple(reasons)
         return verdict
 
 

@@ -28,8 +28,7 @@ class Rule(NamedTuple):
 
 def run(rule: Rule, tree: cst.Module) -> Outcome:
     """Applies a rule to a tree."""
-    codemod = rule.codemod(rule)
-    return Outcome(tree.visit(codemod), codemod.pending, 0)
+    return rule.codemod(rule).applied_to(tree)
 
 
 class _ImportFrom(Codemod):
