@@ -18,15 +18,16 @@ import subprocess
 import sys
 import time
 import traceback
-from typing import IO, Any, Dict, List, Optional
+from typing import IO, Any, Dict, List, Optional, Tuple
 
 from ..trainer.errors import TrainerError
 from ..trainer.files import write_json_atomically
 from .errors import BenchError
 from .log import last_line
 from .processes import die_with_parent
+from .results_folder import ROW_NAME
 
-ROW_NAME, LOG_NAME = "row.json", "log.txt"
+LOG_NAME = "log.txt"
 SHARING_NAME = "cells_per_gpu.json"  # beside a checkpoint: its seconds were counted beside so many cells
 
 
@@ -165,10 +166,10 @@ def how_it_ended(status: int, log_path: str) -> str:
     return f"the process {how}{memory}" + (f"; its last line: {words}" if words else "")
 
 
-def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Any:
+def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Tuple[str, IO[str]]:
     """Waits for a GPU that fewer than per_gpu cells of these locks have: one that none has, where there is one.
 
-    Returns (its name, the lock, which is to be kept open).
+    Returns its name, and the lock, which is to be kept open.
     """
     import fcntl
 

@@ -18,17 +18,18 @@ from types import MappingProxyType
 from typing import IO, Any, Dict, Iterator, List, Mapping, Optional, Sequence
 
 from ..trainer.files import write_json_atomically, write_text_atomically
-from .cell import ROW_NAME, identity
+from .cell import identity
 from .errors import BenchError
 from .measure import ALEX_VARIABLE
 from .preparation import check_paths, given, made_scene, missing_folders, prepared_method
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
+from .results_folder import CELLS_FOLDER, ROW_NAME, ROWS_NAME
 from .selection import chosen, earlier_rows, plan
 from .suite import Suite, find_suite, load_suite, missing
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
-SUITE_NAME, ROWS_NAME, LOCK_NAME = "suite.json", "rows.jsonl", ".lock"
+SUITE_NAME, CELL_NAME, LOCK_NAME = "suite.json", "cell.json", ".lock"
 
 
 def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = None,
@@ -82,7 +83,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
 def check_folder(suite: Suite, results: str) -> None:
     """Raises BenchError where the folder has rows of another suite or of another protocol."""
     here = read_json(os.path.join(results, SUITE_NAME))
-    if here is None or not glob.glob(os.path.join(glob.escape(results), "cells", "*", ROW_NAME)):
+    if here is None or not glob.glob(os.path.join(glob.escape(results), CELLS_FOLDER, "*", ROW_NAME)):
         return
     differ = [] if here["name"] == suite.name else [f"name is {here['name']!r} there and {suite.name!r} here"]
     differ += [f"protocol.{field} is {here['protocol'].get(field)!r} there and {suite.protocol.get(field)!r} here"
@@ -141,8 +142,8 @@ def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_f
     scenes: Dict[str, Dict[str, Any]] = {}
     methods: Dict[str, Dict[str, Any]] = {}
     for cell in cells:
-        folder = os.path.join(results, "cells", cell["id"])
-        file, row = os.path.join(folder, "cell.json"), os.path.join(folder, ROW_NAME)
+        folder = os.path.join(results, CELLS_FOLDER, cell["id"])
+        file, row = os.path.join(folder, CELL_NAME), os.path.join(folder, ROW_NAME)
         done = row_of(results, cell, retry_failed)
         if done is None and cell["id"] in earlier:  # another suite may have had the cell
             done = {**earlier[cell["id"]], **identity(cell)}
@@ -171,11 +172,11 @@ def row_of(results: str, cell: Dict[str, Any], retry_failed: bool) -> Optional[D
 
     That is a failed one too with retry_failed, or where its paths have changed.
     """
-    folder = os.path.join(results, "cells", cell["id"])
+    folder = os.path.join(results, CELLS_FOLDER, cell["id"])
     row = read_json(os.path.join(folder, ROW_NAME))
     if row is None or row["ok"]:
         return row
-    before = read_json(os.path.join(folder, "cell.json")) or {}
+    before = read_json(os.path.join(folder, CELL_NAME)) or {}
     return None if retry_failed or before.get("given", given(cell)) != given(cell) else row
 
 
@@ -213,7 +214,7 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
         words += ["--default-resources", *slurm] if slurm else []
     else:
         words += ["--cores", str(at_once)] + (["--resources", f"gpu={per_gpu * len(gpus)}"] if on_gpu else [])
-    headline = [f"cells/{cell['id']}/{ROW_NAME}" for cell in cells if cell["headline"]]
+    headline = [f"{CELLS_FOLDER}/{cell['id']}/{ROW_NAME}" for cell in cells if cell["headline"]]
     return words + (["--prioritize", *headline] if headline else [])
 
 
@@ -239,13 +240,13 @@ def environment() -> Dict[str, str]:
 
 def collect(results: str) -> Dict[str, Dict[str, Any]]:
     """Every row in RESULTS/cells by its cell's name; writes RESULTS/rows.jsonl."""
-    folder = os.path.join(results, "cells")
+    folder = os.path.join(results, CELLS_FOLDER)
     rows = {}
     for name in sorted(os.listdir(folder)):
         row = read_json(os.path.join(folder, name, ROW_NAME))
         if row is not None:
             rows[name] = row
-    lines = [json.dumps(row, sort_keys=False) for row in rows.values()]
+    lines = [json.dumps(row) for row in rows.values()]
     write_text_atomically(os.path.join(results, ROWS_NAME), "".join(line + "\n" for line in lines))
     return rows
 

@@ -1,4 +1,4 @@
-"""Which cells of a suite are run: those that --only leaves, less those that --rows brings; and the plan of a dry run."""
+"""Which cells of a suite are run: those that --only leaves, less those of --rows; and the plan of a dry run."""
 from __future__ import annotations
 
 from typing import Any, Dict, List, Mapping, Sequence

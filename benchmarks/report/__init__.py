@@ -10,7 +10,8 @@ import os
 import shutil
 from typing import Any, Callable, Dict, List, Sequence
 
-from .rows import CELLS_FOLDER, ReportError, Row, grouped, read_rows, safe_name, shared_gpu
+from ..results_folder import CELLS_FOLDER
+from .rows import ReportError, Row, grouped, read_rows, safe_name, shared_gpu
 
 __all__ = ["ReportError", "report"]
 

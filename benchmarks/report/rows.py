@@ -8,12 +8,10 @@ import statistics
 from typing import Any, Callable, Dict, Iterable, List, NamedTuple, Optional, Sequence, Tuple
 
 from ..errors import BenchError
+from ..results_folder import CELLS_FOLDER, ROW_NAME, ROWS_NAME
 
 Row = Dict[str, Any]
 
-ROWS_NAME = "rows.jsonl"
-CELLS_FOLDER = "cells"
-ROW_NAME = "row.json"
 NEEDED = {"cell": str, "suite": str, "ok": bool, "method": str, "blend_mode": str, "scene": str, "seed": int}
 # What two rows of one scene must share to be comparable, where both say it.
 RULES = ("split", "resolution", "image_size", "downscaler", "background", "principal_point")

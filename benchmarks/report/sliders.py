@@ -11,8 +11,9 @@ import torch
 from PIL import Image
 
 from ...trainer.metrics import psnr
+from ..results_folder import CELLS_FOLDER
 from .layouts import end_of
-from .rows import CELLS_FOLDER, Group, ReportError, Row, grouped, safe_name
+from .rows import Group, ReportError, Row, grouped, safe_name
 
 IMAGES_FOLDER = "images"
 TRUTH = "ground truth"
