@@ -15,9 +15,9 @@ import collections
 import itertools
 import json
 import os
-import statistics
 import sys
 import time
+from statistics import fmean, median
 from typing import Dict, NamedTuple
 
 import torch
@@ -91,24 +91,19 @@ def measure(model: models.Model, cases, repeats: int) -> Dict[Case, list]:
     return samples
 
 
-def mean(values) -> float:
-    values = list(values)
-    return sum(values) / len(values)
-
-
 def summary(samples: Dict[Case, list], mode: str, threads: int) -> Dict[str, float]:
     """Means over views of the medians, the minima and the maxima over repeats, and of the stages."""
     views = [runs for case, runs in samples.items() if (case.mode, case.threads) == (mode, threads)]
     row = {"mode": mode, "threads": threads}
     for name in ("forward", "backward", "total"):
-        row[name] = mean(statistics.median(getattr(run, name) for run in runs) for runs in views)
-    row["fastest"] = mean(min(run.total for run in runs) for runs in views)
-    row["slowest"] = mean(max(run.total for run in runs) for runs in views)
-    row["processor"] = mean(statistics.median(run.processor for run in runs) for runs in views)
+        row[name] = fmean(median(getattr(run, name) for run in runs) for runs in views)
+    row["fastest"] = fmean(min(run.total for run in runs) for runs in views)
+    row["slowest"] = fmean(max(run.total for run in runs) for runs in views)
+    row["processor"] = fmean(median(run.processor for run in runs) for runs in views)
     for name in STAGES:
-        row[name] = mean(statistics.median(run.stages[name] for run in runs) for runs in views)
+        row[name] = fmean(median(run.stages[name] for run in runs) for runs in views)
     for name in PAIRS:
-        row[name] = mean(runs[0].stages[name] for runs in views)
+        row[name] = fmean(runs[0].stages[name] for runs in views)
     row["other"] = max(0.0, row["total"] - sum(row[name] for name in STAGES))
     return row
 
@@ -211,7 +206,7 @@ def print_dense(model: models.Model, views, modes, threads: int, repeats: int, r
             dense_torch.rasterize_with_gradients(model.inputs, settings, image_gradient(settings))
             seconds["forward", view].append(middle - start)
             seconds["total", view].append(time.perf_counter() - middle)
-        results[mode] = {name: mean(statistics.median(seconds[name, view]) for view in views)
+        results[mode] = {name: fmean(median(seconds[name, view]) for view in views)
                          for name in ("forward", "total")}
         lines.append((mode, f"{results[mode]['forward']:.2f}", f"{results[mode]['total']:.2f}",
                       f"{results[mode]['total'] / totals[mode]:.0f}"))

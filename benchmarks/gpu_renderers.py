@@ -11,6 +11,7 @@ from typing import Dict, List
 
 import torch
 
+from diff_smoe_rasterization.trainer.cameras import Camera
 from models import Model
 
 NEAR = 0.2
@@ -188,6 +189,11 @@ class FasterGSInference(FasterGS):
                                      True, False)
 
 
+def intrinsics_of(camera: Camera, device: torch.device) -> torch.Tensor:
+    """[3, 3]; the principal point is the image centre, as a packed model has it."""
+    return torch.tensor([[camera.fx, 0, camera.width / 2], [0, camera.fy, camera.height / 2], [0, 0, 1]], device=device)
+
+
 class Gsplat(Renderer):
     folder = "gsplat"
     packed = True
@@ -202,8 +208,7 @@ class Gsplat(Renderer):
 
     def make_view(self, model, view):
         camera, settings = model.cameras[view], model.settings(view, "alpha")
-        intrinsics = torch.tensor([[camera.fx, 0, camera.width / 2], [0, camera.fy, camera.height / 2], [0, 0, 1]],
-                                  device=settings.bg.device)
+        intrinsics = intrinsics_of(camera, settings.bg.device)
         return dict(viewmats=settings.viewmatrix.T[None].contiguous(), Ks=intrinsics[None], width=camera.width,
                     height=camera.height, near_plane=NEAR, sh_degree=model.sh_degree, packed=self.packed)
 
@@ -244,8 +249,7 @@ class GsplatInference(Renderer):
 
     def make_view(self, model, view):
         camera, settings = model.cameras[view], model.settings(view, "alpha")
-        intrinsics = torch.tensor([[camera.fx, 0, camera.width / 2], [0, camera.fy, camera.height / 2], [0, 0, 1]],
-                                  device=settings.bg.device)
+        intrinsics = intrinsics_of(camera, settings.bg.device)
         return dict(viewmat=settings.viewmatrix.T.contiguous(), K=intrinsics, width=camera.width,
                     height=camera.height, near_plane=NEAR)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 import json
 import math
 import os
-import statistics
 import sys
 import time
 import traceback
+from statistics import fmean, median
 from typing import Any, Callable, Dict, List
 
 import torch
@@ -22,11 +22,6 @@ WALL_REPEATS = 20
 STAGE_REPEATS = 5
 
 
-def mean(values) -> float:
-    values = list(values)
-    return sum(values) / len(values)
-
-
 def event_milliseconds(call: Callable[[], Any], warmup: int, repeats: int) -> float:
     """The median time between CUDA events around the call; the host runs ahead, as in a training loop."""
     for _ in range(warmup):
@@ -38,7 +33,7 @@ def event_milliseconds(call: Callable[[], Any], warmup: int, repeats: int) -> fl
         call()
         end.record()
     torch.cuda.synchronize()
-    return statistics.median(start.elapsed_time(end) for start, end in events)
+    return median(start.elapsed_time(end) for start, end in events)
 
 
 def wall_milliseconds(call: Callable[[], Any], repeats: int) -> float:
@@ -50,7 +45,7 @@ def wall_milliseconds(call: Callable[[], Any], repeats: int) -> float:
         call()
         torch.cuda.synchronize()
         times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times)
+    return median(times)
 
 
 def wake_the_clocks() -> None:
@@ -92,13 +87,13 @@ class Measurement:
             calls["total"] = self.forward_and_backward
         result = {}
         for name, call in calls.items():
-            result[name + "_ms"] = mean(event_milliseconds(lambda v=view, c=call: c(v), warmup, repeats)
-                                        for view in self.renderer.views)
-            result[name + "_wall_ms"] = mean(wall_milliseconds(lambda v=view, c=call: c(v), WALL_REPEATS)
-                                             for view in self.renderer.views)
+            result[name + "_ms"] = fmean(event_milliseconds(lambda v=view, c=call: c(v), warmup, repeats)
+                                         for view in self.renderer.views)
+            result[name + "_wall_ms"] = fmean(wall_milliseconds(lambda v=view, c=call: c(v), WALL_REPEATS)
+                                              for view in self.renderer.views)
         return result
 
-    def peak_megabytes(self) -> float:
+    def peak_mib(self) -> float:
         """What torch's allocator holds at most beyond parameters and gradients, of the worst view, in MiB."""
         def start():
             torch.cuda.synchronize()
@@ -144,7 +139,7 @@ def compare(measurement: Measurement, folder: str) -> Dict[str, float]:
         return {}
     expected_images, expected_gradient = torch.load(path)
     values = [psnr(image, expected) for image, expected in zip(images, expected_images)]
-    row = {"psnr": mean(values), "psnr_worst": min(values)}
+    row = {"psnr": fmean(values), "psnr_worst": min(values)}
     if means_gradient is not None:
         row["cosine"] = cosine(means_gradient, expected_gradient)
     return row
@@ -174,14 +169,14 @@ def stages(measurement: Measurement) -> Dict[str, Any]:
             measurement.forward_and_backward(view)
             torch.cuda.synchronize()
             runs.append(stage_times())
-        samples.append({name: statistics.median(run[name] for run in runs) for name in runs[0]})
+        samples.append({name: median(run[name] for run in runs) for name in runs[0]})
     set_profiling(False)
-    times = {name: mean(sample[name] for sample in samples) for name in samples[0]}
+    times = {name: fmean(sample[name] for sample in samples) for name in samples[0]}
     with torch.no_grad():
-        visible = mean(int((rasterize(settings=view, **renderer.parameters).radii > 0).sum()) for view in views)
+        visible = fmean(int((rasterize(settings=view, **renderer.parameters).radii > 0).sum()) for view in views)
     counts = gpu_floor.Counts(
         gaussians=len(renderer.parameters["means3D"]), visible=visible,
-        instances=mean(num_instances(renderer, view) for view in views),
+        instances=fmean(num_instances(renderer, view) for view in views),
         pixels=views[0].image_width * views[0].image_height, forward_pairs=times["forward_pairs"],
         backward_pairs=times["backward_pairs"],
         parameter_bytes=sum(tensor[0].numel() * tensor.element_size() for tensor in renderer.parameters.values()))
@@ -213,7 +208,7 @@ def measure(request: Dict[str, Any], row: Dict[str, Any]) -> None:
     if renderer.is_alpha:
         row.update(compare(measurement, request["folder"]))
     row.update(measurement.times(request["warmup"], request["repeats"]))
-    row["peak_mib"] = measurement.peak_megabytes()
+    row["peak_mib"] = measurement.peak_mib()
     row["outside_torch_mib"] = (outside - torch.cuda.mem_get_info()[0] - torch.cuda.memory_reserved()) / MEBIBYTE
     if isinstance(renderer, Ours):
         row.update(stages(measurement))

@@ -13,6 +13,7 @@ from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.modelfile import load_model
 from diff_smoe_rasterization.trainer.scene import load_cameras
 
+
 class Model(NamedTuple):
     """Activated Gaussians, by the argument names of `rasterize`, and views of them."""
 
