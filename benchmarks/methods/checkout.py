@@ -84,7 +84,11 @@ class ThreeDGS:
             words.append("--antialiasing")
         if self.method["variant"] == "patched":
             words += ["--blend_mode", config.blend_mode]
-        return [str(word) for word in words] + list(self.method["arguments"])
+        return [str(word) for word in words] + self.own_arguments()
+
+    def own_arguments(self) -> List[str]:
+        """What the method adds to them."""
+        return list(self.method["arguments"])
 
     def own_bytes(self) -> int:
         """Size of what the method calls its model."""
@@ -152,10 +156,8 @@ class C3DGS(ThreeDGS):
         self.model = compressed
         return trained
 
-    def train_arguments(self) -> List[str]:
-        own = list(self.method["arguments"])  # which are those of compress.py
-        words = super().train_arguments()
-        return words[:len(words) - len(own)]
+    def own_arguments(self) -> List[str]:
+        return []  # the method's are those of compress.py
 
     def train_seconds(self, trained: Dict[str, Any]) -> Optional[float]:
         """Training, and what compress.py says of its own stages; None where it says nothing."""

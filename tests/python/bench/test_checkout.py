@@ -183,6 +183,14 @@ def test_steady_means_neither_reset_nor_size_prune(small):
     assert "--opacity_reset_interval" not in shapes.ThreeDGS(cell, shapes.config_of(cell), "out").train_arguments()
 
 
+def test_the_arguments_of_a_compression_are_not_those_of_the_training_before_it(small):
+    mode = ["--blend_mode", "smoe"]
+    for name, last in (("taming", [*mode, "--budget", "5"]), ("c3dgs", mode)):
+        cell = small.cell(name, arguments=["--budget", 5])
+        words = shapes.SHAPES[name](cell, shapes.config_of(cell), "out").train_arguments()
+        assert words[-len(last):] == last
+
+
 def test_a_checkout_that_was_trained_on_other_images_is_refused(small, scene, tmp_path):
     other = tmp_path / "other scene"
     shutil.copytree(scene, other)
