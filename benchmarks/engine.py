@@ -21,7 +21,7 @@ from ..trainer.files import write_json_atomically, write_text_atomically
 from .cell import identity
 from .errors import BenchError
 from .measure import ALEX_VARIABLE
-from .preparation import check_paths, given, made_scene, missing_folders, prepared_method
+from .preparation import check_variables, given, made_scene, missing_folders, prepared_method
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .results_folder import CELLS_FOLDER, ROW_NAME, ROWS_NAME
@@ -59,7 +59,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     if dry_run:
         print(plan(cells, done, absent))
         return []
-    check_paths([cell for cell in cells if cell["id"] not in done])
+    check_variables([cell for cell in cells if cell["id"] not in done])
     if absent:
         raise BenchError(f"{absent[0]}; name its folder, or leave it out with --only")
     if importlib.util.find_spec("snakemake") is None:

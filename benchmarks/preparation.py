@@ -15,7 +15,7 @@ from .suite import NOT_IN_THE_IDENTITY
 NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", "build")
 
 
-def check_paths(cells: List[Dict[str, Any]]) -> None:
+def check_variables(cells: List[Dict[str, Any]]) -> None:
     """Raises BenchError where a path of these cells has a variable that is not set."""
     for cell in cells:
         for part in (cell["scene"], cell["method"]):

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List
 
 import torch
 
@@ -49,7 +49,7 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
 
 
 def _history(folder: str) -> List[Dict[str, Any]]:
-    path: Optional[str] = os.path.join(folder, HISTORY_NAME)
+    path = os.path.join(folder, HISTORY_NAME)
     if not os.path.isfile(path):
         return []
     with open(path, encoding="utf-8") as file:

@@ -12,7 +12,6 @@ from .tables import (OURS, PAPER, Cell, Column, Table, TableRow, cell, column, p
 
 Paper = Dict[str, Any]
 END_NAMES = ("sparse", "dense")
-UNTOUCHED = "3dgs"  # the schedule of the paper's protocol
 ABLATION = {"smoe": "full", "smoe_tn": "without T_d", "smoe_std": "without T_n,d"}
 SHARED = "shared"  # stands for a time or FPS where there is none for this reason
 SHARED_NOTE = ("Times and FPS are of cells that had their GPU alone. shared: several cells had one GPU at once, so "

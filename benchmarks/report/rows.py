@@ -16,7 +16,7 @@ NEEDED = {"cell": str, "suite": str, "ok": bool, "method": str, "blend_mode": st
 # What two rows of one scene must share to be comparable, where both say it.
 RULES = ("split", "resolution", "image_size", "downscaler", "background", "principal_point")
 RULE_PREFIXES = ("psnr", "ssim", "lpips", "edge", "fps", "size", "quantisation")
-PAPER_ITERATIONS = 30000
+PAPER_ITERATIONS, PAPER_SCHEDULE = 30000, "3dgs"
 MEGABYTE = 1e6
 TIMES = ("train_seconds", "wall_seconds", "fps")  # of cells that shared their GPU these are not the GPU's own
 LPIPS = "lpips:"  # the figure's name goes on with its kind, such as lpips_alex
@@ -60,7 +60,7 @@ class Setting(NamedTuple):
         words = [self.source]
         if blend_mode:
             words.append(self.blend_mode)
-        if self.schedule not in (None, "3dgs"):
+        if self.schedule not in (None, PAPER_SCHEDULE):
             words.append(self.schedule)
         if self.budget is not None:
             words.append("fixed number")

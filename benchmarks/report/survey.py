@@ -5,8 +5,8 @@ import csv
 import os
 from typing import Dict, List, Optional, Sequence
 
-from .layouts import UNTOUCHED, end_of
-from .rows import Group, Row, grouped, safe_name
+from .layouts import end_of
+from .rows import PAPER_SCHEDULE, Group, Row, grouped, safe_name
 
 HEADER = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
 LPIPS_FIGURE = "lpips:lpips_vgg_inria"  # the survey's tables hold 3DGS's own LPIPS, and no other may stand there
@@ -24,7 +24,7 @@ def folder_of(group: Group, datasets: Dict[str, Sequence[str]]) -> str:
 def submethod(group: Group) -> str:
     """The survey shows rows with a submethod in its table, others in its plots only; it appends the name to ours."""
     words = [group.setting.source, group.setting.blend_mode]
-    if group.setting.schedule not in (None, UNTOUCHED):
+    if group.setting.schedule not in (None, PAPER_SCHEDULE):
         words.append(group.setting.schedule)
     if group.setting.budget is not None:
         words.append(f"n{group.setting.budget}")

@@ -236,7 +236,7 @@ def test_variables_are_needed_for_cells_that_are_run(content, tmp_path, monkeypa
     told = capsys.readouterr().err
     assert "methods[1].path: $NOT_THERE is not set" in told and "set it, or leave it out with --only" in told
     assert not (tmp_path / "results").exists()
-    preparation.check_paths([cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"])
+    preparation.check_variables([cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"])
 
 
 @pytest.fixture
