@@ -5,7 +5,7 @@ skipped.
 """
 from __future__ import annotations
 
-from typing import NamedTuple, Tuple, Type
+from typing import Dict, NamedTuple, Tuple, Type
 
 import libcst as cst
 from libcst.helpers import get_full_name_for_node
@@ -149,18 +149,38 @@ class _LpipsOffline(Codemod):
         return with_import(updated_node, RUNTIME, "nan_without_network") if self.pending else updated_node
 
 
-class _EighInParts(Codemod):
-    """`torch.linalg.eigh(...)` becomes `eigh_in_parts(...)`."""
+class _CallOfOurs(Codemod):
+    """`FOREIGN(...)` becomes `OURS(...)`, where it has no other keywords than these."""
+
+    foreign = ours = ""
+    keywords: Tuple[str, ...] = ()
+
+    def fits(self, given: Dict[str, cst.BaseExpression]) -> bool:
+        """Whether a call with these values of its keywords is one to change."""
+        return True
 
     def leave_Call(self, original_node: cst.Call, updated_node: cst.Call) -> cst.Call:
-        given = {argument.keyword.value if argument.keyword else None for argument in updated_node.args}
-        if get_full_name_for_node(updated_node.func) != "torch.linalg.eigh" or not given <= {None, "UPLO"}:
+        given = {argument.keyword.value: argument.value for argument in updated_node.args if argument.keyword}
+        if (get_full_name_for_node(updated_node.func) != self.foreign or not set(given) <= set(self.keywords)
+                or not self.fits(given)):
             return updated_node
         self.pending += 1
-        return updated_node.with_changes(func=cst.Name("eigh_in_parts"))
+        return updated_node.with_changes(func=cst.Name(self.ours))
 
     def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
-        return with_import(updated_node, RUNTIME, "eigh_in_parts") if self.pending else updated_node
+        return with_import(updated_node, RUNTIME, self.ours) if self.pending else updated_node
+
+
+class _EighInParts(_CallOfOurs):
+    foreign, ours, keywords = "torch.linalg.eigh", "eigh_in_parts", ("UPLO",)
+
+
+class _UniqueRows(_CallOfOurs):
+    foreign, ours = "torch.unique", "unique_rows"
+    keywords = ("sorted", "return_inverse", "return_counts", "dim")
+
+    def fits(self, given: Dict[str, cst.BaseExpression]) -> bool:
+        return isinstance(given.get("dim"), cst.Integer) and given["dim"].evaluated_value == 0
 
 
 class _CppStandard(Codemod):
@@ -206,6 +226,8 @@ RULES = (
          _NumpyByte, ("np.byte", "numpy.byte")),
     Rule("eigh-in-parts", "cuSOLVER of CUDA 12.8 and later fails on the many covariances that c3dgs gives it at once",
          _EighInParts, ("linalg.eigh",)),
+    Rule("unique-rows", "torch.unique(dim=0) can fail on CUDA where processes share a GPU: its merge sort has a race",
+         _UniqueRows, ("torch.unique",)),
     Rule("cpp-standard", "C++14 was asked for; torch 2.1 needs C++17, 2.13 C++20, and asks for it itself",
          _CppStandard, ("c++14",)),
 )

@@ -130,6 +130,30 @@ def eigh_in_parts(matrices: Any, UPLO: str = "L") -> Any:
     return type(parts[0])((values.reshape(matrices.shape[:-1]), vectors.reshape(matrices.shape)))
 
 
+def unique_rows(input: Any, sorted: bool = True, return_inverse: bool = False, return_counts: bool = False,
+                dim: int = 0) -> Any:
+    """Returns what torch.unique returns, of integers along dim 0 without the merge sort that may fail on CUDA.
+
+    With that of CUB (NVIDIA/cccl 5456) processes that share a GPU ended with cudaErrorIllegalAddress. In one dimension
+    torch.unique has a radix sort.
+    input: [N, ...]. As in torch, rows are sorted whatever `sorted` says.
+    """
+    import torch
+
+    if dim != 0 or input.dim() == 0 or input.numel() == 0 or input.is_floating_point() or input.is_complex():
+        return torch.unique(input, sorted, return_inverse, return_counts, dim)
+    columns = input.reshape(len(input), -1)
+    unique, inverse = columns[:1, :0], torch.zeros(len(input), dtype=torch.int64, device=input.device)
+    for column in columns.unbind(1):
+        values, rank = torch.unique(column, return_inverse=True)
+        # Of the columns so far and this one. Both are ranks below N: no key reaches N^2, of which int64 takes N < 3e9.
+        key, inverse, counts = torch.unique(inverse * len(values) + rank, return_inverse=True, return_counts=True)
+        unique = torch.cat([unique[key // len(values)], values[key % len(values), None]], dim=1)
+    unique = unique.reshape(-1, *input.shape[1:])
+    results = (unique,) + (inverse,) * return_inverse + (counts,) * return_counts
+    return results if len(results) > 1 else unique
+
+
 class _Absent:
     def __init__(self, error: ImportError) -> None:
         self._error = error

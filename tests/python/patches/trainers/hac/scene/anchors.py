@@ -104,7 +104,7 @@ class Anchors(GrowingTensors):
             mask = (steepness >= threshold * 2 ** depth) & (torch.rand_like(steepness) > 0.5 ** (depth + 1))
             if not bool(mask.any()):
                 continue
-            cells, owners = (positions[mask] / size).round().unique(dim=0, return_inverse=True)
+            cells, owners = torch.unique((positions[mask] / size).round().int(), dim=0, return_inverse=True)
             best = scatter_max(features[mask], owners[:, None].expand(-1, self.feat_dim), dim=0)[0]
             taken = (self._anchor.detach() / size).round()
             empty = (cells[:, None] != taken).any(dim=-1).all(dim=1)
