@@ -21,15 +21,14 @@ from ..trainer.files import write_json_atomically, write_text_atomically
 from .cell import identity
 from .errors import BenchError
 from .measure import ALEX_VARIABLE
-from .preparation import check_variables, given, made_scene, missing_folders, prepared_method
+from .preparation import given, made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
-from .results_folder import CELLS_FOLDER, ROW_NAME, ROWS_NAME
+from .results_folder import CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME
 from .selection import chosen, earlier_rows, plan
 from .suite import Suite, find_suite, load_suite, missing
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
-SUITE_NAME, CELL_NAME, LOCK_NAME = "suite.json", "cell.json", ".lock"
 
 
 def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = None,
@@ -55,13 +54,13 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     if rows:
         print(f"{len(taken)} of {len(cells)} cells taken from {rows}")
     done = {**{name: row for name, row in there.items() if row is not None}, **taken}
-    absent = missing_folders([cell for cell in cells if cell["id"] not in done])
+    absent = what_is_missing([cell for cell in cells if cell["id"] not in done])
     if dry_run:
         print(plan(cells, done, absent))
         return []
-    check_variables([cell for cell in cells if cell["id"] not in done])
     if absent:
-        raise BenchError(f"{absent[0]}; name its folder, or leave it out with --only")
+        more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
+        raise BenchError(f"{absent[0]}; set the variable or name the folder, or leave it out with --only{more}")
     if importlib.util.find_spec("snakemake") is None:
         raise BenchError(missing("snakemake", ImportError("needs Python 3.11 or later")))
     words = command(suite, cells, results, jobs, slurm, per_gpu)

@@ -15,20 +15,13 @@ from .suite import NOT_IN_THE_IDENTITY
 NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", "build")
 
 
-def check_variables(cells: List[Dict[str, Any]]) -> None:
-    """Raises BenchError where a path of these cells has a variable that is not set."""
-    for cell in cells:
-        for part in (cell["scene"], cell["method"]):
-            if "unset" in part:
-                raise BenchError(f"{part['unset']}; set it, or leave it out with --only")
-
-
-def missing_folders(cells: List[Dict[str, Any]]) -> List[str]:
-    """Which folders of these cells' scenes and checkouts do not exist, in words."""
+def what_is_missing(cells: List[Dict[str, Any]]) -> List[str]:
+    """What these cells need and is not there, in words: variables, then folders of scenes and of checkouts."""
     scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
     methods = {cell["method"]["label"]: cell["method"] for cell in cells}
-    absent = [f"scene {name}: {scene['path']}: no such folder" for name, scene in scenes.items()
-              if scene["path"] is not None and is_missing(scene, "path")]
+    absent = [part["unset"] for part in (*scenes.values(), *methods.values()) if "unset" in part]
+    absent += [f"scene {name}: {scene['path']}: no such folder" for name, scene in scenes.items()
+               if scene["path"] is not None and is_missing(scene, "path")]
     return absent + [f"method {label}: {key}: {method[key]}: no such folder, where {wanted}"
                      for label, method in methods.items() for key, wanted in wanted_checkouts(method).items()
                      if is_missing(method, key)]

@@ -6,7 +6,7 @@ from collections import namedtuple
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 
 
-def settings_with(name, module):
+def settings_with(name: str, module: str) -> type:
     """Returns the package's settings as a class whose thirteenth field is `name`.
 
     A field that the package has too moves there with its default; another one has the default None.

@@ -14,6 +14,7 @@ def weightedDistance(coefs: torch.Tensor, codebook: torch.Tensor) -> Tuple[torch
     """Returns each row's squared distance [N] to the nearest row of the codebook, and the number [N] of that, int64.
 
     Of rows whose distances differ by no more than rounding, either may be taken; the distance is of the one taken.
+    Rows with an infinity or a NaN are taken last. Under TF32 or autocast the nearest is found with their precision.
     coefs: [N, K]; codebook: [C, K], C > 0, of the same type and on the same device. No gradient.
     Raises ValueError where the shapes do not fit.
     """
@@ -21,14 +22,19 @@ def weightedDistance(coefs: torch.Tensor, codebook: torch.Tensor) -> Tuple[torch
         raise ValueError(f"weightedDistance: coefs has shape {list(coefs.shape)}, codebook {list(codebook.shape)}; "
                          "they must be [N, K] and [C, K] with C > 0")
     coefs, codebook = coefs.detach(), codebook.detach()
-    center = codebook.mean(0)  # products lose fewer digits of what is near the origin
-    centred = codebook - center
-    half_squares = 0.5 * centred.square().sum(1)
+    # Products lose fewer digits near the origin. The codebook may have rows far from all others: c3dgs divides random
+    # ones by their trace.
+    center = coefs.mean(0)
+    finite = codebook.isfinite().all(1)
+    centred = torch.where(finite[:, None], codebook - center, 0)
+    half_squares = torch.where(finite, 0.5 * centred.square().sum(1), torch.inf)
+    distances = coefs.new_empty(len(coefs))
     indices = torch.empty(len(coefs), dtype=torch.int64, device=coefs.device)
     rows = max(1, DISTANCES_AT_ONCE // len(codebook))
     for begin in range(0, len(coefs), rows):
         part = slice(begin, begin + rows)
         # |x - c|^2 = |x|^2 + 2 (|c|^2 / 2 - x c), whose first term is the same for all c.
         indices[part] = torch.addmm(half_squares, coefs[part] - center, centred.T, alpha=-1).argmin(1)
-    # By differences: by products, small distances would lose their digits.
-    return (coefs - codebook[indices]).square_().sum(1), indices
+        # By differences: by products, small distances would lose their digits.
+        distances[part] = (coefs[part] - codebook[indices[part]]).square().sum(1)
+    return distances, indices

@@ -4,6 +4,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from typing import List
 
 from . import engine
 from .errors import PatchError
@@ -31,7 +32,7 @@ def apply(arguments: argparse.Namespace) -> int:
         written = "would be" if arguments.dry_run else "was"
         print(f"{arguments.path}: already patched ({verdict.trainer}); nothing {written} written")
         _print_lines(verdict.reasons)
-    _print_lines(planned.notes)
+    _print_lines(_remarks(planned, arguments))
     return 0
 
 
@@ -42,12 +43,16 @@ def check(arguments: argparse.Namespace) -> int:
     trainer = f" ({verdict.trainer})" if verdict.trainer else ""
     print(f"{arguments.path}: {verdict}{trainer}")
     if verdict in ("patchable", "patched"):
-        _print_lines((*verdict.reasons, *planned.notes))
-        if any(rule.pending for rule in planned.modernised):
-            _print_lines([_how_to_modernise(planned, arguments)])
+        _print_lines((*verdict.reasons, *_remarks(planned, arguments)))
         return 0
     print(f"dsmoe patch: error: {engine.refusal(verdict)}", file=sys.stderr)
     return 1
+
+
+def _remarks(planned: engine.Plan, arguments: argparse.Namespace) -> List[str]:
+    """The notes on a checkout, and what to type where rules of --modernise are still not applied."""
+    pending = not planned.written and any(rule.pending for rule in planned.modernised)
+    return [*planned.notes] + ([_how_to_modernise(planned, arguments)] if pending else [])
 
 
 def _how_to_modernise(planned: engine.Plan, arguments: argparse.Namespace) -> str:

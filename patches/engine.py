@@ -133,7 +133,7 @@ def pending(planned: Plan) -> Dict[str, bytes]:
         return {}
     edited = [name for name, state in record.states().items() if state == "changed"] if record else []
     if edited and planned.modernise == record.manifest["modernise"]:
-        return {}  # every rule is applied
+        return {}  # nothing is written over an edit
     if edited:
         raise PatchError(f"{edited[0]}: was changed since it was patched: undo your edit, then apply it with "
                          "--modernise")
@@ -229,7 +229,7 @@ def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str,
     if set(states.values()) <= {"patched", "changed"}:
         files = {name: _read(root / name) for name in python_files(root)}
         if Patch(files, trainer).state()[0] == "patched":
-            return "patched", by + [f"{name}: was edited since; every rule is still applied"
+            return "patched", by + [f"{name}: was edited since; every rule for the blend mode is still applied"
                                     for name, state in states.items() if state == "changed"]
     return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
 

@@ -77,18 +77,23 @@ class Patch:
 
         read_now: the bytes of a file as it is now, patched or not; None where it is gone.
         """
-        modernised = []
-        for rule in modernise.RULES:
-            changed = tuple(name for name in sorted(self.files)
-                            if rule.looks_at(self.files[name]) and self._changes(modernise.run, rule, name))
-            pending = tuple(name for name in changed if self._is_pending(rule, name, read_now(name)))
-            modernised.append(Modernised(rule.name, rule.reason, changed, pending))
-        return tuple(modernised)
+        changed = {rule: tuple(name for name in sorted(self.files)
+                               if rule.looks_at(self.files[name]) and self._changes(modernise.run, rule, name))
+                   for rule in modernise.RULES}
+        after = {change.name: change.after for change in self.changes()}
+        return tuple(Modernised(rule.name, rule.reason, names, tuple(
+            name for name in names if self._is_pending(rule, name, read_now(name), after[name])))
+            for rule, names in changed.items())
 
-    def _is_pending(self, rule: modernise.Rule, name: str, now: Optional[bytes]) -> bool:
-        """Whether a rule that changes a file is still to be applied to what the file is now."""
+    def _is_pending(self, rule: modernise.Rule, name: str, now: Optional[bytes], after: bytes) -> bool:
+        """Whether a rule that changes a file is still to be applied to what the file is now.
+
+        after: what the file is once every rule is applied.
+        """
         if now is None or now == self.files[name]:
             return True
+        if now == after:
+            return False
         try:
             return rule.looks_at(now) and modernise.run(rule, source.parse(name, now)[0]).pending > 0
         except PatchError:  # an edit that cannot be read

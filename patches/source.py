@@ -45,20 +45,25 @@ def parse(name: str, data: bytes):
 def _where(data: bytes) -> str:
     """Returns what Python itself says of a file that LibCST cannot parse."""
     try:
-        ast.parse(data)
-    except SyntaxError as error:
-        return f"line {error.lineno}: {error.msg}"
+        _parsed(data)
+    except (SyntaxError, ValueError) as error:  # a ValueError of a null byte, as some Pythons have it
+        line = getattr(error, "lineno", None)
+        return f"line {line}: {error.msg}" if line else str(error)
     return ""
 
 
 def python_tree(data: bytes) -> ast.AST:
     """Returns the syntax tree of a file as Python's own parser has it; of one that cannot be parsed an empty one."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # such as of invalid escapes in a string
-            return ast.parse(data)
+        return _parsed(data)
     except (SyntaxError, ValueError):
         return ast.Module(body=[], type_ignores=[])
+
+
+def _parsed(data: bytes) -> ast.AST:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # such as of invalid escapes in a string
+        return ast.parse(data)
 
 
 def called_name(call: ast.Call) -> str:

@@ -21,7 +21,7 @@ from .loop import train
 from .metrics import psnr, quantised
 from .modelfile import model_path
 from .pictures import comparison, evenly_spaced, file_names
-from .process import keep_freed_memory
+from .process import set_up_process
 from .results import results_table, write_results
 from .scene import Scene, load_scene, read_layout
 from .synthetic import write_synthetic_scene
@@ -44,7 +44,6 @@ FIXED = ("scene", "output", "blend_mode", "eval_every", "checkpoint_every")
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the comparison; returns the exit status."""
     arguments = _parse(argv)
-    keep_freed_memory()
     try:
         run(arguments)
         return 0
@@ -80,6 +79,7 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
         print(f"making a scene in {folder}")
         write_synthetic_scene(folder)
     config = choose_options(folder, given)
+    set_up_process(config.device)
     os.makedirs(output, exist_ok=True)  # a folder that cannot be made is told before images are read
     scene = load_scene(config, progress)
     rows = []

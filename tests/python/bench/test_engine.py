@@ -220,7 +220,7 @@ def test_checkouts_that_are_not_there_are_named_before_anything_is_run(content, 
     assert "no such folder" not in capsys.readouterr().out
     for line, only in ((lines[0], []), (lines[1], ["--only", "method=c3dgs"])):
         assert main([*words, *only]) == 1
-        assert f"{line}; name its folder, or leave it out with --only" in capsys.readouterr().err
+        assert f"{line}; set the variable or name the folder, or leave it out with --only" in capsys.readouterr().err
     assert not (tmp_path / "results").exists()
 
 
@@ -231,12 +231,14 @@ def test_variables_are_needed_for_cells_that_are_run(content, tmp_path, monkeypa
     monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
     words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
     assert main([*words, "--dry-run"]) == 0
-    assert capsys.readouterr().out.endswith("0 done, 4 to do, 0 failed\n")
+    told = capsys.readouterr().out
+    assert "\nmethods[1].path: $NOT_THERE is not set" in told and told.endswith("0 done, 4 to do, 0 failed\n")
     assert main(words) == 1
     told = capsys.readouterr().err
-    assert "methods[1].path: $NOT_THERE is not set" in told and "set it, or leave it out with --only" in told
+    assert "methods[1].path: $NOT_THERE is not set" in told and "leave it out with --only" in told
     assert not (tmp_path / "results").exists()
-    preparation.check_variables([cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"])
+    native = [cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"]
+    assert preparation.what_is_missing(native) == []
 
 
 @pytest.fixture

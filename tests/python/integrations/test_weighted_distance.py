@@ -16,9 +16,19 @@ def test_the_nearest_row(monkeypatch, at_once):
     distances, indices = weighted_distance.weightedDistance(coefs, codebook)
     every = (coefs.double()[:, None] - codebook.double()).square().sum(2)
     assert distances.dtype == torch.float32 and indices.dtype == torch.int64
-    # Differences of these float32 numbers are exact; six squares and their sum round eleven times at most, by half a digit.
+    # Differences of these float32 numbers are exact; six squares and their sum round eleven times, by half a digit.
     torch.testing.assert_close(distances.double(), every.min(1).values, rtol=11 * 2 ** -24, atol=0)
     assert (indices == every.min(1).indices).all()
+
+
+@pytest.mark.parametrize("far", [1e6, 1e30, float("inf"), float("nan")])
+def test_a_row_of_the_codebook_far_from_all_others_changes_nothing(far):
+    """c3dgs makes such rows: it divides random ones by their trace, which may be small."""
+    torch.manual_seed(0)
+    coefs, codebook = 100 + torch.rand(37, 6), 100 + torch.rand(11, 6)
+    codebook[3] = far
+    every = (coefs.double()[:, None] - codebook.double()).square().sum(2).nan_to_num(nan=torch.inf)
+    assert (weighted_distance.weightedDistance(coefs, codebook)[1] == every.min(1).indices).all()
 
 
 def test_no_rows_and_wrong_shapes():

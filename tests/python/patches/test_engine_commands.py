@@ -40,7 +40,8 @@ def test_check_has_the_options_of_apply_and_names_what_it_would(tmp_path, dsmoe)
     checkout = make(tmp_path, {"film.py": "from gaussian_renderer import render\n"})
     before = snapshot(checkout)
     said = dsmoe("patch", "check", checkout, "--modernise")
-    assert said.status == 0 and "modernise checkpoint-load: not applied in train.py: " in said.out and "film.py: renders" in said.out
+    assert said.status == 0 and "film.py: renders" in said.out
+    assert "modernise checkpoint-load: not applied in train.py: " in said.out
     assert ": patchable (3dgs-2023)" in dsmoe("patch", "check", checkout, "--trainer", "3dgs-2023").out
     assert dsmoe("patch", "check", checkout, "--trainer", "hac").status == 1
     assert snapshot(checkout) == before
@@ -72,9 +73,11 @@ def test_check_says_that_an_edit_keeps_a_rule_from_being_applied(tmp_path, dsmoe
     patches.apply(checkout, modernise=True)
     modernised = (checkout / "utils/loading.py").read_text()
     (checkout / "utils/loading.py").write_text("from diff_smoe_rasterization import io\n" + LOAD)
-    said = dsmoe("patch", "check", checkout)
-    assert "modernise checkpoint-load: applied in train.py, not applied in utils/loading.py: " in said.out
-    assert "undo your edit of patched files, then type: dsmoe patch apply --modernise" in said.out
+    for words in (["check"], ["apply", "--modernise"]):
+        said = dsmoe("patch", *words, checkout)
+        assert "every rule for the blend mode is still applied" in said.out
+        assert "modernise checkpoint-load: applied in train.py, not applied in utils/loading.py: " in said.out
+        assert "undo your edit of patched files, then type: dsmoe patch apply --modernise" in said.out
     (checkout / "utils/loading.py").write_text(modernised)
     patches.revert(checkout)
     patches.apply(checkout)
@@ -83,6 +86,14 @@ def test_check_says_that_an_edit_keeps_a_rule_from_being_applied(tmp_path, dsmoe
     said = dsmoe("patch", "check", checkout, "--modernise")
     assert said.status == 0 and "not applied in train.py" in said.out
     assert "cannot be applied as it is: train.py: was changed since it was patched: undo your edit" in said.out
+
+
+def test_a_file_with_a_null_byte_is_named_in_words(tmp_path, dsmoe):
+    checkout = make(tmp_path)
+    (checkout / "film.py").write_bytes(b"import diff_gaussian_rasterization\n\0x")
+    said = dsmoe("patch", "check", checkout)
+    assert "film.py: is not Python that can be parsed: " in said.out and "null byte" in said.out
+    assert "line None" not in said.out
 
 
 @pytest.mark.parametrize("words, usage", [(["patch", "apply"], "usage: dsmoe patch apply "),
