@@ -20,7 +20,7 @@ from typing import IO, Any, Dict, Iterator, List, Mapping, Optional, Sequence
 from ..trainer.files import write_json_atomically, write_text_atomically
 from .cell import identity
 from .errors import BenchError
-from .measure import ALEX_VARIABLE
+from .lpips import files_of_weights
 from .preparation import given, made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
@@ -60,7 +60,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         return []
     if absent:
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
-        raise BenchError(f"{absent[0]}; set the variable or name the folder, or leave it out with --only{more}")
+        raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
     if importlib.util.find_spec("snakemake") is None:
         raise BenchError(missing("snakemake", ImportError("needs Python 3.11 or later")))
     words = command(suite, cells, results, jobs, slurm, per_gpu)
@@ -230,10 +230,8 @@ def environment() -> Dict[str, str]:
     """Of Snakemake and its cells: this package is found from any folder, and its commit is known."""
     path = [ROOT if os.path.isfile(os.path.join(ROOT, "sources.txt")) else os.path.dirname(ROOT)]
     path += [os.path.abspath(item) for item in os.environ.get("PYTHONPATH", "").split(os.pathsep) if item]
-    known = {COMMIT_VARIABLE: project_commit()}
-    if os.environ.get(ALEX_VARIABLE):
-        known[ALEX_VARIABLE] = os.path.abspath(os.environ[ALEX_VARIABLE])  # cells run in another folder,
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(path), "PYTHONSAFEPATH": "1",  # and import nothing from there
+    known = {COMMIT_VARIABLE: project_commit(), **files_of_weights()}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path), "PYTHONSAFEPATH": "1",  # nothing of a cell's folder
             **{name: value for name, value in known.items() if value}}
 
 

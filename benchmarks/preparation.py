@@ -16,13 +16,13 @@ NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", 
 
 
 def what_is_missing(cells: List[Dict[str, Any]]) -> List[str]:
-    """What these cells need and is not there, in words: variables, then folders of scenes and of checkouts."""
+    """What these cells need and is not there: variables, folders of scenes and of checkouts; and what to do."""
     scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
     methods = {cell["method"]["label"]: cell["method"] for cell in cells}
-    absent = [part["unset"] for part in (*scenes.values(), *methods.values()) if "unset" in part]
-    absent += [f"scene {name}: {scene['path']}: no such folder" for name, scene in scenes.items()
+    absent = [f"{part['unset']}; set it" for part in (*scenes.values(), *methods.values()) if "unset" in part]
+    absent += [f"scene {name}: {scene['path']}: no such folder; name it" for name, scene in scenes.items()
                if scene["path"] is not None and is_missing(scene, "path")]
-    return absent + [f"method {label}: {key}: {method[key]}: no such folder, where {wanted}"
+    return absent + [f"method {label}: {key}: {method[key]}: no such folder, where {wanted}; name it"
                      for label, method in methods.items() for key, wanted in wanted_checkouts(method).items()
                      if is_missing(method, key)]
 

@@ -6,7 +6,7 @@ from typing import Any, Dict
 
 from ..settings import BLEND_MODES
 from ..trainer.config import PRINCIPAL_POINTS, SCHEDULES, TrainConfig
-from .measure import LPIPS_KINDS
+from .lpips import LPIPS_KINDS
 from .methods.names import CHECKOUTS, NATIVE, VARIANTS
 from .protocol import RECIPE
 

@@ -14,7 +14,7 @@ def weightedDistance(coefs: torch.Tensor, codebook: torch.Tensor) -> Tuple[torch
     """Returns each row's squared distance [N] to the nearest row of the codebook, and the number [N] of that, int64.
 
     Of rows whose distances differ by no more than rounding, either may be taken; the distance is of the one taken.
-    Rows with an infinity or a NaN are taken last. Under TF32 or autocast the nearest is found with their precision.
+    Rows of the codebook with an infinity or a NaN, or whose squares overflow, are taken last. Under TF32 or autocast the nearest is found with their precision.
     coefs: [N, K]; codebook: [C, K], C > 0, of the same type and on the same device. No gradient.
     Raises ValueError where the shapes do not fit.
     """
@@ -22,12 +22,14 @@ def weightedDistance(coefs: torch.Tensor, codebook: torch.Tensor) -> Tuple[torch
         raise ValueError(f"weightedDistance: coefs has shape {list(coefs.shape)}, codebook {list(codebook.shape)}; "
                          "they must be [N, K] and [C, K] with C > 0")
     coefs, codebook = coefs.detach(), codebook.detach()
-    # Products lose fewer digits near the origin. The codebook may have rows far from all others: c3dgs divides random
-    # ones by their trace.
-    center = coefs.mean(0)
-    finite = codebook.isfinite().all(1)
-    centred = torch.where(finite[:, None], codebook - center, 0)
-    half_squares = torch.where(finite, 0.5 * centred.square().sum(1), torch.inf)
+    # Products lose fewer digits near the origin. A median, since either argument may have rows far from all others:
+    # c3dgs divides random rows of a codebook by their trace.
+    center = codebook.nanmedian(0).values
+    centred = codebook - center
+    half_squares = 0.5 * centred.square().sum(1)
+    finite = half_squares.isfinite()
+    centred = torch.where(finite[:, None], centred, 0)
+    half_squares = torch.where(finite, half_squares, torch.inf)
     distances = coefs.new_empty(len(coefs))
     indices = torch.empty(len(coefs), dtype=torch.int64, device=coefs.device)
     rows = max(1, DISTANCES_AT_ONCE // len(codebook))

@@ -24,7 +24,6 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     """Trains in output/run, continuing where an earlier attempt stopped, and measures. Raises TrainerError."""
     folder = os.path.join(output, "run")
     config = config_of(cell, folder)
-    measures = Measures(config.device, cell["protocol"]["lpips"])
     set_up_process(config.device)
     on_gpu = config.device == "cuda"
     if on_gpu:
@@ -34,6 +33,7 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     row = train(config, resume=True, progress=False, scene=scene)
     # The peak of a part of the training would be taken for that of the whole.
     peak = torch.cuda.max_memory_allocated() / 2**20 if on_gpu and not continued else None
+    measures = Measures(config.device, cell["protocol"]["lpips"])  # after the peak, of which its networks are no part
     ply = model_path(folder, config.iterations)
     renderer = open_renderer(config, ply, config.blend_mode, config.device)
     evaluation = evaluate(renderer, scene.test, config.device, measure=measures)

@@ -195,7 +195,7 @@ def test_results_of_another_protocol_are_not_added_to(words, finished, tmp_path,
 def test_scenes_that_are_not_there_are_named_before_anything_is_run(content, tmp_path, capsys):
     content["scenes"].append({"name": "absent", "path": "nowhere"})
     words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
-    line = f"scene absent: {tmp_path / 'nowhere'}: no such folder"
+    line = f"scene absent: {tmp_path / 'nowhere'}: no such folder; name it"
     assert main([*words, "--dry-run"]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [line, "0 done, 4 to do, 0 failed"]
     assert main([*words, "--dry-run", "--only", "scene=tiny"]) == 0
@@ -211,16 +211,16 @@ def test_checkouts_that_are_not_there_are_named_before_anything_is_run(content, 
                            {"name": "2dgs", "label": "other", "path": "there"},  # that is enough beforehand
                            {"name": "c3dgs", "path": "there", "base": "neither"}]
     words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
-    lines = [f"method taming: path: {tmp_path / 'nowhere'}: no such folder, where a checkout of taming must be",
+    lines = [f"method taming: path: {tmp_path / 'nowhere'}: no such folder, where a checkout of taming must be; name it",
              f"method c3dgs: base: {tmp_path / 'neither'}: no such folder, where the 3DGS checkout must be that "
-             "trains what c3dgs compresses"]
+             "trains what c3dgs compresses; name it"]
     assert main([*words, "--dry-run"]) == 0
     assert capsys.readouterr().out.splitlines()[7:] == [*lines, "0 done, 7 to do, 0 failed"]
     assert main([*words, "--dry-run", "--only", "method=native"]) == 0
     assert "no such folder" not in capsys.readouterr().out
     for line, only in ((lines[0], []), (lines[1], ["--only", "method=c3dgs"])):
         assert main([*words, *only]) == 1
-        assert f"{line}; set the variable or name the folder, or leave it out with --only" in capsys.readouterr().err
+        assert f"{line}, or leave it out with --only" in capsys.readouterr().err
     assert not (tmp_path / "results").exists()
 
 
@@ -235,7 +235,7 @@ def test_variables_are_needed_for_cells_that_are_run(content, tmp_path, monkeypa
     assert "\nmethods[1].path: $NOT_THERE is not set" in told and told.endswith("0 done, 4 to do, 0 failed\n")
     assert main(words) == 1
     told = capsys.readouterr().err
-    assert "methods[1].path: $NOT_THERE is not set" in told and "leave it out with --only" in told
+    assert "methods[1].path: $NOT_THERE is not set" in told and "; set it, or leave it out with --only" in told
     assert not (tmp_path / "results").exists()
     native = [cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"]
     assert preparation.what_is_missing(native) == []
@@ -426,10 +426,11 @@ def test_a_second_run_on_the_same_results_is_refused(tmp_path):
                 pass
 
 
-def test_a_file_of_weights_is_found_from_the_folder_of_cells(monkeypatch, tmp_path):
+@pytest.mark.parametrize("variable", ["DSMOE_LPIPS_ALEX", "DSMOE_LPIPS_VGG"])
+def test_a_file_of_weights_is_found_from_the_folder_of_cells(monkeypatch, tmp_path, variable):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("DSMOE_LPIPS_ALEX", "weights.npz")
-    assert engine.environment()["DSMOE_LPIPS_ALEX"] == str(tmp_path / "weights.npz")
+    monkeypatch.setenv(variable, "weights.npz")
+    assert engine.environment()[variable] == str(tmp_path / "weights.npz")
 
 
 def test_cells_are_chosen_by_their_fields(content):

@@ -4,14 +4,10 @@ from __future__ import annotations
 import json
 import math
 
-import numpy as np
 import pytest
-import real_data
 import torch
 
-from diff_smoe_rasterization.benchmarks import measure
-from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.measure import Measures, edge_mask, edge_psnr, headline_lpips
+from diff_smoe_rasterization.benchmarks.measure import Measures, edge_mask, edge_psnr
 from diff_smoe_rasterization.trainer.evaluation import summary
 
 
@@ -62,114 +58,6 @@ def test_measures_have_the_trainers_metrics_and_more():
     assert set(found) == {"psnr", "ssim", "psnr_float", "psnr_edge"}
     assert found["psnr"] == found["psnr_edge"] == math.inf  # a thousandth is rounded away in 8 bits
     assert found["psnr_float"] == pytest.approx(60, abs=0.01)  # float32 holds 0.801 - 0.8 to 6e-8
-
-
-def test_an_unknown_kind_of_lpips_is_refused():
-    with pytest.raises(BenchError, match="lpips_squeeze"):
-        Measures("cpu", ["lpips_squeeze"])
-
-
-def test_lpips_without_weights_is_null_with_the_reason(monkeypatch, tmp_path):
-    monkeypatch.setenv(measure.ALEX_VARIABLE, str(tmp_path / "absent.npz"))
-    measures = Measures("cpu", ["lpips_alex"])
-    row, = measures.lpips_of(measures(step_image(), step_image()))
-    assert row["value"] is None and row["kind"] == "lpips_alex" and "absent.npz" in row["reason"]
-
-
-def test_lpips_of_a_damaged_file_names_what_is_missing(monkeypatch, tmp_path):
-    path = tmp_path / "weights.npz"
-    np.savez(path, **{"conv1.weight": np.zeros(3)})
-    monkeypatch.setenv(measure.ALEX_VARIABLE, str(path))
-    row, = Measures("cpu", ["lpips_alex"]).lpips_of({})
-    assert "conv1.bias" in row["reason"]
-
-
-def test_the_first_kind_with_a_value_is_the_headline():
-    rows = [{"value": None, "kind": "a", "reason": "x"}, {"value": 0.1, "kind": "b", "reason": None}]
-    assert headline_lpips(rows)["kind"] == "b"
-    assert headline_lpips(rows[:1])["kind"] == "a"
-    assert headline_lpips([])["value"] is None
-
-
-def made_up_weights(path, seed=0):
-    """An AlexNet of the right shapes with random weights."""
-    random = np.random.RandomState(seed)
-    shapes = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
-    arrays = {}
-    for layer, (outputs, inputs, side) in enumerate(shapes):
-        arrays[f"conv{layer + 1}.weight"] = random.randn(outputs, inputs, side, side).astype(np.float32) / side
-        arrays[f"conv{layer + 1}.bias"] = random.randn(outputs).astype(np.float32)
-        arrays[f"lin{layer}.weight"] = random.rand(outputs).astype(np.float32)
-    np.savez(path, **arrays)
-    return arrays
-
-
-def lpips_by_modules(arrays, image, target):
-    """LPIPS by torch's modules, in torchvision's order of AlexNet's layers, in float64."""
-    nn = torch.nn
-    layers = [nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(),
-              nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, 1, 1), nn.ReLU(), nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(),
-              nn.Conv2d(256, 256, 3, 1, 1), nn.ReLU()]
-    convolutions = [layer for layer in layers if isinstance(layer, nn.Conv2d)]
-    for index, layer in enumerate(convolutions):
-        layer.weight = nn.Parameter(torch.from_numpy(arrays[f"conv{index + 1}.weight"]))
-        layer.bias = nn.Parameter(torch.from_numpy(arrays[f"conv{index + 1}.bias"]))
-    mean, deviation = (np.array(values)[:, None, None] for values in ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]))
-    total, index = 0.0, 0
-    with torch.no_grad():
-        a, b = (torch.from_numpy((x.double().numpy() - mean) / deviation)[None] for x in (image, target))
-        for layer in layers:
-            a, b = layer.double()(a), layer(b)
-            if isinstance(layer, nn.ReLU):
-                unit_a, unit_b = (nn.functional.normalize(x, dim=1).numpy()[0] for x in (a, b))
-                weight = arrays[f"lin{index}.weight"].astype(np.float64)[:, None, None]
-                total += float((weight * (unit_a - unit_b) ** 2).sum(axis=0).mean())
-                index += 1
-    assert index == 5
-    return total
-
-
-@pytest.fixture(params=["made up", "published"])
-def alex_weights(request, tmp_path):
-    path = tmp_path / "weights.npz"
-    if request.param == "made up":
-        made_up_weights(path)
-        return str(path)
-    folder = real_data.folder("bonsai")
-    return folder.replace("bonsai", "lpips_alex_v01.npz")
-
-
-def test_lpips_alex_agrees_with_torchs_modules(alex_weights):
-    """[0, 1] normalised by ImageNet's mean and deviation is [-1, 1] shifted and scaled as LPIPS has it."""
-    random = np.random.RandomState(1)
-    image, target = (torch.from_numpy(random.rand(3, 64, 72).astype(np.float32)) for _ in range(2))
-    network = measure.AlexLpips(alex_weights, "cpu")
-    assert network(image, image) == 0
-    with np.load(alex_weights) as file:
-        expected = lpips_by_modules({name: file[name] for name in file.files}, image, target)
-    # The float32 network is 1e-5 off the float64 one: sums of some thousand terms.
-    assert network(image, target) == pytest.approx(expected, rel=1e-4)
-    closer = 0.9 * target + 0.1 * image
-    assert network(closer, target) < network(image, target)
-
-
-def test_an_image_too_small_for_the_network_has_no_lpips(monkeypatch, tmp_path):
-    made_up_weights(tmp_path / "weights.npz")
-    monkeypatch.setenv(measure.ALEX_VARIABLE, str(tmp_path / "weights.npz"))
-    measures = Measures("cpu", ["lpips_alex"])
-    found = measures(step_image(8, 8, 4), step_image(8, 8, 4))
-    assert found["lpips_alex"] is None
-    assert "RuntimeError" in measures.lpips_of(found)[0]["reason"]
-
-
-def test_where_alexnets_weights_may_be_is_said(monkeypatch):
-    def offline(kind, device):
-        raise OSError("no network")
-
-    monkeypatch.setattr(measure, "lpips_network", offline)
-    alex, vgg = Measures("cpu", ["lpips_alex", "lpips_vgg_std"]).lpips_of({})
-    assert alex["reason"] == "no weights at hand: OSError: no network ($DSMOE_LPIPS_ALEX may name a file of them)"
-    assert vgg["reason"] == "no weights at hand: OSError: no network"
 
 
 def test_means_count_each_view_once_and_fps_is_the_inverse_of_the_mean_time():

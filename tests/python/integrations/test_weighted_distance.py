@@ -21,14 +21,19 @@ def test_the_nearest_row(monkeypatch, at_once):
     assert (indices == every.min(1).indices).all()
 
 
-@pytest.mark.parametrize("far", [1e6, 1e30, float("inf"), float("nan")])
-def test_a_row_of_the_codebook_far_from_all_others_changes_nothing(far):
-    """c3dgs makes such rows: it divides random ones by their trace, which may be small."""
+@pytest.mark.parametrize("far", [1e6, 1e30, 3e38, -3e38, float("inf"), float("nan")])
+def test_a_row_far_from_all_others_changes_nothing_for_these(far):
+    """c3dgs makes such rows of a codebook: it divides random ones by their trace, which may be small."""
     torch.manual_seed(0)
     coefs, codebook = 100 + torch.rand(37, 6), 100 + torch.rand(11, 6)
     codebook[3] = far
     every = (coefs.double()[:, None] - codebook.double()).square().sum(2).nan_to_num(nan=torch.inf)
     assert (weighted_distance.weightedDistance(coefs, codebook)[1] == every.min(1).indices).all()
+    codebook[3] = 100
+    nearest = (coefs.double()[:, None] - codebook.double()).square().sum(2).min(1).indices
+    coefs[5] = far
+    others = torch.arange(37) != 5
+    assert (weighted_distance.weightedDistance(coefs, codebook)[1] == nearest)[others].all()
 
 
 def test_no_rows_and_wrong_shapes():

@@ -1,0 +1,178 @@
+"""LPIPS from files of weights, against torch's own modules; and where there are none."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import real_data
+import torch
+from test_measure import step_image
+
+from diff_smoe_rasterization.benchmarks import lpips, measure
+from diff_smoe_rasterization.benchmarks.errors import BenchError
+from diff_smoe_rasterization.benchmarks.measure import Measures, headline_lpips
+
+
+def test_an_unknown_kind_of_lpips_is_refused():
+    with pytest.raises(BenchError, match="lpips_squeeze"):
+        Measures("cpu", ["lpips_squeeze"])
+
+
+def test_lpips_without_weights_is_null_with_the_reason(monkeypatch, tmp_path):
+    monkeypatch.setenv("DSMOE_LPIPS_ALEX", str(tmp_path / "absent.npz"))
+    measures = Measures("cpu", ["lpips_alex"])
+    row, = measures.lpips_of(measures(step_image(), step_image()))
+    assert row["value"] is None and row["kind"] == "lpips_alex" and "absent.npz" in row["reason"]
+
+
+@pytest.mark.parametrize("content, said", [
+    (b"", "is no .npz file that can be read (EOFError)"),
+    (b"some words", "is no .npz file that can be read"),
+    ("half", "is no .npz file that can be read"),
+    ({"conv1.weight": np.zeros((8, 3, 11, 11))}, "conv1.bias is missing; it must have shape [8]"),
+    ("vgg", "conv1.weight has shape [8, 3, 3, 3]; it must have shape [any, 3, 11, 11]")])
+def test_a_file_that_does_not_fit_is_the_reason(monkeypatch, tmp_path, content, said):
+    path = tmp_path / "weights.npz"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif isinstance(content, dict):
+        np.savez(path, **content)
+    else:
+        made_up_weights(path, "vgg" if content == "vgg" else "alex")
+        if content == "half":
+            path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+    monkeypatch.setenv("DSMOE_LPIPS_ALEX", str(path))
+    row, = Measures("cpu", ["lpips_alex"]).lpips_of({})
+    assert row["value"] is None and row["reason"].startswith(f"$DSMOE_LPIPS_ALEX: ValueError: {path}")
+    assert said in row["reason"]
+
+
+def test_a_weight_for_other_channels_is_the_reason(monkeypatch, tmp_path):
+    """One number would fit every shape."""
+    arrays = made_up_weights(tmp_path / "weights.npz")
+    np.savez(tmp_path / "weights.npz", **{**arrays, "lin0.weight": np.ones(1)})
+    monkeypatch.setenv("DSMOE_LPIPS_ALEX", str(tmp_path / "weights.npz"))
+    row, = Measures("cpu", ["lpips_alex"]).lpips_of({})
+    assert "lin0.weight has shape [1]; it must have shape [64]" in row["reason"]
+
+
+def test_the_first_kind_with_a_value_is_the_headline():
+    rows = [{"value": None, "kind": "a", "reason": "x"}, {"value": 0.1, "kind": "b", "reason": None}]
+    assert headline_lpips(rows)["kind"] == "b"
+    assert headline_lpips(rows[:1])["kind"] == "a"
+    assert headline_lpips([])["value"] is None
+
+
+def made_up_weights(path, net="alex", seed=0):
+    """Random weights of the right shapes; of a VGG with an eighth of its channels."""
+    random = np.random.RandomState(seed)
+    outputs = {"alex": (64, 192, 384, 256, 256), "vgg": (8, 8, 16, 16, 32, 32, 32, 64, 64, 64, 64, 64, 64)}[net]
+    sides = {"alex": (11, 5, 3, 3, 3), "vgg": (3,) * 13}[net]
+    compared = {"alex": outputs, "vgg": (8, 16, 32, 64, 64)}[net]
+    arrays = {}
+    for index, (inputs, channels, side) in enumerate(zip((3, *outputs), outputs, sides)):
+        weight = random.randn(channels, inputs, side, side) / (side * inputs ** 0.5)
+        arrays[f"conv{index + 1}.weight"] = weight.astype(np.float32)
+        arrays[f"conv{index + 1}.bias"] = random.randn(channels).astype(np.float32)
+    for index, channels in enumerate(compared):
+        arrays[f"lin{index}.weight"] = random.rand(channels).astype(np.float32)
+    np.savez(path, **arrays)
+    return arrays
+
+
+def modules(net):
+    """Torch's modules in torchvision's order of the network's layers: numbers of channels, and maximum poolings."""
+    nn = torch.nn
+    if net == "alex":
+        return [nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(),
+                nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, 1, 1), nn.ReLU(), nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(),
+                nn.Conv2d(256, 256, 3, 1, 1), nn.ReLU()]
+    layers = []
+    for word in "64 64 M 128 128 M 256 256 256 M 512 512 512 M 512 512 512".split():  # configuration D of its paper
+        layers += [nn.MaxPool2d(2, 2)] if word == "M" else [nn.Conv2d(1, 1, 3, 1, 1), nn.ReLU()]
+    return layers
+
+
+def lpips_by_modules(net, arrays, image, target, normalise):
+    """LPIPS by torch's modules in float64, of the last ReLU of each block (VGG), of each ReLU (AlexNet)."""
+    nn = torch.nn
+    layers = modules(net)
+    convolutions = [layer for layer in layers if isinstance(layer, nn.Conv2d)]
+    for index, layer in enumerate(convolutions):
+        layer.weight = nn.Parameter(torch.from_numpy(arrays[f"conv{index + 1}.weight"]))
+        layer.bias = nn.Parameter(torch.from_numpy(arrays[f"conv{index + 1}.bias"]))
+    # Of [0, 1], ImageNet's; of [-1, 1] as LPIPS prints them, rounded.
+    mean, deviation = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]) if normalise else \
+        ([-0.030, -0.088, -0.188], [0.458, 0.448, 0.450])
+    mean, deviation = (np.array(values)[:, None, None] for values in (mean, deviation))
+    total, index = 0.0, 0
+    with torch.no_grad():
+        a, b = (torch.from_numpy((x.double().numpy() - mean) / deviation)[None] for x in (image, target))
+        for place, layer in enumerate(layers):
+            a, b = layer.double()(a), layer(b)
+            ends_a_block = place + 1 == len(layers) or isinstance(layers[place + 1], nn.MaxPool2d)
+            if isinstance(layer, nn.ReLU) and (net == "alex" or ends_a_block):
+                unit_a, unit_b = (nn.functional.normalize(x, dim=1).numpy()[0] for x in (a, b))
+                weight = arrays[f"lin{index}.weight"].astype(np.float64).reshape(-1, 1, 1)
+                total += float((weight * (unit_a - unit_b) ** 2).sum(axis=0).mean())
+                index += 1
+    assert index == 5
+    return total
+
+
+@pytest.fixture(params=["made up alex", "made up vgg", "published alex"])
+def weights(request, tmp_path):
+    """The network, and its file."""
+    *made_up, net = request.param.split()
+    path = tmp_path / "weights.npz"
+    if made_up[0] == "made":
+        made_up_weights(path, net)
+        return net, str(path)
+    folder = real_data.folder("bonsai")
+    return net, folder.replace("bonsai", "lpips_alex_v01.npz")
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_lpips_of_a_file_agrees_with_torchs_modules(weights, normalise):
+    """[0, 1] normalised by ImageNet's mean and deviation is [-1, 1] shifted and scaled as LPIPS has it."""
+    net, path = weights
+    random = np.random.RandomState(1)
+    image, target = (torch.from_numpy(random.rand(3, 64, 72).astype(np.float32)) for _ in range(2))
+    network = lpips.FileLpips(net, path, normalise, "cpu")
+    assert network(image, image) == 0
+    with np.load(path) as file:
+        expected = lpips_by_modules(net, {name: file[name] for name in file.files}, image, target, normalise)
+    # The float32 network is 1e-5 off the float64 one: sums of some thousand terms.
+    assert network(image, target) == pytest.approx(expected, rel=1e-4)
+    closer = 0.9 * target + 0.1 * image
+    assert network(closer, target) < network(image, target)
+
+
+@pytest.mark.parametrize("kind, variable, net", [("lpips_alex", "DSMOE_LPIPS_ALEX", "alex"),
+                                                 ("lpips_vgg_std", "DSMOE_LPIPS_VGG", "vgg"),
+                                                 ("lpips_vgg_inria", "DSMOE_LPIPS_VGG", "vgg")])
+def test_each_kind_takes_its_file(monkeypatch, tmp_path, kind, variable, net):
+    made_up_weights(tmp_path / "weights.npz", net)
+    monkeypatch.setenv(variable, str(tmp_path / "weights.npz"))
+    measures = Measures("cpu", [kind])
+    value = measures(step_image(64, 64, 32) + 0.1, step_image(64, 64, 32))[kind]
+    expected = lpips.FileLpips(net, str(tmp_path / "weights.npz"), kind != "lpips_vgg_inria", "cpu")
+    assert value == expected(measure.quantised(step_image(64, 64, 32) + 0.1), step_image(64, 64, 32)) > 0
+
+
+def test_an_image_too_small_for_the_network_has_no_lpips(monkeypatch, tmp_path):
+    made_up_weights(tmp_path / "weights.npz")
+    monkeypatch.setenv("DSMOE_LPIPS_ALEX", str(tmp_path / "weights.npz"))
+    measures = Measures("cpu", ["lpips_alex"])
+    found = measures(step_image(8, 8, 4), step_image(8, 8, 4))
+    assert found["lpips_alex"] is None
+    assert "RuntimeError" in measures.lpips_of(found)[0]["reason"]
+
+
+def test_where_weights_may_be_is_said(monkeypatch):
+    def offline(kind, device):
+        raise OSError("no network")
+
+    monkeypatch.setattr(measure, "lpips_network", offline)
+    alex, vgg = Measures("cpu", ["lpips_alex", "lpips_vgg_std"]).lpips_of({})
+    assert alex["reason"] == "no weights at hand: OSError: no network ($DSMOE_LPIPS_ALEX may name a file of them)"
+    assert vgg["reason"] == "no weights at hand: OSError: no network ($DSMOE_LPIPS_VGG may name a file of them)"
