@@ -14,7 +14,8 @@ def weightedDistance(coefs: torch.Tensor, codebook: torch.Tensor) -> Tuple[torch
     """Returns each row's squared distance [N] to the nearest row of the codebook, and the number [N] of that, int64.
 
     Of rows whose distances differ by no more than rounding, either may be taken; the distance is of the one taken.
-    Rows of the codebook with an infinity or a NaN, or whose squares overflow, are taken last. Under TF32 or autocast the nearest is found with their precision.
+    Rows of the codebook with an infinity or a NaN, or whose squares overflow, are taken last. Under TF32 or autocast
+    the nearest is found with their precision.
     coefs: [N, K]; codebook: [C, K], C > 0, of the same type and on the same device. No gradient.
     Raises ValueError where the shapes do not fit.
     """
