@@ -211,7 +211,8 @@ def test_checkouts_that_are_not_there_are_named_before_anything_is_run(content, 
                            {"name": "2dgs", "label": "other", "path": "there"},  # that is enough beforehand
                            {"name": "c3dgs", "path": "there", "base": "neither"}]
     words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
-    lines = [f"method taming: path: {tmp_path / 'nowhere'}: no such folder, where a checkout of taming must be; name it",
+    lines = [f"method taming: path: {tmp_path / 'nowhere'}: no such folder, where a checkout of taming must be; "
+             "name it",
              f"method c3dgs: base: {tmp_path / 'neither'}: no such folder, where the 3DGS checkout must be that "
              "trains what c3dgs compresses; name it"]
     assert main([*words, "--dry-run"]) == 0
