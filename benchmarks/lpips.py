@@ -98,22 +98,27 @@ class FileLpips:
 
 
 def arrays_of(net: str, path: str) -> Dict[str, np.ndarray]:
-    """The arrays of a file of a network's weights. Raises OSError, and ValueError where they are not that."""
+    """The arrays of a network from a file, lin as [channels]. Raises OSError; ValueError where they are not that."""
     try:
         with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files}
+            found = {name: file[name] for name in file.files}
     except OSError:
         raise
     except Exception as error:  # damaged files: numpy, zipfile and zlib raise many kinds
         raise ValueError(f"{path} is no .npz file that can be read ({type(error).__name__})") from error
+    found = {name: array.reshape(-1) if name.startswith("lin") else array for name, array in found.items()}
     layout, channels = LAYOUTS[net], 3
+    arrays: Dict[str, np.ndarray] = {}
+
+    def take(name: str, shape: Tuple[Optional[int], ...]) -> np.ndarray:
+        arrays[name] = _checked(found, path, name, shape)
+        return arrays[name]
+
     for index, side in enumerate(layout.sides):
-        outputs = len(_checked(arrays, path, f"conv{index + 1}.weight", (None, channels, side, side)))
-        _checked(arrays, path, f"conv{index + 1}.bias", (outputs,))
-        channels = outputs
+        channels = len(take(f"conv{index + 1}.weight", (None, channels, side, side)))
+        take(f"conv{index + 1}.bias", (channels,))
         if index in layout.compared:
-            name = f"lin{layout.compared.index(index)}.weight"
-            _checked({name: arrays[name].reshape(-1)} if name in arrays else {}, path, name, (outputs,))
+            take(f"lin{layout.compared.index(index)}.weight", (channels,))
     return arrays
 
 

@@ -80,10 +80,12 @@ class Patch:
         changed = {rule: tuple(name for name in sorted(self.files)
                                if rule.looks_at(self.files[name]) and self._changes(modernise.run, rule, name))
                    for rule in modernise.RULES}
-        after = {change.name: change.after for change in self.changes()}
-        return tuple(Modernised(rule.name, rule.reason, names, tuple(
-            name for name in names if self._is_pending(rule, name, read_now(name), after[name])))
-            for rule, names in changed.items())
+        states = {change.name: (read_now(change.name), change.after) for change in self.changes()}
+        modernised = []
+        for rule, names in changed.items():
+            pending = tuple(name for name in names if self._is_pending(rule, name, *states[name]))
+            modernised.append(Modernised(rule.name, rule.reason, names, pending))
+        return tuple(modernised)
 
     def _is_pending(self, rule: modernise.Rule, name: str, now: Optional[bytes], after: bytes) -> bool:
         """Whether a rule that changes a file is still to be applied to what the file is now.
