@@ -74,23 +74,27 @@ def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
     path = method[key]
     if not CHECKOUTS[method["name"]]:
         return path
-    verdict = patches.check(path)
-    if method["variant"] == "unpatched" and verdict != "patchable":
-        raise BenchError(f"{path} is {verdict}, and the suite says it is an unpatched checkout (`dsmoe patch revert` "
-                         "takes a patch back)")
-    if method["variant"] == "unpatched" or verdict == "patched":
+    found = patches.inspect(path)
+    is_patched, is_fused = found.verdict == "patched", "fuse" in found.options
+    if method["variant"] == "unpatched" and found.verdict != "patchable":
+        raise BenchError(f"{path} is {found.verdict}, and the suite says it is an unpatched checkout (`dsmoe patch "
+                         "revert` takes a patch back)")
+    if method["variant"] == "patched" and is_patched and is_fused:
+        raise BenchError(f"{path} is patched with --fuse, which the suite calls `variant: fused`")
+    if method["variant"] == "unpatched" or (is_patched and is_fused == (method["variant"] == "fused")):
         return path
-    return patched_copy(path, os.path.join(results, "checkouts", f"{method['label']}-{key}"))
+    folder = os.path.join(results, "checkouts", f"{method['label']}-{key}")
+    return patched_copy(path, folder, fuse=method["variant"] == "fused")
 
 
-def patched_copy(path: str, folder: str) -> str:
+def patched_copy(path: str, folder: str, fuse: bool) -> str:
     """A patched copy of a checkout, which itself stays as it is; made once. Raises PatchError."""
     if os.path.isdir(folder):
-        patches.apply(folder, modernise=True)  # what an interruption left is finished; else nothing is written
+        patches.apply(folder, modernise=True, fuse=fuse)  # what an interruption left is finished; else nothing is done
         return folder
     part = folder + ".part"
     shutil.rmtree(part, ignore_errors=True)
     shutil.copytree(path, part, ignore=NOT_COPIED)
-    patches.apply(part, modernise=True)
+    patches.apply(part, modernise=True, fuse=fuse)
     os.rename(part, folder)
     return folder

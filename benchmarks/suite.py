@@ -179,9 +179,9 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     arguments = [str(word) for word in given.get("arguments", [])]
     _no_protocol_among(arguments, where)
     variant = given.setdefault("variant", "patched" if CHECKOUTS[name] else "unpatched")
-    if variant == "native" or (variant == "patched" and not CHECKOUTS[name]):
+    if variant == "native" or (variant != "unpatched" and not CHECKOUTS[name]):
         raise BenchError(f"{where}.variant: is {variant!r}; {name} can be "
-                         + ("unpatched or patched" if CHECKOUTS[name] else "unpatched only"))
+                         + ("unpatched, patched or fused" if CHECKOUTS[name] else "unpatched only"))
     if variant == "unpatched":
         if axes.get("blend_modes", ["alpha"]) != ["alpha"]:
             raise BenchError(f"{where}.blend_modes: an unpatched checkout has its own blending alone, which is `alpha`")
@@ -203,7 +203,7 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     given.setdefault("pythonpath", [])
     paths = _paths({key: given[key] for key in ("path", "base", "pythonpath") if key in given}, where, folder)
     python = os.path.expanduser(given["python"]) if "python" in given else None
-    return {"label": name if variant == "patched" else f"{name}-unpatched", **given, **paths, "python": python,
+    return {"label": name if variant == "patched" else f"{name}-{variant}", **given, **paths, "python": python,
             "arguments": arguments, "axes": axes}
 
 

@@ -123,6 +123,8 @@ def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
         if name != "revert":
             action.add_argument("--modernise", action="store_true",
                                 help="also what the trainer needs to start on today's torch, CUDA and Python")
+            action.add_argument("--fuse", action="store_true",
+                                help="also SSIM and Adam by this package's kernels: the same results, sooner")
             action.add_argument("--trainer", metavar="NAME", help="which trainer it is (default: found out)")
         if name == "apply":
             action.add_argument("--dry-run", action="store_true", help="show the changes, write nothing")

@@ -11,11 +11,12 @@ from .extension import _C  # noqa: F401  (loading it registers the ops)
 _OPS = torch.ops.diff_smoe_rasterization
 
 
-class FusedAdam(torch.optim.Optimizer):
+class FusedAdam(torch.optim.Adam):
     """Adam as torch.optim.Adam computes it, but for rounding: one kernel launch a step for each precision and device.
 
     The state of a parameter is {"step": int, "exp_avg": tensor, "exp_avg_sq": tensor}; a step counted by a tensor, as
-    torch.optim.Adam keeps it, is taken too. Parameters and moments are dense, float32 or float64.
+    torch.optim.Adam keeps it, is taken too, and state_dict() of each is taken by the other. Parameters and moments are
+    dense, float32 or float64. Raises ValueError where a group asks for weight_decay, amsgrad or maximize.
     """
 
     def __init__(self, params: Iterable[Any], lr: float = 1e-3, betas: Any = (0.9, 0.999), eps: float = 1e-8) -> None:
@@ -25,7 +26,7 @@ class FusedAdam(torch.optim.Optimizer):
             raise ValueError(f"FusedAdam: eps is {eps}; it must be 0 or more")
         if not all(0 <= beta < 1 for beta in betas):
             raise ValueError(f"FusedAdam: betas is {betas}; both must be in [0, 1)")
-        super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps})
+        super().__init__(params, lr=lr, betas=tuple(betas), eps=eps)
 
     @torch.no_grad()
     def step(self, closure: Optional[Callable[[], Any]] = None) -> Any:
@@ -36,6 +37,10 @@ class FusedAdam(torch.optim.Optimizer):
                 loss = closure()
         launches: Dict[Any, _Launch] = {}
         for group in self.param_groups:
+            for option in ("weight_decay", "amsgrad", "maximize"):
+                if group.get(option):  # absent from a state that an earlier version saved
+                    raise ValueError(f"FusedAdam: {option} of group {group.get('name', '')!r} is {group[option]}, which "
+                                     "it does not have; take torch.optim.Adam")
             beta1, beta2 = group["betas"]
             for parameter in group["params"]:
                 if parameter.grad is None:

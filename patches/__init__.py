@@ -7,10 +7,10 @@ engine.py plans and carries out; trainers/ has a short file of rules for each tr
 changes a file; shims/ is what `dsmoe run` puts in front of an unmodified checkout. runtime.py is what a patched trainer
 imports.
 """
-from .engine import apply, check, diff, plan, revert
+from .engine import apply, check, diff, inspect, plan, revert
 from .errors import PatchError
 from .facts import names
 
 TRAINERS = names()
 
-__all__ = ["PatchError", "TRAINERS", "apply", "check", "diff", "plan", "revert"]
+__all__ = ["PatchError", "TRAINERS", "apply", "check", "diff", "inspect", "plan", "revert"]

@@ -5,7 +5,7 @@ another: take a kind of node, say in `leave_...` what it becomes, count, and add
 """
 from __future__ import annotations
 
-from typing import List, NamedTuple, Sequence
+from typing import Dict, List, NamedTuple, Sequence, Tuple
 
 import libcst as cst
 from libcst.helpers import get_full_name_for_node
@@ -145,6 +145,44 @@ class _PipeBlendMode(Codemod):
 
     def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
         return with_import(updated_node, RUNTIME, "blend_mode_of") if self.pending else updated_node
+
+
+class CallOfOurs(Codemod):
+    """`FOREIGN(...)` becomes `OURS(...)`, imported from SOURCE, where it has no other keywords than these."""
+
+    foreign = ours = ""
+    source = RUNTIME
+    keywords: Tuple[str, ...] = ()
+
+    def fits(self, given: Dict[str, cst.BaseExpression]) -> bool:
+        """Whether a call with these values of its keywords is one to change."""
+        return True
+
+    def leave_Call(self, original_node: cst.Call, updated_node: cst.Call) -> cst.Call:
+        given = {argument.keyword.value: argument.value for argument in updated_node.args if argument.keyword}
+        if (get_full_name_for_node(updated_node.func) != self.foreign or not set(given) <= set(self.keywords)
+                or not self.fits(given)):
+            return updated_node
+        self.pending += 1
+        return updated_node.with_changes(func=cst.Name(self.ours))
+
+    def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
+        return with_import(updated_node, self.source, self.ours) if self.pending else updated_node
+
+
+class Decorated(Codemod):
+    """A function at the top of a module that has no decorator gets one of runtime.py."""
+
+    function = decorator = ""
+
+    def changed_function(self, function: cst.FunctionDef) -> cst.FunctionDef:
+        if self.within or function.name.value != self.function or function.decorators:
+            return function
+        self.pending += 1
+        return function.with_changes(decorators=[cst.Decorator(cst.Name(self.decorator))])
+
+    def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
+        return with_import(updated_node, RUNTIME, self.decorator) if self.pending else updated_node
 
 
 CODEMODS = {ImportRasterizer: _ImportRasterizer, SettingsBlendMode: _SettingsBlendMode, ModelParameter: _ModelParameter,

@@ -4,7 +4,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from typing import List
+from typing import List, Tuple
 
 from . import engine
 from .errors import PatchError
@@ -13,7 +13,7 @@ from .errors import PatchError
 def apply(arguments: argparse.Namespace) -> int:
     """Patches, or with --dry-run shows what a patch would change."""
     if arguments.dry_run:
-        planned = engine.plan(arguments.path, arguments.modernise, arguments.trainer)
+        planned = engine.plan(arguments.path, arguments.modernise, arguments.trainer, arguments.fuse)
         todo = engine.pending(planned)
         for name, data in todo.items():
             sys.stdout.write(engine.diff_of(name, (planned.root / name).read_bytes(), data))
@@ -21,7 +21,7 @@ def apply(arguments: argparse.Namespace) -> int:
             _print_notes(planned)
             return 0
     else:
-        planned = engine.apply(arguments.path, arguments.modernise, arguments.trainer)
+        planned = engine.apply(arguments.path, arguments.modernise, arguments.trainer, arguments.fuse)
     verdict = planned.verdict
     if planned.written:
         print(f"{arguments.path}: patched ({verdict.trainer})")
@@ -38,7 +38,7 @@ def apply(arguments: argparse.Namespace) -> int:
 
 def check(arguments: argparse.Namespace) -> int:
     """Says in one word how the checkout is, and why."""
-    planned = engine.inspect(arguments.path, arguments.modernise, arguments.trainer)
+    planned = engine.inspect(arguments.path, arguments.modernise, arguments.trainer, arguments.fuse)
     verdict = planned.verdict
     trainer = f" ({verdict.trainer})" if verdict.trainer else ""
     print(f"{arguments.path}: {verdict}{trainer}")
@@ -50,26 +50,27 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _remarks(planned: engine.Plan, arguments: argparse.Namespace) -> List[str]:
-    """The notes on a checkout, and what to type where rules of --modernise are still not applied."""
-    pending = not planned.written and any(rule.pending for rule in planned.modernised)
-    return [*planned.notes] + ([_how_to_modernise(planned, arguments)] if pending else [])
+    """The notes on a checkout, and what to type where rules that an option asks for are still not applied."""
+    pending = [] if planned.written else [rule.option for rule in planned.requested if rule.pending]
+    return [*planned.notes] + ([_how_to_apply(tuple(dict.fromkeys(pending)), planned, arguments)] if pending else [])
 
 
-def _how_to_modernise(planned: engine.Plan, arguments: argparse.Namespace) -> str:
-    """Says what to type for rules of --modernise that are not applied, or why they cannot be."""
+def _how_to_apply(options: Tuple[str, ...], planned: engine.Plan, arguments: argparse.Namespace) -> str:
+    """Says what to type for rules of these options that are not applied, or why they cannot be."""
     try:
         is_written = bool(engine.pending(planned))
     except PatchError as error:
-        return f"modernise: cannot be applied as it is: {error}"
+        return f"{', '.join(options)}: cannot be applied as it is: {error}"
     trainer = ["--trainer", arguments.trainer] if arguments.trainer else []
-    command = " ".join(map(shlex.quote, ["dsmoe", "patch", "apply", "--modernise", *trainer, str(arguments.path)]))
+    command = " ".join(map(shlex.quote, ["dsmoe", "patch", "apply", *engine.words_of(options).split(), *trainer,
+                                         str(arguments.path)]))
     before = "" if is_written else "undo your edit of patched files, then "
-    return f"modernise: to apply what is not, {before}type: {command}"
+    return f"{', '.join(options)}: to apply what is not, {before}type: {command}"
 
 
 def diff(arguments: argparse.Namespace) -> int:
     """Shows what the patch changes, against the files as they were before any patch."""
-    planned = engine.plan(arguments.path, arguments.modernise, arguments.trainer)
+    planned = engine.plan(arguments.path, arguments.modernise, arguments.trainer, arguments.fuse)
     for change in planned.changes:
         sys.stdout.write(engine.diff_of(change.name, change.before, change.after))
     if planned.verdict == "patched" and planned.record is None:

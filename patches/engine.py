@@ -22,7 +22,7 @@ from .scope import build_files, notes_on_scripts, other_files, python_files
 from .trainers import TRAINERS
 
 if TYPE_CHECKING:
-    from .patch import Change, Modernised  # which need LibCST
+    from .patch import Change, Requested  # which need LibCST
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
 PathLike = Union[str, Path]
@@ -48,23 +48,26 @@ class Plan(NamedTuple):
     verdict: Verdict
     changes: Tuple[Change, ...]
     remarks: Tuple[str, ...]  # which scripts no rule reaches, which files are left as they are
-    modernise: bool
+    options: Tuple[str, ...]  # of the patch, "modernise" and "fuse"; also those that it was made with
     record: Optional[Record]
-    modernised: Tuple[Modernised, ...] = ()  # every rule of --modernise, where it is asked for
+    requested: Tuple[Requested, ...] = ()  # every rule that the options ask for
     written: bool = False  # whether `apply` wrote files by this plan
 
     @property
     def notes(self) -> Tuple[str, ...]:
-        """The remarks, and of each rule of --modernise where it is applied, or that it is skipped."""
-        matching = [rule.note(self.written) for rule in self.modernised if rule.files]
-        skipped = [rule.rule for rule in self.modernised if not rule.files]
-        rest = [f"modernise: skipped, nothing matches: {', '.join(skipped)}"] if skipped else []
-        return (*self.remarks, *matching, *rest)
+        """The remarks, and of each rule that an option asks for where it is applied, or that it is skipped."""
+        notes = []
+        for option in self.options:
+            rules = [rule for rule in self.requested if rule.option == option]
+            notes += [rule.note(self.written) for rule in rules if rule.files]
+            skipped = [rule.rule for rule in rules if not rule.files]
+            notes += [f"{option}: skipped, nothing matches: {', '.join(skipped)}"] if skipped else []
+        return (*self.remarks, *notes)
 
 
-def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
     """Plans the patch of a checkout, also of one that is patched. Raises PatchError where it is refused."""
-    planned = inspect(path, modernise, trainer)
+    planned = inspect(path, modernise, trainer, fuse)
     if planned.verdict in ("patchable", "patched"):
         return planned
     if planned.verdict == "half-patched" and planned.record and planned.record.can_be_finished():
@@ -72,24 +75,24 @@ def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None)
     raise PatchError(refusal(planned.verdict))
 
 
-def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Verdict:
+def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Verdict:
     """Says how a checkout is: unknown, patchable, patched, half-patched or drifted, with `.trainer` and `.reasons`."""
-    return inspect(path, modernise, trainer).verdict
+    return inspect(path, modernise, trainer, fuse).verdict
 
 
-def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> str:
+def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> str:
     """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
-    changes = plan(path, modernise, trainer).changes
+    changes = plan(path, modernise, trainer, fuse).changes
     return "".join(diff_of(change.name, change.before, change.after) for change in changes)
 
 
-def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
     """Patches a checkout; writes nothing where it is patched already.
 
     Returns the plan; its `verdict` is how the checkout was before, `written` whether anything was changed.
     Raises PatchError where it is refused, and then every file is as it was.
     """
-    planned = plan(path, modernise, trainer)
+    planned = plan(path, modernise, trainer, fuse)
     root, record, todo = planned.root, planned.record, pending(planned)
     if not todo:
         if record and not record.manifest["complete"]:
@@ -100,7 +103,7 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         check_writable(root, name)
     if record is None and (root / FOLDER / "manifest.json").exists():  # of a patch of which nothing is left
         Record.load(root).remove()
-    notes = {"version": __version__, "trainer": planned.verdict.trainer, "modernise": planned.modernise,
+    notes = {"version": __version__, "trainer": planned.verdict.trainer, "options": planned.options,
              "rules": {change.name: change.rules for change in planned.changes}}
     try:
         begun = Record.write(root, before, after, notes)
@@ -126,17 +129,17 @@ def pending(planned: Plan) -> Dict[str, bytes]:
     """Returns what `apply` would write, by the files' names. Raises PatchError where it refuses."""
     record = planned.record
     if planned.verdict == "patched" and record is None:
-        if planned.modernise and planned.changes:
+        if planned.options and planned.changes:
             raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
                              f"checkout is patched and has no {FOLDER}: take the patch back by your version control, "
-                             "then apply it with --modernise")
+                             f"then apply it with {words_of(planned.options)}")
         return {}
     edited = [name for name, state in record.states().items() if state == "changed"] if record else []
-    if edited and planned.modernise == record.manifest["modernise"]:
+    if edited and planned.options == options_of(record):
         return {}  # nothing is written over an edit
     if edited:
         raise PatchError(f"{edited[0]}: was changed since it was patched: undo your edit, then apply it with "
-                         "--modernise")
+                         f"{words_of(planned.options)}")
     return {name: after for name, (_, after) in _outcome(planned).items()
             if (planned.root / name).read_bytes() != after}
 
@@ -179,14 +182,15 @@ _SINCE = {"changed": "was changed since it was patched", "gone": "was removed si
           "original": "is the original, though the record says that it was patched; `revert` puts back the others too"}
 
 
-def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None) -> Plan:
+def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
     """Plans the patch of a checkout in whatever state it is."""
     source.have_libcst()
     from .patch import Patch
 
     root = _root(path)
     record = Record.in_force(root)
-    modernise = modernise or bool(record and record.manifest["modernise"])
+    before = options_of(record)
+    options = tuple(name for name, wanted in (("modernise", modernise), ("fuse", fuse)) if wanted or name in before)
 
     def read(name: str) -> Optional[bytes]:
         if record and name in record.files:
@@ -194,15 +198,15 @@ def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = No
         return _read(root / name)
 
     if read(GR) is None:
-        return Plan(root, Verdict("unknown", None, [_no_renderer(root)]), (), (), modernise, record)
+        return Plan(root, Verdict("unknown", None, [_no_renderer(root)]), (), (), options, record)
     chosen, reason = _trainer(read, trainer or (record.manifest["trainer"] if record else None))
     if chosen is None:
-        return Plan(root, Verdict("unknown", None, [reason]), (), (), modernise, record)
+        return Plan(root, Verdict("unknown", None, [reason]), (), (), options, record)
     files = {name: read(name) for name in python_files(root)}
-    if modernise:
+    if "modernise" in options:
         files.update((name, read(name)) for name in build_files(root))
     patch = Patch(files, chosen)
-    modernised = patch.modernise(lambda name: _read(root / name)) if modernise else ()
+    requested = patch.request(options, lambda name: _read(root / name))
     state, reasons = patch.state()
     if record and not patch.problems:
         state, reasons = _state_by_record(root, record, chosen)
@@ -213,7 +217,7 @@ def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = No
         patch.notes.insert(0, f"--trainer {trainer}: by what it imports and calls this is {looks_like.name}, whose "
                               f"rasterizer has another API ({looks_like.flavour}, not {chosen.flavour})")
     remarks = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
-    return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), remarks, modernise, record, modernised)
+    return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), remarks, options, record, requested)
 
 
 def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str, List[str]]:
@@ -221,7 +225,7 @@ def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str,
     from .patch import Patch
 
     states = record.states()
-    by = [f"by version {record.manifest['version']}" + (", with --modernise" if record.manifest["modernise"] else "")]
+    by = [", with ".join(filter(None, [f"by version {record.manifest['version']}", words_of(options_of(record))]))]
     if set(states.values()) <= {"patched"}:
         return "patched", by
     if record.can_be_finished():
@@ -232,6 +236,19 @@ def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str,
             return "patched", by + [f"{name}: was edited since; every rule for the blend mode is still applied"
                                     for name, state in states.items() if state == "changed"]
     return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
+
+
+def options_of(record: Optional[Record]) -> Tuple[str, ...]:
+    """The options that a patch was made with."""
+    if record is None:
+        return ()
+    earlier = ["modernise"] if record.manifest.get("modernise") else []  # as records were written that had no "options"
+    return tuple(record.manifest.get("options", earlier))
+
+
+def words_of(options: Tuple[str, ...]) -> str:
+    """The options as they are typed."""
+    return " ".join("--" + option for option in options)
 
 
 def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:

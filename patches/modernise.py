@@ -1,34 +1,17 @@
 """What a trainer needs to start on today's torch, CUDA and Python, and has nothing to do with blending: --modernise.
 
-Each rule has a name and the reason for it, and is a LibCST codemod as those in codemods.py. One that matches nothing is
-skipped.
+Each rule is a LibCST codemod as those in codemods.py. One that matches nothing is skipped.
 """
 from __future__ import annotations
 
-from typing import Dict, NamedTuple, Tuple, Type
+from typing import Dict, Tuple
 
 import libcst as cst
 from libcst.helpers import get_full_name_for_node
 
-from .codemods import Codemod, Outcome, statement, with_import
+from .codemods import CallOfOurs, Codemod, Decorated, statement
+from .optional import Rule
 from .rules import INTEGRATIONS, RUNTIME
-
-
-class Rule(NamedTuple):
-    """A rule of --modernise."""
-
-    name: str
-    reason: str
-    codemod: Type[Codemod]
-    hints: Tuple[str, ...]  # a file without any of these words cannot match and is not parsed
-
-    def looks_at(self, data: bytes) -> bool:
-        return any(hint.encode() in data for hint in self.hints)
-
-
-def run(rule: Rule, tree: cst.Module) -> Outcome:
-    """Applies a rule to a tree."""
-    return rule.codemod(rule).applied_to(tree)
 
 
 class _ImportFrom(Codemod):
@@ -136,46 +119,17 @@ class _LpipsWhenUsed(Codemod):
                                 body=[only.with_changes(value=value)])
 
 
-class _LpipsOffline(Codemod):
-    """The function `lpips` of lpipsPyTorch gets a decorator."""
+class _LpipsOffline(Decorated):
+    """Of lpipsPyTorch."""
 
-    def changed_function(self, function: cst.FunctionDef) -> cst.FunctionDef:
-        if self.within or function.name.value != "lpips" or function.decorators:
-            return function
-        self.pending += 1
-        return function.with_changes(decorators=[cst.Decorator(cst.Name("nan_without_network"))])
-
-    def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
-        return with_import(updated_node, RUNTIME, "nan_without_network") if self.pending else updated_node
+    function, decorator = "lpips", "nan_without_network"
 
 
-class _CallOfOurs(Codemod):
-    """`FOREIGN(...)` becomes `OURS(...)`, where it has no other keywords than these."""
-
-    foreign = ours = ""
-    keywords: Tuple[str, ...] = ()
-
-    def fits(self, given: Dict[str, cst.BaseExpression]) -> bool:
-        """Whether a call with these values of its keywords is one to change."""
-        return True
-
-    def leave_Call(self, original_node: cst.Call, updated_node: cst.Call) -> cst.Call:
-        given = {argument.keyword.value: argument.value for argument in updated_node.args if argument.keyword}
-        if (get_full_name_for_node(updated_node.func) != self.foreign or not set(given) <= set(self.keywords)
-                or not self.fits(given)):
-            return updated_node
-        self.pending += 1
-        return updated_node.with_changes(func=cst.Name(self.ours))
-
-    def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
-        return with_import(updated_node, RUNTIME, self.ours) if self.pending else updated_node
-
-
-class _EighInParts(_CallOfOurs):
+class _EighInParts(CallOfOurs):
     foreign, ours, keywords = "torch.linalg.eigh", "eigh_in_parts", ("UPLO",)
 
 
-class _UniqueRows(_CallOfOurs):
+class _UniqueRows(CallOfOurs):
     foreign, ours = "torch.unique", "unique_rows"
     keywords = ("sorted", "return_inverse", "return_counts", "dim")
 

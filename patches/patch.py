@@ -1,9 +1,9 @@
 """The rules of a trainer, applied to its files in memory."""
 from __future__ import annotations
 
-from typing import Callable, Dict, List, NamedTuple, Optional, Tuple
+from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Tuple
 
-from . import codemods, modernise, source
+from . import codemods, fuse, modernise, optional, source
 from .errors import PatchError
 from .record import FOLDER
 from .rules import RASTERIZER, ImportRasterizer, Trainer
@@ -18,9 +18,13 @@ class Change(NamedTuple):
     rules: Tuple[str, ...]
 
 
-class Modernised(NamedTuple):
-    """What becomes of a rule of --modernise; without files nothing matches it."""
+OPTIONS = {"modernise": modernise.RULES, "fuse": fuse.RULES}
 
+
+class Requested(NamedTuple):
+    """What becomes of a rule that an option asks for; without files nothing matches it."""
+
+    option: str
     rule: str
     reason: str
     files: Tuple[str, ...]  # that it changes, as they were before any patch
@@ -31,7 +35,7 @@ class Modernised(NamedTuple):
         todo = () if written else self.pending
         states = {"applied in": [name for name in self.files if name not in todo], "not applied in": todo}
         said = ", ".join(f"{state} {', '.join(names)}" for state, names in states.items() if names)
-        return f"modernise {self.rule}: {said}: {self.reason}"
+        return f"{self.option} {self.rule}: {said}: {self.reason}"
 
 
 class Patch:
@@ -72,22 +76,22 @@ class Patch:
                     self.notes.append(f"{name}: the import from {RASTERIZER}._C stays; where it fails, the file has to "
                                       "do without what it names")
 
-    def modernise(self, read_now: Callable[[str], Optional[bytes]]) -> Tuple[Modernised, ...]:
-        """Applies the rules of --modernise; returns what becomes of each.
+    def request(self, options: Iterable[str], read_now: Callable[[str], Optional[bytes]]) -> Tuple[Requested, ...]:
+        """Applies the rules of these of OPTIONS; returns what becomes of each.
 
         read_now: the bytes of a file as it is now, patched or not; None where it is gone.
         """
-        changed = {rule: tuple(name for name in sorted(self.files)
-                               if rule.looks_at(self.files[name]) and self._changes(modernise.run, rule, name))
-                   for rule in modernise.RULES}
+        changed = {(option, rule): tuple(name for name in sorted(self.files) if rule.looks_at(self.files[name])
+                                         and self._changes(optional.run, rule, name))
+                   for option in options for rule in OPTIONS[option]}
         states = {change.name: (read_now(change.name), change.after) for change in self.changes()}
-        modernised = []
-        for rule, names in changed.items():
+        requested = []
+        for (option, rule), names in changed.items():
             pending = tuple(name for name in names if self._is_pending(rule, name, *states[name]))
-            modernised.append(Modernised(rule.name, rule.reason, names, pending))
-        return tuple(modernised)
+            requested.append(Requested(option, rule.name, rule.reason, names, pending))
+        return tuple(requested)
 
-    def _is_pending(self, rule: modernise.Rule, name: str, now: Optional[bytes], after: bytes) -> bool:
+    def _is_pending(self, rule: optional.Rule, name: str, now: Optional[bytes], after: bytes) -> bool:
         """Whether a rule that changes a file is still to be applied to what the file is now.
 
         after: what the file is once every rule is applied.
@@ -97,7 +101,7 @@ class Patch:
         if now == after:
             return False
         try:
-            return rule.looks_at(now) and modernise.run(rule, source.parse(name, now)[0]).pending > 0
+            return rule.looks_at(now) and optional.run(rule, source.parse(name, now)[0]).pending > 0
         except PatchError:  # an edit that cannot be read
             return True
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 from typing import NamedTuple, Tuple
 
 RASTERIZER = "diff_gaussian_rasterization"
-INTEGRATIONS = "diff_smoe_rasterization.integrations"
-RUNTIME = "diff_smoe_rasterization.patches.runtime"
+PACKAGE = "diff_smoe_rasterization"
+INTEGRATIONS = f"{PACKAGE}.integrations"
+RUNTIME = f"{PACKAGE}.patches.runtime"
 
 
 class ImportRasterizer(NamedTuple):

@@ -112,6 +112,62 @@ def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+# Of the largest value. A variance E[x^2] - E[x]^2 of the pair below is 4e-3 of E[x^2], so that what float32 rounds off,
+# some 1e-7, becomes some 1e-5 to 1e-4 of it; another window, border or constant makes several per cent.
+SSIM_ROUNDING = 1e-3
+
+
+def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a trainer's ssim(img1, img2, window_size=11, size_average=True), computed by `fused_ssim` where it can be.
+
+    img1, img2: [3, H, W] or [B, 3, H, W]. When it is called first both are computed of a small pair of images: where
+    they differ in value or gradient the trainer's own stays, and a line on stderr says so. It is also called for other
+    windows and types, means of each image, and gradients by img2, which the kernel does not have.
+    """
+    @functools.lru_cache(maxsize=None)
+    def is_the_same(device: Any, dimensions: int) -> bool:
+        from diff_smoe_rasterization import fused_ssim
+
+        ours, theirs = (ssim_and_gradient(each, device, dimensions) for each in (fused_ssim, ssim))
+        differs = max(float((one - other).abs().max() / other.abs().max()) for one, other in zip(ours, theirs))
+        if not differs <= SSIM_ROUNDING:
+            _say(f"--fuse: {ssim.__module__}.{ssim.__name__} is not SSIM as it is fused here (they differ by "
+                 f"{differs:.1e} of the largest value): it is computed as before")
+        return differs <= SSIM_ROUNDING
+
+    @functools.wraps(ssim)
+    def call(img1: Any, img2: Any, *arguments: Any, **keywords: Any) -> Any:
+        import torch
+        from diff_smoe_rasterization import fused_ssim
+
+        as_fused = {"window_size": 11, "size_average": True}
+        asked = {**as_fused, **dict(zip(as_fused, arguments)), **keywords}
+        fits = (asked == as_fused and img1.dim() in (3, 4) and img1.shape == img2.shape
+                and img1.dtype == img2.dtype == torch.float32 and img1.device == img2.device
+                and not (img2.requires_grad and torch.is_grad_enabled()))
+        if not fits or not is_the_same(img1.device, img1.dim()):
+            return ssim(img1, img2, *arguments, **keywords)
+        return fused_ssim(img1, img2)
+
+    return call
+
+
+def ssim_and_gradient(ssim: Callable[..., Any], device: Any, dimensions: int) -> Any:
+    """Returns ssim(img1, img2) of a pair of images, [3, 24, 31] or [1, 3, 24, 31], and its gradient by img1.
+
+    Their contrast is small, so that SSIM's constants count, and so are they, so that their border does.
+    """
+    import torch
+
+    shape = (1, 3, 24, 31)[-dimensions:]
+    noise = torch.rand(2, *shape, generator=torch.Generator().manual_seed(0)).to(device)
+    with torch.enable_grad():
+        img1 = (0.4 + 0.1 * noise[0]).requires_grad_()
+        value = ssim(img1, 0.5 + 0.1 * noise[1])
+        gradient, = torch.autograd.grad(value, img1)
+    return value.detach(), gradient
+
+
 EIGH_AT_ONCE = 16_384  # cuSOLVER's batched solver of CUDA 12.8 and later fails on batches somewhere above 32,000
 
 

@@ -82,7 +82,7 @@ class ThreeDGS:
             words += ["--opacity_reset_interval", reset]
         if config.antialiasing:
             words.append("--antialiasing")
-        if self.method["variant"] == "patched":
+        if self.method["variant"] != "unpatched":
             words += ["--blend_mode", config.blend_mode]
         return [str(word) for word in words] + self.own_arguments()
 

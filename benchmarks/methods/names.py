@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 NATIVE = "native"
-VARIANTS = ("native", "unpatched", "patched")
+VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse
 # Of each public trainer, whether it can be patched to this package's rasterizer (patches/).
 CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
              "2dgs": False, "dbs": False}

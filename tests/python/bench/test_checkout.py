@@ -250,6 +250,24 @@ def test_a_patched_checkout_is_a_copy(small, tmp_path):
     assert preparation.patches.check(cell["method"]["path"]) == "patched"
 
 
+def test_a_fused_checkout_is_a_copy_of_its_own(small, tmp_path):
+    cell = small.cell("3dgs-2023", variant="fused")
+    assert cell["method"]["label"] == "3dgs-2023-fused" and "refused" not in cell["method"]
+    patched = small.cell("3dgs-2023")["method"]["path"]
+    losses = [Path(path, "utils", "loss_utils.py").read_text() for path in (cell["method"]["path"], patched)]
+    assert ["@fused_where_equal" in text for text in losses] == [True, False]
+    row = row_of(cell, tmp_path / "out")
+    assert row["ok"] and row["variant"] == "fused" and row["protocol"]["arguments"][-2:] == ["--blend_mode", "smoe"]
+    # A checkout that was fused already is used as it is, and is not the patched one.
+    for path, variant, expected in ((cell["method"]["path"], "fused", cell["method"]["path"]),
+                                    (cell["method"]["path"], "patched", None),
+                                    (patched, "fused", str(tmp_path / "checkouts" / "fused-path"))):
+        method = dict(cell["method"], label="fused", path=path, variant=variant)
+        method = preparation.prepared_method(method, str(tmp_path))
+        assert method["path"] == (expected or path)
+        assert ("`variant: fused`" in method.get("refused", "")) == (expected is None)
+
+
 def test_an_unpatched_checkout_must_be_one(small, tmp_path):
     cell = small.cell("3dgs-2023", variant="unpatched", blend_mode="alpha")
     assert "refused" not in cell["method"]

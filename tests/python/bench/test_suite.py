@@ -212,7 +212,8 @@ def test_the_suite_of_the_readme_is_valid(monkeypatch):
     readme = Path(__file__).resolve().parents[3] / "benchmarks" / "README.md"  # which is not installed
     text = readme.read_text(encoding="utf-8").partition("```yaml")[2].partition("```")[0]
     cells = expand(yaml.safe_load(text), "").cells
-    assert {cell["method"]["label"] for cell in cells} == {"native", "3dgs-2023", "3dgs-2023-unpatched", "c3dgs"}
+    assert {cell["method"]["label"] for cell in cells} == {"native", "3dgs-2023", "3dgs-2023-unpatched", "3dgs-2023-fused",
+                                                             "c3dgs"}
     assert {cell["seed"] for cell in cells if cell["headline"]} == {0, 1, 2}
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import torch
 
+from diff_smoe_rasterization import fused_ssim
 from diff_smoe_rasterization.integrations import weighted_distance
 from diff_smoe_rasterization.integrations.torch_scatter import scatter, scatter_max
 from diff_smoe_rasterization.patches.runtime import unique_rows
@@ -39,3 +40,20 @@ def test_sums_and_maxima_of_groups(gpu):
     for ours, expected in zip(scatter_max(values.to(gpu), index.to(gpu), 0, dim_size=310),
                               scatter_max(values, index, 0, dim_size=310)):
         assert torch.equal(ours.cpu(), expected)
+
+
+def test_ssim_is_fused_on_the_device_of_its_images(gpu, capsys):
+    """The trainer's own is the CPU's kernel here, which the reference tests hold to the equation."""
+    called = []
+
+    def of_the_trainer(img1, img2, window_size=11, size_average=True):
+        called.append(img1.shape)
+        return fused_ssim(img1.cpu(), img2.cpu()).to(img1.device)
+
+    call = runtime.fused_where_equal(of_the_trainer)
+    torch.manual_seed(0)
+    image, target = torch.rand(2, 3, 70, 50, device=gpu)
+    value = call(image.requires_grad_(), target)
+    value.backward()
+    assert image.grad.abs().max() > 0 and called == [(3, 24, 31)] and capsys.readouterr().err == ""
+    assert abs(value.item() - fused_ssim(image.detach().cpu(), target.cpu()).item()) < 1e-5  # rounding of float32

@@ -132,6 +132,29 @@ def test_a_state_of_torch_adam_is_taken(device):
     torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
 
 
+def test_torch_adam_takes_its_state(device):
+    ours, theirs = random_parameters(torch.float64, [(30,)]), random_parameters(torch.float64, [(30,)])
+    fused, adam = FusedAdam(ours, lr=0.1), torch.optim.Adam(theirs, lr=0.3)
+    set_gradients(ours, 0)
+    fused.step()
+    adam.load_state_dict(copy.deepcopy(fused.state_dict()))
+    with torch.no_grad():
+        theirs[0].copy_(ours[0])
+    for parameters, optimizer in ((ours, fused), (theirs, adam)):
+        set_gradients(parameters, 1)
+        optimizer.step()
+    torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("option, value", [("weight_decay", 0.1), ("amsgrad", True), ("maximize", True)])
+def test_what_it_does_not_have_is_refused(device, option, value):
+    parameters = random_parameters(torch.float32, [(3,)])
+    optimizer = FusedAdam([{"params": parameters, "name": "xyz", option: value}], lr=0.1)
+    set_gradients(parameters, 0)
+    with pytest.raises(ValueError, match=f"{option} of group 'xyz' is {value}"):
+        optimizer.step()
+
+
 def test_autograd_notices_the_step(device):
     parameter = random_normal((3,), 0).requires_grad_()
     output = (parameter * parameter).sum()

@@ -11,7 +11,7 @@ import torch
 cst = pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
 from diff_smoe_rasterization import patches  # noqa: E402
-from diff_smoe_rasterization.patches import modernise, runtime  # noqa: E402
+from diff_smoe_rasterization.patches import modernise, optional, runtime  # noqa: E402
 from diff_smoe_rasterization.patches.rules import RUNTIME  # noqa: E402
 from checkouts import make_checkout  # noqa: E402
 from test_patch_engine import TRAIN, make, snapshot  # noqa: E402
@@ -64,10 +64,10 @@ BEFORE_AND_AFTER = [
 @pytest.mark.parametrize("name, before, after", BEFORE_AND_AFTER)
 def test_what_a_rule_changes(name, before, after):
     assert RULES[name].looks_at(before.encode())
-    outcome = modernise.run(RULES[name], cst.parse_module(before))
+    outcome = optional.run(RULES[name], cst.parse_module(before))
     assert outcome.tree.code == (before if after is None else after)
     assert outcome.pending == (after is not None)
-    assert modernise.run(RULES[name], outcome.tree).pending == 0  # by which it is seen that a rule is applied
+    assert optional.run(RULES[name], outcome.tree).pending == 0  # by which it is seen that a rule is applied
 
 
 def test_every_rule_is_tried_above():
@@ -98,7 +98,7 @@ def test_anchors_are_made_in_unique_cells_of_ours(name, tmp_path):
     checkout = make_checkout(name, tmp_path / name)
     before = (checkout / "scene/anchors.py").read_text()
     planned = patches.apply(checkout, modernise=True)
-    assert [rule.files for rule in planned.modernised if rule.rule == "unique-rows"] == [("scene/anchors.py",)]
+    assert [rule.files for rule in planned.requested if rule.rule == "unique-rows"] == [("scene/anchors.py",)]
     after = (checkout / "scene/anchors.py").read_text()
     assert before.count("torch.unique(") == after.count(" unique_rows(") == 1 and "torch.unique(" not in after
     assert before.count(".unique(dim=0)") == after.count(".unique(dim=0)") == 1  # of floats, by the tensor's method

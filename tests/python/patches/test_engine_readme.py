@@ -18,7 +18,8 @@ def rows():
 
 def test_trainers_rules_and_states_are_in_it():
     pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
-    from diff_smoe_rasterization.patches import engine, modernise
+    from diff_smoe_rasterization.patches import engine
+    from diff_smoe_rasterization.patches.patch import OPTIONS
     from diff_smoe_rasterization.patches.trainers import TRAINERS
 
     table = rows()
@@ -29,5 +30,7 @@ def test_trainers_rules_and_states_are_in_it():
         if trainer.name != "hac-plus":  # "the same"
             functions = {rule.function for rule in trainer.rules if rule.name == "pipe-blend-mode"}
             assert functions == set(re.findall(r"`(\w+)`", row[3]))
-    assert {rule.name for rule in modernise.RULES} <= set(table)
+    for option, optional_rules in OPTIONS.items():
+        assert f"## --{option}\n" in README.read_text()
+        assert {rule.name for rule in optional_rules} <= set(table)
     assert all(state in README.read_text() for state in engine.STATES)

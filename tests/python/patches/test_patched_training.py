@@ -189,6 +189,18 @@ def test_a_modernised_trainer_trains_as_before(name, runs, tmp_path):
     assert same_bits(model(tmp_path / "out"), model(runs(name).outputs["patched", "smoe"]))
 
 
+def test_a_trainer_whose_ssim_is_its_own_trains_as_before(runs, tmp_path):
+    """That of the small trainer has boxes for windows; its Adam is its own too."""
+    checkout = make_checkout("3dgs-2023", tmp_path / "fused")
+    planned = patches.apply(checkout, fuse=True)
+    assert [rule.files for rule in planned.requested] == [("utils/loss_utils.py",), ()]
+    script, *words = runs.script("3dgs-2023", "smoe")
+    result = runs.processes.run(checkout / script, *words, tmp_path / "out", "--blend_mode", "smoe", cwd=checkout)
+    assert result.status == 0, result.err
+    assert "utils.loss_utils.ssim is not SSIM as it is fused here" in result.err
+    assert same_bits(model(tmp_path / "out"), model(runs("3dgs-2023").outputs["patched", "smoe"]))
+
+
 def test_scripts_that_build_commands_pass_the_mode_on(runs, tmp_path):
     evaluation, shell = make_checkout("3dgs-2023", tmp_path / "2023"), make_checkout("hac", tmp_path / "hac")
     for checkout in (evaluation, shell):
