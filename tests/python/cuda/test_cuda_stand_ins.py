@@ -6,6 +6,7 @@ import torch
 from diff_smoe_rasterization import fused_ssim
 from diff_smoe_rasterization.integrations import weighted_distance
 from diff_smoe_rasterization.integrations.torch_scatter import scatter, scatter_max
+from diff_smoe_rasterization.patches import runtime
 from diff_smoe_rasterization.patches.runtime import unique_rows
 
 
