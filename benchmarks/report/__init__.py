@@ -6,16 +6,19 @@ paper.json holds the paper's printed figures.
 """
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import tempfile
 from typing import Any, Callable, Dict, List, Sequence
 
-from ..results_folder import CELLS_FOLDER
-from .rows import ReportError, Row, grouped, read_rows, safe_name, shared_gpu
+from ..results_folder import CELLS_FOLDER, SUITE_NAME
+from .rows import ReportError, Row, at_once, grouped, read_rows, safe_name, shared, some
 
 __all__ = ["ReportError", "report"]
 
-FOLDERS = ("tables", "figures", "images", "survey")
+PARTS = ("tables", "figures", "images", "survey", "report.md")  # of a report, beside its page
+MOST_ABSENT = 3  # cells without a row that are named
 TABLE_FORMS = {"md": "to_markdown", "csv": "to_csv", "tex": "to_latex"}
 NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
                 "continued", "arguments")  # of one cell, or said otherwise
@@ -24,15 +27,30 @@ NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "ve
 def report(results: str, output: str) -> str:
     """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT.
 
-    OUTPUT/index.html, report.md, tables/, figures/, images/, survey/; an earlier report there is replaced. Returns the
-    page's path. Raises ReportError where there are no rows, where a row is damaged, where rows cannot be compared or
-    where OUTPUT/index.html is someone else's, and ImportError where a library is missing.
+    OUTPUT/index.html, report.md, tables/, figures/, images/, survey/; an earlier report there is replaced by a whole
+    one or not at all. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged,
+    where rows cannot be compared or where OUTPUT has such files of someone else, and ImportError where a library is
+    missing.
     """
     try:
         import jinja2  # noqa: F401
         import matplotlib  # noqa: F401
     except ImportError as error:
         raise ImportError(f"a report needs {error.name}; type: pip install '.[bench]' in the source folder") from error
+    from .page import PAGE_NAME
+
+    rows = read_rows(results)
+    _refuse_files_of_others(output)
+    os.makedirs(output, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".report-", dir=output) as made:
+        _make(results, rows, made)
+        for name in (PAGE_NAME, *PARTS):  # the page first: it says that the others are a report's
+            _replace(os.path.join(made, name), os.path.join(output, name))
+    return os.path.join(output, PAGE_NAME)
+
+
+def _make(results: str, rows: Sequence[Row], output: str) -> None:
+    """Writes a report into an empty folder."""
     from . import tables
     from .curves import draw_all
     from .layouts import commits, end_of, read_paper, tables_of
@@ -40,9 +58,7 @@ def report(results: str, output: str) -> str:
     from .sliders import collect
     from .survey import write_survey
 
-    rows, paper = read_rows(results), read_paper()
-    _clear(output)
-    sections = []
+    paper, sections = read_paper(), []
     for suite in sorted({row["suite"] for row in rows}):
         members = [row for row in rows if row["suite"] == suite]
         made = tables_of(suite, members, paper)
@@ -52,14 +68,14 @@ def report(results: str, output: str) -> str:
         pictures = draw_all(suite, grouped(members, end_of), os.path.join(output, "figures"))
         scenes = collect(results, suite, members, output)
         write_survey(members, paper["datasets"], os.path.join(output, "survey", suite))
-        sections.append(Section(suite, safe_name(suite), _counts(members), made, pictures, scenes,
+        counts = _counts(members) + _absent(results, suite, members)
+        sections.append(Section(suite, safe_name(suite), counts, made, pictures, scenes,
                                 _no_images(results, members), _protocols(members)))
     _write(os.path.join(output, "report.md"), _markdown(sections, tables.to_markdown))
-    return write_page(output, sections, commits(rows))
+    write_page(output, sections, commits(rows))
 
 
-def _clear(output: str) -> None:
-    """Removes an earlier report, so that no figure of it stands among the new ones."""
+def _refuse_files_of_others(output: str) -> None:
     from .page import GENERATOR, PAGE_NAME
 
     page = os.path.join(output, PAGE_NAME)
@@ -67,9 +83,20 @@ def _clear(output: str) -> None:
         with open(page, encoding="utf-8", errors="replace") as file:
             if f'content="{GENERATOR}"' not in file.read():
                 raise ReportError(f"{page} is no report; name another folder")
-        for folder in FOLDERS:
-            shutil.rmtree(os.path.join(output, folder), ignore_errors=True)
-    os.makedirs(output, exist_ok=True)
+        return
+    for name in PARTS:
+        if os.path.exists(os.path.join(output, name)):
+            raise ReportError(f"{os.path.join(output, name)} is of no report; name another folder")
+
+
+def _replace(new: str, old: str) -> None:
+    """Puts a file or folder in the place of an earlier one; where there is no new one, the place is empty then."""
+    if os.path.isdir(old):
+        shutil.rmtree(old)
+    elif os.path.lexists(old) and not os.path.exists(new):
+        os.remove(old)
+    if os.path.exists(new):
+        os.replace(new, old)
 
 
 def _markdown(sections: Sequence[Any], to_markdown: Callable[[Any], str]) -> str:
@@ -92,9 +119,27 @@ def _counts(rows: Sequence[Row]) -> str:
     failed = sum(not row["ok"] for row in rows)
     scenes = len({row["scene"] for row in rows})
     seeds = len({row["seed"] for row in rows})
-    text = f"{len(rows)} cells on {scenes} {'scene' if scenes == 1 else 'scenes'}, {seeds} " \
-           f"{'seed' if seeds == 1 else 'seeds'}"
+    text = ", ".join([f"{_number(len(rows), 'cell')} on {_number(scenes, 'scene')}", _number(seeds, "seed")])
     return text + (f"; {failed} failed" if failed else "; none failed")
+
+
+def _number(count: int, of: str) -> str:
+    return f"{count} {of}" if count == 1 else f"{count} {of}s"
+
+
+def _absent(results: str, suite: str, rows: Sequence[Row]) -> str:
+    """Which cells of the suite have no row yet, where RESULTS is a folder that lists its cells."""
+    try:
+        with open(os.path.join(results, SUITE_NAME), encoding="utf-8") as file:
+            said = json.load(file)
+        cells = said["cells"] if said["name"] == suite else []
+        absent = sorted(set(cells) - {row["cell"] for row in rows})
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    if not absent:
+        return ""
+    return f"; {len(absent)} of {_number(len(cells), 'cell')} {'has' if len(absent) == 1 else 'have'} no row yet: " \
+           f"{some(absent, MOST_ABSENT)}"
 
 
 def _no_images(results: str, rows: Sequence[Row]) -> str:
@@ -115,16 +160,16 @@ def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
             if value is not None and _plain(name, value) not in values:
                 values.append(_plain(name, value))
     for scene, rules in found.items():
-        shared = [row for row in measured if row["scene"] == scene and shared_gpu(row)]
-        if shared:
+        beside = [row for row in measured if row["scene"] == scene and shared(row)]
+        if beside:
             cells = sum(row["scene"] == scene for row in measured)
-            rules["cells that shared a GPU"] = [f"{len(shared)} of {cells}, up to "
-                                                f"{max(row['machine']['cells_per_gpu'] for row in shared)} at once"]
+            rules["cells that shared their GPU or CPU"] = [f"{len(beside)} of {cells}, up to "
+                                                           f"{max(map(at_once, beside))} at once"]
     return [{"scene": scene, "rules": {name: "; ".join(values) for name, values in sorted(rules.items())}}
             for scene, rules in sorted(found.items())]
 
 
 def _plain(name: str, value: Any) -> str:
-    if name == "image_size":
+    if name == "image_size" and isinstance(value, list):
         return "×".join(map(str, value))
     return "; ".join(f"{key}: {entry}" for key, entry in value.items()) if isinstance(value, dict) else str(value)

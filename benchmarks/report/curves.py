@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.lines import Line2D  # noqa: E402
 
-from .rows import LPIPS, Group, Setting, figure, lpips_figures, order, safe_name  # noqa: E402
+from .rows import LPIPS, Group, Setting, device_of, lpips_figures, order, safe_name, shared  # noqa: E402
 from .tables import column  # noqa: E402
 
 # Okabe and Ito's colours, told apart with every kind of colour vision; black and yellow are left out for the pages.
@@ -56,7 +56,7 @@ def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
                         break
                     files[theme] = save(drawn, folder, safe_name(f"{suite}-{scene}-{kind}"), theme)
             if files:
-                modes = ", ".join(dict.fromkeys(group.setting.label() for group in shown))
+                modes = "; ".join(dict.fromkeys(group.setting.label() for group in shown))
                 pictures.append(Picture(safe_name(f"{suite}-{scene}-{kind}"), f"{scene}: {title}",
                                         f"{scene}: {title} of {modes}; the figures are in the tables", files))
     return pictures
@@ -65,8 +65,9 @@ def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
 def rate_distortion(groups: Sequence[Group]):
     """One panel for each quality figure (rows) and amount (columns) that was measured; a point is a mean over seeds."""
     rows = [row for group in groups for row in group.rows]
-    qualities = [name for name in ("psnr", "ssim", *lpips_figures(rows)) if _measured(rows, name)]
-    amounts = [name for name in AMOUNTS if _measured(rows, name)]
+    qualities = [name for name in ("psnr", "ssim", *lpips_figures(rows))
+                 if any(_drawn(group, name) for group in groups)]
+    amounts = [name for name in AMOUNTS if any(_drawn(group, name) for group in groups)]
     if not qualities or not amounts:
         return None
     drawn, axes = plt.subplots(len(qualities), len(amounts), squeeze=False, sharey="row", sharex="col",
@@ -76,8 +77,8 @@ def rate_distortion(groups: Sequence[Group]):
         for axis, amount in zip(line, amounts):
             for series, look in looks.items():
                 members = [group for group in groups if group.setting.series == series
-                           and group.by_seed(quality) and group.by_seed(amount)]
-                points = sorted(((group.measured(amount).mean, *group.measured(quality)) for group in members),
+                           and _drawn(group, quality) and _drawn(group, amount)]
+                points = sorted(((group.measured(amount).mean, *group.measured(quality)[:2]) for group in members),
                                 key=lambda point: point[0])
                 if points:
                     xs, ys, spreads = zip(*points)
@@ -86,7 +87,7 @@ def rate_distortion(groups: Sequence[Group]):
         line[0].set_ylabel(column(quality).name + (" (lower is better)" if quality.startswith(LPIPS) else ""))
     for axis, amount in zip(axes[-1], amounts):
         axis.set_xlabel(column(amount).name)
-        _amounts(axis, [group.measured(amount).mean for group in groups if group.by_seed(amount)])
+        _amounts(axis, [group.measured(amount).mean for group in groups if _drawn(group, amount)])
     legend(drawn, [Line2D([], [], label=series.label(), **look) for series, look in looks.items()])
     return drawn
 
@@ -123,13 +124,12 @@ def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
 def bars(groups: Sequence[Group]):
     """Training seconds and frames per second, a bar for each setting; whiskers are the spread over seeds.
 
-    Settings without either, such as those whose cells shared a GPU, are left out.
+    Settings without either, such as those whose cells shared a GPU, are left out; of several machines none is drawn.
     """
-    rows = [row for group in groups for row in group.rows]
-    figures = [name for name in ("train_seconds", "fps") if _measured(rows, name)]
-    if not figures:
+    figures = [name for name in ("train_seconds", "fps") if any(_drawn(group, name) for group in groups)]
+    groups = [group for group in groups if any(_drawn(group, name) for name in figures)]
+    if not groups or len({device_of(row) for group in groups for row in group.rows if not shared(row)}) > 1:
         return None
-    groups = [group for group in groups if any(group.by_seed(name) for name in figures)]
     styles = _styles(groups)
     amounts = list(dict.fromkeys(group.setting.amount() for group in
                                  sorted(groups, key=lambda group: (group.setting.budget or 0,
@@ -144,7 +144,7 @@ def bars(groups: Sequence[Group]):
                        if group.setting.series == series and group.setting.amount() == amount]
             for index, group in enumerate(members):
                 color, (_, _, hatch) = styles[group.setting.series]
-                mean, spread = group.measured(name)
+                mean, spread, _ = group.measured(name)
                 if mean is not None:
                     axis.bar(place + (index - (len(members) - 1) / 2) * width, mean, width, color=color, hatch=hatch,
                              yerr=spread, capsize=3, ecolor=plt.rcParams["text.color"],
@@ -161,8 +161,10 @@ def bars(groups: Sequence[Group]):
     return drawn
 
 
-def _measured(rows: Sequence[dict], name: str) -> bool:
-    return any(figure(row, name) is not None for row in rows)
+def _drawn(group: Group, name: str) -> bool:
+    """Whether the figure has a place on an axis: one of amounts may be logarithmic."""
+    mean = group.measured(name).mean
+    return mean is not None and math.isfinite(mean) and (mean > 0 or name not in AMOUNTS)
 
 
 def _styles(groups: Sequence[Group]) -> Dict[Setting, Tuple[str, Tuple[str, str, str]]]:

@@ -4,18 +4,21 @@ from __future__ import annotations
 import functools
 import json
 import os
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+import statistics
+from typing import Any, Dict, List, Optional, Sequence, Set, Tuple
 
-from .rows import (Group, Measured, Row, Setting, figure, grouped, lpips_figures, lpips_reasons, order,
-                   over_scenes, paired, safe_name, shared_gpu)
+from .rows import (SHARED, Group, Row, Setting, device_of, difference, figure, grouped, lpips_figures, lpips_reasons,
+                   order, over, ratio, safe_name, shared, some)
 from .tables import (OURS, PAPER, Cell, Column, Table, TableRow, cell, column, printed, without_empty_columns)
 
 Paper = Dict[str, Any]
 END_NAMES = ("sparse", "dense")
 ABLATION = {"smoe": "full", "smoe_tn": "without T_d", "smoe_std": "without T_n,d"}
-SHARED = "shared"  # stands for a time or FPS where there is none for this reason
-SHARED_NOTE = ("Times and FPS are of cells that had their GPU alone. shared: several cells had one GPU at once, so "
-               "theirs are not the GPU's; the rows have them.")
+COMPARED = ("alpha", "smoe")
+SEEDS = "seeds"  # the column that says how many seeds an average over scenes is of
+MOST_PAIRS = 6  # are named in a note
+SHARED_NOTE = (f"Times and FPS are of cells that had their GPU or CPU alone. {SHARED}: several cells had it at once, "
+               "so theirs are not the machine's; the rows have them.")
 SPREAD_NOTE = "± is the sample standard deviation over seeds; figures without it are of one seed."
 
 
@@ -55,20 +58,23 @@ def table1(groups: Sequence[Group], paper: Paper) -> Table:
         return Table("table1", "", (), (), ())
     known = [scene for scenes in ours.values() for scene in scenes]
     ours.update({scene: [scene] for scene in sorted({group.scene for group in groups}) if scene not in known})
-    names = ["psnr", "ssim", "lpips:paper", *lpips_figures(_rows(groups)), "num_gaussians_m", "size_own_mb"]
+    names = ["psnr", "ssim", "lpips:paper", *lpips_figures(_rows(groups)), "num_gaussians_m", "size_own_mb", SEEDS]
     columns = tuple(column(name, place if scenes in ([place], sorted(paper["datasets"].get(place, [])))
                            else f"{place} (ours: {', '.join(scenes)})")
                     for place, scenes in ours.items() for name in names)
     rows: List[TableRow] = []
+    seed_notes: List[str] = []
     for end in END_NAMES:
         for method, averages in paper["table1"][end].items():
             cells_ = tuple(_printed(paper["table1"]["columns"], averages.get(place), name)
                            for place in ours for name in names)
             rows.append(TableRow((end, method), cells_, PAPER))
-        for setting, by_scene in _settings(groups, end, paper, "table1"):
-            cells_ = tuple(_average(by_scene, scenes, name) for scenes in ours.values() for name in names)
+        settings = _settings(groups, end, paper, "table1")
+        for setting in settings:
+            cells_ = tuple(entry for scenes in ours.values() for entry in _averages(setting, settings, scenes, names))
             rows.append(TableRow((end, setting.label()), cells_))
-    notes = [paper["source"] + ".", *_scene_notes(groups, paper), *_notes(groups)]
+        seed_notes += _seed_notes(settings, list(ours.values()))
+    notes = [paper["source"] + ".", *_scene_notes(groups, paper), *seed_notes, *_notes(groups)]
     return without_empty_columns(Table("table1", "Quality, number of Gaussians and size (the paper's Table 1)",
                                        ("end", "method"), columns, tuple(rows), tuple(notes)))
 
@@ -76,17 +82,21 @@ def table1(groups: Sequence[Group], paper: Paper) -> Table:
 def table2(groups: Sequence[Group], paper: Paper) -> Table:
     """The paper's Table 2: other trainers with the gate put in; averages over all scenes at hand."""
     names = ["psnr", "ssim", "lpips:paper", *lpips_figures(_rows(groups)), "num_gaussians_m", "size_own_mb",
-             "train_seconds", "fps"]
+             "train_seconds", "fps", SEEDS]
     scenes = sorted({group.scene for group in groups})
     rows: List[TableRow] = []
+    seed_notes: List[str] = []
     for end in END_NAMES:
         for method, averages in paper["table2"][end].items():
             cells_ = tuple(_printed(paper["table2"]["columns"], averages, name) for name in names)
             rows.append(TableRow((end, method), cells_, PAPER))
-        for setting, by_scene in _settings(groups, end, paper, "table2"):
-            rows.append(TableRow((end, setting.label()), tuple(_average(by_scene, scenes, name) for name in names)))
+        settings = _settings(groups, end, paper, "table2")
+        rows += [TableRow((end, setting.label()), tuple(_averages(setting, settings, scenes, names)))
+                 for setting in settings]
+        seed_notes += _seed_notes(settings, [scenes])
     notes = [paper["source"] + "; averages of three data sets.",
-             f"Ours are averages over {', '.join(scenes)}: not the paper's scenes, and not its GPU.", *_notes(groups)]
+             f"Ours are averages over {', '.join(scenes)}: not the paper's scenes, and not its GPU.", *seed_notes,
+             *_notes(groups)]
     return without_empty_columns(Table("table2", "The gate in other trainers (the paper's Table 2)", ("end", "method"),
                                        tuple(column(name) for name in names), tuple(rows), tuple(notes)))
 
@@ -97,16 +107,17 @@ def table3(groups: Sequence[Group], paper: Paper) -> Table:
     ablated = {(group.setting.pair, group.scene) for group in groups
                if group.setting.blend_mode in ("smoe_tn", "smoe_std")}
     printed_rows, where = paper["table3"]["rows"], f"{paper['table3']['dataset']}, {paper['table3']['end']}"
-    rows = [TableRow((where, "", ABLATION[mode]), tuple(_printed(paper["table3"]["columns"], printed_rows[mode], name)
-                                                        for name in names), PAPER) for mode in printed_rows]
+    rows = [TableRow((where, "", ABLATION[mode], ""),
+                     tuple(_printed(paper["table3"]["columns"], figures, name) for name in names), PAPER)
+            for mode, figures in printed_rows.items()]
     for group in groups:
         if (group.setting.pair, group.scene) in ablated and group.setting.blend_mode in ABLATION:
             labels = (f"{group.scene}, {group.setting.amount()}", group.setting.label(blend_mode=False),
-                      f"{group.setting.blend_mode}: {ABLATION[group.setting.blend_mode]}")
+                      f"{group.setting.blend_mode}: {ABLATION[group.setting.blend_mode]}", group.seeds())
             rows.append(TableRow(labels, tuple(_seeds_cell(group, name) for name in names)))
     notes = (paper["source"] + ".", "T_d: the transmittance in the denominator; T_n,d: in both.", *_notes(groups))
     return without_empty_columns(Table("table3", "Ablation of the transmittance (the paper's Table 3)",
-                                       ("scene, threshold", "method", "gate"),
+                                       ("scene, threshold", "method", "gate", "seeds"),
                                        tuple(column(name) for name in names), tuple(rows), notes))
 
 
@@ -116,6 +127,7 @@ def deltas(groups: Sequence[Group], paper: Paper) -> Table:
     differences = ["psnr", "psnr_edge", "ssim", *lpips_figures(_rows(groups))]
     ratios = ["num_gaussians", "size_own_mb", "train_seconds", "fps"]
     rows: List[TableRow] = []
+    unequal: List[str] = []
     for end in END_NAMES:
         averages = paper["table1"][end]
         for dataset in paper["datasets"]:
@@ -131,18 +143,20 @@ def deltas(groups: Sequence[Group], paper: Paper) -> Table:
         if group.setting.blend_mode != "alpha" or gated is None:
             continue
         failed = [f"{mode.setting.blend_mode} failed" for mode in (group, gated) if not mode.rows]
-        cells_ = [cell(paired(group, gated, name, lambda new, old: new - old)) for name in differences]
-        cells_ += [_or_shared(paired(group, gated, name, lambda new, old: new / old if old else float("nan")),
-                              (group, gated), name) for name in ratios]
+        cells_ = [cell(over((group, gated), name, difference)) for name in differences]
+        cells_ += [cell(over((group, gated), name, ratio)) for name in ratios]
         if failed:
             cells_[0] = Cell(text=", ".join(failed))
-        seeds = len(set(group.by_seed("psnr")) & set(gated.by_seed("psnr")))
-        rows.append(TableRow((group.scene, group.setting.label(blend_mode=False), group.setting.amount(), str(seeds)),
-                             tuple(cells_)))
+        labels = (group.scene, group.setting.label(blend_mode=False), group.setting.amount())
+        rows.append(TableRow((*labels, str(len(group.done() & gated.done()))), tuple(cells_)))
+        unequal += [f"{', '.join(labels)}, seed {seed}: {commits_}" for seed, commits_ in _unequal(group, gated)]
     columns = [column(name, difference=True) for name in differences]
     columns += [Column(f"{column(name).name.partition(' [')[0]} ratio", 2) for name in ratios]
     notes = ("Δ: smoe less alpha; ratio: smoe over alpha; of seeds that both have. The paper's are of its printed "
              "averages over a data set.", SPREAD_NOTE, *_shared_notes(_rows(groups)))
+    if unequal:
+        notes += (f"alpha and smoe are of different commits in {len(unequal)} "
+                  f"{'pair' if len(unequal) == 1 else 'pairs'}: {some(unequal, MOST_PAIRS)}.",)
     return without_empty_columns(Table("deltas", "smoe against alpha, all else equal",
                                        ("scene", "method", "threshold", "seeds"), tuple(columns), tuple(rows), notes))
 
@@ -168,41 +182,75 @@ def _rows(groups: Sequence[Group]) -> List[Row]:
     return [row for group in groups for row in group.rows]
 
 
-def _settings(groups: Sequence[Group], end: str, paper: Paper,
-              table: str) -> List[Tuple[Setting, Dict[str, Group]]]:
-    """The settings of an end whose method stands in a table of the paper, each with its groups by scene."""
+def _settings(groups: Sequence[Group], end: str, paper: Paper, table: str) -> Dict[Setting, Dict[str, Group]]:
+    """The settings of an end whose method stands in a table of the paper, each with its groups by scene, in order."""
     found: Dict[Setting, Dict[str, Group]] = {}
     for group in groups:
         names = paper["names"].get(group.setting.method, {})
         if group.setting.end == end and any(name in paper[table][end] for name in names.values()):
             found.setdefault(group.setting, {})[group.scene] = group
-    return sorted(found.items(), key=lambda item: order(item[0]))
+    return dict(sorted(found.items(), key=lambda item: order(item[0])))
 
 
-def _average(by_scene: Dict[str, Group], scenes: Sequence[str], name: str) -> Cell:
-    """The mean over scenes, or which of them failed or were not run: an average never leaves a scene out."""
+def _averages(setting: Setting, settings: Dict[Setting, Dict[str, Group]], scenes: Sequence[str],
+              names: Sequence[str]) -> List[Cell]:
+    """The means over scenes, or which of them failed or were not run: an average never leaves a scene out."""
+    by_scene = settings[setting]
     failed = [scene for scene in scenes if scene in by_scene and not by_scene[scene].rows]
     absent = [scene for scene in scenes if scene not in by_scene]
-    if failed or absent:
-        text = "failed" if failed else "not run"
-        if len(scenes) > 1:
-            text += ": " + ", ".join(failed or absent)
-        return Cell(text=text if name == "psnr" else "")
+    common, left_out = _seeds(_beside(setting, settings, scenes))
+    text = "failed" if failed else "not run" if absent else "" if common else "no common seed"
+    if text:
+        text += ": " + ", ".join(failed or absent) if len(scenes) > 1 and (failed or absent) else ""
+        return [Cell(text=text if name == "psnr" else "") for name in names]
+    seeds = Cell(text=f"{len(common)} of {len(common) + len(left_out)}") if left_out else Cell(len(common))
     groups = [by_scene[scene] for scene in scenes]
-    return _or_shared(over_scenes(groups, name), groups, name)
+    return [seeds if name == SEEDS else cell(over(groups, name, statistics.fmean, common)) for name in names]
+
+
+def _beside(setting: Setting, settings: Dict[Setting, Dict[str, Group]], scenes: Sequence[str]) -> List[Group]:
+    """What takes its averages of the same seeds: every scene, in alpha and smoe too where these have all scenes."""
+    modes = [by_scene for other, by_scene in settings.items() if other == setting
+             or (other.pair == setting.pair and other.blend_mode in COMPARED)]
+    return [by_scene[scene] for by_scene in modes for scene in scenes
+            if all(scene in by_scene and by_scene[scene].rows for scene in scenes)]
+
+
+def _seeds(groups: Sequence[Group]) -> Tuple[Set[int], Set[int]]:
+    """The seeds that all groups have, and those that some lack."""
+    common = set.intersection(*(group.done() for group in groups)) if groups else set()
+    return common, {row["seed"] for group in groups for row in group.rows + group.failed} - common
+
+
+def _seed_notes(settings: Dict[Setting, Dict[str, Group]], places: Sequence[Sequence[str]]) -> List[str]:
+    """Which seeds averages leave out, and why."""
+    notes = []
+    for setting in settings:
+        for groups in (_beside(setting, settings, scenes) for scenes in places):
+            for seed in sorted(_seeds(groups)[1]):
+                lacking = [f"{group.setting.blend_mode} "
+                           f"{'failed' if any(row['seed'] == seed for row in group.failed) else 'was not run'} on "
+                           f"{group.scene}" for group in groups if seed not in group.done()]
+                notes.append(f"{setting.end}, {setting.label(blend_mode=False)}: averages leave seed {seed} out, "
+                             f"since {', '.join(lacking)}.")
+    return list(dict.fromkeys(notes))
+
+
+def _unequal(one: Group, other: Group) -> List[Tuple[int, str]]:
+    """The seeds whose rows are of different commits, with these."""
+    first, second = ({row["seed"]: row.get("commit") or {} for row in group.rows} for group in (one, other))
+    found = []
+    for seed in sorted(set(first) & set(second)):
+        differ = [f"{name} {first[seed].get(name) or 'unknown'} and {second[seed].get(name) or 'unknown'}"
+                  for name in sorted({*first[seed], *second[seed]}) if first[seed].get(name) != second[seed].get(name)]
+        found += [(seed, ", ".join(differ))] if differ else []
+    return found
 
 
 def _seeds_cell(group: Group, name: str) -> Cell:
     if name == "psnr" and group.failed and not group.rows:
         return Cell(text="failed")
-    return _or_shared(group.measured(name), [group], name)
-
-
-def _or_shared(measured: Measured, groups: Sequence[Group], name: str) -> Cell:
-    """The figure; where it is absent because cells of a group shared their GPU, that."""
-    if measured.mean is None and any(group.shared(name) for group in groups):
-        return Cell(text=SHARED)
-    return cell(measured)
+    return cell(group.measured(name))
 
 
 def _printed(names: Sequence[str], values: Optional[Sequence[str]], name: str) -> Cell:
@@ -236,29 +284,25 @@ def _notes(groups: Sequence[Group]) -> List[str]:
     notes += [f"Not measured, {reason.rstrip('.')}." for reason in lpips_reasons(rows)]
     if lpips_figures(rows):
         notes.append("LPIPS of different nets or normalisations cannot be compared.")
-    machines = sorted({_machine(row) for row in rows if _machine(row)})
-    if machines:
-        notes.append(f"Measured on {', '.join(machines)}; times and FPS compare on one machine only.")
-    notes += sorted({row["fps_note"] for row in rows if row.get("fps_note")})
+    machines: Dict[str, List[str]] = {}
+    for group in groups:
+        for device in filter(None, map(device_of, group.rows)):
+            machines.setdefault(device, []).append(group.setting.label())
+    of = {device: f" ({'; '.join(dict.fromkeys(labels))})" if len(machines) > 1 else ""
+          for device, labels in sorted(machines.items())}
+    if of:
+        notes.append(f"Measured on {', '.join(device + whose for device, whose in of.items())}; times and FPS compare "
+                     "on one machine only.")
     return notes + _shared_notes(rows)
 
 
 def _shared_notes(rows: Sequence[Row]) -> List[str]:
-    return [SHARED_NOTE] if any(map(shared_gpu, rows)) else []
-
-
-def _machine(row: Row) -> str:
-    machine = row.get("machine") or (row.get("protocol") or {}).get("machine") or ""
-    if isinstance(machine, dict):
-        return str(machine.get("gpu") or machine.get("name") or machine.get("cpu") or machine.get("device") or "")
-    return str(machine)
+    return [SHARED_NOTE] if any(map(shared, rows)) else []
 
 
 def commits(rows: Sequence[Row]) -> List[str]:
     """The commits of this project and of trainers that rows were measured with."""
     found = set()
     for row in rows:
-        commit = row.get("commit")
-        named = commit.items() if isinstance(commit, dict) else [("project", commit)]
-        found |= {f"{name} {value}" for name, value in named if value}
+        found |= {f"{name} {value}" for name, value in (row.get("commit") or {}).items() if value}
     return sorted(found)

@@ -2,23 +2,36 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import statistics
-from typing import Any, Callable, Dict, Iterable, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 
 from ..errors import BenchError
 from ..results_folder import CELLS_FOLDER, ROW_NAME, ROWS_NAME
 
 Row = Dict[str, Any]
 
+NUMBER = (int, float)
 NEEDED = {"cell": str, "suite": str, "ok": bool, "method": str, "blend_mode": str, "scene": str, "seed": int}
+# What else is read of a row; each may be absent or null.
+OPTIONAL = {**dict.fromkeys(("label", "variant", "schedule", "dataset", "end", "reason"), str),
+            **dict.fromkeys(("budget", "iterations"), int),
+            **dict.fromkeys(("densify_grad_threshold", "psnr", "psnr_float", "psnr_edge", "ssim", "num_gaussians",
+                             "train_seconds", "wall_seconds", "fps", "peak_gpu_mib"), NUMBER),
+            **dict.fromkeys(("size_bytes", "lpips", "protocol", "commit", "machine"), dict), "lpips_all": list}
+PARTS = {"size_bytes": {"own": NUMBER, "common": NUMBER}, "lpips": {"kind": str, "value": NUMBER},
+         "machine": {"device": str, "cells_per_gpu": int, "cells_at_once": int}}
+LARGEST = 1e18  # of a number that is a figure
 # What two rows of one scene must share to be comparable, where both say it.
-RULES = ("split", "resolution", "image_size", "downscaler", "background", "principal_point")
+RULES = ("split", "train_views", "test_views", "resolution", "image_size", "downscaler", "background",
+         "principal_point", "sh_degree", "recipe", "scale_recipe")
 RULE_PREFIXES = ("psnr", "ssim", "lpips", "edge", "fps", "size", "quantisation")
 PAPER_ITERATIONS, PAPER_SCHEDULE = 30000, "3dgs"
 MEGABYTE = 1e6
-TIMES = ("train_seconds", "wall_seconds", "fps")  # of cells that shared their GPU these are not the GPU's own
+TIMES = ("train_seconds", "wall_seconds", "fps")  # of cells that shared their machine these are not its own
+SHARED, MACHINES_DIFFER = "shared", "machines differ"  # why there is no time
 LPIPS = "lpips:"  # the figure's name goes on with its kind, such as lpips_alex
 
 
@@ -51,9 +64,9 @@ class Setting(NamedTuple):
 
     @property
     def source(self) -> str:
-        """The method's label, which says where a checkout is unpatched."""
-        told = self.variant != "unpatched" or "unpatched" in self.name
-        return self.name if told else f"{self.name}-unpatched"
+        """The method's label, which says where a checkout is unpatched or fused."""
+        told = self.variant in (None, "native", "patched") or self.variant in self.name
+        return self.name if told else f"{self.name}-{self.variant}"
 
     def label(self, blend_mode: bool = True) -> str:
         """Such as "native, smoe, steady"."""
@@ -80,6 +93,7 @@ class Measured(NamedTuple):
 
     mean: Optional[float] = None
     spread: Optional[float] = None
+    why: str = ""  # there is no mean
 
 
 class Group:
@@ -97,18 +111,13 @@ class Group:
             return row["dataset"]
         return next((dataset for dataset, scenes in datasets.items() if self.scene in scenes), None)
 
-    def by_seed(self, name: str) -> Dict[int, float]:
-        """{seed: figure} of the seeds that have it."""
-        figures = {row["seed"]: figure(row, name) for row in self.rows}
-        return {seed: value for seed, value in figures.items() if value is not None}
-
     def measured(self, name: str) -> Measured:
         """The figure's mean and spread over seeds."""
-        return measured(self.by_seed(name).values())
+        return over([self], name, lambda figures: figures[0])
 
-    def shared(self, name: str) -> bool:
-        """Whether the figure is left out because every cell shared its GPU."""
-        return name in TIMES and bool(self.rows) and all(map(shared_gpu, self.rows))
+    def done(self) -> Set[int]:
+        """The seeds that did not fail."""
+        return {row["seed"] for row in self.rows}
 
     def seeds(self) -> str:
         """How many seeds the figures are of, such as "3", or "2 of 3" where one failed."""
@@ -159,33 +168,63 @@ def _parsed(text: str, place: str) -> Row:
     missing = [name for name in NEEDED if name not in row]
     if missing:
         raise ReportError(f"{place}: the row lacks {', '.join(missing)}")
-    for name, kind in NEEDED.items():
-        if not isinstance(row[name], kind):
-            raise ReportError(f"{place}: {name} is {row[name]!r}; it must be of type {kind.__name__}")
+    for name, value, kind in _fields(row):
+        if (value is not None or name in NEEDED) and not _legal(name, value, kind):
+            wanted = "a finite number" if kind in (int, NUMBER) else f"of type {kind.__name__}"
+            raise ReportError(f"{place}: {name} is {value!r}; it must be {wanted}")
     return row
+
+
+def _fields(row: Row) -> Iterator[Tuple[str, Any, Any]]:
+    """(name, value, type) of all that is read of a row, each before its parts."""
+    for name, kind in {**NEEDED, **OPTIONAL}.items():
+        yield name, row.get(name), kind
+        for part, part_kind in PARTS.get(name, {}).items():
+            yield f"{name}.{part}", (row.get(name) or {}).get(part), part_kind
+    for index, lpips in enumerate(row.get("lpips_all") or []):
+        yield f"lpips_all[{index}]", lpips, dict
+        for part, part_kind in PARTS["lpips"].items():
+            yield f"lpips_all[{index}].{part}", (lpips or {}).get(part), part_kind
+
+
+def _legal(name: str, value: Any, kind: Any) -> bool:
+    if not isinstance(value, kind) or isinstance(value, bool) != (kind is bool):
+        return False
+    if kind not in (int, NUMBER):
+        return True
+    return abs(value) < LARGEST or (value == math.inf and name.startswith("psnr"))  # NaN is not smaller either
 
 
 def _refuse_mixed_protocols(rows: Iterable[Row]) -> None:
     first: Dict[Tuple[str, str, str], Tuple[Any, str]] = {}
     for row in rows:
-        for name, value in (row.get("protocol") or {}).items():
-            if row["ok"] and (name in RULES or name.startswith(RULE_PREFIXES)):
-                known, cell = first.setdefault((row["suite"], row["scene"], name), (value, row["cell"]))
-                if known != value:
-                    raise ReportError(f"suite {row['suite']}, scene {row['scene']}: cells of different protocols stand "
-                                      f"in no common table: {name} is {known!r} in {cell} and {value!r} in "
-                                      f"{row['cell']}")
+        for name, value in _rules(row) if row["ok"] else ():
+            known, cell = first.setdefault((row["suite"], row["scene"], name), (value, row["cell"]))
+            if known != value:
+                raise ReportError(f"suite {row['suite']}, scene {row['scene']}: cells of different protocols stand "
+                                  f"in no common table: {name} is {known!r} in {cell} and {value!r} in {row['cell']}")
+
+
+def _rules(row: Row) -> Iterator[Tuple[str, Any]]:
+    """(name, value) of each rule that the row states; the entries of one that is a dict stand alone."""
+    for name, value in (row.get("protocol") or {}).items():
+        if name in RULES or name.startswith(RULE_PREFIXES):
+            entries = {f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict) else {
+                name: value}
+            yield from ((key, entry) for key, entry in entries.items() if entry is not None)
 
 
 def figure(row: Row, name: str) -> Optional[float]:
     """A figure of a row by its name: a field; size_own_mb, size_common_mb, num_gaussians_m; lpips:KIND.
 
-    None where it was not measured, and for times of a cell that shared its GPU.
+    None where it was not measured, and for times of a cell that shared its machine.
     """
-    if name in TIMES and shared_gpu(row):
+    if name in TIMES and shared(row):
         return None
+    if name in ("psnr", "psnr_float") and row.get(name) is None and row["ok"] and row.get("ssim") is not None:
+        return math.inf  # json has no number for it: renderings that equal the ground truth
     if name.startswith(LPIPS):
-        return next((lpips["value"] for lpips in _lpips(row) if lpips["kind"] == name[len(LPIPS):]), None)
+        return next((lpips.get("value") for lpips in _lpips(row) if lpips["kind"] == name[len(LPIPS):]), None)
     if name in ("size_own_mb", "size_common_mb"):
         size = (row.get("size_bytes") or {}).get(name[len("size_"):-len("_mb")])
         return None if size is None else size / MEGABYTE
@@ -195,26 +234,37 @@ def figure(row: Row, name: str) -> Optional[float]:
     return row.get(name)
 
 
-def shared_gpu(row: Row) -> bool:
-    """Whether other cells may have been at work on the row's GPU."""
-    machine = row.get("machine")
-    return isinstance(machine, dict) and (machine.get("cells_per_gpu") or 1) > 1
+def at_once(row: Row) -> int:
+    """How many cells may have been at work at once on the row's GPU or CPU."""
+    machine = row.get("machine") or {}
+    return max(machine.get("cells_per_gpu") or 1, machine.get("cells_at_once") or 1)
+
+
+def shared(row: Row) -> bool:
+    """Whether other cells may have been at work on the row's GPU or CPU."""
+    return at_once(row) > 1
+
+
+def device_of(row: Row) -> Optional[str]:
+    """What the row was measured on, such as "NVIDIA H200"."""
+    return (row.get("machine") or {}).get("device")
 
 
 def lpips_figures(rows: Iterable[Row]) -> List[str]:
     """The names of the LPIPS figures that some row has, such as lpips:lpips_alex."""
     return [LPIPS + kind for kind in sorted({lpips["kind"] for row in rows for lpips in _lpips(row)
-                                             if lpips["value"] is not None})]
+                                             if lpips.get("value") is not None})]
 
 
 def lpips_reasons(rows: Iterable[Row]) -> List[str]:
     """Which kinds of LPIPS are missing, and why."""
     return sorted({f"{lpips['kind']}: {lpips['reason']}" for row in rows if row["ok"] for lpips in _lpips(row)
-                   if lpips["value"] is None and lpips.get("reason")})
+                   if lpips.get("value") is None and lpips.get("reason")})
 
 
 def _lpips(row: Row) -> List[Row]:
-    return row.get("lpips_all") or ([row["lpips"]] if row.get("lpips") else [])
+    """What the row says of each kind of LPIPS; a suite may ask for none."""
+    return [lpips for lpips in row.get("lpips_all") or [row.get("lpips")] if lpips and lpips.get("kind")]
 
 
 def setting_of(row: Row, end_of: Callable[[Row], Optional[str]]) -> Setting:
@@ -252,29 +302,37 @@ def safe_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name)
 
 
-def measured(values: Iterable[float]) -> Measured:
-    """Mean and sample standard deviation."""
-    values = list(values)
-    if not values:
-        return Measured()
+def over(groups: Sequence[Group], name: str, combine: Callable[[List[float]], float],
+         seeds: Optional[Set[int]] = None) -> Measured:
+    """Mean and spread of combine([the figure of each group]) over the seeds that all groups have it of.
+
+    seeds: no others. What combine gives as NaN is left out. Times are of one machine, or there are none.
+    """
+    found = [{row["seed"]: row for row in group.rows if figure(row, name) is not None} for group in groups]
+    common = set.intersection(*map(set, found), *([] if seeds is None else [seeds]))
+    if name in TIMES and not common and any(shared(row) for group in groups for row in group.rows):
+        return Measured(why=SHARED)
+    if name in TIMES and len({device_of(rows[seed]) for rows in found for seed in common}) > 1:
+        return Measured(why=MACHINES_DIFFER)
+    values = [combine([figure(rows[seed], name) for rows in found]) for seed in sorted(common)]
+    values = [value for value in values if not math.isnan(value)]
+    if not values or math.inf in values:
+        return Measured(math.inf if values else None)
     return Measured(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
 
 
-def over_scenes(groups: Sequence[Group], name: str) -> Measured:
-    """The mean over scenes of the means over seeds; None where a scene lacks the figure.
-
-    The spread is that of the averages over scenes, over the seeds that all scenes have.
-    """
-    by_scene = [group.by_seed(name) for group in groups]
-    if not by_scene or not all(by_scene):
-        return Measured()
-    mean = statistics.fmean(statistics.fmean(figures.values()) for figures in by_scene)
-    common = set.intersection(*(set(figures) for figures in by_scene))
-    averages = [statistics.fmean(figures[seed] for figures in by_scene) for seed in sorted(common)]
-    return Measured(mean, statistics.stdev(averages) if len(averages) > 1 else None)
+def difference(figures: Sequence[float]) -> float:
+    """By how much the second is larger; NaN where one is infinite."""
+    first, second = figures
+    return second - first if math.isfinite(first) and math.isfinite(second) else math.nan
 
 
-def paired(one: Group, other: Group, name: str, combine: Callable[[float, float], float]) -> Measured:
-    """combine(other, one) for each seed that both have, averaged."""
-    first, second = one.by_seed(name), other.by_seed(name)
-    return measured(combine(second[seed], first[seed]) for seed in sorted(set(first) & set(second)))
+def ratio(figures: Sequence[float]) -> float:
+    """The second over the first; NaN where that is 0."""
+    first, second = figures
+    return second / first if first else math.nan
+
+
+def some(names: Sequence[str], most: int) -> str:
+    """The first of the names, and how many more there are."""
+    return "; ".join([*names[:most], *([f"{len(names) - most} more"] if names[most:] else [])])

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Sequence
 
 import matplotlib
 import numpy as np
@@ -24,7 +24,8 @@ ERROR_COLORS = "inferno"
 def collect(results: str, suite: str, rows: Sequence[Row], output: str) -> List[Dict[str, Any]]:
     """Copies the images of a suite's cells to OUTPUT/images and draws their errors.
 
-    Of several seeds the first that has images is taken. Returns for every scene, with paths relative to OUTPUT:
+    Of several seeds that is taken which the most blend modes have images of. Returns for every scene, with paths
+    relative to OUTPUT:
       {"scene", "settings": [{"label", "views": [{"name", "width", "height", "layers": [{"label", "path", "note"}]}]}]}
     """
     found: Dict[str, Dict[Any, List[Group]]] = {}
@@ -52,18 +53,19 @@ def error_image(truth: np.ndarray, image: np.ndarray) -> np.ndarray:
     return (colors[..., :3] * 255 + 0.5).astype(np.uint8)
 
 
-def _images_of(results: str, group: Group) -> Optional[str]:
-    """The images folder of the first seed that has one, or None."""
-    for row in sorted(group.rows, key=lambda row: row["seed"]):
-        folder = os.path.join(results, CELLS_FOLDER, row["cell"], "images")
-        if os.path.isdir(os.path.join(folder, "gt")) and os.path.isdir(os.path.join(folder, "render")):
-            return folder
-    return None
+def _images_of(results: str, group: Group) -> Dict[int, str]:
+    """The images folder of each seed that has one."""
+    folders = {row["seed"]: os.path.join(results, CELLS_FOLDER, row["cell"], "images") for row in group.rows}
+    return {seed: folder for seed, folder in folders.items()
+            if all(os.path.isdir(os.path.join(folder, kind)) for kind in ("gt", "render"))}
 
 
 def _views(results: str, groups: Sequence[Group], output: str, folder: str) -> List[Dict[str, Any]]:
-    """The views that every blend mode of a setting has."""
-    folders = {group.setting.blend_mode: _images_of(results, group) for group in groups}
+    """The views that every blend mode of a setting has, of one seed: the first of those that the most modes have."""
+    by_mode = {group.setting.blend_mode: _images_of(results, group) for group in groups}
+    seeds = sorted({seed for found in by_mode.values() for seed in found})
+    seed = max(seeds, key=lambda seed: sum(seed in found for found in by_mode.values()))
+    folders = {mode: found[seed] for mode, found in by_mode.items() if seed in found}
     names = set.intersection(*(set(os.listdir(os.path.join(source, kind))) for source in folders.values()
                                for kind in ("gt", "render")))
     views = []

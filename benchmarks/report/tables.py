@@ -12,6 +12,7 @@ DASH = "–"
 OURS, PAPER = "ours", "paper"
 # How a figure is headed and with how many digits it is printed.
 FIGURES: Dict[str, Tuple[str, int]] = {
+    "seeds": ("seeds", 0),
     "psnr": ("PSNR [dB]", 2),
     "psnr_float": ("PSNR, floats [dB]", 2),
     "psnr_edge": ("PSNR at edges [dB]", 2),
@@ -92,7 +93,7 @@ def column(name: str, group: str = "", difference: bool = False) -> Column:
 
 def cell(figure: Measured) -> Cell:
     """A measured figure as a cell."""
-    return Cell(figure.mean, figure.spread)
+    return Cell(figure.mean, figure.spread, figure.why)
 
 
 def printed(text: str) -> Cell:
@@ -141,7 +142,7 @@ def to_csv(table: Table) -> str:
 
 def _unrounded(value: float) -> str:
     """The number; a whole one without ".0"."""
-    return str(int(value)) if value == int(value) else repr(value)
+    return str(int(value)) if float(value).is_integer() else repr(value)
 
 
 def to_latex(table: Table) -> str:

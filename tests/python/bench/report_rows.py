@@ -21,7 +21,7 @@ def row(scene="bonsai", blend_mode="alpha", threshold=0.005, seed=0, psnr=20.0, 
               "psnr_edge": None if psnr is None else psnr - 2,
               "num_gaussians": 40000, "size_bytes": {"own": 2_000_000, "common": 9_440_000}, "train_seconds": 100.0,
               "wall_seconds": 120.0, "fps": 200.0, "peak_gpu_mib": None, "protocol": dict(PROTOCOL),
-              "commit": {"project": "abc1234", "trainer": None}, "machine": {"gpu": "Card X"}, "history": []}
+              "commit": {"project": "abc1234", "trainer": None}, "machine": {"device": "Card X"}, "history": []}
     fields.update(changes)
     name = "-".join(str(fields[part]) for part in ("suite", "method", "scene", "blend_mode", "schedule",
                                                     "densify_grad_threshold", "seed"))

@@ -40,10 +40,12 @@ def test_a_cell_is_the_mean_over_seeds_with_its_spread():
 def test_a_scene_counts_once_however_many_seeds_it_has():
     entries = [row("truck", seed=0, psnr=20.0), row("truck", seed=1, psnr=22.0), row("train", seed=0, psnr=31.0)]
     line = shown(table_of(entries, "table1"), end="sparse")
-    assert line["Tanks and Temples PSNR [dB]"] == "26.00"  # ((20 + 22) / 2 + 31) / 2; only seed 0 is common: no spread
+    assert line["Tanks and Temples PSNR [dB]"] == "25.50"  # (20 + 31) / 2: train has no seed 1
+    assert line["Tanks and Temples seeds"] == "1 of 2"
     entries.append(row("train", seed=1, psnr=33.0))
     line = shown(table_of(entries, "table1"), end="sparse")
     assert line["Tanks and Temples PSNR [dB]"] == "26.50 ± 1.41"  # 25.5 and 27.5
+    assert line["Tanks and Temples seeds"] == "2"
 
 
 def test_an_average_leaves_no_scene_out():
@@ -182,7 +184,7 @@ def test_an_average_over_scenes_has_no_time_where_one_of_them_shared_its_gpu():
 
 
 def test_cells_that_were_alone_are_not_marked():
-    table = table_of([shared(1), row("fox"), row("lego", machine="Card X")], "cells")
+    table = table_of([shared(1), row("fox"), row("lego", machine={"device": "Card X", "cells_at_once": 1})], "cells")
     assert shown(table, scene="bonsai")["FPS"] == "3" and layouts.SHARED_NOTE not in table.notes
 
 

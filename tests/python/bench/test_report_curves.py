@@ -74,7 +74,7 @@ def test_bars_are_the_means():
 
 
 def test_bars_are_of_cells_that_had_their_gpu_alone():
-    two = {"gpu": "Card X", "cells_per_gpu": 2}
+    two = {"device": "Card X", "cells_per_gpu": 2}
     entries = [row(), row(seed=1, train_seconds=900.0, machine=two), row(blend_mode="smoe", fps=1.0, machine=two)]
     drawn = curves.bars(groups_of(entries))
     train, fps = drawn.axes

@@ -103,7 +103,7 @@ def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path):
     text = (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
     rules = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
     assert rules["iterations"] == "30000" and rules["schedules"] == "3dgs; steady"
-    assert rules["cells that shared a GPU"] == "1 of 2, up to 3 at once" and "arguments" not in rules
+    assert rules["cells that shared their GPU or CPU"] == "1 of 2, up to 3 at once" and "arguments" not in rules
 
 
 def test_text_of_rows_is_text(written):
