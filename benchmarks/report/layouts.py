@@ -199,9 +199,10 @@ def _averages(setting: Setting, settings: Dict[Setting, Dict[str, Group]], scene
     failed = [scene for scene in scenes if scene in by_scene and not by_scene[scene].rows]
     absent = [scene for scene in scenes if scene not in by_scene]
     common, left_out = _seeds(_beside(setting, settings, scenes))
-    text = "failed" if failed else "not run" if absent else "" if common else "no common seed"
-    if text:
-        text += ": " + ", ".join(failed or absent) if len(scenes) > 1 and (failed or absent) else ""
+    if failed or absent or not common:
+        text = "failed" if failed else "not run" if absent else "no common seed"
+        if len(scenes) > 1 and (failed or absent):
+            text += ": " + ", ".join(failed or absent)
         return [Cell(text=text if name == "psnr" else "") for name in names]
     seeds = Cell(text=f"{len(common)} of {len(common) + len(left_out)}") if left_out else Cell(len(common))
     groups = [by_scene[scene] for scene in scenes]

@@ -8,7 +8,8 @@ from PIL import Image
 
 PROTOCOL = {"split": "sorted by name, every 8th is a test image", "resolution": -1, "image_size": [48, 32],
             "downscaler": "pillow bicubic", "background": "black", "principal_point": "scene",
-            "psnr": "8-bit images, mean over test views"}
+            "psnr": "8-bit images, mean over test views", "sh_degree": 3, "train_views": 9, "test_views": 2,
+            "scale_recipe": False, "recipe": {"lambda_dssim": 0.2, "feature_lr": 0.0025, "opacity_lr": 0.025}}
 TRUTH, ALPHA, SMOE = (100, 100, 100), (180, 100, 100), (100, 100, 160)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 
 import pytest
 from report_rows import PROTOCOL, failed, row, write_rows
@@ -56,6 +57,26 @@ def test_an_average_leaves_no_scene_out():
     assert shown(table, method="native, alpha")[name] == "20.00"
     assert shown(table, method="native, smoe")[name] == "not run: train"
     assert shown(table, method="3dgs-2023, alpha")[name] == "failed: train"
+
+
+def test_an_average_is_of_the_seeds_that_every_scene_has_in_both_modes():
+    """Seeds that differ by more than the modes do: an average over whichever there are would turn the sign."""
+    alpha = [row(scene, seed=seed, psnr=15.0 + 3 * seed) for scene in ("truck", "train") for seed in range(3)]
+    smoe = [row(entry["scene"], "smoe", seed=entry["seed"], psnr=entry["psnr"] + 1)
+            if (entry["scene"], entry["seed"]) not in (("truck", 1), ("truck", 2), ("train", 2)) else
+            failed(scene=entry["scene"], blend_mode="smoe", seed=entry["seed"]) for entry in alpha]
+    table, name = table_of(alpha + smoe, "table1"), "Tanks and Temples"
+    for mode, psnr in (("alpha", "15.00"), ("smoe", "16.00")):
+        line = shown(table, method=f"native, {mode}")
+        assert (line[f"{name} PSNR [dB]"], line[f"{name} seeds"]) == (psnr, "1 of 3")
+    assert [note for note in table.notes if "averages leave" in note] == [
+        "sparse, native: averages leave seed 1 out, since smoe failed on truck.",
+        "sparse, native: averages leave seed 2 out, since smoe failed on train, smoe failed on truck."]
+    # A mode that lacks a scene has no average, and takes no seed from the other.
+    line = shown(table_of(alpha + [row("truck", "smoe")], "table1"), method="native, alpha")
+    assert (line[f"{name} PSNR [dB]"], line[f"{name} seeds"]) == ("18.00 ± 3.00", "3")
+    apart = [row("truck", seed=0), row("train", seed=1)]
+    assert shown(table_of(apart, "table1"), end="sparse")[f"{name} PSNR [dB]"] == "no common seed"
 
 
 def test_the_papers_figures_stand_beside_ours_and_are_marked():
@@ -113,7 +134,7 @@ def test_other_trainers_stand_in_table_2():
     assert shown(table, method="taming, smoe")["PSNR [dB]"] == "21.00"
     assert shown(table, method="taming, alpha")["FPS"] == "100"
     printed = next(line for line in table.rows if line.labels == ("sparse", "3DSMoES-Taming"))
-    assert printed.source == tables.PAPER and [cell.printed for cell in printed.cells][-2:] == ["280", "194"]
+    assert printed.source == tables.PAPER and [cell.printed for cell in printed.cells][-3:-1] == ["280", "194"]
     assert table_of([row()], "table2") is None
 
 
@@ -155,10 +176,72 @@ def test_deltas_beside_what_the_paper_prints():
     assert cells[names.index("#Gaussians ratio")].value == pytest.approx(0.064 / 0.088)
 
 
+@pytest.mark.parametrize("alpha, smoe, number, train", [(0, 50.0, "–", "0.50"), (40000, 0.0, "0.50", "0.00")])
+def test_nothing_is_divided_by_0(alpha, smoe, number, train):
+    entries = [row(num_gaussians=alpha), row(blend_mode="smoe", num_gaussians=20000, train_seconds=smoe),
+               row("fox", train_seconds=0.0), row("fox", blend_mode="smoe", num_gaussians=10000)]
+    line = shown(table_of(entries, "deltas"), scene="bonsai")
+    assert (line["#Gaussians ratio"], line["train ratio"]) == (number, train)
+    line = shown(table_of(entries, "deltas"), scene="fox")
+    assert (line["#Gaussians ratio"], line["train ratio"]) == ("0.25", "–")
+
+
+def test_renderings_that_equal_the_ground_truth_have_an_infinite_psnr(tmp_path):
+    """json has no number for it: some write null, some Infinity."""
+    entries = rows.read_rows(write_rows(tmp_path, [row(psnr=None), row(seed=1), row(blend_mode="smoe", psnr=math.inf),
+                                                   row(blend_mode="smoe", seed=1, psnr=21.0)]))
+    table = table_of(entries, "cells")
+    assert {shown(table, method=f"native, {mode}")["PSNR [dB]"] for mode in ("alpha", "smoe")} == {"inf"}
+    assert next(csv.DictReader(io.StringIO(tables.to_csv(table))))["PSNR [dB]"] == "inf"
+    assert shown(table_of(entries, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "+1.00"  # of seed 1
+    nothing = row("fox", psnr=None, ssim=None, psnr_edge=None)  # without test views
+    assert "PSNR [dB]" not in shown(table_of([nothing], "cells"), scene="fox")
+
+
+def test_pairs_of_different_commits_are_named():
+    entries = [row(seed=seed, blend_mode=mode, commit={"project": commit, "trainer": None})
+               for seed, commits in ((0, "aa"), (1, "ab")) for mode, commit in zip(("alpha", "smoe"), commits)]
+    notes = table_of(entries, "deltas").notes
+    assert notes[-1] == ("alpha and smoe are of different commits in 1 pair: bonsai, native, 0.005, seed 1: "
+                         "project a and b.")
+    assert not any("commits" in note for note in table_of(entries[:2], "deltas").notes)
+
+
+def elsewhere(**changes):
+    """A row of another machine, which is ten times as slow."""
+    return row(**{"train_seconds": 1000.0, "fps": 20.0, **changes, "machine": {"device": "Card Y"}})
+
+
+def test_times_of_different_machines_are_neither_averaged_nor_divided():
+    entries = [elsewhere(), row(blend_mode="smoe", psnr=21.0), row(seed=1), row(blend_mode="smoe", seed=1)]
+    line = shown(table_of(entries, "deltas"), scene="bonsai")
+    assert [line[name] for name in ("train ratio", "FPS ratio", "Δ PSNR [dB]")] == ["machines differ"] * 2 + [
+        "+0.50 ± 0.71"]
+    table = table_of(entries, "cells")
+    line = shown(table, method="native, alpha")
+    assert [line[name] for name in ("train [s]", "FPS", "PSNR [dB]")] == ["machines differ"] * 2 + ["20.00 ± 0.00"]
+    assert shown(table, method="native, smoe")["FPS"] == "200 ± 0"
+    assert ("Measured on Card X (native, alpha; native, smoe), Card Y (native, alpha); times and FPS compare on one "
+            "machine only.") in table.notes
+    # Only seeds that both have are compared.
+    line = shown(table_of(entries[1:], "deltas"), scene="bonsai")
+    assert (line["train ratio"], line["FPS ratio"]) == ("1.00", "1.00")
+    taming = {"method": "taming", "variant": "patched"}
+    line = shown(table_of([row("truck", **taming), elsewhere(scene="train", **taming)], "table2"), end="sparse")
+    assert (line["PSNR [dB]"], line["train [s]"], line["FPS"]) == ("20.00", "machines differ", "machines differ")
+
+
 def shared(cells_per_gpu=2, **changes):
     """A row of a cell that shared its GPU: its times are far from those of `row`."""
     return row(**{"train_seconds": 7000.0, "wall_seconds": 8000.0, "fps": 3.0, **changes,
                   "machine": {"device": "Card X", "cells_per_gpu": cells_per_gpu}})
+
+
+def test_times_of_cells_that_shared_a_cpu_are_left_out():
+    machine = {"device": "CPU X", "cells_at_once": 2}
+    table = table_of([row(machine=machine), row("fox", machine={**machine, "cells_at_once": 1})], "cells")
+    assert shown(table, scene="bonsai")["train [s]"] == "shared" and shown(table, scene="fox")["train [s]"] == "100"
+    assert layouts.SHARED_NOTE in table.notes
 
 
 def test_times_of_cells_that_shared_their_gpu_are_left_out():
@@ -208,6 +291,20 @@ def test_lpips_of_different_kinds_have_columns_of_their_own():
     assert (line["LPIPS Alex"], line["LPIPS VGG as 3DGS"]) == ("0.300", "0.400")
     assert "LPIPS VGG" not in line
     assert any("lpips_vgg_std: no weights at hand" in note for note in table.notes)
+
+
+def test_a_suite_that_asks_for_no_lpips_lacks_none():
+    none = {"value": None, "kind": None, "reason": "the suite asks for none"}
+    assert not any("Not measured" in note for note in table_of([row(lpips=none, lpips_all=[])], "cells").notes)
+
+
+@pytest.mark.parametrize("label, text", [("3dgs-2023-fused", "3dgs-2023-fused, smoe"), ("mine", "mine-fused, smoe")])
+def test_a_fused_checkout_says_so_once(label, text):
+    entries = [row(blend_mode="smoe", method="3dgs-2023", label=label, variant="fused"),
+               row(blend_mode="smoe", method="3dgs-2023", variant="patched", psnr=21.0)]
+    assert shown(table_of(entries, "cells"), method=text)["PSNR [dB]"] == "20.00"
+    assert shown(table_of(entries, "table1"), method=text)["Mip-NeRF 360 (ours: bonsai) PSNR [dB]"] == "20.00"
+    assert shown(table_of(entries, "cells"), method="3dgs-2023, smoe")["PSNR [dB]"] == "21.00"
 
 
 def test_short_runs_and_unpatched_checkouts_say_so():
@@ -270,12 +367,25 @@ def test_a_cells_own_row_wins_over_the_list(tmp_path):
 
 
 @pytest.mark.parametrize("name, value", [("background", "white"), ("image_size", [96, 64]), ("split", "none"),
-                                         ("downscaler", "box"), ("psnr", "floats")])
+                                         ("downscaler", "box"), ("psnr", "floats"), ("sh_degree", 2),
+                                         ("train_views", 7), ("test_views", 7), ("scale_recipe", True),
+                                         ("recipe", {"lambda_dssim": 0.0})])
 def test_mixed_protocols_are_refused(tmp_path, name, value):
     other = row(blend_mode="smoe", protocol={**PROTOCOL, name: value})
     with pytest.raises(ReportError, match=name) as caught:
         rows.read_rows(write_rows(tmp_path, [row(), other]))
     assert other["cell"] in str(caught.value) and row()["cell"] in str(caught.value)
+
+
+def test_rules_that_one_row_does_not_state_are_not_compared(tmp_path):
+    """Rows of earlier versions state fewer, and a checkout's recipe has not all names of the native one."""
+    bare = {name: value for name, value in PROTOCOL.items() if name not in ("recipe", "sh_degree")}
+    entries = [row(protocol={**bare, "scale_recipe": None}), row(seed=1),
+               row(seed=2, protocol={**PROTOCOL, "recipe": {"feature_lr": 0.0025, "opacity_lr": None}})]
+    assert len(rows.read_rows(write_rows(tmp_path, entries))) == 3
+    entries.append(row(seed=3, protocol={**PROTOCOL, "recipe": {"feature_lr": 0.01}}))
+    with pytest.raises(ReportError, match="recipe.feature_lr is 0.0025 in .* and 0.01 in "):
+        rows.read_rows(write_rows(tmp_path, entries))
 
 
 def test_scenes_and_suites_may_differ_in_protocol(tmp_path):
@@ -292,6 +402,17 @@ def test_damaged_results_are_refused(tmp_path, text, reason):
     (tmp_path / "rows.jsonl").write_text(text, encoding="latin-1")
     with pytest.raises(ReportError, match=reason):
         rows.read_rows(str(tmp_path))
+
+
+@pytest.mark.parametrize("name, value", [
+    ("psnr", "12.3"), ("ssim", math.nan), ("fps", math.inf), ("psnr", -math.inf), ("num_gaussians", True),
+    ("train_seconds", 10 ** 400), ("seed", True), ("budget", "1"), ("iterations", [1]), ("label", 1),
+    ("lpips_all", [1]), ("lpips_all", [{"kind": 1}]), ("lpips", {"kind": "lpips_alex", "value": "0.3"}),
+    ("size_bytes", 3), ("size_bytes", {"own": "3"}), ("densify_grad_threshold", "0.005"), ("protocol", []), ("machine", "Card X"),
+    ("machine", {"cells_per_gpu": "2"}), ("commit", "abc")])
+def test_a_field_of_another_type_is_refused(tmp_path, name, value):
+    with pytest.raises(ReportError, match=rf"rows.jsonl, line 2: {name}[\[\]0-9]*(\.\w+)? is .*; it must be "):
+        rows.read_rows(write_rows(tmp_path, [row(), {**row(blend_mode="smoe"), name: value}]))
 
 
 def test_one_setting_twice_is_refused():

@@ -85,6 +85,21 @@ def test_bars_are_of_cells_that_had_their_gpu_alone():
     assert len(curve.containers) == 2  # quality is as it is
 
 
+def test_bars_are_of_one_machine():
+    entries = [row(), row(blend_mode="smoe", machine={"device": "Card Y"})]
+    assert curves.bars(groups_of(entries)) is None
+    one_shared = [*entries[:1], row(blend_mode="smoe", machine={"device": "Card Y", "cells_per_gpu": 2})]
+    assert len(curves.bars(groups_of(one_shared)).axes[0].patches) == 1
+
+
+def test_what_has_no_place_on_an_axis_is_left_out():
+    entries = [row(psnr=float("inf")), row(threshold=0.002, num_gaussians=0), row(threshold=0.001, num_gaussians=7)]
+    psnr = curves.rate_distortion(groups_of(entries)).axes[0]
+    assert [line.get_xydata().tolist() for line in psnr.containers[0].lines[:1]] == [[[7, 20]]]
+    nothing = [row(num_gaussians=0, size_bytes={"own": 0, "common": 0})]
+    assert curves.rate_distortion(groups_of(nothing)) is None
+
+
 @pytest.mark.parametrize("draw", [curves.rate_distortion, curves.bars])
 @pytest.mark.parametrize("methods", [1, 4])
 def test_the_legend_lies_inside_and_above_the_panels(draw, methods):

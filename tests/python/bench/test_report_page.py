@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import shutil
@@ -14,7 +15,7 @@ from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images,
 
 pytest.importorskip("matplotlib", reason="a report needs matplotlib")
 pytest.importorskip("jinja2", reason="a report needs jinja2")
-from diff_smoe_rasterization.benchmarks.report import ReportError, report, sliders  # noqa: E402
+from diff_smoe_rasterization.benchmarks.report import ReportError, report, sliders, survey  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +73,45 @@ def test_a_second_report_leaves_nothing_of_the_first(written, tmp_path):
     names = {path.relative_to(output).as_posix() for path in output.rglob("*") if path.is_file()}
     assert {"mine.txt", "index.html", "report.md", "survey/table1/other/fox.csv"} < names
     assert not [name for name in names if "bonsai" in name or "failures" in name or name.startswith("images/")]
+
+
+def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypatch):
+    output = tmp_path / "report"
+    shutil.copytree(written, output)
+
+    def files():
+        return {path.relative_to(output).as_posix(): path.read_bytes() for path in output.rglob("*") if path.is_file()}
+
+    before = files()
+    monkeypatch.setattr(survey, "write_survey", lambda *_: 1 / 0)  # after tables, figures and images
+    with pytest.raises(ZeroDivisionError):
+        report(write_rows(tmp_path / "results", [row("fox")]), str(output))
+    assert files() == before
+
+
+def test_a_folder_of_others_is_left_alone(tmp_path):
+    (tmp_path / "report" / "images").mkdir(parents=True)
+    with pytest.raises(ReportError, match="images is of no report"):
+        report(write_rows(tmp_path / "results", [row()]), str(tmp_path / "report"))
+
+
+def test_cells_without_a_row_are_named(tmp_path):
+    def counts(rows, **suite):
+        folder = tmp_path / "results"
+        write_rows(folder, rows)
+        (folder / "suite.json").write_text(json.dumps(suite))
+        report(str(folder), str(tmp_path / "report"))
+        return (tmp_path / "report" / "report.md").read_text(encoding="utf-8").split("\n")[4]
+
+    entries, here = [row(), row(seed=1)], "1 cell on 1 scene, 1 seed; none failed"
+    assert counts(entries[:1], name="table1", cells=[entries[0]["cell"], "b"]) == (
+        f"{here}; 1 of 2 cells has no row yet: b.")
+    assert counts(entries[:1], name="table1", cells=[*"edcba", entries[0]["cell"]]) == (
+        f"{here}; 5 of 6 cells have no row yet: a; b; c; 2 more.")
+    for suite in ({"name": "other", "cells": ["b"]}, {"name": "table1"}, {"name": "table1", "cells": 3}):
+        assert counts(entries[:1], **suite) == f"{here}."
+    assert counts(entries, name="table1", cells=[entry["cell"] for entry in entries]) == (
+        "2 cells on 1 scene, 2 seeds; none failed.")
 
 
 def test_files_of_others_are_left_alone(tmp_path):
@@ -136,6 +176,15 @@ def test_errors_take_the_whole_scale():
     full = sliders.error_image(np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 64, np.uint8))
     beyond = sliders.error_image(np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 255, np.uint8))
     assert (full == beyond).all() and full.sum() > brightness[-1]
+
+
+def test_images_under_one_slider_are_of_one_seed(tmp_path):
+    entries = [row(seed=0), row(seed=1), row(blend_mode="smoe", seed=1), row(blend_mode="smoe", seed=2)]
+    for entry, color in zip(entries, (TRUTH, ALPHA, SMOE, TRUTH)):
+        write_images(tmp_path / "results", entry, color, names=("one",))
+    found = sliders.collect(str(tmp_path / "results"), "s", entries, str(tmp_path))
+    _, alpha, smoe, *_ = found[0]["settings"][0]["views"][0]["layers"]
+    assert [Image.open(tmp_path / layer["path"]).getpixel((0, 0)) for layer in (alpha, smoe)] == [ALPHA, SMOE]
 
 
 @pytest.mark.parametrize("changes", [{"truth": (99, 100, 100)}, {"size": (32, 48)}])
