@@ -1,6 +1,6 @@
 """One cell: one training and its measurement, from a file of plain values to a row.
 
-    python -I -m diff_smoe_rasterization.benchmarks.cell CELL.json OUT [--gpus 0,1 --per-gpu 2 --locks FOLDER]
+    python -I -m diff_smoe_rasterization.benchmarks.cell CELL.json OUT [--gpus 0,1 --per-device 2 --locks FOLDER]
 
 OUT/row.json is written in any case but one: where this command itself is killed, so that whoever started it starts it
 again. The work is done in a process of its own, whose end, a crash or a lack of memory included, becomes a row with the
@@ -28,7 +28,8 @@ from .processes import die_with_parent
 from .results_folder import ROW_NAME
 
 LOG_NAME = "log.txt"
-SHARING_NAME = "cells_per_gpu.json"  # beside a checkpoint: its seconds were counted beside so many cells
+SHARING = {"cuda": "cells_per_gpu", "cpu": "cells_at_once"}  # what a row's machine calls it, by device
+SHARING_NAME = "cells_at_once.json"  # beside a checkpoint: its seconds were counted while so many shared the device
 
 
 def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
@@ -51,17 +52,18 @@ def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float])
 
 
 def measured_row(cell: Dict[str, Any], output: str, started: float,
-                 cells_per_gpu: Optional[int] = None) -> Dict[str, Any]:
-    """Trains and measures. cells_per_gpu: as `supervise` has it. Raises what goes wrong."""
+                 per_device: Optional[int] = None) -> Dict[str, Any]:
+    """Trains and measures. per_device: as `supervise` has it. Raises what goes wrong."""
     from ..trainer.results import result_row
     from . import methods, protocol
     from .measure import headline_lpips
 
-    earlier = note_sharing(output, cells_per_gpu)
+    earlier = note_sharing(output, per_device)
     outcome = methods.run(cell, output)
     if outcome.notes.get("continued"):  # train_seconds goes on from what the earlier attempt counted
-        cells_per_gpu = max(filter(None, (cells_per_gpu, earlier)), default=None)
+        per_device = max(filter(None, (per_device, earlier)), default=None)
     config = protocol.config_of(cell, output)
+    sharing = {} if per_device is None else {SHARING[config.device]: per_device}
     metrics = outcome.evaluation.metrics
     trained = result_row(config, outcome.scene, outcome.num_gaussians, outcome.train_seconds, outcome.evaluation)
     rules = protocol.protocol_of(trained["protocol"], config, outcome.lpips)
@@ -69,24 +71,25 @@ def measured_row(cell: Dict[str, Any], output: str, started: float,
     return {**identity(cell), "ok": True, "reason": None, "psnr": metrics["psnr"], "psnr_float": metrics["psnr_float"],
             "ssim": metrics["ssim"], "lpips": headline_lpips(outcome.lpips), "lpips_all": outcome.lpips,
             "psnr_edge": metrics.get("psnr_edge"), "num_gaussians": outcome.num_gaussians,
-            "size_bytes": {"own": outcome.own_bytes, "common": protocol.common_bytes(outcome.num_gaussians)},
+            "size_bytes": {"own": outcome.own_bytes, "common": protocol.common_bytes(
+                outcome.num_gaussians, outcome.common_bytes_per_primitive)},
             "train_seconds": outcome.train_seconds, "wall_seconds": time.time() - started,
             "fps": outcome.evaluation.fps, "peak_gpu_mib": outcome.peak_gpu_mib,
             "protocol": {**rules, **outcome.notes},
             "commit": {"project": protocol.project_commit(), "trainer": outcome.commit},
-            "machine": protocol.machine_of(config.device, cells_per_gpu), "history": outcome.history,
+            "machine": {**protocol.machine_of(config.device), **sharing}, "history": outcome.history,
             "per_view": outcome.evaluation.per_view}
 
 
-def note_sharing(output: str, cells_per_gpu: Optional[int]) -> Optional[int]:
-    """Writes beside the checkpoint how many cells may have this one's GPU; returns the most of earlier attempts."""
+def note_sharing(output: str, per_device: Optional[int]) -> Optional[int]:
+    """Writes beside the checkpoint how many cells may have this one's device; returns the most of earlier attempts."""
     path, earlier = os.path.join(output, "run", SHARING_NAME), None
     if os.path.isfile(path):
         with open(path, encoding="utf-8") as file:
             earlier = json.load(file)
-    if (cells_per_gpu or 0) > (earlier or 0):
+    if (per_device or 0) > (earlier or 0):
         os.makedirs(os.path.dirname(path), exist_ok=True)
-        write_json_atomically(path, cells_per_gpu)
+        write_json_atomically(path, per_device)
     return earlier
 
 
@@ -104,28 +107,28 @@ def write_images(output: str, outcome: Any) -> None:
             to_image(image_of(name)).save(os.path.join(folder, names[name] + ".png"))
 
 
-def work(cell: Dict[str, Any], output: str, started: float, cells_per_gpu: Optional[int] = None) -> None:
+def work(cell: Dict[str, Any], output: str, started: float, per_device: Optional[int] = None) -> None:
     """The inner process: writes the row, and removes what is no longer needed. Raises nothing but what kills it."""
     path = os.path.join(output, ROW_NAME)
     try:
-        row = measured_row(cell, output, started, cells_per_gpu)
+        row = measured_row(cell, output, started, per_device)
     except Exception as error:  # whatever it is, it is the row's reason; KeyboardInterrupt and SystemExit are not
         if not isinstance(error, TrainerError):
             traceback.print_exc()
         text = str(error) if isinstance(error, TrainerError) else f"{type(error).__name__}: {error}"
         write_json_atomically(path, failed_row(cell, text, time.time() - started))
         return
+    write_json_atomically(path, row)
     if not cell["keep_models"]:
         shutil.rmtree(os.path.join(output, "run"), ignore_errors=True)
-    write_json_atomically(path, row)
 
 
-def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_gpu: int = 1,
+def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device: Optional[int] = None,
               held: Optional[IO[str]] = None) -> Dict[str, Any]:
     """Runs `work` in a process of its own and returns the row that is in OUT then.
 
-    gpu: the one that the process is given, together with other cells up to per_gpu in all; None: as the machine has it.
-    held: a lock that the process has too.
+    gpu: the one that the process is given; None: as the machine has it. per_device: how many cells may have that GPU,
+    or on the CPU this machine, at once; None where nobody counts. held: a lock that the process has too.
     """
     with open(cell_path, encoding="utf-8") as file:
         cell = json.load(file)
@@ -139,7 +142,7 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_gpu: i
     started = time.time()
     command = [sys.executable, *["-I"] * sys.flags.isolated, "-m", __spec__.name if __spec__ else __name__]
     command += [cell_path, output, "--inside"]
-    command += ["--per-gpu", str(per_gpu)] if gpu is not None else []
+    command += ["--per-device", str(per_device)] if per_device is not None else []
     with open(log_path, "ab") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                                    env=environment, preexec_fn=die_with_parent,
@@ -206,6 +209,19 @@ def at_least_one(text: str) -> int:
     return number
 
 
+def shown(value: Optional[float], form: str) -> str:
+    """A figure as text; "-" where there is none, or an infinite one, for which json has no number."""
+    return "-" if value is None else format(value, form)
+
+
+def tell(text: str) -> None:
+    """Prints a line where it can be printed: Snakemake would remove the row of a command that failed at this."""
+    try:
+        print(text, flush=True)
+    except (OSError, ValueError):  # whoever read the output has gone; or its encoding lacks a character
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where the rest goes when the process ends
+
+
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; 0 where there is a row, whatever it says."""
     parser = argparse.ArgumentParser(prog="python -I -m diff_smoe_rasterization.benchmarks.cell",
@@ -213,8 +229,9 @@ def main(argv: Optional[List[str]] = None) -> int:
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
     parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
     parser.add_argument("--gpus", metavar="N,N", default="", help="take one of these GPUs")
-    parser.add_argument("--per-gpu", metavar="K", type=at_least_one,
-                        help="cells that may have one GPU at once (default: 1)")
+    parser.add_argument("--per-device", metavar="K", type=at_least_one,
+                        help="cells that may have one GPU, or on the CPU this machine, at once; the row says it "
+                             "(default: 1 with --gpus, else nothing is said)")
     parser.add_argument("--locks", metavar="FOLDER", help="where cells tell each other which GPU they have")
     parser.add_argument("--hold", metavar="FILE",
                         help="a lock that is held, together with other cells; ends with what started this command")
@@ -222,16 +239,17 @@ def main(argv: Optional[List[str]] = None) -> int:
     arguments = parser.parse_args(argv)
     if arguments.inside:
         with open(arguments.cell, encoding="utf-8") as file:
-            work(json.load(file), arguments.output, time.time(), arguments.per_gpu)
+            work(json.load(file), arguments.output, time.time(), arguments.per_device)
         return 0
-    gpu, lock, held, per_gpu = None, None, None, arguments.per_gpu or 1
+    gpu, lock, held, per_device = None, None, None, arguments.per_device
     try:
         if arguments.hold:
             die_with_parent()
             held = hold(arguments.hold)
         if arguments.gpus:
-            gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_gpu)
-        row = supervise(arguments.cell, arguments.output, gpu, per_gpu, held)
+            per_device = per_device or 1
+            gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_device)
+        row = supervise(arguments.cell, arguments.output, gpu, per_device, held)
     except BenchError as error:
         print(f"{arguments.cell}: {error}", file=sys.stderr)
         return 1
@@ -240,8 +258,8 @@ def main(argv: Optional[List[str]] = None) -> int:
     finally:
         for file in filter(None, (lock, held)):
             file.close()
-    print(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {row['psnr']:.2f} dB" if row["ok"]
-                                else f"failed: {row['reason']}"), flush=True)
+    tell(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {shown(row['psnr'], '.2f')} dB" if row["ok"]
+                               else f"failed: {row['reason']}"))
     return 0
 
 

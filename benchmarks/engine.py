@@ -5,7 +5,6 @@ concatenation of the rows.
 """
 from __future__ import annotations
 
-import glob
 import importlib.util
 import json
 import os
@@ -18,15 +17,15 @@ from types import MappingProxyType
 from typing import IO, Any, Dict, Iterator, List, Mapping, Optional, Sequence
 
 from ..trainer.files import write_json_atomically, write_text_atomically
-from .cell import identity
+from .cell import SHARING, identity, shown
 from .errors import BenchError
 from .lpips import files_of_weights
 from .preparation import given, made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
-from .results_folder import CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME
-from .selection import chosen, earlier_rows, plan
-from .suite import Suite, find_suite, load_suite, missing
+from .results_folder import CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME, read_object
+from .selection import SAID_BY_THE_ID, chosen, earlier_rows, plan
+from .suite import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, missing
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 
@@ -38,9 +37,11 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
 
     name: a file or a shipped suite. results: by default bench_results/NAME. jobs: cells at once, by default per_gpu
     on each GPU, or one on the CPU. slurm: None, or Snakemake's default resources ("slurm_partition=gpu"). only:
-    "field=value" of cells that are run. per_gpu: cells that one GPU is given at once; beyond 1 their times are not the
-    GPU's own, and rows say so. rows: a file of rows, or a folder of results, whose cells are not run again, failed ones
-    neither unless retry_failed. Raises BenchError.
+    "field=value" of cells that are run. per_gpu: cells that one GPU is given at once. Where it, or jobs on the CPU, is
+    beyond 1, times are not the machine's own, and rows say so. rows: a file of rows, or a folder, whose cells
+    are not run again, failed ones neither unless retry_failed. Raises BenchError.
+
+    Where nothing is to be done, neither a GPU nor Snakemake is needed.
     """
     suite = load_suite(find_suite(name))
     check_sharing(suite, jobs, slurm, per_gpu)
@@ -54,21 +55,20 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     if rows:
         print(f"{len(taken)} of {len(cells)} cells taken from {rows}")
     done = {**{name: row for name, row in there.items() if row is not None}, **taken}
-    absent = what_is_missing([cell for cell in cells if cell["id"] not in done])
+    to_do = [cell for cell in cells if cell["id"] not in done]
+    absent = what_is_missing(to_do)
     if dry_run:
         print(plan(cells, done, absent))
         return []
     if absent:
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
-    if importlib.util.find_spec("snakemake") is None:
-        raise BenchError(missing("snakemake", ImportError("needs Python 3.11 or later")))
-    words = command(suite, cells, results, jobs, slurm, per_gpu)
+    words = command(suite, to_do, results, jobs, slurm, per_gpu) if to_do else None
     os.makedirs(results, exist_ok=True)
     with only_one(results) as lock:
         write_cells(suite, cells, results, retry_failed, earlier)
         try:
-            status = run_snakemake(words, lock, signal.SIGKILL if slurm is None else signal.SIGINT)
+            status = run_snakemake(words, lock, signal.SIGKILL if slurm is None else signal.SIGINT) if words else 0
         finally:
             measured = collect(results)
     here = [measured[cell["id"]] for cell in cells if cell["id"] in measured]
@@ -80,17 +80,32 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
 
 
 def check_folder(suite: Suite, results: str) -> None:
-    """Raises BenchError where the folder has rows of another suite or of another protocol."""
-    here = read_json(os.path.join(results, SUITE_NAME))
-    if here is None or not glob.glob(os.path.join(glob.escape(results), CELLS_FOLDER, "*", ROW_NAME)):
-        return
-    differ = [] if here["name"] == suite.name else [f"name is {here['name']!r} there and {suite.name!r} here"]
-    differ += [f"protocol.{field} is {here['protocol'].get(field)!r} there and {suite.protocol.get(field)!r} here"
-               for field in sorted({*here["protocol"], *suite.protocol})
-               if here["protocol"].get(field) != suite.protocol.get(field)]
+    """Raises BenchError where the folder has rows of another suite or of another protocol, or a row that is none.
+
+    What it is a row of, its cell's file says. Scenes and methods that are new, and values of the axes, may be added.
+    """
+    if os.path.exists(results) and not os.path.isdir(results):
+        raise BenchError(f"{results}: is a file; it must be a folder, or a name where there is nothing yet")
+    here = {"": {"name": suite.name}, "protocol.": suite.protocol,
+            **{f"scene {scene['name']}: ": scene for scene in suite.scenes},
+            **{f"method {method['label']}: ": method for method in suite.methods}}
+    differ: Dict[str, None] = {}  # in words, each once
+    for name in cell_folders(results):
+        row, path = read_row(results, name), os.path.join(results, CELLS_FOLDER, name, CELL_NAME)
+        cell = read_object(path, ("suite", "protocol", "scene", "method"))
+        if row is None or cell is None:
+            continue
+        there = {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
+                 f"scene {cell['scene']['name']}: ": cell["scene"],
+                 f"method {cell['method']['label']}: ": cell["method"]}
+        for what in filter(here.__contains__, there):
+            for field in sorted({*there[what], *here[what]} - {*NOT_IN_THE_IDENTITY, "axes", "refused"}):
+                one, other = there[what].get(field), here[what].get(field)
+                if one != other:
+                    differ[f"{what}{field} is {one!r} there and {other!r} here"] = None
     if differ:
         raise BenchError(f"{results}: holds rows of another suite or of another protocol, which are not put together: "
-                         f"{'; '.join(differ)}. Choose another folder")
+                         f"{'; '.join(differ)}. Choose another folder with -o")
 
 
 @contextmanager
@@ -150,7 +165,6 @@ def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_f
         if done is not None:
             if not os.path.isfile(file):
                 write_json_atomically(file, {**cell, "given": given(cell)})
-            os.utime(row)  # newer than its cell's file
             continue
         scene, method = cell["scene"]["name"], cell["method"]["label"]  # what no cell needs is not prepared
         if scene not in scenes:
@@ -158,12 +172,12 @@ def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_f
         if method not in methods:
             methods[method] = prepared_method(cell["method"], results)
         prepared = {**cell, "scene": scenes[scene], "method": methods[method], "given": given(cell)}
-        if read_json(file) != prepared:
+        if read_object(file) != prepared:
             write_json_atomically(file, prepared)
         if os.path.isfile(row):
             os.remove(row)
-    write_json_atomically(os.path.join(results, SUITE_NAME),
-                          {"name": suite.name, "protocol": suite.protocol, "cells": [cell["id"] for cell in cells]})
+    said = {"name": suite.name, "protocol": suite.protocol, "cells": [cell["id"] for cell in suite.cells]}
+    write_json_atomically(os.path.join(results, SUITE_NAME), said)
 
 
 def row_of(results: str, cell: Dict[str, Any], retry_failed: bool) -> Optional[Dict[str, Any]]:
@@ -171,12 +185,26 @@ def row_of(results: str, cell: Dict[str, Any], retry_failed: bool) -> Optional[D
 
     That is a failed one too with retry_failed, or where its paths have changed.
     """
-    folder = os.path.join(results, CELLS_FOLDER, cell["id"])
-    row = read_json(os.path.join(folder, ROW_NAME))
+    row = read_row(results, cell["id"])
     if row is None or row["ok"]:
         return row
-    before = read_json(os.path.join(folder, CELL_NAME)) or {}
+    before = read_object(os.path.join(results, CELLS_FOLDER, cell["id"], CELL_NAME)) or {}
     return None if retry_failed or before.get("given", given(cell)) != given(cell) else row
+
+
+def read_row(results: str, name: str) -> Optional[Dict[str, Any]]:
+    """The row in a cell's folder; None where there is none. Raises BenchError where it is damaged or another cell's."""
+    path = os.path.join(results, CELLS_FOLDER, name, ROW_NAME)
+    row = read_object(path, ("cell", "ok", "label", *SAID_BY_THE_ID))
+    if row is not None and row["cell"] != name:
+        raise BenchError(f"{path}: is the row of another cell, {row['cell']}; remove it to have it made anew")
+    return row
+
+
+def cell_folders(results: str) -> List[str]:
+    """The names in RESULTS/cells."""
+    folder = os.path.join(results, CELLS_FOLDER)
+    return sorted(os.listdir(folder)) if os.path.isdir(folder) else []
 
 
 def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[str]], per_gpu: int) -> None:
@@ -191,20 +219,25 @@ def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[st
 
 def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optional[int],
             slurm: Optional[Sequence[str]], per_gpu: int = 1) -> List[str]:
-    """Snakemake's command line. Raises BenchError."""
+    """Snakemake's command line, for cells that are all to be run. Raises BenchError."""
+    if importlib.util.find_spec("snakemake") is None:
+        raise BenchError(missing("snakemake", ImportError("needs Python 3.11 or later")))
     on_gpu = suite.protocol["device"] == "cuda"
     gpus = visible_gpus() if on_gpu and slurm is None else []
     if on_gpu and slurm is None and not gpus:
         raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine; for the "
                          "CPU set protocol.device: cpu")
-    at_once = jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus)))
+    at_once = min(jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus))), len(cells))
+    per_device = at_once
     if gpus:
-        per_gpu = min(per_gpu, -(-at_once // len(gpus)))  # cells spread over the GPUs first: no more of them share one
+        per_device = min(per_gpu, -(-at_once // len(gpus)))  # spread over the GPUs first: no more of them share one
+    threads = threads_of_each(at_once) if slurm is None else 1
     words = [sys.executable, "-m", "snakemake", "all", "--snakefile", SNAKEFILE, "--directory", results, "--nolock",
              "--quiet", "host", "reason", "rules", "--keep-going", "--rerun-incomplete",
              "--rerun-triggers", "mtime", "--scheduler", "greedy",
              "--config", f"cells={json.dumps([cell['id'] for cell in cells])}", f"python={sys.executable}",
-             f"device={suite.protocol['device']}", f"per_gpu={per_gpu}",
+             f"device={suite.protocol['device']}", f"threads={threads}",
+             f"per_device={per_device if slurm is None else 0}",  # 0: nobody counts
              f"gpus={json.dumps(gpus)}"]  # a list: Snakemake takes a bare 0 for a number
     if slurm is not None:
         if importlib.util.find_spec("snakemake_executor_plugin_slurm") is None:
@@ -212,9 +245,18 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
         words += ["--executor", "slurm", "--jobs", str(at_once)]
         words += ["--default-resources", *slurm] if slurm else []
     else:
-        words += ["--cores", str(at_once)] + (["--resources", f"gpu={per_gpu * len(gpus)}"] if on_gpu else [])
+        words += ["--cores", str(at_once * threads)]
+        words += ["--resources", f"gpu={per_device * len(gpus)}"] if on_gpu else []
     headline = [f"{CELLS_FOLDER}/{cell['id']}/{ROW_NAME}" for cell in cells if cell["headline"]]
     return words + (["--prioritize", *headline] if headline else [])
+
+
+def threads_of_each(at_once: int) -> int:
+    """Threads of each of so many cells: as many as torch would take for one alone, if there are cores for that."""
+    import torch
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(torch.get_num_threads(), cores // at_once))
 
 
 def visible_gpus() -> List[str]:
@@ -237,26 +279,11 @@ def environment() -> Dict[str, str]:
 
 def collect(results: str) -> Dict[str, Dict[str, Any]]:
     """Every row in RESULTS/cells by its cell's name; writes RESULTS/rows.jsonl."""
-    folder = os.path.join(results, CELLS_FOLDER)
-    rows = {}
-    for name in sorted(os.listdir(folder)):
-        row = read_json(os.path.join(folder, name, ROW_NAME))
-        if row is not None:
-            rows[name] = row
+    found = {name: read_row(results, name) for name in cell_folders(results)}
+    rows = {name: row for name, row in found.items() if row is not None}
     lines = [json.dumps(row) for row in rows.values()]
     write_text_atomically(os.path.join(results, ROWS_NAME), "".join(line + "\n" for line in lines))
     return rows
-
-
-def read_json(path: str) -> Any:
-    """What a file says; None where it is absent. Raises BenchError where it is damaged."""
-    if not os.path.isfile(path):
-        return None
-    try:
-        with open(path, encoding="utf-8") as file:
-            return json.load(file)
-    except ValueError as error:
-        raise BenchError(f"{path}: not valid json ({error}); remove it to have it made anew") from error
 
 
 def rows_table(rows: List[Dict[str, Any]]) -> str:
@@ -264,16 +291,14 @@ def rows_table(rows: List[Dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         name = "  ".join([row["label"], row["scene"], row["blend_mode"], row.get("schedule") or "own schedule",
-                          f"{row['densify_grad_threshold']:g}", f"s{row['seed']}"])
-        at_once = row["machine"].get("cells_per_gpu") or 1
+                          shown(row["densify_grad_threshold"], "g"), f"s{row['seed']}"])
+        machine = row.get("machine") or {}
+        at_once = max(machine.get(key) or 1 for key in SHARING.values())
         if row["ok"]:
-            lines.append(f"{name}:  {_shown(row['psnr'], '.2f')} dB  SSIM {_shown(row['ssim'], '.4f')}  "
-                         f"{row['num_gaussians']:,} Gaussians  {_shown(row['train_seconds'], '.1f')} s  "
-                         f"{_shown(row['fps'], '.1f')} FPS" + (f" ({at_once} cells on a GPU)" if at_once > 1 else ""))
+            lines.append(f"{name}:  {shown(row.get('psnr'), '.2f')} dB  SSIM {shown(row.get('ssim'), '.4f')}  "
+                         f"{shown(row.get('num_gaussians'), ',')} Gaussians  "
+                         f"{shown(row.get('train_seconds'), '.1f')} s  {shown(row.get('fps'), '.1f')} FPS"
+                         + (f" ({at_once} cells at once)" if at_once > 1 else ""))
         else:
-            lines.append(f"{name}:  FAILED: {row['reason']}")
+            lines.append(f"{name}:  FAILED: {row.get('reason')}")
     return "\n".join(lines)
-
-
-def _shown(value: Optional[float], form: str) -> str:
-    return "-" if value is None else format(value, form)

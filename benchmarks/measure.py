@@ -4,6 +4,7 @@ Every metric is one number of one image; a scene's figure is the mean over its t
 """
 from __future__ import annotations
 
+import math
 import os
 from typing import Dict, List, Optional, Sequence
 
@@ -63,15 +64,18 @@ class Measures:
         metrics: Dict[str, Optional[float]] = {**image_metrics(color, target), "psnr_edge": edge_psnr(png, target)}
         for kind, network in self._networks.items():
             try:
-                metrics[kind] = network(png, target)
-            except (RuntimeError, ValueError) as error:  # an image too small for the network's strides
+                metrics[kind] = distance = network(png, target)
+                if not math.isfinite(distance):
+                    raise ValueError(f"it is {distance}")
+            except (RuntimeError, ValueError) as error:  # an image too small for the strides, too large for the memory
                 metrics[kind] = None
                 self.reasons[kind] = f"{type(error).__name__}: {error}".splitlines()[0]
         return metrics
 
     def lpips_of(self, metrics: Dict[str, Optional[float]]) -> List[Dict[str, object]]:
-        """Each kind asked for, with its mean or the reason why there is none."""
-        return [{"value": metrics.get(kind), "kind": kind, "reason": reason} for kind, reason in self.reasons.items()]
+        """Each kind asked for, with its mean, or the reason why some view, and so the scene, has none."""
+        return [{"value": metrics.get(kind) if reason is None else None, "kind": kind, "reason": reason}
+                for kind, reason in self.reasons.items()]
 
 
 def headline_lpips(rows: Sequence[Dict[str, object]]) -> Dict[str, object]:

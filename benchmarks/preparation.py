@@ -1,15 +1,18 @@
 """What cells need before they can run: scenes that are there or made up, checkouts that are there and patched."""
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from typing import Any, Dict, List
 
 from .. import patches
+from ..trainer.files import write_json_atomically
 from ..trainer.synthetic import write_synthetic_scene
 from .errors import BenchError
 from .methods.names import CHECKOUTS, NATIVE
 from .protocol import commit_of
+from .results_folder import read_object
 from .suite import NOT_IN_THE_IDENTITY
 
 NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", "build")
@@ -46,12 +49,15 @@ def given(cell: Dict[str, Any]) -> Dict[str, Any]:
 
 
 def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
-    """The scene with its path; a synthetic one is made where it is not there yet."""
+    """The scene with its path; a synthetic one is made where it is not there yet, or was made otherwise."""
     if scene["path"] is not None:
         return scene
     folder = os.path.join(results, "scenes", scene["name"])
-    if not os.path.isfile(os.path.join(folder, "sparse", "0", "cameras.txt")):
+    record = os.path.join(folder, "synthetic.json")  # written last
+    if read_object(record) != scene["synthetic"]:
+        shutil.rmtree(folder, ignore_errors=True)
         write_synthetic_scene(folder, **scene["synthetic"])
+        write_json_atomically(record, scene["synthetic"])
     return dict(scene, path=folder)
 
 
@@ -66,7 +72,8 @@ def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
         paths = {key: prepared_checkout(method, key, results) for key in wanted_checkouts(method)}
     except (patches.PatchError, BenchError, OSError) as error:
         return {**method, "refused": " ".join(str(error).split())}
-    return {**method, **paths, "commit": commit_of(method["path"]) or method.get("commit")}
+    commits = {"path": "commit", "base": "base_commit"}  # of what is copied, not of a copy
+    return {**method, **paths, **{commits[key]: commit_of(method[key]) or method.get(commits[key]) for key in paths}}
 
 
 def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
@@ -88,13 +95,29 @@ def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
 
 
 def patched_copy(path: str, folder: str, fuse: bool) -> str:
-    """A patched copy of a checkout, which itself stays as it is; made once. Raises PatchError."""
-    if os.path.isdir(folder):
-        patches.apply(folder, modernise=True, fuse=fuse)  # what an interruption left is finished; else nothing is done
-        return folder
-    part = folder + ".part"
-    shutil.rmtree(part, ignore_errors=True)
-    shutil.copytree(path, part, ignore=NOT_COPIED)
-    patches.apply(part, modernise=True, fuse=fuse)
-    os.rename(part, folder)
+    """A patched copy of a checkout, which itself stays as it is; made anew where it has changed. Raises PatchError."""
+    record, now = folder + ".json", {"files": state_of_files(path)}
+    if not os.path.isdir(folder) or read_object(record) != now:
+        if os.path.isfile(record):  # removed first, and written once the copy is complete
+            os.remove(record)
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(path, folder, ignore=NOT_COPIED)
+        write_json_atomically(record, now)
+    patches.apply(folder, modernise=True, fuse=fuse)  # what an interruption left is finished; else nothing is done
     return folder
+
+
+def state_of_files(path: str) -> str:
+    """A checksum of the names, sizes and times of the files of a checkout that are copied.
+
+    Of a commit that moves no file it says nothing, of an edit that is not committed it does.
+    """
+    checksum = hashlib.sha256()
+    for folder, folders, names in os.walk(path, followlinks=True):
+        left_out = NOT_COPIED(folder, [*folders, *names])
+        folders[:] = sorted(set(folders) - left_out)
+        for name in sorted(set(names) - left_out):
+            file = os.path.join(folder, name)
+            state = os.stat(file)
+            checksum.update(f"{os.path.relpath(file, path)}\0{state.st_size}\0{state.st_mtime_ns}\n".encode())
+    return checksum.hexdigest()

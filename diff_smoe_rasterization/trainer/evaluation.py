@@ -1,12 +1,14 @@
 """Quality and speed of a model over a set of views."""
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence
 
 import torch
 from tqdm import tqdm
 
+from .errors import TrainerError
 from .images import View
 from .metrics import image_metrics
 from .rendering import Renderer
@@ -30,7 +32,7 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
              measure: Measure = image_metrics) -> Evaluation:
     """Renders every view; times rendering alone, synchronised, without loading, metrics or disk.
 
-    measure: from a rendering and its ground truth, [3, H, W], to metrics by name.
+    measure: from a rendering and its ground truth, [3, H, W], to metrics by name. Raises what `summary` raises.
     """
     per_view: List[Dict[str, object]] = []
     with torch.no_grad():
@@ -46,7 +48,13 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
 
 
 def summary(per_view: List[Dict[str, Any]]) -> Evaluation:
-    """Means of what was measured of each view. A metric that is None for some views is the mean over the others."""
+    """Means of what was measured of each view. A metric that is None for some views is the mean over the others.
+
+    Raises TrainerError for a rendering that has NaN or infinite pixels: its figures would be none.
+    """
+    for row in per_view:
+        if math.isnan(row["psnr"]):
+            raise TrainerError(f"the rendering of {row['name']} has NaN or infinite pixels")
     names = list(METRICS) + [name for name in (per_view[0] if per_view else ())
                              if name not in (*METRICS, "name", "milliseconds")]
     metrics: Dict[str, Optional[float]] = {}

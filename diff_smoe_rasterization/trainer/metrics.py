@@ -17,17 +17,20 @@ def quantised(image: torch.Tensor) -> torch.Tensor:
 def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
     """Peak signal-to-noise ratio in dB of one image [3, H, W], the squared error averaged over pixels and channels.
 
-    Infinite for equal images.
+    Infinite for equal images, NaN where a pixel is.
     """
     mean_squared_error = float((image - target).double().pow(2).mean())
-    return -10 * math.log10(mean_squared_error) if mean_squared_error > 0 else math.inf
+    return math.inf if mean_squared_error == 0 else -10 * math.log10(mean_squared_error)
 
 
 def image_metrics(image: torch.Tensor, target: torch.Tensor) -> Dict[str, float]:
     """Metrics of one rendering [3, H, W] against its ground truth in [0, 1].
 
-    psnr, ssim: on 8-bit values (the headline). psnr_float: on floats clamped to [0, 1].
+    psnr, ssim: on 8-bit values (the headline). psnr_float: on floats clamped to [0, 1]. All of them are NaN where a
+    pixel of the rendering is NaN or infinite.
     """
+    if not bool(torch.isfinite(image).all()):  # clamping would hide the infinite ones
+        return {"psnr": math.nan, "ssim": math.nan, "psnr_float": math.nan}
     png = quantised(image)
     return {
         "psnr": psnr(png, target),

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -10,13 +11,16 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from bench_commands import command, environment, rows_of, wait_for
+from PIL import Image
 
 from diff_smoe_rasterization.benchmarks import cell as cells
 from diff_smoe_rasterization.benchmarks import engine, preparation, selection
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import expand
 from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.rendering import Renderer
 
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
@@ -62,6 +66,7 @@ def test_a_row_says_what_was_measured_and_how(finished):
     assert [point["iteration"] for point in row["history"]] == [6]
     assert row["lpips"]["value"] is None and row["lpips"]["reason"]
     assert row["train_seconds"] < row["wall_seconds"]
+    assert row["machine"]["cells_at_once"] == 2  # --jobs 2, two cells
 
 
 def test_a_failed_cell_is_a_row_with_its_reason(finished):
@@ -133,6 +138,59 @@ def test_rows_of_an_earlier_run_elsewhere_are_not_run_again(finished, tmp_path, 
     assert "absent.jsonl" in capsys.readouterr().err
 
 
+def test_where_all_is_done_nothing_is_needed(finished, tmp_path, monkeypatch):
+    """Neither Snakemake nor, for a suite for GPUs, a GPU; the suite's file lists all cells, chosen or not."""
+    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(engine, "visible_gpus", list)
+    content = {**finished[0], "protocol": {**finished[0]["protocol"], "device": "cuda"}}
+    wanted = expand(content, "").cells
+    (tmp_path / "rows.jsonl").write_text("".join(done_row(cell) + "\n" for cell in wanted))
+    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
+    assert main([*words, "--rows", str(tmp_path / "rows.jsonl"), "--only", "scene=tiny"]) == 0
+    assert set(rows_of(tmp_path / "results")) == {wanted[0]["id"]}
+    said = json.loads((tmp_path / "results" / "suite.json").read_text())
+    assert said["cells"] == [cell["id"] for cell in wanted] and len(wanted) == 2 and said["name"] == "two"
+    assert main([*words, "--only", "scene=tiny"]) == 0  # without --rows: it is there
+    assert main(words) == 1  # the other one is not
+
+
+def done_row(cell):
+    """A line that says that a cell worked."""
+    return json.dumps({**cells.failed_row(cell, "", 1.0), "ok": True, "psnr": 20.0, "num_gaussians": 5})
+
+
+@pytest.mark.parametrize("damaged", ["{}", "[]", "3", "null", '{"ok": true}', "", "another cell's"])
+def test_a_damaged_row_is_named_before_anything_is_run(damaged, finished, tmp_path, capsys):
+    _, suite, results = finished
+    copied = tmp_path / "results"
+    subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
+    one, other = sorted(copied.glob("cells/*/row.json"))
+    one.write_text(other.read_text() if damaged == "another cell's" else damaged)
+    for more in ([], ["--dry-run"], ["--only", f"scene={json.loads(other.read_text())['scene']}"]):
+        assert main(["bench", "run", suite, "-o", str(copied), *more]) == 1
+        told = capsys.readouterr().err
+        assert f"error: {one}: " in told and "remove it to have it made anew" in told
+    one.unlink()
+    assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 0
+    assert "1 to do" in capsys.readouterr().out
+
+
+def test_what_else_may_be_wrong_with_a_folder(finished, tmp_path, capsys):
+    _, suite, results = finished
+    (tmp_path / "file").touch()
+    for more in ([], ["--dry-run"]):
+        assert main(["bench", "run", suite, "-o", str(tmp_path / "file"), *more]) == 1
+        assert f"{tmp_path / 'file'}: is a file; it must be a folder" in capsys.readouterr().err
+    copied = tmp_path / "results"
+    subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
+    (copied / "suite.json").write_text("{}")
+    assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 0
+    cell = next(copied.glob("cells/*/cell.json"))
+    cell.write_text("{}")
+    assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 1
+    assert f"error: {cell}: " in capsys.readouterr().err
+
+
 def test_rows_must_be_of_the_suites_cells(finished, tmp_path, capsys):
     content, suite, results = finished
     longer = write_suite({**content, "protocol": {**content["protocol"], "iterations": 13}}, tmp_path)
@@ -190,6 +248,40 @@ def test_results_of_another_protocol_are_not_added_to(words, finished, tmp_path,
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "suite.json").write_text((results / "suite.json").read_text())
     assert main([*words, str(tmp_path / "empty")]) == 0  # which has no row
+
+
+def test_scenes_and_methods_that_have_rows_stay_as_they_are(content, tmp_path, monkeypatch, capsys):
+    """Where they lie may change; what is new may be added; the axes may be extended."""
+    for folder in ("taming", "moved"):
+        (tmp_path / folder).mkdir()
+    content["protocol"].update(device="cuda", principal_point="centre")
+    scene, = content["scenes"]
+    method = {"name": "taming", "path": "taming", "arguments": ["--cams", 10]}
+    content["methods"] = [method]
+    cell = expand(content, str(tmp_path)).cells[0]
+    (tmp_path / "rows.jsonl").write_text(done_row(cell) + "\n")
+    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results"), "--only",
+             "blend_mode=alpha"]
+    assert main([*words, "--rows", str(tmp_path / "rows.jsonl")]) == 0
+
+    def said(**changes):
+        write_suite({**content, **changes}, tmp_path)
+        status = main([*words, "--dry-run"])
+        told = capsys.readouterr()
+        assert status == (1 if told.err else 0)
+        return told.err or told.out
+
+    for field, here, there in (("resolution", 2, -1), ("background", "white", "black"), ("images", "others", "images"),
+                               ("dataset", "Other", None)):
+        told = said(scenes=[{**scene, field: here}])
+        assert f"scene tiny: {field} is {there!r} there and {here!r} here" in told and "another folder with -o" in told
+    assert "scene tiny: synthetic is None there and {'views': 3} here" in said(
+        scenes=[{"name": "tiny", "synthetic": {"views": 3}}])
+    assert "method taming: arguments is ['--cams', '10'] there and ['--cams', '20'] here" in said(
+        methods=[{**method, "arguments": ["--cams", 20]}])
+    assert said(methods=[{**method, "path": "moved"}]).endswith("1 done, 0 to do, 0 failed\n")
+    assert said(scenes=[scene, {**scene, "name": "new", "resolution": 2}],
+                methods=[method, {"name": "native"}], seeds=[0, 1]).endswith("1 done, 7 to do, 0 failed\n")
 
 
 def test_scenes_that_are_not_there_are_named_before_anything_is_run(content, tmp_path, capsys):
@@ -342,6 +434,35 @@ def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatc
     assert "signal 9" in row["reason"] and "memory" in row["reason"] and row["reason"].endswith(": the last words")
 
 
+def test_a_rendering_that_equals_the_truth_is_a_row(content, tiny_scene, tmp_path, capsys):
+    """A black scene, black from the start: its PSNR is infinite, for which json has no number."""
+    black = tmp_path / "black"
+    subprocess.run(["cp", "-r", tiny_scene, str(black)], check=True)
+    for path in (black / "images").iterdir():
+        Image.new("RGB", Image.open(path).size).save(path)
+    points = black / "sparse" / "0" / "points3D.txt"
+    rows = [line.split() for line in points.read_text().splitlines() if not line.startswith("#")]
+    points.write_text("".join(" ".join([*row[:4], "0", "0", "0", *row[7:]]) + "\n" for row in rows))
+    cell = expand({**content, "scenes": [{"name": "black", "path": str(black)}]}, "").cells[0]
+    (tmp_path / "cell.json").write_text(json.dumps(cell))
+    assert cells.main([str(tmp_path / "cell.json"), str(tmp_path / "out")]) == 0
+    assert "Gaussians, PSNR - dB" in capsys.readouterr().out
+    row = json.loads((tmp_path / "out" / "row.json").read_text())
+    assert row["ok"] and row["psnr"] is None and row["ssim"] == pytest.approx(1)
+
+
+def test_what_cannot_be_printed_costs_no_row(tmp_path):
+    """Snakemake removes the row of a command that fails: one whose reader has gone, or that lacks a character."""
+    program = "from diff_smoe_rasterization.benchmarks.cell import tell; tell('\u2013')"
+    reader, writer = os.pipe()
+    os.close(reader)
+    for encoding, output in (("utf-8", writer), ("ascii", subprocess.DEVNULL)):
+        done = subprocess.run([sys.executable, "-c", program], stdout=output, stderr=subprocess.PIPE,
+                              env=environment(PYTHONIOENCODING=encoding))
+        assert (done.returncode, done.stderr) == (0, b"")
+    os.close(writer)
+
+
 def test_two_cells_never_have_one_gpu(tmp_path):
     one, first = cells.claim_gpu(["3", "5"], str(tmp_path))
     other, second = cells.claim_gpu(["3", "5"], str(tmp_path))
@@ -374,31 +495,53 @@ class Raises:
 
 @pytest.fixture
 def worked(content, tmp_path):
-    """A function of an attempt's folder and its number of cells per GPU to its row."""
+    """A function of an attempt's folder and its number of cells at once to its row."""
     cell = expand({**content, "keep_models": True}, "").cells[0]
 
-    def row(name, cells_per_gpu):
+    def row(name, per_device=None):
         (tmp_path / name).mkdir(exist_ok=True)
-        cells.work(cell, str(tmp_path / name), time.time(), cells_per_gpu)
+        cells.work(cell, str(tmp_path / name), time.time(), per_device)
         return json.loads((tmp_path / name / "row.json").read_text())
 
     return row
 
 
-def test_a_row_says_that_its_cell_shared_its_gpu(worked):
-    alone, shared, uncounted = worked("one", 1), worked("two", 2), worked("three", None)
-    assert (alone["machine"].pop("cells_per_gpu"), shared["machine"].pop("cells_per_gpu")) == (1, 2)
+def test_pixels_that_are_no_numbers_are_a_rows_reason(worked, monkeypatch):
+    render = Renderer.__call__
+
+    def broken(renderer, camera, **arguments):
+        rendering = render(renderer, camera, **arguments)
+        if camera.name == "view_008.png":  # the second of two test views
+            rendering.color[0, 5, 5] = math.nan
+        return rendering
+
+    monkeypatch.setattr(Renderer, "__call__", broken)
+    row = worked("out")
+    assert not row["ok"] and "the rendering of view_008.png has NaN or infinite pixels" in row["reason"]
+
+
+def test_a_row_is_written_before_its_model_is_removed(content, tmp_path, monkeypatch):
+    """Whatever happens in between, nothing is trained again."""
+    monkeypatch.setattr(cells.shutil, "rmtree", lambda path, **options: there.append((tmp_path / "row.json").exists()))
+    there = []
+    cells.work(expand(content, "").cells[0], str(tmp_path), time.time())
+    assert there == [True]
+
+
+def test_a_row_says_that_its_cell_shared_its_processor(worked):
+    alone, shared, uncounted = worked("one", 1), worked("two", 2), worked("three")
+    assert (alone["machine"].pop("cells_at_once"), shared["machine"].pop("cells_at_once")) == (1, 2)
     assert alone["machine"] == shared["machine"] == uncounted["machine"]
     for row in (alone, shared):
         assert row["ok"] and row["train_seconds"] > 0 and row["fps"] > 0
     assert alone["cell"] == shared["cell"] and alone["protocol"] == shared["protocol"]
 
 
-def test_a_training_that_goes_on_from_one_that_shared_its_gpu_shared_it_too(worked):
+def test_a_training_that_goes_on_from_one_that_shared_its_processor_shared_it_too(worked):
     """Its seconds hold those of the attempt that was not alone."""
     worked("out", 3)
     again = worked("out", 1)
-    assert again["protocol"]["continued"] and again["machine"]["cells_per_gpu"] == 3
+    assert again["protocol"]["continued"] and again["machine"]["cells_at_once"] == 3
 
 
 def test_the_process_of_a_cell_is_told_its_gpu_and_how_many_have_it(cell_file, tmp_path, monkeypatch):
@@ -406,17 +549,17 @@ def test_the_process_of_a_cell_is_told_its_gpu_and_how_many_have_it(cell_file, t
     python.write_text("#!/bin/sh\necho $CUDA_VISIBLE_DEVICES $*\n")
     python.chmod(0o755)
     monkeypatch.setattr(cells.sys, "executable", str(python))
-    assert cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-gpu", "2",
+    assert cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-device", "2",
                        "--locks", str(tmp_path / "locks")]) == 0
     said = (tmp_path / "out" / "log.txt").read_text().split()
-    assert said[0] == "7" and said[-3:] == ["--inside", "--per-gpu", "2"]
+    assert said[0] == "7" and said[-3:] == ["--inside", "--per-device", "2"]
 
 
 @pytest.mark.parametrize("number", ["0", "-1"])
 def test_a_gpu_is_given_to_one_cell_at_least(number, cell_file, tmp_path, capsys):
     with pytest.raises(SystemExit):
-        cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-gpu", number])
-    assert f"--per-gpu: is {number}; it must be at least 1" in capsys.readouterr().err
+        cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-device", number])
+    assert f"--per-device: is {number}; it must be at least 1" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -448,20 +591,23 @@ def test_cells_are_chosen_by_their_fields(content):
 
 def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
     content["protocol"].update(device="cuda", principal_point="centre")
-    suite = expand({**content, "headline": {"blend_modes": ["smoe"]}}, "")
+    suite = expand({**content, "headline": {"blend_modes": ["smoe"]}, "seeds": list(range(8))}, "")
+    headline = [f"cells/{cell['id']}/row.json" for cell in suite.cells if cell["blend_mode"] == "smoe"]
+    monkeypatch.setattr(engine, "threads_of_each", lambda at_once: 24 // at_once)
     with monkeypatch.context() as patch:
         patch.setattr(engine, "visible_gpus", lambda: ["0", "2", "3"])
         words = engine.command(suite, suite.cells, "out", None, None)
-        assert words[words.index("--cores") + 1] == "3" and "gpu=3" in words and 'gpus=["0", "2", "3"]' in words
-        assert words[words.index("--prioritize") + 1:] == [f"cells/{suite.cells[1]['id']}/row.json"]
-        assert "--executor" not in words and "per_gpu=1" in words
+        assert words[words.index("--cores") + 1] == "24" and "gpu=3" in words and 'gpus=["0", "2", "3"]' in words
+        assert words[words.index("--prioritize") + 1:] == headline
+        assert "--executor" not in words and "per_device=1" in words and "threads=8" in words
         words = engine.command(suite, suite.cells, "out", None, None, per_gpu=4)
-        assert words[words.index("--cores") + 1] == "12" and "gpu=12" in words and "per_gpu=4" in words
+        assert words[words.index("--cores") + 1] == "24" and "gpu=12" in words and "per_device=4" in words
         words = engine.command(suite, suite.cells, "out", 5, None, per_gpu=4)
-        # Five cells on three GPUs: two share one at the most.
-        assert words[words.index("--cores") + 1] == "5" and "gpu=6" in words and "per_gpu=2" in words
+        # Five cells on three GPUs: two share one at the most. So it is where only five are to be run.
+        assert words[words.index("--cores") + 1] == "20" and "gpu=6" in words and "per_device=2" in words
+        assert "per_device=2" in engine.command(suite, suite.cells[:5], "out", None, None, per_gpu=4)
         words = engine.command(suite, suite.cells, "out", 3, None, per_gpu=2)
-        assert "gpu=3" in words and "per_gpu=1" in words
+        assert "gpu=3" in words and "per_device=1" in words
         with pytest.raises(BenchError, match="--per-gpu is 0"):
             engine.check_sharing(suite, None, None, per_gpu=0)
         with pytest.raises(BenchError, match="--per-gpu is 2; it is for"):
@@ -472,16 +618,30 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
         patch.setattr(engine.importlib.util, "find_spec", lambda name: object())
         words = engine.command(suite, suite.cells, "out", None, ["slurm_partition=gpu", "runtime=60"])
         assert words[words.index("--executor") + 1] == "slurm" and "gpus=[]" in words
+        assert "per_device=0" in words and "threads=1" in words
         assert words[words.index("--default-resources") + 1:][:2] == ["slurm_partition=gpu", "runtime=60"]
-        patch.setattr(engine.importlib.util, "find_spec", lambda name: None)
+        patch.setattr(engine.importlib.util, "find_spec", lambda name: None if "slurm" in name else object())
         with pytest.raises(BenchError, match="snakemake-executor-plugin-slurm"):
             engine.command(suite, suite.cells, "out", None, [])
 
 
+def test_on_the_cpu_cells_share_its_cores(content, monkeypatch):
+    """As many threads as torch takes, if there are cores for them: 10 cores here, where torch takes 8."""
+    suite = expand({**content, "seeds": [0, 1]}, "")
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(10), raising=False)
+    for jobs, cells_, at_once, threads in ((None, 4, 1, 8), (1, 4, 1, 8), (3, 4, 3, 3), (16, 4, 4, 2), (16, 1, 1, 8)):
+        words = engine.command(suite, suite.cells[:cells_], "out", jobs, None)
+        assert f"per_device={at_once}" in words and f"threads={threads}" in words
+        assert words[words.index("--cores") + 1] == str(at_once * threads)
+    assert engine.threads_of_each(11) == 1
+
+
 ECHO = """#!/bin/sh
 case "$*" in *snakemake*) exec "{python}" "$@" ;; esac
-echo '{{"ok": false, "label": "native", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1,' \\
-     '"seed": 0, "machine": {{}}, "reason": "'"$*"'"}}' >"$4/row.json"
+echo '{{"cell": "'"${{4#cells/}}"'", "ok": false, "label": "native", "method": "native", "variant": "native",' \\
+     '"schedule": "3dgs", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1, "iterations": 1,' \\
+     '"seed": 0, "machine": {{}}, "reason": "'"$OMP_NUM_THREADS threads $*"'"}}' >"$4/row.json"
 """
 
 
@@ -494,14 +654,18 @@ def test_cells_are_told_the_gpus(content, tmp_path, monkeypatch):
     python.chmod(0o755)
     monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
     monkeypatch.setattr(engine.sys, "executable", str(python))
+    monkeypatch.setattr(engine, "threads_of_each", lambda at_once: 6 // at_once)
 
     def reasons():
         lines = (tmp_path / "results" / "rows.jsonl").read_text().splitlines()
-        return [json.loads(line)["reason"].partition(" --gpus ")[2] for line in lines]
+        reasons = [json.loads(line)["reason"].partition(" --hold .lock") for line in lines]
+        return {reason[0].partition(" -m")[0] + reason[2] for reason in reasons}
 
-    assert main([*words, "--per-gpu", "2"]) == 1 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2
-    assert main(words) == 1 and reasons() == ["0 --per-gpu 2 --locks .locks"] * 2  # what is done is not done again
-    assert main([*words, "--retry-failed"]) == 1 and reasons() == ["0 --per-gpu 1 --locks .locks"] * 2
+    two = {"3 threads --gpus 0 --locks .locks --per-device 2"}
+    assert main([*words, "--per-gpu", "2"]) == 1 and reasons() == two
+    assert main(words) == 1 and reasons() == two  # what is done is not done again
+    one = {"6 threads --gpus 0 --locks .locks --per-device 1"}
+    assert main([*words, "--retry-failed"]) == 1 and reasons() == one
 
 
 def test_without_snakemake_the_message_says_what_to_install(finished, tmp_path, monkeypatch, capsys):

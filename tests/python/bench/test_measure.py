@@ -3,12 +3,16 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from diff_smoe_rasterization.benchmarks import measure
 from diff_smoe_rasterization.benchmarks.measure import Measures, edge_mask, edge_psnr
-from diff_smoe_rasterization.trainer.evaluation import summary
+from diff_smoe_rasterization.trainer.errors import TrainerError
+from diff_smoe_rasterization.trainer.evaluation import evaluate, summary
+from diff_smoe_rasterization.trainer.metrics import image_metrics, psnr
 
 
 def step_image(height=24, width=32, column=16, low=0.2, high=0.8):
@@ -69,3 +73,48 @@ def test_means_count_each_view_once_and_fps_is_the_inverse_of_the_mean_time():
     nothing = summary([])
     assert nothing.fps is None and set(nothing.metrics.values()) == {None}
     assert json.dumps(nothing.metrics)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("metrics", [image_metrics, Measures("cpu")])
+def test_a_rendering_with_a_pixel_that_is_no_number_has_no_figures(value, metrics):
+    """One such pixel is enough; the view is named."""
+    target = step_image()
+    broken = target.clone()
+    broken[1, 3, 4] = value
+    found = metrics(broken, target)
+    assert all(math.isnan(found[name]) for name in ("psnr", "ssim", "psnr_float"))
+    views = [SimpleNamespace(camera=SimpleNamespace(name=name), image_float=lambda: target) for name in ("one", "two")]
+
+    def renderer(camera):
+        return SimpleNamespace(color=broken if camera.name == "two" else target)
+
+    with pytest.raises(TrainerError, match="^the rendering of two has NaN or infinite pixels$"):
+        evaluate(renderer, views, "cpu", measure=metrics)
+    assert evaluate(renderer, views[:1], "cpu", measure=metrics).metrics["psnr"] == math.inf
+
+
+def test_psnr_of_what_is_no_number_is_none():
+    target = torch.zeros(3, 2, 2)
+    assert math.isnan(psnr(target + math.nan, target)) and psnr(target, target) == math.inf
+
+
+@pytest.mark.parametrize("failing", [RuntimeError("CUDA out of memory"), math.nan])
+def test_lpips_is_a_mean_over_all_views_or_none(failing, monkeypatch):
+    answers = [0.25, failing, 0.75]
+
+    def network(image, target):
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(measure, "lpips_network", lambda kind, device: network)
+    measures = Measures("cpu", ["lpips_alex"])
+    per_view = [{"name": "view", "milliseconds": 1.0, **measures(step_image(), step_image(low=0.1))} for _ in range(3)]
+    found, = measures.lpips_of(summary(per_view).metrics)
+    assert found["value"] is None and found["reason"] in ("RuntimeError: CUDA out of memory", "ValueError: it is nan")
+    answers[:] = [0.25, 0.75]
+    measures = Measures("cpu", ["lpips_alex"])
+    per_view = [{"name": "view", "milliseconds": 1.0, **measures(step_image(), step_image(low=0.1))} for _ in range(2)]
+    assert measures.lpips_of(summary(per_view).metrics) == [{"value": 0.5, "kind": "lpips_alex", "reason": None}]
