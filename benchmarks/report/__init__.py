@@ -67,7 +67,7 @@ def _make(results: str, rows: Sequence[Row], output: str) -> None:
                 _write(os.path.join(output, "tables", f"{table.name}.{form}"), getattr(tables, writer)(table))
         pictures = draw_all(suite, grouped(members, end_of), os.path.join(output, "figures"))
         scenes = collect(results, suite, members, output)
-        write_survey(members, paper["datasets"], os.path.join(output, "survey", suite))
+        write_survey(members, paper["datasets"], os.path.join(output, "survey", safe_name(suite)))
         counts = _counts(members) + _absent(results, suite, members)
         sections.append(Section(suite, safe_name(suite), counts, made, pictures, scenes,
                                 _no_images(results, members), _protocols(members)))

@@ -16,7 +16,7 @@ END_NAMES = ("sparse", "dense")
 ABLATION = {"smoe": "full", "smoe_tn": "without T_d", "smoe_std": "without T_n,d"}
 COMPARED = ("alpha", "smoe")
 SEEDS = "seeds"  # the column that says how many seeds an average over scenes is of
-MOST_PAIRS = 6  # are named in a note
+MOST_PAIRS = 20  # are named in a note
 SHARED_NOTE = (f"Times and FPS are of cells that had their GPU or CPU alone. {SHARED}: several cells had it at once, "
                "so theirs are not the machine's; the rows have them.")
 SPREAD_NOTE = "± is the sample standard deviation over seeds; figures without it are of one seed."

@@ -408,8 +408,8 @@ def test_damaged_results_are_refused(tmp_path, text, reason):
     ("psnr", "12.3"), ("ssim", math.nan), ("fps", math.inf), ("psnr", -math.inf), ("num_gaussians", True),
     ("train_seconds", 10 ** 400), ("seed", True), ("budget", "1"), ("iterations", [1]), ("label", 1),
     ("lpips_all", [1]), ("lpips_all", [{"kind": 1}]), ("lpips", {"kind": "lpips_alex", "value": "0.3"}),
-    ("size_bytes", 3), ("size_bytes", {"own": "3"}), ("densify_grad_threshold", "0.005"), ("protocol", []), ("machine", "Card X"),
-    ("machine", {"cells_per_gpu": "2"}), ("commit", "abc")])
+    ("size_bytes", 3), ("size_bytes", {"own": "3"}), ("densify_grad_threshold", "0.005"), ("protocol", []),
+    ("machine", "Card X"), ("machine", {"cells_per_gpu": "2"}), ("commit", "abc")])
 def test_a_field_of_another_type_is_refused(tmp_path, name, value):
     with pytest.raises(ReportError, match=rf"rows.jsonl, line 2: {name}[\[\]0-9]*(\.\w+)? is .*; it must be "):
         rows.read_rows(write_rows(tmp_path, [row(), {**row(blend_mode="smoe"), name: value}]))
