@@ -17,7 +17,7 @@ from .measure import EDGE_RULE
 
 COMMIT_VARIABLE = "DSMOE_COMMIT"  # says the project's commit where its files are no git checkout
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-FLOATS_PER_GAUSSIAN = 59  # position 3, SH colours 48, opacity 1, scale 3, quaternion 4
+BYTES_PER_GAUSSIAN = 4 * 59  # float32 numbers: position 3, SH colours 48, opacity 1, scale 3, quaternion 4
 
 # Options of the native trainer that a suite may set: those of the recipe. The others have a field of their own.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
@@ -57,10 +57,14 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
 
 
 def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Dict[str, Any]:
-    """The protocol of a row. measured: the protocol that the trainer's `result_row` gives."""
+    """The protocol of a row of the native trainer; a checkout's notes replace what is otherwise there.
+
+    measured: the protocol that the trainer's `result_row` gives.
+    """
     rules = {**RULES, "lpips": {row["kind"]: RULES["lpips"][row["kind"]] for row in lpips}}
     return {**measured, **rules, "images": config.images, "downscaler": downscaler(config, measured["downscaler"]),
-            "sh_degree": config.sh_degree, "eval": "every test view of the split, none left out"}
+            "sh_degree": config.sh_degree, "recipe": {name: getattr(config, name) for name in RECIPE},
+            "eval": "every test view of the split, none left out"}
 
 
 def downscaler(config: TrainConfig, name: str) -> str:
@@ -73,15 +77,17 @@ def downscaler(config: TrainConfig, name: str) -> str:
     return name
 
 
-def common_bytes(num_gaussians: int) -> int:
-    """Size in the container that all methods are compared in: float32 numbers of a 3DGS Gaussian of SH degree 3."""
-    return num_gaussians * FLOATS_PER_GAUSSIAN * 4
+def common_bytes(num_primitives: int, bytes_per_primitive: Optional[int] = BYTES_PER_GAUSSIAN) -> Optional[int]:
+    """Size in the container that all methods are compared in: float32 numbers of a 3DGS Gaussian of SH degree 3.
+
+    None for primitives that are no such Gaussians.
+    """
+    return None if bytes_per_primitive is None else num_primitives * bytes_per_primitive
 
 
-def machine_of(device: str, cells_per_gpu: Optional[int] = None) -> Dict[str, Any]:
-    """What a cell ran on. cells_per_gpu: how many may have had its GPU at once; None where nobody counted."""
-    shared = {} if cells_per_gpu is None else {"cells_per_gpu": cells_per_gpu}
-    return {"device": machine(device), **shared, "versions": versions()}
+def machine_of(device: str) -> Dict[str, Any]:
+    """What a cell ran on."""
+    return {"device": machine(device), "versions": versions()}
 
 
 def project_commit() -> Optional[str]:

@@ -46,7 +46,7 @@ SCENE = _object(
                       seed=COUNT), **AXES)
 METHOD = _object(
     ("name",), name={"enum": [NATIVE, *CHECKOUTS]}, label=NAME, variant={"enum": list(VARIANTS)}, path=TEXT, base=TEXT,
-    commit=TEXT, python=TEXT, pythonpath=_list(TEXT, 0),
+    commit=TEXT, base_commit=TEXT, python=TEXT, pythonpath=_list(TEXT, 0),
     arguments={"type": "array", "items": {"type": ["string", "number"]}}, end={"enum": ["sparse", "dense"]},
     budget=POSITIVE, **AXES)
 SUITE = _object(

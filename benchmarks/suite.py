@@ -18,7 +18,7 @@ import numpy as np
 
 from ..trainer.errors import ConfigError
 from .errors import BenchError
-from .methods.names import CHECKOUTS, NATIVE, NEEDS, WITHOUT_SCHEDULE
+from .methods.names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, WITHOUT_SCHEDULE
 from .protocol import RECIPE, config_of
 from .schema import SUITE
 
@@ -32,7 +32,8 @@ AXES = {"blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": list(THRESH
         "seeds": [0]}
 AXIS_OF = {"blend_modes": "blend_mode", "densify_grad_thresholds": "densify_grad_threshold", "schedules": "schedule",
            "seeds": "seed"}
-NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "unset")  # where things lie changes no figure
+# Where things lie changes no figure.
+NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "base_commit", "unset")
 
 
 @dataclass(frozen=True)
@@ -78,10 +79,8 @@ def expand(content: Any, folder: str) -> Suite:
     _one_downscaler(scenes)
     cells: List[Dict[str, Any]] = []
     for scene, method in itertools.product(scenes, methods):
-        schedules = _values("schedules", content, scene, method)
-        if scene["background"] == "white" and "steady" in schedules and method["name"] != NATIVE:
-            raise BenchError(f"scenes: {scene['name']} is white, where 3DGS resets opacities once more: a checkout's "
-                             "schedule cannot be `steady` there")
+        if method["name"] != NATIVE:
+            _can_train(content, scene, method)
         cells += _cells(content, protocol, scene, method)
     for cell in cells:
         try:
@@ -107,10 +106,22 @@ def read_yaml(path: str) -> Any:
         import yaml
     except ImportError as error:
         raise BenchError(missing("pyyaml", error)) from error
+
+    class Loader(yaml.SafeLoader):
+        """Of a key that is there twice YAML keeps the last, without a word."""
+
+        def compose_mapping_node(self, anchor: Any) -> Any:
+            node = super().compose_mapping_node(anchor)
+            keys = [key.value for key, _ in node.value]
+            for index, (key, _) in enumerate(node.value):
+                if key.value in keys[:index]:
+                    raise yaml.MarkedYAMLError(problem=f"{key.value!r} is there twice", problem_mark=key.start_mark)
+            return node
+
     try:
         with open(path, encoding="utf-8") as file:
-            return yaml.safe_load(file)
-    except yaml.YAMLError as error:
+            return yaml.load(file, Loader)
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: no text, or a date that is none
         raise BenchError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
 
 
@@ -120,8 +131,10 @@ def check_schema(content: Any) -> None:
         import jsonschema
     except ImportError as error:
         raise BenchError(missing("jsonschema", error)) from error
-    errors = sorted(jsonschema.Draft7Validator(SUITE).iter_errors(content),
-                    key=lambda error: list(map(str, error.path)))
+    numbers = jsonschema.Draft7Validator.TYPE_CHECKER.redefine(  # a 7.0 would be trained as a number that is none
+        "integer", lambda _, value: isinstance(value, int) and not isinstance(value, bool))
+    validator = jsonschema.validators.extend(jsonschema.Draft7Validator, type_checker=numbers)(SUITE)
+    errors = sorted(validator.iter_errors(content), key=lambda error: list(map(str, error.path)))
     if errors and content is None:
         raise BenchError("the file is empty")
     if errors:
@@ -165,8 +178,7 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     given = {key: value for key, value in method.items() if key not in AXES}
     axes = {axis: method[axis] for axis in AXES if axis in method}
     if name == NATIVE:
-        wrong = [key for key in ("variant", "path", "base", "python", "pythonpath", "arguments", "commit")
-                 if key in given and given[key] != "native"]
+        wrong = [key for key in ("variant", "arguments", *NOT_IN_THE_IDENTITY) if key in given and given[key] != NATIVE]
         if wrong:
             raise BenchError(f"{where}.{wrong[0]}: is for checkouts; the native trainer's recipe stands in "
                              "protocol.options")
@@ -177,7 +189,7 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
         raise BenchError(f"{where}.base: c3dgs, and nothing else, needs it: a 3DGS checkout that trains what it "
                          "compresses")
     arguments = [str(word) for word in given.get("arguments", [])]
-    _no_protocol_among(arguments, where)
+    _no_protocol_among(arguments, name, where)
     variant = given.setdefault("variant", "patched" if CHECKOUTS[name] else "unpatched")
     if variant == "native" or (variant != "unpatched" and not CHECKOUTS[name]):
         raise BenchError(f"{where}.variant: is {variant!r}; {name} can be "
@@ -188,10 +200,48 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
         axes["blend_modes"] = ["alpha"]
     if name in NEEDS and NEEDS[name] not in arguments:
         raise BenchError(f"{where}.arguments: {name} needs {NEEDS[name]} N in place of a threshold")
+    if name in COUNTED_BY and "budget" in given:
+        wanted = {COUNTED_BY[name]: str(given["budget"])}
+        if name == "taming":
+            wanted["--mode"] = "final_count"  # else its number is a multiple of that of the first points
+        if not wanted.items() <= dict(zip(arguments, arguments[1:])).items():
+            raise BenchError(f"{where}.budget: is {given['budget']}; {name} is told so by its arguments, among which "
+                             f"must be {' '.join(itertools.chain(*wanted.items()))}")
     if name in WITHOUT_SCHEDULE:
         if "schedules" in axes:
             raise BenchError(f"{where}.schedules: {name} has none of the schedules; leave them out")
         axes["schedules"] = [None]
+    _can_follow(protocol, name, where)
+    given.setdefault("pythonpath", [])
+    paths = _paths({key: given[key] for key in ("path", "base", "pythonpath") if key in given}, where, folder)
+    python = os.path.expanduser(os.path.expandvars(given["python"])) if "python" in given else None
+    return {"label": name if variant == "patched" else f"{name}-{variant}", **given, **paths, "python": python,
+            "arguments": arguments, "axes": axes}
+
+
+# Flags of the public trainers that the harness sets itself from protocol, scene and axes; then those that would change
+# the split, the start, the background or the number of steps.
+SET_BY_THE_HARNESS = ("-s", "--source_path", "-m", "--model_path", "-r", "--resolution", "-i", "--images", "--eval",
+                      "-w", "--white_background", "--iterations", "--blend_mode", "--densify_grad_threshold",
+                      "--test_iterations", "--save_iterations", *(f"--{name}" for name in RECIPE),
+                      "--train_test_exp", "--llffhold", "--lod", "--start_checkpoint", "--init_type",
+                      "--random_background", "--warmup", "--load_iteration", "--output_vq")
+# Taming's published recipe sets the first, which is a part of the method there; neither is short for another flag.
+OWN_FLAGS = {"taming": ("--densification_interval", "--mode")}
+
+
+def _no_protocol_among(arguments: Sequence[str], name: str, where: str) -> None:
+    """Refuses those flags, also as argparse takes them: --res for --resolution, -r4 for -r 4."""
+    for word in arguments:
+        flag = word.partition("=")[0]
+        shortened = flag.startswith("--") and any(known.startswith(flag) for known in SET_BY_THE_HARNESS)
+        if (shortened or word[:2] in SET_BY_THE_HARNESS) and flag not in OWN_FLAGS.get(name, ()):
+            raise BenchError(f"{where}.arguments: {word} is the same for all methods of a suite, which would mix "
+                             "protocols otherwise; it belongs to protocol, scenes or the axes")
+
+
+def _can_follow(protocol: Dict[str, Any], name: str, where: str) -> None:
+    """Raises BenchError where a checkout cannot follow the protocol."""
     if protocol["principal_point"] != "centre":
         raise BenchError(f"protocol.principal_point: is 'scene', but the loader of {name} ({where}) moves it to the "
                          "image centre; it must be 'centre', or the figures would not be comparable")
@@ -200,25 +250,25 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     if protocol["options"].get("sh_degree_interval", 1000) != 1000 or protocol["scale_recipe"]:
         raise BenchError(f"protocol: {name} ({where}) raises the SH degree every 1000 steps, whatever the recipe: "
                          "scale_recipe and options.sh_degree_interval are for the native trainer alone")
-    given.setdefault("pythonpath", [])
-    paths = _paths({key: given[key] for key in ("path", "base", "pythonpath") if key in given}, where, folder)
-    python = os.path.expanduser(given["python"]) if "python" in given else None
-    return {"label": name if variant == "patched" else f"{name}-{variant}", **given, **paths, "python": python,
-            "arguments": arguments, "axes": axes}
+    for option, value in protocol["options"].items():
+        if option in LACKS[name] and value is not False:
+            raise BenchError(f"protocol.options.{option}: {name} ({where}) has no such option, or means something else "
+                             "by it: its recipe could not be the protocol's")
 
 
-# Flags of the public trainers that the harness sets itself from protocol, scene and axes.
-SET_BY_THE_HARNESS = ("-s", "--source_path", "-m", "--model_path", "-r", "--resolution", "-i", "--images", "--eval",
-                      "-w", "--white_background", "--iterations", "--blend_mode", "--densify_grad_threshold",
-                      "--test_iterations", "--save_iterations", *(f"--{name}" for name in RECIPE))
-
-
-def _no_protocol_among(arguments: Sequence[str], where: str) -> None:
-    own = {"--densification_interval"}  # Taming's published recipe sets it; it is a part of the method there
-    for word in arguments:
-        if word.partition("=")[0] in SET_BY_THE_HARNESS and word not in own:
-            raise BenchError(f"{where}.arguments: {word} is the same for all methods of a suite, which would mix "
-                             "protocols otherwise; it belongs to protocol, scenes or the axes")
+def _can_train(content: Dict[str, Any], scene: Dict[str, Any], method: Dict[str, Any]) -> None:
+    """Raises BenchError where a checkout cannot train a scene as the suite says."""
+    what = f"scenes: {scene['name']}, methods: {method['label']}"
+    if scene["background"] == "white" and "steady" in _values("schedules", content, scene, method):
+        raise BenchError(f"{what}: {scene['name']} is white, where 3DGS resets opacities once more: a checkout's "
+                         "schedule cannot be `steady` there")
+    if scene["init_points"]:
+        raise BenchError(f"{what}: init_points is {scene['init_points']}, but checkouts start from all points")
+    thresholds = _values("densify_grad_thresholds", content, scene, method)
+    if method["name"] in COUNTED_BY and len(thresholds) > 1:
+        raise BenchError(f"{what}: {method['name']} has no threshold ({COUNTED_BY[method['name']]} stands for it): "
+                         f"{len(thresholds)} of them would be the same training over again; give the method "
+                         "densify_grad_thresholds of one value, which names its cells")
 
 
 def _values(axis: str, content: Dict[str, Any], scene: Dict[str, Any], method: Dict[str, Any]) -> List[Any]:

@@ -13,6 +13,7 @@ from ...trainer.config import TrainConfig
 from ...trainer.evaluation import Evaluation
 from ...trainer.scene import Scene
 from ..errors import BenchError
+from ..protocol import BYTES_PER_GAUSSIAN
 from .names import NATIVE
 
 
@@ -27,10 +28,11 @@ class Outcome:
     own_bytes: Optional[int]  # in the method's own container
     train_seconds: Optional[float]
     peak_gpu_mib: Optional[float]
+    common_bytes_per_primitive: Optional[int] = BYTES_PER_GAUSSIAN  # None: it does not fit into the common container
     commit: Optional[str] = None  # of the checkout
     history: List[Dict[str, Any]] = field(default_factory=list)
     renders: Dict[str, torch.Tensor] = field(default_factory=dict)  # [3, H, W] of the test views whose images are kept
-    notes: Dict[str, Any] = field(default_factory=dict)  # further entries of the row's protocol
+    notes: Dict[str, Any] = field(default_factory=dict)  # of the row's protocol: further or other entries
 
 
 def run(cell: Dict[str, Any], output: str) -> Outcome:

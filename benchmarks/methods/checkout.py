@@ -11,7 +11,6 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import fields
 from typing import Any, Dict, List, Optional, Tuple, Type
 
 import numpy as np
@@ -26,14 +25,14 @@ from ..errors import BenchError
 from ..log import last_line
 from ..measure import Measures
 from ..processes import die_with_parent
-from ..protocol import RECIPE, commit_of, config_of
+from ..protocol import BYTES_PER_GAUSSIAN, RECIPE, commit_of, config_of
 from . import Outcome, require_test_views
+from .names import COUNTED_BY
 
 OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py")
 # Mean difference between the trainer's ground truth and ours: rounding leaves half a grey level at the most, another
 # downscaler or background leaves several.
 MAX_TRUTH_DIFFERENCE = 1 / 255
-SET_OTHERWISE = ("sh_degree_interval", "antialiasing", "opacity_reset_interval")
 
 
 class ThreeDGS:
@@ -43,6 +42,7 @@ class ThreeDGS:
     observed: Tuple[str, ...] = ()  # further arguments of the observer
     render_arguments: Tuple[str, ...] = ()
     container = "point_cloud.ply"
+    of_gaussians = True  # as those of 3DGS are, with SH colours
 
     def __init__(self, cell: Dict[str, Any], config: TrainConfig, output: str) -> None:
         self.cell, self.config, self.output = cell, config, os.path.abspath(output)
@@ -50,6 +50,7 @@ class ThreeDGS:
         self.model = os.path.join(self.output, "run")
         self.renders = os.path.join(self.output, "renders")
         self.scene = os.path.join(self.output, "scene")
+        self.arguments: List[str] = []  # of the commands that made the model
 
     def train(self) -> Dict[str, Any]:
         """Trains; returns the observer's record."""
@@ -64,27 +65,48 @@ class ThreeDGS:
         """What the protocol and the axes are in the trainer's words."""
         config = self.config
         words = ["-s", self.scene, "-m", self.model, "--eval", "--iterations", config.iterations,
-                 "--densify_grad_threshold", config.densify_grad_threshold, "--test_iterations", -1,
-                 "--save_iterations", config.iterations, "--port", 0]  # 0: a free one, since cells run side by side
+                 "--test_iterations", -1, "--save_iterations", config.iterations,
+                 "--port", 0]  # 0: a free one, since cells run side by side
+        if self.method["name"] not in COUNTED_BY:
+            words += ["--densify_grad_threshold", config.densify_grad_threshold]
         if config.resolution != -1:
             words += ["-r", config.resolution]
         if config.images != "images":
             words += ["--images", config.images]
         if config.white_background:
             words.append("--white_background")
-        # Size prune and reset both wait for the interval: beyond the last iteration there is neither.
-        reset = config.iterations + 1 if config.schedule == "steady" else config.opacity_reset_interval
-        defaults = {option.name: option.default for option in fields(TrainConfig)}
-        for name in RECIPE:
-            if name not in SET_OTHERWISE and getattr(config, name) != defaults[name]:
-                words += ["--" + name, getattr(config, name)]
-        if reset != defaults["opacity_reset_interval"]:
-            words += ["--opacity_reset_interval", reset]
-        if config.antialiasing:
-            words.append("--antialiasing")
+        words += self.recipe_arguments()
         if self.method["variant"] != "unpatched":
             words += ["--blend_mode", config.blend_mode]
         return [str(word) for word in words] + self.own_arguments()
+
+    def recipe_arguments(self) -> List[str]:
+        """What the suite says of the recipe, default of ours or not; what it does not say is the trainer's own."""
+        options = {name: value for name, value in self.recipe().items() if name != "sh_degree_interval"}
+        if self.config.schedule == "steady":
+            # Size prune and reset both wait for the interval: beyond the last iteration there is neither.
+            options["opacity_reset_interval"] = self.config.iterations + 1
+        flags = ["--antialiasing"] if options.pop("antialiasing", False) else []
+        return flags + [str(word) for name, value in options.items() for word in ("--" + name, value)]
+
+    def recipe(self) -> Dict[str, Any]:
+        """The options of the recipe that the suite sets."""
+        options = self.cell["protocol"]["options"]
+        return {name: getattr(self.config, name) for name in RECIPE if name in options}
+
+    def rules(self) -> Dict[str, Any]:
+        """What the row's protocol says otherwise than of the native trainer; None where there is no such thing."""
+        own = {word.partition("=")[0] for word in self.method["arguments"]}
+        recipe = {name: value for name, value in self.recipe().items() if "--" + name not in own}
+        rules = {"schedule": self.cell["schedule"], "recipe": recipe, "scale_recipe": False,
+                 "arguments": portable(self.arguments)}
+        if not self.of_gaussians:
+            rules["sh_degree"] = recipe.get("sh_degree")
+        if self.method["name"] in COUNTED_BY:
+            rules["densify_grad_threshold"] = None
+        if "base" in self.method:
+            rules["base_commit"] = self.method.get("base_commit") or commit_of(self.method["base"])
+        return rules
 
     def own_arguments(self) -> List[str]:
         """What the method adds to them."""
@@ -110,6 +132,8 @@ class ThreeDGS:
         if not os.path.isfile(os.path.join(folder, script)):
             raise BenchError(f"{folder}: there is no {script} in it; {self.method['name']} is run by it")
         log = os.path.join(self.output, name + ".log")
+        if name != "render":
+            self.arguments += words
         with open(log, "w", encoding="utf-8") as file:
             status = subprocess.call(line, cwd=folder, stdout=file, stderr=subprocess.STDOUT,
                                      stdin=subprocess.DEVNULL, env=self.environment(), preexec_fn=die_with_parent)
@@ -151,10 +175,13 @@ class C3DGS(ThreeDGS):
         self.model = os.path.join(self.output, "run", "base")
         trained = self.command("train", self.method["base"], "train.py", *self.train_arguments())
         compressed = os.path.join(self.output, "run", "compressed")
-        self.command("compress", self.method["path"], "compress.py", "--model_path", self.model, "--output_vq",
-                     compressed, "--load_iteration", str(self.config.iterations), *self.method["arguments"])
+        # --iterations 0: no bar is the one that is timed, as a peak would begin with it, and leave earlier stages out.
+        finished = self.command("compress", self.method["path"], "compress.py", "--model_path", self.model,
+                                "--output_vq", compressed, "--load_iteration", str(self.config.iterations),
+                                *self.recipe_arguments(), *self.method["arguments"], observed=("--iterations", "0"))
         self.model = compressed
-        return trained
+        peaks = [record["peak_gpu_mib"] for record in (trained, finished)]
+        return {**trained, "peak_gpu_mib": None if None in peaks else max(peaks)}
 
     def own_arguments(self) -> List[str]:
         return []  # the method's are those of compress.py
@@ -187,6 +214,7 @@ class HAC(InOneProcess):
     """HAC and HAC++: train.py trains, encodes, decodes and renders in one process."""
 
     stubs = ()  # it reads its pictures again with torchvision, at the end
+    of_gaussians = False  # anchors, from which networks make Gaussians
 
     def train_arguments(self) -> List[str]:
         words = super().train_arguments()
@@ -208,10 +236,11 @@ class DBS(InOneProcess):
     # Of its viewer, of its compression, and one that its rasterizer imports and does not use.
     stubs = (*ThreeDGS.stubs, "viser", "nerfview", "plas", "turtle")
     observed = ("--hold-out", "--model-renders", "beta_model")
+    of_gaussians = False  # Beta primitives, with lobes of its own beside SH
 
     def train_arguments(self) -> List[str]:
         words = super().train_arguments()
-        for word, values in (("--eval", 0), ("--densify_grad_threshold", 1), ("--test_iterations", 1)):
+        for word, values in (("--eval", 0), ("--test_iterations", 1)):
             at = words.index(word)
             del words[at:at + 1 + values]
         return words + ["--disable_viewer", "--no-compress"]
@@ -246,8 +275,9 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
     return Outcome(scene=scene, evaluation=evaluation, lpips=measures.lpips_of(evaluation.metrics),
                    num_gaussians=rendered["num_gaussians"], own_bytes=shape.own_bytes(),
                    train_seconds=shape.train_seconds(trained), peak_gpu_mib=trained["peak_gpu_mib"],
+                   common_bytes_per_primitive=BYTES_PER_GAUSSIAN if shape.of_gaussians else None,
                    commit=shape.method.get("commit") or commit_of(shape.method["path"]), renders=renders,
-                   notes={"ground_truth_difference": difference, "arguments": portable(shape.train_arguments())})
+                   notes={"ground_truth_difference": difference, **shape.rules()})
 
 
 def portable(words: List[str]) -> List[str]:

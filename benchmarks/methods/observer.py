@@ -6,8 +6,8 @@ It runs in the trainer's own Python and imports nothing of this project. What it
 trainers have in common: they seed with constants, show their loop as a tqdm bar over the iterations, and render by
 `gaussian_renderer.render(view, model, ...)["render"]` (HAC after `prefilter_voxel`) or `model.render(view)["render"]`.
 
-RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, views [{name, milliseconds, file, truth}]. The files of the
-renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
+RECORD.json: loop_seconds, peak_gpu_mib (up to where the bar of a training is closed), num_gaussians, views [{name,
+milliseconds, file, truth}]. The files of the renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
 """
 import argparse
 import importlib.abc
@@ -92,9 +92,11 @@ def watch_loop(iterations, views):
     class Bar(tqdm.tqdm):
         def __init__(self, *arguments, **keywords):
             super().__init__(*arguments, **keywords)
-            if self.desc and self.desc.startswith("Rendering progress"):
+            words = getattr(self, "desc", "")  # a bar that is disabled has none
+            if words.startswith("Rendering progress"):
                 views.clear()
             self.counted = self.total == iterations
+            self.trains = self.counted or words.startswith("Training progress")
             if self.counted and torch.cuda.is_available():
                 torch.cuda.reset_peak_memory_stats()
             synchronise()
@@ -104,8 +106,8 @@ def watch_loop(iterations, views):
             if getattr(self, "counted", False) and "seconds" not in found:
                 synchronise()
                 found["seconds"] = time.perf_counter() - self.began
-                if torch.cuda.is_available():
-                    found["peak"] = torch.cuda.max_memory_allocated() / 2 ** 20
+            if getattr(self, "trains", False) and "peak" not in found and torch.cuda.is_available():
+                found["peak"] = torch.cuda.max_memory_allocated() / 2 ** 20
             super().close()
 
     tqdm.tqdm = Bar

@@ -86,7 +86,7 @@ class SmallTrainers:
         path = self.folder / f"checkout-{name}"
         return str(path if path.is_dir() else small_trainers().make_checkout(name, path))
 
-    def cell(self, name, variant="patched", scene=None, seed=0, blend_mode="smoe", **method):
+    def cell(self, name, variant="patched", scene=None, seed=0, blend_mode="smoe", options=None, **method):
         """A suite refuses checkouts on the CPU, as the public ones cannot train there: it is set afterwards."""
         method = {"name": name, "variant": variant, "pythonpath": [str(small_trainers().PACKAGES)],
                   "blend_modes": [blend_mode], **method}
@@ -94,7 +94,7 @@ class SmallTrainers:
             method["path"] = self.checkout(name)
         if name == "c3dgs":
             method["base"] = self.checkout("3dgs-2023")
-        content = {"name": "checkouts", "protocol": {"iterations": ITERATIONS, "lpips": []},
+        content = {"name": "checkouts", "protocol": {"iterations": ITERATIONS, "lpips": [], "options": options or {}},
                    "scenes": [{"name": "made-up", "path": str(scene or self.scene)}], "methods": [method],
                    "seeds": [seed], "densify_grad_thresholds": [0.0001], "images": 1}
         cell, = expand(content, "").cells
@@ -135,6 +135,10 @@ def test_a_patched_checkout_gives_a_row(name, small):
     assert row["schedule"] == (None if name == "hac" else "3dgs")
     for figure in ("psnr", "psnr_float", "ssim", "fps", "num_gaussians"):
         assert row[figure] > 0, figure
+    protocol = row["protocol"]
+    assert protocol["schedule"] == row["schedule"] and protocol["recipe"] == {} and protocol["scale_recipe"] is False
+    assert protocol["densify_grad_threshold"] == 0.0001 and protocol["sh_degree"] == (None if name == "hac" else 3)
+    assert row["size_bytes"]["common"] == (None if name == "hac" else 236 * row["num_gaussians"])
     if name == "c3dgs":
         assert row["train_seconds"] is None  # the small one does not say how long compression took
     else:
@@ -154,6 +158,9 @@ def test_a_trainer_that_would_choose_on_the_test_views_is_kept_from_it(small, tm
     row = row_of(small.cell("dbs", variant="unpatched", blend_mode="alpha", path=str(checkout),
                             arguments=["--cap_max", 12]), tmp_path / "out")
     assert row["ok"], row["reason"]
+    rules = row["protocol"]
+    assert rules["schedule"] is rules["densify_grad_threshold"] is rules["sh_degree"] is None and rules["recipe"] == {}
+    assert row["size_bytes"]["common"] is None  # a Beta primitive is no Gaussian of 59 numbers
     assert row["num_gaussians"] == 12 and row["train_seconds"] > 0 and row["fps"] > 0 and row["schedule"] is None
     level = np.mean([views[name].mean() for name in sorted(views)[1:]])
     truth = np.asarray(Image.open(small.scene / "images" / "view0.png"), np.float64) / 255
@@ -181,6 +188,80 @@ def test_steady_means_neither_reset_nor_size_prune(small):
     assert words[words.index("--opacity_reset_interval") + 1] == str(ITERATIONS + 1)
     cell = small.cell("3dgs-2023")
     assert "--opacity_reset_interval" not in shapes.ThreeDGS(cell, shapes.config_of(cell), "out").train_arguments()
+
+
+def rules_and_words(cell):
+    """What the row's protocol would say, and the words of the trainer's command."""
+    shape = shapes.SHAPES[cell["method"]["name"]](cell, shapes.config_of(cell), "out")
+    return shape.rules(), shape.train_arguments()
+
+
+def test_an_option_of_the_suite_reaches_a_checkout_also_where_it_is_our_default(small):
+    """0.05 is not the default of 3DGS of 2024."""
+    rules, words = rules_and_words(small.cell("3dgs-2024", options={"opacity_lr": 0.05, "antialiasing": True}))
+    assert words[words.index("--opacity_lr") + 1] == "0.05" and "--antialiasing" in words and "True" not in words
+    assert rules["recipe"] == {"opacity_lr": 0.05, "antialiasing": True} and rules["scale_recipe"] is False
+    rules, words = rules_and_words(small.cell("3dgs-2024", options={"antialiasing": False, "sh_degree_interval": 1000}))
+    assert not [word for word in words if "antialiasing" in word or "sh_degree" in word or word == "--opacity_lr"]
+
+
+def test_an_option_that_a_method_has_a_value_of_its_own_for_is_not_said_of_its_row(small):
+    cell = small.cell("taming", options={"densification_interval": 100, "opacity_lr": 0.05},
+                      arguments=["--densification_interval=500"])
+    rules, words = rules_and_words(cell)
+    assert words[-1] == "--densification_interval=500"  # the last word counts
+    assert rules["recipe"] == {"opacity_lr": 0.05} and rules["densify_grad_threshold"] is None
+    assert "--densify_grad_threshold" not in words
+
+
+def test_the_degree_of_a_checkout_with_another_default_is_said_where_the_suite_says_it(small):
+    for options, degree in (({}, None), ({"sh_degree": 2}, 2)):
+        method = {"variant": "unpatched", "blend_mode": "alpha", "path": "p", "arguments": ["--cap_max", 5]}
+        assert rules_and_words(small.cell("dbs", options=options, **method))[0]["sh_degree"] == degree
+
+
+def test_the_row_of_a_compression_says_what_decided_it(small, tmp_path):
+    """Both commands with the recipe, both commits and the larger peak."""
+    options, arguments = {"lambda_dssim": 0.3}, ["--finetune_iterations", 2]
+    cell = small.cell("c3dgs", options=options, arguments=arguments, base_commit="1234567")
+    row = row_of(cell, tmp_path / "out")
+    assert row["ok"], row["reason"]
+    rules = row["protocol"]
+    trained, compressed = (rules["arguments"][:rules["arguments"].index("--model_path")],
+                           rules["arguments"][rules["arguments"].index("--model_path"):])
+    assert trained[:4] == ["-s", "scene", "-m", "base"] and compressed[:4] == ["--model_path", "base", "--output_vq",
+                                                                              "compressed"]
+    for words in (trained, compressed):
+        assert words[words.index("--lambda_dssim") + 1] == "0.3"
+    assert compressed[-2:] == ["--finetune_iterations", "2"] and rules["recipe"] == options
+    assert rules["base_commit"] == "1234567"
+
+
+@pytest.mark.parametrize("base, compression, peak", [(5.0, 7.0, 7.0), (7.0, 5.0, 7.0), (None, None, None)])
+def test_the_peak_of_a_compression_is_that_of_both_its_commands(base, compression, peak, small, monkeypatch):
+    records = iter([{"loop_seconds": 1.0, "peak_gpu_mib": base}, {"loop_seconds": None, "peak_gpu_mib": compression}])
+    cell = small.cell("c3dgs")
+    shape = shapes.C3DGS(cell, shapes.config_of(cell), "out")
+    monkeypatch.setattr(shape, "command", lambda *words, **more: next(records))
+    assert shape.train() == {"loop_seconds": 1.0, "peak_gpu_mib": peak}
+
+
+def test_the_peak_of_a_command_ends_with_the_bar_of_its_training(monkeypatch):
+    """compress.py measures LPIPS afterwards, whose networks are no part of it; a bar may be one that is disabled."""
+    import tqdm
+
+    from diff_smoe_rasterization.benchmarks.methods import observer
+
+    held = iter([3, 9])
+    monkeypatch.setattr(tqdm, "tqdm", tqdm.tqdm)  # is put back
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: next(held) * 2**20)
+    found = observer.watch_loop(0, {})
+    for keywords in ({"desc": "Calculating"}, {"disable": True}, {"desc": "Training progress"},
+                     {"desc": "Training progress"}):
+        tqdm.tqdm(range(5), **keywords).close()
+    assert found == {"peak": 3.0}
 
 
 def test_the_arguments_of_a_compression_are_not_those_of_the_training_before_it(small):

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
+from diff_smoe_rasterization.benchmarks.methods import run
 from diff_smoe_rasterization.benchmarks.methods.checkout import SHAPES
-from diff_smoe_rasterization.benchmarks.methods.names import CHECKOUTS
-from diff_smoe_rasterization.benchmarks.protocol import config_of
+from diff_smoe_rasterization.benchmarks.methods.names import CHECKOUTS, LACKS
+from diff_smoe_rasterization.benchmarks.protocol import RECIPE, config_of, protocol_of
 from diff_smoe_rasterization.benchmarks.suite import SHIPPED, THRESHOLDS, expand, find_suite, load_suite
 from diff_smoe_rasterization.trainer.config import TrainConfig
 
@@ -54,6 +55,17 @@ def test_a_scaled_recipe_is_that_of_the_trainer(content):
     assert config.opacity_reset_interval == shortened.opacity_reset_interval
 
 
+def test_the_row_of_a_native_cell_has_its_whole_recipe(content, tmp_path):
+    content["protocol"].update(scale_recipe=True, options={"lambda_dssim": 0.3})
+    cell = expand(content, "").cells[0]
+    config = config_of(cell)
+    recipe = protocol_of({"downscaler": "that of a trainer"}, config, [])["recipe"]
+    assert recipe["lambda_dssim"] == 0.3 and recipe["rotation_lr"] == 0.001
+    assert recipe["densify_until_iter"] == TrainConfig(iterations=12, blend_mode="alpha").shortened().densify_until_iter
+    assert set(recipe) == set(RECIPE)
+    assert run(cell, str(tmp_path)).notes["scale_recipe"] is True
+
+
 def test_an_axis_of_a_method_wins_over_the_scenes_over_the_suites(content, tiny_scene):
     scenes = [{"name": "one", "path": tiny_scene},
               {"name": "two", "path": tiny_scene, "densify_grad_thresholds": [0.001]}]
@@ -90,6 +102,7 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tiny_scene, tmp_path
     ({"seeds": []}, ["seeds"]),
     ({"seeds": 0}, ["seeds", "a list, such as [0]"]),
     ({"name": "../x"}, ["name"]),
+    ({"seeds": [1.0]}, ["seeds[0]", "1.0", "integer"]),
     ({"scenes": [{"name": "a"}]}, ["scenes[0]", "path", "synthetic"]),
     ({"scenes": [{"name": "a", "path": "p", "resolution": 0}]}, ["scenes[0].resolution"]),
     ({"scenes": [{"name": "a", "path": "p"}, {"name": "a", "path": "q"}]}, ["scenes[1].name", "'a'"]),
@@ -116,6 +129,31 @@ def test_a_file_that_is_no_suite_is_named(tmp_path, text):
     path.write_text(text)
     with pytest.raises(BenchError, match="suite.yaml"):
         load_suite(str(path))
+
+
+def test_a_file_that_is_no_text_is_named(tmp_path):
+    path = tmp_path / "suite.yaml"
+    path.write_bytes(b"\x89PNG\r\n\xff")
+    with pytest.raises(BenchError, match="suite.yaml: not valid YAML"):
+        load_suite(str(path))
+
+
+@pytest.mark.parametrize("text, words", [
+    ("protocol: {iterations: 7}\nname: a\nprotocol: {}\n", "'protocol' is there twice.*line 3"),
+    ("protocol: {options: {opacity_lr: 1, opacity_lr: 2}}\n", "'opacity_lr' is there twice.*line 1")])
+def test_a_field_that_is_there_twice_is_refused(tmp_path, text, words):
+    path = tmp_path / "suite.yaml"
+    path.write_text(text)
+    with pytest.raises(BenchError, match=words):
+        load_suite(str(path))
+
+
+def test_a_field_may_stand_for_a_merged_one(content, tmp_path):
+    """The merged mapping is read after the one it goes into: what is the same in both is there once."""
+    path = tmp_path / "suite.yaml"
+    scenes = "scenes: [{<<: &a {<<: &b {path: p, images: x}, images: y, name: c}}, {<<: *a, name: d}]\n"
+    path.write_text("name: merged\nmethods: [{name: native}]\n" + scenes)
+    assert [(scene["name"], scene["images"]) for scene in load_suite(str(path)).scenes] == [("c", "y"), ("d", "y")]
 
 
 def test_a_variable_that_is_not_set_is_named(content, monkeypatch):
@@ -146,10 +184,23 @@ def test_a_checkout_whose_loader_moves_the_principal_point_is_not_compared_with_
 
 
 @pytest.mark.parametrize("words", [["-r", 4], ["--images", "images_2"], ["--white_background"], ["--iterations", 7000],
-                                   ["--resolution=2"], ["--densify_grad_threshold", 0.1]])
+                                   ["--resolution=2"], ["--densify_grad_threshold", 0.1], ["--train_test_exp"],
+                                   ["--random_background"], ["--llffhold", 4], ["--start_checkpoint", "/x"],
+                                   ["--lambda_dss", 0.5], ["--iter", 7000], ["--res=4"], ["-r4"], ["-wr4"],
+                                   ["--load_iteration", 7], ["--densification", 7]])
 def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
     with pytest.raises(BenchError, match=r"methods\[0\].arguments: " + words[0].partition("=")[0]):
         expand(on_cuda(content, methods=[{"name": "taming", "path": "p", "arguments": words}]), "")
+
+
+def test_flags_that_are_a_methods_own_are_its_own(content):
+    """argparse takes a whole flag as itself: --mode of Taming is not short for --model_path, as it is elsewhere."""
+    words = ["--densification_interval=500", "--mode", "final_count", "--budget", 9]
+    taming = {"name": "taming", "path": "p", "arguments": words}
+    assert expand(on_cuda(content, methods=[taming]), "").methods[0]["arguments"][-1] == "9"
+    for word in words[:2]:
+        with pytest.raises(BenchError, match=r"methods\[0\].arguments: " + word.partition("=")[0]):
+            expand(on_cuda(content, methods=[{"name": "3dgs-2023", "path": "p", "arguments": [word, 3]}]), "")
 
 
 def test_two_downscalers_are_refused(content):
@@ -168,6 +219,22 @@ def test_recipes_that_a_checkout_cannot_follow_are_refused(content):
     white = [{"name": "lego", "path": "p", "background": "white"}]
     with pytest.raises(BenchError, match="lego is white"):
         expand(on_cuda(content, methods=methods, scenes=white, schedules=["steady"]), "")
+    few = [{"name": "lego", "path": "p", "init_points": 10}]
+    with pytest.raises(BenchError, match="lego, methods: 3dgs-2023: init_points is 10"):
+        expand(on_cuda(content, methods=[{"name": "native"}, *methods], scenes=few), "")
+    assert expand(on_cuda(content, scenes=few), "").cells
+
+
+@pytest.mark.parametrize("name, option, value", [
+    ("3dgs-2023", "antialiasing", True), ("2dgs", "antialiasing", True), ("taming", "feature_lr", 0.01),
+    ("hac", "opacity_reset_interval", 500), ("hac-plus", "sh_degree", 2), ("dbs", "percent_dense", 0.1),
+    ("dbs", "opacity_reset_interval", 3000), ("dbs", "feature_lr", 0.0025)])
+def test_an_option_that_a_checkout_lacks_is_refused(name, option, value, content):
+    method = {"name": name, "path": "p", "arguments": ["--cap_max", 5] if name == "dbs" else []}
+    with pytest.raises(BenchError, match=rf"protocol.options.{option}: {name} \(methods\[0\]\)"):
+        expand(on_cuda(content, methods=[method], protocol={"options": {option: value}}), "")
+    assert expand(on_cuda(content, methods=[method], protocol={"options": {"antialiasing": False}}), "").cells
+    assert expand(on_cuda(content, protocol={"options": {option: value}}), "").cells
 
 
 def test_an_unpatched_checkout_has_its_own_blending_alone(content):
@@ -185,6 +252,30 @@ def test_a_method_without_a_threshold_needs_its_size(content):
         expand(on_cuda(content, methods=[{"name": "dbs", "path": "p"}]), "")
 
 
+@pytest.mark.parametrize("name, arguments", [("dbs", ["--cap_max", 3000]), ("taming", [])])
+def test_a_method_without_a_threshold_is_trained_once(name, arguments, content):
+    method = {"name": name, "path": "p", "arguments": arguments, "blend_modes": ["alpha"]}
+    with pytest.raises(BenchError, match=f"scenes: tiny, methods: .*{name} has no threshold"):
+        expand(on_cuda(content, methods=[method], densify_grad_thresholds=[0.005, 0.0002]), "")
+    method["densify_grad_thresholds"] = [0.0002]
+    assert len(expand(on_cuda(content, methods=[method], densify_grad_thresholds=[0.005, 0.0002]), "").cells) == 1
+
+
+@pytest.mark.parametrize("name, arguments, right", [
+    ("dbs", ["--cap_max", 3000], False), ("dbs", ["--cap_max", 999], True),
+    ("taming", ["--mode", "final_count", "--budget", 3000], False), ("taming", [], False),
+    ("taming", ["--budget", 999], False), ("taming", ["--mode", "multiplier", "--budget", 999], False),
+    ("taming", ["--budget", 999, "--mode", "final_count"], True)])
+def test_a_budget_is_that_of_the_arguments(name, arguments, right, content):
+    """Taming's --budget is a count with --mode final_count, and else a multiple of the number of points."""
+    suite = on_cuda(content, methods=[{"name": name, "path": "p", "arguments": arguments, "budget": 999}])
+    if right:
+        assert expand(suite, "").cells
+    else:
+        with pytest.raises(BenchError, match=r"methods\[0\].budget: is 999"):
+            expand(suite, "")
+
+
 def test_a_method_with_a_schedule_of_its_own_has_none_of_ours(content):
     methods = [{"name": "hac", "path": "p"}]
     assert {cell["schedule"] for cell in expand(on_cuda(content, methods=methods), "").cells} == {None}
@@ -193,7 +284,7 @@ def test_a_method_with_a_schedule_of_its_own_has_none_of_ours(content):
 
 
 def test_every_checkout_that_a_suite_may_name_can_be_run():
-    assert set(SHAPES) == set(CHECKOUTS)
+    assert set(SHAPES) == set(CHECKOUTS) == set(LACKS)
 
 
 @pytest.mark.parametrize("name", SHIPPED_NAMES)
@@ -212,8 +303,8 @@ def test_the_suite_of_the_readme_is_valid(monkeypatch):
     readme = Path(__file__).resolve().parents[3] / "benchmarks" / "README.md"  # which is not installed
     text = readme.read_text(encoding="utf-8").partition("```yaml")[2].partition("```")[0]
     cells = expand(yaml.safe_load(text), "").cells
-    assert {cell["method"]["label"] for cell in cells} == {"native", "3dgs-2023", "3dgs-2023-unpatched", "3dgs-2023-fused",
-                                                             "c3dgs"}
+    assert {cell["method"]["label"] for cell in cells} == {
+        "native", "3dgs-2023", "3dgs-2023-unpatched", "3dgs-2023-fused", "c3dgs"}
     assert {cell["seed"] for cell in cells if cell["headline"]} == {0, 1, 2}
 
 
