@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import subprocess
 
 import pytest
@@ -24,8 +23,8 @@ def results(tmp_path_factory):
 
 def call(*words, cwd):
     """Fails with all that the command said."""
-    done = subprocess.run(command(*words), env=environment(OMP_NUM_THREADS=str(os.cpu_count())), cwd=str(cwd),
-                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    done = subprocess.run(command(*words), env=environment(), cwd=str(cwd), stdout=subprocess.PIPE,
+                          stderr=subprocess.STDOUT)
     assert done.returncode == 0, done.stdout.decode(errors="replace")
 
 
