@@ -119,5 +119,5 @@ def state_of_files(path: str) -> str:
         for name in sorted(set(names) - left_out):
             file = os.path.join(folder, name)
             state = os.stat(file)
-            checksum.update(f"{os.path.relpath(file, path)}\0{state.st_size}\0{state.st_mtime_ns}\n".encode())
+            checksum.update(os.fsencode(f"{os.path.relpath(file, path)}\0{state.st_size}\0{state.st_mtime_ns}\n"))
     return checksum.hexdigest()
