@@ -140,7 +140,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                                                     "fig4, fig5, captures, captures_ablation, captures_baselines")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
     run.add_argument("--jobs", type=int, metavar="N",
-                     help="cells at once (default: --per-gpu on each GPU, one on the CPU)")
+                     help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
+                          "FPS stay out of the report)")
     run.add_argument("--per-gpu", type=int, default=1, metavar="K",
                      help="cells that share a GPU (default: 1); beyond 1 their times and FPS stay out of the report")
     run.add_argument("--slurm", nargs="*", metavar="KEY=VALUE",
