@@ -81,8 +81,9 @@ def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
     path = method[key]
     if not CHECKOUTS[method["name"]]:
         return path
-    found = patches.inspect(path)
-    is_patched, is_fused = found.verdict == "patched", "fuse" in found.options
+    found = patches.inspect(path, fuse=True)
+    is_patched = found.verdict == "patched"
+    is_fused = any(set(rule.files) - set(rule.pending) for rule in found.requested if rule.option == "fuse")
     if method["variant"] == "unpatched" and found.verdict != "patchable":
         raise BenchError(f"{path} is {found.verdict}, and the suite says it is an unpatched checkout (`dsmoe patch "
                          "revert` takes a patch back)")

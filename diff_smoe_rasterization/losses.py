@@ -64,7 +64,9 @@ class _ImageLoss(torch.autograd.Function):
         return loss
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, dL_dloss: torch.Tensor) -> Tuple[Any, ...]:  # type: ignore[override]
+        if torch.is_grad_enabled():  # as it is with create_graph alone
+            raise RuntimeError("SSIM and the image loss: second derivatives are not implemented; leave out "
+                               "create_graph=True")
         gradient, = ctx.saved_tensors
         return (gradient * dL_dloss,) + (None,) * 5

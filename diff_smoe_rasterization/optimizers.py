@@ -14,9 +14,9 @@ _OPS = torch.ops.diff_smoe_rasterization
 class FusedAdam(torch.optim.Adam):
     """Adam as torch.optim.Adam computes it, but for rounding: one kernel launch a step for each precision and device.
 
-    The state of a parameter is {"step": int, "exp_avg": tensor, "exp_avg_sq": tensor}; a step counted by a tensor, as
-    torch.optim.Adam keeps it, is taken too, and state_dict() of each is taken by the other. Parameters and moments are
-    dense, float32 or float64. Raises ValueError where a group asks for weight_decay, amsgrad or maximize.
+    Groups and state are torch.optim.Adam's but for state["step"], an int here; each takes the state_dict() of the other.
+    Where a group asks for weight_decay, amsgrad or maximize, or a gradient is sparse or neither float32 nor float64, the
+    step is torch.optim.Adam's own.
     """
 
     def __init__(self, params: Iterable[Any], lr: float = 1e-3, betas: Any = (0.9, 0.999), eps: float = 1e-8) -> None:
@@ -35,12 +35,13 @@ class FusedAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        if not all(_is_fused(group) for group in self.param_groups):
+            for state in self.state.values():
+                state["step"] = torch.as_tensor(state["step"], dtype=torch.float32)
+            super().step()
+            return loss
         launches: Dict[Any, _Launch] = {}
         for group in self.param_groups:
-            for option in ("weight_decay", "amsgrad", "maximize"):
-                if group.get(option):  # absent from a state that an earlier version saved
-                    raise ValueError(f"FusedAdam: {option} of group {group.get('name', '')!r} is {group[option]}, which "
-                                     "it does not have; take torch.optim.Adam")
             beta1, beta2 = group["betas"]
             for parameter in group["params"]:
                 if parameter.grad is None:
@@ -130,6 +131,14 @@ def _launch_of(launches: Dict[Any, _Launch], parameter: torch.Tensor, group: Dic
     if launch is None:
         launch = launches[key] = _Launch(*group["betas"], group["eps"])
     return launch
+
+
+def _is_fused(group: Dict[str, Any]) -> bool:
+    """Whether the op has what a group of torch.optim.Adam asks for; an earlier version's groups have fewer options."""
+    gradients = [parameter.grad for parameter in group["params"] if parameter.grad is not None]
+    return (not any(group.get(option) for option in ("weight_decay", "amsgrad", "maximize"))
+            and all(gradient.dtype in (torch.float32, torch.float64) and gradient.layout == torch.strided
+                    for gradient in gradients))
 
 
 def _zero_moments(parameter: torch.Tensor) -> Dict[str, torch.Tensor]:

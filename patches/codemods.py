@@ -148,10 +148,11 @@ class _PipeBlendMode(Codemod):
 
 
 class CallOfOurs(Codemod):
-    """`FOREIGN(...)` becomes `OURS(...)`, imported from SOURCE, where it has no other keywords than these."""
+    """`FOREIGN(...)` becomes `OURS(...)`, imported from SOURCE, where it has no other arguments than these."""
 
     foreign = ours = ""
     source = RUNTIME
+    positional = 1  # at most
     keywords: Tuple[str, ...] = ()
 
     def fits(self, given: Dict[str, cst.BaseExpression]) -> bool:
@@ -160,8 +161,10 @@ class CallOfOurs(Codemod):
 
     def leave_Call(self, original_node: cst.Call, updated_node: cst.Call) -> cst.Call:
         given = {argument.keyword.value: argument.value for argument in updated_node.args if argument.keyword}
+        self.done += is_name(updated_node.func, self.ours)
         if (get_full_name_for_node(updated_node.func) != self.foreign or not set(given) <= set(self.keywords)
-                or not self.fits(given)):
+                or len(updated_node.args) - len(given) > self.positional
+                or any(argument.star for argument in updated_node.args) or not self.fits(given)):
             return updated_node
         self.pending += 1
         return updated_node.with_changes(func=cst.Name(self.ours))
@@ -176,7 +179,10 @@ class Decorated(Codemod):
     function = decorator = ""
 
     def changed_function(self, function: cst.FunctionDef) -> cst.FunctionDef:
-        if self.within or function.name.value != self.function or function.decorators:
+        if self.within or function.name.value != self.function:
+            return function
+        self.done += any(is_name(decorator.decorator, self.decorator) for decorator in function.decorators)
+        if function.decorators:
             return function
         self.pending += 1
         return function.with_changes(decorators=[cst.Decorator(cst.Name(self.decorator))])

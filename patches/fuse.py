@@ -15,12 +15,12 @@ class _Ssim(Decorated):
 
 class _Adam(CallOfOurs):
     foreign, ours, source = "torch.optim.Adam", "FusedAdam", PACKAGE
-    keywords = ("lr", "betas", "eps")
+    positional, keywords = 4, ("lr", "betas", "eps")
 
 
 RULES = (
     Rule("fused-loss", "the five convolutions of SSIM and their gradients are two kernels here",
          _Ssim, ("def ssim",)),
     Rule("fused-adam", "a step of Adam reads and writes every Gaussian once instead of a dozen times",
-         _Adam, ("torch.optim.Adam",)),
+         _Adam, ("torch.optim.Adam", "FusedAdam")),
 )

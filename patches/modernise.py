@@ -126,11 +126,11 @@ class _LpipsOffline(Decorated):
 
 
 class _EighInParts(CallOfOurs):
-    foreign, ours, keywords = "torch.linalg.eigh", "eigh_in_parts", ("UPLO",)
+    foreign, ours, keywords, positional = "torch.linalg.eigh", "eigh_in_parts", ("UPLO",), 2
 
 
 class _UniqueRows(CallOfOurs):
-    foreign, ours = "torch.unique", "unique_rows"
+    foreign, ours, positional = "torch.unique", "unique_rows", 5
     keywords = ("sorted", "return_inverse", "return_counts", "dim")
 
     def fits(self, given: Dict[str, cst.BaseExpression]) -> bool:
@@ -179,9 +179,9 @@ RULES = (
     Rule("blender-images", "new Pillow releases take no signed bytes for a picture",
          _NumpyByte, ("np.byte", "numpy.byte")),
     Rule("eigh-in-parts", "cuSOLVER of CUDA 12.8 and later fails on the many covariances that c3dgs gives it at once",
-         _EighInParts, ("linalg.eigh",)),
+         _EighInParts, ("linalg.eigh", "eigh_in_parts")),
     Rule("unique-rows", "torch.unique(dim=0) can fail on CUDA where processes share a GPU: its merge sort has a race",
-         _UniqueRows, ("torch.unique",)),
+         _UniqueRows, ("torch.unique", "unique_rows")),
     Rule("cpp-standard", "C++14 was asked for; torch 2.1 needs C++17, 2.13 C++20, and asks for it itself",
          _CppStandard, ("c++14",)),
 )

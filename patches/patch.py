@@ -27,7 +27,7 @@ class Requested(NamedTuple):
     option: str
     rule: str
     reason: str
-    files: Tuple[str, ...]  # that it changes, as they were before any patch
+    files: Tuple[str, ...]  # that it changes, or had changed when they were read: as they were before any known patch
     pending: Tuple[str, ...]  # those of them in which it is not applied, as they are now
 
     def note(self, written: bool) -> str:
@@ -71,7 +71,7 @@ class Patch:
         known = {rule.file for rule in trainer.rules if isinstance(rule, ImportRasterizer)}
         for name in sorted(set(files) - known):
             if RASTERIZER.encode() in files[name] and not name.startswith("submodules/"):
-                self._changes(codemods.run, ImportRasterizer(name, trainer.flavour), name)
+                self._tried(codemods.run, ImportRasterizer(name, trainer.flavour), name)
                 if f"from {RASTERIZER}._C ".encode() in files[name]:
                     self.notes.append(f"{name}: the import from {RASTERIZER}._C stays; where it fails, the file has to "
                                       "do without what it names")
@@ -81,13 +81,15 @@ class Patch:
 
         read_now: the bytes of a file as it is now, patched or not; None where it is gone.
         """
-        changed = {(option, rule): tuple(name for name in sorted(self.files) if rule.looks_at(self.files[name])
-                                         and self._changes(optional.run, rule, name))
-                   for option in options for rule in OPTIONS[option]}
+        found = {(option, rule): {name: self._tried(optional.run, rule, name) for name in sorted(self.files)
+                                  if rule.looks_at(self.files[name])}
+                 for option in options for rule in OPTIONS[option]}
         states = {change.name: (read_now(change.name), change.after) for change in self.changes()}
         requested = []
-        for (option, rule), names in changed.items():
-            pending = tuple(name for name in names if self._is_pending(rule, name, *states[name]))
+        for (option, rule), outcomes in found.items():
+            names = tuple(name for name, outcome in outcomes.items() if outcome and (outcome.pending or outcome.done))
+            pending = tuple(name for name in names if outcomes[name].pending
+                            and self._is_pending(rule, name, *states[name]))
             requested.append(Requested(option, rule.name, rule.reason, names, pending))
         return tuple(requested)
 
@@ -105,14 +107,14 @@ class Patch:
         except PatchError:  # an edit that cannot be read
             return True
 
-    def _changes(self, run, rule, name: str) -> bool:
+    def _tried(self, run, rule, name: str) -> Optional[codemods.Outcome]:
         """Applies a rule that may match or not; a file that cannot be read is left as it is."""
         try:
-            return self._run(run, rule, name).pending > 0
+            return self._run(run, rule, name)
         except PatchError as error:
             note = f"left as it is: {error}"
             self.notes += [note] if note not in self.notes else []
-            return False
+            return None
 
     def state(self) -> Tuple[str, List[str]]:
         if self.problems:

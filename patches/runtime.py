@@ -4,7 +4,6 @@ from __future__ import annotations
 import ast
 import functools
 import importlib
-import math
 import os
 import sys
 import warnings
@@ -113,65 +112,80 @@ def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-# Of the largest value. A variance E[x^2] - E[x]^2 of the pair below is 4e-3 of E[x^2], so that what float32 rounds off,
-# some 1e-7, becomes some 1e-5 to 1e-4 of it; another window, border or constant makes several per cent.
+# Of the largest value. A variance E[x^2] - E[x]^2 of the first pair below is 4e-3 of E[x^2], so that what float32 rounds
+# off, some 1e-7, becomes some 1e-5 to 1e-4 of it; another window, border or constant makes several per cent.
 SSIM_ROUNDING = 1e-3
 
 
 def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
     """Returns a trainer's ssim(img1, img2, window_size=11, size_average=True), computed by `fused_ssim` where it can be.
 
-    img1, img2: [3, H, W] or [B, 3, H, W]. When it is called first both are computed of a small pair of images: where
-    they differ in value or gradient the trainer's own stays, and a line on stderr says so. It is also called for other
-    windows and types, means of each image, and gradients by img2, which the kernel does not have.
+    img1, img2: [3, H, W] or [B, 3, H, W]. When images of a shape come first, both are computed of pairs of that shape:
+    where they differ in value or gradient the trainer's own stays, and a line on stderr says so. It is also called for
+    other windows and types, means of each image, under autocast, and for gradients by img2: the kernel has none of it.
     """
     @functools.lru_cache(maxsize=None)
-    def is_the_same(device: Any, dimensions: int) -> bool:
-        from diff_smoe_rasterization import fused_ssim
-
-        try:
-            ours, theirs = (ssim_and_gradient(each, device, dimensions) for each in (fused_ssim, ssim))
-            differs = max(float((one - other).abs().max() / other.abs().max()) for one, other in zip(ours, theirs))
-            found = f"they differ by {differs:.1e} of the largest value"
-        except Exception as error:  # whatever another function has against the pair: it is not this package's to end
-            differs, found = math.inf, f"of a small pair of images it raises {error!r}"
-        if not differs <= SSIM_ROUNDING:
+    def is_the_same(device: Any, shape: Any) -> bool:
+        found = difference_of_ssim(ssim, device, shape)
+        if found:
             _say(f"--fuse: {ssim.__module__}.{ssim.__name__} is not SSIM as it is fused here ({found}): it is computed "
                  "as before")
-        return differs <= SSIM_ROUNDING
+        return not found
 
     @functools.wraps(ssim)
-    def call(img1: Any, img2: Any, *arguments: Any, **keywords: Any) -> Any:
-        import torch
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        if not can_be_fused(*arguments, **keywords) or not is_the_same(arguments[0].device, arguments[0].shape):
+            return ssim(*arguments, **keywords)
         from diff_smoe_rasterization import fused_ssim
 
-        as_fused = {"window_size": 11, "size_average": True}
-        asked = {**as_fused, **dict(zip(as_fused, arguments)), **keywords}
-        fits = (asked == as_fused and img1.dim() in (3, 4) and img1.shape == img2.shape
-                and img1.dtype == img2.dtype == torch.float32 and img1.device == img2.device
-                and not (img2.requires_grad and torch.is_grad_enabled()))
-        if not fits or not is_the_same(img1.device, img1.dim()):
-            return ssim(img1, img2, *arguments, **keywords)
-        return fused_ssim(img1, img2)
+        return fused_ssim(*arguments[:2])
 
     return call
 
 
-def ssim_and_gradient(ssim: Callable[..., Any], device: Any, dimensions: int) -> Any:
-    """Returns ssim(img1, img2) of a pair of images, [3, 24, 31] or [1, 3, 24, 31], and its gradient by img1.
-
-    Their contrast is small, so that SSIM's constants count, and so are they, so that their border does.
-    """
+def can_be_fused(*arguments: Any, **keywords: Any) -> bool:
+    """Whether `fused_ssim` has what is asked for by these arguments of a trainer's ssim."""
     import torch
 
-    shape = (1, 3, 24, 31)[-dimensions:]
-    noise = torch.rand(2, *shape, generator=torch.Generator().manual_seed(0)).to(device)
-    with torch.inference_mode(False), torch.enable_grad():
-        noise = noise.clone()  # which is no inference tensor
-        img1 = (0.4 + 0.1 * noise[0]).requires_grad_()
-        value = ssim(img1, 0.5 + 0.1 * noise[1])
-        gradient, = torch.autograd.grad(value, img1)
-    return value.detach(), gradient
+    as_fused = {"window_size": 11, "size_average": True}
+    if not 2 <= len(arguments) <= 4 or not set(keywords) <= set(as_fused):
+        return False
+    img1, img2, *rest = arguments
+    asked = {**as_fused, **dict(zip(as_fused, rest)), **keywords}
+    return (all(type(asked[name]) is type(value) and asked[name] == value for name, value in as_fused.items())
+            and isinstance(img1, torch.Tensor) and isinstance(img2, torch.Tensor) and img1.dim() in (3, 4)
+            and img1.shape == img2.shape and img1.dtype == img2.dtype == torch.float32 and img1.device == img2.device
+            and not torch.is_autocast_enabled() and not (img2.requires_grad and torch.is_grad_enabled()))
+
+
+def difference_of_ssim(ssim: Callable[..., Any], device: Any, shape: Any) -> str:
+    """What a trainer's ssim and `fused_ssim` differ in on two pairs of images of a shape; empty where in nothing.
+
+    One pair has little contrast, so that SSIM's constants count. The other leaves [0, 1], and its SSIM is negative.
+    """
+    import torch
+    from diff_smoe_rasterization import fused_ssim
+
+    def value_and_gradient(similarity: Callable[..., Any]) -> Any:
+        img1 = one.clone().requires_grad_()
+        value = similarity(img1, other)
+        return (value.detach(), *torch.autograd.grad(value, img1))
+
+    generator = torch.Generator().manual_seed(0)
+    with torch.inference_mode(False), torch.enable_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        noise = [torch.rand(tuple(shape), generator=generator).to(device) for _ in range(2)]
+        for one, other in ((0.4 + 0.1 * noise[0], 0.5 + 0.1 * noise[1]),
+                           (1.4 * (1 - noise[0]) - 0.2 + 0.05 * noise[1], noise[0])):
+            try:
+                for ours, theirs in zip(value_and_gradient(fused_ssim), value_and_gradient(ssim)):
+                    if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
+                        return f"it gives {theirs.dtype} {list(theirs.shape)}, not {ours.dtype} {list(ours.shape)}"
+                    differs, largest = float((ours - theirs).abs().max()), float(ours.abs().max())
+                    if not differs <= SSIM_ROUNDING * largest:  # NaN is no such number
+                        return f"they differ by {differs:.1e} where the largest value is {largest:.1e}"
+            except Exception as error:  # whatever another function has against the pair: it is not this package's to end
+                return f"it raises {error!r}"
+    return ""
 
 
 EIGH_AT_ONCE = 16_384  # cuSOLVER's batched solver of CUDA 12.8 and later fails on batches somewhere above 32,000

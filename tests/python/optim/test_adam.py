@@ -146,13 +146,29 @@ def test_torch_adam_takes_its_state(device):
     torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("option, value", [("weight_decay", 0.1), ("amsgrad", True), ("maximize", True)])
-def test_what_it_does_not_have_is_refused(device, option, value):
-    parameters = random_parameters(torch.float32, [(3,)])
-    optimizer = FusedAdam([{"params": parameters, "name": "xyz", option: value}], lr=0.1)
-    set_gradients(parameters, 0)
-    with pytest.raises(ValueError, match=f"{option} of group 'xyz' is {value}"):
-        optimizer.step()
+@pytest.mark.parametrize("dtype, options", [
+    (torch.float64, {"weight_decay": 0.1}), (torch.float64, {"amsgrad": True}), (torch.float64, {"maximize": True}),
+    (torch.bfloat16, {})])
+def test_what_the_kernel_does_not_have_is_computed_by_torch(device, dtype, options):
+    ours, theirs = random_parameters(dtype, [(30,), (4, 3)]), random_parameters(dtype, [(30,), (4, 3)])
+    groups = [[{"params": parameters[:1], **options}, {"params": parameters[1:]}] for parameters in (ours, theirs)]
+    optimizers = [FusedAdam(groups[0], lr=0.1), torch.optim.Adam(groups[1], lr=0.1)]
+    before = ours[0].detach().clone()
+    for seed in range(4):
+        for parameters, optimizer in zip((ours, theirs), optimizers):
+            set_gradients(parameters, seed)
+            optimizer.step()
+    assert all(torch.equal(mine, other) for mine, other in zip(ours, theirs)) and not torch.equal(ours[0], before)
+
+
+def test_a_group_may_ask_for_more_later(device):
+    ours, theirs = random_parameters(torch.float64, [(30,)]), random_parameters(torch.float64, [(30,)])
+    for parameters, optimizer in ((ours, FusedAdam(ours, lr=0.1)), (theirs, torch.optim.Adam(theirs, lr=0.1))):
+        for seed, decay in enumerate((0, 0.1, 0)):
+            optimizer.param_groups[0]["weight_decay"] = decay
+            set_gradients(parameters, seed)
+            assert optimizer.step(lambda: seed) == seed
+    torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
 
 
 def test_autograd_notices_the_step(device):
@@ -175,7 +191,7 @@ def test_bad_tensors_are_refused(device):
     half = torch.zeros(2, dtype=torch.float16, requires_grad=True)
     half.grad = torch.ones_like(half)
     with pytest.raises(TypeError, match=r"adam: parameters\[0\] is Half"):
-        FusedAdam([half]).step()
+        SparseGaussianAdam([{"params": [half]}], lr=0.1, eps=1e-15).step(torch.ones(2, dtype=torch.bool), 2)
 
 
 def sparse_adam_by_hand(parameter, moment, square, gradient, visible, rate, epsilon):

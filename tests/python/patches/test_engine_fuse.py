@@ -4,11 +4,13 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
-from torch.nn.functional import conv2d
+from torch.nn.functional import avg_pool2d, conv2d
 
 cst = pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
@@ -28,6 +30,9 @@ BEFORE_AND_AFTER = [
     ("fused-adam", "import torch\noptimizer = torch.optim.Adam(l, lr=0.0, eps=1e-15)  # all\n",
      "import torch\nfrom diff_smoe_rasterization import FusedAdam\noptimizer = FusedAdam(l, lr=0.0, eps=1e-15)  # all\n"),
     ("fused-adam", "torch.optim.Adam(l, lr=0.0, weight_decay=0.1)\ntorch.optim.AdamW(l)\n", None),
+    ("fused-adam", "torch.optim.Adam(l, lr=0.0, fused=True)\n", None),
+    ("fused-adam", "torch.optim.Adam(l, 0.1, (0.9, 0.99), 1e-8, 0.01)\n", None),
+    ("fused-adam", "torch.optim.Adam(l, **options)\ntorch.optim.Adam(*arguments)\n", None),
 ]
 LOSSES = {"utils/loss_utils.py": "def ssim(img1, img2, window_size=11, size_average=True):\n    return 1\n"}
 
@@ -67,6 +72,15 @@ def test_check_says_what_to_type(tmp_path, dsmoe):
     said = dsmoe("patch", "check", tmp_path, "--fuse", "--modernise")
     assert "fuse fused-loss: not applied in utils/loss_utils.py" in said.out
     assert f"modernise, fuse: to apply what is not, type: dsmoe patch apply --modernise --fuse {tmp_path}" in said.out
+
+
+def test_it_is_seen_without_a_record(tmp_path, dsmoe):
+    make(tmp_path, {**LOSSES, "scene/model.py": "import torch\nadam = torch.optim.Adam(l, lr=0.0, eps=1e-15)\n"})
+    patches.apply(tmp_path, fuse=True)
+    shutil.rmtree(tmp_path / ".dsmoe_patch")
+    said = dsmoe("patch", "check", tmp_path, "--fuse")
+    assert "fuse fused-loss: applied in utils/loss_utils.py" in said.out
+    assert "fuse fused-adam: applied in scene/model.py" in said.out and "type: " not in said.out
 
 
 def test_a_record_from_before_the_option_is_read(tmp_path):
@@ -115,7 +129,7 @@ def ssim(img1, img2, window_size=11, size_average=True):
 
 @pytest.fixture
 def fused_calls(monkeypatch):
-    """The shapes that `fused_ssim` is called with."""
+    """The shapes that `fused_ssim` is called with; the first two are of a comparison."""
     calls, original = [], diff_smoe_rasterization.fused_ssim
 
     def counted(img1, img2):
@@ -126,9 +140,10 @@ def fused_calls(monkeypatch):
     return calls
 
 
-@pytest.mark.parametrize("shape", [(3, 40, 52), (2, 3, 40, 52)])
+@pytest.mark.parametrize("shape", [(3, 40, 52), (1, 24, 31), (2, 3, 40, 52)])
 def test_ssim_is_fused_where_it_is_the_same(shape, fused_calls, capsys):
     call = runtime.fused_where_equal(ssim)
+    torch.manual_seed(0)
     image, target = torch.rand(shape, requires_grad=True), torch.rand(shape)
     for arguments in ((), (11,), (11, True)):
         value = call(image, target, *arguments)
@@ -138,36 +153,68 @@ def test_ssim_is_fused_where_it_is_the_same(shape, fused_calls, capsys):
         assert float(value.detach()) == pytest.approx(float(expected.detach()), abs=1e-5)
         torch.testing.assert_close(gradient, torch.autograd.grad(expected, image)[0], rtol=0,
                                    atol=1e-4 * float(gradient.abs().max()))
-    assert fused_calls.count(shape) == 3 and len(fused_calls) == 4  # once to compare
+    assert fused_calls == [shape] * 5  # two of them to compare, once
     assert capsys.readouterr().err == "" and call.__name__ == "ssim"
 
 
 def test_what_the_kernel_does_not_have_is_computed_as_before(fused_calls):
     call = runtime.fused_where_equal(ssim)
+    torch.manual_seed(0)
     one, other = torch.rand(2, 1, 3, 20, 30)
     assert torch.equal(call(one, other, 7), ssim(one, other, 7))
     assert torch.equal(call(one, other, size_average=False), ssim(one, other, size_average=False))
     assert torch.equal(call(one.double(), other.double()), ssim(one.double(), other.double()))
+    assert torch.equal(call(one, other[..., :1]), ssim(one, other[..., :1]))
+    assert torch.equal(call(img1=one, img2=other), ssim(one, other))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert call(one, other) == ssim(one, other)
     assert torch.equal(call(one, other.requires_grad_()), ssim(one, other)) and not fused_calls
     with torch.inference_mode():
         assert float(call(one, other)) == pytest.approx(float(ssim(one, other)), abs=1e-5)
-    assert len(fused_calls) == 2
+    assert len(fused_calls) == 3
+
+
+@pytest.mark.parametrize("arguments, keywords", [
+    ((torch.ones(20, 30),), {}), ((11, True, torch.ones(20, 30)), {}), ((), {"mask": torch.ones(20, 30)})])
+def test_other_arguments_are_the_trainers_own(arguments, keywords, fused_calls):
+    def masked(img1, img2, *rest, mask=None):
+        return ssim(img1, img2) * (rest[-1] if mask is None else mask).mean()
+
+    one, other = torch.rand(2, 3, 20, 30)
+    assert runtime.fused_where_equal(masked)(one, other, *arguments, **keywords) == ssim(one, other)
+    assert runtime.fused_where_equal(lambda img1, img2: 3)(one.numpy(), other.numpy()) == 3 and not fused_calls
 
 
 @pytest.mark.parametrize("other", [
     lambda img1, img2: ssim(img1, img2, 9), lambda img1, img2: ssim(img1, img2) + 0.01,
     lambda img1, img2: ssim(img1[..., 5:-5, 5:-5], img2[..., 5:-5, 5:-5]),
-    lambda img1, img2: ssim(2 * img1, 2 * img2),  # as other constants
-    lambda img1, img2: ssim(img1.unflatten(-1, (2, -1)).flatten(-2), img2),  # takes even widths alone
-    lambda img1, img2: ssim(img1.detach(), img2) + 0 * img1.mean(), lambda img1, img2: ssim(img1, img2) * math.nan])
-def test_another_ssim_stays_and_that_is_said_once(other, fused_calls, capsys):
+    lambda img1, img2: ssim(0.95 * img1, 0.95 * img2),  # as other constants
+    lambda img1, img2: ssim(img1.clamp(0, 1), img2.clamp(0, 1)), lambda img1, img2: ssim(img1, img2).clamp(min=0),
+    lambda img1, img2: ssim(avg_pool2d(img1, 2), avg_pool2d(img2, 2)) if img1.shape[-1] > 28 else ssim(img1, img2),
+    lambda img1, img2: ssim(img1, img2, size_average=False), lambda img1, img2: len(img1) * ssim(img1, img2),
+    lambda img1, img2: ssim(img1.unflatten(-1, (4, -1)).flatten(-2), img2),  # takes no such width
+    lambda img1, img2: ssim(img1.detach(), img2) + 0 * img1.mean(), lambda img1, img2: ssim(img1, img2) * math.nan,
+    lambda img1, img2: ssim(img1, img2) + 0 * (img1 - img1.detach()).sqrt().sum()])  # its gradient alone is NaN
+def test_another_ssim_stays_and_that_is_said_once(other, capsys):
     runtime._say.cache_clear()
     call = runtime.fused_where_equal(other)
-    one, two = torch.rand(2, 1, 3, 20, 30)
+    torch.manual_seed(0)
+    one, two = torch.rand(2, 2, 3, 20, 30)
     for _ in range(2):
-        torch.testing.assert_close(call(one, two), other(one, two), rtol=0, atol=0, equal_nan=True)
-    said = capsys.readouterr().err
-    assert said.count("is not SSIM as it is fused here") == 1 and len(fused_calls) == 1
+        try:
+            expected = other(one, two)
+        except RuntimeError as error:
+            with pytest.raises(RuntimeError, match=re.escape(str(error).splitlines()[0])):
+                call(one, two)
+        else:
+            torch.testing.assert_close(call(one, two), expected, rtol=0, atol=0, equal_nan=True)
+    assert capsys.readouterr().err.count("is not SSIM as it is fused here") == 1
+
+
+def test_a_second_derivative_is_refused():
+    image, target = torch.rand(3, 20, 30, requires_grad=True), torch.rand(3, 20, 30)
+    with pytest.raises(RuntimeError, match="second derivatives are not implemented"):
+        torch.autograd.grad(diff_smoe_rasterization.fused_ssim(image, target), image, create_graph=True)
 
 
 def test_a_small_fit_goes_the_same_way():
