@@ -155,7 +155,17 @@ def can_be_fused(*arguments: Any, **keywords: Any) -> bool:
     return (all(type(asked[name]) is type(value) and asked[name] == value for name, value in as_fused.items())
             and isinstance(img1, torch.Tensor) and isinstance(img2, torch.Tensor) and img1.dim() in (3, 4)
             and img1.shape == img2.shape and img1.dtype == img2.dtype == torch.float32 and img1.device == img2.device
-            and not torch.is_autocast_enabled() and not (img2.requires_grad and torch.is_grad_enabled()))
+            and not is_autocast(img1.device.type) and not (img2.requires_grad and torch.is_grad_enabled()))
+
+
+def is_autocast(device_type: str) -> bool:
+    """Whether autocast is on for a type of device."""
+    import torch
+
+    try:
+        return torch.is_autocast_enabled(device_type)
+    except TypeError:  # torch before 2.4
+        return torch.is_autocast_cpu_enabled() if device_type == "cpu" else torch.is_autocast_enabled()
 
 
 def difference_of_ssim(ssim: Callable[..., Any], device: Any, shape: Any) -> str:
