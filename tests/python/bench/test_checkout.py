@@ -340,7 +340,10 @@ def test_a_fused_checkout_is_a_copy_of_its_own(small, tmp_path):
     row = row_of(cell, tmp_path / "out")
     assert row["ok"] and row["variant"] == "fused" and row["protocol"]["arguments"][-2:] == ["--blend_mode", "smoe"]
     # A checkout that was fused already is used as it is, and is not the patched one.
+    without_record = str(tmp_path / "without record")
+    shutil.copytree(cell["method"]["path"], without_record, ignore=shutil.ignore_patterns(".dsmoe_patch"))
     for path, variant, expected in ((cell["method"]["path"], "fused", cell["method"]["path"]),
+                                    (without_record, "fused", without_record), (without_record, "patched", None),
                                     (cell["method"]["path"], "patched", None),
                                     (patched, "fused", str(tmp_path / "checkouts" / "fused-path"))):
         method = dict(cell["method"], label="fused", path=path, variant=variant)
