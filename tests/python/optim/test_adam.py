@@ -117,33 +117,19 @@ def test_a_parameter_with_other_strides(device, make, step):
     assert not torch.equal(dense, numbers.t())
 
 
-def test_a_state_of_torch_adam_is_taken(device):
-    ours, theirs = random_parameters(torch.float64, [(30,)]), random_parameters(torch.float64, [(30,)])
-    adam = torch.optim.Adam(theirs, lr=0.1)
-    set_gradients(theirs, 0)
-    adam.step()
-    fused = FusedAdam(ours, lr=0.1)
-    fused.load_state_dict(copy.deepcopy(adam.state_dict()))  # torch would share the moments
+@pytest.mark.parametrize("first, second", [(torch.optim.Adam, FusedAdam), (FusedAdam, torch.optim.Adam)])
+def test_either_adam_takes_the_state_of_the_other(device, first, second):
+    before, after = random_parameters(torch.float64, [(30,)]), random_parameters(torch.float64, [(30,)])
+    giving, taking = first(before, lr=0.1), second(after, lr=0.3)
+    set_gradients(before, 0)
+    giving.step()
+    taking.load_state_dict(copy.deepcopy(giving.state_dict()))  # torch would share the moments
     with torch.no_grad():
-        ours[0].copy_(theirs[0])
-    for parameters, optimizer in ((ours, fused), (theirs, adam)):
+        after[0].copy_(before[0])
+    for parameters, optimizer in ((before, giving), (after, taking)):
         set_gradients(parameters, 1)
         optimizer.step()
-    torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
-
-
-def test_torch_adam_takes_its_state(device):
-    ours, theirs = random_parameters(torch.float64, [(30,)]), random_parameters(torch.float64, [(30,)])
-    fused, adam = FusedAdam(ours, lr=0.1), torch.optim.Adam(theirs, lr=0.3)
-    set_gradients(ours, 0)
-    fused.step()
-    adam.load_state_dict(copy.deepcopy(fused.state_dict()))
-    with torch.no_grad():
-        theirs[0].copy_(ours[0])
-    for parameters, optimizer in ((ours, fused), (theirs, adam)):
-        set_gradients(parameters, 1)
-        optimizer.step()
-    torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
+    torch.testing.assert_close(after[0], before[0], rtol=1e-14, atol=1e-14)
 
 
 @pytest.mark.parametrize("dtype, options", [
