@@ -231,7 +231,7 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
     per_device = at_once
     if gpus:
         per_device = min(per_gpu, -(-at_once // len(gpus)))  # spread over the GPUs first: no more of them share one
-    threads = threads_of_each(at_once) if slurm is None else 1
+    threads = threads_of_each(at_once) if slurm is None else threads_asked_for(slurm)
     words = [sys.executable, "-m", "snakemake", "all", "--snakefile", SNAKEFILE, "--directory", results, "--nolock",
              "--quiet", "host", "reason", "rules", "--keep-going", "--rerun-incomplete",
              "--rerun-triggers", "mtime", "--scheduler", "greedy",
@@ -257,6 +257,17 @@ def threads_of_each(at_once: int) -> int:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(torch.get_num_threads(), cores // at_once))
+
+
+def threads_asked_for(resources: Sequence[str]) -> int:
+    """Threads of a cell in Slurm's queue: what its resources say as cpus_per_task=N, else 1. Raises BenchError."""
+    threads = "1"
+    for name, _, value in (resource.partition("=") for resource in resources):
+        if name == "cpus_per_task":
+            threads = value
+    if not threads.isdecimal() or int(threads) < 1:
+        raise BenchError(f"--slurm cpus_per_task={threads}: must be a number of at least 1")
+    return int(threads)
 
 
 def visible_gpus() -> List[str]:

@@ -2,25 +2,21 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
 from bench_commands import command, environment, rows_of, wait_for
-from PIL import Image
 
-from diff_smoe_rasterization.benchmarks import cell as cells
 from diff_smoe_rasterization.benchmarks import engine, preparation, selection
+from diff_smoe_rasterization.benchmarks.cell import failed_row
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import expand
 from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.rendering import Renderer
 
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
@@ -156,7 +152,7 @@ def test_where_all_is_done_nothing_is_needed(finished, tmp_path, monkeypatch):
 
 def done_row(cell):
     """A line that says that a cell worked."""
-    return json.dumps({**cells.failed_row(cell, "", 1.0), "ok": True, "psnr": 20.0, "num_gaussians": 5})
+    return json.dumps({**failed_row(cell, "", 1.0), "ok": True, "psnr": 20.0, "num_gaussians": 5})
 
 
 @pytest.mark.parametrize("damaged", ["{}", "[]", "3", "null", '{"ok": true}', "", "another cell's"])
@@ -405,164 +401,6 @@ def processes_with(words):
     return found
 
 
-@pytest.fixture
-def cell_file(content, tmp_path):
-    cell = expand(content, "").cells[0]
-    path = tmp_path / "cell.json"
-    path.write_text(json.dumps(cell))
-    return cell, path
-
-
-def test_one_cell_is_one_command(cell_file, tmp_path):
-    cell, path = cell_file
-    done = subprocess.run([sys.executable, "-m", "diff_smoe_rasterization.benchmarks.cell", str(path),
-                           str(tmp_path / "out")], env=environment(), cwd=str(tmp_path), stdout=subprocess.PIPE)
-    assert done.returncode == 0 and cell["id"].encode() in done.stdout
-    assert json.loads((tmp_path / "out" / "row.json").read_text())["ok"]
-
-
-def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatch):
-    """As the system does where memory is short."""
-    cell, path = cell_file
-    killer = tmp_path / "python"
-    killer.write_text("#!/bin/sh\necho the last words\n"
-                      "printf 'Training:  50%%|#### | 5/10 [00:01<00:01, 5.0it/s]'\nkill -9 $$\n")
-    killer.chmod(0o755)
-    monkeypatch.setattr(cells.sys, "executable", str(killer))
-    row = cells.supervise(str(path), str(tmp_path / "out"))
-    assert not row["ok"] and row["cell"] == cell["id"]
-    assert "signal 9" in row["reason"] and "memory" in row["reason"] and row["reason"].endswith(": the last words")
-
-
-def test_a_rendering_that_equals_the_truth_is_a_row(content, tiny_scene, tmp_path, capsys):
-    """A black scene, black from the start: its PSNR is infinite, for which json has no number."""
-    black = tmp_path / "black"
-    subprocess.run(["cp", "-r", tiny_scene, str(black)], check=True)
-    for path in (black / "images").iterdir():
-        Image.new("RGB", Image.open(path).size).save(path)
-    points = black / "sparse" / "0" / "points3D.txt"
-    rows = [line.split() for line in points.read_text().splitlines() if not line.startswith("#")]
-    points.write_text("".join(" ".join([*row[:4], "0", "0", "0", *row[7:]]) + "\n" for row in rows))
-    cell = expand({**content, "scenes": [{"name": "black", "path": str(black)}]}, "").cells[0]
-    (tmp_path / "cell.json").write_text(json.dumps(cell))
-    assert cells.main([str(tmp_path / "cell.json"), str(tmp_path / "out")]) == 0
-    assert "Gaussians, PSNR - dB" in capsys.readouterr().out
-    row = json.loads((tmp_path / "out" / "row.json").read_text())
-    assert row["ok"] and row["psnr"] is None and row["ssim"] == pytest.approx(1)
-
-
-def test_what_cannot_be_printed_costs_no_row(tmp_path):
-    """Snakemake removes the row of a command that fails: one whose reader has gone, or that lacks a character."""
-    program = "from diff_smoe_rasterization.benchmarks.cell import tell; tell('\u2013')"
-    reader, writer = os.pipe()
-    os.close(reader)
-    for encoding, output in (("utf-8", writer), ("ascii", subprocess.DEVNULL)):
-        done = subprocess.run([sys.executable, "-c", program], stdout=output, stderr=subprocess.PIPE,
-                              env=environment(PYTHONIOENCODING=encoding))
-        assert (done.returncode, done.stderr) == (0, b"")
-    os.close(writer)
-
-
-def test_two_cells_never_have_one_gpu(tmp_path):
-    one, first = cells.claim_gpu(["3", "5"], str(tmp_path))
-    other, second = cells.claim_gpu(["3", "5"], str(tmp_path))
-    assert (one, other) == ("3", "5")
-    first.close()
-    again, third = cells.claim_gpu(["3", "5"], str(tmp_path))
-    assert again == "3"
-    second.close(), third.close()
-
-
-def test_cells_that_share_gpus_are_spread_over_them_first(tmp_path):
-    claims = [cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2) for _ in range(4)]
-    assert [gpu for gpu, _ in claims] == ["3", "5", "3", "5"]
-    with pytest.raises(TimeoutError):  # a fifth waits
-        cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2, poll_seconds=Raises())
-    claims.pop(1)[1].close()
-    again, lock = cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2)
-    assert again == "5"
-    lock.close()
-    for _, lock in claims:
-        lock.close()
-
-
-class Raises:
-    """A number of seconds that is never waited."""
-
-    def __index__(self):
-        raise TimeoutError
-
-
-@pytest.fixture
-def worked(content, tmp_path):
-    """A function of an attempt's folder and its number of cells at once to its row."""
-    cell = expand({**content, "keep_models": True}, "").cells[0]
-
-    def row(name, per_device=None):
-        (tmp_path / name).mkdir(exist_ok=True)
-        cells.work(cell, str(tmp_path / name), time.time(), per_device)
-        return json.loads((tmp_path / name / "row.json").read_text())
-
-    return row
-
-
-def test_pixels_that_are_no_numbers_are_a_rows_reason(worked, monkeypatch):
-    render = Renderer.__call__
-
-    def broken(renderer, camera, **arguments):
-        rendering = render(renderer, camera, **arguments)
-        if camera.name == "view_008.png":  # the second of two test views
-            rendering.color[0, 5, 5] = math.nan
-        return rendering
-
-    monkeypatch.setattr(Renderer, "__call__", broken)
-    row = worked("out")
-    assert not row["ok"] and "the rendering of view_008.png has NaN or infinite pixels" in row["reason"]
-
-
-def test_a_row_is_written_before_its_model_is_removed(content, tmp_path, monkeypatch):
-    """Whatever happens in between, nothing is trained again."""
-    monkeypatch.setattr(cells.shutil, "rmtree", lambda path, **options: there.append((tmp_path / "row.json").exists()))
-    there = []
-    cells.work(expand(content, "").cells[0], str(tmp_path), time.time())
-    assert there == [True]
-
-
-def test_a_row_says_that_its_cell_shared_its_processor(worked):
-    alone, shared, uncounted = worked("one", 1), worked("two", 2), worked("three")
-    assert (alone["machine"].pop("cells_at_once"), shared["machine"].pop("cells_at_once")) == (1, 2)
-    assert alone["machine"] == shared["machine"] == uncounted["machine"]
-    for row in (alone, shared):
-        assert row["ok"] and row["train_seconds"] > 0 and row["fps"] > 0
-    assert alone["cell"] == shared["cell"] and alone["protocol"] == shared["protocol"]
-
-
-def test_a_training_that_goes_on_from_one_that_shared_its_processor_shared_it_too(worked):
-    """Its seconds hold those of the attempt that was not alone."""
-    worked("out", 3)
-    again = worked("out", 1)
-    assert again["protocol"]["continued"] and again["machine"]["cells_at_once"] == 3
-
-
-def test_the_process_of_a_cell_is_told_its_gpu_and_how_many_have_it(cell_file, tmp_path, monkeypatch):
-    python = tmp_path / "python"
-    python.write_text("#!/bin/sh\necho $CUDA_VISIBLE_DEVICES $*\n")
-    python.chmod(0o755)
-    monkeypatch.setattr(cells.sys, "executable", str(python))
-    assert cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-device", "2",
-                       "--locks", str(tmp_path / "locks")]) == 0
-    said = (tmp_path / "out" / "log.txt").read_text().split()
-    assert said[0] == "7" and said[-3:] == ["--inside", "--per-device", "2"]
-
-
-@pytest.mark.parametrize("number", ["0", "-1"])
-def test_a_gpu_is_given_to_one_cell_at_least(number, cell_file, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-device", number])
-    assert f"--per-device: is {number}; it must be at least 1" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_second_run_on_the_same_results_is_refused(tmp_path):
     with engine.only_one(str(tmp_path)):
         with pytest.raises(BenchError, match="another run"):
@@ -620,6 +458,10 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
         assert words[words.index("--executor") + 1] == "slurm" and "gpus=[]" in words
         assert "per_device=0" in words and "threads=1" in words
         assert words[words.index("--default-resources") + 1:][:2] == ["slurm_partition=gpu", "runtime=60"]
+        assert "threads=8" in engine.command(suite, suite.cells, "out", None, ["runtime=60", "cpus_per_task=8"])
+        for number in ("0", "-2", "all", ""):
+            with pytest.raises(BenchError, match=f"cpus_per_task={number}: must be a number of at least 1"):
+                engine.command(suite, suite.cells, "out", None, [f"cpus_per_task={number}"])
         patch.setattr(engine.importlib.util, "find_spec", lambda name: None if "slurm" in name else object())
         with pytest.raises(BenchError, match="snakemake-executor-plugin-slurm"):
             engine.command(suite, suite.cells, "out", None, [])
