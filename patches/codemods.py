@@ -148,12 +148,21 @@ class _PipeBlendMode(Codemod):
 
 
 class CallOfOurs(Codemod):
-    """`FOREIGN(...)` becomes `OURS(...)`, imported from SOURCE, where it has no other arguments than these."""
+    """`FOREIGN(...)` becomes `OURS(...)`, imported from SOURCE, where it has no other arguments than these.
+
+    Nothing changes in a module that imports something else by that name.
+    """
 
     foreign = ours = ""
     source = RUNTIME
     positional = 1  # at most
     keywords: Tuple[str, ...] = ()
+    is_taken = False
+
+    def visit_ImportFrom(self, node: cst.ImportFrom) -> None:
+        names = () if isinstance(node.names, cst.ImportStar) else node.names
+        if node.module is None or get_full_name_for_node(node.module) != self.source:
+            self.is_taken |= any(self.ours == (name.evaluated_alias or name.evaluated_name) for name in names)
 
     def fits(self, given: Dict[str, cst.BaseExpression]) -> bool:
         """Whether a call with these values of its keywords is one to change."""
@@ -170,6 +179,9 @@ class CallOfOurs(Codemod):
         return updated_node.with_changes(func=cst.Name(self.ours))
 
     def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
+        if self.is_taken:
+            self.pending = self.done = 0
+            return original_node
         return with_import(updated_node, self.source, self.ours) if self.pending else updated_node
 
 

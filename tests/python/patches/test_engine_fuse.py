@@ -201,7 +201,7 @@ def test_a_small_fit_goes_the_same_way():
             loss.backward()
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-            losses.append(float(loss))
+            losses.append(loss.item())
             if step == 20:
                 state = optimizer.state.pop(image)
                 image = optimizer.param_groups[0]["params"][0] = torch.nn.Parameter(image.detach().clone())

@@ -59,6 +59,8 @@ BEFORE_AND_AFTER = [
     ("fused-adam", "import torch\noptimizer = torch.optim.Adam(l, lr=0.0, eps=1e-15)  # all\n",
      "import torch\nfrom diff_smoe_rasterization import FusedAdam\n"
      "optimizer = FusedAdam(l, lr=0.0, eps=1e-15)  # all\n"),
+    ("fused-adam", "from apex.optimizers import FusedAdam\na = FusedAdam(l) if fast else torch.optim.Adam(l)\n", None),
+    ("fused-adam", "from .mine import Adam as FusedAdam\na = FusedAdam(torch.optim.Adam(l))\n", None),
     ("fused-adam", "torch.optim.Adam(l, lr=0.0, weight_decay=0.1)\ntorch.optim.AdamW(l)\n", None),
     ("fused-adam", "torch.optim.Adam(l, lr=0.0, fused=True)\n", None),
     ("fused-adam", "torch.optim.Adam(l, 0.1, (0.9, 0.99), 1e-8, 0.01)\n", None),
@@ -73,6 +75,11 @@ def test_what_a_rule_changes(name, before, after):
     assert outcome.tree.code == (before if after is None else after)
     assert outcome.pending == (after is not None)
     assert optional.run(RULES[name], outcome.tree).pending == 0  # by which it is seen that a rule is applied
+
+
+def test_calls_of_another_function_by_our_name_are_none_of_ours():
+    tree = cst.parse_module("from . import FusedAdam\na, b = FusedAdam(l), torch.optim.Adam(m)\n")
+    assert optional.run(RULES["fused-adam"], tree)[1:] == (0, 0, 0)  # neither pending, nor done, nor a misfit
 
 
 def test_every_rule_is_tried_above():
