@@ -68,7 +68,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     with only_one(results) as lock:
         write_cells(suite, cells, results, retry_failed, earlier)
         try:
-            status = run_snakemake(words, lock, signal.SIGKILL if slurm is None else signal.SIGINT) if words else 0
+            status = run_snakemake(words, lock, is_queued=slurm is not None) if words else 0
         finally:
             measured = collect(results)
     here = [measured[cell["id"]] for cell in cells if cell["id"] in measured]
@@ -124,16 +124,18 @@ def only_one(results: str) -> Iterator[IO[str]]:
         yield file
 
 
-def run_snakemake(words: List[str], lock: IO[str], end: int) -> int:
+def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
     """Runs Snakemake, which shares the lock with its cells; returns its status.
 
-    end: the signal that it gets where this process is interrupted or ends, however it ends. On a signal that it can
-    catch Snakemake waits for the cells that run here; those of a queue it cancels.
+    Where this process is interrupted or ends, however it ends, Snakemake is killed, since on a signal that it can catch
+    it waits for the cells that run here. Those of a queue it is to cancel (is_queued): it gets one SIGINT. A second one
+    would end it before it has, and so would a SIGHUP; in a session of its own it does not get the terminal's.
     """
     import fcntl
 
+    end = signal.SIGINT if is_queued else signal.SIGKILL
     fcntl.flock(lock, fcntl.LOCK_SH)
-    process = subprocess.Popen(words, env=environment(), pass_fds=[lock.fileno()],
+    process = subprocess.Popen(words, env=environment(), pass_fds=[lock.fileno()], start_new_session=is_queued,
                                preexec_fn=partial(die_with_parent, end))
     handler = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
@@ -243,7 +245,9 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
         if importlib.util.find_spec("snakemake_executor_plugin_slurm") is None:
             raise BenchError("--slurm needs Snakemake's plugin: pip install snakemake-executor-plugin-slurm")
         words += ["--executor", "slurm", "--jobs", str(at_once)]
-        words += ["--default-resources", *slurm] if slurm else []
+        # Named resources bring Snakemake's own, 1000 MB among them; with 0 a cell has what the queue gives it.
+        memory = [] if any(word.startswith("mem") for word in slurm) else ["mem_mb=0"]
+        words += ["--default-resources", *slurm, *memory] if slurm else []
     else:
         words += ["--cores", str(at_once * threads)]
         words += ["--resources", f"gpu={per_device * len(gpus)}"] if on_gpu else []

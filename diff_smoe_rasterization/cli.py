@@ -146,7 +146,7 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                      help="cells that share a GPU (default: 1); beyond 1 their times and FPS stay out of the report")
     run.add_argument("--slurm", nargs="*", metavar="KEY=VALUE",
                      help="submit cells to Slurm; resources of each, such as slurm_partition=gpu runtime=120 "
-                          "cpus_per_task=8")
+                          "mem_mb=32000 cpus_per_task=8")
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
                      help="only such cells; fields: method, scene, blend_mode, schedule, densify_grad_threshold, "
                           "seed, headline")

@@ -382,6 +382,33 @@ def test_what_a_run_has_started_ends_with_it_and_keeps_others_away_till_then(num
         assert (results / "rows.jsonl").read_text() == ""
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_what_is_queued_is_cancelled_at_leisure(number, tmp_path):
+    """Whatever ends the command, and where a terminal tells all that it has started. Snakemake is another program here:
+    it is interrupted once, cancels for a second, and a second signal would end it."""
+    told = tmp_path / "told"
+    snakemake = tmp_path / "snakemake.py"
+    snakemake.write_text(
+        "import signal, time\n"
+        "def cancel(*_):\n"
+        "    signal.signal(signal.SIGINT, signal.SIG_DFL)\n"
+        "    time.sleep(1)\n"
+        f"    open({str(told)!r}, 'a').write('cancelled')\n"
+        "    raise SystemExit(1)\n"
+        "signal.signal(signal.SIGINT, cancel)\n"
+        f"open({str(told)!r}, 'w').write('running ')\n"
+        "time.sleep(60)\n")
+    program = ("import sys\nfrom diff_smoe_rasterization.benchmarks import engine\n"
+               f"with engine.only_one({str(tmp_path)!r}) as lock:\n"
+               f"    engine.run_snakemake([sys.executable, {str(snakemake)!r}], lock, is_queued=True)\n")
+    run = subprocess.Popen([sys.executable, "-c", program], env=environment(), start_new_session=True,
+                           stderr=subprocess.DEVNULL, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    wait_for(lambda: told.exists() and told.read_text() == "running ", 60)
+    os.killpg(run.pid, number)
+    wait_for(lambda: told.read_text() == "running cancelled", 30)
+    run.wait(timeout=30)
+
+
 def is_free(results):
     try:
         with engine.only_one(str(results)):
@@ -457,7 +484,9 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
         words = engine.command(suite, suite.cells, "out", None, ["slurm_partition=gpu", "runtime=60"])
         assert words[words.index("--executor") + 1] == "slurm" and "gpus=[]" in words
         assert "per_device=0" in words and "threads=1" in words
-        assert words[words.index("--default-resources") + 1:][:2] == ["slurm_partition=gpu", "runtime=60"]
+        assert words[words.index("--default-resources") + 1:][:3] == ["slurm_partition=gpu", "runtime=60", "mem_mb=0"]
+        words = engine.command(suite, suite.cells, "out", None, ["mem_mb_per_cpu=2000"])
+        assert words[words.index("--default-resources") + 1:][:2] == ["mem_mb_per_cpu=2000", "--prioritize"]
         assert "threads=8" in engine.command(suite, suite.cells, "out", None, ["runtime=60", "cpus_per_task=8"])
         for number in ("0", "-2", "all", ""):
             with pytest.raises(BenchError, match=f"cpus_per_task={number}: must be a number of at least 1"):
