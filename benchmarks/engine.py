@@ -19,11 +19,12 @@ from typing import IO, Any, Dict, Iterator, List, Mapping, Optional, Sequence
 from ..trainer.files import write_json_atomically, write_text_atomically
 from .cell import SHARING, identity, shown
 from .errors import BenchError
-from .lpips import files_of_weights
+from .lpips import check_weights, files_of_weights
 from .preparation import given, made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
-from .results_folder import CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME, read_object
+from .report.rows import ReportError, check_row
+from .results_folder import CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME, made_folder, read_object
 from .selection import SAID_BY_THE_ID, chosen, earlier_rows, plan
 from .suite import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, missing
 
@@ -45,6 +46,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     """
     suite = load_suite(find_suite(name))
     check_sharing(suite, jobs, slurm, per_gpu)
+    check_weights(suite.protocol["lpips"])
     cells = chosen(suite.cells, only)
     results = os.path.abspath(results or os.path.join("bench_results", suite.name))
     found = earlier_rows(rows, suite.cells) if rows else {}
@@ -64,7 +66,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
     words = command(suite, to_do, results, jobs, slurm, per_gpu) if to_do else None
-    os.makedirs(results, exist_ok=True)
+    made_folder(results)
     with only_one(results) as lock:
         write_cells(suite, cells, results, retry_failed, earlier)
         try:
@@ -74,8 +76,9 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     here = [measured[cell["id"]] for cell in cells if cell["id"] in measured]
     lacking = len(cells) - len(here)
     if status != 0 or lacking:
+        log = os.path.join(results, ".snakemake", "log")
         raise BenchError(f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The "
-                         f"same command continues; {os.path.join(results, '.snakemake', 'log')} says what happened")
+                         f"same command continues; {log if os.path.isdir(log) else 'what it printed'} says what happened")
     return here
 
 
@@ -92,12 +95,12 @@ def check_folder(suite: Suite, results: str) -> None:
     differ: Dict[str, None] = {}  # in words, each once
     for name in cell_folders(results):
         row, path = read_row(results, name), os.path.join(results, CELLS_FOLDER, name, CELL_NAME)
-        cell = read_object(path, ("suite", "protocol", "scene", "method"))
+        cell = read_object(path, {"suite": str, "protocol": dict, "scene": dict, "method": dict})
         if row is None or cell is None:
             continue
         there = {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
-                 f"scene {cell['scene']['name']}: ": cell["scene"],
-                 f"method {cell['method']['label']}: ": cell["method"]}
+                 f"scene {cell['scene'].get('name')}: ": cell["scene"],
+                 f"method {cell['method'].get('label')}: ": cell["method"]}
         for what in filter(here.__contains__, there):
             for field in sorted({*there[what], *here[what]} - {*NOT_IN_THE_IDENTITY, "axes", "refused"}):
                 one, other = there[what].get(field), here[what].get(field)
@@ -197,8 +200,14 @@ def row_of(results: str, cell: Dict[str, Any], retry_failed: bool) -> Optional[D
 def read_row(results: str, name: str) -> Optional[Dict[str, Any]]:
     """The row in a cell's folder; None where there is none. Raises BenchError where it is damaged or another cell's."""
     path = os.path.join(results, CELLS_FOLDER, name, ROW_NAME)
-    row = read_object(path, ("cell", "ok", "label", *SAID_BY_THE_ID))
-    if row is not None and row["cell"] != name:
+    row = read_object(path, dict.fromkeys(("label", *SAID_BY_THE_ID), object))
+    if row is None:
+        return None
+    try:
+        check_row(row, path)
+    except ReportError as error:
+        raise BenchError(f"{error}; remove it to have it made anew") from error
+    if row["cell"] != name:
         raise BenchError(f"{path}: is the row of another cell, {row['cell']}; remove it to have it made anew")
     return row
 
@@ -213,6 +222,9 @@ def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[st
     """Raises BenchError where --jobs, --slurm and --per-gpu are out of range or do not go together."""
     if jobs is not None and jobs < 1:
         raise BenchError(f"--jobs is {jobs}; it must be at least 1")
+    for word in slurm or ():
+        if not word.partition("=")[0] or not word.partition("=")[2]:
+            raise BenchError(f"--slurm {word}: must be KEY=VALUE, such as slurm_partition=gpu; the suite comes first")
     if per_gpu < 1:
         raise BenchError(f"--per-gpu is {per_gpu}; it must be at least 1")
     if per_gpu > 1 and (suite.protocol["device"] != "cuda" or slurm is not None):
@@ -269,7 +281,7 @@ def threads_asked_for(resources: Sequence[str]) -> int:
     for name, _, value in (resource.partition("=") for resource in resources):
         if name == "cpus_per_task":
             threads = value
-    if not threads.isdecimal() or int(threads) < 1:
+    if not (threads.isascii() and threads.isdecimal() and int(threads)):
         raise BenchError(f"--slurm cpus_per_task={threads}: must be a number of at least 1")
     return int(threads)
 

@@ -2,11 +2,13 @@
 from __future__ import annotations
 
 import os
-from typing import Callable, Dict, List, NamedTuple, Optional, Tuple
+from typing import Callable, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+
+from .errors import BenchError
 
 Distance = Callable[[torch.Tensor, torch.Tensor], float]  # of two images [3, H, W] in [0, 1]
 
@@ -131,6 +133,15 @@ def _checked(arrays: Dict[str, np.ndarray], path: str, name: str, shape: Tuple[O
         raise ValueError(f"{path}: {name} " + ("is missing" if found is None else f"has shape {list(found)}")
                          + f"; it must have shape [{wanted}]")
     return arrays[name]
+
+
+def check_weights(kinds: Sequence[str]) -> None:
+    """Raises BenchError where a variable names a file of weights that is wanted and not there."""
+    for kind in kinds:
+        variable = VARIABLES[net_of(kind)]
+        if os.environ.get(variable) and not os.path.isfile(os.environ[variable]):
+            raise BenchError(f"{variable}: {os.environ[variable]}: no such file, where the weights of {kind} must be; "
+                             "name it, or unset the variable to have torchmetrics download them")
 
 
 def files_of_weights() -> Dict[str, str]:

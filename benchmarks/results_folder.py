@@ -4,9 +4,11 @@ The Snakefile, which Snakemake reads as a file of its own, repeats the names.
 """
 from __future__ import annotations
 
+import errno
 import json
 import os
-from typing import Any, Dict, Optional, Sequence
+from types import MappingProxyType
+from typing import Any, Dict, Mapping, Optional
 
 from .errors import BenchError
 
@@ -18,10 +20,22 @@ SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its ce
 LOCK_NAME = ".lock"  # held by the one run that is at work
 
 
-def read_object(path: str, needed: Sequence[str] = ()) -> Optional[Dict[str, Any]]:
+def made_folder(path: str) -> str:
+    """The folder, which is made where it is not there. Raises BenchError where nothing can be written in it."""
+    try:
+        os.makedirs(path, exist_ok=True)
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise BenchError(f"{path}: nothing can be written there ({error.strerror}); choose another folder with "
+                         "-o") from error
+    return path
+
+
+def read_object(path: str, needed: Mapping[str, type] = MappingProxyType({})) -> Optional[Dict[str, Any]]:
     """The object of a .json file; None where there is no file. Raises BenchError where it is damaged.
 
-    needed: fields that it must have.
+    needed: fields that it must have, and of which types.
     """
     if not os.path.isfile(path):
         return None
@@ -33,6 +47,9 @@ def read_object(path: str, needed: Sequence[str] = ()) -> Optional[Dict[str, Any
         lacking = [field for field in needed if field not in found]
         if lacking:
             raise ValueError(f"it lacks {', '.join(lacking)}")
+        for field, kind in needed.items():
+            if not isinstance(found[field], kind):
+                raise ValueError(f"{field} is {found[field]!r}; it must be of type {kind.__name__}")
     except ValueError as error:
         raise BenchError(f"{path}: not valid json, or not what it must be ({error}); remove it to have it made "
                          "anew") from error

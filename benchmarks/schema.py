@@ -20,11 +20,12 @@ def _object(required: tuple, **properties: Any) -> Dict[str, Any]:
 
 
 TEXT = {"type": "string", "minLength": 1}
-NAME = {"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9_+-]*$"}  # becomes a part of file names
+# Becomes a part of file names. \\Z: in Python $ is in front of a last newline too.
+NAME = {"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9_+-]*\\Z", "maxLength": 64}
 FLAG = {"type": "boolean"}
 COUNT = {"type": "integer", "minimum": 0}
 POSITIVE = {"type": "integer", "minimum": 1}
-THRESHOLD = {"type": "number", "exclusiveMinimum": 0}
+THRESHOLD = {"type": "number", "exclusiveMinimum": 0, "maximum": 1e6}  # its digits are a part of file names
 AXES = {
     "blend_modes": _list({"enum": list(BLEND_MODES)}),
     "densify_grad_thresholds": _list(THRESHOLD),

@@ -121,7 +121,7 @@ def read_yaml(path: str) -> Any:
     try:
         with open(path, encoding="utf-8") as file:
             return yaml.load(file, Loader)
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: no text, or a date that is none
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: no text, or a date that is none
         raise BenchError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
 
 
@@ -177,8 +177,12 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
     where, name = f"methods[{index}]", method["name"]
     given = {key: value for key, value in method.items() if key not in AXES}
     axes = {axis: method[axis] for axis in AXES if axis in method}
+    if "budget" in given and name not in COUNTED_BY:
+        raise BenchError(f"{where}.budget: is for {' and '.join(COUNTED_BY)}, which are given a number of primitives; "
+                         f"{name} has densify_grad_thresholds")
     if name == NATIVE:
-        wrong = [key for key in ("variant", "arguments", *NOT_IN_THE_IDENTITY) if key in given and given[key] != NATIVE]
+        wrong = [key for key in ("variant", "arguments", *NOT_IN_THE_IDENTITY)
+                 if key in given and (key, given[key]) != ("variant", NATIVE)]
         if wrong:
             raise BenchError(f"{where}.{wrong[0]}: is for checkouts; the native trainer's recipe stands in "
                              "protocol.options")
@@ -200,7 +204,7 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
         axes["blend_modes"] = ["alpha"]
     if name in NEEDS and NEEDS[name] not in arguments:
         raise BenchError(f"{where}.arguments: {name} needs {NEEDS[name]} N in place of a threshold")
-    if name in COUNTED_BY and "budget" in given:
+    if "budget" in given:
         wanted = {COUNTED_BY[name]: str(given["budget"])}
         if name == "taming":
             wanted["--mode"] = "final_count"  # else its number is a multiple of that of the first points

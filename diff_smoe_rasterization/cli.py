@@ -135,7 +135,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION")
     run = actions.add_parser("run", help="run what is not done yet of a suite",
                              description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
-                                         "becomes a row with its reason, and the command returns 1.")
+                                         "becomes a row with its reason, and the command returns 1.",
+                             usage="%(prog)s SUITE [-o RESULTS] [OPTION ...]")  # --slurm would take a SUITE behind it
     run.add_argument("suite", metavar="SUITE", help="a .yaml file, or a shipped one: smoke, table1, table2, table3, "
                                                     "fig4, fig5, captures, captures_ablation, captures_baselines")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")

@@ -150,7 +150,7 @@ class _PipeBlendMode(Codemod):
 class CallOfOurs(Codemod):
     """`FOREIGN(...)` becomes `OURS(...)`, imported from SOURCE, where it has no other arguments than these.
 
-    Nothing changes in a module that imports something else by that name.
+    Nothing changes in a module where something else has that name.
     """
 
     foreign = ours = ""
@@ -163,6 +163,23 @@ class CallOfOurs(Codemod):
         names = () if isinstance(node.names, cst.ImportStar) else node.names
         if node.module is None or get_full_name_for_node(node.module) != self.source:
             self.is_taken |= any(self.ours == (name.evaluated_alias or name.evaluated_name) for name in names)
+
+    def visit_Import(self, node: cst.Import) -> None:
+        self.is_taken |= any(self.ours == (name.evaluated_alias or name.evaluated_name) for name in node.names)
+
+    def visit_ClassDef(self, node: cst.ClassDef) -> None:
+        super().visit_ClassDef(node)
+        self.is_taken |= is_name(node.name, self.ours)
+
+    def visit_FunctionDef(self, node: cst.FunctionDef) -> None:
+        super().visit_FunctionDef(node)
+        self.is_taken |= is_name(node.name, self.ours)
+
+    def visit_AssignTarget(self, node: cst.AssignTarget) -> None:
+        self.is_taken |= is_name(node.target, self.ours)
+
+    def visit_AnnAssign(self, node: cst.AnnAssign) -> None:
+        self.is_taken |= is_name(node.target, self.ours)
 
     def fits(self, given: Dict[str, cst.BaseExpression]) -> bool:
         """Whether a call with these values of its keywords is one to change."""

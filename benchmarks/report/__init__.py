@@ -12,7 +12,7 @@ import shutil
 import tempfile
 from typing import Any, Callable, Dict, List, Sequence
 
-from ..results_folder import CELLS_FOLDER, SUITE_NAME
+from ..results_folder import CELLS_FOLDER, SUITE_NAME, made_folder
 from .rows import ReportError, Row, at_once, grouped, read_rows, safe_name, shared, some
 
 __all__ = ["ReportError", "report"]
@@ -27,10 +27,10 @@ NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "ve
 def report(results: str, output: str) -> str:
     """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT.
 
-    OUTPUT/index.html, report.md, tables/, figures/, images/, survey/; an earlier report there is replaced by a whole
-    one or not at all. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged,
-    where rows cannot be compared or where OUTPUT has such files of someone else, and ImportError where a library is
-    missing.
+    OUTPUT/index.html, report.md, tables/, figures/, images/, survey/; an earlier report there is replaced once the new
+    one is whole. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged, where
+    rows cannot be compared or where OUTPUT has such files of someone else, BenchError where nothing can be written
+    there, and ImportError where a library is missing.
     """
     try:
         import jinja2  # noqa: F401
@@ -41,7 +41,7 @@ def report(results: str, output: str) -> str:
 
     rows = read_rows(results)
     _refuse_files_of_others(output)
-    os.makedirs(output, exist_ok=True)
+    made_folder(output)
     with tempfile.TemporaryDirectory(prefix=".report-", dir=output) as made:
         _make(results, rows, made)
         for name in (PAGE_NAME, *PARTS):  # the page first: it says that the others are a report's
@@ -91,9 +91,9 @@ def _refuse_files_of_others(output: str) -> None:
 
 def _replace(new: str, old: str) -> None:
     """Puts a file or folder in the place of an earlier one; where there is no new one, the place is empty then."""
-    if os.path.isdir(old):
+    if os.path.isdir(old) and not os.path.islink(old):
         shutil.rmtree(old)
-    elif os.path.lexists(old) and not os.path.exists(new):
+    elif os.path.islink(old) or (os.path.lexists(old) and not os.path.exists(new)):
         os.remove(old)
     if os.path.exists(new):
         os.replace(new, old)

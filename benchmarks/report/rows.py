@@ -162,17 +162,25 @@ def _parsed(text: str, place: str) -> Row:
     try:
         row = json.loads(text)
     except ValueError as error:
-        raise ReportError(f"{place}: not valid json ({error})") from error
+        raise ReportError(f"{place}: not valid json, as a row of `dsmoe bench run` is ({error})") from error
     if not isinstance(row, dict):
         raise ReportError(f"{place}: expected one object, a row")
+    check_row(row, place)
+    return row
+
+
+def check_row(row: Row, place: str) -> None:
+    """Raises ReportError where a row lacks a field, or has one of another type than what reads it needs.
+
+    place: where the row stands, in words.
+    """
     missing = [name for name in NEEDED if name not in row]
     if missing:
-        raise ReportError(f"{place}: the row lacks {', '.join(missing)}")
+        raise ReportError(f"{place}: the row lacks {', '.join(missing)}, which those of `dsmoe bench run` have")
     for name, value, kind in _fields(row):
         if (value is not None or name in NEEDED) and not _legal(name, value, kind):
-            wanted = "a finite number" if kind in (int, NUMBER) else f"of type {kind.__name__}"
+            wanted = {int: "a whole number", NUMBER: "a finite number"}.get(kind) or f"of type {kind.__name__}"
             raise ReportError(f"{place}: {name} is {value!r}; it must be {wanted}")
-    return row
 
 
 def _fields(row: Row) -> Iterator[Tuple[str, Any, Any]]:

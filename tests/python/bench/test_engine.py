@@ -182,9 +182,26 @@ def test_what_else_may_be_wrong_with_a_folder(finished, tmp_path, capsys):
     (copied / "suite.json").write_text("{}")
     assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 0
     cell = next(copied.glob("cells/*/cell.json"))
-    cell.write_text("{}")
-    assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 1
-    assert f"error: {cell}: " in capsys.readouterr().err
+    for damaged in ("{}", json.dumps({"suite": "two", "protocol": 2, "scene": 3, "method": 4})):
+        cell.write_text(damaged)
+        assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 1
+        assert f"error: {cell}: " in capsys.readouterr().err
+    inside = str(tmp_path / "file" / "results")
+    assert main(["bench", "run", suite, "-o", inside]) == 1
+    assert f"{inside}: nothing can be written there (Not a directory)" in capsys.readouterr().err
+
+
+def test_a_row_that_a_report_would_refuse_is_named(finished, tmp_path, capsys):
+    _, suite, results = finished
+    copied = tmp_path / "results"
+    subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
+    path = next(copied.glob("cells/*/row.json"))
+    row = json.loads(path.read_text())
+    for field, value, wanted in (("ok", 3, "of type bool"), ("seed", "q", "a whole number"), ("psnr", "20", "a finite")):
+        path.write_text(json.dumps({**row, field: value}))
+        assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 1
+        told = capsys.readouterr().err
+        assert f"error: {path}: {field} is {value!r}; it must be {wanted}" in told and "made anew" in told
 
 
 def test_rows_must_be_of_the_suites_cells(finished, tmp_path, capsys):
@@ -216,7 +233,9 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_written(
     suite, results = write_suite(content, tmp_path), tmp_path / "results"
     for words, told in ((["--jobs", "0"], "--jobs is 0"), (["--per-gpu", "-1"], "--per-gpu is -1"),
                         (["--per-gpu", "2"], "protocol.device cuda"),
-                        (["--per-gpu", "2", "--slurm"], "without --slurm")):
+                        (["--per-gpu", "2", "--slurm"], "without --slurm"),
+                        (["--slurm", "gpu"], "--slurm gpu: must be KEY=VALUE"),
+                        (["--slurm", "=gpu"], "--slurm =gpu: must be KEY=VALUE")):
         for more in ([], ["--dry-run"]):
             assert main(["bench", "run", suite, "-o", str(results), *words, *more]) == 1
             assert told in capsys.readouterr().err
@@ -488,7 +507,7 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
         words = engine.command(suite, suite.cells, "out", None, ["mem_mb_per_cpu=2000"])
         assert words[words.index("--default-resources") + 1:][:2] == ["mem_mb_per_cpu=2000", "--prioritize"]
         assert "threads=8" in engine.command(suite, suite.cells, "out", None, ["runtime=60", "cpus_per_task=8"])
-        for number in ("0", "-2", "all", ""):
+        for number in ("0", "-2", "all", "", "\u0663"):
             with pytest.raises(BenchError, match=f"cpus_per_task={number}: must be a number of at least 1"):
                 engine.command(suite, suite.cells, "out", None, [f"cpus_per_task={number}"])
         patch.setattr(engine.importlib.util, "find_spec", lambda name: None if "slurm" in name else object())
@@ -510,8 +529,8 @@ def test_on_the_cpu_cells_share_its_cores(content, monkeypatch):
 
 ECHO = """#!/bin/sh
 case "$*" in *snakemake*) exec "{python}" "$@" ;; esac
-echo '{{"cell": "'"${{4#cells/}}"'", "ok": false, "label": "native", "method": "native", "variant": "native",' \\
-     '"schedule": "3dgs", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1, "iterations": 1,' \\
+echo '{{"cell": "'"${{4#cells/}}"'", "suite": "tiny", "ok": false, "label": "native", "method": "native",' \\
+     '"variant": "native", "schedule": "3dgs", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1, "iterations": 1,' \\
      '"seed": 0, "machine": {{}}, "reason": "'"$OMP_NUM_THREADS threads $*"'"}}' >"$4/row.json"
 """
 

@@ -15,6 +15,7 @@ from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images,
 
 pytest.importorskip("matplotlib", reason="a report needs matplotlib")
 pytest.importorskip("jinja2", reason="a report needs jinja2")
+from diff_smoe_rasterization.benchmarks.errors import BenchError  # noqa: E402
 from diff_smoe_rasterization.benchmarks.report import ReportError, report, sliders, survey  # noqa: E402
 
 
@@ -121,6 +122,21 @@ def test_files_of_others_are_left_alone(tmp_path):
     with pytest.raises(ReportError, match="index.html is no report"):
         report(write_rows(tmp_path / "results", [row()]), str(tmp_path / "report"))
     assert (tmp_path / "report" / "images" / "mine.png").is_file()
+
+
+def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path):
+    results = write_rows(tmp_path / "results", [row()])
+    (tmp_path / "file").touch()
+    with pytest.raises(BenchError, match="file: nothing can be written there .* choose another folder with -o"):
+        report(results, str(tmp_path / "file"))
+    report(results, str(tmp_path / "report"))
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "mine.txt").touch()
+    shutil.rmtree(tmp_path / "report" / "tables")
+    (tmp_path / "report" / "tables").symlink_to(tmp_path / "elsewhere")
+    report(results, str(tmp_path / "report"))
+    assert not (tmp_path / "report" / "tables").is_symlink() and list((tmp_path / "report" / "tables").iterdir())
+    assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["mine.txt"]
 
 
 def test_a_page_without_images_says_why(written, tmp_path):

@@ -102,6 +102,9 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tiny_scene, tmp_path
     ({"seeds": []}, ["seeds"]),
     ({"seeds": 0}, ["seeds", "a list, such as [0]"]),
     ({"name": "../x"}, ["name"]),
+    ({"name": "x\n"}, ["name", "x\\n"]),
+    ({"name": 65 * "x"}, ["name", "too long"]),
+    ({"densify_grad_thresholds": [1e300]}, ["densify_grad_thresholds[0]", "maximum of 1000000"]),
     ({"seeds": [1.0]}, ["seeds[0]", "1.0", "integer"]),
     ({"scenes": [{"name": "a"}]}, ["scenes[0]", "path", "synthetic"]),
     ({"scenes": [{"name": "a", "path": "p", "resolution": 0}]}, ["scenes[0].resolution"]),
@@ -110,6 +113,8 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tiny_scene, tmp_path
     ({"methods": [{"name": "4dgs"}]}, ["methods[0].name", "4dgs"]),
     ({"methods": [{"name": "native"}, {"name": "native"}]}, ["methods[1].label", "native"]),
     ({"methods": [{"name": "native", "path": "p"}]}, ["methods[0].path"]),
+    ({"methods": [{"name": "native", "path": "native"}]}, ["methods[0].path", "is for checkouts"]),
+    ({"methods": [{"name": "native", "budget": 5}]}, ["methods[0].budget", "taming and dbs"]),
     ({"methods": [{"name": "native", "iterations": 7}]}, ["methods[0]", "iterations"]),
     ({"protocol": {"iterations": 0}}, ["protocol.iterations"]),
     ({"protocol": {"options": {"densify_until": 1}}}, ["protocol.options", "densify_until"]),
@@ -123,7 +128,7 @@ def test_a_mistake_names_its_field(content, change, words):
         assert word in str(error.value)
 
 
-@pytest.mark.parametrize("text", ["[1, 2]", "a: [", "", "name: x"])
+@pytest.mark.parametrize("text", ["[1, 2]", "a: [", "", "name: x", 2000 * "["])
 def test_a_file_that_is_no_suite_is_named(tmp_path, text):
     path = tmp_path / "suite.yaml"
     path.write_text(text)

@@ -60,6 +60,11 @@ BEFORE_AND_AFTER = [
      "import torch\nfrom diff_smoe_rasterization import FusedAdam\n"
      "optimizer = FusedAdam(l, lr=0.0, eps=1e-15)  # all\n"),
     ("fused-adam", "from apex.optimizers import FusedAdam\na = FusedAdam(l) if fast else torch.optim.Adam(l)\n", None),
+    ("fused-adam", "class FusedAdam(torch.optim.Adam): pass\na = torch.optim.Adam(l)\n", None),
+    ("fused-adam", "def FusedAdam(l):\n    return torch.optim.Adam(l)\n", None),
+    ("fused-adam", "FusedAdam = torch.optim.SGD\na = torch.optim.Adam(l)\n", None),
+    ("fused-adam", "FusedAdam: type = torch.optim.SGD\na = torch.optim.Adam(l)\n", None),
+    ("fused-adam", "import apex.optimizers as FusedAdam\na = torch.optim.Adam(l)\n", None),
     ("fused-adam", "from .mine import Adam as FusedAdam\na = FusedAdam(torch.optim.Adam(l))\n", None),
     ("fused-adam", "torch.optim.Adam(l, lr=0.0, weight_decay=0.1)\ntorch.optim.AdamW(l)\n", None),
     ("fused-adam", "torch.optim.Adam(l, lr=0.0, fused=True)\n", None),
