@@ -24,7 +24,8 @@ from .preparation import given, made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .report.rows import ReportError, check_row
-from .results_folder import CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME, made_folder, read_object
+from .results_folder import (CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME, made_folder,
+                             read_object)
 from .selection import SAID_BY_THE_ID, chosen, earlier_rows, plan
 from .suite import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, missing
 
@@ -77,8 +78,9 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     lacking = len(cells) - len(here)
     if status != 0 or lacking:
         log = os.path.join(results, ".snakemake", "log")
+        where = log if os.path.isdir(log) else "what it printed"
         raise BenchError(f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The "
-                         f"same command continues; {log if os.path.isdir(log) else 'what it printed'} says what happened")
+                         f"same command continues; {where} says what happened")
     return here
 
 
@@ -277,10 +279,7 @@ def threads_of_each(at_once: int) -> int:
 
 def threads_asked_for(resources: Sequence[str]) -> int:
     """Threads of a cell in Slurm's queue: what its resources say as cpus_per_task=N, else 1. Raises BenchError."""
-    threads = "1"
-    for name, _, value in (resource.partition("=") for resource in resources):
-        if name == "cpus_per_task":
-            threads = value
+    threads = dict(resource.partition("=")[::2] for resource in resources).get("cpus_per_task", "1")
     if not (threads.isascii() and threads.isdecimal() and int(threads)):
         raise BenchError(f"--slurm cpus_per_task={threads}: must be a number of at least 1")
     return int(threads)

@@ -4,7 +4,6 @@ The Snakefile, which Snakemake reads as a file of its own, repeats the names.
 """
 from __future__ import annotations
 
-import errno
 import json
 import os
 from types import MappingProxyType
@@ -22,13 +21,13 @@ LOCK_NAME = ".lock"  # held by the one run that is at work
 
 def made_folder(path: str) -> str:
     """The folder, which is made where it is not there. Raises BenchError where nothing can be written in it."""
+    reason = ""
     try:
         os.makedirs(path, exist_ok=True)
-        if not os.access(path, os.W_OK | os.X_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:
-        raise BenchError(f"{path}: nothing can be written there ({error.strerror}); choose another folder with "
-                         "-o") from error
+        reason = f" ({error.strerror})"
+    if reason or not os.access(path, os.W_OK | os.X_OK):
+        raise BenchError(f"{path}: nothing can be written there{reason}; choose another folder with -o")
     return path
 
 

@@ -20,7 +20,7 @@ def _object(required: tuple, **properties: Any) -> Dict[str, Any]:
 
 
 TEXT = {"type": "string", "minLength": 1}
-# Becomes a part of file names. \\Z: in Python $ is in front of a last newline too.
+# Becomes a part of file names. \Z: in Python $ is in front of a last newline too.
 NAME = {"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9_+-]*\\Z", "maxLength": 64}
 FLAG = {"type": "boolean"}
 COUNT = {"type": "integer", "minimum": 0}

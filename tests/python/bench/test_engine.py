@@ -197,7 +197,8 @@ def test_a_row_that_a_report_would_refuse_is_named(finished, tmp_path, capsys):
     subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
     path = next(copied.glob("cells/*/row.json"))
     row = json.loads(path.read_text())
-    for field, value, wanted in (("ok", 3, "of type bool"), ("seed", "q", "a whole number"), ("psnr", "20", "a finite")):
+    for field, value, wanted in (("ok", 3, "of type bool"), ("seed", "q", "a whole number"),
+                                 ("psnr", "20", "a finite number")):
         path.write_text(json.dumps({**row, field: value}))
         assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 1
         told = capsys.readouterr().err
@@ -530,8 +531,8 @@ def test_on_the_cpu_cells_share_its_cores(content, monkeypatch):
 ECHO = """#!/bin/sh
 case "$*" in *snakemake*) exec "{python}" "$@" ;; esac
 echo '{{"cell": "'"${{4#cells/}}"'", "suite": "tiny", "ok": false, "label": "native", "method": "native",' \\
-     '"variant": "native", "schedule": "3dgs", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1, "iterations": 1,' \\
-     '"seed": 0, "machine": {{}}, "reason": "'"$OMP_NUM_THREADS threads $*"'"}}' >"$4/row.json"
+     '"variant": "native", "schedule": "3dgs", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1,' \\
+     '"iterations": 1, "seed": 0, "machine": {{}}, "reason": "'"$OMP_NUM_THREADS threads $*"'"}}' >"$4/row.json"
 """
 
 
