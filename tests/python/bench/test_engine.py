@@ -421,9 +421,11 @@ def test_what_is_queued_is_cancelled_at_leisure(number, tmp_path):
     program = ("import sys\nfrom diff_smoe_rasterization.benchmarks import engine\n"
                f"with engine.only_one({str(tmp_path)!r}) as lock:\n"
                f"    engine.run_snakemake([sys.executable, {str(snakemake)!r}], lock, is_queued=True)\n")
-    run = subprocess.Popen([sys.executable, "-c", program], env=environment(), start_new_session=True,
-                           stderr=subprocess.DEVNULL, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
-    wait_for(lambda: told.exists() and told.read_text() == "running ", 60)
+    run = subprocess.Popen([sys.executable, "-c", program], env=environment(), cwd=str(tmp_path),
+                           start_new_session=True, stderr=subprocess.DEVNULL,
+                           preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    wait_for(lambda: run.poll() is not None or (told.exists() and told.read_text() == "running "), 60)
+    assert run.poll() is None
     os.killpg(run.pid, number)
     wait_for(lambda: told.read_text() == "running cancelled", 30)
     run.wait(timeout=30)
