@@ -24,7 +24,7 @@ from .preparation import given, made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .report.rows import ReportError, check_row
-from .results_folder import (CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME, made_folder,
+from .results_folder import (CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME, make_folder,
                              read_object)
 from .selection import SAID_BY_THE_ID, chosen, earlier_rows, plan
 from .suite import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, missing
@@ -67,7 +67,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
     words = command(suite, to_do, results, jobs, slurm, per_gpu) if to_do else None
-    made_folder(results)
+    make_folder(results)
     with only_one(results) as lock:
         write_cells(suite, cells, results, retry_failed, earlier)
         try:

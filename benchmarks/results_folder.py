@@ -19,8 +19,8 @@ SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its ce
 LOCK_NAME = ".lock"  # held by the one run that is at work
 
 
-def made_folder(path: str) -> str:
-    """The folder, which is made where it is not there. Raises BenchError where nothing can be written in it."""
+def make_folder(path: str) -> None:
+    """Makes a folder where it is not there. Raises BenchError where nothing can be written in it."""
     reason = ""
     try:
         os.makedirs(path, exist_ok=True)
@@ -28,7 +28,6 @@ def made_folder(path: str) -> str:
         reason = f" ({error.strerror})"
     if reason or not os.access(path, os.W_OK | os.X_OK):
         raise BenchError(f"{path}: nothing can be written there{reason}; choose another folder with -o")
-    return path
 
 
 def read_object(path: str, needed: Mapping[str, type] = MappingProxyType({})) -> Optional[Dict[str, Any]]:

@@ -159,13 +159,11 @@ class CallOfOurs(Codemod):
     keywords: Tuple[str, ...] = ()
     is_taken = False
 
-    def visit_ImportFrom(self, node: cst.ImportFrom) -> None:
-        names = () if isinstance(node.names, cst.ImportStar) else node.names
-        if node.module is None or get_full_name_for_node(node.module) != self.source:
-            self.is_taken |= any(self.ours == (name.evaluated_alias or name.evaluated_name) for name in names)
+    def visit_ImportFrom(self, node: cst.ImportFrom) -> bool:
+        return node.module is None or get_full_name_for_node(node.module) != self.source  # ours are not looked into
 
-    def visit_Import(self, node: cst.Import) -> None:
-        self.is_taken |= any(self.ours == (name.evaluated_alias or name.evaluated_name) for name in node.names)
+    def visit_ImportAlias(self, node: cst.ImportAlias) -> None:
+        self.is_taken |= self.ours == (node.evaluated_alias or node.evaluated_name)
 
     def visit_ClassDef(self, node: cst.ClassDef) -> None:
         super().visit_ClassDef(node)

@@ -12,7 +12,7 @@ import shutil
 import tempfile
 from typing import Any, Callable, Dict, List, Sequence
 
-from ..results_folder import CELLS_FOLDER, SUITE_NAME, made_folder
+from ..results_folder import CELLS_FOLDER, SUITE_NAME, make_folder
 from .rows import ReportError, Row, at_once, grouped, read_rows, safe_name, shared, some
 
 __all__ = ["ReportError", "report"]
@@ -41,7 +41,7 @@ def report(results: str, output: str) -> str:
 
     rows = read_rows(results)
     _refuse_files_of_others(output)
-    made_folder(output)
+    make_folder(output)
     with tempfile.TemporaryDirectory(prefix=".report-", dir=output) as made:
         _make(results, rows, made)
         for name in (PAGE_NAME, *PARTS):  # the page first: it says that the others are a report's

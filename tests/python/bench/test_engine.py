@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -45,6 +46,12 @@ def finished(tmp_path_factory, tiny_scene):
     suite = write_suite(content, folder)
     assert main(["bench", "run", suite, "-o", str(folder / "results"), "--jobs", "2"]) == 1
     return content, suite, folder / "results"
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """The results of that suite once more, to be changed."""
+    return Path(shutil.copytree(finished[2], tmp_path / "results"))
 
 
 def test_a_row_says_what_was_measured_and_how(finished):
@@ -99,14 +106,12 @@ def test_what_is_done_is_not_done_again(finished, capsys):
 
 
 @pytest.mark.parametrize("words", [[], ["--retry-failed"]])
-def test_a_failed_cell_is_tried_again_where_its_path_has_changed(words, finished, tmp_path):
+def test_a_failed_cell_is_tried_again_where_its_path_has_changed(words, copied, finished, tmp_path):
     """The reason is gone, and only the cell that failed is run."""
-    content, _, results = finished
+    content, _, _ = finished
     there, absent = content["scenes"]
     moved = {**content, "scenes": [there, {**absent, "path": there["path"]}]}
     suite = write_suite(moved, tmp_path)
-    copied = tmp_path / "results"
-    subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
     logs = {path.parent.name: path.read_text() for path in copied.glob("cells/*/log.txt")}
     assert main(["bench", "run", suite, "-o", str(copied), *words]) == 0
     rows = rows_of(copied)
@@ -156,10 +161,8 @@ def done_row(cell):
 
 
 @pytest.mark.parametrize("damaged", ["{}", "[]", "3", "null", '{"ok": true}', "", "another cell's"])
-def test_a_damaged_row_is_named_before_anything_is_run(damaged, finished, tmp_path, capsys):
-    _, suite, results = finished
-    copied = tmp_path / "results"
-    subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
+def test_a_damaged_row_is_named_before_anything_is_run(damaged, copied, finished, capsys):
+    _, suite, _ = finished
     one, other = sorted(copied.glob("cells/*/row.json"))
     one.write_text(other.read_text() if damaged == "another cell's" else damaged)
     for more in ([], ["--dry-run"], ["--only", f"scene={json.loads(other.read_text())['scene']}"]):
@@ -171,14 +174,12 @@ def test_a_damaged_row_is_named_before_anything_is_run(damaged, finished, tmp_pa
     assert "1 to do" in capsys.readouterr().out
 
 
-def test_what_else_may_be_wrong_with_a_folder(finished, tmp_path, capsys):
-    _, suite, results = finished
+def test_what_else_may_be_wrong_with_a_folder(copied, finished, tmp_path, capsys):
+    _, suite, _ = finished
     (tmp_path / "file").touch()
     for more in ([], ["--dry-run"]):
         assert main(["bench", "run", suite, "-o", str(tmp_path / "file"), *more]) == 1
         assert f"{tmp_path / 'file'}: is a file; it must be a folder" in capsys.readouterr().err
-    copied = tmp_path / "results"
-    subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
     (copied / "suite.json").write_text("{}")
     assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 0
     cell = next(copied.glob("cells/*/cell.json"))
@@ -191,10 +192,8 @@ def test_what_else_may_be_wrong_with_a_folder(finished, tmp_path, capsys):
     assert f"{inside}: nothing can be written there (Not a directory)" in capsys.readouterr().err
 
 
-def test_a_row_that_a_report_would_refuse_is_named(finished, tmp_path, capsys):
-    _, suite, results = finished
-    copied = tmp_path / "results"
-    subprocess.run(["cp", "-r", str(results), str(copied)], check=True)
+def test_a_row_that_a_report_would_refuse_is_named(copied, finished, capsys):
+    _, suite, _ = finished
     path = next(copied.glob("cells/*/row.json"))
     row = json.loads(path.read_text())
     for field, value, wanted in (("ok", 3, "of type bool"), ("seed", "q", "a whole number"),
