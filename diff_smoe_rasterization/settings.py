@@ -1,8 +1,9 @@
 """What a caller says about one rendering: camera, image, blend mode and options."""
 from __future__ import annotations
 
+import math
 import os
-from typing import NamedTuple, Optional
+from typing import NamedTuple, Optional, Union
 
 import torch
 
@@ -13,13 +14,23 @@ BLEND_MODES = ("alpha", "smoe", "smoe_tn", "smoe_std")
 name       paper                  colour of a pixel                           background
 ========== ====================== =========================================== ==========
 alpha      Eq. 3 (3DGS)           sum c_i alpha_i T_i + T bg                  blended
-smoe       Eq. 7 (the method)     sum c_i alpha_i T_i / sum alpha_i T_i       where no gate
+smoe       Eq. 7 (the method)     sum c_i alpha_i T_i / sum alpha_i T_i       by its gate
 smoe_tn    Eq. 8 (ablation)       sum c_i alpha_i T_i / sum alpha_i           where no gate
 smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               where no gate
 ========== ====================== =========================================== ==========
+
+`smoe` is a family. With a `background_gate` lambda > 0 the background is one more expert, behind all others:
+
+    (sum c_i alpha_i T_i + lambda T bg) / (sum alpha_i T_i + lambda T)
+
+At 0, the default, this is Eq. 7, and the background is seen where no gate is open; at 1 it is alpha blending.
 """
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
+BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
+
+BackgroundGate = Union[float, torch.Tensor]
+"""lambda: a number, or a tensor of one element, which receives a gradient."""
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -47,6 +58,8 @@ class GaussianRasterizationSettings(NamedTuple):
     blend_mode: Optional[str] = None  # one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha"
     deterministic: bool = False  # CUDA: gradients equal bit for bit from run to run; slower. The CPU's always are
     clamp_color: bool = True  # colours from shs are at least 0; False: as the harmonics give them, with their gradient
+    # `smoe`: how much the background weighs against the Gaussians, 0 or more; None: $DSMOE_BACKGROUND_GATE, else 0
+    background_gate: Optional[BackgroundGate] = None
 
 
 class Rendering(NamedTuple):
@@ -54,9 +67,9 @@ class Rendering(NamedTuple):
 
     color: torch.Tensor  # [C, H, W]
     radii: torch.Tensor  # [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
-    alpha: Optional[torch.Tensor] = None  # [1, H, W]; alpha: 1 - T, SMoE modes: the denominator (gate sum)
+    alpha: Optional[torch.Tensor] = None  # [1, H, W]; the gate sum W = sum alpha_i T_i; ablations: sum alpha_i
     depth: Optional[torch.Tensor] = None  # [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
-    inverse_depth: Optional[torch.Tensor] = None  # [1, H, W]; alpha: sum(w / z), SMoE modes: divided by the gate sum
+    inverse_depth: Optional[torch.Tensor] = None  # [1, H, W]; 1 / z blended as a colour, over background 0
 
 
 class Contributions(NamedTuple):
@@ -90,3 +103,34 @@ def resolve_blend_mode(blend_mode: Optional[str]) -> str:
     if blend_mode not in BLEND_MODES:
         raise ValueError(f"{source} is {blend_mode!r}; it must be one of {', '.join(BLEND_MODES)}")
     return blend_mode
+
+
+def resolve_background_gate(blend_mode: str, background_gate: Optional[BackgroundGate]) -> BackgroundGate:
+    """Returns the background's gate lambda that a rendering in this blend mode uses.
+
+    In `smoe` an explicit value wins; None means the environment variable DSMOE_BACKGROUND_GATE, for callers that
+    cannot be edited, and 0 (Eq. 7) where that is unset. `alpha` is the family's member with 1; the ablations have none.
+    Raises ValueError for a number that is negative, NaN or infinite, a tensor that has not one element, and for a value
+    in a mode that knows none.
+    """
+    if blend_mode != "smoe":
+        of_mode = 1.0 if blend_mode == "alpha" else 0.0
+        if background_gate is None or (blend_mode == "alpha" and not isinstance(background_gate, torch.Tensor)
+                                       and background_gate == 1):
+            return of_mode
+        raise ValueError(f"background_gate is given, but blend_mode is {blend_mode!r}; only 'smoe' knows it")
+    source = "background_gate"
+    if background_gate is None:
+        background_gate = os.environ.get(BACKGROUND_GATE_VARIABLE) or 0.0
+        source = BACKGROUND_GATE_VARIABLE
+    if isinstance(background_gate, torch.Tensor):
+        if background_gate.numel() != 1:
+            raise ValueError(f"background_gate has shape {list(background_gate.shape)}; it must have one element")
+        return background_gate
+    try:
+        value = float(background_gate)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise ValueError(f"{source} is {background_gate!r}; it must be a number, 0 or more and finite")
+    return value
