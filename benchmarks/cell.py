@@ -36,10 +36,10 @@ def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
     """What a row says of its cell, whether it was measured or failed."""
     method, scene = cell["method"], cell["scene"]
     return {"cell": cell["id"], "suite": cell["suite"], "method": method["name"], "label": method["label"],
-            "variant": method["variant"], "blend_mode": cell["blend_mode"], "schedule": cell["schedule"],
-            "densify_grad_threshold": cell["densify_grad_threshold"], "scene": scene["name"],
-            "dataset": scene["dataset"], "seed": cell["seed"], "iterations": cell["protocol"]["iterations"],
-            "headline": cell["headline"], "end": method.get("end"), "budget": method.get("budget")}
+            "variant": method["variant"], "scene": scene["name"], "dataset": scene["dataset"],
+            **{field: cell[field] for field in ("blend_mode", "background_gate", "schedule", "densify_grad_threshold",
+                                                "seed", "headline")},
+            "iterations": cell["protocol"]["iterations"], "end": method.get("end"), "budget": method.get("budget")}
 
 
 def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float]) -> Dict[str, Any]:

@@ -143,10 +143,10 @@ def print_ratios(rows) -> None:
         if threads[0] != threads[-1]:
             print(f"{mode}: {first['total'] / last['total']:.2f} times faster from {threads[0]} to {threads[-1]} "
                   "threads")
-    for count in threads:
-        if ("alpha", count) in by_case and ("smoe", count) in by_case:
-            ratio = by_case["smoe", count]["total"] / by_case["alpha", count]["total"]
-            print(f"smoe takes {ratio:.2f} times as long as alpha on {count} thread{'s' if count > 1 else ''}")
+    for (mode, count), row in by_case.items():
+        if mode != "alpha" and ("alpha", count) in by_case:
+            ratio = row["total"] / by_case["alpha", count]["total"]
+            print(f"{mode} takes {ratio:.2f} times as long as alpha on {count} thread{'s' if count > 1 else ''}")
     print()
 
 
@@ -163,7 +163,8 @@ def print_floor(rows) -> None:
         print(f"{count} thread{'s' if count > 1 else ''}: {rate / 1e9:.1f} G multiply-adds/s in torch's matrix product")
     lines = [("arithmetic floor", "threads", "M pairs forward", "backward", "floor ms", "blend ms", "times the floor")]
     for row in rows:
-        row["floor"] = floor.floor_seconds(row["mode"], *(row[name] for name in PAIRS), rates[row["threads"]])
+        mode = row["mode"].partition(":")[0]
+        row["floor"] = floor.floor_seconds(mode, *(row[name] for name in PAIRS), rates[row["threads"]])
         blend = row["blend"] + row["blend_backward"]
         lines.append((row["mode"], row["threads"], *(f"{row[name] / 1e6:.1f}" for name in PAIRS),
                       f"{1e3 * row['floor']:.1f}", f"{1e3 * blend:.1f}", f"{blend / row['floor']:.2f}"))
@@ -224,7 +225,8 @@ def parse(arguments):
     parser.add_argument("--synthetic", type=int, metavar="N", help="N made-up Gaussians instead")
     parser.add_argument("--views", type=numbers, default=[0], help="numbers of the views, such as 0,18")
     parser.add_argument("--threads", type=numbers, default=sorted({1, num_cores()}), help="such as 1,2")
-    parser.add_argument("--modes", type=lambda text: text.split(","), default=list(BLEND_MODES))
+    parser.add_argument("--modes", type=blends, default=list(BLEND_MODES),
+                        help=f"of {', '.join(BLEND_MODES)}; smoe:0.05 is smoe with that background gate")
     parser.add_argument("--repeats", type=int, default=11)
     parser.add_argument("--dense", type=int, default=0, metavar="REPEATS",
                         help="also time the dense torch baseline, which takes seconds a view")
@@ -237,9 +239,13 @@ def parse(arguments):
         parser.error("--ply and --scene go together")
     if options.repeats < 1 or min(options.threads) < 1:
         parser.error("--repeats and --threads must be at least 1")
-    if not set(options.modes) <= set(BLEND_MODES):
-        parser.error(f"--modes may hold {','.join(BLEND_MODES)}")
     return parser, options
+
+
+def blends(text: str):
+    for blend in text.split(","):
+        models.mode_and_gate(blend)
+    return text.split(",")
 
 
 def numbers(text: str):

@@ -20,6 +20,7 @@ from ..trainer.files import write_json_atomically, write_text_atomically
 from .cell import SHARING, identity, shown
 from .errors import BenchError
 from .lpips import check_weights, files_of_weights
+from .methods.names import blend_of
 from .preparation import given, made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
@@ -316,7 +317,7 @@ def rows_table(rows: List[Dict[str, Any]]) -> str:
     """A line for each row: what a terminal shows at the end."""
     lines = []
     for row in rows:
-        name = "  ".join([row["label"], row["scene"], row["blend_mode"], row.get("schedule") or "own schedule",
+        name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("schedule") or "own schedule",
                           shown(row["densify_grad_threshold"], "g"), f"s{row['seed']}"])
         machine = row.get("machine") or {}
         at_once = max(machine.get(key) or 1 for key in SHARING.values())

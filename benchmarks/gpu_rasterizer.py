@@ -21,7 +21,7 @@ import torch
 
 import models
 from diff_smoe_rasterization import build_info
-from gpu_renderers import RENDERERS
+from gpu_renderers import RENDERERS, renderer_named
 
 
 def machine() -> Dict[str, Any]:
@@ -136,7 +136,8 @@ def parse(arguments):
     parser.add_argument("--height", type=int)
     parser.add_argument("--views", type=int, default=8, help="at most so many, evenly chosen")
     parser.add_argument("--peers-path", help="folder of the other rasterizers' folders")
-    parser.add_argument("--renderers", help=f"comma-separated, of {', '.join(RENDERERS)}; default: all that are found")
+    parser.add_argument("--renderers", help=f"comma-separated, of {', '.join(RENDERERS)}, also with other gates; "
+                        "default: all that are found")
     parser.add_argument("--warmup", type=int, default=10)
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--timeout", type=float, default=240, help="seconds a renderer")
@@ -150,11 +151,12 @@ def parse(arguments):
     if min(options.views, options.repeats) < 1 or options.warmup < 0:
         parser.error("--views and --repeats must be at least 1, --warmup at least 0")
     names = options.renderers.split(",") if options.renderers else found(options.peers_path)
-    unknown = sorted(set(names) - set(RENDERERS))
-    if unknown:
-        parser.error(f"--renderers: {', '.join(unknown)} is none of {', '.join(RENDERERS)}")
-    options.renderers = sorted(names, key=list(RENDERERS).index)
-    if not RENDERERS[options.renderers[0]].is_alpha:
+    try:
+        options.renderers = sorted(names, key=lambda name: [*RENDERERS, name].index(name))
+        first, *_ = map(renderer_named, options.renderers)
+    except ValueError as error:
+        parser.error(f"--renderers: {error}: none of {', '.join(RENDERERS)}, nor of ours with another gate")
+    if not first.is_alpha:
         parser.error(f"--renderers must hold one of {', '.join(n for n, r in RENDERERS.items() if r.is_alpha)}")
     return options
 

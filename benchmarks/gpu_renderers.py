@@ -7,12 +7,13 @@ ones), the same cameras, a black background and the near plane of 3DGS, 0.2.
 from __future__ import annotations
 
 import importlib
-from typing import Dict, List
+from typing import Dict, List, Type
 
 import torch
 
+from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
 from diff_smoe_rasterization.trainer.cameras import Camera
-from models import Model
+from models import Model, mode_and_gate
 
 NEAR = 0.2
 FAR = 1e4  # for the peers that take a far plane; beyond every Gaussian
@@ -56,9 +57,9 @@ class Renderer:
 
 
 class Ours(Renderer):
-    """This project, one of its modes. Also makes the gradient of means2D, as a trainer needs it."""
+    """This project, one of its blends. Also makes the gradient of means2D, as a trainer needs it."""
 
-    mode = "alpha"
+    blend = "alpha"
     deterministic = False
 
     def __init__(self, model: Model):
@@ -71,30 +72,20 @@ class Ours(Renderer):
         return {**parameters, "means2D": torch.zeros_like(parameters["means3D"])}
 
     def make_view(self, model, view):
-        return model.settings(view, self.mode)._replace(deterministic=self.deterministic)
+        return model.settings(view, self.blend)._replace(deterministic=self.deterministic)
 
     def render(self, view):
         return self.rasterize(settings=view, **self.parameters).color
 
 
-class OursSmoe(Ours):
-    mode, is_alpha = "smoe", False
-
-
-class OursSmoeTn(Ours):
-    mode, is_alpha = "smoe_tn", False
-
-
-class OursSmoeStd(Ours):
-    mode, is_alpha = "smoe_std", False
-
-
-class OursDeterministic(Ours):
-    deterministic = True
-
-
-class OursSmoeDeterministic(OursSmoe):
-    deterministic = True
+def ours(name: str) -> Type[Ours]:
+    """Of a name such as "ours smoe:0.05 deterministic". Raises ValueError."""
+    word, _, rest = name.partition(" ")
+    blend, _, how = rest.partition(" ")
+    if word != "ours" or how not in ("", "deterministic"):
+        raise ValueError(f"{name} is no renderer")
+    mode_and_gate(blend)
+    return type(name, (Ours,), {"blend": blend, "deterministic": bool(how), "is_alpha": blend == "alpha"})
 
 
 class Inria(Renderer):
@@ -262,10 +253,17 @@ class GsplatInference(Renderer):
 
 
 RENDERERS = {
-    "inria": Inria, "ours alpha": Ours, "ours smoe": OursSmoe, "ours smoe_tn": OursSmoeTn,
-    "ours smoe_std": OursSmoeStd, "ours alpha deterministic": OursDeterministic,
-    "ours smoe deterministic": OursSmoeDeterministic, "dr_aa": InriaAntialiasing, "accel": Accelerated,
-    "speedy": Speedy, "fastergs": FasterGS, "fastergs inference": FasterGSInference, "gsplat": Gsplat,
-    "gsplat unpacked": GsplatUnpacked, "higs": GsplatInference,
+    "inria": Inria,
+    **{name: ours(name) for name in ("ours alpha", f"ours smoe:{RECOMMENDED_BACKGROUND_GATE}", "ours smoe",
+                                     "ours smoe_tn", "ours smoe_std", "ours alpha deterministic",
+                                     "ours smoe deterministic")},
+    "dr_aa": InriaAntialiasing, "accel": Accelerated, "speedy": Speedy, "fastergs": FasterGS,
+    "fastergs inference": FasterGSInference, "gsplat": Gsplat, "gsplat unpacked": GsplatUnpacked,
+    "higs": GsplatInference,
 }
 """By the name in the tables. Inria's comes first: the images and gradients of the others are compared with its."""
+
+
+def renderer_named(name: str) -> Type[Renderer]:
+    """One of RENDERERS, or ours with another blend. Raises ValueError."""
+    return RENDERERS.get(name) or ours(name)

@@ -14,7 +14,7 @@ import torch
 
 import gpu_floor
 import models
-from gpu_renderers import RENDERERS, Ours, Renderer
+from gpu_renderers import Ours, Renderer, renderer_named
 
 DEVICE = "cuda"
 MEBIBYTE = 2 ** 20
@@ -147,15 +147,11 @@ def compare(measurement: Measurement, folder: str) -> Dict[str, float]:
 
 def num_instances(renderer: Ours, settings) -> int:
     """(Gaussian, tile) pairs of a rendering: where the last tile's list ends."""
-    from diff_smoe_rasterization import BLEND_MODES, extension
-    operator = torch.ops.diff_smoe_rasterization.rasterize.default
-    values = {**settings._asdict(), "blend_mode": BLEND_MODES.index(settings.blend_mode), "depth": False,
-              "inverse_depth": False, **renderer.parameters}
+    from diff_smoe_rasterization import extension, rasterize_with_splats
     with torch.no_grad():
-        results = operator(*(values.get(argument.name) for argument in operator._schema.arguments))
-    offsets = results[[result.name for result in operator._schema.returns].index("tile_offsets")]
+        _, splats = rasterize_with_splats(settings=settings, **renderer.parameters)
     tile = extension._C.constants["tile_size"]
-    return int(offsets[-(-settings.image_width // tile) * -(-settings.image_height // tile)])
+    return int(splats._tile_offsets[-(-settings.image_width // tile) * -(-settings.image_height // tile)])
 
 
 def stages(measurement: Measurement) -> Dict[str, Any]:
@@ -180,7 +176,7 @@ def stages(measurement: Measurement) -> Dict[str, Any]:
         pixels=views[0].image_width * views[0].image_height, forward_pairs=times["forward_pairs"],
         backward_pairs=times["backward_pairs"],
         parameter_bytes=sum(tensor[0].numel() * tensor.element_size() for tensor in renderer.parameters.values()))
-    floors = gpu_floor.floors(renderer.mode, counts)
+    floors = gpu_floor.floors(views[0].blend_mode, counts)
     return {"counts": counts._asdict(),
             "stages": {name: {"ms": 1e3 * times[name], "floor_ms": 1e3 * floor.seconds,
                               "bytes_ms": 1e3 * floor.bytes, "instructions_ms": 1e3 * floor.instructions}
@@ -189,7 +185,7 @@ def stages(measurement: Measurement) -> Dict[str, Any]:
 
 def measure(request: Dict[str, Any], row: Dict[str, Any]) -> None:
     """Fills the row; what was measured before an error stays in it."""
-    renderer_type = RENDERERS[request["renderer"]]
+    renderer_type = renderer_named(request["renderer"])
     row["note"] = renderer_type.note
     if renderer_type.folder:
         sys.path.insert(0, os.path.join(request["peers_path"], renderer_type.folder))

@@ -9,6 +9,7 @@ from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tu
 import numpy as np
 
 from .mechanism_probe import QUANTILES
+from .methods.names import blend_of
 from .report import curves
 from .report.curves import COLORS, MARKS, PANEL, plt
 
@@ -105,10 +106,10 @@ def densification(runs: Sequence[Run]):
 
 
 def named(records: Sequence[Record]) -> List[Run]:
-    """Runs by name: the options in which they differ, the blend mode always."""
+    """Runs by name: the options in which they differ, the blend always."""
     options = [name for name in ("scene", "schedule", "densify_grad_threshold", "iterations", "seed")
                if len({record["config"][name] for record in records}) > 1]
-    return [Run(record, " ".join(str(record["config"][name]) for name in ["blend_mode", *options]),
+    return [Run(record, " ".join([blend_of(record["config"]), *(str(record["config"][name]) for name in options)]),
                 COLORS[index % len(COLORS)], *MARKS[record["config"]["blend_mode"]][:2])
             for index, record in enumerate(records)]
 

@@ -26,7 +26,7 @@ class Probe:
         """renderer: the training's own; scene: on its device."""
         self.model = renderer.model
         self.renderer = Renderer(renderer.model, renderer.blend_mode, renderer.background, renderer.antialiasing,
-                                 rasterize_with_splats)
+                                 rasterize_with_splats, background_gate=renderer.background_gate)
         self.test = [(scene.test[index].camera, scene.test[index].image_float())
                      for index in evenly_spaced(len(scene.test), VIEWS)]
         train = [scene.train[index] for index in evenly_spaced(len(scene.train), VIEWS)]
@@ -48,7 +48,7 @@ class Probe:
     def shares(self) -> torch.Tensor:
         """How much each of N Gaussians gives to the training views: [N], the factor of its colour, summed over pixels.
 
-        The factor is the weight in the blend's numerator, in SMoE modes over the gate sum. One rendering and its
+        The factor is the weight in the blend's numerator, in SMoE modes over its denominator. One rendering and its
         backward pass for each view.
         """
         found = self.model.raw["means3D"].detach().new_zeros(self.model.num_gaussians)

@@ -16,6 +16,7 @@ import torch
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.trainer.cameras import Camera
+from models import Model
 
 UNITS = ("Gaussian", "pixel", "tile instance")
 LIMITS = dict(zip(UNITS, (200, 64, 72)))  # bytes of float32 renderings with three channels
@@ -76,7 +77,7 @@ def _grid(num_gaussians: int, columns: int, rows: int, opacity: float, sigma: fl
                   shs=0.1 * torch.ones(num_gaussians, 16, 3))
     camera = Camera("", np.eye(3), np.zeros(3), FOCAL, FOCAL, columns * TILE / 2, rows * TILE / 2, columns * TILE,
                     rows * TILE)
-    return inputs, camera
+    return Model("grid", inputs, [camera])
 
 
 SCENES = {  # Gaussians, columns and rows of tiles, opacity, sigma in pixels
@@ -98,30 +99,30 @@ def _start_peak() -> None:
         file.write("5")
 
 
-def _measure(unit: str, mode: str, threads: int, pipe) -> None:
+def _measure(unit: str, blend: str, threads: int, pipe) -> None:
     """Child process: sends (Counts, bytes at the peak beyond inputs, outputs and gradients)."""
     torch.set_num_threads(threads)
-    bg = torch.zeros(3)
 
     def run(num_gaussians, columns, rows, opacity, sigma):
-        inputs, camera = _grid(num_gaussians, columns, rows, opacity, sigma)
-        leaves = {name: tensor.requires_grad_() for name, tensor in inputs.items()}
-        dL_dcolor = torch.ones(3, camera.height, camera.width)
+        model = _grid(num_gaussians, columns, rows, opacity, sigma)
+        leaves = {name: tensor.requires_grad_() for name, tensor in model.inputs.items()}
+        settings = model.settings(0, blend)
+        dL_dcolor = torch.ones(3, settings.image_height, settings.image_width)
         _start_peak()
         before = _status("VmRSS")
-        rendering = rasterize(settings=camera.settings(bg, 3, mode), **leaves)
+        rendering = rasterize(settings=settings, **leaves)
         gradients = torch.autograd.grad(rendering.color, list(leaves.values()), dL_dcolor)
         returned = (rendering.color, rendering.radii, *gradients)
         beyond = _status("VmHWM") - before - sum(tensor.numel() * tensor.element_size() for tensor in returned)
-        return {name: tensor.detach() for name, tensor in leaves.items()}, camera, beyond
+        return {name: tensor.detach() for name, tensor in leaves.items()}, settings, beyond
 
     run(64, 4, 4, 0.5, 0.1)  # code and thread stacks
-    inputs, camera, beyond = run(*SCENES[unit])
-    counts, _ = kept_tensors(inputs, camera.settings(bg, 3, mode))
+    inputs, settings, beyond = run(*SCENES[unit])
+    counts, _ = kept_tensors(inputs, settings)
     pipe.send((tuple(counts), beyond))
 
 
-def peak_per_unit(mode: str, threads: int) -> Dict[str, float]:
+def peak_per_unit(blend: str, threads: int) -> Dict[str, float]:
     """Returns the peak's bytes per Gaussian, pixel and tile instance.
 
     Linux with glibc only; raises OSError or AttributeError elsewhere.
@@ -131,7 +132,7 @@ def peak_per_unit(mode: str, threads: int) -> Dict[str, float]:
     equations, peaks = [], []
     for unit in UNITS:
         receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(target=_measure, args=(unit, mode, threads, sender))
+        process = context.Process(target=_measure, args=(unit, blend, threads, sender))
         process.start()
         sender.close()
         try:

@@ -2,16 +2,24 @@
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Optional
+from typing import Dict, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 import torch
 
-from diff_smoe_rasterization.settings import GaussianRasterizationSettings
+from diff_smoe_rasterization.settings import GaussianRasterizationSettings, resolve_background_gate, resolve_blend_mode
 from diff_smoe_rasterization.trainer.cameras import Camera
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.modelfile import load_model
 from diff_smoe_rasterization.trainer.scene import load_cameras
+
+
+def mode_and_gate(blend: str) -> Tuple[str, Optional[float]]:
+    """The settings ("smoe", 0.05) of "smoe:0.05"; "smoe" alone has gate 0. Raises ValueError."""
+    mode, _, text = blend.partition(":")
+    gate = float(text) if text else 0.0 if mode == "smoe" else None
+    resolve_background_gate(resolve_blend_mode(mode), gate)
+    return mode, gate
 
 
 class Model(NamedTuple):
@@ -29,10 +37,10 @@ class Model(NamedTuple):
     def sh_degree(self):
         return math.isqrt(self.inputs["shs"].shape[1]) - 1
 
-    def settings(self, view: int, mode: str) -> GaussianRasterizationSettings:
+    def settings(self, view: int, blend: str) -> GaussianRasterizationSettings:
         """The settings of a view before a black background, on the device of the Gaussians."""
-        background = torch.zeros(3, device=self.inputs["means3D"].device)
-        return self.cameras[view].settings(background, self.sh_degree, mode)
+        background, (mode, gate) = torch.zeros(3, device=self.inputs["means3D"].device), mode_and_gate(blend)
+        return self.cameras[view].settings(background, self.sh_degree, mode)._replace(background_gate=gate)
 
     def to(self, device: str) -> "Model":
         return self._replace(inputs={name: tensor.to(device) for name, tensor in self.inputs.items()})

@@ -5,7 +5,7 @@ from dataclasses import fields
 from typing import Any, Dict
 
 from ..settings import BLEND_MODES
-from ..trainer.config import PRINCIPAL_POINTS, SCHEDULES, TrainConfig
+from ..trainer.config import LEARNED, PRINCIPAL_POINTS, SCHEDULES, TrainConfig
 from .lpips import LPIPS_KINDS
 from .methods.names import CHECKOUTS, NATIVE, VARIANTS
 from .protocol import RECIPE
@@ -28,6 +28,7 @@ POSITIVE = {"type": "integer", "minimum": 1}
 THRESHOLD = {"type": "number", "exclusiveMinimum": 0, "maximum": 1e6}  # its digits are a part of file names
 AXES = {
     "blend_modes": _list({"enum": list(BLEND_MODES)}),
+    "background_gates": _list({"type": ["number", "string"], "minimum": 0, "pattern": f"^{LEARNED}\\Z"}),
     "densify_grad_thresholds": _list(THRESHOLD),
     "schedules": _list({"enum": list(SCHEDULES)}),
     "seeds": _list({"type": "integer", "minimum": 0, "maximum": 2**32 - 1}),

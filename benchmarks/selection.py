@@ -5,7 +5,9 @@ from typing import Any, Dict, List, Mapping, Sequence
 
 from .cell import identity
 from .errors import BenchError
+from .methods.names import blend_of
 from .report.rows import read_rows
+from .suite import AXIS_OF
 
 SAID_BY_THE_ID = ("method", "variant", "blend_mode", "schedule", "densify_grad_threshold", "scene", "seed",
                   "iterations")  # fields of a row
@@ -21,7 +23,7 @@ def earlier_rows(path: str, cells: List[Dict[str, Any]]) -> Dict[str, Dict[str, 
     if not found:
         raise BenchError(f"--rows {path}: none of its {len(rows)} rows is of a cell of this suite")
     for cell in found:
-        row, expected = rows[cell["id"]], identity(cell)
+        row, expected = ({**said, "blend_mode": blend_of(said)} for said in (rows[cell["id"]], identity(cell)))
         for field in SAID_BY_THE_ID:
             if row.get(field) != expected[field]:
                 raise BenchError(f"--rows {path}: the row of cell {cell['id']}: {field} is {row.get(field)!r}; it must "
@@ -38,22 +40,23 @@ def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, A
             raise BenchError(f"--only {text}: must be FIELD=VALUE with a field of {', '.join(SELECTORS)}")
         wanted.setdefault(field, []).append(value)
     for field, values in wanted.items():
-        there = [SELECTORS[field](cell) for cell in cells]
+        there = [_said(cell, field) for cell in cells]
         for value in values:
             if not any(_same(entry, value) for entry in there):
                 raise BenchError(f"--only {field}={value}: no cell of the suite is so; its cells have "
                                  + ", ".join(dict.fromkeys(map(str, there))))
     found = [cell for cell in cells
-             if all(any(_same(SELECTORS[field](cell), value) for value in values) for field, values in wanted.items())]
+             if all(any(_same(_said(cell, field), value) for value in values) for field, values in wanted.items())]
     if not found:
         raise BenchError(f"--only {' '.join(only)}: no cell of the suite is so")
     return found
 
 
-SELECTORS = {"method": lambda cell: cell["method"]["label"], "scene": lambda cell: cell["scene"]["name"],
-             "blend_mode": lambda cell: cell["blend_mode"], "schedule": lambda cell: cell["schedule"],
-             "densify_grad_threshold": lambda cell: cell["densify_grad_threshold"], "seed": lambda cell: cell["seed"],
-             "headline": lambda cell: cell["headline"]}
+SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")
+
+
+def _said(cell: Dict[str, Any], field: str) -> Any:
+    return cell["method"]["label"] if field == "method" else cell["scene"]["name"] if field == "scene" else cell[field]
 
 
 def _same(value: Any, text: str) -> bool:

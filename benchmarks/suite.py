@@ -12,13 +12,15 @@ import json
 import os
 import re
 from dataclasses import dataclass
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
+from ..settings import resolve_background_gate
+from ..trainer.config import LEARNED
 from ..trainer.errors import ConfigError
 from .errors import BenchError
-from .methods.names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, WITHOUT_SCHEDULE
+from .methods.names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, WITHOUT_SCHEDULE, blend_of
 from .protocol import RECIPE, config_of
 from .schema import SUITE
 
@@ -28,10 +30,9 @@ THRESHOLDS = (0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
 PROTOCOL = {"iterations": 30_000, "device": "cuda", "background": "black", "principal_point": "centre",
             "lpips": ["lpips_vgg_inria", "lpips_vgg_std", "lpips_alex"], "evaluate_every": 0, "checkpoint_every": 1000,
             "scale_recipe": False, "options": {}}
-AXES = {"blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": list(THRESHOLDS), "schedules": ["3dgs"],
-        "seeds": [0]}
-AXIS_OF = {"blend_modes": "blend_mode", "densify_grad_thresholds": "densify_grad_threshold", "schedules": "schedule",
-           "seeds": "seed"}
+AXES = {"blend_modes": ["alpha", "smoe"], "background_gates": [0], "densify_grad_thresholds": list(THRESHOLDS),
+        "schedules": ["3dgs"], "seeds": [0]}
+AXIS_OF = {axis: axis[:-1] for axis in AXES}
 # Where things lie changes no figure.
 NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "base_commit", "unset")
 
@@ -226,8 +227,9 @@ def _method(method: Dict[str, Any], index: int, protocol: Dict[str, Any], folder
 # Flags of the public trainers that the harness sets itself from protocol, scene and axes; then those that would change
 # the split, the start, the background or the number of steps.
 SET_BY_THE_HARNESS = ("-s", "--source_path", "-m", "--model_path", "-r", "--resolution", "-i", "--images", "--eval",
-                      "-w", "--white_background", "--iterations", "--blend_mode", "--densify_grad_threshold",
-                      "--test_iterations", "--save_iterations", *(f"--{name}" for name in RECIPE),
+                      "-w", "--white_background", "--iterations", "--blend_mode", "--background_gate",
+                      "--densify_grad_threshold", "--test_iterations", "--save_iterations",
+                      *(f"--{name}" for name in RECIPE),
                       "--train_test_exp", "--llffhold", "--lod", "--start_checkpoint", "--init_type",
                       "--random_background", "--warmup", "--load_iteration", "--output_vq")
 # Taming's published recipe sets the first, which is a part of the method there; neither is short for another flag.
@@ -268,6 +270,8 @@ def _can_train(content: Dict[str, Any], scene: Dict[str, Any], method: Dict[str,
                          "schedule cannot be `steady` there")
     if scene["init_points"]:
         raise BenchError(f"{what}: init_points is {scene['init_points']}, but checkouts start from all points")
+    if LEARNED in _values("background_gates", content, scene, method) and method["variant"] != "unpatched":
+        raise BenchError(f"{what}: background_gates: {LEARNED!r} is for the native trainer alone; it must be a number")
     thresholds = _values("densify_grad_thresholds", content, scene, method)
     if method["name"] in COUNTED_BY and len(thresholds) > 1:
         raise BenchError(f"{what}: {method['name']} has no threshold ({COUNTED_BY[method['name']]} stands for it): "
@@ -288,12 +292,18 @@ def _cells(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, A
     """Every combination of the axes; headline cells also with `headline_seeds`."""
     values = [_values(axis, content, scene, method) for axis in AXIS_OF]
     made = [_cell(content, protocol, scene, method, dict(zip(AXIS_OF.values(), chosen)))
-            for chosen in itertools.product(*values)]
+            for chosen in dict.fromkeys(itertools.starmap(_gated, itertools.product(*values)))]
     for cell in [cell for cell in made if cell["headline"] and cell["seed"] == values[-1][0]]:
         chosen = {name: cell[name] for name in AXIS_OF.values()}
         made += [_cell(content, protocol, scene, method, {**chosen, "seed": seed})
                  for seed in content.get("headline_seeds", []) if seed not in values[-1]]
     return made
+
+
+def _gated(blend_mode: str, gate: Any, *rest: Any) -> Tuple[Any, ...]:
+    """A combination of the axes with the gate that is its mode's: those of the axis are for `smoe` alone."""
+    own = gate if blend_mode == "smoe" else resolve_background_gate(blend_mode, None)
+    return (blend_mode, own if own == LEARNED else float(own), *rest)
 
 
 def _cell(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, Any], method: Dict[str, Any],
@@ -310,13 +320,15 @@ def _cell(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, An
 
 def cell_id(cell: Dict[str, Any]) -> str:
     """A readable name, and a checksum of everything that decides the figures: another protocol is another cell."""
-    identity = {key: cell[key] for key in ("blend_mode", "densify_grad_threshold", "schedule", "seed", "protocol")}
+    blend = blend_of(cell)
+    identity = {**{key: cell[key] for key in ("densify_grad_threshold", "schedule", "seed", "protocol")},
+                "blend_mode": blend}
     for key in ("method", "scene"):
         identity[key] = {name: value for name, value in cell[key].items() if name not in NOT_IN_THE_IDENTITY}
     checksum = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:6]
     threshold = re.sub(r"\.?0+$", "", f"{cell['densify_grad_threshold']:.7f}")
-    return "_".join([cell["method"]["label"], cell["scene"]["name"], cell["blend_mode"], cell["schedule"] or "own",
-                     threshold, f"s{cell['seed']}", checksum])
+    return "_".join([cell["method"]["label"], cell["scene"]["name"], blend.replace(" ", "-"),
+                     cell["schedule"] or "own", threshold, f"s{cell['seed']}", checksum])
 
 
 def _paths(given: Dict[str, Any], where: str, folder: str) -> Dict[str, Any]:

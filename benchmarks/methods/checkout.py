@@ -16,6 +16,7 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import numpy as np
 import torch
 
+from ...settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE
 from ...trainer.config import TrainConfig
 from ...trainer.evaluation import Evaluation, summary
 from ...trainer.images import View
@@ -78,6 +79,7 @@ class ThreeDGS:
         words += self.recipe_arguments()
         if self.method["variant"] != "unpatched":
             words += ["--blend_mode", config.blend_mode]
+            words += ["--background_gate", config.background_gate] if config.blend_mode == "smoe" else []
         return [str(word) for word in words] + self.own_arguments()
 
     def recipe_arguments(self) -> List[str]:
@@ -148,7 +150,7 @@ class ThreeDGS:
         ours = os.environ.get("PYTHONPATH", "").split(os.pathsep)
         path = [item for item in [*self.method["pythonpath"], *ours] if item]
         environment = {name: value for name, value in os.environ.items()
-                       if name not in ("DSMOE_BLEND_MODE", "PYTHONSAFEPATH")}
+                       if name not in (BLEND_MODE_VARIABLE, BACKGROUND_GATE_VARIABLE, "PYTHONSAFEPATH")}
         return {**environment, "PYTHONPATH": os.pathsep.join(path), "PYTHONDONTWRITEBYTECODE": "1"}
 
 

@@ -1,5 +1,7 @@
-"""The names of the methods a suite may ask for; what they are is in the modules beside this one."""
+"""The names of the methods and blends a suite may ask for; what methods are is in the modules beside this one."""
 from __future__ import annotations
+
+from typing import Any, Mapping
 
 NATIVE = "native"
 VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse
@@ -17,3 +19,14 @@ LACKS = {"3dgs-2023": ("antialiasing",), "3dgs-2024": (), "c3dgs": ("antialiasin
          **dict.fromkeys(("hac", "hac-plus"), (*OF_3DGS_ALONE, "sh_degree", "sh_degree_interval", "opacity_lr",
                                                "rotation_lr", "densify_from_iter", "densify_until_iter",
                                                "densification_interval"))}
+
+
+def blend_of(row: Mapping[str, Any]) -> str:
+    """The blend of a row or a cell: its mode, in `smoe` with its gate, such as "smoe 0.05" or "smoe learned".
+
+    "smoe" alone is gate 0, the paper's Eq. 7: that of rows that say none, which are older than the gate.
+    """
+    gate = row.get("background_gate") or 0
+    if row["blend_mode"] != "smoe" or gate == 0:
+        return row["blend_mode"]
+    return f"smoe {gate if isinstance(gate, str) else format(gate, 'g')}"

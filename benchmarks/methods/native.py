@@ -45,7 +45,8 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     return Outcome(scene=scene, evaluation=evaluation, lpips=measures.lpips_of(evaluation.metrics),
                    num_gaussians=row["num_gaussians"], own_bytes=os.path.getsize(ply),
                    train_seconds=row["train_seconds"], peak_gpu_mib=peak, history=_history(folder), renders=renders,
-                   notes={"continued": continued, "scale_recipe": cell["protocol"]["scale_recipe"]})
+                   notes={"continued": continued, "scale_recipe": cell["protocol"]["scale_recipe"],
+                          "background_gate": row["background_gate"]})
 
 
 def _history(folder: str) -> List[Dict[str, Any]]:

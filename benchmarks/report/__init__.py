@@ -21,7 +21,7 @@ PARTS = ("tables", "figures", "images", "survey", "report.md")  # of a report, b
 MOST_ABSENT = 3  # cells without a row that are named
 TABLE_FORMS = {"md": "to_markdown", "csv": "to_csv", "tex": "to_latex"}
 NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
-                "continued", "arguments")  # of one cell, or said otherwise
+                "continued", "arguments", "background_gate")  # of one cell, or said otherwise
 
 
 def report(results: str, output: str) -> str:

@@ -4,6 +4,7 @@ Each is drawn twice, for light and for dark pages, as SVG; the light one also as
 """
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from typing import Dict, List, NamedTuple, Sequence, Tuple
@@ -20,9 +21,9 @@ from .tables import column  # noqa: E402
 
 # Okabe and Ito's colours, told apart with every kind of colour vision; black and yellow are left out for the pages.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-# Blend modes differ by more than colour: mark, line and hatch.
+# Blends differ by more than colour: mark, line and hatch.
 MARKS = {"alpha": ("o", "--", ""), "smoe": ("s", "-", "//"), "smoe_tn": ("^", "-.", ".."), "smoe_std": ("v", ":", "xx")}
-OTHER_MARK = ("D", "-", "\\\\")
+OTHER_MARKS = (("D", "-", "\\\\"), ("P", "-", "++"), ("X", "-", "oo"))  # gates of smoe, as they come
 THEMES = {"light": {"background": "#ffffff", "ink": "#1c1c1e", "grid": "#d8d8dc"},
           "dark": {"background": "#1b1c20", "ink": "#e8e8ea", "grid": "#3c3d44"}}
 AMOUNTS = ("num_gaussians", "size_own_mb", "size_common_mb")
@@ -106,7 +107,7 @@ def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
     """How each series is drawn: lines through three points and more, since two are no curve.
 
     Marks in one place are all seen: those of each next method and schedule are smaller and in front, and those of
-    alpha, in front of the other blend modes', are hollow.
+    alpha, in front of the other blends', are hollow.
     """
     looks: Dict[Setting, Dict[str, object]] = {}
     styles = _styles(groups)
@@ -114,7 +115,7 @@ def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
     smaller = min(2, (LARGEST_MARK - MARK) / max(1, len(kinds) - 1))
     for series, (color, (mark, dash, _)) in styles.items():
         points = sum(group.setting.series == series for group in groups)
-        hollow, place = series.blend_mode == "alpha", kinds.index(series.pair)
+        hollow, place = series.blend == "alpha", kinds.index(series.pair)
         looks[series] = {"color": color, "marker": mark, "markersize": MARK + smaller * (len(kinds) - 1 - place),
                          "markerfacecolor": "none" if hollow else color, "markeredgewidth": 1.5,
                          "linestyle": dash if points > 2 else "", "zorder": 3 + place + 0.5 * hollow}
@@ -168,16 +169,14 @@ def _drawn(group: Group, name: str) -> bool:
 
 
 def _styles(groups: Sequence[Group]) -> Dict[Setting, Tuple[str, Tuple[str, str, str]]]:
-    """Of every series: a colour for all but the blend mode, and marks for the blend mode."""
+    """Of every series: a colour for all but the blend, and marks for the blend."""
     found = sorted({group.setting.series for group in groups}, key=order)
     kinds = list(dict.fromkeys(series.pair for series in found))
-    modes = list(MARKS)
-    styles = {}
-    for series in found:
-        # alpha and smoe of one method take neighbouring colours, so that bars differ by colour too
-        place = kinds.index(series.pair) * 2 + modes.index(series.blend_mode) if series.blend_mode in MARKS else 0
-        styles[series] = (COLORS[place % len(COLORS)], MARKS.get(series.blend_mode, OTHER_MARK))
-    return styles
+    blends = list(dict.fromkeys(["alpha", "smoe", *sorted(series.blend for series in found)]))
+    marks = {**dict(zip((blend for blend in blends if blend not in MARKS), itertools.cycle(OTHER_MARKS))), **MARKS}
+    # The blends of one method take neighbouring colours, so that bars differ by colour too.
+    return {series: (COLORS[(kinds.index(series.pair) * len(blends) + blends.index(series.blend)) % len(COLORS)],
+                     marks[series.blend]) for series in found}
 
 
 def style(theme: str) -> Dict[str, object]:

@@ -42,7 +42,10 @@ def end_of(row: Row) -> Optional[str]:
 def tables_of(suite: str, rows: Sequence[Row], paper: Paper) -> List[Table]:
     """The tables of one suite's rows; those with nothing of ours in them are left out."""
     groups = grouped(rows, end_of)
-    made = [table1(groups, paper), table2(groups, paper), table3(groups, paper), deltas(groups, paper),
+    blends = {group.setting.blend: group.setting.mode for group in groups}
+    made = [table1(groups, paper), table2(groups, paper), table3(groups, paper),
+            *(deltas(groups, paper, base, blend) for base in COMPARED for blend, mode in blends.items()
+              if mode == "smoe" and blend != base),
             cells(groups), failures(rows)]
     return [table._replace(name=safe_name(f"{suite}_{table.name}")) for table in made
             if any(row.source == OURS for row in table.rows)]
@@ -105,15 +108,15 @@ def table3(groups: Sequence[Group], paper: Paper) -> Table:
     """The paper's Table 3: the gate without the transmittance, in its denominator and altogether."""
     names = ["psnr", "ssim", "lpips:paper", *lpips_figures(_rows(groups)), "train_seconds", "num_gaussians_m"]
     ablated = {(group.setting.pair, group.scene) for group in groups
-               if group.setting.blend_mode in ("smoe_tn", "smoe_std")}
+               if group.setting.blend in ("smoe_tn", "smoe_std")}
     printed_rows, where = paper["table3"]["rows"], f"{paper['table3']['dataset']}, {paper['table3']['end']}"
     rows = [TableRow((where, "", ABLATION[mode], ""),
                      tuple(_printed(paper["table3"]["columns"], figures, name) for name in names), PAPER)
             for mode, figures in printed_rows.items()]
     for group in groups:
-        if (group.setting.pair, group.scene) in ablated and group.setting.blend_mode in ABLATION:
-            labels = (f"{group.scene}, {group.setting.amount()}", group.setting.label(blend_mode=False),
-                      f"{group.setting.blend_mode}: {ABLATION[group.setting.blend_mode]}", group.seeds())
+        if (group.setting.pair, group.scene) in ablated and group.setting.blend in ABLATION:
+            labels = (f"{group.scene}, {group.setting.amount()}", group.setting.label(blend=False),
+                      f"{group.setting.blend}: {ABLATION[group.setting.blend]}", group.seeds())
             rows.append(TableRow(labels, tuple(_seeds_cell(group, name) for name in names)))
     notes = (paper["source"] + ".", "T_d: the transmittance in the denominator; T_n,d: in both.", *_notes(groups))
     return without_empty_columns(Table("table3", "Ablation of the transmittance (the paper's Table 3)",
@@ -121,14 +124,15 @@ def table3(groups: Sequence[Group], paper: Paper) -> Table:
                                        tuple(column(name) for name in names), tuple(rows), notes))
 
 
-def deltas(groups: Sequence[Group], paper: Paper) -> Table:
-    """smoe against alpha in equal settings, seed by seed; beside it what the paper's printed averages differ by."""
+def deltas(groups: Sequence[Group], paper: Paper, base: str, blend: str) -> Table:
+    """A blend against another in equal settings, seed by seed; beside smoe against alpha what the paper prints."""
+    is_papers = (base, blend) == COMPARED
     by_key = {(group.setting, group.scene): group for group in groups}
     differences = ["psnr", "psnr_edge", "ssim", *lpips_figures(_rows(groups))]
     ratios = ["num_gaussians", "size_own_mb", "train_seconds", "fps"]
     rows: List[TableRow] = []
     unequal: List[str] = []
-    for end in END_NAMES:
+    for end in END_NAMES if is_papers else ():
         averages = paper["table1"][end]
         for dataset in paper["datasets"]:
             alpha, smoe = (dict(zip(paper["table1"]["columns"], map(float, averages[method][dataset])))
@@ -139,32 +143,34 @@ def deltas(groups: Sequence[Group], paper: Paper) -> Table:
             rows.append(TableRow((dataset, "3DGS", f"{paper['ends'][end]:g}" + f" ({end})", ""),
                                  tuple(Cell(found.get(name)) for name in differences + ratios), PAPER))
     for group in groups:
-        gated = by_key.get((group.setting._replace(blend_mode="smoe"), group.scene))
-        if group.setting.blend_mode != "alpha" or gated is None:
+        gated = by_key.get((group.setting._replace(blend=blend), group.scene))
+        if group.setting.blend != base or gated is None:
             continue
-        failed = [f"{mode.setting.blend_mode} failed" for mode in (group, gated) if not mode.rows]
+        failed = [f"{either.setting.blend} failed" for either in (group, gated) if not either.rows]
         cells_ = [cell(over((group, gated), name, difference)) for name in differences]
         cells_ += [cell(over((group, gated), name, ratio)) for name in ratios]
         if failed:
             cells_[0] = Cell(text=", ".join(failed))
-        labels = (group.scene, group.setting.label(blend_mode=False), group.setting.amount())
+        labels = (group.scene, group.setting.label(blend=False), group.setting.amount())
         rows.append(TableRow((*labels, str(len(group.done() & gated.done()))), tuple(cells_)))
         unequal += [f"{', '.join(labels)}, seed {seed}: {commits_}" for seed, commits_ in _unequal(group, gated)]
     columns = [column(name, difference=True) for name in differences]
     columns += [Column(f"{column(name).name.partition(' [')[0]} ratio", 2) for name in ratios]
-    notes = ("Δ: smoe less alpha; ratio: smoe over alpha; of seeds that both have. The paper's are of its printed "
-             "averages over a data set.", SPREAD_NOTE, *_shared_notes(_rows(groups)))
+    papers = " The paper's are of its printed averages over a data set." if is_papers else ""
+    notes = (f"Δ: {blend} less {base}; ratio: {blend} over {base}; of seeds that both have.{papers}", SPREAD_NOTE,
+             *_shared_notes(_rows(groups)))
     if unequal:
-        notes += (f"alpha and smoe are of different commits in {len(unequal)} "
+        notes += (f"{base} and {blend} are of different commits in {len(unequal)} "
                   f"{'pair' if len(unequal) == 1 else 'pairs'}: {some(unequal, MOST_PAIRS)}.",)
-    return without_empty_columns(Table("deltas", "smoe against alpha, all else equal",
+    return without_empty_columns(Table("deltas" if is_papers else f"deltas_{blend}_{base}",
+                                       f"{blend} against {base}, all else equal",
                                        ("scene", "method", "threshold", "seeds"), tuple(columns), tuple(rows), notes))
 
 
 def cells(groups: Sequence[Group]) -> Table:
     """Every setting on every scene, averaged over seeds, with all that was measured."""
     names = ["psnr", "psnr_float", "psnr_edge", "ssim", *lpips_figures(_rows(groups)), "num_gaussians", "size_own_mb",
-             "size_common_mb", "train_seconds", "wall_seconds", "fps", "peak_gpu_mib"]
+             "size_common_mb", "train_seconds", "wall_seconds", "fps", "peak_gpu_mib", "learned_gate"]
     rows = [TableRow((group.scene, group.setting.label(), group.setting.amount(), group.seeds()),
                      tuple(_seeds_cell(group, name) for name in names)) for group in groups]
     return without_empty_columns(Table("cells", "All settings", ("scene", "method", "threshold", "seeds"),
@@ -211,9 +217,9 @@ def _averages(setting: Setting, settings: Dict[Setting, Dict[str, Group]], scene
 
 def _beside(setting: Setting, settings: Dict[Setting, Dict[str, Group]], scenes: Sequence[str]) -> List[Group]:
     """What takes its averages of the same seeds: every scene, in alpha and smoe too where these have all scenes."""
-    modes = [by_scene for other, by_scene in settings.items() if other == setting
-             or (other.pair == setting.pair and other.blend_mode in COMPARED)]
-    return [by_scene[scene] for by_scene in modes for scene in scenes
+    blends = [by_scene for other, by_scene in settings.items() if other == setting
+             or (other.pair == setting.pair and other.mode in COMPARED)]
+    return [by_scene[scene] for by_scene in blends for scene in scenes
             if all(scene in by_scene and by_scene[scene].rows for scene in scenes)]
 
 
@@ -229,10 +235,10 @@ def _seed_notes(settings: Dict[Setting, Dict[str, Group]], places: Sequence[Sequ
     for setting in settings:
         for groups in (_beside(setting, settings, scenes) for scenes in places):
             for seed in sorted(_seeds(groups)[1]):
-                lacking = [f"{group.setting.blend_mode} "
+                lacking = [f"{group.setting.blend} "
                            f"{'failed' if any(row['seed'] == seed for row in group.failed) else 'was not run'} on "
                            f"{group.scene}" for group in groups if seed not in group.done()]
-                notes.append(f"{setting.end}, {setting.label(blend_mode=False)}: averages leave seed {seed} out, "
+                notes.append(f"{setting.end}, {setting.label(blend=False)}: averages leave seed {seed} out, "
                              f"since {', '.join(lacking)}.")
     return list(dict.fromkeys(notes))
 

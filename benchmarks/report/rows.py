@@ -8,19 +8,24 @@ import re
 import statistics
 from typing import Any, Callable, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Set, Tuple
 
+from ...settings import BLEND_MODES
+from ...trainer.config import LEARNED
 from ..errors import BenchError
+from ..methods.names import blend_of
 from ..results_folder import CELLS_FOLDER, ROW_NAME, ROWS_NAME
 
 Row = Dict[str, Any]
 
 NUMBER = (int, float)
+GATE = (*NUMBER, str)  # of the background: a number, or LEARNED
 NEEDED = {"cell": str, "suite": str, "ok": bool, "method": str, "blend_mode": str, "scene": str, "seed": int}
 # What else is read of a row; each may be absent or null.
 OPTIONAL = {**dict.fromkeys(("label", "variant", "schedule", "dataset", "end", "reason"), str),
             **dict.fromkeys(("budget", "iterations"), int),
             **dict.fromkeys(("densify_grad_threshold", "psnr", "psnr_float", "psnr_edge", "ssim", "num_gaussians",
                              "train_seconds", "wall_seconds", "fps", "peak_gpu_mib"), NUMBER),
-            **dict.fromkeys(("size_bytes", "lpips", "protocol", "commit", "machine"), dict), "lpips_all": list}
+            **dict.fromkeys(("size_bytes", "lpips", "protocol", "commit", "machine"), dict), "lpips_all": list,
+            "background_gate": GATE}
 PARTS = {"size_bytes": {"own": NUMBER, "common": NUMBER}, "lpips": {"kind": str, "value": NUMBER},
          "machine": {"device": str, "cells_per_gpu": int, "cells_at_once": int}}
 LARGEST = 1e18  # of a number that is a figure
@@ -45,7 +50,7 @@ class Setting(NamedTuple):
     method: str
     name: str  # the method's label in the suite: it tells apart what the other fields do not
     variant: Optional[str]
-    blend_mode: str
+    blend: str  # as `blend_of` has it: each gate of smoe is a blend of its own
     schedule: Optional[str]
     threshold: Optional[float]
     budget: Optional[int]
@@ -59,8 +64,13 @@ class Setting(NamedTuple):
 
     @property
     def pair(self) -> "Setting":
-        """The setting without the blend mode: what alpha and smoe are compared in."""
-        return self._replace(blend_mode="")
+        """The setting without the blend: what alpha and smoe are compared in."""
+        return self._replace(blend="")
+
+    @property
+    def mode(self) -> str:
+        """The blend mode, whatever the gate."""
+        return self.blend.partition(" ")[0]
 
     @property
     def source(self) -> str:
@@ -68,11 +78,11 @@ class Setting(NamedTuple):
         told = self.variant in (None, "native", "patched") or self.variant in self.name
         return self.name if told else f"{self.name}-{self.variant}"
 
-    def label(self, blend_mode: bool = True) -> str:
+    def label(self, blend: bool = True) -> str:
         """Such as "native, smoe, steady"."""
         words = [self.source]
-        if blend_mode:
-            words.append(self.blend_mode)
+        if blend:
+            words.append(self.blend)
         if self.schedule not in (None, PAPER_SCHEDULE):
             words.append(self.schedule)
         if self.budget is not None:
@@ -179,7 +189,8 @@ def check_row(row: Row, place: str) -> None:
         raise ReportError(f"{place}: the row lacks {', '.join(missing)}, which those of `dsmoe bench run` have")
     for name, value, kind in _fields(row):
         if (value is not None or name in NEEDED) and not _legal(name, value, kind):
-            wanted = {int: "a whole number", NUMBER: "a finite number"}.get(kind) or f"of type {kind.__name__}"
+            wanted = {int: "a whole number", NUMBER: "a finite number", GATE: f"a finite number or {LEARNED!r}"}.get(
+                kind) or f"of type {kind.__name__}"
             raise ReportError(f"{place}: {name} is {value!r}; it must be {wanted}")
 
 
@@ -196,6 +207,8 @@ def _fields(row: Row) -> Iterator[Tuple[str, Any, Any]]:
 
 
 def _legal(name: str, value: Any, kind: Any) -> bool:
+    if kind is GATE:
+        return value == LEARNED or _legal(name, value, NUMBER)
     if not isinstance(value, kind) or isinstance(value, bool) != (kind is bool):
         return False
     if kind not in (int, NUMBER):
@@ -223,7 +236,8 @@ def _rules(row: Row) -> Iterator[Tuple[str, Any]]:
 
 
 def figure(row: Row, name: str) -> Optional[float]:
-    """A figure of a row by its name: a field; size_own_mb, size_common_mb, num_gaussians_m; lpips:KIND.
+    """A figure of a row by its name: a field; size_own_mb, size_common_mb, num_gaussians_m; learned_gate;
+    lpips:KIND.
 
     None where it was not measured, and for times of a cell that shared its machine.
     """
@@ -236,6 +250,8 @@ def figure(row: Row, name: str) -> Optional[float]:
     if name in ("size_own_mb", "size_common_mb"):
         size = (row.get("size_bytes") or {}).get(name[len("size_"):-len("_mb")])
         return None if size is None else size / MEGABYTE
+    if name == "learned_gate":
+        return (row.get("protocol") or {}).get("background_gate") if row.get("background_gate") == LEARNED else None
     if name == "num_gaussians_m":
         count = row.get("num_gaussians")
         return None if count is None else count / 1e6
@@ -277,13 +293,13 @@ def _lpips(row: Row) -> List[Row]:
 
 def setting_of(row: Row, end_of: Callable[[Row], Optional[str]]) -> Setting:
     """The setting of a row; end_of says to which end of the paper's tables a row belongs."""
-    return Setting(row["method"], row.get("label") or row["method"], row.get("variant"), row["blend_mode"],
+    return Setting(row["method"], row.get("label") or row["method"], row.get("variant"), blend_of(row),
                    row.get("schedule"), row.get("densify_grad_threshold"), row.get("budget"), row.get("iterations"),
                    end_of(row))
 
 
 def grouped(rows: Iterable[Row], end_of: Callable[[Row], Optional[str]]) -> List[Group]:
-    """Groups of seeds, in the order of scene, method, schedule, threshold (the largest first), blend mode."""
+    """Groups of seeds, in the order of scene, method, schedule, threshold (the largest first), blend."""
     found: Dict[Tuple[Setting, str], List[Row]] = {}
     for row in rows:
         members = found.setdefault((setting_of(row, end_of), row["scene"]), [])
@@ -298,11 +314,10 @@ def grouped(rows: Iterable[Row], end_of: Callable[[Row], Optional[str]]) -> List
 
 def order(setting: Setting) -> Tuple:
     """A sort key: methods as one list, thresholds from sparse to dense, alpha before the gated modes."""
-    modes = ("alpha", "smoe", "smoe_tn", "smoe_std")
-    mode = modes.index(setting.blend_mode) if setting.blend_mode in modes else len(modes)
+    mode = BLEND_MODES.index(setting.mode) if setting.mode in BLEND_MODES else len(BLEND_MODES)
     return (setting.method != "native", setting.method, setting.name, setting.variant or "", setting.schedule or "",
             setting.budget is not None, setting.budget or 0, setting.iterations or 0, setting.end != "sparse",
-            -(setting.threshold or 0), mode, setting.blend_mode)
+            -(setting.threshold or 0), mode, setting.blend)
 
 
 def safe_name(name: str) -> str:

@@ -24,7 +24,7 @@ ERROR_COLORS = "inferno"
 def collect(results: str, suite: str, rows: Sequence[Row], output: str) -> List[Dict[str, Any]]:
     """Copies the images of a suite's cells to OUTPUT/images and draws their errors.
 
-    Of several seeds that is taken which the most blend modes have images of. Returns for every scene, with paths
+    Of several seeds that is taken which the most blends have images of. Returns for every scene, with paths
     relative to OUTPUT:
       {"scene", "settings": [{"label", "views": [{"name", "width", "height", "layers": [{"label", "path", "note"}]}]}]}
     """
@@ -37,7 +37,7 @@ def collect(results: str, suite: str, rows: Sequence[Row], output: str) -> List[
         settings = []
         for number, groups in enumerate(pairs.values()):
             folder = os.path.join(IMAGES_FOLDER, safe_name(f"{suite}-{scene}-{number}"))
-            label = groups[0].setting.label(blend_mode=False)
+            label = groups[0].setting.label(blend=False)
             settings.append({"label": f"{label}, threshold {groups[0].setting.amount()}"
                                       if groups[0].setting.threshold is not None or groups[0].setting.budget is not None
                                       else label,
@@ -61,11 +61,11 @@ def _images_of(results: str, group: Group) -> Dict[int, str]:
 
 
 def _views(results: str, groups: Sequence[Group], output: str, folder: str) -> List[Dict[str, Any]]:
-    """The views that every blend mode of a setting has, of one seed: the first of those that the most modes have."""
-    by_mode = {group.setting.blend_mode: _images_of(results, group) for group in groups}
-    seeds = sorted({seed for found in by_mode.values() for seed in found})
-    seed = max(seeds, key=lambda seed: sum(seed in found for found in by_mode.values()))
-    folders = {mode: found[seed] for mode, found in by_mode.items() if seed in found}
+    """The views that every blend of a setting has, of one seed: the first of those that the most have."""
+    by_blend = {group.setting.blend: _images_of(results, group) for group in groups}
+    seeds = sorted({seed for found in by_blend.values() for seed in found})
+    seed = max(seeds, key=lambda seed: sum(seed in found for found in by_blend.values()))
+    folders = {blend: found[seed] for blend, found in by_blend.items() if seed in found}
     names = set.intersection(*(set(os.listdir(os.path.join(source, kind))) for source in folders.values()
                                for kind in ("gt", "render")))
     views = []
@@ -76,7 +76,7 @@ def _views(results: str, groups: Sequence[Group], output: str, folder: str) -> L
         truth = _pixels(first)
         layers = [{"label": TRUTH, "path": _copied(first, output, folder, f"{stem}-truth.png"), "note": ""}]
         errors = []
-        for mode, source in folders.items():
+        for blend, source in folders.items():
             own_truth = _pixels(os.path.join(source, "gt", name))
             image = _pixels(os.path.join(source, "render", name))
             if own_truth.shape != truth.shape or (own_truth != truth).any() or image.shape != truth.shape:
@@ -84,11 +84,11 @@ def _views(results: str, groups: Sequence[Group], output: str, folder: str) -> L
                                   f"not that of {first} {truth.shape}: these cells cannot be compared")
             decibels = psnr(*(torch.from_numpy(pixels.transpose(2, 0, 1).astype(np.float32)) / 255
                               for pixels in (image, truth)))
-            path = _copied(os.path.join(source, "render", name), output, folder, f"{stem}-{mode}.png")
-            layers.append({"label": mode, "path": path, "note": f"{decibels:.2f} dB"})
-            path = os.path.join(folder, f"{stem}-{mode}-error.png")
+            path = _copied(os.path.join(source, "render", name), output, folder, f"{stem}-{safe_name(blend)}.png")
+            layers.append({"label": blend, "path": path, "note": f"{decibels:.2f} dB"})
+            path = os.path.join(folder, f"{stem}-{safe_name(blend)}-error.png")
             Image.fromarray(error_image(truth, image)).save(os.path.join(output, path))
-            errors.append({"label": f"error of {mode}", "path": _url(path), "note": f"{decibels:.2f} dB"})
+            errors.append({"label": f"error of {blend}", "path": _url(path), "note": f"{decibels:.2f} dB"})
         views.append({"name": os.path.splitext(name)[0], "width": truth.shape[1], "height": truth.shape[0],
                       "layers": layers + errors})
     return views

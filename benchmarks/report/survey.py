@@ -23,7 +23,7 @@ def folder_of(group: Group, datasets: Dict[str, Sequence[str]]) -> str:
 
 def submethod(group: Group) -> str:
     """The survey shows rows with a submethod in its table, others in its plots only; it appends the name to ours."""
-    words = [group.setting.source, group.setting.blend_mode]
+    words = [group.setting.source, group.setting.blend.replace(" ", "-")]
     if group.setting.schedule not in (None, PAPER_SCHEDULE):
         words.append(group.setting.schedule)
     if group.setting.budget is not None:

@@ -25,6 +25,7 @@ FIGURES: Dict[str, Tuple[str, int]] = {
     "wall_seconds": ("wall [s]", 0),
     "fps": ("FPS", 0),
     "peak_gpu_mib": ("GPU peak [MiB]", 0),
+    "learned_gate": ("learned gate", 3),
 }
 LPIPS_NAMES = {"lpips_alex": "LPIPS Alex", "lpips_vgg_std": "LPIPS VGG", "lpips_vgg_inria": "LPIPS VGG as 3DGS",
                "paper": "LPIPS, paper's"}
