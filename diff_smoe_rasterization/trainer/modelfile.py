@@ -83,15 +83,18 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
 
     A file that records `smoe` and no gate is an older one, trained with 0. Raises TrainerError.
     """
-    gate = recorded.background_gate
     if blend_mode != "smoe":
-        gate = float(resolve_background_gate(blend_mode, None))  # the mode's own
-    elif gate is None and recorded.blend_mode is not None:
+        own = float(resolve_background_gate(blend_mode, None))
+        for said in (recorded.background_gate, asked):
+            if said not in (None, own):
+                raise TrainerError(f"{path}: the background gate is {said:g}; in the blend mode {blend_mode} it is {own:g}")
+        return own
+    gate = recorded.background_gate
+    if gate is None and recorded.blend_mode is not None:
         gate = 0.0
-    for said in (recorded.background_gate, asked):
-        if gate is not None and said is not None and said != gate:
-            raise TrainerError(f"{path} was trained with the background gate {gate:g} ({blend_mode}), not {said:g}; "
-                               "with another one its Gaussians show another scene")
+    if gate is not None and asked is not None and asked != gate:
+        raise TrainerError(f"{path} was trained with the background gate {gate:g}, not {asked:g}; "
+                           "with another one its Gaussians show another scene")
     if gate is None and asked is None:
         raise TrainerError(f"{path} does not say which background gate it was trained with (no `comment "
                            "background_gate`); pass --background-gate, which is 0 for the paper's Eq. 7")

@@ -43,7 +43,7 @@ def kill_at(monkeypatch, iteration):
 @pytest.mark.parametrize("blend_mode, killed_at", [("alpha", 26), ("smoe", 26), ("smoe", 11), ("smoe", 39)])
 def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, blend_mode, killed_at):
     """Checkpoints are at 10, 20, 30; densifications at 8, 16, 24 and resets at 12, 24 lie on both sides."""
-    straight = dataclasses.replace(tiny_config, blend_mode=blend_mode, output=str(tmp_path / "straight"))
+    straight = tiny_config.changed(blend_mode=blend_mode, output=str(tmp_path / "straight"))
     row = train(straight, progress=False)
     broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
     with monkeypatch.context() as patch:
@@ -186,7 +186,7 @@ def test_other_options_cannot_be_resumed(tiny_config):
     with pytest.raises(TrainerError, match="--seed is 0 .* 1 "):
         train(dataclasses.replace(tiny_config, seed=1), resume=True, progress=False)
     with pytest.raises(TrainerError, match="--blend-mode"):
-        train(dataclasses.replace(tiny_config, blend_mode="alpha"), resume=True, progress=False)
+        train(tiny_config.changed(blend_mode="alpha"), resume=True, progress=False)
 
 
 def test_a_run_is_not_overwritten_unasked(tiny_config):
@@ -270,7 +270,7 @@ def test_views_come_once_each_in_random_order():
 
 def test_training_lowers_the_loss(tiny_config, mode):
     """The whole loop learns: a fixed set of Gaussians, the loss of the first and of a later pass over the views."""
-    config = dataclasses.replace(tiny_config, blend_mode=mode, densify_until_iter=0, iterations=200)
+    config = tiny_config.changed(blend_mode=mode, densify_until_iter=0, iterations=200)
     trainer = Trainer(config, load_scene(config, progress=False))
     losses = [float(trainer.step().loss.detach()) for _ in range(20 * 7)]
     assert sum(losses[-7:]) < 0.9 * sum(losses[:7]), losses
