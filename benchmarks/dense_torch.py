@@ -13,7 +13,7 @@ import math
 import torch
 
 from diff_smoe_rasterization import reference
-from diff_smoe_rasterization.settings import resolve_blend_mode
+from diff_smoe_rasterization.settings import resolve_background_gate, resolve_blend_mode
 
 TILE = reference.TILE
 
@@ -126,8 +126,12 @@ def blend_tile(rows, x, y, settings, mode):
     with torch.no_grad():
         skipped = raw < reference.ALPHA_MIN if mode == "alpha" else kernel < reference.KERNEL_MIN
         skipped |= power > 0
+        gate = resolve_background_gate(mode, settings.background_gate)
         if mode != "alpha" and settings.alpha_min > 0:
             skipped |= raw < settings.alpha_min
+        if mode == "smoe" and gate > 0:
+            least = float(torch.tensor(gate, dtype=torch.float32) * reference.ALPHA_MIN)  # rounded as float32
+            skipped |= raw < (opacity * reference.KERNEL_KEPT).clamp(max=least)
     alpha = reference._PassThroughClamp.apply(raw.masked_fill(skipped, 0))
 
     weight = alpha
@@ -141,6 +145,9 @@ def blend_tile(rows, x, y, settings, mode):
         blended = weight @ (color - settings.bg) + settings.bg  # the transmittance left over is 1 - sum of weights
     else:
         gate_sum = (weight if mode == "smoe" else alpha).sum(1, keepdim=True)
-        has_gate = gate_sum >= reference.GATE_SUM_MIN
-        blended = torch.where(has_gate, weight @ color / gate_sum.masked_fill(~has_gate, 1), settings.bg)
+        background = gate * (1 - gate_sum)
+        total = gate_sum + background
+        has_gate = total >= reference.GATE_SUM_MIN
+        blended = weight @ color + background * settings.bg
+        blended = torch.where(has_gate, blended / total.masked_fill(~has_gate, 1), settings.bg)
     return blended.T.reshape(-1, len(y), len(x))

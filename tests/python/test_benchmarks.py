@@ -28,22 +28,23 @@ def same_number_of_threads_afterwards():
 
 def test_the_command_measures_every_case(tmp_path, capsys):
     path = tmp_path / "out.json"
-    assert cpu_rasterizer.main(["--synthetic", "300", "--repeats", "1", "--threads", "1,2", "--modes", "alpha,smoe",
+    assert cpu_rasterizer.main(["--synthetic", "300", "--repeats", "1", "--threads", "1,2", "--modes", "alpha,smoe,smoe:0.5",
                                 "--no-memory", "--json", str(path)]) == 0
     rows = {(row["mode"], row["threads"]): row for row in json.loads(path.read_text(encoding="utf-8"))["rows"]}
-    assert sorted(rows) == [("alpha", 1), ("alpha", 2), ("smoe", 1), ("smoe", 2)]
+    assert sorted(rows) == [(mode, threads) for mode in ("alpha", "smoe", "smoe:0.5") for threads in (1, 2)]
     for row in rows.values():
         stages = [row[name] for name in cpu_rasterizer.STAGES]
         assert min(stages) > 0
         assert sum(stages) <= row["total"]
-        # A gate reaches 4.8 sigma, an alpha at most 3.33: more pairs are walked. Threads change nothing.
-        assert 0 < rows["alpha", 1]["forward_pairs"] < rows["smoe", 1]["forward_pairs"]
+        # A gate reaches 4.8 sigma, an alpha at most 3.33, the background's gate lies between. Threads change nothing.
+        assert 0 < rows["alpha", 1]["forward_pairs"] < rows["smoe:0.5", 1]["forward_pairs"]
+        assert rows["smoe:0.5", 1]["forward_pairs"] < rows["smoe", 1]["forward_pairs"]
         assert row["forward_pairs"] == rows[row["mode"], 1]["forward_pairs"]
     assert "times the floor" in capsys.readouterr().out
 
 
 def test_the_command_refuses_what_does_not_fit(capsys):
-    for arguments, reason in ((["--synthetic", "9", "--modes", "beta"], "--modes"), ([], "--synthetic"),
+    for arguments, reason in ((["--synthetic", "9", "--modes", "alpha:0.5"], "--modes"), ([], "--synthetic"),
                               (["--ply", "a.ply"], "--scene"), (["--synthetic", "9", "--views", "1"], "--views")):
         with pytest.raises(SystemExit):
             cpu_rasterizer.main(arguments)
@@ -109,8 +110,11 @@ def test_the_gpu_command_refuses_what_does_not_fit(capsys, tmp_path):
     (tmp_path / "gsplat").mkdir()  # empty: not installed
     options = gpu_rasterizer.parse(["--synthetic", "9", "--peers-path", str(tmp_path)])
     assert options.renderers[:2] == ["inria", "ours alpha"] and "gsplat" not in options.renderers
+    options = gpu_rasterizer.parse(["--synthetic", "9", "--renderers", "ours smoe:0.3,ours smoe,ours alpha"])
+    assert options.renderers == ["ours alpha", "ours smoe", "ours smoe:0.3"]
     for arguments, reason in (([], "--synthetic"), (["--ply", "a.ply"], "--scene"),
                               (["--synthetic", "9", "--renderers", "none"], "--renderers"),
+                              (["--synthetic", "9", "--renderers", "ours alpha,ours smoe:-1"], "--renderers"),
                               (["--synthetic", "9", "--renderers", "ours smoe"], "--renderers")):
         with pytest.raises(SystemExit):
             gpu_rasterizer.parse(arguments)
@@ -121,7 +125,7 @@ def test_the_gpu_command_refuses_what_does_not_fit(capsys, tmp_path):
 def test_the_gpu_command_measures(tmp_path, capsys):
     path = tmp_path / "out.json"
     assert gpu_rasterizer.main(["--synthetic", "3000", "--repeats", "2", "--warmup", "1", "--renderers",
-                                "ours alpha,ours smoe,ours alpha deterministic", "--json", str(path)]) == 0
+                                "ours alpha,ours smoe:0.3,ours alpha deterministic", "--json", str(path)]) == 0
     rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
     assert [row.get("error") for row in rows] == [None] * 3
     assert all(row["forward_ms"] > 0 and row["total_ms"] > 0 and row["peak_mib"] > 0 for row in rows)

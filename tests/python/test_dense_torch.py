@@ -19,8 +19,9 @@ import dense_torch  # noqa: E402
 TOLERANCE = 1e-9
 
 
-def compare(mode, **scene_options):
+def compare(mode, gate=None, **scene_options):
     scene = random_scene(mode, **scene_options)
+    scene = scene._replace(settings=scene.settings._replace(background_gate=gate))
     expected, expected_gradients = gradients(reference_rasterize, scene, camera=False)
     assert_not_empty(expected, scene.settings)
 
@@ -39,9 +40,9 @@ def compare(mode, **scene_options):
     assert torch.equal(rendered, image)
 
 
-@pytest.mark.parametrize("mode", BLEND_MODES)
-def test_image_and_gradients_are_those_of_the_reference(mode):
-    compare(mode)
+@pytest.mark.parametrize("mode, gate", [*((mode, None) for mode in BLEND_MODES), ("smoe", 0.05)])
+def test_image_and_gradients_are_those_of_the_reference(mode, gate):
+    compare(mode, gate)
 
 
 @pytest.mark.parametrize("mode", BLEND_MODES)

@@ -6,6 +6,8 @@ import json
 import numpy as np
 from PIL import Image
 
+from diff_smoe_rasterization.benchmarks.methods.names import blend_of
+
 PROTOCOL = {"split": "sorted by name, every 8th is a test image", "resolution": -1, "image_size": [48, 32],
             "downscaler": "pillow bicubic", "background": "black", "principal_point": "scene",
             "psnr": "8-bit images, mean over test views", "sh_degree": 3, "train_views": 9, "test_views": 2,
@@ -24,9 +26,9 @@ def row(scene="bonsai", blend_mode="alpha", threshold=0.005, seed=0, psnr=20.0, 
               "wall_seconds": 120.0, "fps": 200.0, "peak_gpu_mib": None, "protocol": dict(PROTOCOL),
               "commit": {"project": "abc1234", "trainer": None}, "machine": {"device": "Card X"}, "history": []}
     fields.update(changes)
-    name = "-".join(str(fields[part]) for part in ("suite", "method", "scene", "blend_mode", "schedule",
-                                                    "densify_grad_threshold", "seed"))
-    return {"cell": name, **fields}
+    parts = ("suite", "method", "scene", "blend", "schedule", "densify_grad_threshold", "seed")
+    named = {**fields, "blend": blend_of(fields)}
+    return {"cell": "-".join(str(named[part]) for part in parts), **fields}
 
 
 def failed(reason="out of memory", **changes):

@@ -121,7 +121,6 @@ def small(scene, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", ABOVE)
         patch.setenv("OMP_NUM_THREADS", "1")
-        patch.delenv("DSMOE_BLEND_MODE", raising=False)
         patch.setattr(shapes.ThreeDGS, "container", "point_cloud.npz")  # the small trainers write no .ply,
         patch.setattr(shapes.HAC, "own_bytes", shapes.ThreeDGS.own_bytes)  # and no bitstreams
         yield SmallTrainers(scene, tmp_path_factory.mktemp("small"))
@@ -176,10 +175,18 @@ def test_the_figures_are_those_of_the_pictures(small):
     assert row["psnr"] == pytest.approx(-10 * np.log10(((gt - render) ** 2).mean()), abs=1e-3)
 
 
-@pytest.mark.parametrize("other", [{"seed": 1}, {"blend_mode": "alpha"}])
-def test_mode_and_seed_reach_the_trainer(other, small):
+@pytest.mark.parametrize("other", [{"seed": 1}, {"blend_mode": "alpha"}, {"background_gates": [0.3]}])
+def test_blend_and_seed_reach_the_trainer(other, small):
     (one, _), (changed, _) = small.run("3dgs-2023"), small.run("3dgs-2023", **other)
     assert one["ok"] and changed["ok"] and one["psnr"] != changed["psnr"]
+
+
+def test_no_variable_decides_a_blend(small, monkeypatch):
+    variables = {"DSMOE_BLEND_MODE": "smoe", "DSMOE_BACKGROUND_GATE": "0.3"}
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    cell = small.cell("3dgs-2023")
+    assert not set(variables) & set(shapes.ThreeDGS(cell, shapes.config_of(cell), "out").environment())
 
 
 def test_steady_means_neither_reset_nor_size_prune(small):
@@ -265,7 +272,7 @@ def test_the_peak_of_a_command_ends_with_the_bar_of_its_training(monkeypatch):
 
 
 def test_the_arguments_of_a_compression_are_not_those_of_the_training_before_it(small):
-    mode = ["--blend_mode", "smoe"]
+    mode = ["--blend_mode", "smoe", "--background_gate", "0.0"]
     for name, last in (("taming", [*mode, "--budget", "5"]), ("c3dgs", mode)):
         cell = small.cell(name, arguments=["--budget", 5])
         words = shapes.SHAPES[name](cell, shapes.config_of(cell), "out").train_arguments()
@@ -338,7 +345,7 @@ def test_a_fused_checkout_is_a_copy_of_its_own(small, tmp_path):
     losses = [Path(path, "utils", "loss_utils.py").read_text() for path in (cell["method"]["path"], patched)]
     assert ["@fused_where_equal" in text for text in losses] == [True, False]
     row = row_of(cell, tmp_path / "out")
-    assert row["ok"] and row["variant"] == "fused" and row["protocol"]["arguments"][-2:] == ["--blend_mode", "smoe"]
+    assert row["ok"] and row["variant"] == "fused" and row["protocol"]["arguments"][-4:-1] == ["--blend_mode", "smoe", "--background_gate"]
     # A checkout that was fused already is used as it is, and is not the patched one.
     without_record = str(tmp_path / "without record")
     shutil.copytree(cell["method"]["path"], without_record, ignore=shutil.ignore_patterns(".dsmoe_patch"))

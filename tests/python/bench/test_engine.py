@@ -16,6 +16,7 @@ from bench_commands import command, environment, rows_of, wait_for
 from diff_smoe_rasterization.benchmarks import engine, preparation, selection
 from diff_smoe_rasterization.benchmarks.cell import failed_row
 from diff_smoe_rasterization.benchmarks.errors import BenchError
+from diff_smoe_rasterization.benchmarks.methods.names import blend_of
 from diff_smoe_rasterization.benchmarks.suite import expand
 from diff_smoe_rasterization.cli import main
 
@@ -468,6 +469,9 @@ def test_cells_are_chosen_by_their_fields(content):
     found = selection.chosen(suite.cells, ["blend_mode=smoe", "seed=0", "seed=1", "densify_grad_threshold=5e-3"])
     assert [(cell["blend_mode"], cell["seed"]) for cell in found] == [("smoe", 0), ("smoe", 1)]
     assert len(selection.chosen(suite.cells, ["headline=true"])) == 2
+    gates = expand({**content, "background_gates": [0, 0.05, "learned"]}, "").cells
+    for text, blend in (("5e-2", "smoe 0.05"), ("0", "smoe"), ("1", "alpha"), ("learned", "smoe learned")):
+        assert [blend_of(cell) for cell in selection.chosen(gates, ["background_gate=" + text])] == [blend]
     with pytest.raises(BenchError, match="--only blend_mode=smoe_std: .* alpha, smoe"):
         selection.chosen(suite.cells, ["blend_mode=smoe_std"])
     for wrong in ("blend_mode", "mode=alpha"):

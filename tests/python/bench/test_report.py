@@ -161,6 +161,29 @@ def test_deltas_are_of_the_seeds_that_both_modes_have():
     assert shown(table_of(same, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "0.00"
 
 
+def test_each_gate_of_smoe_is_a_blend_of_its_own():
+    """Rows of before there were gates are of gate 0; each gate is compared with alpha and with that."""
+    smoe = {"blend_mode": "smoe"}
+    entries = [row(background_gate=1.0), row(psnr=21.0, **smoe), row(psnr=23.0, seed=1, background_gate=0.0, **smoe),
+               row(psnr=24.5, background_gate=0.05, **smoe), row(blend_mode="smoe_tn", background_gate=0.0),
+               row(psnr=24.0, background_gate="learned", protocol={"background_gate": 0.25}, **smoe)]
+    lines = [line for line in table_of(entries, "cells").rows]
+    assert [line.labels[1].partition(", ")[2] for line in lines] == ["alpha", "smoe", "smoe 0.05", "smoe learned",
+                                                                     "smoe_tn"]
+    assert shown(table_of(entries, "cells"), method="native, smoe", seeds="2")["PSNR [dB]"] == "22.00 ± 1.41"
+    assert shown(table_of(entries, "cells"), method="native, smoe learned")["learned gate"] == "0.250"
+    for name, title, delta in (("deltas", "smoe against alpha", "+1.00"),
+                               ("deltas_smoe_0.05_alpha", "smoe 0.05 against alpha", "+4.50"),
+                               ("deltas_smoe_0.05_smoe", "smoe 0.05 against smoe", "+3.50"),
+                               ("deltas_smoe_learned_smoe", "smoe learned against smoe", "+3.00")):
+        table = table_of(entries, name)
+        assert table.title == f"{title}, all else equal" and shown(table, seeds="1")["Δ PSNR [dB]"] == delta
+        assert any(line.source == tables.PAPER for line in table.rows) == (name == "deltas")
+    shared_out = table_of([*entries, row(seed=1)], "table1")  # averages of all gates are of the seeds they share
+    assert shown(shared_out, method="native, smoe")["Mip-NeRF 360 (ours: bonsai) PSNR [dB]"] == "21.00"
+    assert survey.submethod(rows.grouped(entries, layouts.end_of)[2]) == "-native-smoe-0.05-t0.005"
+
+
 def test_deltas_hold_all_else_equal():
     entries = [row(), row(blend_mode="smoe", threshold=0.001), row(blend_mode="smoe", schedule="steady"),
                row("fox", blend_mode="smoe"), row(blend_mode="smoe", label="native, capped")]
@@ -409,7 +432,7 @@ def test_damaged_results_are_refused(tmp_path, text, reason):
     ("train_seconds", 10 ** 400), ("seed", True), ("budget", "1"), ("iterations", [1]), ("label", 1),
     ("lpips_all", [1]), ("lpips_all", [{"kind": 1}]), ("lpips", {"kind": "lpips_alex", "value": "0.3"}),
     ("size_bytes", 3), ("size_bytes", {"own": "3"}), ("densify_grad_threshold", "0.005"), ("protocol", []),
-    ("machine", "Card X"), ("machine", {"cells_per_gpu": "2"}), ("commit", "abc")])
+    ("background_gate", "0.05"), ("background_gate", math.nan), ("machine", "Card X"), ("machine", {"cells_per_gpu": "2"}), ("commit", "abc")])
 def test_a_field_of_another_type_is_refused(tmp_path, name, value):
     with pytest.raises(ReportError, match=rf"rows.jsonl, line 2: {name}[\[\]0-9]*(\.\w+)? is .*; it must be "):
         rows.read_rows(write_rows(tmp_path, [row(), {**row(blend_mode="smoe"), name: value}]))

@@ -113,12 +113,13 @@ def test_the_legend_lies_inside_and_above_the_panels(draw, methods):
     assert box.y0 >= max(axis.get_window_extent().y1 for axis in drawn.axes)
 
 
-def test_blend_modes_differ_by_more_than_colour():
-    entries = [row(blend_mode=mode) for mode in curves.MARKS]
-    styles = curves._styles(groups_of(entries))
-    for part in range(3):
-        assert len({marks[part] for _, marks in styles.values()}) == 4
-    assert len({color for color, _ in styles.values()}) == 4
+def test_blends_differ_by_more_than_colour():
+    modes = [row(blend_mode=mode) for mode in curves.MARKS]
+    gates = [row(blend_mode="smoe", background_gate=gate) for gate in (0.05, 0.3, "learned")]
+    for entries, parts in ((modes, (0, 1, 2)), (modes[:2] + gates, (0, 2))):  # gates: by mark and hatch
+        styles = curves._styles(groups_of(entries))
+        assert all(len({marks[part] for _, marks in styles.values()}) == len(entries) for part in parts)
+        assert len({color for color, _ in styles.values()}) == len(entries)
 
 
 def test_what_was_not_measured_is_not_drawn(tmp_path):

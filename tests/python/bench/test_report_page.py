@@ -167,17 +167,17 @@ def test_text_of_rows_is_text(written):
 
 
 def test_renderings_are_copied_byte_for_byte(tmp_path):
-    entry = row()
+    entry = row(blend_mode="smoe", background_gate=0.05)
     write_images(tmp_path / "results", entry, ALPHA, names=("a b",))
     found = sliders.collect(str(tmp_path / "results"), "s u", [entry], str(tmp_path))
     view, = found[0]["settings"][0]["views"]
-    truth, alpha, error = view["layers"]
+    truth, gated, error = view["layers"]
     source = tmp_path / "results" / "cells" / entry["cell"] / "images"
-    assert (tmp_path / alpha["path"]).read_bytes() == (source / "render" / "a b.png").read_bytes()
+    assert (tmp_path / gated["path"]).read_bytes() == (source / "render" / "a b.png").read_bytes()
     assert (tmp_path / truth["path"]).read_bytes() == (source / "gt" / "a b.png").read_bytes()
-    assert " " not in truth["path"] + alpha["path"] + error["path"]
+    assert " " not in truth["path"] + gated["path"] + error["path"]
     # One of three channels is off by 80 of 255: 10 log10(3 (255 / 80)^2)
-    assert alpha["note"] == error["note"] == "14.84 dB"
+    assert gated["note"] == error["note"] == "14.84 dB"
 
 
 def test_errors_take_the_whole_scale():

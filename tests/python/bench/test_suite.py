@@ -12,6 +12,7 @@ from diff_smoe_rasterization.benchmarks.methods import run
 from diff_smoe_rasterization.benchmarks.methods.checkout import SHAPES
 from diff_smoe_rasterization.benchmarks.methods.names import CHECKOUTS, LACKS
 from diff_smoe_rasterization.benchmarks.protocol import RECIPE, config_of, protocol_of
+from diff_smoe_rasterization.benchmarks.selection import earlier_rows
 from diff_smoe_rasterization.benchmarks.suite import SHIPPED, THRESHOLDS, expand, find_suite, load_suite
 from diff_smoe_rasterization.trainer.config import TrainConfig
 
@@ -19,7 +20,7 @@ pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip 
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 
 SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "captures", "captures_ablation",
-                 "captures_baselines")
+                 "captures_baselines", "gate", "gate_equal")
 
 
 def changed(content, **fields):
@@ -40,10 +41,22 @@ def test_cells_are_every_combination(content):
     assert len(suite.cells) == len(found) == len({cell["id"] for cell in suite.cells}) == 16
 
 
+def test_gates_are_of_smoe_alone(content):
+    """And a cell of gate 0 is the one that a suite without gates has, so that its rows stay."""
+    cells = expand(changed(content, blend_modes=["smoe_tn", "smoe", "alpha"],
+                           background_gates=["learned", 0, 0.05]), "").cells
+    assert [(cell["blend_mode"], cell["background_gate"], config_of(cell).background_gate) for cell in cells] == [
+        ("smoe_tn", 0, 0), ("smoe", "learned", "learned"), ("smoe", 0, 0), ("smoe", 0.05, 0.05), ("alpha", 1, 1)]
+    names = [cell["id"] for cell in cells]
+    assert [cell["id"] for cell in expand(content, "").cells] == [names[4], names[2]]
+    assert names[1].startswith("native_tiny_smoe-learned_3dgs_") and names[3].startswith("native_tiny_smoe-0.05_3dgs_")
+
+
 def test_a_cell_has_all_options_of_its_training(content):
     cell = expand(content, "").cells[1]
     config = config_of(cell, "out")
     assert (config.blend_mode, config.iterations, config.densify_grad_threshold) == ("smoe", 12, 0.005)
+    assert config.background_gate == 0  # whatever the trainer's default
     assert (config.densification_interval, config.eval_every, config.principal_point) == (4, 6, "scene")
 
 
@@ -95,8 +108,10 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tiny_scene, tmp_path
 
 
 @pytest.mark.parametrize("change, words", [
-    ({"blend_mode": ["alpha"]}, ["blend_mode", "allowed are blend_modes, densify_grad_thresholds"]),
+    ({"blend_mode": ["alpha"]}, ["blend_mode", "allowed are background_gates, blend_modes"]),
     ({"blend_modes": ["smooth"]}, ["blend_modes[0]", "smooth"]),
+    ({"background_gates": [-1]}, ["background_gates[0]", "-1"]),
+    ({"background_gates": ["leanred"]}, ["background_gates[0]", "leanred"]),
     ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
     ({"densify_grad_thresholds": ["5e-3"]}, ["densify_grad_thresholds[0]", "write 0.005"]),
     ({"seeds": []}, ["seeds"]),
@@ -228,6 +243,8 @@ def test_recipes_that_a_checkout_cannot_follow_are_refused(content):
     with pytest.raises(BenchError, match="lego, methods: 3dgs-2023: init_points is 10"):
         expand(on_cuda(content, methods=[{"name": "native"}, *methods], scenes=few), "")
     assert expand(on_cuda(content, scenes=few), "").cells
+    with pytest.raises(BenchError, match="methods: 3dgs-2023: background_gates: 'learned' is for the native"):
+        expand(on_cuda(content, methods=methods, background_gates=["learned"]), "")
 
 
 @pytest.mark.parametrize("name, option, value", [
@@ -311,6 +328,17 @@ def test_the_suite_of_the_readme_is_valid(monkeypatch):
     assert {cell["method"]["label"] for cell in cells} == {
         "native", "3dgs-2023", "3dgs-2023-unpatched", "3dgs-2023-fused", "c3dgs"}
     assert {cell["seed"] for cell in cells if cell["headline"]} == {0, 1, 2}
+
+
+def test_rows_from_before_there_were_gates_are_of_todays_cells(monkeypatch):
+    """They are of Eq. 7; the suite of gates has some of them."""
+    monkeypatch.setenv("DSMOE_DATA", "/somewhere")
+    monkeypatch.setenv("DSMOE_TRAINERS", "/somewhere")
+    rows = str(Path(__file__).resolve().parents[3] / "benchmarks" / "results" / "captures_h200.jsonl")
+    for name, lacking in (("captures", set()), ("gate", {0.05, 0.3, "learned"})):
+        cells = [cell for cell in load_suite(find_suite(name)).cells if cell["seed"] == 0]
+        found = earlier_rows(rows, cells)
+        assert {cell["background_gate"] for cell in cells if cell["id"] not in found} == lacking
 
 
 def test_every_shipped_suite_is_listed_here():
