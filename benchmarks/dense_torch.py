@@ -28,7 +28,7 @@ def rasterize_with_gradients(gaussians, settings, dL_dcolor=None):
         dL_dcolor: [C, H, W], or None to render only.
     Returns: the image [C, H, W], and a dict of gradients, a key an argument (None without dL_dcolor).
     """
-    mode = resolve_blend_mode(settings.blend_mode)
+    mode = "alpha" if settings.background_gate == 1 else resolve_blend_mode(settings.blend_mode)
     backward = dL_dcolor is not None
     leaves = {name: tensor.detach().clone().requires_grad_(backward) for name, tensor in gaussians.items()}
     with torch.set_grad_enabled(backward):

@@ -345,7 +345,8 @@ def test_a_fused_checkout_is_a_copy_of_its_own(small, tmp_path):
     losses = [Path(path, "utils", "loss_utils.py").read_text() for path in (cell["method"]["path"], patched)]
     assert ["@fused_where_equal" in text for text in losses] == [True, False]
     row = row_of(cell, tmp_path / "out")
-    assert row["ok"] and row["variant"] == "fused" and row["protocol"]["arguments"][-4:-1] == ["--blend_mode", "smoe", "--background_gate"]
+    assert row["ok"] and row["variant"] == "fused"
+    assert row["protocol"]["arguments"][-4:] == ["--blend_mode", "smoe", "--background_gate", "0.0"]
     # A checkout that was fused already is used as it is, and is not the patched one.
     without_record = str(tmp_path / "without record")
     shutil.copytree(cell["method"]["path"], without_record, ignore=shutil.ignore_patterns(".dsmoe_patch"))

@@ -60,6 +60,7 @@ def test_a_row_says_what_was_measured_and_how(finished):
     for name in ("psnr", "psnr_float", "ssim", "psnr_edge", "train_seconds", "wall_seconds", "fps"):
         assert row[name] > 0, name
     assert (row["method"], row["variant"], row["blend_mode"], row["schedule"]) == ("native", "native", "smoe", "3dgs")
+    assert row["background_gate"] == row["protocol"]["background_gate"] == 0
     assert row["size_bytes"]["common"] == row["num_gaussians"] * 236  # 59 numbers of 4 bytes
     assert row["size_bytes"]["own"] > row["size_bytes"]["common"]  # the file has normals and a header beside them
     protocol = row["protocol"]

@@ -260,13 +260,6 @@ def shared(cells_per_gpu=2, **changes):
                   "machine": {"device": "Card X", "cells_per_gpu": cells_per_gpu}})
 
 
-def test_times_of_cells_that_shared_a_cpu_are_left_out():
-    machine = {"device": "CPU X", "cells_at_once": 2}
-    table = table_of([row(machine=machine), row("fox", machine={**machine, "cells_at_once": 1})], "cells")
-    assert shown(table, scene="bonsai")["train [s]"] == "shared" and shown(table, scene="fox")["train [s]"] == "100"
-    assert layouts.SHARED_NOTE in table.notes
-
-
 def test_times_of_cells_that_shared_their_gpu_are_left_out():
     entries = [shared(), shared(blend_mode="smoe", psnr=21.0), shared(1, threshold=0.0002),
                row(threshold=0.0002, seed=1, train_seconds=9000.0), shared(threshold=0.0002, seed=2)]
@@ -290,8 +283,11 @@ def test_an_average_over_scenes_has_no_time_where_one_of_them_shared_its_gpu():
 
 
 def test_cells_that_were_alone_are_not_marked():
-    table = table_of([shared(1), row("fox"), row("lego", machine={"device": "Card X", "cells_at_once": 1})], "cells")
+    entries = [shared(1), row("fox"), row("lego", machine={"device": "CPU X", "cells_at_once": 1})]
+    table = table_of(entries, "cells")
     assert shown(table, scene="bonsai")["FPS"] == "3" and layouts.SHARED_NOTE not in table.notes
+    table = table_of([*entries, row("train", machine={"device": "CPU X", "cells_at_once": 2})], "cells")
+    assert shown(table, scene="train")["train [s]"] == "shared" and layouts.SHARED_NOTE in table.notes
 
 
 def test_a_failed_cell_is_a_row_with_its_reason():
@@ -432,7 +428,8 @@ def test_damaged_results_are_refused(tmp_path, text, reason):
     ("train_seconds", 10 ** 400), ("seed", True), ("budget", "1"), ("iterations", [1]), ("label", 1),
     ("lpips_all", [1]), ("lpips_all", [{"kind": 1}]), ("lpips", {"kind": "lpips_alex", "value": "0.3"}),
     ("size_bytes", 3), ("size_bytes", {"own": "3"}), ("densify_grad_threshold", "0.005"), ("protocol", []),
-    ("background_gate", "0.05"), ("background_gate", math.nan), ("machine", "Card X"), ("machine", {"cells_per_gpu": "2"}), ("commit", "abc")])
+    ("machine", "Card X"), ("machine", {"cells_per_gpu": "2"}), ("commit", "abc"), ("background_gate", "0.05"),
+    ("background_gate", math.nan)])
 def test_a_field_of_another_type_is_refused(tmp_path, name, value):
     with pytest.raises(ReportError, match=rf"rows.jsonl, line 2: {name}[\[\]0-9]*(\.\w+)? is .*; it must be "):
         rows.read_rows(write_rows(tmp_path, [row(), {**row(blend_mode="smoe"), name: value}]))
