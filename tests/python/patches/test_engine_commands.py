@@ -22,7 +22,7 @@ def test_a_dry_run_shows_what_is_still_to_be_done(tmp_path, dsmoe):
     assert said.status == 0 and "already patched" in said.out and "would be written" in said.out
     assert "+++" not in said.out
     said = dsmoe("patch", "apply", checkout, "--dry-run", "--modernise")
-    assert "+++ b/train.py" in said.out and "weights_only" in said.out and "blend_mode_of" not in "".join(
+    assert "+++ b/train.py" in said.out and "weights_only" in said.out and "blend_of" not in "".join(
         line for line in said.out.splitlines() if line[0] == "+")
     assert snapshot(checkout) == before
 
