@@ -45,10 +45,10 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
     mode = given or "alpha"
     cfg_args = Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
     saved = _saved(cfg_args) if getattr(dataset, "model_path", "") else {}
-    said = f"blend mode {mode}, " + _whence("blend_mode", mode, functools.partial(resolve_blend_mode, None),
-                                            saved.get("blend_mode"), cfg_args)
+    whence = _whence("blend_mode", mode, functools.partial(resolve_blend_mode, None), saved.get("blend_mode"), cfg_args)
     if mode not in BLEND_MODES:
-        raise ValueError(f"the {said}; it must be one of {', '.join(BLEND_MODES)}")
+        raise ValueError(f"the blend mode is {mode!r}, {whence}; it must be one of {', '.join(BLEND_MODES)}")
+    said = f"blend mode {mode}, {whence}"
     if not given:
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
               "the patch); --blend_mode says otherwise")

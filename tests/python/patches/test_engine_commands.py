@@ -104,10 +104,6 @@ def test_an_option_that_there_is_not_shows_the_usage_of_the_command(tmp_path, ds
     assert said.status == 2 and usage in said.err and "--modernize" in said.err
 
 
-def test_run_takes_both_spellings_of_the_mode(dsmoe):
-    assert "there is no command" in dsmoe("run", "--blend_mode", "smoe").err
-
-
 def test_a_record_that_may_not_be_read_is_named(tmp_path, monkeypatch, dsmoe):
     checkout = make(tmp_path)
     patches.apply(checkout)

@@ -310,6 +310,26 @@ def test_the_way_out_of_an_edit_is_the_one_that_is_named(tmp_path):
     assert snapshot(tmp_path) == original
 
 
+def test_a_patch_by_rules_of_before_is_known_and_brought_up_to_date(tmp_path):
+    """Such as set `pipe.blend_mode` alone."""
+    original = snapshot(make(tmp_path))
+    former = {name: text.replace("**pipe.blend,", "blend_mode=pipe.blend_mode,").replace(".blend = ", ".blend_mode = ")
+              for name, text in PATCHED.items()}
+    record = record_module.Record.write(tmp_path, *({name: text.encode() for name, text in texts.items()}
+                                                    for texts in (CHECKOUT, former)),
+                                        {"version": "0", "trainer": "3dgs-2023", "options": []})
+    make(tmp_path, former)
+    record.completed()
+    verdict = patches.check(tmp_path)
+    assert verdict == "patched" and verdict.reasons[0] == "by version 0"
+    assert f"to bring it up to date, type: dsmoe patch apply {tmp_path}" in verdict.reasons[1]
+    assert patches.apply(tmp_path).written and not patches.apply(tmp_path).written
+    assert all((tmp_path / name).read_text() == text for name, text in PATCHED.items())
+    assert len(patches.check(tmp_path).reasons) == 1
+    patches.revert(tmp_path)
+    assert snapshot(tmp_path) == original
+
+
 def another_commit(folder):
     """Replaces every file by that of a later version, as `git checkout` does."""
     for name, text in CHECKOUT.items():
