@@ -67,8 +67,7 @@ def test_a_wrong_gate_is_refused_by_name(mode, gate, variable, message, monkeypa
         runtime.blend_of(run(mode, gate))
 
 
-def test_a_model_in_smoe_of_before_there_were_gates_has_eq_7_and_says_so(monkeypatch, tmp_path):
-    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.25")  # it must not fill the gap
+def test_a_model_in_smoe_of_before_there_were_gates_has_eq_7_and_says_so(tmp_path):
     (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe')")
     old = SimpleNamespace(blend_mode="smoe", model_path=str(tmp_path))
     with pytest.warns(UserWarning, match="records no background gate, so it is 0, Eq. 7"):
