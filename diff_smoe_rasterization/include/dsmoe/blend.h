@@ -112,14 +112,14 @@ struct FamilyBlend {
 };
 
 template <> struct Blend<BlendMode::kAlpha> : FamilyBlend {
-  static constexpr bool kDivides = false;
+  static constexpr bool kDivides = false, kHasBackgroundGate = false;
 
   template <class Real> static DSMOE_HD Real denominator(const PixelEnd<Real>&) { return Real(Scalar<Real>(1)); }
   template <class Real> static DSMOE_HD Real background_weight(const PixelEnd<Real>& end) { return end.transmittance; }
 };
 
 template <> struct Blend<BlendMode::kSmoe> : FamilyBlend {
-  static constexpr bool kDivides = true;
+  static constexpr bool kDivides = true, kHasBackgroundGate = true;
 
   template <class Real> static DSMOE_HD Real denominator(const PixelEnd<Real>& end) {
     return end.gate_sum + background_weight(end);
@@ -131,7 +131,7 @@ template <> struct Blend<BlendMode::kSmoe> : FamilyBlend {
 
 // The ablations leave the background out.
 struct AblationBlend {
-  static constexpr bool kDivides = true;
+  static constexpr bool kDivides = true, kHasBackgroundGate = false;
   static constexpr bool kStopsEarly = false;  // the denominator runs on behind a full pixel
   static constexpr bool kSuffixAboutBase = false;
 
@@ -180,7 +180,7 @@ enum class FeatureRule {
   kAveraged,  // divided by the gate sum in every mode: expected depth
 };
 
-// D, and what of it is the background's, as the rule has them. Where no gate is open, the feature is its background.
+// D, and what of it is the background's. Where no gate is open, the feature is its background.
 template <class Real> struct Normaliser {
   Real denominator, background_weight;
   Mask<Real> open;
@@ -189,17 +189,15 @@ template <class Real> struct Normaliser {
 template <BlendMode kMode, class Real>
 DSMOE_HD Normaliser<Real> normaliser(FeatureRule rule, const PixelEnd<Real>& end) {
   using S = Scalar<Real>;
-  const bool averaged = rule == FeatureRule::kAveraged;
-  const Real denominator = averaged ? end.gate_sum : Blend<kMode>::denominator(end);
-  return {denominator, averaged ? Real(S(0)) : Blend<kMode>::background_weight(end),
-          denominator >= Real(S(kGateSumCut))};
+  const Mask<Real> open = end.gate_sum >= Real(S(kGateSumCut));
+  if (rule == FeatureRule::kAveraged) return {end.gate_sum, Real(S(0)), open};
+  return {Blend<kMode>::denominator(end), Blend<kMode>::background_weight(end), open};
 }
 
 template <BlendMode kMode, class Real>
 DSMOE_HD Real finish_feature(FeatureRule rule, const PixelEnd<Real>& end, Real sum, Real background) {
   const auto by = normaliser<kMode>(rule, end);
-  const Mask<Real> blends = by.background_weight > Real(Scalar<Real>(0));  // not 0 times a background without bound
-  return select(by.open, select(blends, sum + by.background_weight * background, sum) / by.denominator, background);
+  return select(by.open, (sum + by.background_weight * background) / by.denominator, background);
 }
 
 // Starts a pixel's backward pass; the features join one by one through add_feature.
@@ -223,10 +221,10 @@ DSMOE_HD FeatureBackward<Real> add_feature(FeatureRule rule, PixelBackward<Real>
   const bool averaged = rule == FeatureRule::kAveraged, divides = Blend<kMode>::kDivides || averaged;
   const Real scaled = select(by.open, dL_dvalue / by.denominator, zero), weighted = by.background_weight * scaled;
   if (divides) pixel.base = pixel.base + scaled * value;
-  pixel.suffix =
-      pixel.suffix + select(by.background_weight > zero, weighted * (divides ? background - value : background), zero);
+  pixel.suffix = pixel.suffix + weighted * (divides ? background - value : background);
+  const bool gated = Blend<kMode>::kHasBackgroundGate && !averaged;
   return {scaled, select(by.open, weighted, dL_dvalue),
-          averaged ? zero : end.transmittance * scaled * (background - value)};
+          gated ? end.transmittance * scaled * (background - value) : zero};
 }
 
 // Continues in front of pairs that another walk has taken: `transmittance` is what they met, `behind` their sum w g'.c.
