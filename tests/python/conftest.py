@@ -60,5 +60,5 @@ def mode(request):
 
 @pytest.fixture(autouse=True)
 def no_blend_mode_in_the_environment(monkeypatch):
-    monkeypatch.delenv("DSMOE_BLEND_MODE", raising=False)
-    monkeypatch.delenv("DSMOE_BACKGROUND_GATE", raising=False)
+    for name in ("DSMOE_BLEND_MODE", "DSMOE_BACKGROUND_GATE"):
+        monkeypatch.delenv(name, raising=False)
