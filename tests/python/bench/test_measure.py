@@ -84,7 +84,8 @@ def test_a_rendering_with_a_pixel_that_is_no_number_has_no_figures(value, metric
     broken[1, 3, 4] = value
     found = metrics(broken, target)
     assert all(math.isnan(found[name]) for name in ("psnr", "ssim", "psnr_float"))
-    views = [SimpleNamespace(camera=SimpleNamespace(name=name), image_float=lambda: target) for name in ("one", "two")]
+    views = [SimpleNamespace(camera=SimpleNamespace(name=name), image_float=lambda: target, mask=None)
+             for name in ("one", "two")]
 
     def renderer(camera):
         return SimpleNamespace(color=broken if camera.name == "two" else target)
