@@ -95,6 +95,15 @@ def test_a_rendering_with_a_pixel_that_is_no_number_has_no_figures(value, metric
     assert evaluate(renderer, views[:1], "cpu", measure=metrics).metrics["psnr"] == math.inf
 
 
+def test_what_a_mask_ignores_changes_no_metric():
+    target = step_image()
+    mask = torch.zeros_like(target[:1])
+    mask[..., :target.shape[2] // 2 + 4] = 1  # with the edge
+    other = torch.where(mask > 0, target * 0.9, 1 - target)
+    assert Measures("cpu")(target * 0.9, target, mask) == Measures("cpu")(other, target, mask)
+    assert edge_psnr(other, target, torch.zeros_like(mask)) is None
+
+
 def test_psnr_of_what_is_no_number_is_none():
     target = torch.zeros(3, 2, 2)
     assert math.isnan(psnr(target + math.nan, target)) and psnr(target, target) == math.inf
