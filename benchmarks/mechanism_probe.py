@@ -26,7 +26,7 @@ class Probe:
         """renderer: the training's own; scene: on its device."""
         self.model = renderer.model
         self.renderer = Renderer(renderer.model, renderer.blend_mode, renderer.background, renderer.antialiasing,
-                                 rasterize_with_splats)
+                                 rasterize_with_splats, background_gate=renderer.background_gate)
         self.test = [(scene.test[index].camera, scene.test[index].image_float())
                      for index in evenly_spaced(len(scene.test), VIEWS)]
         train = [scene.train[index] for index in evenly_spaced(len(scene.train), VIEWS)]

@@ -47,6 +47,8 @@ def build_parser() -> argparse.ArgumentParser:
                         help="which cameras (default: test)")
     render.add_argument("--blend-mode", choices=BLEND_MODES,
                         help="needed for a .ply that does not record it; must agree where it does")
+    render.add_argument("--background-gate", type=float, metavar="X",
+                        help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
     render.add_argument("--resolution", type=int, metavar="N",
                         help="as in train (default: the run's, for a .ply -1)")
     render.add_argument("--principal-point", choices=PRINCIPAL_POINTS,
@@ -203,11 +205,12 @@ def _run(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     from .trainer.loop import train
     from .trainer.process import set_up_process
-    from .trainer.results import results_table
+    from .trainer.results import blend_name, results_table
 
     config = config_from_arguments(arguments)
     set_up_process(config.device)
-    print(f"{config.scene} -> {config.output}: blend mode {config.blend_mode}, schedule {config.schedule}, "
+    print(f"{config.scene} -> {config.output}: blend mode {blend_name(config.blend_mode, config.background_gate)}, "
+          f"schedule {config.schedule}, "
           f"{config.iterations} iterations, seed {config.seed}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)
     print(results_table([row]))
@@ -237,7 +240,8 @@ def _render(arguments: argparse.Namespace) -> None:
         if not arguments.scene:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
-    paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device)
+    paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
+                          background_gate=arguments.background_gate)
     print(f"{len(paths)} images in {arguments.output}")
 
 

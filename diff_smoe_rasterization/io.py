@@ -32,7 +32,8 @@ class Gaussians:
     log_scales: np.ndarray  # [N, 3]; scale = exp
     rotations: np.ndarray  # [N, 4] (w, x, y, z), not normalised
     blend_mode: Optional[str] = None  # the mode that the model was trained with; None where the file does not say
-    comments: Tuple[str, ...] = ()  # comment lines of the file, the one that records the blend mode included
+    background_gate: Optional[float] = None  # lambda of `smoe`, likewise
+    comments: Tuple[str, ...] = ()  # comment lines of the file, those that record mode and gate included
 
     @property
     def sh_degree(self) -> int:
@@ -87,16 +88,19 @@ def read_gaussians(path: PathLike) -> Gaussians:
     """Reads an Inria-format .ply of SH degree 0 to 3: ascii or binary, columns in any order and scalar type.
 
     NaN and infinities are returned as they are. Raises OSError; ValueError for malformed content, a missing column,
-    or comments that record two different blend modes.
+    comments that record two different blend modes or background gates, or a gate that is none.
     """
     return Gaussians(**_io.read_gaussians(os.fsencode(path)))
 
 
 def write_gaussians(path: PathLike, gaussians: Gaussians) -> None:
-    """Writes an Inria-format .ply (binary little endian, float32, zero normals), with `comment blend_mode NAME`.
+    """Writes an Inria-format .ply (binary little endian, float32, zero normals).
 
+    `comment blend_mode NAME` and `comment background_gate VALUE` record what is not None; the value is read back
+    exactly.
     The arrays may be anything that numpy.asarray takes. The file appears under its name only when it is complete.
-    Raises OSError; ValueError naming the array, its shape and the shape it must have.
+    Raises OSError; ValueError naming the array, its shape and the shape it must have, and for comments that record
+    another mode or gate.
     """
     g = gaussians
     count = np.shape(g.means3D)[0] if np.ndim(g.means3D) else 0
@@ -110,7 +114,7 @@ def write_gaussians(path: PathLike, gaussians: Gaussians) -> None:
         "rotations": (count, 4),
     }
     arrays = [_array("write_gaussians", name, getattr(g, name), np.float32, shape) for name, shape in shapes.items()]
-    _io.write_gaussians(os.fsencode(path), sh_degree, *arrays, g.blend_mode or "", list(g.comments))
+    _io.write_gaussians(os.fsencode(path), sh_degree, *arrays, g.blend_mode or "", g.background_gate, list(g.comments))
 
 
 def read_points(path: PathLike) -> Points:

@@ -6,15 +6,17 @@ import dataclasses
 import json
 import os
 from dataclasses import dataclass, field
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Optional, Sequence, Union
 
-from ..settings import BLEND_MODES, resolve_blend_mode
+from ..settings import (BACKGROUND_GATE_VARIABLE, BLEND_MODES, RECOMMENDED_BACKGROUND_GATE, resolve_background_gate,
+                        resolve_blend_mode)
 from .errors import ConfigError
 from .files import write_text_atomically
 
 CONFIG_NAME = "config.json"
 SCHEDULES = ("3dgs", "steady")
 PRINCIPAL_POINTS = ("scene", "centre")
+LEARNED = "learned"  # the background gate that a training finds
 
 
 def _option(default: Any, text: str, **extra: Any) -> Any:
@@ -33,6 +35,11 @@ class TrainConfig:
     output: str = _option("", "folder to write", flags=("-o", "--output"), required=True)
     blend_mode: Optional[str] = _option(
         None, "how Gaussians make a pixel (default: $DSMOE_BLEND_MODE, else alpha)", choices=BLEND_MODES)
+    background_gate: Union[float, str, None] = _option(
+        None, "smoe: how much the background weighs against the Gaussians: 0 is the paper's Eq. 7, 1 alpha blending, "
+              "`learned` finds it (default: $DSMOE_BACKGROUND_GATE, else "
+              f"{RECOMMENDED_BACKGROUND_GATE})", metavar=f"X|{LEARNED}")
+    background_gate_bound: float = _option(0.03, "a learned background gate stays above this")
     iterations: int = _option(30_000, "optimisation steps")
     resolution: int = _option(
         -1, "1, 2, 4, 8: divide the image size by it; -1: cap the width at 1600; else the width in pixels")
@@ -41,6 +48,8 @@ class TrainConfig:
         "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
         choices=PRINCIPAL_POINTS)
     white_background: bool = _option(False, "white background instead of black")
+    random_background: bool = _option(
+        False, "each step's image with transparency lies over a colour of its own; measured over black or white")
     init_points: int = _option(
         0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
            "0: all points, respectively 100,000")
@@ -76,6 +85,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         try:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
+            self.background_gate = _training_gate(self.blend_mode, self.background_gate)
         except ValueError as error:
             raise ConfigError(str(error)) from error
 
@@ -90,6 +100,7 @@ class TrainConfig:
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
         self._require("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "between 0 and 1")
+        self._require("background_gate_bound", 0.0 <= self.background_gate_bound < 1.0, "at least 0 and below 1")
         self._require("seed", 0 <= self.seed < 2**32, "between 0 and 2^32 - 1")
         for name in ("sh_degree_interval", "position_lr_max_steps", "densification_interval", "opacity_reset_interval"):
             self._require(name, getattr(self, name) >= 1, "at least 1")
@@ -106,7 +117,9 @@ class TrainConfig:
             raise ConfigError(f"{flag} is {getattr(self, name)!r}; it must be {requirement}")
 
     def changed(self, **options: Any) -> "TrainConfig":
-        """A validated copy with some options set."""
+        """A validated copy with some options set; another blend mode takes its own background gate."""
+        if options.get("blend_mode", self.blend_mode) != self.blend_mode:
+            options = {"background_gate": None, **options}
         return dataclasses.replace(self, **options).validate()
 
     def shortened(self) -> "TrainConfig":
@@ -128,6 +141,12 @@ class TrainConfig:
         """Writes OUT/config.json."""
         text = json.dumps(dataclasses.asdict(self), indent=2) + "\n"
         write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
+
+    @classmethod
+    def of_record(cls, values: Dict[str, Any]) -> "TrainConfig":
+        """The options of an earlier run; one that names no background gate was trained with 0."""
+        gate = values.get("background_gate")
+        return cls(**{**values, "background_gate": 0.0 if gate is None and values["blend_mode"] == "smoe" else gate})
 
     @classmethod
     def load(cls, folder: str) -> "TrainConfig":
@@ -152,7 +171,7 @@ class TrainConfig:
                              f"it must be one of {', '.join(BLEND_MODES)}")
         values["output"] = folder  # the folder may have been moved
         try:
-            return cls(**values).validate()
+            return cls.of_record(values).validate()
         except (TypeError, ConfigError) as error:
             raise ConfigError(f"{path}: {error}") from error
 
@@ -168,11 +187,31 @@ class TrainConfig:
         return texts
 
 
+def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:
+    """The background gate that a training takes: a number, 1 in `alpha` and 0 in the ablations, or LEARNED.
+
+    asked: None means in `smoe` $DSMOE_BACKGROUND_GATE, else the recommended one. Raises ValueError for a value that is
+    no gate, and for one that the mode does not know.
+    """
+    if blend_mode == "smoe":
+        if asked == LEARNED:
+            return LEARNED
+        if asked is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
+            asked = RECOMMENDED_BACKGROUND_GATE
+    elif asked == resolve_background_gate(blend_mode, None):  # the mode's own
+        asked = None
+    return float(resolve_background_gate(blend_mode, asked))
+
+
+def _number_or_learned(text: str) -> Union[float, str]:
+    return text if text == LEARNED else float(text)
+
+
 def _flag(option: "dataclasses.Field[Any]") -> str:
     return "--" + option.name.replace("_", "-")
 
 
-_TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str}
+_TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
 
 
 def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), defaults: bool = True) -> None:
@@ -200,7 +239,8 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), def
         if option.metadata.get("choices"):
             keywords["choices"] = option.metadata["choices"]
         else:
-            keywords["metavar"] = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
+            kind = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
+            keywords["metavar"] = option.metadata.get("metavar", kind)
         parser.add_argument(*flags, help=text, dest=option.name, **keywords)
 
 

@@ -15,7 +15,7 @@ from .rendering import Renderer
 from .stopwatch import synchronised_time
 
 WARM_UP_VIEWS = 2  # rendered untimed before the first timed one
-Measure = Callable[[torch.Tensor, torch.Tensor], Mapping[str, Optional[float]]]
+Measure = Callable[..., Mapping[str, Optional[float]]]
 METRICS = ("psnr", "ssim", "psnr_float")  # what image_metrics gives
 
 
@@ -32,7 +32,8 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
              measure: Measure = image_metrics) -> Evaluation:
     """Renders every view; times rendering alone, synchronised, without loading, metrics or disk.
 
-    measure: from a rendering and its ground truth, [3, H, W], to metrics by name. Raises what `summary` raises.
+    measure: from a rendering and its ground truth, [3, H, W], and of a view that has one its mask [1, H, W], to metrics
+    by name. Raises what `summary` raises.
     """
     per_view: List[Dict[str, object]] = []
     with torch.no_grad():
@@ -42,8 +43,9 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
             started = synchronised_time(device)
             color = renderer(view.camera).color
             elapsed = synchronised_time(device) - started
+            pair = (color, view.image_float())
             per_view.append({"name": view.camera.name, "milliseconds": elapsed * 1000,
-                             **measure(color, view.image_float())})
+                             **(measure(*pair) if view.mask is None else measure(*pair, view.mask_float()))})
     return summary(per_view)
 
 

@@ -1,10 +1,11 @@
 """Ground-truth images: read in parallel, composited, downscaled as 3DGS does."""
 from __future__ import annotations
 
+import dataclasses
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import List, Sequence, Tuple
+from typing import List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -29,11 +30,33 @@ class View:
     """A camera and its ground truth."""
 
     camera: Camera
-    image: torch.Tensor  # [3, H, W] uint8
+    image: torch.Tensor  # [3, H, W] uint8, over black or white
+    opacity: Optional[torch.Tensor] = None  # [1, H, W] uint8; --random-background: the alpha plane, if there is one
+    mask: Optional[torch.Tensor] = None  # [1, H, W] uint8: 255, the pixel counts, to 0; None: all count
 
     def image_float(self) -> torch.Tensor:
         """[3, H, W] in [0, 1]"""
-        return self.image.float() / 255
+        return as_float(self.image)
+
+    def image_over(self, color: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
+        """[3, H, W] in [0, 1]: an image with opacity over another colour [3] than `background` [3], where it lies."""
+        clear = 1 - as_float(self.opacity)
+        return (self.image_float() + clear * (color - background)[:, None, None]).clamp(0, 1)
+
+    def mask_float(self) -> Optional[torch.Tensor]:
+        """[1, H, W] in [0, 1]; None where every pixel counts."""
+        return None if self.mask is None else as_float(self.mask)
+
+    def to(self, device: str) -> "View":
+        """The same view with its images on `device`."""
+        planes = {name: getattr(self, name) for name in ("image", "opacity", "mask")}
+        return dataclasses.replace(self, **{name: plane.to(device) for name, plane in planes.items()
+                                            if plane is not None})
+
+
+def as_float(image: torch.Tensor) -> torch.Tensor:
+    """An image of bytes in [0, 1]; floats as they are."""
+    return image if image.is_floating_point() else image.float() / 255
 
 
 def target_size(width: int, height: int, resolution: int) -> Tuple[int, int]:
@@ -63,12 +86,35 @@ def load_view(posed: PosedImage, config: TrainConfig) -> View:
     try:
         with Image.open(posed.path) as file:
             image = composited(file, config.white_background)
+            opacity = _opacity(file) if config.random_background else None
     except UNREADABLE as error:
         raise SceneError(f"{posed.path}: not a readable image ({error})") from error
     camera = fitted_camera(posed, image.size, config)
+    mask = None if posed.mask is None else _mask(posed.mask, posed.path, image.size, camera)
+    return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask)
+
+
+def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -> torch.Tensor:
+    """[C, H, W] uint8: the image in the camera's size."""
     if (camera.width, camera.height) != image.size:
-        image = image.resize((camera.width, camera.height), Image.BICUBIC)
-    return View(camera, torch.from_numpy(np.array(image)).permute(2, 0, 1).contiguous())
+        image = image.resize((camera.width, camera.height), resample)
+    return torch.from_numpy(np.atleast_3d(np.array(image))).permute(2, 0, 1).contiguous()
+
+
+def _mask(path: str, image_path: str, size: Tuple[int, int], camera: Camera) -> torch.Tensor:
+    """[1, H, W] uint8: the mask of an image file of that size (width, height)."""
+    try:
+        with Image.open(path) as file:
+            mask = composited(file, white=False).convert("L")
+    except UNREADABLE as error:
+        raise SceneError(f"{path}: not a readable image ({error})") from error
+    if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > MAX_ASPECT_ERROR:
+        raise SceneError(f"{path}: the mask is {mask.width}x{mask.height}, its image {image_path} "
+                         f"{size[0]}x{size[1]}: another shape")
+    planes = _planes(mask, camera, Image.BILINEAR)  # which does not overshoot at edges
+    if not bool(planes.any()):
+        raise SceneError(f"{path}: the mask keeps no pixel of {image_path}; white is what counts, black is ignored")
+    return planes
 
 
 def fitted_camera(posed: PosedImage, size: Tuple[int, int], config: TrainConfig) -> Camera:
@@ -90,12 +136,20 @@ def composited(image: Image.Image, white: bool) -> Image.Image:
     """The image as RGB; where it has transparency, over white or black. Raises ValueError beyond 8 bits a channel."""
     if image.mode == "F" or image.mode.startswith("I"):
         raise ValueError(f"its pixels have more than 8 bits (Pillow's mode {image.mode}); convert it to 8 bits")
-    if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
+    if not _is_transparent(image):
         return image.convert("RGB")
     rgba = np.asarray(image.convert("RGBA"), np.float32) / 255
     color, alpha = rgba[..., :3], rgba[..., 3:]
     blended = color * alpha + (1.0 if white else 0.0) * (1 - alpha)
     return Image.fromarray((blended * 255).round().astype(np.uint8))
+
+
+def _is_transparent(image: Image.Image) -> bool:
+    return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+
+
+def _opacity(image: Image.Image) -> Optional[Image.Image]:
+    return image.convert("RGBA").getchannel("A") if _is_transparent(image) else None
 
 
 def image_size(path: str) -> Tuple[int, int]:

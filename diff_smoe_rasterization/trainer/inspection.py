@@ -9,13 +9,13 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from .config import TrainConfig
+from .config import LEARNED, TrainConfig
 from .errors import TrainerError
 from .evaluation import evaluate
 from .files import write_json_atomically
 from .loop import PER_VIEW_NAME, check_device
 from .metrics import quantised
-from .modelfile import agreed_blend_mode, load_model, trained_model_path
+from .modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
 from .pictures import file_names
 from .rendering import Rasterize, Renderer, background_color
 from .results import read_results, result_row, write_results
@@ -33,13 +33,13 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     ply = trained_model_path(output, config.iterations)
     earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
     scene = load_scene(config, progress).to(device)
-    renderer = open_renderer(config, ply, config.blend_mode, device, rasterize)
+    renderer = open_renderer(config, ply, config.blend_mode, device, rasterize, _gate_of(config))
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
         raise TrainerError(f"scene {config.scene} has no {split} views")
     evaluation = evaluate(renderer, views, device, progress)
     seconds = earlier[0].get("train_seconds") if earlier else None
-    row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation)
+    row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
     if split == "test":
         write_results(output, [row])
         write_json_atomically(os.path.join(output, PER_VIEW_NAME), evaluation.per_view)
@@ -47,26 +47,39 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
 
 
 def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str], device: str,
-                  rasterize: Optional[Rasterize] = None) -> Renderer:
-    """A renderer for a .ply with the blend mode that it records; config gives background and antialiasing."""
+                  rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None) -> Renderer:
+    """A renderer for a .ply with the blend mode and the background gate that it records.
+
+    config gives background and antialiasing. Raises TrainerError where what is asked disagrees with the file.
+    """
     model, recorded = load_model(ply, device)
-    mode = agreed_blend_mode(ply, recorded, asked_blend_mode)
-    return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize)
+    mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
+    gate = agreed_background_gate(ply, mode, recorded, asked_gate)
+    return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize,
+                    background_gate=gate)
+
+
+def _gate_of(config: TrainConfig) -> Optional[float]:
+    """The gate that a run names; None where it was learned, which its .ply alone says."""
+    return None if config.background_gate == LEARNED else float(config.background_gate)
 
 
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
                   blend_mode: Optional[str] = None, device: str = "cpu",
-                  rasterize: Optional[Rasterize] = None) -> List[str]:
+                  rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None) -> List[str]:
     """Writes a PNG per camera of config.scene into `folder`; returns the paths.
 
-    ply: a file whose comment, else `blend_mode`, gives the blend mode; None: the model of the run that config is of,
-    whose recorded mode `blend_mode` must not contradict. Raises TrainerError.
+    ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: the model of the
+    run that config is of, whose record these two must not contradict. Raises TrainerError.
     """
     check_device(device)
     if ply is None:
         ply = trained_model_path(config.output, config.iterations)
         blend_mode = agreed_blend_mode(config.output, config.blend_mode, blend_mode)
-    renderer = open_renderer(config, ply, blend_mode, device, rasterize)
+        if config.background_gate != LEARNED:
+            recorded = Recorded(blend_mode, float(config.background_gate))
+            background_gate = agreed_background_gate(config.output, blend_mode, recorded, background_gate)
+    renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
     cameras = load_cameras(config, split)
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views")

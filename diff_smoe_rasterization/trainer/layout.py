@@ -1,14 +1,16 @@
 """What a scene folder says before any image is read, and the train/test split."""
 from __future__ import annotations
 
+import dataclasses
 import os
 from dataclasses import dataclass
-from typing import List, Sequence, Tuple
+from typing import List, Optional, Sequence, Tuple
 
 from .cameras import Camera
 from .errors import SceneError
 from .pointcloud import PointCloud
 
+MASKS = "masks"  # folder of a scene, beside its images
 HOLD_OUT = 8  # every 8th image of a COLMAP scene, by sorted name, is a test image
 
 
@@ -18,6 +20,7 @@ class PosedImage:
 
     camera: Camera
     path: str
+    mask: Optional[str] = None  # the file that says which pixels count
 
 
 @dataclass(frozen=True)
@@ -43,3 +46,25 @@ def check_files(paths: Sequence[str]) -> None:
     missing = [path for path in paths if not os.path.isfile(path)]
     if missing:
         raise SceneError(f"{missing[0]}: no such image ({len(missing)} of {len(paths)} images are missing)")
+
+
+def with_masks(folder: str, layout: Layout) -> Layout:
+    """The layout with each image's mask, where the scene has a folder of masks.
+
+    A mask is named as its image, with .png behind the name or in place of its extension, in the same subfolder.
+    Raises SceneError where an image has none.
+    """
+    masks = os.path.join(folder, MASKS)
+    if not os.path.isdir(masks):
+        return layout
+
+    def with_mask(image: PosedImage) -> PosedImage:
+        names = [image.camera.name + ".png", os.path.splitext(image.camera.name)[0] + ".png"]
+        for name in names:
+            if os.path.isfile(os.path.join(masks, name)):
+                return dataclasses.replace(image, mask=os.path.join(masks, name))
+        raise SceneError(f"{masks}: the image {image.camera.name} has no mask there; it must be {names[0]} or "
+                         f"{names[1]} (without masks, every pixel counts: rename the folder)")
+
+    return dataclasses.replace(layout, train=[with_mask(image) for image in layout.train],
+                               test=[with_mask(image) for image in layout.test])

@@ -11,12 +11,14 @@ import torch
 from tqdm import tqdm
 
 from ..losses import l1_ssim_loss_and_gradient
+from .background_gate import LearnedGate
 from .checkpoint import CHECKPOINT_NAME, load_checkpoint, save_checkpoint
-from .config import CONFIG_NAME, TrainConfig
+from .config import CONFIG_NAME, LEARNED, TrainConfig
 from .environment import extension_info
 from .errors import TrainerError
 from .evaluation import Evaluation, evaluate
 from .files import write_json_atomically
+from .images import as_float
 from .interrupt import DelayedInterrupt
 from .metrics import psnr
 from .model import GaussianModel, GaussianOptimizer
@@ -58,7 +60,11 @@ class Trainer:
         self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
         self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
         background = background_color(config.white_background, config.device)
-        self.renderer = Renderer(self.model, str(config.blend_mode), background, config.antialiasing, rasterize)
+        learned = config.background_gate == LEARNED
+        self.gate = LearnedGate(config.background_gate_bound, config.device) if learned else None
+        self.renderer = Renderer(
+            self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
+            background_gate=self.gate.value if self.gate else float(config.background_gate))
         self.strategy = STRATEGIES[config.schedule](StrategyContext(
             config, self.model, self.optimizer, scene.extent, [view.camera for view in scene.train], self.renderer))
         self.order = ViewOrder(len(scene.train), config.seed)
@@ -80,11 +86,19 @@ class Trainer:
         self.optimizer.set_position_rate(self.iteration)
         if self.iteration % config.sh_degree_interval == 0:
             model.raise_sh_degree()
-        index = self.order.next()
-        view = self.scene.train[index]
+        view = self.scene.train[self.order.next()]
         means2D = torch.zeros_like(model.raw["means3D"], requires_grad=True)
-        rendering = self.renderer(view.camera, means2D=means2D)
-        loss, gradient = l1_ssim_loss_and_gradient(rendering.color, view.image, config.lambda_dssim)
+        color = torch.rand(3, device=config.device) if config.random_background else None
+        rendering = self.renderer(view.camera, background=color, means2D=means2D,
+                                  background_gate=self.gate() if self.gate else None)
+        image = rendering.color.detach()
+        target = view.image if view.opacity is None else view.image_over(color, self.renderer.background)
+        if view.mask is None:
+            loss, gradient = l1_ssim_loss_and_gradient(image, target, config.lambda_dssim)
+        else:
+            mask = view.mask_float()
+            loss, gradient = l1_ssim_loss_and_gradient(image * mask, as_float(target) * mask, config.lambda_dssim)
+            gradient = gradient * mask
         step = Step(self.iteration, view.camera, rendering, means2D, loss)
         self.strategy.before_backward(step)
         rendering.color.backward(gradient)
@@ -94,14 +108,21 @@ class Trainer:
             with torch.no_grad():
                 self.strategy.after_backward(step)
                 self.optimizer.step()
+                if self.gate:
+                    self.gate.step()
                 self.strategy.after_step(step)
-        self._report = (index, rendering.color.detach())
+        self._report = (image, target, view)
         return step
 
     def training_psnr(self) -> float:
         """PSNR of the last step's rendering against its training image."""
-        index, color = self._report
-        return psnr(color.clamp(0, 1), self.scene.train[index].image_float())
+        image, target, view = self._report
+        return psnr(image.clamp(0, 1), as_float(target), view.mask_float())
+
+    @property
+    def background_gate(self) -> float:
+        """The gate as it is now; where it is learned, the host waits for the device."""
+        return float(self.renderer.background_gate)
 
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views."""
@@ -118,18 +139,20 @@ class Trainer:
             "active_sh_degree": self.model.active_sh_degree,
             "optimizer": self.optimizer.state_dict(),
             "strategy": self.strategy.state_dict(),
+            "gate": self.gate.state_dict() if self.gate else None,
             "order": self.order.state_dict(),
             "random": random_state(),
         }
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         """Takes what `state_dict` gave. Raises TrainerError where it was another run's."""
-        differences = TrainConfig(**state["config"]).differences(self.config)
+        differences = TrainConfig.of_record(state["config"]).differences(self.config)
         if differences:
             raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
         for name, here in scene_fingerprint(self.scene).items():
-            if here != state["scene"][name]:
-                raise TrainerError(f"the checkpoint is of a run on another scene: {name} {state['scene'][name]} there "
+            there = state["scene"].get(name, 0)  # an earlier version knew no masks
+            if here != there:
+                raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
                                    f"and {here} in {self.config.scene}")
         self.iteration = state["iteration"]
         self.watch.seconds = state["train_seconds"]
@@ -137,6 +160,8 @@ class Trainer:
         self.model.active_sh_degree = state["active_sh_degree"]
         self.optimizer.load_state_dict(state["optimizer"])
         self.strategy.load_state_dict(state["strategy"])
+        if self.gate:
+            self.gate.load_state_dict(state["gate"])
         self.order.load_state_dict(state["order"])
         restore_random_state(state["random"])
 
@@ -182,9 +207,10 @@ class Run:
             trainer.watch.stop()
         if interrupt.asked:
             raise KeyboardInterrupt
-        save_model(model_path(config.output, trainer.iteration), trainer.model, str(config.blend_mode))
+        gate = trainer.background_gate
+        save_model(model_path(config.output, trainer.iteration), trainer.model, str(config.blend_mode), gate)
         evaluation = trainer.evaluate(self.progress)
-        row = result_row(config, trainer.scene, trainer.model.num_gaussians, trainer.watch.seconds, evaluation)
+        row = result_row(config, trainer.scene, trainer.model.num_gaussians, trainer.watch.seconds, evaluation, gate)
         write_results(config.output, [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
         return row
@@ -195,8 +221,10 @@ class Run:
 
     def _show(self, bar: Any, loss: float) -> None:
         if self.progress:
-            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{self.trainer.training_psnr():.2f}",
-                            gaussians=self.trainer.model.num_gaussians, refresh=False)
+            trainer = self.trainer
+            gate = {"gate": f"{trainer.background_gate:.4f}"} if trainer.gate else {}
+            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{trainer.training_psnr():.2f}", **gate,
+                            gaussians=trainer.model.num_gaussians, refresh=False)
 
     def _evaluate(self, bar: Any) -> None:
         trainer = self.trainer
@@ -258,6 +286,9 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     layout = None if scene else read_layout(config)
     os.makedirs(config.output, exist_ok=True)  # a folder that cannot be made is told before images are read
     scene = scene or load_scene(config, progress, layout)
+    if config.random_background and config.background_gate == 0:
+        print("warning: --random-background with a background gate of 0: the background is seen only where no Gaussian "
+              "is, so little is learned of transparency")
     run = Run(Trainer(config, scene, rasterize), progress)
     if resume:
         resumed = run.resume()

@@ -1,17 +1,24 @@
-"""GaussianModel to and from Inria-format .ply files, whose comment records the blend mode."""
+"""GaussianModel to and from Inria-format .ply files, whose comments record blend mode and background gate."""
 from __future__ import annotations
 
 import os
-from typing import Optional, Tuple
+from typing import NamedTuple, Optional, Tuple
 
 import torch
 
 from .. import io
-from ..settings import BLEND_MODES
+from ..settings import BLEND_MODES, resolve_background_gate
 from .errors import TrainerError
 from .model import GaussianModel
 
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
+
+
+class Recorded(NamedTuple):
+    """What a file says of the blend that its Gaussians were trained with; None where it does not."""
+
+    blend_mode: Optional[str]
+    background_gate: Optional[float]
 
 
 def model_path(output: str, iteration: int) -> str:
@@ -27,17 +34,18 @@ def trained_model_path(output: str, iterations: int) -> str:
     return path
 
 
-def save_model(path: str, model: GaussianModel, blend_mode: str) -> None:
-    """Writes the raw parameters and `comment blend_mode NAME`."""
+def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float) -> None:
+    """Writes the raw parameters, `comment blend_mode NAME` and in `smoe` `comment background_gate VALUE`."""
     os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
     raw = {name: tensor.detach().cpu().numpy() for name, tensor in model.raw.items()}
     io.write_gaussians(path, io.Gaussians(
         means3D=raw["means3D"], dc=raw["dc"], shs=raw["shs"], opacity_logits=raw["opacities"],
-        log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=blend_mode))
+        log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=blend_mode,
+        background_gate=background_gate if blend_mode == "smoe" else None))
 
 
-def load_model(path: str, device: str) -> Tuple[GaussianModel, Optional[str]]:
-    """Reads a .ply; returns the model, all its SH degrees active, and its recorded blend mode or None.
+def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
+    """Reads a .ply; returns the model, all its SH degrees active, and what the file says of its blend.
 
     Raises TrainerError naming file and reason.
     """
@@ -50,7 +58,7 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Optional[str]]:
     raw = {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
     model = GaussianModel(raw, stored.sh_degree)
     model.active_sh_degree = stored.sh_degree
-    return model, stored.blend_mode
+    return model, Recorded(stored.blend_mode, stored.background_gate)
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
@@ -68,3 +76,30 @@ def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) 
         raise TrainerError(f"{path} was trained with the blend mode {recorded}, not {asked}; "
                            "in another mode its Gaussians show another scene")
     return recorded or asked or ""
+
+
+def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked: Optional[float]) -> float:
+    """The background gate to render a .ply with in this blend mode: by the rules of `agreed_blend_mode`.
+
+    A file that records `smoe` and no gate is an older one, trained with 0. Raises TrainerError.
+    """
+    if blend_mode != "smoe":
+        own = float(resolve_background_gate(blend_mode, None))
+        for said in (recorded.background_gate, asked):
+            if said not in (None, own):
+                raise TrainerError(f"{path}: the background gate is {said:g}; in the blend mode {blend_mode} it is "
+                                   f"{own:g}")
+        return own
+    gate = recorded.background_gate
+    if gate is None and recorded.blend_mode is not None:
+        gate = 0.0
+    if gate is not None and asked is not None and asked != gate:
+        raise TrainerError(f"{path} was trained with the background gate {gate:g}, not {asked:g}; "
+                           "with another one its Gaussians show another scene")
+    if gate is None and asked is None:
+        raise TrainerError(f"{path} does not say which background gate it was trained with (no `comment "
+                           "background_gate`); pass --background-gate, which is 0 for the paper's Eq. 7")
+    try:
+        return gate if gate is not None else float(resolve_background_gate(blend_mode, asked))
+    except ValueError as error:
+        raise TrainerError(str(error)) from error

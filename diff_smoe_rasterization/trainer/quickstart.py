@@ -38,7 +38,7 @@ MAX_PIXELS = 70_000  # of an image
 MAX_POINTS = 30_000
 
 # Offered by `dsmoe train` and fixed here.
-FIXED = ("scene", "output", "blend_mode", "eval_every", "checkpoint_every")
+FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "eval_every", "checkpoint_every")
 
 
 def main(argv: Optional[List[str]] = None) -> int:
@@ -125,11 +125,11 @@ def write_pictures(config: TrainConfig, scene: Scene, output: str) -> List[str]:
     paths = []
     for index in evenly_spaced(len(views), PICTURES):
         view, labelled = views[index], []
-        truth = view.image_float()
+        truth, mask = view.image_float(), view.mask_float()
         for mode, renderer in renderers:
             with torch.no_grad():
                 color = renderer(view.camera).color.cpu()
-            labelled.append((f"{mode}  {psnr(quantised(color), truth):.2f} dB", to_image(color)))
+            labelled.append((f"{mode}  {psnr(quantised(color), truth, mask):.2f} dB", to_image(color)))
         paths.append(os.path.join(output, f"compare_{names[index]}.png"))
         comparison(to_image(truth), labelled).save(paths[-1])
     return paths

@@ -3,9 +3,9 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List, Optional, Union
 
-from .config import TrainConfig
+from .config import LEARNED, TrainConfig
 from .environment import machine, versions
 from .errors import TrainerError
 from .evaluation import Evaluation
@@ -17,12 +17,25 @@ RESULTS_NAME = "results.json"
 
 
 def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seconds: Optional[float],
-               evaluation: Evaluation) -> Dict[str, Any]:
-    """One row: the figures first, then the protocol that makes them comparable."""
-    first = (list(scene.test) or list(scene.train))[0].camera
+               evaluation: Evaluation, background_gate: Optional[float] = None) -> Dict[str, Any]:
+    """One row: the figures first, then the protocol that makes them comparable.
+
+    background_gate: the one that was rendered with; None: the config's.
+    """
+    views = list(scene.test) or list(scene.train)
+    first = views[0].camera
+    # Named only where they are not as usual, so that other rows stay comparable with earlier ones.
+    unusual: Dict[str, Any] = {}
+    if config.background_gate == LEARNED:
+        unusual.update(background_gate_learned=True, background_gate_bound=config.background_gate_bound)
+    if config.random_background:
+        unusual["random_background"] = True
+    if views[0].mask is not None:
+        unusual["masks"] = "metrics over the kept pixels; SSIM of images times their masks"
     return {
         "scene": os.path.basename(os.path.normpath(config.scene)),
         "blend_mode": config.blend_mode,
+        "background_gate": config.background_gate if background_gate is None else background_gate,
         **evaluation.metrics,
         "num_gaussians": num_gaussians,
         "train_seconds": train_seconds,  # the loop alone: without loading, evaluation and checkpoints
@@ -44,6 +57,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
             "seed": config.seed,
             "psnr": "8-bit images, mean over test views; psnr_float: floats clamped to [0, 1]",
             "ssim": "8-bit images, 11x11 window, sigma 1.5, zero padding, mean over test views",
+            **unusual,
             "device": config.device,
             "machine": machine(config.device),
             "versions": versions(),
@@ -72,14 +86,22 @@ def read_results(folder: str) -> List[Dict[str, Any]]:
 
 
 def results_table(rows: List[Dict[str, Any]]) -> str:
-    """Rows as a text table: blend mode, PSNR, SSIM, #Gaussians, training seconds, frames per second."""
+    """Rows as a text table: blend mode and gate, PSNR, SSIM, #Gaussians, training seconds, frames per second."""
     header = ("blend mode", "PSNR [dB]", "SSIM", "#Gaussians", "train [s]", "FPS")
-    body = [(row["blend_mode"], _number(row["psnr"], 2), _number(row["ssim"], 4), f"{row['num_gaussians']:,}",
-             _number(row["train_seconds"], 1), _number(row["fps"], 1)) for row in rows]
+    body = [(blend_name(row["blend_mode"], row.get("background_gate")), _number(row["psnr"], 2),
+             _number(row["ssim"], 4), f"{row['num_gaussians']:,}", _number(row["train_seconds"], 1),
+             _number(row["fps"], 1)) for row in rows]
     widths = [max(len(line[column]) for line in [header, *body]) for column in range(len(header))]
     lines = ["  ".join(cell.ljust(width) if column == 0 else cell.rjust(width)
                        for column, (cell, width) in enumerate(zip(line, widths))) for line in [header, *body]]
     return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+
+
+def blend_name(blend_mode: str, background_gate: Union[float, str, None]) -> str:
+    """The blend in words: the mode, in `smoe` with its background gate."""
+    if blend_mode != "smoe" or background_gate is None:
+        return blend_mode
+    return f"smoe {background_gate if isinstance(background_gate, str) else format(background_gate, '.3g')}"
 
 
 def _number(value: Optional[float], digits: int) -> str:

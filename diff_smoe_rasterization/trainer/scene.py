@@ -5,6 +5,7 @@ Everything that can be wrong with a folder is a SceneError here, before training
 """
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from .cameras import Camera, scene_extent
 from .config import TrainConfig
 from .errors import SceneError
 from .images import View, fitted_camera, image_size, load_views
-from .layout import Layout, check_files
+from .layout import Layout, check_files, with_masks
 from .pointcloud import PointCloud
 from .scene_colmap import read_colmap_layout
 from .scene_nerf import read_nerf_layout
@@ -36,10 +37,8 @@ class Scene:
     def to(self, device: str) -> "Scene":
         """The same scene with its images on `device`."""
 
-        def moved(views: Sequence[View]) -> List[View]:
-            return [View(view.camera, view.image.to(device)) for view in views]
-
-        return Scene(self.kind, moved(self.train), moved(self.test), self.points, self.extent, self.split)
+        return dataclasses.replace(self, train=[view.to(device) for view in self.train],
+                                   test=[view.to(device) for view in self.test])
 
 
 def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None) -> Scene:
@@ -70,7 +69,7 @@ def read_layout(config: TrainConfig) -> Layout:
     if not layout.train:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
     check_files([image.path for image in list(layout.train) + list(layout.test)])
-    return layout
+    return with_masks(folder, layout)
 
 
 def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
@@ -83,6 +82,7 @@ def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
     return {
         "number of training views": len(scene.train),
         "number of test views": len(scene.test),
+        "number of masks": sum(view.mask is not None for view in [*scene.train, *scene.test]),
         "number of points": len(scene.points.positions),
         # Six digits, since another numpy may sum in another order.
         "extent": f"{scene.extent:.6g}",

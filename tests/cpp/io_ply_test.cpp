@@ -3,6 +3,7 @@
 
 #include <cmath>
 #include <limits>
+#include <optional>
 
 #include "io/ply.h"
 #include "io/ply_vertices.h"
@@ -169,6 +170,52 @@ TEST(PlyGaussians, TwoBlendModesAreRefused) {
   std::string bytes = one_gaussian(0);
   bytes.insert(bytes.find("element"), "comment blend_mode alpha\ncomment blend_mode smoe\n");
   expect_contains(format_error_of([&] { parse_gaussians(bytes, "a.ply"); }), "two blend modes");
+}
+
+TEST(PlyGaussians, BackgroundGateReadsBackExactly) {
+  const TemporaryFolder folder;
+  // Neither a tenth nor the float nearest to it has a short binary form; the least double has the longest exponent.
+  for (const double gate : {0.0, 0.05, 0.1, static_cast<double>(0.1F), 1.0 / 3, 5e-324, 1e300}) {
+    GaussianModel model = make_model(1, 0);
+    model.blend_mode = "smoe";
+    model.background_gate = gate;
+    write_gaussians(folder.file("a.ply"), model);
+    const GaussianModel read = read_gaussians(folder.file("a.ply"));
+    EXPECT_EQ(read.background_gate, std::optional<double>(gate));
+    write_gaussians(folder.file("b.ply"), read);  // it is not recorded once more
+    EXPECT_EQ(read_bytes(folder.file("b.ply")), read_bytes(folder.file("a.ply")));
+  }
+  GaussianModel model = make_model(1, 0);
+  model.comments = {"background_gates are other words"};
+  write_gaussians(folder.file("c.ply"), model);
+  EXPECT_EQ(read_gaussians(folder.file("c.ply")).background_gate, std::nullopt);
+  model.background_gate = 0.05;
+  write_gaussians(folder.file("d.ply"), model);
+  expect_contains(read_bytes(folder.file("d.ply")), "\ncomment background_gate 0.05\n");
+}
+
+TEST(PlyGaussians, WhatIsNoBackgroundGateIsRefused) {
+  const TemporaryFolder folder;
+  const auto message_of = [](const std::string& comments) {
+    std::string bytes = one_gaussian(0);
+    bytes.insert(bytes.find("element"), comments);
+    return format_error_of([&] { parse_gaussians(bytes, "a.ply"); });
+  };
+  for (const std::string text : {"", " -0.05", " nan", " inf", " 0.05x", " 0.05 0.06", " 1e999", " learned"}) {
+    const std::string message = message_of("comment blend_mode smoe\ncomment background_gate" + text + "\n");
+    expect_contains(message, "a.ply, line 4: the comment's background gate is");
+    expect_contains(message, "0 or more");
+  }
+  expect_contains(message_of("comment background_gate 0.05\ncomment background_gate 0.1\n"),
+                  "a.ply, line 4: the comments record two background gates, 0.05 and 0.1");
+
+  GaussianModel model = make_model(1, 0);
+  model.background_gate = -1;
+  expect_contains(format_error_of([&] { write_gaussians(folder.file("a.ply"), model); }), "\"-1\"");
+  model.comments = {"background_gate 0.1"};
+  model.background_gate = 0.05;
+  expect_contains(format_error_of([&] { write_gaussians(folder.file("a.ply"), model); }), "two background gates");
+  EXPECT_FALSE(std::filesystem::exists(folder.file("a.ply")));
 }
 
 TEST(PlyGaussians, WritingChecksEverySize) {
@@ -354,6 +401,7 @@ TEST(PlyErrors, EveryTruncationIsSeen) {
   const TemporaryFolder folder;
   GaussianModel model = make_model(2, 0);
   model.blend_mode = "smoe";
+  model.background_gate = 0.05;
   write_gaussians(folder.file("a.ply"), model);
   const std::string bytes = read_bytes(folder.file("a.ply"));
   for (std::size_t length = 0; length < bytes.size(); ++length) {
@@ -363,7 +411,9 @@ TEST(PlyErrors, EveryTruncationIsSeen) {
 
 TEST(PlyErrors, DamageIsSurvived) {
   const TemporaryFolder folder;
-  write_gaussians(folder.file("a.ply"), make_model(3, 1));
+  GaussianModel model = make_model(3, 1);
+  model.background_gate = 0.05;
+  write_gaussians(folder.file("a.ply"), model);
   expect_survives_damage(read_bytes(folder.file("a.ply")), [](const std::string& b) { parse_gaussians(b, "damaged"); });
   const auto parse = [](const std::string& bytes) { parse_points(bytes, "damaged"); };
   expect_survives_damage(ascii_points(), parse);

@@ -65,6 +65,9 @@ class LineCursor {
   /// Moves to the next line that is neither blank nor begins with '#'.
   bool next_content_line();
 
+  /// The current line's number, from 1 on.
+  std::size_t line_number() const { return line_number_; }
+
   /// Byte offset of the line after this one.
   std::size_t next_offset() const { return next_; }
 

@@ -13,6 +13,7 @@ namespace dsmoe::io {
 namespace {
 
 constexpr std::string_view kBlendModeKey = "blend_mode ";
+constexpr std::string_view kBackgroundGateKey = "background_gate";
 constexpr int kMaxShDegree = 3;
 
 std::size_t num_rest(int sh_degree) { return static_cast<std::size_t>((sh_degree + 1) * (sh_degree + 1) - 1); }
@@ -57,6 +58,33 @@ std::string recorded_blend_mode(const std::vector<std::string>& comments, const 
   return mode;
 }
 
+/// Returns the background gate that the comments record, if any. Throws where they record two, or what is none.
+/// lines: the comments' line numbers, for errors; empty where they are not from a file.
+std::optional<double> recorded_background_gate(const std::vector<std::string>& comments,
+                                               const std::vector<std::size_t>& lines, const std::string& file) {
+  std::optional<double> gate;
+  for (std::size_t i = 0; i < comments.size(); ++i) {
+    std::string_view text = comments[i];
+    if (text.rfind(kBackgroundGateKey, 0) != 0) continue;
+    text.remove_prefix(kBackgroundGateKey.size());
+    const std::size_t begin = text.find_first_not_of(" \t");
+    if (begin == 0) continue;  // another word
+    text.remove_prefix(std::min(begin, text.size()));
+    const std::string where = file + (lines.empty() ? "" : ", line " + std::to_string(lines[i]));
+    double found = 0;
+    if (!parse_number(text, found) || !(found >= 0 && std::isfinite(found))) {
+      throw FormatError(where + ": the comment's background gate is " + printable(text) +
+                        "; it must be a number, 0 or more and finite");
+    }
+    if (gate && *gate != found) {
+      throw FormatError(where + ": the comments record two background gates, " + shortest_text(*gate) + " and " +
+                        shortest_text(found));
+    }
+    gate = found;
+  }
+  return gate;
+}
+
 void check_size(const std::string& path, const char* name, std::size_t size, std::size_t expected) {
   if (size == expected) return;
   throw FormatError(path + ": " + name + " has " + std::to_string(size) + " values; it must have " +
@@ -79,6 +107,7 @@ GaussianModel parse_gaussians(std::string bytes, const std::string& file) {
   model.sh_degree = sh_degree_of(vertices);
   model.comments = vertices.comments();
   model.blend_mode = recorded_blend_mode(model.comments, file);
+  model.background_gate = recorded_background_gate(model.comments, vertices.comment_lines(), file);
 
   // f_rest is stored channel by channel, the model coefficient by coefficient.
   const std::size_t rest = num_rest(model.sh_degree);
@@ -117,11 +146,13 @@ void write_gaussians(const std::string& path, const GaussianModel& model) {
   check_size(path, "rotations", model.rotations.size(), 4 * model.count);
 
   std::vector<std::string> comments = model.comments;
-  if (!model.blend_mode.empty()) {
-    const std::string line = std::string(kBlendModeKey) + model.blend_mode;
+  const auto record = [&comments](const std::string& line) {
     if (std::find(comments.begin(), comments.end(), line) == comments.end()) comments.push_back(line);
-  }
-  recorded_blend_mode(comments, path);  // throws where the caller's comments name another mode
+  };
+  if (!model.blend_mode.empty()) record(std::string(kBlendModeKey) + model.blend_mode);
+  if (model.background_gate) record(std::string(kBackgroundGateKey) + " " + shortest_text(*model.background_gate));
+  recorded_blend_mode(comments, path);  // throw where the caller's comments name another mode or gate
+  recorded_background_gate(comments, {}, path);
 
   std::vector<PlyColumn> columns;
   const auto add = [&](const std::string& name) { columns.push_back({name, PlyType::kFloat32}); };

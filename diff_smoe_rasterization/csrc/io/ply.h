@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstddef>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -21,7 +22,8 @@ struct GaussianModel {
   std::vector<float> log_scales;           // [N, 3]
   std::vector<float> rotations;            // [N, 4] (w, x, y, z), not normalised
   std::string blend_mode;                  // what "comment blend_mode NAME" records; empty: the file does not say
-  std::vector<std::string> comments = {};  // all comment lines, that one included
+  std::optional<double> background_gate;   // what "comment background_gate VALUE" records, likewise
+  std::vector<std::string> comments = {};  // all comment lines, these included
 };
 
 /// Reads a model; columns are found by name, in any order and scalar type, and others are ignored.
@@ -31,8 +33,9 @@ GaussianModel read_gaussians(const std::string& path);
 /// The same from the bytes of a file, which `file` names in errors.
 GaussianModel parse_gaussians(std::string bytes, const std::string& file);
 
-/// Writes binary little endian float32 columns in Inria's order, normals zero. A blend mode becomes a comment line.
-/// Throws FileError; FormatError where a vector has not the size that count and sh_degree ask for.
+/// Writes binary little endian float32 columns in Inria's order, normals zero. Blend mode and background gate become
+/// comment lines; the gate is read back as the same double. Throws FileError; FormatError where a vector has not the
+/// size that count and sh_degree ask for, and where the comments record something else.
 void write_gaussians(const std::string& path, const GaussianModel& model);
 
 /// Reads x y z and, where present, red green blue (whole numbers 0 to 255) and nx ny nz.

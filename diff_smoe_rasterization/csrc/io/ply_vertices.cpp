@@ -82,6 +82,7 @@ struct Header {
   std::optional<PlyFormat> format;
   std::vector<HeaderElement> elements;
   std::vector<std::string> comments;
+  std::vector<std::size_t> comment_lines;
 };
 
 PlyFormat read_format(LineCursor& lines) {
@@ -133,6 +134,7 @@ Header read_header(LineCursor& lines) {
     const std::string_view keyword = lines.field("a keyword");
     if (keyword == "comment") {
       header.comments.emplace_back(lines.rest());
+      header.comment_lines.push_back(lines.line_number());
     } else if (keyword == "obj_info") {
       lines.rest();
     } else if (keyword == "format") {
@@ -238,6 +240,7 @@ PlyVertices PlyVertices::parse(std::string bytes, const std::string& file) {
   LineCursor lines(vertices.bytes_, file);
   Header header = read_header(lines);
   vertices.comments_ = std::move(header.comments);
+  vertices.comment_lines_ = std::move(header.comment_lines);
   const PlyFormat format = *header.format;
   const ByteOrder order = format == PlyFormat::kBigEndian ? ByteOrder::kBigEndian : ByteOrder::kLittleEndian;
   ByteCursor binary(vertices.bytes_, file, lines.next_offset());

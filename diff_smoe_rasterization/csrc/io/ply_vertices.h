@@ -35,6 +35,9 @@ class PlyVertices {
   /// The text of the header's `comment` lines, in their order.
   const std::vector<std::string>& comments() const { return comments_; }
 
+  /// The number of each of these lines in the file, from 1 on.
+  const std::vector<std::size_t>& comment_lines() const { return comment_lines_; }
+
   /// Returns the column of that name, or null.
   const PlyProperty* find(std::string_view name) const;
 
@@ -50,6 +53,7 @@ class PlyVertices {
   std::size_t count_ = 0;
   std::vector<PlyProperty> properties_;
   std::vector<std::string> comments_;
+  std::vector<std::size_t> comment_lines_;
   std::string bytes_;          // holds the rows
   std::size_t first_row_ = 0;  // byte offset in bytes_
   std::size_t stride_ = 0;     // bytes from row to row

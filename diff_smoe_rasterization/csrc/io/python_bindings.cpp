@@ -90,6 +90,7 @@ py::dict read_gaussians_python(const std::string& path) {
   result["log_scales"] = to_numpy(std::move(model.log_scales), {n, 3});
   result["rotations"] = to_numpy(std::move(model.rotations), {n, 4});
   result["blend_mode"] = model.blend_mode.empty() ? py::object(py::none()) : decode_utf8(model.blend_mode);
+  result["background_gate"] = model.background_gate;
   result["comments"] = decode_comments(model.comments);
   return result;
 }
@@ -98,7 +99,7 @@ void write_gaussians_python(const std::string& path, int sh_degree, const InputA
                             const InputArray<float>& dc, const InputArray<float>& shs,
                             const InputArray<float>& opacity_logits, const InputArray<float>& log_scales,
                             const InputArray<float>& rotations, const std::string& blend_mode,
-                            const std::vector<std::string>& comments) {
+                            std::optional<double> background_gate, const std::vector<std::string>& comments) {
   GaussianModel model;
   model.count = static_cast<std::size_t>(means3D.size() / 3);
   model.sh_degree = sh_degree;
@@ -109,6 +110,7 @@ void write_gaussians_python(const std::string& path, int sh_degree, const InputA
   model.log_scales = to_vector(log_scales);
   model.rotations = to_vector(rotations);
   model.blend_mode = blend_mode;
+  model.background_gate = background_gate;
   model.comments = comments;
   const py::gil_scoped_release unlocked;
   write_gaussians(path, model);

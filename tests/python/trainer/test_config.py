@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
 from diff_smoe_rasterization.trainer.config import TrainConfig, add_arguments, config_from_arguments
 from diff_smoe_rasterization.trainer.errors import ConfigError
 
@@ -49,7 +50,53 @@ def test_blend_mode_follows_the_environment_unless_given(monkeypatch):
         parse()
 
 
+def test_background_gate_of_each_mode(monkeypatch):
+    modes = ("alpha", "smoe", "smoe_tn", "smoe_std")
+    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [
+        1.0, RECOMMENDED_BACKGROUND_GATE, 0.0, 0.0]
+    assert parse("--blend-mode", "smoe", "--background-gate", "0").background_gate == 0.0, "the paper's"
+    assert parse("--blend-mode", "smoe", "--background-gate", "learned").background_gate == "learned"
+    assert parse("--blend-mode", "alpha", "--background-gate", "1").background_gate == 1.0
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.2")
+    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, 0.2, 0.0, 0.0]
+    assert parse("--blend-mode", "smoe", "--background-gate", "0.4").background_gate == 0.4
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "learned")
+    with pytest.raises(ConfigError, match="DSMOE_BACKGROUND_GATE is 'learned'"):
+        parse("--blend-mode", "smoe")
+
+
+@pytest.mark.parametrize("mode, gate, words", [
+    ("smoe", -0.1, "background_gate is -0.1"), ("smoe", float("inf"), "background_gate is inf"),
+    ("alpha", 0.1, "only 'smoe'"), ("alpha", "learned", "only 'smoe'"), ("smoe_tn", 0.1, "only 'smoe'"),
+    ("smoe_std", 1.0, "only 'smoe'"),
+])
+def test_a_background_gate_that_the_mode_does_not_know_is_refused(mode, gate, words):
+    with pytest.raises(ConfigError, match=words):
+        TrainConfig(blend_mode=mode, background_gate=gate)
+
+
+def test_another_mode_takes_its_own_background_gate():
+    config = TrainConfig(blend_mode="smoe", background_gate=0.3)
+    assert config.changed(seed=1).background_gate == 0.3
+    alpha = config.changed(blend_mode="alpha")
+    assert (alpha.background_gate, alpha.changed(blend_mode="smoe").background_gate) == (
+        1.0, RECOMMENDED_BACKGROUND_GATE)
+    assert alpha.changed(blend_mode="smoe", background_gate=0.2).background_gate == 0.2
+
+
+@pytest.mark.parametrize("mode, expected", [("smoe", 0.0), ("alpha", 1.0), ("smoe_tn", 0.0)])
+def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypatch, mode, expected):
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")  # must not fill the gap
+    TrainConfig(scene="s", output=str(tmp_path), blend_mode=mode).save(str(tmp_path))
+    values = json.loads((tmp_path / "config.json").read_text())
+    assert values.pop("background_gate") == (0.7 if mode == "smoe" else expected), "the resolved one"
+    (tmp_path / "config.json").write_text(json.dumps(values))
+    assert TrainConfig.load(str(tmp_path)).background_gate == expected
+
+
 @pytest.mark.parametrize("option, value, words", [
+    ("background_gate_bound", 1.0, "--background-gate-bound is 1.0; it must be at least 0 and below 1"),
+    ("background_gate_bound", -0.1, "--background-gate-bound is -0.1"),
     ("iterations", 0, "--iterations is 0; it must be at least 1"),
     ("resolution", 0, "--resolution is 0"),
     ("resolution", -2, "--resolution is -2"),
@@ -108,7 +155,7 @@ def test_differences_ignore_where_and_when_things_are_written():
     one = TrainConfig(scene="a", output="b", seed=1, checkpoint_every=5)
     assert one.differences(TrainConfig(scene="c", output="d", seed=1, eval_every=7)) == []
     texts = one.differences(TrainConfig(seed=2, blend_mode="smoe"))
-    assert len(texts) == 2 and any("--seed is 1 here and 2 there" in text for text in texts)
+    assert len(texts) == 3 and any("--seed is 1 here and 2 there" in text for text in texts)
 
 
 def test_shortened_keeps_the_shares_of_the_recipe():

@@ -11,7 +11,8 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.model import PARAMETERS, GaussianModel, GaussianOptimizer, exponential_rate
-from diff_smoe_rasterization.trainer.modelfile import agreed_blend_mode, load_model, save_model
+from diff_smoe_rasterization.trainer.modelfile import (Recorded, agreed_background_gate, agreed_blend_mode, load_model,
+                                                       save_model)
 from diff_smoe_rasterization.trainer.pointcloud import PointCloud
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
@@ -106,9 +107,9 @@ def test_degree_zero_renders_the_base_colour_alone():
 def test_ply_round_trip(tmp_path, mode, sh_degree):
     model = random_model(sh_degree=sh_degree)
     path = str(tmp_path / "deep" / "model.ply")
-    save_model(path, model, mode)
+    save_model(path, model, mode, 0.1)
     loaded, recorded = load_model(path, "cpu")
-    assert recorded == mode
+    assert recorded == (mode, 0.1 if mode == "smoe" else None), "the other modes have no choice"
     assert loaded.sh_degree == loaded.active_sh_degree == sh_degree
     for name in PARAMETERS:
         assert torch.equal(loaded.raw[name], model.raw[name]), name
@@ -125,9 +126,33 @@ def test_blend_mode_of_a_file_is_never_guessed():
         agreed_blend_mode("a.ply", "future", None)
 
 
+@pytest.mark.parametrize("mode, recorded, asked, expected", [
+    ("smoe", ("smoe", 0.1), None, 0.1),
+    ("smoe", ("smoe", 0.1), 0.1, 0.1),
+    ("smoe", ("smoe", 0.1), 0.2, r"a\.ply was trained with the background gate 0\.1, not 0\.2"),
+    ("smoe", ("smoe", None), None, 0.0),  # older files are of Eq. 7
+    ("smoe", ("smoe", None), 0.05, "background gate 0, not 0.05"),
+    ("smoe", (None, None), None, r"a\.ply does not say which background gate.*--background-gate"),
+    ("smoe", (None, None), 0.2, 0.2),
+    ("smoe", (None, None), -1.0, "background_gate is -1.0"),
+    ("alpha", ("alpha", None), None, 1.0),
+    ("alpha", (None, None), 1.0, 1.0),
+    ("alpha", (None, None), 0.1, "background gate is 0.1; in the blend mode alpha it is 1"),
+    ("alpha", (None, 0.1), None, "background gate is 0.1; in the blend mode alpha it is 1"),
+    ("smoe_tn", ("smoe_tn", None), 0.0, 0.0),
+])
+def test_background_gate_of_a_file_is_never_guessed(monkeypatch, mode, recorded, asked, expected):
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")  # must not fill the gap
+    if isinstance(expected, float):
+        assert agreed_background_gate("a.ply", mode, Recorded(*recorded), asked) == expected
+    else:
+        with pytest.raises(TrainerError, match=expected):
+            agreed_background_gate("a.ply", mode, Recorded(*recorded), asked)
+
+
 def test_a_damaged_ply_is_named(tmp_path):
     path = tmp_path / "model.ply"
-    save_model(str(path), random_model(), "alpha")
+    save_model(str(path), random_model(), "alpha", 1.0)
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(TrainerError, match="model.ply"):
         load_model(str(path), "cpu")
@@ -140,4 +165,4 @@ def test_files_of_other_programs_load_without_a_mode(tmp_path):
     raw = {name: tensor.detach().numpy() for name, tensor in model.raw.items()}
     io.write_gaussians(str(tmp_path / "a.ply"), io.Gaussians(
         raw["means3D"], raw["dc"], raw["shs"], raw["opacities"], raw["scales"], raw["rotations"]))
-    assert load_model(str(tmp_path / "a.ply"), "cpu")[1] is None
+    assert load_model(str(tmp_path / "a.ply"), "cpu")[1] == (None, None)

@@ -30,7 +30,7 @@ def scene(tiny_config):
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_the_first_steps_are_those_of_the_cpu(tiny_config, scene, mode):
     """Until something is densified or pruned, rounding alone differs."""
-    config = dataclasses.replace(tiny_config, blend_mode=mode, densify_until_iter=0)
+    config = tiny_config.changed(blend_mode=mode, densify_until_iter=0)
     trainers = [Trainer(dataclasses.replace(config, device=device), scene) for device in ("cpu", "cuda")]
     for _ in range(5):
         losses = [float(trainer.step().loss) for trainer in trainers]
@@ -48,7 +48,7 @@ def test_the_first_steps_are_those_of_the_cpu(tiny_config, scene, mode):
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_a_fixed_set_of_gaussians_ends_as_good_as_on_the_cpu(tiny_config, scene, tmp_path, mode):
     scene = dataclasses.replace(scene, test=scene.train)  # measured where it learns
-    config = dataclasses.replace(tiny_config, blend_mode=mode, densify_until_iter=0, iterations=300)
+    config = tiny_config.changed(blend_mode=mode, densify_until_iter=0, iterations=300)
     configs = [dataclasses.replace(config, device=device, output=str(tmp_path / device)) for device in ("cpu", "cuda")]
     rows = [train(config, scene=scene, progress=False) for config in configs]
     start = Trainer(config, scene).evaluate().metrics["psnr"]
@@ -57,8 +57,9 @@ def test_a_fixed_set_of_gaussians_ends_as_good_as_on_the_cpu(tiny_config, scene,
     assert rows[1]["psnr"] == pytest.approx(rows[0]["psnr"], abs=0.1)
 
 
-def test_a_step_does_not_wait_for_the_device(config, scene):
-    trainer = Trainer(dataclasses.replace(config, densify_until_iter=0), scene)
+@pytest.mark.parametrize("options", [dict(), dict(background_gate="learned", random_background=True)])
+def test_a_step_does_not_wait_for_the_device(config, scene, options):
+    trainer = Trainer(dataclasses.replace(config, densify_until_iter=0, **options), scene)
     for _ in range(8):
         trainer.step()  # every view once: cameras are sent, memory is taken
     torch.cuda.set_sync_debug_mode("error")
@@ -73,7 +74,7 @@ def test_a_step_does_not_wait_for_the_device(config, scene):
 @pytest.mark.parametrize("schedule", ["3dgs", "steady"])
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_a_whole_run(config, schedule, mode):
-    config = dataclasses.replace(config, schedule=schedule, blend_mode=mode, eval_every=10)
+    config = config.changed(schedule=schedule, blend_mode=mode, eval_every=10)
     row = train(config, progress=False)
     assert row["protocol"]["device"] == "cuda" and math.isfinite(row["psnr"]) and row["fps"] > 0
     with open(os.path.join(config.output, "history.json"), encoding="utf-8") as file:

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from diff_smoe_rasterization import io
+from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
 from diff_smoe_rasterization.trainer import quickstart
 from diff_smoe_rasterization.trainer.pictures import busiest_window, comparison, evenly_spaced
 
@@ -31,7 +32,9 @@ def test_both_modes_are_trained_with_the_same_settings(output):
 
 def test_the_models_record_their_modes(output):
     for mode in ("alpha", "smoe"):
-        assert io.read_gaussians(str(output / f"{mode}.ply")).blend_mode == mode
+        model = io.read_gaussians(str(output / f"{mode}.ply"))
+        assert model.blend_mode == mode
+        assert model.background_gate == (RECOMMENDED_BACKGROUND_GATE if mode == "smoe" else None)
 
 
 def test_pictures_show_truth_and_both_modes(output):
@@ -44,7 +47,8 @@ def test_pictures_show_truth_and_both_modes(output):
 def test_the_table_and_a_second_run(tiny_scene, output, capsys):
     assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "20", "--quiet"]) == 0
     text = capsys.readouterr().out
-    for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", "\nsmoe ", "compare_view_000.png"):
+    for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", f"\nsmoe {RECOMMENDED_BACKGROUND_GATE} ",
+                 "compare_view_000.png"):
         assert word in text
 
 

@@ -43,7 +43,7 @@ def kill_at(monkeypatch, iteration):
 @pytest.mark.parametrize("blend_mode, killed_at", [("alpha", 26), ("smoe", 26), ("smoe", 11), ("smoe", 39)])
 def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, blend_mode, killed_at):
     """Checkpoints are at 10, 20, 30; densifications at 8, 16, 24 and resets at 12, 24 lie on both sides."""
-    straight = dataclasses.replace(tiny_config, blend_mode=blend_mode, output=str(tmp_path / "straight"))
+    straight = tiny_config.changed(blend_mode=blend_mode, output=str(tmp_path / "straight"))
     row = train(straight, progress=False)
     broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
     with monkeypatch.context() as patch:
@@ -61,6 +61,34 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, bl
     for name in states[0]["optimizer"]:
         for key, value in states[0]["optimizer"][name].items():
             assert torch.equal(torch.as_tensor(value), torch.as_tensor(states[1]["optimizer"][name][key])), (name, key)
+
+
+@pytest.mark.parametrize("options", [
+    dict(blend_mode="smoe", background_gate="learned"), dict(blend_mode="alpha", random_background=True)])
+def test_a_learned_gate_and_random_backgrounds_resume_bit_for_bit(tiny_config, tmp_path, monkeypatch, options):
+    straight = tiny_config.changed(output=str(tmp_path / "straight"), **options)
+    row = train(straight, progress=False)
+    broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
+    with monkeypatch.context() as patch:
+        kill_at(patch, 26)
+        with pytest.raises(Killed):
+            train(broken, progress=False)
+    torch.manual_seed(12345)
+    resumed = train(broken, resume=True, progress=False)
+    assert ply_bytes(broken) == ply_bytes(straight)
+    assert (resumed["psnr"], resumed["background_gate"]) == (row["psnr"], row["background_gate"])
+
+
+def test_a_checkpoint_of_a_version_without_gate_and_masks_is_one_of_the_paper(tiny_config):
+    config = tiny_config.changed(background_gate=0.0, iterations=2)
+    row = train(config, progress=False)
+    path = os.path.join(config.output, "checkpoint.pt")
+    state = load_checkpoint(path, "cpu")
+    del state["gate"], state["scene"]["number of masks"], state["config"]["background_gate"]
+    save_checkpoint(path, state)
+    assert train(config, resume=True, progress=False)["psnr"] == row["psnr"]
+    with pytest.raises(TrainerError, match="--background-gate is 0.0 .* 0.05"):
+        train(config.changed(background_gate=0.05), resume=True, progress=False)
 
 
 def test_resume_before_the_first_checkpoint_starts_anew(tiny_config, tmp_path, monkeypatch, capsys):
@@ -186,7 +214,7 @@ def test_other_options_cannot_be_resumed(tiny_config):
     with pytest.raises(TrainerError, match="--seed is 0 .* 1 "):
         train(dataclasses.replace(tiny_config, seed=1), resume=True, progress=False)
     with pytest.raises(TrainerError, match="--blend-mode"):
-        train(dataclasses.replace(tiny_config, blend_mode="alpha"), resume=True, progress=False)
+        train(tiny_config.changed(blend_mode="alpha"), resume=True, progress=False)
 
 
 def test_a_run_is_not_overwritten_unasked(tiny_config):
@@ -270,7 +298,7 @@ def test_views_come_once_each_in_random_order():
 
 def test_training_lowers_the_loss(tiny_config, mode):
     """The whole loop learns: a fixed set of Gaussians, the loss of the first and of a later pass over the views."""
-    config = dataclasses.replace(tiny_config, blend_mode=mode, densify_until_iter=0, iterations=200)
+    config = tiny_config.changed(blend_mode=mode, densify_until_iter=0, iterations=200)
     trainer = Trainer(config, load_scene(config, progress=False))
     losses = [float(trainer.step().loss.detach()) for _ in range(20 * 7)]
     assert sum(losses[-7:]) < 0.9 * sum(losses[:7]), losses
