@@ -61,3 +61,4 @@ def mode(request):
 @pytest.fixture(autouse=True)
 def no_blend_mode_in_the_environment(monkeypatch):
     monkeypatch.delenv("DSMOE_BLEND_MODE", raising=False)
+    monkeypatch.delenv("DSMOE_BACKGROUND_GATE", raising=False)
