@@ -5,7 +5,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import gradients, op_arguments, random_scene
+from scenes import gradients, op_arguments, random_scene, with_gate
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
@@ -61,6 +61,7 @@ def images_and_gradients(function, scene):
                     for (name, leaf), value in zip(leaves.items(), values)}
 
 
+@with_gate
 @pytest.mark.parametrize("case", [dict(degree=1), dict(degree=1, split_dc=True), dict(channels=5, covariance="cov3D")],
                          ids=["shs", "dc", "channels"])
 def test_opcheck_of_rasterize(mode, case):
@@ -79,6 +80,7 @@ def test_opcheck_of_mark_visible():
                           (scene.inputs["means3D"], scene.settings.viewmatrix, 0.2))
 
 
+@with_gate
 def test_opcheck_of_contributions(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
     saved = dict(zip(RESULTS, torch.ops.diff_smoe_rasterization.rasterize.default(*op_arguments(scene))))
@@ -125,6 +127,7 @@ def test_compiled_renderings_without_gradients_have_no_backward_pass_to_come():
     assert wanted == [True, False]
 
 
+@with_gate
 @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
 def test_compiled_equals_eager(mode, backend):
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32, degree=1)
