@@ -14,11 +14,11 @@ from .extension import _C  # noqa: F401  (loading it registers the ops)
 
 _OPS = torch.ops.diff_smoe_rasterization
 _CAN_REGISTER = hasattr(torch.library, "register_autograd")
-_NUM_INPUTS = 13  # tensors before the options
-_NUM_OPTIONS = 15  # options that the backward op takes too
+_NUM_INPUTS = 14  # tensors before the options
+_NUM_OPTIONS = 16  # options that the backward op takes too
 _NUM_IMAGES = 5  # results that are the caller's: color, radii, gate_sum, depth, inverse_depth
 _RADII, _DEPTH = 1, 3
-_BLEND_MODE = _NUM_INPUTS + 8  # among the op's arguments
+_BLEND_MODE = _NUM_INPUTS + 9  # among the op's arguments
 _ALPHA = 0  # BLEND_MODES.index("alpha")
 
 
@@ -99,9 +99,9 @@ def rasterize_op(*inputs):
 
 
 def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-                    viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier, near,
-                    alpha_min, sh_degree, blend_mode, antialiasing, depth, inverse_depth, deterministic,
-                    debug, clamp_color, strict, prefiltered, for_backward=True):
+                    viewmatrix, projmatrix, campos, background_gate, image_height, image_width, tanfovx, tanfovy,
+                    scale_modifier, near, alpha_min, fixed_background_gate, sh_degree, blend_mode, antialiasing, depth,
+                    inverse_depth, deterministic, debug, clamp_color, strict, prefiltered, for_backward=True):
     """The results' shapes and types, as csrc/torch/tensors.cpp allocates them."""
     count = means3D.shape[0]
     channels = 3 if colors_precomp is None else colors_precomp.shape[1]

@@ -7,7 +7,8 @@ import torch
 
 from .autograd import rasterize_op
 from .extension import BACKENDS, build_info
-from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend_mode
+from .settings import (
+    BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_background_gate, resolve_blend_mode)
 from .splats import Splats
 
 
@@ -21,7 +22,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     Args:
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1.
-        settings: camera and options; its viewmatrix, projmatrix, campos and bg are differentiable too, each on its own.
+        settings: camera and options; its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
+            differentiable too, each on its own.
         means2D: [N, 3]; its value is ignored, its gradient is dL/d(pixel) times (width / 2, height / 2), z = 0: what
             densification reads.
         shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.
@@ -35,10 +37,13 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     Returns: Rendering. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
     Raises:
         ValueError: a shape or a value does not fit; both or neither of shs and colors_precomp, or of scales with
-            rotations and cov3D_precomp, are given; under `settings.strict` an attribute is not finite; under
-            `settings.prefiltered` a Gaussian is not beyond the near plane.
+            rotations and cov3D_precomp, are given; background_gate does not fit the blend mode; under
+            `settings.strict` an attribute is not finite; under `settings.prefiltered` a Gaussian is not beyond the near
+            plane.
         TypeError: a type or a device does not fit.
         RuntimeError: the Gaussians cover more tiles than fit; under `settings.debug` a result or gradient is NaN.
+
+    On CUDA the value of a tensor background_gate is not checked: the host would have to wait for it.
     """
     return _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scales, rotations, cov3D_precomp,
                    outputs)[0]
@@ -63,19 +68,24 @@ def _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scal
     """Returns the Rendering, and the results of the op that are no images: what it saved."""
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
+    blend_mode = resolve_blend_mode(settings.blend_mode)
+    background_gate = resolve_background_gate(blend_mode, settings.background_gate)
     required, optional = _checks("rasterize", "means3D", means3D)
+    tensor_gate, fixed_gate = None, background_gate
+    if isinstance(background_gate, torch.Tensor):
+        tensor_gate, fixed_gate = required("background_gate", background_gate), 0.0
     color, radii, gate_sum, depth, inverse_depth, *saved = rasterize_op(
         means3D, optional("means2D", means2D), required("opacities", opacities), optional("dc", dc),
         optional("shs", shs), optional("colors_precomp", colors_precomp), optional("scales", scales),
         optional("rotations", rotations), optional("cov3D_precomp", cov3D_precomp), required("bg", settings.bg),
         _without_batch(required("viewmatrix", settings.viewmatrix), 2),
         _without_batch(required("projmatrix", settings.projmatrix), 2),
-        _without_batch(required("campos", settings.campos), 1),
+        _without_batch(required("campos", settings.campos), 1), tensor_gate,
         int(settings.image_height), int(settings.image_width), float(settings.tanfovx), float(settings.tanfovy),
-        float(settings.scale_modifier), float(settings.near), float(settings.alpha_min), int(settings.sh_degree),
-        BLEND_MODES.index(resolve_blend_mode(settings.blend_mode)), bool(settings.antialiasing), "depth" in outputs,
-        "inverse_depth" in outputs, bool(settings.deterministic), bool(settings.debug),
-        bool(settings.clamp_color), bool(settings.strict), bool(settings.prefiltered))
+        float(settings.scale_modifier), float(settings.near), float(settings.alpha_min), fixed_gate,
+        int(settings.sh_degree), BLEND_MODES.index(blend_mode), bool(settings.antialiasing), "depth" in outputs,
+        "inverse_depth" in outputs, bool(settings.deterministic), bool(settings.debug), bool(settings.clamp_color),
+        bool(settings.strict), bool(settings.prefiltered))
     return Rendering(color, radii, alpha=gate_sum if "alpha" in outputs else None,
                      depth=depth if "depth" in outputs else None,
                      inverse_depth=inverse_depth if "inverse_depth" in outputs else None), saved

@@ -6,7 +6,8 @@ from typing import Sequence
 import torch
 
 from .extension import _C  # noqa: F401  (loading it registers the ops)
-from .settings import BLEND_MODES, Contributions, GaussianRasterizationSettings, resolve_blend_mode
+from .settings import (
+    BLEND_MODES, Contributions, GaussianRasterizationSettings, resolve_background_gate, resolve_blend_mode)
 
 _OPS = torch.ops.diff_smoe_rasterization
 
@@ -22,8 +23,11 @@ class Splats:
         (self._projected, _, self._instance_offsets, self._tile_offsets, self._instances, _, self._last_contributor,
          self._order, *_) = (tensor.detach() for tensor in saved)
         self._radii = radii
-        self._alpha_min = float(settings.alpha_min)
-        self._blend_mode = BLEND_MODES.index(resolve_blend_mode(settings.blend_mode))
+        blend_mode = resolve_blend_mode(settings.blend_mode)
+        gate = resolve_background_gate(blend_mode, settings.background_gate)
+        # A tensor is copied: an optimizer may change it before anybody asks for contributions.
+        tensor_gate, fixed_gate = (gate.detach().clone(), 0.0) if isinstance(gate, torch.Tensor) else (None, gate)
+        self._blend = (tensor_gate, float(settings.alpha_min), fixed_gate, BLEND_MODES.index(blend_mode))
 
     @property
     def centers(self) -> torch.Tensor:
@@ -48,7 +52,7 @@ class Splats:
                             "torch.Tensor")
         return Contributions(*_OPS.contributions(
             pixel_weights.detach(), self._radii, self._projected, self._instance_offsets, self._tile_offsets,
-            self._instances, self._last_contributor, self._order, self._alpha_min, self._blend_mode))
+            self._instances, self._last_contributor, self._order, *self._blend))
 
     def _of_visible(self, values: torch.Tensor) -> torch.Tensor:
         """Returns a copy with zeros for culled Gaussians, whose rows may hold anything."""

@@ -61,11 +61,12 @@ void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const Ra
     const Stopwatch stopwatch(times, &StageTimes::blend_backward);
     const auto& kernels = tile_kernels<S>();
     const int64_t tiles = num_tiles(camera.width, camera.height);
-    std::vector<S> dL_dbackground(gradients.background != nullptr ? tiles * config.num_channels : 0);
+    const int background = config.num_channels + 1;  // numbers: its colour and its gate
+    std::vector<S> dL_dbackground(gradients.background != nullptr ? tiles * background : 0);
     const int64_t pairs = for_each_tile<S>(
         config.num_threads, camera.width, camera.height, config.num_features(),
         [&](int64_t tile, int x, int y, S* scratch) {
-          S* tile_background = dL_dbackground.empty() ? nullptr : dL_dbackground.data() + tile * config.num_channels;
+          S* tile_background = dL_dbackground.empty() ? nullptr : dL_dbackground.data() + tile * background;
           return kernels.backward(
               {config, saved, images, image_gradients, camera.width, camera.height, x, y, saved.tile_offsets[tile],
                saved.tile_offsets[tile + 1], dL_dinstances.get(), tile_background},
@@ -73,8 +74,8 @@ void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const Ra
         });
     if (times != nullptr) times->backward_pairs += pairs;
     if (gradients.background != nullptr) {
-      std::vector<double> wide(config.num_channels);
-      sum_records(dL_dbackground.data(), tiles, config.num_channels, wide.data(), gradients.background);
+      std::vector<double> wide(background);
+      sum_records(dL_dbackground.data(), tiles, background, wide.data(), gradients.background);
     }
   }
 

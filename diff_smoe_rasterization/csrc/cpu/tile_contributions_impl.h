@@ -26,6 +26,7 @@ template <class S, BlendMode kMode> int64_t sum_tile(const ContributionTile<S>& 
 
   const int64_t end = tile.begin + num_seen;
   for (int64_t i = end; i < tile.end; ++i) tile.instances[tile.saved.instances[i].slot] = no_contribution<S>();
+  const AlphaCut<S> cut = tile.config.alpha_cut();
   int64_t pairs = 0;
   for (int64_t i = tile.begin; i < end; ++i) {
     prefetch_gaussian(tile.saved, tile.saved.instances[min(i + kPrefetchDistance, end - 1)], 0);
@@ -33,6 +34,7 @@ template <class S, BlendMode kMode> int64_t sum_tile(const ContributionTile<S>& 
     const ProjectedGaussian<S>& gaussian = tile.saved.projected[instance.gaussian];
     const RowRange rows = rows_of(gaussian, extent);
     const S faintest = least_power(gaussian), position = S(i - tile.begin);
+    const S least_alpha = cut.of(gaussian.opacity);
     auto sum = no_contribution<P>();
     for (int strip = 0; strip < kStrips<S>; ++strip) {
       const P dx = P::iota() + P(S(extent.x0 + strip * P::kLanes) - gaussian.mean.x);
@@ -44,7 +46,7 @@ template <class S, BlendMode kMode> int64_t sum_tile(const ContributionTile<S>& 
         const S dy = S(extent.y0 + row) - gaussian.mean.y;
         const P power = exponent.at(dy);
         if (!kRowsAreExact<S> && !any(power >= P(faintest))) continue;
-        const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, tile.config.alpha_min);
+        const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, least_alpha);
         PixelState<P> state = {transmittance.load(strip, row), gate_sum.load(strip, row)};
         const auto pair = Blend<kMode>::accumulate(state, gate);
         transmittance.store(strip, row, state.transmittance);

@@ -30,7 +30,7 @@ template <class S> struct BackwardTile {
   int tile_x, tile_y;
   int64_t begin, end;
   S* dL_dinstances;   // [I, kNumGateMoments + F] by slot; the tile's are written whole
-  S* dL_dbackground;  // [C] the tile's share, or null
+  S* dL_dbackground;  // [C + 1] the tile's share, or null
 };
 
 template <class S> struct ContributionTile {

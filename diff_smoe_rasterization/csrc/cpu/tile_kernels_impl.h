@@ -105,6 +105,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const Forw
     for (bool& row : strip) row = true;
   }
 
+  const AlphaCut<S> cut = tile.config.alpha_cut();
   int64_t pairs = 0;
   for (int64_t i = tile.begin; i < tile.end && open_strips > 0; ++i) {
     prefetch_gaussian(tile.saved, tile.saved.instances[min(i + kPrefetchDistance, tile.end - 1)], num_features);
@@ -113,6 +114,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const Forw
     const S* features = tile.saved.features + static_cast<int64_t>(instance.gaussian) * num_features;
     const RowRange rows = rows_of(gaussian, extent);
     const S faintest = least_power(gaussian), position = S(i - tile.begin + 1);
+    const S least_alpha = cut.of(gaussian.opacity);
     for (int strip = 0; strip < kStrips<S>; ++strip) {
       const P dx = P::iota() + P(S(extent.x0 + strip * P::kLanes) - gaussian.mean.x);
       const ColumnExponent<P, S> exponent(gaussian.conic, dx);
@@ -121,7 +123,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const Forw
         pairs += P::kLanes;
         const P power = exponent.at(S(extent.y0 + row) - gaussian.mean.y);
         if (!kRowsAreExact<S> && !any(power >= P(faintest))) continue;
-        const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, tile.config.alpha_min);
+        const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, least_alpha);
         PixelState<P> state = {transmittance.load(strip, row), gate_sum.load(strip, row)};
         const auto pair = Blend<kMode>::accumulate(state, gate);
         for (int f = 0; f < num_features; ++f) {
@@ -138,6 +140,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const Forw
     }
   }
 
+  const S background_gate = tile.config.gate_of_background();
   const int64_t pixels = static_cast<int64_t>(tile.width) * tile.height;
   extent.for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
     tile.saved.final_transmittance[index] = abs(transmittance.pixel(x, y));
@@ -151,7 +154,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile(const Forw
     const auto sum = sum_of(f);
     extent.for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
       const PixelState<S> state = {transmittance.pixel(x, y), gate_sum.pixel(x, y)};
-      image[index] = finish_feature<kMode>(rule, state, sum.pixel(x, y), background);
+      image[index] = finish_feature<kMode>(rule, state.end(background_gate), sum.pixel(x, y), background);
     });
   }
   return pairs;
@@ -175,20 +178,22 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile_backward(c
   for (int i = 0; i < kTilePixels * (4 + num_features); ++i) transmittance.values[i] = S(0);
   for (int i = 0; i < kTilePixels; ++i) transmittance.values[i] = S(1);
   const int64_t pixels = static_cast<int64_t>(tile.width) * tile.height;
+  const S background_gate = tile.config.gate_of_background();
   int64_t num_seen = 0;  // entries of the list that some numerator has seen
   extent.for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
-    const S final_transmittance = tile.saved.final_transmittance[index], gate_sum = tile.saved.gate_sum[index];
-    const S dL_dgate_sum = tile.dL_dimages.gate_sum != nullptr ? tile.dL_dimages.gate_sum[index] : S(0);
-    auto pixel = begin_backward<kMode>(final_transmittance, dL_dgate_sum);
+    const PixelEnd<S> pixel_end = {tile.saved.final_transmittance[index], tile.saved.gate_sum[index], background_gate};
+    auto pixel =
+        begin_backward(pixel_end, tile.dL_dimages.gate_sum != nullptr ? tile.dL_dimages.gate_sum[index] : S(0));
     for (int f = 0; f < num_features; ++f) {
       const S* gradient = feature_image(tile.config, tile.dL_dimages, f, pixels);
       if (gradient == nullptr) continue;
       const S value = feature_image(tile.config, tile.images, f, pixels)[index];
-      scaled_of(f).pixel(x, y) = add_feature<kMode>(feature_rule(tile.config, f), pixel, gate_sum, gradient[index],
-                                                    value, feature_background(tile.config, f));
-      if (tile.dL_dbackground != nullptr && f < tile.config.num_channels) {
-        tile.dL_dbackground[f] += background_backward<kMode>(final_transmittance, gate_sum, gradient[index]);
-      }
+      const auto share = add_feature<kMode>(feature_rule(tile.config, f), pixel, pixel_end, gradient[index], value,
+                                            feature_background(tile.config, f));
+      scaled_of(f).pixel(x, y) = share.scaled;
+      if (tile.dL_dbackground == nullptr) continue;
+      if (f < tile.config.num_channels) tile.dL_dbackground[f] += share.background;
+      tile.dL_dbackground[tile.config.num_channels] += share.background_gate;
     }
     transmittance.pixel(x, y) = pixel.transmittance;
     suffix.pixel(x, y) = pixel.suffix;
@@ -203,6 +208,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile_backward(c
     for (int k = 0; k < record; ++k) out[k] = S(0);
   }
 
+  const AlphaCut<S> cut = tile.config.alpha_cut();
   int64_t pairs = 0;
   for (int64_t i = end - 1; i >= tile.begin; --i) {
     prefetch_gaussian(tile.saved, tile.saved.instances[max(i - kPrefetchDistance, tile.begin)], num_features);
@@ -211,6 +217,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile_backward(c
     const S* features = tile.saved.features + static_cast<int64_t>(instance.gaussian) * num_features;
     const RowRange rows = rows_of(gaussian, extent);
     const S faintest = least_power(gaussian), position = S(i - tile.begin);
+    const S least_alpha = cut.of(gaussian.opacity);
     P one = S(0), x = S(0), y = S(0), xx = S(0), xy = S(0), yy = S(0);
     for (int f = 0; f < num_features; ++f) dL_dfeatures[f] = P(S(0));
     for (int strip = 0; strip < kStrips<S>; ++strip) {
@@ -224,7 +231,7 @@ template <class S, BlendMode kMode, int kFeatures> int64_t blend_tile_backward(c
         const S dy = S(extent.y0 + row) - gaussian.mean.y;
         const P power = exponent.at(dy);
         if (!kRowsAreExact<S> && !any(power >= P(faintest))) continue;
-        const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, tile.config.alpha_min);
+        const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, least_alpha);
         const auto contributes = gate.counts & not_past;
         P value = S(0);
         for (int f = 0; f < num_features; ++f) value = fma(scaled_of(f).load(strip, row), P(features[f]), value);

@@ -51,6 +51,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     for (int f = 0; f < kSums; ++f) sums[k][f] = S(0);
     last[k] = 0;
   }
+  const AlphaCut<S> cut = config.alpha_cut();
   unsigned hits = 0;
   constexpr bool kSegments = kWalksSegments<S, kSums>;
   const bool segments = kSegments && has_segments(arguments.saved, tile);
@@ -74,10 +75,10 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
       const StagedGaussian<S> current = staged[j];
       const ProjectedGaussian<S>& gaussian = current.gaussian;
       const ColumnExponent<S, S> exponent(gaussian.conic, S(tile.x) - gaussian.mean.x);
-      const S dy = S(tile.y) - gaussian.mean.y;
+      const S dy = S(tile.y) - gaussian.mean.y, least_alpha = cut.of(gaussian.opacity);
 #pragma unroll
       for (int k = 0; k < kLanePixels; ++k) {
-        const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, config.alpha_min);
+        const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
         const auto pair = Blend<kMode>::accumulate(state[k], gate);
         for (int f = 0; f < kSums; ++f) sums[k][f] = fma(pair.weight, current.features[f], sums[k][f]);
         last[k] = pair.contributes ? chunk + j + 1 : last[k];
@@ -96,16 +97,17 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   for (int k = 0; k < kLanePixels; ++k) {
     if (!tile.inside(arguments, k)) continue;
     const int64_t index = tile.pixel_index(arguments, k);
+    const auto end = state[k].end(config.gate_of_background());
     if (first_feature == 0) {
-      arguments.saved.final_transmittance[index] = abs(state[k].transmittance);
-      arguments.saved.gate_sum[index] = state[k].gate_sum;
+      arguments.saved.final_transmittance[index] = end.transmittance;
+      arguments.saved.gate_sum[index] = end.gate_sum;
       arguments.saved.last_contributor[index] = last[k];
     }
     for (int f = 0; f < kSums; ++f) {
       const int feature = first_feature + f;
       if (kSums == kFeatureChunk && feature >= config.num_features()) break;
-      feature_image(config, arguments.images, feature, pixels)[index] = finish_feature<kMode>(
-          feature_rule(config, feature), state[k], sums[k][f], feature_background(config, feature));
+      feature_image(config, arguments.images, feature, pixels)[index] =
+          finish_feature<kMode>(feature_rule(config, feature), end, sums[k][f], feature_background(config, feature));
     }
   }
   if (arguments.pairs != nullptr && first_feature == 0 && tile.lane == 0) {

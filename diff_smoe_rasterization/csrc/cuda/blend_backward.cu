@@ -13,7 +13,7 @@ template <class S> struct BackwardArguments : BlendArguments<S> {
   ImageGradients<S> dL_dimages;
   S* dL_dgaussians;        // [N, record]
   S* slots;                // [capacity, kSlotsPerInstance, record], or null
-  S* dL_dbackground_rows;  // [tiles * kWarpsPerTile, C] of each warp, or null
+  S* dL_dbackground_rows;  // [tiles * kWarpsPerTile, C + 1] of each warp, or null
   S* scaled;               // [F, H, W] g', where the number of features is not known
   int num_features;
   int tiles;
@@ -121,43 +121,48 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
   const int64_t pixels = int64_t(arguments.width) * arguments.height;
 
   PixelBackward<S> pixel[kLanePixels];
+  PixelEnd<S> pixel_end[kLanePixels];
   ScaledGradients<S, kFeatures> scaled;
   int32_t last[kLanePixels];
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
-    const S final_transmittance = inside ? arguments.saved.final_transmittance[index] : S(1);
-    const S gate_sum = inside ? arguments.saved.gate_sum[index] : S(0);
+    pixel_end[k] = {S(1), S(0), config.gate_of_background()};
+    if (inside) {
+      pixel_end[k].transmittance = arguments.saved.final_transmittance[index];
+      pixel_end[k].gate_sum = arguments.saved.gate_sum[index];
+    }
     const S* dL_dgate_sum = arguments.dL_dimages.gate_sum;
-    pixel[k] =
-        begin_backward<kMode>(final_transmittance, inside && dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
+    pixel[k] = begin_backward(pixel_end[k], inside && dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
     last[k] = inside ? arguments.saved.last_contributor[index] : 0;
-    for (int f = 0; f < num_features; ++f) {
-      const S* gradient = feature_image(config, arguments.dL_dimages, f, pixels);
+  }
+  S* dL_dbackground = nullptr;  // the warp's row
+  if (arguments.dL_dbackground_rows != nullptr && segment == 0) {
+    dL_dbackground =
+        arguments.dL_dbackground_rows + (int64_t(tile_index) * kWarpsPerTile + quarter) * (config.num_channels + 1);
+  }
+  S dL_dbackground_gate = S(0);
+  for (int f = 0; f < num_features; ++f) {
+    const S* gradient = feature_image(config, arguments.dL_dimages, f, pixels);
+    S share = S(0);
+    for (int k = 0; k < kLanePixels; ++k) {
       S value = S(0), dL_dvalue = S(0);
-      if (inside && gradient != nullptr) {
+      if (gradient != nullptr && tile.inside(arguments, k)) {
+        const int64_t index = tile.pixel_index(arguments, k);
         value = feature_image(config, arguments.images, f, pixels)[index], dL_dvalue = gradient[index];
       }
-      scaled.set(arguments, tile, k, f,
-                 add_feature<kMode>(feature_rule(config, f), pixel[k], gate_sum, dL_dvalue, value,
-                                    feature_background(config, f)));
+      const auto feature = add_feature<kMode>(feature_rule(config, f), pixel[k], pixel_end[k], dL_dvalue, value,
+                                              feature_background(config, f));
+      scaled.set(arguments, tile, k, f, feature.scaled);
+      share += feature.background, dL_dbackground_gate += feature.background_gate;
     }
+    if (dL_dbackground == nullptr || f >= config.num_channels) continue;
+    share = sum_lanes(share);
+    if (tile.lane == 0) dL_dbackground[f] = share;
   }
-  if (arguments.dL_dbackground_rows != nullptr && segment == 0) {
-    for (int c = 0; c < config.num_channels; ++c) {
-      S share = S(0);
-      for (int k = 0; k < kLanePixels; ++k) {
-        if (!tile.inside(arguments, k) || arguments.dL_dimages.color == nullptr) continue;
-        const int64_t index = tile.pixel_index(arguments, k);
-        share += background_backward<kMode>(arguments.saved.final_transmittance[index], arguments.saved.gate_sum[index],
-                                            arguments.dL_dimages.color[c * pixels + index]);
-      }
-      share = sum_lanes(share);
-      if (tile.lane == 0) {
-        arguments.dL_dbackground_rows[(int64_t(tile_index) * kWarpsPerTile + quarter) * config.num_channels + c] =
-            share;
-      }
-    }
+  if (dL_dbackground != nullptr) {
+    const S share = sum_lanes(dL_dbackground_gate);
+    if (tile.lane == 0) dL_dbackground[config.num_channels] = share;
   }
   if (tile.empty) return;
 
@@ -190,6 +195,7 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
   if constexpr (kTensor) fill_gradient_basis(tensor_stage, scaled.values, tile.lane);
   constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
   const TransposedSum<kTogether> sum(tile.lane);
+  const AlphaCut<S> cut = config.alpha_cut();
   unsigned hits = 0;
 
   // Back to front: lane 0 takes the last entry of a chunk.
@@ -211,11 +217,12 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
       const int32_t position = chunk - j;
       const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
       const ColumnExponent<S, S> exponent(gaussian.conic, dx);
+      const S least_alpha = cut.of(gaussian.opacity);
       Gate<S> gate[kLanePixels];
       bool contributes[kLanePixels], any = false;
 #pragma unroll
       for (int k = 0; k < kLanePixels; ++k) {
-        gate[k] = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, config.alpha_min);
+        gate[k] = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
         contributes[k] = gate[k].counts && position < last[k];
         any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
       }
@@ -301,7 +308,8 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
   arguments.tiles = static_cast<int>(tiles);
   const int64_t blocks = tiles + (known && saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0);
   const int64_t warps = tiles * kWarpsPerTile;
-  if (dL_dbackground != nullptr) arguments.dL_dbackground_rows = allocate<S>(scratch, warps * config.num_channels);
+  if (dL_dbackground != nullptr)
+    arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
   if (!known) {
     arguments.scaled = allocate<S>(scratch, int64_t(camera.width) * camera.height * arguments.num_features);
   }
@@ -312,7 +320,7 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
     DSMOE_CHECK_LAUNCH("blend_backward");
   });
   if (dL_dbackground != nullptr) {
-    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels, dL_dbackground, stream);
+    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
   }
 }
 

@@ -46,6 +46,7 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
   }
   tile.length = max_over_lanes(seen);
   const TransposedSum<kNumContributions> sum_pixels(tile.lane);
+  const AlphaCut<S> cut = arguments.config.alpha_cut();
 
   auto next = load_entry<false>(arguments, tile, tile.lane, 0);
   for (int32_t chunk = 0; chunk < tile.length; chunk += kWarp) {
@@ -62,12 +63,13 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp)
       const ProjectedGaussian<S> gaussian = staged[warp][j];
       const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
       const ColumnExponent<S, S> exponent(gaussian.conic, dx);
+      const S least_alpha = cut.of(gaussian.opacity);
       auto sum = no_contribution<S>();
       bool any = false;
 #pragma unroll
       for (int k = 0; k < kLanePixels; ++k) {
         const S below = dy + S(k * kLaneStep);
-        const auto gate = evaluate_gate<kMode>(exponent.at(below), gaussian.opacity, arguments.config.alpha_min);
+        const auto gate = evaluate_gate<kMode>(exponent.at(below), gaussian.opacity, least_alpha);
         const auto pair = Blend<kMode>::accumulate(state[k], gate);
         const bool contributes = pair.contributes && chunk + j < last[k];
         any |= contributes;

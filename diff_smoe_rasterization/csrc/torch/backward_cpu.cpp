@@ -19,16 +19,17 @@ void backward(const Inputs& inputs, const Options& options, const Outputs& outpu
                     " rows, but instance_offsets counts ", counted, "; both must come from one call of rasterize");
   auto config = raster_config<S>(inputs, options);
   config.num_threads = at::get_num_threads();
-  CameraGradient<S> camera_gradient;
-  const bool camera_wanted =
-      gradients[kViewMatrix].defined() || gradients[kProjMatrix].defined() || gradients[kCampos].defined();
   auto gaussian_gradient = gaussian_gradients<S>(gradients);
-  if (camera_wanted) gaussian_gradient.camera = &camera_gradient;
+  const auto camera_gradient = camera_joint(gradients, inputs[kMeans3D]);
+  const auto background_gradient = background_joint(inputs, gradients);
+  gaussian_gradient.camera = reinterpret_cast<CameraGradient<S>*>(mutable_data<S>(camera_gradient.whole));
+  gaussian_gradient.background = mutable_data<S>(background_gradient.whole);
   StageRecorder recorder(Pass::kBackward);
   cpu::backward(gaussian_inputs<S>(inputs, options), camera<S>(inputs, options), config, saved_forward<S>(outputs),
                 image_outputs<S>(outputs), image_gradients<S>(image_gradient_tensors), gaussian_gradient,
                 recorder.times());
-  store_camera_gradient(camera_gradient, gradients);
+  camera_gradient.store(gradients);
+  background_gradient.store(gradients);
 }
 
 void backward_any(const Inputs& inputs, const Options& options, const Outputs& outputs,

@@ -26,13 +26,10 @@ void backward(const Inputs& inputs, const Options& options, const Outputs& outpu
   const int64_t record = kNumGateMoments + config.num_features();
 
   auto gaussian_gradient = gaussian_gradients<S>(gradients);
-  const bool camera_wanted =
-      gradients[kViewMatrix].defined() || gradients[kProjMatrix].defined() || gradients[kCampos].defined();
-  at::Tensor camera_gradient;
-  if (camera_wanted) {
-    camera_gradient = at::empty({sizeof(CameraGradient<S>) / sizeof(S)}, like.options());
-    gaussian_gradient.camera = reinterpret_cast<CameraGradient<S>*>(camera_gradient.data_ptr<S>());
-  }
+  const auto camera_gradient = camera_joint(gradients, like);
+  const auto background_gradient = background_joint(inputs, gradients);
+  gaussian_gradient.camera = reinterpret_cast<CameraGradient<S>*>(mutable_data<S>(camera_gradient.whole));
+  gaussian_gradient.background = mutable_data<S>(background_gradient.whole);
 
   StageRecorder recorder(Pass::kBackward);
   at::Tensor pairs;
@@ -53,16 +50,8 @@ void backward(const Inputs& inputs, const Options& options, const Outputs& outpu
   clock.finish();
   if (pairs.defined()) recorder.times()->backward_pairs = pairs.item<int64_t>();
 
-  if (camera_wanted) {
-    const std::pair<Input, int64_t> parts[] = {{kViewMatrix, 16}, {kProjMatrix, 16}, {kCampos, 3}};
-    int64_t begin = 0;
-    for (const auto& [input, size] : parts) {
-      if (gradients[input].defined()) {
-        gradients[input].copy_(camera_gradient.narrow(0, begin, size).view(gradients[input].sizes()));
-      }
-      begin += size;
-    }
-  }
+  camera_gradient.store(gradients);
+  background_gradient.store(gradients);
 }
 
 void backward_any(const Inputs& inputs, const Options& options, const Outputs& outputs,

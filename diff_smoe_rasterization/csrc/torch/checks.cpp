@@ -101,6 +101,19 @@ void check_present(const Inputs& inputs) {
                     "; the covariance needs both");
 }
 
+void check_not_negative(const char* function, const char* name, double value) {
+  TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0, function, ": ", name, " is ", value,
+                    "; it must be 0 or more and finite");
+}
+
+// On the CPU its value too; on a GPU the host would have to wait for it.
+void check_background_gate(const char* function, const at::Tensor& gate) {
+  if (!gate.defined()) return;
+  TORCH_CHECK_VALUE(gate.numel() == 1, function, ": background_gate has shape ", gate.sizes(),
+                    "; it must have one element");
+  if (gate.is_cpu()) check_not_negative(function, "background_gate", gate.item<double>());
+}
+
 void check_shapes(const Inputs& inputs) {
   check_shape(kMeans3D, inputs, {"N", 3});
   const int64_t count = num_gaussians(inputs);
@@ -118,6 +131,7 @@ void check_shapes(const Inputs& inputs) {
   check_shape(kViewMatrix, inputs, {4, 4});
   check_shape(kProjMatrix, inputs, {4, 4});
   check_shape(kCampos, inputs, {3});
+  check_background_gate("rasterize", inputs[kBackgroundGate]);
   TORCH_CHECK_VALUE(count <= INT_MAX, "rasterize: means3D has ", count, " Gaussians; the most is ", INT_MAX);
 }
 
@@ -158,15 +172,12 @@ void check_options(const Options& options) {
     TORCH_CHECK_VALUE(std::isfinite(value) && value > 0, "rasterize: ", name, " is ", value,
                       "; it must be positive and finite");
   };
-  const auto check_not_negative = [](const char* name, double value) {
-    TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0, "rasterize: ", name, " is ", value,
-                      "; it must be 0 or more and finite");
-  };
   check_positive("tanfovx", options.tanfovx);
   check_positive("tanfovy", options.tanfovy);
-  check_not_negative("scale_modifier", options.scale_modifier);
-  check_not_negative("near", options.near);
-  check_not_negative("alpha_min", options.alpha_min);
+  check_not_negative("rasterize", "scale_modifier", options.scale_modifier);
+  check_not_negative("rasterize", "near", options.near);
+  check_not_negative("rasterize", "alpha_min", options.alpha_min);
+  check_not_negative("rasterize", "background_gate", options.fixed_background_gate);
   check_blend_mode("rasterize", options.blend_mode);
 }
 
@@ -210,8 +221,8 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
   }
 }
 
-void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs& outputs, double alpha_min,
-                                  int64_t blend_mode) {
+void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs& outputs,
+                                  const at::Tensor& background_gate, const Options& blend) {
   const char* function = "contributions";
   const at::Tensor &projected = outputs[kProjected], &image = outputs[kLastContributor];
   check_real(function, kOutputNames[kProjected], projected);
@@ -232,9 +243,11 @@ void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs
   }
   check_like(function, "pixel_weights", pixel_weights, "means3D", projected);
   check_shape(function, "pixel_weights", pixel_weights, {image.size(0), image.size(1)});
-  TORCH_CHECK_VALUE(std::isfinite(alpha_min) && alpha_min >= 0, function, ": alpha_min is ", alpha_min,
-                    "; it must be 0 or more and finite");
-  check_blend_mode(function, blend_mode);
+  if (background_gate.defined()) check_like(function, "background_gate", background_gate, "projected", projected);
+  check_background_gate(function, background_gate);
+  check_not_negative(function, "alpha_min", blend.alpha_min);
+  check_not_negative(function, "background_gate", blend.fixed_background_gate);
+  check_blend_mode(function, blend.blend_mode);
 }
 
 void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix) {

@@ -17,8 +17,8 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
                               const ImageGradientTensors& image_gradients, const InputMask& wanted);
 
 // The op contributions: of the outputs those that it reads.
-void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs& outputs, double alpha_min,
-                                  int64_t blend_mode);
+void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs& outputs,
+                                  const at::Tensor& background_gate, const Options& blend);
 
 void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix);
 

@@ -27,22 +27,25 @@ auto rasterize(const at::Tensor& means3D, const OptionalTensor& means2D, const a
                const OptionalTensor& dc, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                const OptionalTensor& scales, const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp,
                const at::Tensor& bg, const at::Tensor& viewmatrix, const at::Tensor& projmatrix,
-               const at::Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
-               double scale_modifier, double near, double alpha_min, int64_t sh_degree, int64_t blend_mode,
-               bool antialiasing, bool depth, bool inverse_depth, bool deterministic, bool debug, bool clamp_color,
-               bool strict, bool prefiltered, bool for_backward) {
+               const at::Tensor& campos, const OptionalTensor& background_gate, int64_t image_height,
+               int64_t image_width, double tanfovx, double tanfovy, double scale_modifier, double near,
+               double alpha_min, double fixed_background_gate, int64_t sh_degree, int64_t blend_mode, bool antialiasing,
+               bool depth, bool inverse_depth, bool deterministic, bool debug, bool clamp_color, bool strict,
+               bool prefiltered, bool for_backward) {
   const auto given = [](const OptionalTensor& tensor) { return tensor.has_value() ? *tensor : at::Tensor(); };
   // clang-format off
   const Inputs inputs = {
       means3D, given(means2D), opacities, given(dc), given(shs), given(colors_precomp), given(scales),
-      given(rotations), given(cov3D_precomp), bg, viewmatrix, projmatrix, campos};
+      given(rotations), given(cov3D_precomp), bg, viewmatrix, projmatrix, campos,
+      given(background_gate)};
   // clang-format on
-  const Options options = {image_height, image_width,   tanfovx,       tanfovy,    scale_modifier,
-                           near,         alpha_min,     sh_degree,     blend_mode, antialiasing,
-                           depth,        inverse_depth, deterministic, debug,      clamp_color};
+  const Options options = {image_height,  image_width,           tanfovx,   tanfovy,    scale_modifier, near,
+                           alpha_min,     fixed_background_gate, sh_degree, blend_mode, antialiasing,   depth,
+                           inverse_depth, deterministic,         debug,     clamp_color};
   check_arguments(inputs, options);
   if (debug) {
-    for (int i = kBackground; i <= kCampos; ++i) refuse_nan(std::string("rasterize: ") + kInputNames[i], inputs[i]);
+    for (int i = kBackground; i <= kBackgroundGate; ++i)
+      refuse_nan(std::string("rasterize: ") + kInputNames[i], inputs[i]);
   }
   const Outputs outputs = kForward(contiguous(inputs), options, {strict, prefiltered, for_backward});
   if (debug) {
@@ -56,9 +59,10 @@ std::vector<at::Tensor> rasterize_backward(const OptionalTensor& dL_dcolor, cons
                                            const OptionalTensor& dL_ddepth, const OptionalTensor& dL_dinverse_depth,
                                            at::TensorList present_inputs, InputMask present, at::TensorList output_list,
                                            int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
-                                           double scale_modifier, double near, double alpha_min, int64_t sh_degree,
-                                           int64_t blend_mode, bool antialiasing, bool depth, bool inverse_depth,
-                                           bool deterministic, bool debug, bool clamp_color, InputMask wanted) {
+                                           double scale_modifier, double near, double alpha_min,
+                                           double fixed_background_gate, int64_t sh_degree, int64_t blend_mode,
+                                           bool antialiasing, bool depth, bool inverse_depth, bool deterministic,
+                                           bool debug, bool clamp_color, InputMask wanted) {
   const auto dense = [](const OptionalTensor& tensor) {
     return tensor.has_value() ? tensor->contiguous() : at::Tensor();
   };
@@ -80,9 +84,9 @@ std::vector<at::Tensor> rasterize_backward(const OptionalTensor& dL_dcolor, cons
   }
   Outputs outputs;
   std::copy(output_list.begin(), output_list.end(), outputs.begin());
-  const Options options = {image_height, image_width,   tanfovx,       tanfovy,    scale_modifier,
-                           near,         alpha_min,     sh_degree,     blend_mode, antialiasing,
-                           depth,        inverse_depth, deterministic, debug,      clamp_color};
+  const Options options = {image_height,  image_width,           tanfovx,   tanfovy,    scale_modifier, near,
+                           alpha_min,     fixed_background_gate, sh_degree, blend_mode, antialiasing,   depth,
+                           inverse_depth, deterministic,         debug,     clamp_color};
   check_backward_arguments(inputs, options, outputs, image_gradients, wanted);
   if (debug) {
     for (int i = 0; i < kNumImageGradients; ++i) {

@@ -18,24 +18,25 @@ using OptionalTensor = c10::optional<at::Tensor>;  // std::optional in newer tor
 
 // The tensors that a rendering depends on, in the order of the ops' arguments. N Gaussians, C channels.
 enum Input : int {
-  kMeans3D,        // [N, 3]
-  kMeans2D,        // [N, 3] or absent; its value is not read, it receives a gradient
-  kOpacities,      // [N] or [N, 1]
-  kDc,             // [N, 1, 3] or absent
-  kShs,            // [N, K, 3] or absent
-  kColorsPrecomp,  // [N, C] or absent
-  kScales,         // [N, 3] or absent
-  kRotations,      // [N, 4] or absent
-  kCov3DPrecomp,   // [N, 6] or absent
-  kBackground,     // [C]
-  kViewMatrix,     // [4, 4]
-  kProjMatrix,     // [4, 4]
-  kCampos,         // [3]
+  kMeans3D,         // [N, 3]
+  kMeans2D,         // [N, 3] or absent; its value is not read, it receives a gradient
+  kOpacities,       // [N] or [N, 1]
+  kDc,              // [N, 1, 3] or absent
+  kShs,             // [N, K, 3] or absent
+  kColorsPrecomp,   // [N, C] or absent
+  kScales,          // [N, 3] or absent
+  kRotations,       // [N, 4] or absent
+  kCov3DPrecomp,    // [N, 6] or absent
+  kBackground,      // [C]
+  kViewMatrix,      // [4, 4]
+  kProjMatrix,      // [4, 4]
+  kCampos,          // [3]
+  kBackgroundGate,  // one element, or absent
   kNumInputs
 };
 constexpr const char* kInputNames[kNumInputs] = {
     "means3D",   "means2D",       "opacities", "dc",         "shs",        "colors_precomp", "scales",
-    "rotations", "cov3D_precomp", "bg",        "viewmatrix", "projmatrix", "campos"};
+    "rotations", "cov3D_precomp", "bg",        "viewmatrix", "projmatrix", "campos",         "background_gate"};
 
 // The tensors that a rendering makes, in the order of the op's results: images first, then what backward needs again.
 enum Output : int {
@@ -92,7 +93,7 @@ using InputMask = std::array<bool, kNumInputs>;
 // The plain numbers of GaussianRasterizationSettings.
 struct Options {
   int64_t image_height, image_width;
-  double tanfovx, tanfovy, scale_modifier, near, alpha_min;
+  double tanfovx, tanfovy, scale_modifier, near, alpha_min, fixed_background_gate;
   int64_t sh_degree, blend_mode;
   bool antialiasing, depth, inverse_depth, deterministic, debug, clamp_color;
 };
@@ -155,13 +156,22 @@ template <class S> Camera<S> camera(const Inputs& inputs, const Options& options
   return out;
 }
 
+// What decides which pairs count and how they are blended; background_gate may be undefined.
+template <class S> void set_blend(RasterConfig<S>& out, const at::Tensor& background_gate, const Options& options) {
+  const BlendMode mode = static_cast<BlendMode>(options.blend_mode);
+  const bool fixed = !background_gate.defined();
+  out.mode = fixed ? family_member(mode, options.fixed_background_gate) : mode;
+  out.background_gate = static_cast<S>(options.fixed_background_gate);
+  out.background_gate_at = data<S>(background_gate);
+  out.alpha_min = static_cast<float>(options.alpha_min);
+}
+
 template <class S> RasterConfig<S> raster_config(const Inputs& inputs, const Options& options) {
   RasterConfig<S> out;
-  out.mode = static_cast<BlendMode>(options.blend_mode);
+  set_blend(out, inputs[kBackgroundGate], options);
   out.num_channels = static_cast<int>(num_channels(inputs));
   out.background = data<S>(inputs[kBackground]);
   out.scale_modifier = static_cast<S>(options.scale_modifier);
-  out.alpha_min = static_cast<float>(options.alpha_min);
   out.antialiasing = options.antialiasing;
   out.depth = options.depth;
   out.inverse_depth = options.inverse_depth;
@@ -202,7 +212,7 @@ template <class S> ImageGradients<S> image_gradients(const ImageGradientTensors&
   return out;
 }
 
-// The camera's three gradients are left out: the core returns them by value.
+// Those of the camera and of the background are left out: the core returns each in one piece.
 template <class S> GaussianGradients<S> gaussian_gradients(const Inputs& gradients) {
   GaussianGradients<S> out;
   out.means3D = mutable_data<S>(gradients[kMeans3D]);
@@ -214,15 +224,41 @@ template <class S> GaussianGradients<S> gaussian_gradients(const Inputs& gradien
   out.colors_precomp = mutable_data<S>(gradients[kColorsPrecomp]);
   out.dc = mutable_data<S>(gradients[kDc]);
   out.shs = mutable_data<S>(gradients[kShs]);
-  out.background = mutable_data<S>(gradients[kBackground]);
   return out;
 }
 
-// Copies the camera's gradients into those of the three tensors that are wanted.
-template <class S> void store_camera_gradient(const CameraGradient<S>& gradient, const Inputs& gradients) {
-  if (gradients[kViewMatrix].defined()) std::copy_n(gradient.view, 16, mutable_data<S>(gradients[kViewMatrix]));
-  if (gradients[kProjMatrix].defined()) std::copy_n(gradient.projection, 16, mutable_data<S>(gradients[kProjMatrix]));
-  if (gradients[kCampos].defined()) std::copy_n(gradient.position, 3, mutable_data<S>(gradients[kCampos]));
+// A gradient that the core returns in one piece, and the inputs whose gradients are its parts, in their order.
+struct JointGradient {
+  struct Part {
+    Input input;
+    int64_t size;
+  };
+  std::vector<Part> parts;
+  at::Tensor whole;  // undefined where none of the parts is wanted
+
+  JointGradient(std::vector<Part> parts, const Inputs& gradients, const at::Tensor& like) : parts(std::move(parts)) {
+    int64_t size = 0;
+    bool wanted = false;
+    for (const auto& part : this->parts) size += part.size, wanted |= gradients[part.input].defined();
+    if (wanted) whole = at::empty({size}, like.options());
+  }
+
+  void store(const Inputs& gradients) const {
+    int64_t begin = 0;
+    for (const auto& [input, size] : parts) {
+      if (gradients[input].defined()) {
+        gradients[input].copy_(whole.narrow(0, begin, size).view(gradients[input].sizes()));
+      }
+      begin += size;
+    }
+  }
+};
+
+inline JointGradient camera_joint(const Inputs& gradients, const at::Tensor& like) {
+  return {{{kViewMatrix, 16}, {kProjMatrix, 16}, {kCampos, 3}}, gradients, like};
+}
+inline JointGradient background_joint(const Inputs& inputs, const Inputs& gradients) {
+  return {{{kBackground, num_channels(inputs)}, {kBackgroundGate, 1}}, gradients, inputs[kMeans3D]};
 }
 
 }  // namespace binding

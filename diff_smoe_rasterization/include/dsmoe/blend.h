@@ -1,34 +1,49 @@
-// The blend modes. Each is a small policy: `accumulate` takes a pair front to back and returns its weight, `finalize`
-// makes the pixel, `begin_backward` the pixel's constants, `backward` takes the pairs back to front.
+// The blend modes. Each is a small policy: `accumulate` takes a pair front to back and returns its weight, the
+// `denominator` and the `background_weight` make the pixel of the sums, `backward` takes the pairs back to front.
 //
-// With alpha_i the gate logit, T_i = prod_{j<i} (1 - alpha_j) (Eq. 4) and c_i the expert:
+// With alpha_i the gate logit, T_i = prod_{j<i} (1 - alpha_j) (Eq. 4), c_i the expert, w_i = alpha_i T_i, W = sum w_i
+// and T what is left behind the last pair:
 //
-//   alpha     Eq. 3   C = sum c_i alpha_i T_i + T_{N+1} bg
-//   smoe      Eq. 7   C = sum c_i alpha_i T_i / sum alpha_i T_i
-//   smoe_tn   Eq. 8   C = sum c_i alpha_i T_i / sum alpha_i
-//   smoe_std  Eq. 6   C = sum c_i alpha_i     / sum alpha_i
+//   alpha     Eq. 3   C = sum c_i w_i + T bg
+//   smoe      Eq. 7   C = sum c_i w_i / W
+//   smoe_tn   Eq. 8   C = sum c_i w_i / sum alpha_i
+//   smoe_std  Eq. 6   C = sum c_i alpha_i / sum alpha_i
 //
-// Gradients are formed as gamma_i = alpha_i dL/dalpha_i: dL/dalpha grows like 1 / gate sum, gamma stays bounded.
-// With g' = dL/dC (alpha) or dL/dC / gate sum (SMoE), u_i = g'.c_i - b and the suffix R_i = sum_{j>i} w_j u_j:
+// The first two are the ends of a family, in which the background is one more expert, with the gate lambda:
+//
+//   C = (sum c_i w_i + lambda T bg) / D,   D = W + lambda T         (smoe at 0; alpha at 1, where D is 1)
+//
+// Gradients are formed as gamma_i = alpha_i dL/dalpha_i: dL/dalpha grows like 1 / D, gamma stays bounded. With
+// g' = dL/dC / D, u_i = g'.c_i - b and the suffix R_i = sum_{j>i} w_j u_j, which begins at lambda T (g'.bg - b):
 //
 //   gamma_i = w_i u_i - alpha_i / (1 - alpha_i) R_i,   dL/dc_i = w_i g'
 //
-// where b is 0 in alpha mode (the suffix starts at T_{N+1} g.bg) and g'.C under a gate: the pixel's own colour takes
-// the place of the background. DEVELOPING.md says what else a new mode needs.
+// where b is g'.C: the pixel's own colour is what each expert is measured against. At lambda = 1 all terms in b cancel,
+// and alpha leaves them out. DEVELOPING.md says what else a new mode needs.
 #pragma once
 
 #include "dsmoe/gate.h"
 
 namespace dsmoe {
 
+// A pixel behind its last pair.
+template <class Real> struct PixelEnd {
+  Real transmittance;            // T
+  Real gate_sum;                 // W; ablations: sum alpha
+  Scalar<Real> background_gate;  // lambda
+};
+
 // The running sums of a pixel. The sign of the transmittance says whether the pixel still takes pairs: it is never 0,
 // because a pixel closes at kTransmittanceCut.
 template <class Real> struct PixelState {
   Real transmittance;  // T; negative once the pixel is full
-  Real gate_sum;       // the denominator, accumulated: as 1 - T it would lose all digits where it is small
+  Real gate_sum;       // W, accumulated: as 1 - T it would lose all digits where it is small; ablations: sum alpha
 
   static DSMOE_HD PixelState open() { return {Real(Scalar<Real>(1)), Real(Scalar<Real>(0))}; }
   DSMOE_HD Mask<Real> is_open() const { return transmittance > Real(Scalar<Real>(0)); }
+  DSMOE_HD PixelEnd<Real> end(Scalar<Real> background_gate) const {
+    return {abs(transmittance), gate_sum, background_gate};
+  }
 };
 
 template <class Real> struct PairWeight {
@@ -77,9 +92,11 @@ DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, const 
 
 template <BlendMode kMode> struct Blend;
 
-template <> struct Blend<BlendMode::kAlpha> {
+// What alpha and smoe share, whatever lambda.
+struct FamilyBlend {
   static constexpr bool kNeedsDepthOrder = true;
-  static constexpr bool kStopsEarly = true;  // once full, a pixel is done
+  static constexpr bool kStopsEarly = true;       // once full, a pixel is done
+  static constexpr bool kSuffixAboutBase = true;  // u_i = g'.c_i - b; else g'.c_i
 
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
     const auto pair = transmit(state, gate);
@@ -87,10 +104,6 @@ template <> struct Blend<BlendMode::kAlpha> {
     return pair;
   }
 
-  template <class Real> static DSMOE_HD Real finalize(const PixelState<Real>& state, Real sum, Real background) {
-    return sum + abs(state.transmittance) * background;
-  }
-
   template <class Real>
   static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
                                               Mask<Real> contributes) {
@@ -98,33 +111,36 @@ template <> struct Blend<BlendMode::kAlpha> {
   }
 };
 
-// What the three gated modes share: the numerator divided by the gate sum, no epsilon; background where no gate is
-// open.
-struct GatedBlend {
-  template <class Real> static DSMOE_HD Real finalize(const PixelState<Real>& state, Real sum, Real background) {
-    const Mask<Real> gated = state.gate_sum >= Real(Scalar<Real>(kGateSumCut));
-    return select(gated, sum / state.gate_sum, background);
+template <> struct Blend<BlendMode::kAlpha> : FamilyBlend {
+  static constexpr bool kDivides = false;
+
+  template <class Real> static DSMOE_HD Real denominator(const PixelEnd<Real>&) { return Real(Scalar<Real>(1)); }
+  template <class Real> static DSMOE_HD Real background_weight(const PixelEnd<Real>& end) { return end.transmittance; }
+};
+
+template <> struct Blend<BlendMode::kSmoe> : FamilyBlend {
+  static constexpr bool kDivides = true;
+
+  template <class Real> static DSMOE_HD Real denominator(const PixelEnd<Real>& end) {
+    return end.gate_sum + background_weight(end);
+  }
+  template <class Real> static DSMOE_HD Real background_weight(const PixelEnd<Real>& end) {
+    return Real(end.background_gate) * end.transmittance;
   }
 };
 
-template <> struct Blend<BlendMode::kSmoe> : GatedBlend {
-  static constexpr bool kNeedsDepthOrder = true;
-  static constexpr bool kStopsEarly = true;
-
-  template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
-    return Blend<BlendMode::kAlpha>::accumulate(state, gate);
-  }
-
-  template <class Real>
-  static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
-                                              Mask<Real> contributes) {
-    return transmit_backward(pixel, gate, value - pixel.base, contributes);
-  }
-};
-
-template <> struct Blend<BlendMode::kSmoeTn> : GatedBlend {
-  static constexpr bool kNeedsDepthOrder = true;
+// The ablations leave the background out.
+struct AblationBlend {
+  static constexpr bool kDivides = true;
   static constexpr bool kStopsEarly = false;  // the denominator runs on behind a full pixel
+  static constexpr bool kSuffixAboutBase = false;
+
+  template <class Real> static DSMOE_HD Real denominator(const PixelEnd<Real>& end) { return end.gate_sum; }
+  template <class Real> static DSMOE_HD Real background_weight(const PixelEnd<Real>&) { return Scalar<Real>(0); }
+};
+
+template <> struct Blend<BlendMode::kSmoeTn> : AblationBlend {
+  static constexpr bool kNeedsDepthOrder = true;
 
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
     state.gate_sum = state.gate_sum + select(gate.counts, gate.alpha, Real(Scalar<Real>(0)));
@@ -141,9 +157,8 @@ template <> struct Blend<BlendMode::kSmoeTn> : GatedBlend {
   }
 };
 
-template <> struct Blend<BlendMode::kSmoeStd> : GatedBlend {
+template <> struct Blend<BlendMode::kSmoeStd> : AblationBlend {
   static constexpr bool kNeedsDepthOrder = false;
-  static constexpr bool kStopsEarly = false;
 
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
     const Real weight = select(gate.counts, gate.alpha, Real(Scalar<Real>(0)));
@@ -165,52 +180,64 @@ enum class FeatureRule {
   kAveraged,  // divided by the gate sum in every mode: expected depth
 };
 
+// D, and what of it is the background's, as the rule has them. Where no gate is open, the feature is its background.
+template <class Real> struct Normaliser {
+  Real denominator, background_weight;
+  Mask<Real> open;
+};
+
 template <BlendMode kMode, class Real>
-DSMOE_HD Real finish_feature(FeatureRule rule, const PixelState<Real>& state, Real sum, Real background) {
-  return rule == FeatureRule::kAveraged ? GatedBlend::finalize(state, sum, background)
-                                        : Blend<kMode>::finalize(state, sum, background);
+DSMOE_HD Normaliser<Real> normaliser(FeatureRule rule, const PixelEnd<Real>& end) {
+  using S = Scalar<Real>;
+  const bool averaged = rule == FeatureRule::kAveraged;
+  const Real denominator = averaged ? end.gate_sum : Blend<kMode>::denominator(end);
+  return {denominator, averaged ? Real(S(0)) : Blend<kMode>::background_weight(end),
+          denominator >= Real(S(kGateSumCut))};
+}
+
+template <BlendMode kMode, class Real>
+DSMOE_HD Real finish_feature(FeatureRule rule, const PixelEnd<Real>& end, Real sum, Real background) {
+  const auto by = normaliser<kMode>(rule, end);
+  const Mask<Real> blends = by.background_weight > Real(Scalar<Real>(0));  // not 0 times a background without bound
+  return select(by.open, select(blends, sum + by.background_weight * background, sum) / by.denominator, background);
 }
 
 // Starts a pixel's backward pass; the features join one by one through add_feature.
-template <BlendMode kMode, class Real>
-DSMOE_HD PixelBackward<Real> begin_backward(Real final_transmittance, Real dL_dgate_sum) {
-  return {final_transmittance, Real(Scalar<Real>(0)), -dL_dgate_sum};
+template <class Real> DSMOE_HD PixelBackward<Real> begin_backward(const PixelEnd<Real>& end, Real dL_dgate_sum) {
+  return {end.transmittance, Real(Scalar<Real>(0)), -dL_dgate_sum};
 }
 
-// Adds one feature's share to b and R, and returns its g'. value is the finished feature of the pixel.
+// What one feature of a pixel hands on.
+template <class Real> struct FeatureBackward {
+  Real scaled;           // g', to the experts
+  Real background;       // dL/dbackground
+  Real background_gate;  // dL/dlambda
+};
+
+// Adds one feature's share to b and R. value is the finished feature of the pixel.
 template <BlendMode kMode, class Real>
-DSMOE_HD Real add_feature(FeatureRule rule, PixelBackward<Real>& pixel, Real gate_sum, Real dL_dvalue, Real value,
-                          Real background) {
-  using S = Scalar<Real>;
-  if (is_smoe(kMode) || rule == FeatureRule::kAveraged) {
-    const Mask<Real> gated = gate_sum >= Real(S(kGateSumCut));
-    const Real scaled = select(gated, dL_dvalue / gate_sum, Real(S(0)));
-    pixel.base = pixel.base + scaled * value;
-    return scaled;
-  }
-  pixel.suffix = pixel.suffix + pixel.transmittance * dL_dvalue * background;
-  return dL_dvalue;
+DSMOE_HD FeatureBackward<Real> add_feature(FeatureRule rule, PixelBackward<Real>& pixel, const PixelEnd<Real>& end,
+                                           Real dL_dvalue, Real value, Real background) {
+  const Real zero = Scalar<Real>(0);
+  const auto by = normaliser<kMode>(rule, end);
+  const bool averaged = rule == FeatureRule::kAveraged, divides = Blend<kMode>::kDivides || averaged;
+  const Real scaled = select(by.open, dL_dvalue / by.denominator, zero), weighted = by.background_weight * scaled;
+  if (divides) pixel.base = pixel.base + scaled * value;
+  pixel.suffix =
+      pixel.suffix + select(by.background_weight > zero, weighted * (divides ? background - value : background), zero);
+  return {scaled, select(by.open, weighted, dL_dvalue),
+          averaged ? zero : end.transmittance * scaled * (background - value)};
 }
 
 // Continues in front of pairs that another walk has taken: `transmittance` is what they met, `behind` their sum w g'.c.
 // Where u is g'.c - b, their sum w b is b times the transmittance they took: sum w = T in front of them - T behind.
 template <BlendMode kMode, class Real>
 DSMOE_HD void resume_backward(PixelBackward<Real>& pixel, Real transmittance, Real behind) {
-  const bool about_base = kMode == BlendMode::kAlpha || kMode == BlendMode::kSmoe;  // u = g'.c - b, else g'.c
   pixel.suffix = pixel.suffix + behind;
-  if (about_base) pixel.suffix = pixel.suffix - pixel.base * (transmittance - pixel.transmittance);
-  pixel.transmittance = transmittance;
-}
-
-// dL/dbackground of one pixel and channel.
-template <BlendMode kMode, class Real>
-DSMOE_HD Real background_backward(Real final_transmittance, Real gate_sum, Real dL_dvalue) {
-  using S = Scalar<Real>;
-  if constexpr (is_smoe(kMode)) {
-    return select(gate_sum >= Real(S(kGateSumCut)), Real(S(0)), dL_dvalue);
-  } else {
-    return final_transmittance * dL_dvalue;
+  if (Blend<kMode>::kSuffixAboutBase) {
+    pixel.suffix = pixel.suffix - pixel.base * (transmittance - pixel.transmittance);
   }
+  pixel.transmittance = transmittance;
 }
 
 }  // namespace dsmoe

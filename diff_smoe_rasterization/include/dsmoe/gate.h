@@ -8,14 +8,20 @@
 namespace dsmoe {
 
 enum class BlendMode : int {
-  kAlpha = 0,    // Eq. 3, 3DGS
-  kSmoe = 1,     // Eq. 7, the method
+  kAlpha = 0,    // Eq. 3, 3DGS: the background's gate is 1
+  kSmoe = 1,     // Eq. 7, the method: it is 0, or any other number
   kSmoeTn = 2,   // Eq. 8, ablation "-T_d"
   kSmoeStd = 3,  // Eq. 6, ablation "-T_n,d", classic SMoE
 };
 constexpr int kNumBlendModes = 4;
 
-DSMOE_HD constexpr bool is_smoe(BlendMode mode) { return mode != BlendMode::kAlpha; }
+// Which pairs count. By alpha: those of 3DGS, alpha >= 1/255 in whole tiles about the Gaussian. Else the paper's, by G.
+DSMOE_HD constexpr bool cuts_by_alpha(BlendMode mode) { return mode == BlendMode::kAlpha; }
+
+// The member of the family alpha - smoe with this background gate: 1 is alpha, bit for bit.
+template <class S> DSMOE_HD constexpr BlendMode family_member(BlendMode mode, S background_gate) {
+  return mode == BlendMode::kSmoe && background_gate == S(1) ? BlendMode::kAlpha : mode;
+}
 
 // The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels: d = pixel - mean, d.x fixed, d.y free.
 template <class Real, class S> struct ColumnExponent {
@@ -28,13 +34,23 @@ template <class Real, class S> struct ColumnExponent {
   DSMOE_HD Real at(S dy) const { return fma(fma(Real(quadratic), Real(dy), linear), Real(dy), constant); }
 };
 
+// The least alpha that counts where pairs are cut by G.
+template <class S> struct AlphaCut {
+  S alpha_min;  // the caller's
+  S faint;      // lambda / 255, and nothing inside 3 sigma
+
+  DSMOE_HD AlphaCut(S alpha_min, S background_gate)
+      : alpha_min(alpha_min), faint(static_cast<float>(background_gate) * kAlphaCut) {}
+  DSMOE_HD S of(S opacity) const { return max(alpha_min, min(faint, opacity * S(kCoreKernel))); }
+};
+
 // The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. Negative: none does.
-template <class S> DSMOE_HD S squared_reach(BlendMode mode, S opacity, S alpha_min) {
+template <class S> DSMOE_HD S squared_reach(BlendMode mode, S opacity, S least_alpha) {
   if (!(opacity > S(0))) return S(-1);
-  const S by_alpha = S(2) * log(opacity / (is_smoe(mode) ? alpha_min : S(kAlphaCut)));
-  if (!is_smoe(mode)) return by_alpha;
+  const S by_alpha = S(2) * log(opacity / (cuts_by_alpha(mode) ? S(kAlphaCut) : least_alpha));
+  if (cuts_by_alpha(mode)) return by_alpha;
   const S by_gate = S(-2) * log(S(kGateCut));
-  return alpha_min > S(0) ? min(by_gate, by_alpha) : by_gate;
+  return least_alpha > S(0) ? min(by_gate, by_alpha) : by_gate;
 }
 
 template <class Real> struct Gate {
@@ -43,16 +59,17 @@ template <class Real> struct Gate {
   Mask<Real> counts;  // the pair takes part
 };
 
-template <BlendMode kMode, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S alpha_min) {
+template <BlendMode kMode, class Real, class S>
+DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
   // Above 0 the conic is no ellipse, and the pair does not count: it must not overflow either.
   const Real kernel = exp(min(power, Real(S(0))));
   Gate<Real> gate;
   gate.logit = Real(opacity) * kernel;
   gate.alpha = min(gate.logit, Real(S(kAlphaMax)));
-  if constexpr (is_smoe(kMode)) {
-    gate.counts = (power <= Real(S(0))) & (kernel >= Real(S(kGateCut))) & (gate.logit >= Real(alpha_min));
-  } else {
+  if constexpr (cuts_by_alpha(kMode)) {
     gate.counts = (power <= Real(S(0))) & (gate.alpha >= Real(S(kAlphaCut)));
+  } else {
+    gate.counts = (power <= Real(S(0))) & (kernel >= Real(S(kGateCut))) & (gate.logit >= Real(least_alpha));
   }
   return gate;
 }

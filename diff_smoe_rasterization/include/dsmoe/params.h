@@ -28,13 +28,19 @@ template <class S> struct RasterConfig {
   int num_channels = 3;           // C
   const S* background = nullptr;  // [C]
   S scale_modifier = 1;
-  S alpha_min = 0;  // SMoE modes: also skip alpha below this
+  S alpha_min = 0;                        // SMoE modes: also skip alpha below this
+  S background_gate = 0;                  // lambda of kSmoe; 1 is kAlpha: family_member
+  const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
   bool antialiasing = false;
   bool clamp_color = true;  // colours from shs are at least 0
   bool depth = false;       // the expected depth is asked for
   bool inverse_depth = false;
   int num_threads = 1;  // CPU backend; below 1 counts as 1
 
+  DSMOE_HD S gate_of_background() const {
+    return background_gate_at != nullptr ? *background_gate_at : background_gate;
+  }
+  DSMOE_HD AlphaCut<S> alpha_cut() const { return {alpha_min, gate_of_background()}; }
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
 };
 
@@ -100,7 +106,7 @@ template <class S> struct GaussianGradients {
   S* colors_precomp = nullptr;  // [N, C]
   S* dc = nullptr;              // [N, 3]
   S* shs = nullptr;             // [N, K, 3]
-  S* background = nullptr;      // [C]
+  S* background = nullptr;      // [C + 1] by the colour, then by its gate
   CameraGradient<S>* camera = nullptr;
 };
 

@@ -65,8 +65,8 @@ template <class S> DSMOE_HD bool attributes_finite(const GaussianInputs<S>& in, 
 // The tiles that may hold pairs of a Gaussian.
 template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, const Camera<S>& camera, Vec2<S> mean, S radius) {
   const TileGrid grid(camera.width, camera.height);
-  if (is_smoe(mode)) return {0, 0, grid.columns, grid.rows};
-  return radius_rect(mean, radius, grid);
+  if (cuts_by_alpha(mode)) return radius_rect(mean, radius, grid);
+  return {0, 0, grid.columns, grid.rows};
 }
 
 // The footprint of Gaussian i. Returns its radius in pixels, 0 where it is culled (then out means nothing).
@@ -85,12 +85,14 @@ DSMOE_HD int32_t project_shape(const GaussianInputs<S>& in, const Camera<S>& cam
   if (!is_ellipse(conic) || !is_finite(radius)) return 0;
   if (!is_finite(pixel.x) || !is_finite(pixel.y)) return 0;
   const S widest_reach = squared_reach(config.mode, S(1), S(0));
-  const bool seen = is_smoe(config.mode) ? meets_image(conic.inverse, pixel, widest_reach, camera.width, camera.height)
-                                         : !tile_bounds(config.mode, camera, pixel, radius).empty();
+  const bool seen = cuts_by_alpha(config.mode)
+                        ? !tile_bounds(config.mode, camera, pixel, radius).empty()
+                        : meets_image(conic.inverse, pixel, widest_reach, camera.width, camera.height);
   if (!seen) return 0;
   S opacity = in.opacities[i];
   if (config.antialiasing) opacity *= opacity_compensation(cov2d, conic);
-  out = {pixel, conic.inverse, opacity, squared_reach(config.mode, opacity, config.alpha_min), view.z};
+  const S reach = squared_reach(config.mode, opacity, config.alpha_cut().of(opacity));
+  out = {pixel, conic.inverse, opacity, reach, view.z};
   return static_cast<int32_t>(min(radius, S(1 << 30)));
 }
 

@@ -53,7 +53,8 @@ void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const Ra
               const GaussianGradients<S>& gradients, StageTimes* times = nullptr);
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say. pixel_weights: [H, W]. Of config it
-// reads the mode, alpha_min and num_threads; of saved neither features nor images but last_contributor.
+// reads the mode, alpha_min, the background's gate and num_threads; of saved neither features nor images but
+// last_contributor.
 template <class S>
 void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
                    const SavedForward<S>& saved, const S* pixel_weights, const ContributionSums<S>& sums);

@@ -115,7 +115,7 @@ void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCon
 
 // From image gradients to one record per Gaussian: the sums over its pixels, [N, kNumGateMoments + F], which must be
 // zero before. slots: [capacity, kSlotsPerInstance, kNumGateMoments + F], also zero, which take the place of the
-// records where the instances fit; or null. dL_dbackground: [C], or null. pairs: as above.
+// records where the instances fit; or null. dL_dbackground: [C + 1], or null. pairs: as above.
 template <class S>
 void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
                     const SavedForward<S>& saved, const ImageOutputs<S>& images,
@@ -130,7 +130,8 @@ void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& ca
                       const GaussianGradients<S>& gradients, Scratch& scratch, cudaStream_t stream);
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
-// may differ in their last digits from call to call. pixel_weights: [H, W]. Of config it reads the mode and alpha_min;
+// may differ in their last digits from call to call. pixel_weights: [H, W]. Of config it reads the mode, alpha_min
+// and the background's gate;
 // of saved neither features nor images but last_contributor; of images the radii.
 template <class S>
 void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
