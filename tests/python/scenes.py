@@ -8,7 +8,7 @@ import pytest
 import torch
 from devices import default_device, random_normal
 
-from diff_smoe_rasterization.settings import BLEND_MODES, GaussianRasterizationSettings
+from diff_smoe_rasterization.settings import BLEND_MODES, GaussianRasterizationSettings, resolve_background_gate
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
 BACKGROUND_GATES = {"smoe_gate": 0.05, "smoe_learned_gate": torch.tensor(0.25, device="cpu")}
@@ -166,7 +166,11 @@ def gradients(function, scene, outputs=(), camera=True):
 
 def op_arguments(scene, op="rasterize", **others):
     """Returns the arguments of an op for a scene and all optional images, by the op's schema; others: by name."""
-    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(scene.settings.blend_mode), "depth": True,
-              "inverse_depth": True, "for_backward": True, **scene.inputs, **others}
+    mode = scene.settings.blend_mode
+    gate = resolve_background_gate(mode, scene.settings.background_gate)
+    learned = isinstance(gate, torch.Tensor)
+    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode), "depth": True, "inverse_depth": True,
+              "background_gate": gate if learned else None, "fixed_background_gate": 0.0 if learned else gate,
+              "for_backward": True, **scene.inputs, **others}
     schema = getattr(torch.ops.diff_smoe_rasterization, op).default._schema
     return tuple(values.get(argument.name) for argument in schema.arguments)

@@ -145,7 +145,7 @@ def test_the_larger_the_gate_the_nearer_is_the_background(function):
 def faint_row(function, opacity, gate, width=81, **fields):
     """Returns sigma in pixels, and a rendering of one Gaussian in the middle of one row of pixels."""
     settings = facing_camera("smoe", width, 1, bg=WHITE, background_gate=gate, **fields)
-    variance = 1e-2
+    variance = 0.09
     inputs = on_axis([2.0], [opacity], [RED], variance)
     inputs["opacities"].requires_grad_(True)
     rendering = function(settings=settings, outputs=("alpha",), **inputs)
@@ -192,29 +192,16 @@ def test_alpha_min_cuts_beside_it(function):
         assert (rendering.alpha > 0).sum() == 1 + 2 * int(sigma * math.sqrt(2 * math.log(0.5 / cut)))
 
 
-@pytest.mark.parametrize("opacity, gate", [(None, 1e-31), (1e-32, 1e-31), (1e-31, 0.0)])
+@pytest.mark.parametrize("opacity, gate", [(0.0, 1e-31), (1e-32, 1e-31), (1e-31, 0.0)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_where_all_gates_are_closed_the_background_takes_pixel_and_gradient(function, opacity, gate, dtype):
-    inputs = on_axis([2.0], [0.5 if opacity is None else opacity], [RED])
-    scene = Scene(inputs, facing_camera("smoe", 9, 7, background_gate=torch.tensor(gate))).to(dtype)
-    rendering, gradient = gradients(function, scene.rows(slice(0)) if opacity is None else scene, OUTPUTS)
+    settings = facing_camera("smoe", 9, 7, background_gate=torch.tensor(gate))
+    scene = Scene(on_axis([2.0], [opacity], [RED]), settings).to(dtype)
+    rendering, gradient = gradients(function, scene, ("depth", "inverse_depth"))
     assert torch.equal(rendering.color, scene.settings.bg[:, None, None].expand_as(rendering.color))
     assert_close(gradient.pop("bg"), random_normal((3, 7, 9), 1).sum((1, 2)), 1e-5, "bg")  # a sum of 63 numbers
-    assert not any(values.any() for name, values in gradient.items() if name != "opacities")
+    assert not any(values.any() for values in gradient.values())
     assert not rendering.depth.any() and not rendering.inverse_depth.any()
-
-
-@pytest.mark.parametrize("value", [0.05, 0.3, 0.7, 1e-3, 30.0])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_an_empty_pixel_is_the_background_itself(value, dtype):
-    """Not lambda b / lambda, whose rounding would be seen beside a white page."""
-    for gate in (value, torch.tensor(value, dtype=dtype)):
-        scene = random_scene("smoe", 60, scale=0.05, dtype=dtype, background_gate=gate, bg=torch.tensor([0.2, 0.7, 1]))
-        rendering, gradient = gradients(rasterize, scene.with_inputs(means3D=10 * scene.inputs["means3D"]), ("alpha",))
-        empty = rendering.alpha[0] == 0
-        assert empty.any()
-        assert torch.equal(rendering.color[:, empty], scene.settings.bg[:, None].expand(3, int(empty.sum())))
-        assert all(torch.isfinite(values).all() for values in gradient.values())
 
 
 @pytest.mark.parametrize("gate", [1e-3, 0.05, 1.0, 20.0])
