@@ -50,11 +50,10 @@ class Scene(NamedTuple):
         return self._replace(inputs={name: tensor[index] for name, tensor in self.inputs.items()})
 
     def requiring_grad(self, camera=True):
-        """Returns the scene with every tensor a fresh leaf that requires its gradient."""
+        """Returns the scene with every tensor a fresh leaf that requires its gradient; camera: CAMERA_FIELDS too."""
         inputs = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in self.inputs.items()}
-        if not camera:
-            return self._replace(inputs=inputs)
-        fields = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in self.camera().items()}
+        fields = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in self.camera().items()
+                  if camera or name not in CAMERA_FIELDS}
         return Scene(inputs, self.settings._replace(**fields))
 
     def leaves(self):

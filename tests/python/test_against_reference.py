@@ -213,7 +213,6 @@ def test_each_optional_output_has_its_own_gradient(mode):
 
 def test_the_core_has_the_constants_of_the_reference():
     expected = {"alpha_max": reference.ALPHA_MAX, "alpha_cut": reference.ALPHA_MIN, "gate_cut": reference.KERNEL_MIN,
-                "gate_kept": reference.KERNEL_KEPT,
                 "transmittance_cut": reference.TRANSMITTANCE_MIN, "gate_sum_cut": reference.GATE_SUM_MIN,
                 "radius_root_floor": reference.EIGENVALUE_SPREAD_MIN, "low_pass": reference.LOW_PASS,
                 "compensation_floor": reference.COMPENSATION_MIN, "frustum_margin": reference.FRUSTUM_MARGIN,

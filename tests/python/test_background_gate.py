@@ -142,14 +142,15 @@ def test_the_larger_the_gate_the_nearer_is_the_background(function):
     assert 0 < distance.max() < 1e-6
 
 
-def faint_row(function, opacity, gate, width=81, **fields):
-    """Returns sigma in pixels, and a rendering of one Gaussian in the middle of one row of pixels."""
-    settings = facing_camera("smoe", width, 1, bg=WHITE, background_gate=gate, **fields)
-    variance = 0.09
-    inputs = on_axis([2.0], [opacity], [RED], variance)
+SIGMA = 6.1  # px, of the Gaussian below
+
+
+def row(function, opacity, gate, sigma=SIGMA, **fields):
+    """Returns a rendering of one Gaussian in the middle of a row of 81 pixels, and its opacity."""
+    settings = facing_camera("smoe", 81, 1, bg=WHITE, background_gate=gate, **fields)
+    inputs = on_axis([2.0], [opacity], [RED], (sigma ** 2 - 0.3) / (81 / 4) ** 2)
     inputs["opacities"].requires_grad_(True)
-    rendering = function(settings=settings, outputs=("alpha",), **inputs)
-    return math.sqrt(variance * (width / 4) ** 2 + 0.3), rendering, inputs["opacities"]
+    return function(settings=settings, outputs=("alpha",), **inputs), inputs["opacities"]
 
 
 @pytest.mark.parametrize("opacity, gate, cut", [
@@ -160,8 +161,8 @@ def faint_row(function, opacity, gate, width=81, **fields):
 ])
 @pytest.mark.parametrize("kind", [float, learned])
 def test_which_pairs_count(function, opacity, gate, cut, kind):
-    sigma, rendering, opacities = faint_row(function, opacity, kind(gate))
-    reach = sigma * math.sqrt(-2 * math.log(cut))
+    rendering, opacities = row(function, opacity, kind(gate))
+    reach = SIGMA * math.sqrt(-2 * math.log(cut))
     counts = rendering.alpha[0, 0, 40:] > 0
     assert counts.tolist() == [distance <= reach for distance in range(41)] and not counts.all()
     # The colour of the last pixel that counts depends on the opacity; under Eq. 7 a lone Gaussian's does not.
@@ -176,20 +177,20 @@ def test_which_pairs_count(function, opacity, gate, cut, kind):
 @pytest.mark.parametrize("kind", [float, learned])
 def test_the_cut_is_a_float32_number(function, kind):
     """In float64 too: otherwise the two types would cut different pairs."""
-    cut = float(numpy.float32(0.05) * numpy.float32(1 / 255))
-    assert abs(cut / (0.05 / 255) - 1) > 1e-9
-    distance = 21
-    kernel = math.exp(-0.5 * distance ** 2 / faint_row(reference.rasterize, 1.0, 0.0)[0] ** 2)
-    assert 1e-5 < kernel < math.exp(-4.5)
-    for excess, counts in ((1e-11, True), (-1e-11, False)):  # exp of a number near 10 is known to 1e-15
-        opacity = cut / kernel * (1 + excess)
-        assert (faint_row(function, opacity, kind(0.05))[1].alpha[0, 0, 40 + distance] > 0) == counts
+    cut, kept = float(numpy.float32(0.05) * numpy.float32(1 / 255)), float(numpy.float32(math.exp(-4.5)))
+    assert abs(cut / (0.05 / 255) - 1) > 1e-9 and abs(kept / math.exp(-4.5) - 1) > 1e-9
+    kernel, distance = math.exp(-0.5 * (21 / SIGMA) ** 2), 21
+    assert 1e-5 < kernel < kept
+    for excess, counts in ((1e-11, True), (-1e-11, False)):  # a sum of a few numbers near 10 is known to 1e-14
+        assert (row(function, cut / kernel * (1 + excess), kind(0.05))[0].alpha[0, 0, 40 + distance] > 0) == counts
+        sigma = distance / math.sqrt(-2 * math.log(kept * (1 + excess)))
+        assert (row(function, 1e-6, kind(0.05), sigma)[0].alpha[0, 0, 40 + distance] > 0) == counts
 
 
 def test_alpha_min_cuts_beside_it(function):
     for alpha_min, cut in ((0.02, 0.02), (1e-5, 0.05 / 255)):
-        sigma, rendering, _ = faint_row(function, 0.5, 0.05, alpha_min=alpha_min)
-        assert (rendering.alpha > 0).sum() == 1 + 2 * int(sigma * math.sqrt(2 * math.log(0.5 / cut)))
+        rendering, _ = row(function, 0.5, 0.05, alpha_min=alpha_min)
+        assert (rendering.alpha > 0).sum() == 1 + 2 * int(SIGMA * math.sqrt(2 * math.log(0.5 / cut)))
 
 
 @pytest.mark.parametrize("opacity, gate", [(0.0, 1e-31), (1e-32, 1e-31), (1e-31, 0.0)])
@@ -294,6 +295,15 @@ def test_a_tensor_that_does_not_fit_is_named(gate, words):
     scene = random_scene("smoe", 5, 20, 18, dtype=torch.float32)
     with pytest.raises(TypeError if words else ValueError, match=f"background_gate .*{words or 'must be'}"):
         rasterize(settings=scene.settings._replace(background_gate=gate()), **scene.inputs)
+
+
+@pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
+def test_the_value_of_a_tensor_is_checked_where_nobody_waits_for_it(value, device):
+    if device.type != "cpu":
+        pytest.skip("the host would wait for the GPU")
+    scene = random_scene("smoe", 5, 20, 18, background_gate=torch.tensor(value).double())
+    with pytest.raises(ValueError, match=f"background_gate is {value}; it must be 0 or more and finite"):
+        rasterize(settings=scene.settings, **scene.inputs)
 
 
 @pytest.mark.skipif(not hasattr(torch.library, "register_autograd"),
