@@ -105,8 +105,10 @@ SCENES = {
 }
 # Scenes that run with the gradients of the optional outputs beside that of the colour.
 WITH_OUTPUTS = ("default", "split_dc", "channels_7", "antialiasing", "saturating", "alpha_min", "faint", "large_splats")
-CASES = [*((mode, name) for name in SCENES for mode in BLEND_MODES), ("smoe_gate", "default"),
-         ("smoe_gate", "many_faint"), *(("smoe_learned_gate", name) for name in WITH_OUTPUTS)]
+# What is in front of the blend is one code for all modes: the two that are trained with go through all of it.
+BLENDING = WITH_OUTPUTS + ("channels_3", "many_faint", "negative_opacities", "one_pixel_more_than_tiles")
+CASES = [(mode, name) for mode in BLEND_MODES + ("smoe_learned_gate",)
+         for name in (SCENES if mode in ("alpha", "smoe") else BLENDING)] + [("smoe_gate", "default")]
 
 
 @functools.lru_cache(maxsize=None)

@@ -58,7 +58,7 @@ def assert_are(actual, expected, tolerance=TOLERANCE):
             assert_close(values, other, tolerance, name)
 
 
-@with_gates
+@with_gate
 @pytest.mark.parametrize("name", SCENES)
 def test_places_and_sums_are_the_references(mode, name):
     scene = SCENES[name](mode)

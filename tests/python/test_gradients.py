@@ -9,7 +9,7 @@ import pytest
 import torch
 from comparison import threshold_margin
 from devices import on_the_cpu
-from scenes import random_scene, with_gate, with_gates
+from scenes import random_scene, with_gate
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -34,7 +34,7 @@ def check_gradients(function, leaves, device, **options):
         assert torch.autograd.gradcheck(function, list(leaves.values()), nondet_tol=tolerance, **options)
 
 
-@with_gates
+@with_gate
 @pytest.mark.parametrize("outputs", [(), OUTPUTS], ids=["colour", "all_outputs"])
 @pytest.mark.parametrize("case", CASES)
 def test_gradients_equal_finite_differences(mode, case, outputs, device):
