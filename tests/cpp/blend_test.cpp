@@ -20,6 +20,7 @@ struct Pixel {
   Vector alpha;
   Vector color, depth, inverse_depth;
   double background = 0.35;
+  double background_gate = 0;  // read by smoe alone
   int size() const { return static_cast<int>(alpha.size()); }
 };
 
@@ -29,7 +30,8 @@ struct Finished {
   int last = 0;  // one past the last pair of the numerator
 };
 
-// Equations 3, 6, 7 and 8 with the sums as the paper writes them. stop: the pair before which the numerator ends.
+// Equations 3, 6, 7 and 8 with the sums as the paper writes them, 7 with the background as one more expert. stop: the
+// pair before which the numerator ends.
 Finished paper(BlendMode mode, const Pixel& pixel, int stop) {
   Finished out;
   double sum_color = 0, sum_z = 0, sum_inverse_z = 0, sum_alpha_t = 0, sum_alpha = 0;
@@ -51,9 +53,13 @@ Finished paper(BlendMode mode, const Pixel& pixel, int stop) {
   out.gate_sum = divide_by_alpha_t ? sum_alpha_t : sum_alpha;
   const bool gated = out.gate_sum >= static_cast<double>(1e-30f);
   out.depth = gated ? sum_z / out.gate_sum : 0;
+  const double of_background = pixel.background_gate * out.transmittance;
   if (mode == BlendMode::kAlpha) {
     out.color = sum_color + out.transmittance * pixel.background;
     out.inverse_depth = sum_inverse_z;
+  } else if (mode == BlendMode::kSmoe && of_background > 0) {
+    out.color = (sum_color + of_background * pixel.background) / (out.gate_sum + of_background);
+    out.inverse_depth = sum_inverse_z / (out.gate_sum + of_background);
   } else {
     out.color = gated ? sum_color / out.gate_sum : pixel.background;
     out.inverse_depth = gated ? sum_inverse_z / out.gate_sum : 0;
@@ -87,9 +93,10 @@ template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
     inverse_depth += pair.weight * Real(pixel.inverse_depth[i]);
     if (pair.contributes) out.last = i + 1;
   }
-  out.color = finish_feature<kMode>(FeatureRule::kBlended, state, color, Real(pixel.background));
-  out.depth = finish_feature<kMode>(FeatureRule::kAveraged, state, depth, Real(0));
-  out.inverse_depth = finish_feature<kMode>(FeatureRule::kBlended, state, inverse_depth, Real(0));
+  const auto end = state.end(Real(pixel.background_gate));
+  out.color = finish_feature<kMode>(FeatureRule::kBlended, end, color, Real(pixel.background));
+  out.depth = finish_feature<kMode>(FeatureRule::kAveraged, end, depth, Real(0));
+  out.inverse_depth = finish_feature<kMode>(FeatureRule::kBlended, end, inverse_depth, Real(0));
   out.gate_sum = state.gate_sum;
   out.transmittance = abs(state.transmittance);
   return out;
@@ -97,6 +104,7 @@ template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
 
 Pixel random_pixel(Random& random, int count, double largest_alpha) {
   Pixel pixel;
+  pixel.background_gate = random.uniform(0, 1) < 0.5 ? 0 : random.log_uniform(1e-3, 3);
   for (int i = 0; i < count; ++i) {
     const double z = random.uniform(1, 4);
     pixel.counts.push_back(random.uniform(0, 1) < 0.8);
@@ -116,6 +124,7 @@ Pixel saturated_pixel() {
   pixel.color = {0.1, 0.9, 0.4, 0.6, 0.2, 0.8, 0.3};
   pixel.depth = {1, 1.5, 2, 2.5, 3, 3.5, 4};
   for (const double z : pixel.depth) pixel.inverse_depth.push_back(1 / z);
+  pixel.background_gate = 0.4;
   return pixel;
 }
 
@@ -215,25 +224,26 @@ struct Weights {
 struct PixelGradient {
   Vector gamma;  // alpha dL/dalpha
   Vector color, depth, inverse_depth;
-  double background = 0;
+  double background = 0, background_gate = 0;
 };
 
 // The pairs in front of `middle` belong to another walk, which knows those behind by their sum alone.
 template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel, const Weights& g, int middle = 0) {
   const Finished forward = blended<kMode, Real>(pixel);
-  const Real gate_sum = Real(forward.gate_sum), transmittance = Real(forward.transmittance);
-  const Real background = Real(pixel.background);
-  auto constants = begin_backward<kMode>(transmittance, Real(g.gate_sum));
-  const Real color =
-      add_feature<kMode>(FeatureRule::kBlended, constants, gate_sum, Real(g.color), Real(forward.color), background);
-  const Real depth =
-      add_feature<kMode>(FeatureRule::kAveraged, constants, gate_sum, Real(g.depth), Real(forward.depth), Real(0));
-  const Real inverse_depth = add_feature<kMode>(FeatureRule::kBlended, constants, gate_sum, Real(g.inverse_depth),
-                                                Real(forward.inverse_depth), Real(0));
+  const PixelEnd<Real> end = {Real(forward.transmittance), Real(forward.gate_sum), Real(pixel.background_gate)};
+  auto constants = begin_backward(end, Real(g.gate_sum));
+  const auto by_color = add_feature<kMode>(FeatureRule::kBlended, constants, end, Real(g.color), Real(forward.color),
+                                           Real(pixel.background));
+  const auto by_depth =
+      add_feature<kMode>(FeatureRule::kAveraged, constants, end, Real(g.depth), Real(forward.depth), Real(0));
+  const auto by_inverse_depth = add_feature<kMode>(FeatureRule::kBlended, constants, end, Real(g.inverse_depth),
+                                                   Real(forward.inverse_depth), Real(0));
+  const Real color = by_color.scaled, depth = by_depth.scaled, inverse_depth = by_inverse_depth.scaled;
   const auto start = constants;
   Real behind = 0;
   PixelGradient out;
-  out.background = background_backward<kMode>(transmittance, gate_sum, Real(g.color));
+  out.background = by_color.background;
+  out.background_gate = by_color.background_gate + by_depth.background_gate + by_inverse_depth.background_gate;
   out.gamma = out.color = out.depth = out.inverse_depth = Vector(pixel.size());
   for (int i = pixel.size() - 1; i >= 0; --i) {
     if (i == middle - 1) {
@@ -264,10 +274,12 @@ Vector flat(const Pixel& pixel, const PixelGradient& g) {
   for (int i = 0; i < pixel.size(); ++i) out.push_back(g.gamma[i] / pixel.alpha[i]);
   for (const Vector* part : {&g.color, &g.depth, &g.inverse_depth}) out.insert(out.end(), part->begin(), part->end());
   out.push_back(g.background);
+  out.push_back(g.background_gate);
   return out;
 }
 
-// Finite differences of the paper's sums by alpha, colour, depth, inverse depth and background, in that order.
+// Finite differences of the paper's sums by alpha, colour, depth, inverse depth, background and its gate, in that
+// order.
 Vector paper_gradient(BlendMode mode, const Pixel& pixel, const Weights& g, double step) {
   const int n = pixel.size(), stop = paper_stop<double>(pixel);
   Vector x = pixel.alpha;
@@ -275,13 +287,15 @@ Vector paper_gradient(BlendMode mode, const Pixel& pixel, const Weights& g, doub
     x.insert(x.end(), part->begin(), part->end());
   }
   x.push_back(pixel.background);
+  x.push_back(pixel.background_gate);
   auto loss = [&](const Vector& v) {
     Pixel moved = pixel;
     moved.alpha.assign(v.begin(), v.begin() + n);
     moved.color.assign(v.begin() + n, v.begin() + 2 * n);
     moved.depth.assign(v.begin() + 2 * n, v.begin() + 3 * n);
     moved.inverse_depth.assign(v.begin() + 3 * n, v.begin() + 4 * n);
-    moved.background = v.back();
+    moved.background = v[4 * n];
+    moved.background_gate = v[4 * n + 1];
     const Finished f = paper(mode, moved, stop);
     return g.color * f.color + g.depth * f.depth + g.inverse_depth * f.inverse_depth + g.gate_sum * f.gate_sum;
   };
@@ -291,6 +305,7 @@ Vector paper_gradient(BlendMode mode, const Pixel& pixel, const Weights& g, doub
 // Alphas well above the step, so that the differences judge dL/dalpha itself.
 Pixel differentiable_pixel(Random& random, double largest_alpha) {
   Pixel pixel = random_pixel(random, 12, largest_alpha);
+  pixel.background_gate = random.uniform(0.05, 2);
   for (double& alpha : pixel.alpha) alpha = random.uniform(0.02, largest_alpha);
   return pixel;
 }

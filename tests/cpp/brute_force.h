@@ -71,14 +71,15 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
       }
       const S dx = S(x) - g.mean.x, dy = S(y) - g.mean.y;
       const S power = ColumnExponent<S, S>(g.conic, dx).at(dy);
-      const auto gate = evaluate_gate<kMode>(power, g.opacity, config.alpha_min);
+      const S least_alpha = config.alpha_cut().of(g.opacity);
+      const auto gate = evaluate_gate<kMode>(power, g.opacity, least_alpha);
       const double terms = double(g.conic.xx) * dx * dx + double(g.conic.yy) * dy * dy;
       if (terms > 0) margin = std::min(margin, std::abs(double(power)) / terms);
       if (kMode == BlendMode::kAlpha) {
         decide(gate.alpha, kAlphaCut);
       } else {
         decide(exp(power), kGateCut);
-        if (config.alpha_min > 0) decide(gate.alpha, config.alpha_min);
+        if (least_alpha > 0) decide(gate.alpha, least_alpha);
       }
       if (gate.counts) {
         ++out.num_pairs;
@@ -93,14 +94,14 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
     if (state.gate_sum > S(0)) decide(state.gate_sum, kGateSumCut);
     out.margin.push_back(margin);
     out.gate_sum[pixel] = state.gate_sum;
+    const auto end = state.end(config.gate_of_background());
     int f = 0;
     for (; f < config.num_channels; ++f) {
-      out.color[f * pixels + pixel] =
-          finish_feature<kMode>(FeatureRule::kBlended, state, sums[f], config.background[f]);
+      out.color[f * pixels + pixel] = finish_feature<kMode>(FeatureRule::kBlended, end, sums[f], config.background[f]);
     }
-    if (config.depth) out.depth[pixel] = finish_feature<kMode>(FeatureRule::kAveraged, state, sums[f++], S(0));
+    if (config.depth) out.depth[pixel] = finish_feature<kMode>(FeatureRule::kAveraged, end, sums[f++], S(0));
     if (config.inverse_depth)
-      out.inverse_depth[pixel] = finish_feature<kMode>(FeatureRule::kBlended, state, sums[f], S(0));
+      out.inverse_depth[pixel] = finish_feature<kMode>(FeatureRule::kBlended, end, sums[f], S(0));
   }
   return out;
 }

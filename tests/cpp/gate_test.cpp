@@ -115,7 +115,7 @@ TYPED_TEST(GateOfMode, APositiveExponentNeverCounts) {
 }
 
 TYPED_TEST(GateOfMode, GateCutOffIsOnTheKernelAndAlphaCutOffOnTheAlpha) {
-  const bool smoe = is_smoe(TypeParam::value);
+  const bool smoe = !cuts_by_alpha(TypeParam::value);
   // o G = 1e-6, G = 1e-3.
   EXPECT_EQ((evaluate_gate<TypeParam::value>(std::log(1e-3), 1e-3, 0.0).counts), smoe);
   // G = 0.9e-5 and o G = 9e-3 at an opacity of 1000.
@@ -130,6 +130,25 @@ TYPED_TEST(GateOfMode, ClampPassesTheGradientStraightThrough) {
     // 1 / 0.99f is rounded once to double and multiplied back.
     EXPECT_NEAR(gate_backward(gate, gate.alpha * dL_dalpha), expected, 1e-14);
   }
+}
+
+// lambda = 0.255: pairs of alpha >= 1e-3 count, and all with G >= exp(-4.5), which faint Gaussians still have.
+TEST(AlphaCut, CutsFaintPairsOutsideThreeSigmaAlone) {
+  const AlphaCut<double> cut(0, 0.255f);
+  EXPECT_NEAR(cut.of(1), 1e-3, 1e-9);
+  EXPECT_NEAR(squared_reach(BlendMode::kSmoe, 1.0, cut.of(1)), -2 * std::log(1e-3), 1e-5);
+  for (const double opacity : {0.05, 1e-3, 1e-9}) {  // 1e-3 is reached inside 3 sigma
+    EXPECT_NEAR(squared_reach(BlendMode::kSmoe, opacity, cut.of(opacity)), 9, 1e-5);
+  }
+  EXPECT_EQ(AlphaCut<double>(0.5, 0.255f).of(1e-9), 0.5) << "the caller's alpha_min cuts everywhere";
+  EXPECT_EQ(AlphaCut<double>(0, 0).of(0.7), 0) << "Eq. 7 cuts on G alone";
+  EXPECT_EQ((AlphaCut<float>(0, 0.1f).faint), static_cast<float>((AlphaCut<double>(0, 0.1).faint)));
+}
+
+TEST(Gate, TheFamilysMemberWithGateOneIsAlpha) {
+  EXPECT_EQ(family_member(BlendMode::kSmoe, 1.0), BlendMode::kAlpha);
+  EXPECT_EQ(family_member(BlendMode::kSmoe, 0.999), BlendMode::kSmoe);
+  EXPECT_EQ(family_member(BlendMode::kSmoeTn, 1.0), BlendMode::kSmoeTn);
 }
 
 TEST(Gate, APairThatDoesNotCountHandsBackZeroWhateverItsExponent) {

@@ -89,7 +89,7 @@ TEST(ProjectGaussian, BackwardIsTheDerivativeWithGivenColoursOfAnyNumber) {
   scene.shs.clear();
   scene.colors_precomp = {0.1, -0.5, 2, 0.3, 0.7};
   scene.config.num_channels = 5;
-  scene.background.resize(5);
+  scene.background.resize(6);
   expect_backward_is_the_derivative(scene);
 }
 

@@ -87,7 +87,7 @@ TYPED_TEST(RasterizeIn, EqualsBruteForceWithAnyNumberOfChannels) {
     Scene<double> scene = in_mode(make_scene(3, 60, 37, 29), TypeParam::value);
     scene.shs.clear();
     scene.colors_precomp = Random(4).uniforms(60 * channels);
-    scene.background = Random(5).uniforms(channels);
+    scene.background = Random(5).uniforms(channels + 1);
     scene.config.num_channels = channels;
     scene.config.depth = channels == 2;  // three features, of which one is no colour
     expect_brute_force(scene);
@@ -121,6 +121,7 @@ TYPED_TEST(RasterizeIn, EqualsBruteForceOnNeedlesAndGiants) {
 Scene<double> smooth_scene(unsigned seed, double smallest_opacity, double largest_opacity) {
   Random random(seed);
   Scene<double> scene = make_scene(seed, 6, 21, 18);
+  scene.background[3] = 0.15;
   for (int64_t i = 0; i < scene.count; ++i) {
     for (int k = 0; k < 3; ++k) {
       scene.means3D[3 * i + k] = random.uniform(-0.6, 0.6);

@@ -56,7 +56,7 @@ std::vector<S> backward_at(const SimdLevel& level, const Scene<S>& scene, Render
   const auto gradients = weights.gradients();
   const auto& camera = scene.camera;
   std::vector<S> out(r.instances.size() * (kNumGateMoments + config.num_features()), S(-12345));
-  std::vector<S> background(config.num_channels);
+  std::vector<S> background(config.num_channels + 1);
   for_each_tile<S>(1, camera.width, camera.height, config.num_features(), [&](int64_t tile, int x, int y, S* scratch) {
     return kernels_of<S>(level).backward(
         {config, saved, images, gradients, camera.width, camera.height, x, y, saved.tile_offsets[tile],

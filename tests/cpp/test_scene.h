@@ -17,8 +17,8 @@ namespace dsmoe {
 template <class S> struct Scene {
   int64_t count = 0;
   Camera<S> camera;
-  RasterConfig<S> config;  // but for the background
-  std::vector<S> background = {S(0.2), S(0.5), S(0.8)};
+  RasterConfig<S> config;                                      // but for the background
+  std::vector<S> background = {S(0.2), S(0.5), S(0.8), S(0)};  // [C + 1] its colour, and its gate
   std::vector<S> means3D, opacities, scales, rotations, cov3D_precomp, colors_precomp, dc, shs;
   int sh_degree = 0;
 
@@ -42,6 +42,7 @@ template <class S> struct Scene {
   RasterConfig<S> raster_config() const {
     RasterConfig<S> out = config;
     out.background = background.data();
+    out.background_gate_at = out.background + out.num_channels;
     return out;
   }
 
@@ -100,13 +101,15 @@ inline Camera<double> make_camera(int width, int height) {
   return camera;
 }
 
-// Gaussians around the origin: some off the image or behind the camera, some more than opaque, some not there at all.
+// Odd seeds have a gate for the background. Gaussians around the origin: some off the image or behind the camera, some
+// more than opaque, some not there at all.
 inline Scene<double> make_scene(unsigned seed, int count, int width, int height) {
   Random random(seed);
   Scene<double> scene;
   scene.count = count;
   scene.camera = make_camera(width, height);
   scene.sh_degree = 1;
+  if (seed % 2 == 1) scene.background[3] = 0.15;
   for (int i = 0; i < count; ++i) {
     for (int k = 0; k < 3; ++k) scene.means3D.push_back(random.uniform(-2, 2) * (i % 7 == 0 ? 3 : 1));
     scene.opacities.push_back(i % 13 == 12 ? -0.1
