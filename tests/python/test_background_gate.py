@@ -201,6 +201,18 @@ def test_where_all_gates_are_closed_the_background_takes_pixel_and_gradient(func
     assert not rendering.depth.any() and not rendering.inverse_depth.any()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_empty_pixel_is_the_background_itself(dtype):
+    """Not lambda b / lambda, which is another number after rounding."""
+    for value in (0.05, 0.3, 0.7, 1e-3, 30.0):
+        for gate in (value, torch.tensor(value, dtype=dtype)):
+            scene = random_scene("smoe", 60, scale=0.05, dtype=dtype, background_gate=gate)
+            rendering = rasterize(settings=scene.settings, outputs=("alpha",), **scene.inputs)
+            empty = rendering.alpha[0] == 0
+            assert empty.any() and not empty.all()
+            assert (rendering.color[:, empty] == scene.settings.bg[:, None]).all()
+
+
 @pytest.mark.parametrize("gate", [1e-3, 0.05, 1.0, 20.0])
 def test_dL_dlambda_equals_a_finite_difference(function, gate):
     """Of a whole image, in which pairs come and go with lambda no nearer than the step."""
