@@ -218,5 +218,6 @@ def test_the_core_has_the_constants_of_the_reference():
                 "transmittance_cut": reference.TRANSMITTANCE_MIN, "gate_sum_cut": reference.GATE_SUM_MIN,
                 "radius_root_floor": reference.EIGENVALUE_SPREAD_MIN, "low_pass": reference.LOW_PASS,
                 "compensation_floor": reference.COMPENSATION_MIN, "frustum_margin": reference.FRUSTUM_MARGIN,
-                "homogeneous_epsilon": reference.W_EPSILON, "tile_size": reference.TILE}
+                "homogeneous_epsilon": reference.W_EPSILON, "tile_size": reference.TILE,
+                "core_kernel": reference.KERNEL_KEPT}
     assert {name: _C.constants[name] for name in expected} == expected
