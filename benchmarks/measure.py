@@ -33,10 +33,16 @@ def edge_mask(target: torch.Tensor) -> torch.Tensor:
     return F.max_pool2d(strong[None, None], 2 * EDGE_REACH + 1, stride=1, padding=EDGE_REACH)[0, 0] > 0
 
 
-def edge_psnr(image: torch.Tensor, target: torch.Tensor) -> Optional[float]:
-    """PSNR in dB of two images [3, H, W] over the pixels of `edge_mask(target)`; None where there are none."""
-    mask = edge_mask(target)
-    return psnr(image[:, mask], target[:, mask]) if bool(mask.any()) else None
+def edge_psnr(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None) -> Optional[float]:
+    """PSNR in dB of two images [3, H, W] over the pixels of `edge_mask(target)` that the mask [1, H, W], if any, keeps.
+
+    None where there are no such pixels.
+    """
+    edges = edge_mask(target)
+    if mask is not None:
+        edges &= mask[0] > 0
+    kept = None if mask is None else mask[:, edges]
+    return psnr(image[:, edges], target[:, edges], kept) if bool(edges.any()) else None
 
 
 class Measures:
@@ -58,10 +64,17 @@ class Measures:
                 self.reasons[kind] = (f"${variable}: {said}" if os.environ.get(variable) else
                                       f"no weights at hand: {said} (${variable} may name a file of them)")
 
-    def __call__(self, color: torch.Tensor, target: torch.Tensor) -> Dict[str, Optional[float]]:
-        """color: a rendering [3, H, W]; target: its ground truth in [0, 1]."""
+    def __call__(self, color: torch.Tensor, target: torch.Tensor,
+                 mask: Optional[torch.Tensor] = None) -> Dict[str, Optional[float]]:
+        """color: a rendering [3, H, W]; target: its ground truth in [0, 1].
+
+        mask: [1, H, W], the view's, if it has one; LPIPS is then that of both images times the mask.
+        """
         png = quantised(color)
-        metrics: Dict[str, Optional[float]] = {**image_metrics(color, target), "psnr_edge": edge_psnr(png, target)}
+        metrics: Dict[str, Optional[float]] = {**image_metrics(color, target, mask),
+                                               "psnr_edge": edge_psnr(png, target, mask)}
+        if mask is not None:
+            png, target = png * mask, target * mask
         for kind, network in self._networks.items():
             try:
                 metrics[kind] = distance = network(png, target)

@@ -7,7 +7,7 @@ import sys
 from typing import List, Optional
 
 from .patches.errors import PatchError
-from .settings import BLEND_MODES
+from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.checkpoint import CHECKPOINT_NAME
 from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments
 from .trainer.errors import TrainerError
@@ -60,15 +60,19 @@ def build_parser() -> argparse.ArgumentParser:
 
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
                                 description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, "
-                                            "Scaffold-GS, HAC or HAC++, which then knows the option --blend_mode.")
+                                            "Scaffold-GS, HAC or HAC++, which then knows the options --blend_mode "
+                                            "and --background_gate.")
     _add_patch_arguments(patch)
 
     run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
-                              usage="dsmoe run --blend-mode MODE [--trainer NAME] -- COMMAND ...",
+                              usage="dsmoe run --blend-mode MODE [--background-gate V] [--trainer NAME] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
     run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
                      help="nothing records it: give the same where a trained model is rendered")
+    run.add_argument("--background-gate", "--background_gate", type=float, metavar="V",
+                     help="in smoe, how much the background weighs; 0 is the paper's Eq. 7 (default: "
+                          f"$DSMOE_BACKGROUND_GATE, else {RECOMMENDED_BACKGROUND_GATE}); nothing records it either")
     run.add_argument("--trainer", metavar="NAME",
                      help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
                           "(inria, inria_2024, scaffold, ...); default: found out from the script's folder")
@@ -195,7 +199,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from .patches.run import run
 
     words = arguments.words[1:] if arguments.words[:1] == ["--"] else arguments.words
-    run(words, arguments.blend_mode, arguments.trainer)
+    run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate)
 
 
 def _train(arguments: argparse.Namespace) -> None:

@@ -96,7 +96,8 @@ def read_gaussians(path: PathLike) -> Gaussians:
 def write_gaussians(path: PathLike, gaussians: Gaussians) -> None:
     """Writes an Inria-format .ply (binary little endian, float32, zero normals).
 
-    `comment blend_mode NAME` and `comment background_gate VALUE` record what is not None; the value is read back exactly.
+    `comment blend_mode NAME` and `comment background_gate VALUE` record what is not None; the value is read back
+    exactly.
     The arrays may be anything that numpy.asarray takes. The file appears under its name only when it is complete.
     Raises OSError; ValueError naming the array, its shape and the shape it must have, and for comments that record
     another mode or gate.

@@ -13,7 +13,9 @@ What the paper leaves open is decided here:
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
 - Opacity plays no part in culling or in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
-- The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
+- The background of a pixel without a gate (denominator under 1e-30) replaces its colour in the SMoE modes.
+- In `smoe` a background gate that is the number 1 is the mode `alpha`, with its tile rectangle and its cut; a tensor of
+  value 1 keeps the footprints of `smoe`. Where the background has a gate, opacity cuts pairs too: see `pair_counts`.
 - The value of `means2D` is ignored; it only receives a gradient.
 """
 from __future__ import annotations
@@ -24,7 +26,7 @@ from typing import NamedTuple, Optional
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from .settings import OUTPUTS, Contributions, Rendering, resolve_blend_mode
+from .settings import OUTPUTS, Contributions, Rendering, resolve_background_gate, resolve_blend_mode
 
 
 def _float32(value):
@@ -40,8 +42,9 @@ TILE = 16  # px; the tiles of 3DGS, whose rectangle is part of its image
 ALPHA_MAX = _float32(0.99)  # no Gaussian is opaque, else T would reach 0 (3DGS)
 ALPHA_MIN = _float32(1 / 255)  # less changes no 8-bit image (3DGS)
 KERNEL_MIN = _float32(1e-5)  # SMoE modes cut on G, not on alpha: faint tails decide where gates are weak (paper)
+KERNEL_KEPT = _float32(math.exp(-4.5))  # G at 3 sigma: nearer, a background gate cuts nothing, or gradients would end
 TRANSMITTANCE_MIN = _float32(1e-4)  # a pixel this dark behind what it has is finished (3DGS)
-GATE_SUM_MIN = _float32(1e-30)  # under this, and only then, a pixel has no gate; far above float32's smallest number
+GATE_SUM_MIN = _float32(1e-30)  # under this, and only then, a sum of gates is none; far above float32's smallest number
 BLOCK = 32  # px; pixels are processed in squares of this side, for speed alone
 
 
@@ -80,7 +83,8 @@ def rasterize(means3D, opacities, settings, means2D=None, dc=None, shs=None, col
     Args:
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1.
-        settings: GaussianRasterizationSettings; viewmatrix, projmatrix, campos and bg are differentiable.
+        settings: GaussianRasterizationSettings; viewmatrix, projmatrix, campos, bg and a tensor background_gate are
+            differentiable.
         means2D: [N, 3]; its gradient is dL/d(pixel) times (0.5 width, 0.5 height), z = 0.
         dc, shs: [N, 1, 3] and [N, K - 1, 3], or shs alone [N, K, 3]; K >= (sh_degree + 1)^2.
         colors_precomp: [N, C] instead of dc and shs.
@@ -91,17 +95,17 @@ def rasterize(means3D, opacities, settings, means2D=None, dc=None, shs=None, col
 
     Returns: Rendering.
     Raises ValueError for both or neither of shs and colors_precomp, of scales with rotations and cov3D_precomp; for an
-    unknown output or blend mode; under `strict` for a value that is not finite; under `prefiltered` for a Gaussian
-    that is not beyond `near`.
+    unknown output or blend mode, for a background gate that the mode does not know; under `strict` for a value that is
+    not finite; under `prefiltered` for a Gaussian that is not beyond `near`.
     """
-    mode = resolve_blend_mode(settings.blend_mode)
+    mode, gate = mode_and_gate(settings)
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     gaussians = _gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
     with torch.no_grad():
         radii, order = visible(gaussians, settings, mode)
     splats = project(_rows(gaussians, order), settings)
-    image = _render_blocks(splats, settings, mode)
+    image = _render_blocks(splats, settings, mode, gate)
     channels = settings.bg.shape[0]
     images = dict(zip(OUTPUTS, image[channels:].split(1)))
     return Rendering(image[:channels], radii, **{name: images[name] for name in outputs})
@@ -115,7 +119,7 @@ def contributions(means3D, opacities, settings, pixel_weights, dc=None, shs=None
     Returns: centres [N, 2] in pixels, depths [N], Contributions. Culled Gaussians have 0.
     """
     with torch.no_grad():
-        mode = resolve_blend_mode(settings.blend_mode)
+        mode, gate = mode_and_gate(settings)
         gaussians = _gather(means3D, None, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
         order = visible(gaussians, settings, mode)[1]
         splats = project(_rows(gaussians, order), settings)
@@ -123,7 +127,7 @@ def contributions(means3D, opacities, settings, pixel_weights, dc=None, shs=None
         for y in range(settings.image_height):
             columns = torch.arange(settings.image_width).to(splats.depth)
             row = torch.full_like(columns, y)
-            counts = pair_counts(splats, columns, row, settings, mode)
+            counts = pair_counts(splats, columns, row, settings, mode, gate)
             weight, stopped = numerator(pair_alphas(splats, columns, row, counts), mode)
             blended = counts & ~stopped
             distance = torch.hypot(columns - splats.position[:, :1], row - splats.position[:, 1:])
@@ -137,6 +141,15 @@ def contributions(means3D, opacities, settings, pixel_weights, dc=None, shs=None
     scores = [of_all(total) for total in sums]
     scores[1] = scores[1].to(torch.int32)
     return of_all(splats.position), of_all(splats.depth), Contributions(*scores)
+
+
+def mode_and_gate(settings):
+    """Returns the blend mode and the background's gate lambda, a number or a tensor of shape []."""
+    mode = resolve_blend_mode(settings.blend_mode)
+    gate = resolve_background_gate(mode, settings.background_gate)
+    if isinstance(gate, torch.Tensor):
+        return mode, gate.reshape(())
+    return "alpha" if gate == 1 else mode, gate
 
 
 def _gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp):
@@ -329,11 +342,12 @@ class _PassThroughClamp(torch.autograd.Function):
         return gradient
 
 
-def pair_counts(splats, x, y, settings, mode):
+def pair_counts(splats, x, y, settings, mode, gate):
     """Returns which pairs of Gaussian and pixel count [n, pixels]; x, y [pixels] are pixel coordinates.
 
     A pair counts where o > 0, power <= 0 and, in "alpha", alpha >= 1/255 within the tile rectangle of 3DGS; in the
-    SMoE modes G >= 1e-5 and alpha >= alpha_min.
+    SMoE modes G >= 1e-5 and alpha >= alpha_min. Where the background has a gate lambda > 0, a pair of less than
+    lambda / 255 changes no 8-bit image either, and counts only within 3 sigma, whatever the Gaussian's opacity.
     """
     opacity = splats.opacity[:, None]
     power = _power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y)
@@ -341,7 +355,9 @@ def pair_counts(splats, x, y, settings, mode):
     alpha = opacity * kernel
     counts = (opacity > 0) & (power <= 0)
     if mode != "alpha":
-        return counts & (kernel >= KERNEL_MIN) & (alpha >= _float32(settings.alpha_min))
+        cut = torch.tensor(float(gate), dtype=torch.float32) * ALPHA_MIN  # rounded as float32
+        return (counts & (kernel >= KERNEL_MIN) & (alpha >= _float32(settings.alpha_min))
+                & (alpha >= (opacity * KERNEL_KEPT).clamp(max=cut.item())))
     (first_x, first_y), (past_x, past_y) = (edge.T[:, :, None] for edge in tile_rectangle(splats, settings))
     tile_x, tile_y = torch.floor(x / TILE), torch.floor(y / TILE)
     counts &= (tile_x >= first_x) & (tile_x < past_x) & (tile_y >= first_y) & (tile_y < past_y)
@@ -377,32 +393,32 @@ def numerator(alpha, mode):
     return (alpha * transmittance).masked_fill(stopped, 0), stopped
 
 
-def blend(alpha, color, depth, bg, mode):
-    """Blends the Gaussians of every pixel, front to back.
+def blend(alpha, color, depth, bg, mode, gate):
+    """Blends the Gaussians of every pixel, front to back, and behind them the background.
 
-    alpha: [n, pixels]; color: [n, C]; depth: [n]; bg: [C].
+    alpha: [n, pixels]; color: [n, C]; depth: [n]; bg: [C]; gate: number or [].
     Returns [C + 3, pixels]: colour, alpha, depth, inverse depth.
     """
     weight, stopped = numerator(alpha, mode)
     gate_sum = weight.sum(0) if mode in ("alpha", "smoe") else alpha.sum(0)
-    has_gate = gate_sum >= GATE_SUM_MIN
-    safe_sum = gate_sum.masked_fill(~has_gate, 1)
+    background = gate * (1 - alpha).masked_fill(stopped, 1).prod(0)  # lambda T, behind the last pair that was blended
+    # alpha (Eq. 3) divides by 1, which this sum is only to rounding; Eq. 7 (smoe), 8 (smoe_tn) and 6 (smoe_std) differ
+    # in weight and gate_sum, and the background has a gate in smoe alone.
+    total = torch.ones_like(gate_sum) if mode == "alpha" else gate_sum + background
 
-    blended = color.T @ weight
-    if mode == "alpha":  # Eq. 3
-        final_transmittance = (1 - alpha).masked_fill(stopped, 1).prod(0)
-        image = blended + final_transmittance * bg[:, None]
-    else:  # Eq. 7 (smoe), 8 (smoe_tn), 6 (smoe_std), which differ in weight and gate_sum
-        image = torch.where(has_gate, blended / safe_sum, bg[:, None])
-
-    expected_depth = (depth @ weight).masked_fill(~has_gate, 0) / safe_sum
-    inverse_depth = (1 / depth) @ weight
-    if mode != "alpha":
-        inverse_depth = inverse_depth.masked_fill(~has_gate, 0) / safe_sum
+    image = _quotient(color.T @ weight + background * bg[:, None], total, bg[:, None])
+    expected_depth = _quotient(depth @ weight, gate_sum, 0)
+    inverse_depth = _quotient((1 / depth) @ weight, total, 0)
     return torch.cat([image, torch.stack([gate_sum, expected_depth, inverse_depth])])
 
 
-def _render_blocks(splats, settings, mode):
+def _quotient(numerator, gates, otherwise):
+    """Returns numerator / gates, and what is to stand where there are none."""
+    without = gates < GATE_SUM_MIN
+    return torch.where(without, torch.as_tensor(otherwise).to(gates), numerator / gates.masked_fill(without, 1))
+
+
+def _render_blocks(splats, settings, mode, gate):
     """Returns [C + 3, height, width]; each block keeps only its inputs for the backward and is computed again there."""
     def block(left, top, right, bottom, *columns):
         splats = Splats(*columns)
@@ -411,9 +427,9 @@ def _render_blocks(splats, settings, mode):
         with torch.no_grad():
             # The slack keeps rounding in this shortcut from losing a pair; `pair_counts` alone decides.
             near = footprint_meets(splats, left, top, right - 1, bottom - 1, settings, mode, slack=1.0)
-            counts = pair_counts(_rows(splats, near), x, y, settings, mode)
+            counts = pair_counts(_rows(splats, near), x, y, settings, mode, gate)
         alpha = pair_alphas(_rows(splats, near), x, y, counts)
-        image = blend(alpha, splats.color[near], splats.depth[near], settings.bg, mode)
+        image = blend(alpha, splats.color[near], splats.depth[near], settings.bg, mode, gate)
         return image.reshape(-1, bottom - top, right - left)
 
     bands = []

@@ -135,3 +135,15 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     if not 0 <= value < math.inf:
         raise ValueError(f"{source} is {background_gate!r}; it must be a number, 0 or more and finite")
     return value
+
+
+def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:
+    """Returns the background's gate that a training takes and records; None in other modes than `smoe`.
+
+    In `smoe` that is the given value, else the environment variable DSMOE_BACKGROUND_GATE, else the recommended one.
+    Raises ValueError as `resolve_background_gate` does.
+    """
+    if blend_mode == "smoe" and background_gate is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
+        background_gate = RECOMMENDED_BACKGROUND_GATE
+    gate = resolve_background_gate(blend_mode, background_gate)
+    return gate if blend_mode == "smoe" else None

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as functional
 
 from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize
+from diff_smoe_rasterization.settings import BackgroundGate
 
 __all__ = ["rasterization"]
 
@@ -25,6 +26,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
                   sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: str = "classic",
                   channel_chunk: int = 32, distributed: bool = False, camera_model: str = "pinhole",
                   segmented: bool = False, covars: Optional[torch.Tensor] = None, blend_mode: Optional[str] = None,
+                  background_gate: Optional[BackgroundGate] = None,
                   **others: Any) -> Tuple[torch.Tensor, torch.Tensor, Dict[str, Any]]:
     """Renders N Gaussians with C pinhole cameras.
 
@@ -42,6 +44,8 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         rasterize_mode: "classic" or "antialiased".
         covars: [N, 3, 3] in place of quats and scales, which are then ignored.
         blend_mode: one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha".
+        background_gate: `smoe`: how much the background weighs, a number or a tensor of one element, which gets a
+            gradient; None: $DSMOE_BACKGROUND_GATE, else 0.
         tile_size, channel_chunk, segmented: taken and without effect, as they change no image.
 
     Returns:
@@ -92,7 +96,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
             image_height=height, image_width=width, tanfovx=width / (2 * focal_x), tanfovy=height / (2 * focal_y),
             bg=backgrounds[camera], scale_modifier=1.0, viewmatrix=viewmats[camera].T, projmatrix=projections[camera],
             sh_degree=sh_degree or 0, campos=centres[camera], antialiasing=rasterize_mode == "antialiased",
-            near=near_plane, blend_mode=blend_mode)
+            near=near_plane, blend_mode=blend_mode, background_gate=background_gate)
         color = colors[camera] if colors.dim() > len(color_shape) else colors
         rendering = rasterize(means, opacities, settings, means2D=_in_ndc(means2d[camera], width, height),
                               outputs=("alpha", "depth") if with_depth else ("alpha",), **{color_name: color}, **shape)

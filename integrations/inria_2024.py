@@ -18,7 +18,7 @@ def rasterize_gaussians(means3D, means2D, dc, sh, colors_precomp, opacities, sca
     """Renders as `diff_smoe_rasterization.rasterize`, whose shapes and errors are these.
 
     Returns: color [C, H, W], radii [N] int32, inverse depth [1, H, W]: in `alpha` mode sum(w / z) over the Gaussians of
-    a pixel, w = alpha T; in the SMoE modes that sum divided by the gate sum. The last has a gradient too.
+    a pixel, w = alpha T; in the SMoE modes divided by what colours are divided by. The last has a gradient too.
     """
     rendering = rasterize(means3D, opacities, raster_settings, means2D=means2D, dc=dc, shs=sh,
                           colors_precomp=colors_precomp, scales=scales, rotations=rotations,

@@ -84,8 +84,8 @@ class _SettingsBlendMode(Codemod):
             return updated_node
         arguments = {argument.keyword.value: argument.value for argument in updated_node.args if argument.keyword}
         pipe = self.pipe_of(arguments)
-        wanted = cst.parse_expression(f"{pipe}.blend_mode") if pipe else None
-        if wanted is not None and "blend_mode" in arguments and arguments["blend_mode"].deep_equals(wanted):
+        wanted = cst.parse_expression(f"{pipe}.blend") if pipe else None
+        if wanted is not None and any(one.star == "**" and one.value.deep_equals(wanted) for one in updated_node.args):
             self.done += 1
             return updated_node
         if wanted is None or "blend_mode" in arguments or len(arguments) != len(updated_node.args):
@@ -94,8 +94,7 @@ class _SettingsBlendMode(Codemod):
         self.pending += 1
         # Before the last one: then every comma, comment and closing parenthesis stays where it is.
         *before, last = updated_node.args
-        more = last.with_changes(keyword=cst.Name("blend_mode"), value=wanted, comma=comma_after(before),
-                                 whitespace_after_arg=cst.SimpleWhitespace(""))
+        more = cst.Arg(wanted, star="**", comma=comma_after(before))
         return updated_node.with_changes(args=[*before, more, last])
 
     def pipe_of(self, arguments):
@@ -108,7 +107,7 @@ class _SettingsBlendMode(Codemod):
 
 
 class _ModelParameter(Codemod):
-    LINE = "self.blend_mode = default_blend_mode()"
+    LINE = "self.blend_mode, self.background_gate = default_blend()"
 
     def changed_function(self, function: cst.FunctionDef) -> cst.FunctionDef:
         is_it = (function.name.value == "__init__" and isinstance(function.body, cst.IndentedBlock)
@@ -126,7 +125,7 @@ class _ModelParameter(Codemod):
         return function
 
     def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
-        return with_import(updated_node, RUNTIME, "default_blend_mode") if self.pending else updated_node
+        return with_import(updated_node, RUNTIME, "default_blend") if self.pending else updated_node
 
 
 class _PipeBlendMode(Codemod):
@@ -137,14 +136,14 @@ class _PipeBlendMode(Codemod):
                  and rule.pipe in parameters and isinstance(block, cst.IndentedBlock))
         if not is_it:
             return function
-        line = f"{rule.pipe}.blend_mode = blend_mode_of({rule.dataset})"
+        line = f"{rule.pipe}.blend = blend_of({rule.dataset})"
         if has_line(block.body, line):
             self.done += 1
             return function
         return function.with_changes(body=self.insert(block, int(is_docstring(block.body[0])), line))
 
     def leave_Module(self, original_node: cst.Module, updated_node: cst.Module) -> cst.Module:
-        return with_import(updated_node, RUNTIME, "blend_mode_of") if self.pending else updated_node
+        return with_import(updated_node, RUNTIME, "blend_of") if self.pending else updated_node
 
 
 class CallOfOurs(Codemod):

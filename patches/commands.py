@@ -27,7 +27,8 @@ def apply(arguments: argparse.Namespace) -> int:
         print(f"{arguments.path}: patched ({verdict.trainer})")
         for change in planned.changes:
             print(f"  {change.name}: {', '.join(change.rules)}")
-        print("It knows --blend_mode now, and saves it in cfg_args; `dsmoe patch revert` takes the patch back.")
+        print("It knows --blend_mode and --background_gate now, and saves them in cfg_args; `dsmoe patch revert` takes "
+              "the patch back.")
     else:
         written = "would be" if arguments.dry_run else "was"
         print(f"{arguments.path}: already patched ({verdict.trainer}); nothing {written} written")

@@ -226,15 +226,15 @@ def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str,
 
     states = record.states()
     by = [", with ".join(filter(None, [f"by version {record.manifest['version']}", words_of(options_of(record))]))]
-    if set(states.values()) <= {"patched"}:
-        return "patched", by
-    if record.can_be_finished():
-        return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
     if set(states.values()) <= {"patched", "changed"}:
         files = {name: _read(root / name) for name in python_files(root)}
         if Patch(files, trainer).state()[0] == "patched":
             return "patched", by + [f"{name}: was edited since; every rule for the blend mode is still applied"
                                     for name, state in states.items() if state == "changed"]
+        if "changed" not in states.values():
+            return "patched", by + [f"its rules were others: to bring it up to date, type: dsmoe patch apply {root}"]
+    if record.can_be_finished():
+        return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
     return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
 
 

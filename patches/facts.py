@@ -12,7 +12,7 @@ PATCHED = "imports from " + INTEGRATIONS
 LOOKED_AT = (GR, "scene/gaussian_model.py", "train.py", "render.py")
 BASE_SETTINGS = {"image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix",
                  "projmatrix", "sh_degree", "campos", "prefiltered", "debug"}
-FURTHER_SETTINGS = {"antialiasing", "pixel_weights", "clamp_color", "blend_mode"}
+FURTHER_SETTINGS = {"antialiasing", "pixel_weights", "clamp_color", "blend_mode", "background_gate"}
 
 
 def of_checkout(read: Callable[[str], Optional[bytes]]) -> Set[str]:
@@ -42,7 +42,7 @@ def _of_node(node: ast.AST) -> Set[str]:
     if isinstance(node, ast.Call):
         called = called_name(node)
         if called == "GaussianRasterizationSettings":
-            return {f"sets {keyword.arg}" for keyword in node.keywords}
+            return {f"sets {keyword.arg}" for keyword in node.keywords if keyword.arg}  # not **pipe.blend
         if called == "visible_filter":
             return {"calls visible_filter"}
     return {"reads invdepthmap"} if isinstance(node, ast.Attribute) and node.attr == "invdepthmap" else set()

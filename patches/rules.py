@@ -27,7 +27,7 @@ class ImportRasterizer(NamedTuple):
 
 
 class SettingsBlendMode(NamedTuple):
-    """The settings call gets `blend_mode=pipe.blend_mode`; `pipe` is what its `debug=pipe.debug` names."""
+    """The settings call gets `**pipe.blend`; `pipe` is what its `debug=pipe.debug` names."""
 
     file: str
     expected: int = 1
@@ -40,7 +40,7 @@ class SettingsBlendMode(NamedTuple):
 
 
 class ModelParameter(NamedTuple):
-    """ModelParams gets `self.blend_mode = default_blend_mode()`, which is the option --blend_mode.
+    """ModelParams gets a statement that makes the options --blend_mode and --background_gate of two attributes.
 
     ModelParams, because of the groups of parameters it alone is saved in cfg_args.
     """
@@ -55,7 +55,7 @@ class ModelParameter(NamedTuple):
 
 
 class PipeBlendMode(NamedTuple):
-    """The function that gets both groups begins with `pipe.blend_mode = blend_mode_of(dataset)`."""
+    """The function that gets both groups begins with `pipe.blend = blend_of(dataset)`."""
 
     file: str
     function: str

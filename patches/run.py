@@ -1,8 +1,8 @@
 """`dsmoe run`: a command of an unmodified trainer, with this package's rasterizer in front of its own.
 
 PYTHONPATH names a folder of shims/, in which `diff_gaussian_rasterization` is the module of integrations whose API the
-trainer calls, and DSMOE_BLEND_MODE the mode; whatever the command starts has both. dsmoe becomes the command (exec), so
-that its exit status and signals are the command's own.
+trainer calls. DSMOE_BLEND_MODE is the mode, and in `smoe` DSMOE_BACKGROUND_GATE the background's gate. Whatever the
+command starts has them. dsmoe becomes the command (exec), so that its exit status and signals are the command's own.
 """
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Dict, Iterator, List, NoReturn, Optional, Sequence, Tuple
 
-from diff_smoe_rasterization.settings import BLEND_MODE_VARIABLE
+from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
 
 from . import facts
 from .errors import PatchError
@@ -42,9 +42,10 @@ print(json.dumps({"version": sys.version.split()[0], "ours": importlib.util.find
 """
 
 
-def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None) -> NoReturn:
+def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
+        background_gate: Optional[float] = None) -> NoReturn:
     """Becomes the command. Raises PatchError where it would not run with this rasterizer."""
-    environment, lines = prepare(words, blend_mode, trainer, dict(os.environ))
+    environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
     for line in lines:
         print("dsmoe run: " + line, file=sys.stderr)
     sys.stdout.flush()
@@ -53,8 +54,12 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None) ->
 
 
 def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
-            environment: Dict[str, str]) -> Tuple[Dict[str, str], List[str]]:
+            environment: Dict[str, str], background_gate: Optional[float] = None) -> Tuple[Dict[str, str], List[str]]:
     """Returns the environment of the command, and what the user is told about it."""
+    try:
+        gate = training_background_gate(blend_mode, background_gate)
+    except ValueError as error:
+        raise PatchError(str(error)) from None
     if not words:
         raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
     if shutil.which(words[0], path=environment.get("PATH")) is None:
@@ -62,15 +67,18 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         raise PatchError(f"{words[0]}: " + (f"is not executable; type: python {words[0]}" if is_script else
                                             "there is no such command"))
     flavour, found = _flavour(words, trainer)
-    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode}
+    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, BACKGROUND_GATE_VARIABLE: str(gate)}
+    if gate is None:
+        del environment[BACKGROUND_GATE_VARIABLE]
     if "PYTHONPYCACHEPREFIX" not in environment:
         environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     answer, lines = _ask_python(words, environment)
     absent = [name for name, module in STAND_INS.items() if module not in answer["usable"]]
     folders = [str(SHIMS / name) for name in [flavour, *absent]]
     environment["PYTHONPATH"] = os.pathsep.join(folders + [path for path in [environment.get("PYTHONPATH")] if path])
-    lines.insert(0, f"{found}: {RASTERIZER} will be {flavour} of this package, blend mode {blend_mode}; each process "
-                    "that imports it says so")
+    lines.insert(0, f"{found}: {RASTERIZER} will be {flavour} of this package, blend mode {blend_mode}"
+                    + (f", background gate {gate}" if gate is not None else "")
+                    + "; each process that imports it says so")
     return environment, lines
 
 

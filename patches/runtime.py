@@ -1,4 +1,4 @@
-"""What a patched trainer calls while it runs: where its blend mode comes from, and stand-ins for what may be absent."""
+"""What a patched trainer calls while it runs: how it blends and who says so, and stand-ins for what may be absent."""
 from __future__ import annotations
 
 import ast
@@ -8,62 +8,103 @@ import os
 import sys
 import warnings
 from pathlib import Path
-from typing import Any, Callable, Optional
+from typing import Any, Callable, Dict, Optional, Tuple
 
-from diff_smoe_rasterization.settings import BLEND_MODE_VARIABLE, BLEND_MODES, resolve_blend_mode
+from diff_smoe_rasterization.settings import (
+    BLEND_MODES, resolve_background_gate, resolve_blend_mode, training_background_gate)
 
 
-def default_blend_mode() -> str:
-    """Returns the default of --blend_mode: $DSMOE_BLEND_MODE, else "alpha".
+def __getattr__(name: str) -> Any:
+    if name in ("default_blend_mode", "blend_mode_of"):
+        raise ImportError(f"{name}: this trainer was patched by an earlier version, which knew no background gate; "
+                          "type: dsmoe patch apply PATH (the checkout's folder)")
+    raise AttributeError(name)
 
-    Scripts that build fixed command lines for train.py pass the mode on by this variable.
-    Raises ValueError where the variable names no mode.
+
+def default_blend() -> Tuple[str, str]:
+    """Returns the defaults of --blend_mode: $DSMOE_BLEND_MODE, else "alpha"; and of --background_gate: "".
+
+    "" is what `training_background_gate` gives for the mode. In rendering the trainers have no defaults, but cfg_args.
+    Scripts that build fixed command lines for train.py pass both on by variables.
+    Raises ValueError where DSMOE_BLEND_MODE names no mode.
     """
-    return resolve_blend_mode(None)
+    return resolve_blend_mode(None), ""
 
 
-def blend_mode_of(dataset: Any) -> str:
-    """Returns the blend mode of a run, and notes it in `dataset`, of which the trainer saves what it holds as cfg_args.
+def blend_of(dataset: Any) -> Dict[str, Any]:
+    """Returns the settings `blend_mode` and `background_gate` of a run (None but in `smoe`).
 
-    dataset: the trainer's extracted ModelParams. Without a `blend_mode` (a cfg_args of before the patch): "alpha".
-    Says on stderr which mode it is, and whence. Warns, once, where the mode may not be the one that was meant or where
-    it changes what the background does.
-    Raises ValueError where the mode is not one of BLEND_MODES, RuntimeError where the renderer has another rasterizer.
+    Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args. Without a
+    `blend_mode` (a cfg_args of before the patch): "alpha". In `smoe` without a `background_gate`: 0, Eq. 7.
+    Says on stderr what they are, and whence. Warns, once, where one may not be what was meant or where it changes what
+    the background does.
+    Raises ValueError where one is wrong, RuntimeError where the renderer has another rasterizer.
     """
     _check_renderer()
     given = getattr(dataset, "blend_mode", None)
     mode = given or "alpha"
     cfg_args = Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
-    saved = _saved_mode(cfg_args) if getattr(dataset, "model_path", "") else None
-    variable = os.environ.get(BLEND_MODE_VARIABLE)
-    is_flag = any(word.startswith("--bl") and "--blend_mode".startswith(word.partition("=")[0]) for word in sys.argv)
-    agreeing = [name for name, value in ((BLEND_MODE_VARIABLE, variable), (str(cfg_args), saved)) if value == mode]
-    source = "as --blend_mode says" if is_flag else f"as in {' and '.join(agreeing)}" if agreeing else "the default"
+    saved = _saved(cfg_args) if getattr(dataset, "model_path", "") else {}
+    whence = _whence("blend_mode", mode, functools.partial(resolve_blend_mode, None), saved.get("blend_mode"), cfg_args)
     if mode not in BLEND_MODES:
-        raise ValueError(f"the blend mode is {mode!r}, {source}; it must be one of {', '.join(BLEND_MODES)}")
-    _say(f"blend mode {mode}, {source}")
+        raise ValueError(f"the blend mode is {mode!r}, {whence}; it must be one of {', '.join(BLEND_MODES)}")
+    said = f"blend mode {mode}, {whence}"
     if not given:
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
               "the patch); --blend_mode says otherwise")
-    # Rendering without the flag never comes here: it has the mode of cfg_args.
-    if saved not in (None, mode):
-        _warn(f"{cfg_args} records blend mode {saved}, but this run has {mode}, {source}; a training overwrites it. "
-              f"To go on as before, give --blend_mode {saved}")
-    if variable and variable != mode:
-        _warn(f"{BLEND_MODE_VARIABLE} is {variable}, but the blend mode is {mode}: --blend_mode and cfg_args win")
+    gate = _gate_of(dataset, mode)
+    if gate is not None:
+        before = saved.get("background_gate", 0.0) if saved.get("blend_mode") == mode else None
+        said += f"; background gate {gate}, " + _whence(
+            "background_gate", gate, functools.partial(resolve_background_gate, mode, None), before, cfg_args)
+    _say(said)
     # The option lies in the trainers' OptimizationParams, which are not at hand where a model is rendered.
     chosen = [name for name, is_on in (("--random_background", "--random_background" in sys.argv),
                                        ("--white_background", getattr(dataset, "white_background", False))) if is_on]
-    if mode != "alpha" and chosen:
-        _warn(f"{' and '.join(chosen)} with blend mode {mode}: the background shows only where no gate is open, so it "
-              "does not penalise transparent Gaussians as it does in alpha mode")
-    dataset.blend_mode = mode
-    return mode
+    if mode != "alpha" and not gate and chosen:
+        _warn(f"{' and '.join(chosen)} with blend mode {mode}{' and background gate 0' if mode == 'smoe' else ''}: the "
+              "background shows only where no gate is open, so it does not penalise transparent Gaussians as it does "
+              "in alpha mode")
+    dataset.blend_mode, dataset.background_gate = mode, gate
+    return {"blend_mode": mode, "background_gate": gate}
+
+
+def _gate_of(dataset: Any, mode: str) -> Optional[float]:
+    """Returns the background's gate of a run, None in other modes than `smoe`: "" is the default, a string typed."""
+    given = getattr(dataset, "background_gate", None)
+    if mode == "smoe" and given is None:
+        _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, in "
+              "another mode, or by a patch that knew none); --background_gate says otherwise")
+        given = 0.0
+    if mode != "smoe" and not isinstance(given, str):  # of a model in `smoe`
+        given = None
+    return training_background_gate(mode, None if given == "" else given)
+
+
+def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any, cfg_args: Path) -> str:
+    """Says in words where an option's value comes from; warns where its variable or cfg_args has another.
+
+    of_variable: reads the variable. saved: what cfg_args has, None where that is nothing.
+    """
+    name, flag, variable = option.replace("_", " "), "--" + option, "DSMOE_" + option.upper()
+    there = {variable: of_variable() if os.environ.get(variable) else None, str(cfg_args): saved}
+    is_flag = any(word.startswith(flag[:4]) and flag.startswith(word.partition("=")[0]) for word in sys.argv)
+    agreeing = [source for source, other in there.items() if other == value]
+    whence = f"as {flag} says" if is_flag else f"as in {' and '.join(agreeing)}" if agreeing else "the default"
+    # Rendering without the flag never comes here: it has the value of cfg_args.
+    if saved not in (None, value):
+        _warn(f"{cfg_args} is of a run with {name} {saved}, but this one has {value}, {whence}; a training overwrites "
+              f"it. To go on as before, give {flag} {saved}")
+    if there[variable] not in (None, value):
+        _warn(f"{variable} is {there[variable]}, but the {name} is {value}: {flag} and cfg_args win")
+    return whence
 
 
 def say_rasterizer(flavour: str) -> None:
     """Says on stderr that `dsmoe run` has its effect: this process has imported this package's rasterizer."""
-    _say(f"the rasterizer is {flavour} of this package, blend mode {default_blend_mode()}")
+    mode = resolve_blend_mode(None)
+    gate = f", background gate {resolve_background_gate(mode, None)}" if mode == "smoe" else ""
+    _say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
 
 
 def say_stand_in(name: str) -> None:
@@ -258,16 +299,14 @@ def _check_renderer() -> None:
                            f"the patch? type: dsmoe patch check {checkout}")
 
 
-def _saved_mode(cfg_args: Path) -> Optional[str]:
-    """Returns the blend mode in the text of a Namespace, or None where there is none. Evaluates nothing."""
+def _saved(cfg_args: Path) -> Dict[str, Any]:
+    """Returns the constants in the text of a Namespace, none where it is no such text. Evaluates nothing."""
     try:
         call = ast.parse(cfg_args.read_text(), mode="eval").body
     except (OSError, ValueError, SyntaxError):
-        return None
-    for keyword in getattr(call, "keywords", ()):
-        if keyword.arg == "blend_mode" and isinstance(keyword.value, ast.Constant):
-            return keyword.value.value
-    return None
+        return {}
+    return {keyword.arg: keyword.value.value for keyword in getattr(call, "keywords", ())
+            if isinstance(keyword.value, ast.Constant)}
 
 
 @functools.lru_cache(maxsize=None)

@@ -75,9 +75,9 @@ def notes_on_scripts(files: Dict[str, bytes], others: Dict[str, bytes], trainer:
         elif name not in ruled and any(_makes_settings(node) for node in nodes):
             notes.append(f"{name}: makes {SETTINGS} of its own without a blend mode, which no rule gives it: without "
                          f"`blend_mode=...` it is $DSMOE_BLEND_MODE, else alpha")
-        if name not in reached and not re.search(rb"\.blend_mode\s*=[^=]", data) and any(map(_renders, nodes)):
+        if name not in reached and not re.search(rb"\.blend\s*=[^=]", data) and any(map(_renders, nodes)):
             notes.append(f"{name}: renders, but no rule reaches it: before it renders it needs the statement "
-                         "`pipe.blend_mode = blend_mode_of(dataset)`, or it stops with an AttributeError")
+                         "`pipe.blend = blend_of(dataset)`, or it stops with an AttributeError")
     return notes
 
 

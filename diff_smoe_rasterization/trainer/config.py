@@ -8,8 +8,8 @@ import os
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Sequence, Union
 
-from ..settings import (BACKGROUND_GATE_VARIABLE, BLEND_MODES, RECOMMENDED_BACKGROUND_GATE, resolve_background_gate,
-                        resolve_blend_mode)
+from ..settings import (BLEND_MODES, RECOMMENDED_BACKGROUND_GATE, resolve_background_gate, resolve_blend_mode,
+                        training_background_gate)
 from .errors import ConfigError
 from .files import write_text_atomically
 
@@ -194,13 +194,9 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     no gate, and for one that the mode does not know.
     """
     if blend_mode == "smoe":
-        if asked == LEARNED:
-            return LEARNED
-        if asked is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
-            asked = RECOMMENDED_BACKGROUND_GATE
-    elif asked == resolve_background_gate(blend_mode, None):  # the mode's own
-        asked = None
-    return float(resolve_background_gate(blend_mode, asked))
+        return LEARNED if asked == LEARNED else training_background_gate(blend_mode, asked)
+    own = float(resolve_background_gate(blend_mode, None))
+    return own if asked == own else float(resolve_background_gate(blend_mode, asked))
 
 
 def _number_or_learned(text: str) -> Union[float, str]:

@@ -63,8 +63,8 @@ def with_masks(folder: str, layout: Layout) -> Layout:
         for name in names:
             if os.path.isfile(os.path.join(masks, name)):
                 return dataclasses.replace(image, mask=os.path.join(masks, name))
-        raise SceneError(f"{masks}: the image {image.camera.name} has no mask there; it must be {names[0]} or {names[1]} "
-                         "(without masks, every pixel counts: rename the folder)")
+        raise SceneError(f"{masks}: the image {image.camera.name} has no mask there; it must be {names[0]} or "
+                         f"{names[1]} (without masks, every pixel counts: rename the folder)")
 
     return dataclasses.replace(layout, train=[with_mask(image) for image in layout.train],
                                test=[with_mask(image) for image in layout.test])

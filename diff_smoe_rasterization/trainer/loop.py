@@ -89,7 +89,8 @@ class Trainer:
         view = self.scene.train[self.order.next()]
         means2D = torch.zeros_like(model.raw["means3D"], requires_grad=True)
         color = torch.rand(3, device=config.device) if config.random_background else None
-        rendering = self.renderer(view.camera, color, self.gate() if self.gate else None, means2D=means2D)
+        rendering = self.renderer(view.camera, background=color, means2D=means2D,
+                                  background_gate=self.gate() if self.gate else None)
         image = rendering.color.detach()
         target = view.image if view.opacity is None else view.image_over(color, self.renderer.background)
         if view.mask is None:

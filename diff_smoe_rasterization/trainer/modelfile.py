@@ -87,7 +87,8 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
         own = float(resolve_background_gate(blend_mode, None))
         for said in (recorded.background_gate, asked):
             if said not in (None, own):
-                raise TrainerError(f"{path}: the background gate is {said:g}; in the blend mode {blend_mode} it is {own:g}")
+                raise TrainerError(f"{path}: the background gate is {said:g}; in the blend mode {blend_mode} it is "
+                                   f"{own:g}")
         return own
     gate = recorded.background_gate
     if gate is None and recorded.blend_mode is not None:

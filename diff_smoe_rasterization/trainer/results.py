@@ -88,8 +88,9 @@ def read_results(folder: str) -> List[Dict[str, Any]]:
 def results_table(rows: List[Dict[str, Any]]) -> str:
     """Rows as a text table: blend mode and gate, PSNR, SSIM, #Gaussians, training seconds, frames per second."""
     header = ("blend mode", "PSNR [dB]", "SSIM", "#Gaussians", "train [s]", "FPS")
-    body = [(blend_name(row["blend_mode"], row.get("background_gate")), _number(row["psnr"], 2), _number(row["ssim"], 4), f"{row['num_gaussians']:,}",
-             _number(row["train_seconds"], 1), _number(row["fps"], 1)) for row in rows]
+    body = [(blend_name(row["blend_mode"], row.get("background_gate")), _number(row["psnr"], 2),
+             _number(row["ssim"], 4), f"{row['num_gaussians']:,}", _number(row["train_seconds"], 1),
+             _number(row["fps"], 1)) for row in rows]
     widths = [max(len(line[column]) for line in [header, *body]) for column in range(len(header))]
     lines = ["  ".join(cell.ljust(width) if column == 0 else cell.rjust(width)
                        for column, (cell, width) in enumerate(zip(line, widths))) for line in [header, *body]]

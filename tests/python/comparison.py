@@ -73,11 +73,11 @@ def reference_gradients(scene, outputs=(), camera=True):
 def threshold_margin(scene):
     """Returns how near each pixel is to another outcome [H, W], CPU: the least |ln(value / threshold)| over its pairs.
 
-    Thresholds are the cut-off on G or on alpha and the early stop. In float32, and under finite differences, a pixel
+    Thresholds are the cut-offs on G and on alpha and the early stop. In float32, and under finite differences, a pixel
     with a margin within the error of its values may fall on the other side. For small scenes: it is dense.
     """
     scene = scene.to("cpu").to(torch.float64)
-    settings, mode = scene.settings, reference.resolve_blend_mode(scene.settings.blend_mode)
+    settings, (mode, gate) = scene.settings, reference.mode_and_gate(scene.settings)
     with torch.no_grad(), on_the_cpu():
         gaussians = reference._gather(*(scene.inputs.get(name) for name in (
             "means3D", "means2D", "opacities", "dc", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")))
@@ -93,8 +93,12 @@ def threshold_margin(scene):
             distances = [power - math.log(reference.KERNEL_MIN)]
             if settings.alpha_min > 0:
                 distances.append(log_alpha - math.log(settings.alpha_min))
+            if gate > 0:
+                # Where the opacity is so small that 3 sigma count, the cut is on G alone.
+                cut = math.log(float(gate) * reference.ALPHA_MIN)
+                distances.append(torch.maximum(log_alpha - cut, power - math.log(reference.KERNEL_KEPT)))
         if mode != "smoe_std":
-            counts = reference.pair_counts(splats, x, y, settings, mode)
+            counts = reference.pair_counts(splats, x, y, settings, mode, gate)
             alpha = reference.pair_alphas(splats, x, y, counts)
             distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
         nearest = torch.cat([torch.full_like(x, math.inf)[None]] + [distance.abs() for distance in distances]).min(0)[0]

@@ -4,12 +4,22 @@ from __future__ import annotations
 import math
 from typing import Dict, NamedTuple
 
+import pytest
 import torch
 from devices import default_device, random_normal
 
-from diff_smoe_rasterization.settings import BLEND_MODES, GaussianRasterizationSettings
+from diff_smoe_rasterization.settings import BLEND_MODES, GaussianRasterizationSettings, resolve_background_gate
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
+BACKGROUND_GATES = {"smoe_gate": 0.05, "smoe_learned_gate": torch.tensor(0.25, device="cpu")}
+"""Further modes of the tests: `smoe` with these background gates, a number and a tensor."""
+with_gate = pytest.mark.parametrize("mode", BLEND_MODES + ("smoe_learned_gate",))
+with_gates = pytest.mark.parametrize("mode", BLEND_MODES + tuple(BACKGROUND_GATES))
+
+
+def gate_of(mode):
+    """Returns lambda, by which a mode weighs the background: a number."""
+    return 1.0 if mode == "alpha" else float(BACKGROUND_GATES.get(mode, 0.0))
 
 
 class Scene(NamedTuple):
@@ -18,9 +28,14 @@ class Scene(NamedTuple):
     inputs: Dict[str, torch.Tensor]
     settings: GaussianRasterizationSettings
 
+    def camera(self):
+        """Returns the tensors of the settings by name, a background gate among them."""
+        fields = {name: getattr(self.settings, name) for name in CAMERA_FIELDS + ("background_gate",)}
+        return {name: tensor for name, tensor in fields.items() if isinstance(tensor, torch.Tensor)}
+
     def to(self, target):
         """Returns the scene with every tensor of the given type or on the given device."""
-        camera = {name: getattr(self.settings, name).detach().to(target) for name in CAMERA_FIELDS}
+        camera = {name: tensor.detach().to(target) for name, tensor in self.camera().items()}
         inputs = {name: tensor.detach().to(target) for name, tensor in self.inputs.items()}
         return Scene(inputs, self.settings._replace(**camera))
 
@@ -35,25 +50,26 @@ class Scene(NamedTuple):
         return self._replace(inputs={name: tensor[index] for name, tensor in self.inputs.items()})
 
     def requiring_grad(self, camera=True):
-        """Returns the scene with every tensor a fresh leaf that requires its gradient."""
+        """Returns the scene with every tensor a fresh leaf that requires its gradient; camera: CAMERA_FIELDS too."""
         inputs = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in self.inputs.items()}
-        if not camera:
-            return self._replace(inputs=inputs)
-        fields = {name: getattr(self.settings, name).detach().clone().requires_grad_(True) for name in CAMERA_FIELDS}
+        fields = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in self.camera().items()
+                  if camera or name not in CAMERA_FIELDS}
         return Scene(inputs, self.settings._replace(**fields))
 
     def leaves(self):
         """Returns the tensors that require their gradient, by name."""
-        tensors = dict(self.inputs, **{name: getattr(self.settings, name) for name in CAMERA_FIELDS})
-        return {name: tensor for name, tensor in tensors.items() if tensor.requires_grad}
+        return {name: tensor for name, tensor in {**self.inputs, **self.camera()}.items() if tensor.requires_grad}
 
 
 def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, principal_point=(0.0, 0.0), degree=0, bg=None,
-                    dtype=torch.float64, **fields):
+                    dtype=torch.float64, blend_mode=None, **fields):
     """Returns settings of a camera that looks from position to the origin, matrices transposed as trainers pass them.
 
-    principal_point: offset from the image centre in pixels.
+    principal_point: offset from the image centre in pixels. blend_mode: may be a name from BACKGROUND_GATES.
     """
+    if blend_mode in BACKGROUND_GATES:
+        gate, blend_mode = BACKGROUND_GATES[blend_mode], "smoe"
+        fields["background_gate"] = gate.to(default_device(), dtype) if isinstance(gate, torch.Tensor) else gate
     position = torch.tensor(position, dtype=torch.float64)
     forward = -position / position.norm()
     right = torch.linalg.cross(torch.tensor([0.1, 1.0, 0.0], dtype=torch.float64), forward)
@@ -75,7 +91,7 @@ def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, princi
     return GaussianRasterizationSettings(
         image_height=height, image_width=width, tanfovx=tanfovx, tanfovy=tanfovy, bg=bg.to(dtype), scale_modifier=1.0,
         viewmatrix=view.to(dtype), projmatrix=(view @ projection).to(dtype), sh_degree=degree,
-        campos=position.to(dtype), prefiltered=False, debug=False, **fields)
+        campos=position.to(dtype), prefiltered=False, debug=False, blend_mode=blend_mode, **fields)
 
 
 def random_scene(mode, num_gaussians=120, width=50, height=37, seed=0, degree=2, channels=None, covariance="scales",
@@ -149,7 +165,11 @@ def gradients(function, scene, outputs=(), camera=True):
 
 def op_arguments(scene, op="rasterize", **others):
     """Returns the arguments of an op for a scene and all optional images, by the op's schema; others: by name."""
-    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(scene.settings.blend_mode), "depth": True,
-              "inverse_depth": True, "for_backward": True, **scene.inputs, **others}
+    mode = scene.settings.blend_mode
+    gate = resolve_background_gate(mode, scene.settings.background_gate)
+    learned = isinstance(gate, torch.Tensor)
+    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode), "depth": True, "inverse_depth": True,
+              "background_gate": gate if learned else None, "fixed_background_gate": 0.0 if learned else gate,
+              "for_backward": True, **scene.inputs, **others}
     schema = getattr(torch.ops.diff_smoe_rasterization, op).default._schema
     return tuple(values.get(argument.name) for argument in schema.arguments)

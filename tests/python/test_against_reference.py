@@ -12,11 +12,11 @@ import pytest
 import torch
 from comparison import assert_all_close, assert_close, assert_same_gradients, one_thread, threshold_margin
 from devices import on_the_cpu, random_normal
-from scenes import assert_not_empty, random_scene
+from scenes import assert_not_empty, random_scene, with_gate
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import _C, reference
-from diff_smoe_rasterization.settings import OUTPUTS
+from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -104,7 +104,11 @@ SCENES = {
     "unclamped_split_dc": _scene(degree=2, split_dc=True, covariance="cov3D", clamp_color=False, seed=27),
 }
 # Scenes that run with the gradients of the optional outputs beside that of the colour.
-WITH_OUTPUTS = {"default", "split_dc", "channels_7", "antialiasing", "saturating", "alpha_min", "faint", "large_splats"}
+WITH_OUTPUTS = ("default", "split_dc", "channels_7", "antialiasing", "saturating", "alpha_min", "faint", "large_splats")
+# What is in front of the blend is one code for all modes: the two that are trained with go through all of it.
+BLENDING = WITH_OUTPUTS + ("channels_3", "many_faint", "negative_opacities", "one_pixel_more_than_tiles")
+CASES = [(mode, name) for mode in BLEND_MODES + ("smoe_learned_gate",)
+         for name in (SCENES if mode in ("alpha", "smoe") else BLENDING)] + [("smoe_gate", "default")]
 
 
 @functools.lru_cache(maxsize=None)
@@ -137,7 +141,7 @@ def render(function, scene, outputs, weights):
     return rendering, {name: image.detach() for name, image in images.items()}, gradients
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("mode, name", CASES)
 def test_float64(mode, name, device):
     scene, outputs, weights, _, (expected, expected_images, expected_gradients), _ = build(name, mode)
     if name != "faint" or mode != "alpha":
@@ -150,7 +154,7 @@ def test_float64(mode, name, device):
     assert_all_close(gradients, expected_gradients, FLOAT64_TOLERANCE)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("mode, name", CASES)
 def test_float32(mode, name, device):
     scene, outputs, weights, safe, (expected, expected_images, _), expected_gradients = build(name, mode)
     assert safe.double().mean() > 0.8
@@ -164,6 +168,7 @@ def test_float32(mode, name, device):
     assert_all_close(gradients, expected_gradients, FLOAT32_GRADIENT_TOLERANCE)
 
 
+@with_gate
 def test_the_optional_outputs_do_not_change_the_colour(mode):
     scene = random_scene(mode, dtype=torch.float32)
     alone = diff_smoe_rasterization.rasterize(settings=scene.settings, **scene.inputs)
@@ -188,17 +193,19 @@ def test_clamp_color_decides_on_colours_below_zero(mode, device):
     assert_same_gradients(clamped[2], unclamped[2])
 
 
+@with_gate
 def test_each_optional_output_has_its_own_gradient(mode):
     scene = random_scene(mode, 60, seed=30)
     for output in OUTPUTS:
         weights = random_normal((1, scene.settings.image_height, scene.settings.image_width), 2)
 
         def gradients(function, scene, output=output, weights=weights):
-            leaves = scene.requiring_grad(camera=False)
-            image = getattr(function(settings=leaves.settings, outputs=(output,), **leaves.inputs), output)
-            values = torch.autograd.grad(image, list(leaves.inputs.values()), weights.to(image), allow_unused=True)
+            scene = scene.requiring_grad()
+            image = getattr(function(settings=scene.settings, outputs=(output,), **scene.inputs), output)
+            leaves = scene.leaves()
+            values = torch.autograd.grad(image, list(leaves.values()), weights.to(image), allow_unused=True)
             return {name: torch.zeros_like(leaf) if value is None else value
-                    for (name, leaf), value in zip(leaves.inputs.items(), values)}
+                    for (name, leaf), value in zip(leaves.items(), values)}
 
         with one_thread(), on_the_cpu():
             expected = gradients(reference.rasterize, scene.to("cpu"))
@@ -211,5 +218,6 @@ def test_the_core_has_the_constants_of_the_reference():
                 "transmittance_cut": reference.TRANSMITTANCE_MIN, "gate_sum_cut": reference.GATE_SUM_MIN,
                 "radius_root_floor": reference.EIGENVALUE_SPREAD_MIN, "low_pass": reference.LOW_PASS,
                 "compensation_floor": reference.COMPENSATION_MIN, "frustum_margin": reference.FRUSTUM_MARGIN,
-                "homogeneous_epsilon": reference.W_EPSILON, "tile_size": reference.TILE}
+                "homogeneous_epsilon": reference.W_EPSILON, "tile_size": reference.TILE,
+                "core_kernel": reference.KERNEL_KEPT}
     assert {name: _C.constants[name] for name in expected} == expected

@@ -8,7 +8,7 @@ import torch
 from by_hand import facing_camera, on_axis
 from comparison import assert_close, assert_same_gradients, one_thread
 from devices import default_device, on_the_cpu, random_normal
-from scenes import gradients, random_scene
+from scenes import gate_of, gradients, random_scene, with_gate, with_gates
 
 from diff_smoe_rasterization import Contributions, rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -58,6 +58,7 @@ def assert_are(actual, expected, tolerance=TOLERANCE):
             assert_close(values, other, tolerance, name)
 
 
+@with_gate
 @pytest.mark.parametrize("name", SCENES)
 def test_places_and_sums_are_the_references(mode, name):
     scene = SCENES[name](mode)
@@ -73,6 +74,7 @@ def test_places_and_sums_are_the_references(mode, name):
     assert not splats.contributions(pixel_weights).pixels[culled].any()
 
 
+@with_gate
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_pairs_are_those_that_the_image_was_blended_of(mode, dtype):
     """With a channel for each Gaussian, an image is the map of one Gaussian's weights."""
@@ -83,7 +85,8 @@ def test_the_pairs_are_those_that_the_image_was_blended_of(mode, dtype):
     pixel_weights = weights_for(scene.settings, dtype=dtype)
     rendering, splats = rasterize_with_splats(settings=scene.settings, outputs=("alpha",), **scene.inputs)
     blended = rendering.color > 0
-    weights = (rendering.color * (1 if mode == "alpha" else rendering.alpha)).double()
+    denominator = rendering.alpha + gate_of(mode) * (1 - rendering.alpha)
+    weights = (rendering.color * denominator).double()
     y, x = torch.meshgrid(torch.arange(43), torch.arange(61), indexing="ij")
     centers = splats.centers.double()[:, :, None, None]
     distances = torch.hypot(x - centers[:, 0], y - centers[:, 1])
@@ -97,6 +100,7 @@ def test_the_pairs_are_those_that_the_image_was_blended_of(mode, dtype):
     assert_close(actual.distances, (distances * blended).sum((1, 2)), tolerance, "distances")
 
 
+@with_gates
 def test_two_gaussians_by_hand(mode):
     """On the axis, round, one behind the other: sums over rows and columns of a formula."""
     width, height, variance, opacities, depths = 11, 7, 0.04, (0.8, 0.6), (2.0, 3.0)
@@ -114,7 +118,8 @@ def test_two_gaussians_by_hand(mode):
                 exponent = -0.5 * ((x - center_x) ** 2 / (variance * (width / 2 / depth) ** 2 + 0.3)
                                    + (y - center_y) ** 2 / (variance * (height / 2 / depth) ** 2 + 0.3))
                 alpha = opacity * math.exp(exponent)
-                if alpha < 1 / 255 if mode == "alpha" else exponent < math.log(1e-5):
+                faint = alpha < gate_of(mode) / 255 and (mode == "alpha" or exponent < -4.5)
+                if faint or mode != "alpha" and exponent < math.log(1e-5):
                     continue
                 weight = alpha if mode == "smoe_std" else alpha * transmittance
                 distance = math.hypot(x - center_x, y - center_y)
@@ -129,6 +134,7 @@ def test_two_gaussians_by_hand(mode):
     assert splats.depths.tolist() == list(depths)
 
 
+@with_gate
 def test_what_fills_a_pixel_and_what_is_behind_it_have_no_share(mode):
     """T is 0.01, then 0.001; the third would leave 1e-5, so that it and the last are left out of the numerator."""
     settings = facing_camera(mode, 1, 1)
@@ -180,6 +186,7 @@ def test_a_nan_in_the_map_reaches_the_gaussians_of_its_pixel_alone(mode):
     assert torch.equal(actual.pixels, expected.pixels)
 
 
+@with_gate
 def test_images_and_gradients_are_those_of_rasterize(mode):
     """And the sums leave what the backward pass needs as it was."""
     def render(settings, outputs, **inputs):

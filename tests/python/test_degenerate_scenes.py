@@ -6,7 +6,7 @@ import pytest
 import torch
 from comparison import assert_all_close, assert_close, reference_gradients
 from devices import random_normal
-from scenes import camera_settings, gradients, random_scene
+from scenes import camera_settings, gradients, random_scene, with_gate
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -65,6 +65,7 @@ def assert_background_only(scene):
     return rendering
 
 
+@with_gate
 @pytest.mark.parametrize("options", [{}, dict(split_dc=True), dict(channels=4, covariance="cov3D")],
                          ids=["shs", "dc", "colours"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -74,23 +75,27 @@ def test_no_gaussians(mode, dtype, options):
     assert rendering.radii.shape == (0,) and rendering.radii.dtype == torch.int32
 
 
+@with_gate
 def test_nothing_visible(mode):
     scene = small_scene(mode, dtype=torch.float32)
     scene = scene.with_inputs(means3D=scene.inputs["means3D"] - torch.tensor([0.0, 0.0, 30.0]))
     assert not assert_background_only(scene).radii.any()
 
 
+@with_gate
 @pytest.mark.parametrize("width, height", [(1, 1), (1, 40), (40, 1), (16, 16), (17, 16), (15, 33), (5, 3)])
 def test_image_sizes(mode, width, height):
     scene = random_scene(mode, 40, width, height, scale=0.3, degree=1)
     assert (assert_equals_reference(scene).radii > 0).any()
 
 
+@pytest.mark.parametrize("mode", ["alpha", "smoe_learned_gate"])  # the two kinds of footprint
 def test_few_gaussians_on_many_tiles(mode):
     scene = random_scene(mode, 6, 520, 300, scale=0.05)
     assert (assert_equals_reference(scene).radii > 0).any()
 
 
+@with_gate
 @pytest.mark.parametrize("opacity", [0.0, -0.5])
 def test_a_gaussian_without_opacity_is_not_drawn(mode, opacity):
     scene = small_scene(mode, dtype=torch.float32)
@@ -106,6 +111,7 @@ def test_a_gaussian_without_opacity_is_not_drawn(mode, opacity):
         assert not gradient[name][index].any(), name
 
 
+@with_gate
 def test_opacities_under_one_part_in_255(mode):
     scene = small_scene(mode, opacity=(1e-4, 3e-3))
     rendering, gradient = gradients(rasterize, scene)
@@ -117,6 +123,7 @@ def test_opacities_under_one_part_in_255(mode):
         assert gradient["shs"].any() and gradient["means3D"].any()
 
 
+@with_gate
 @pytest.mark.parametrize("opacity", [1.0, 1.5, 100.0])
 def test_opacities_of_one_and_above(mode, opacity):
     scene = small_scene(mode)
@@ -141,6 +148,7 @@ def test_scales_of_zero(mode, axes, antialiasing):
     assert_equals_reference(scene.with_inputs(scales=scales))
 
 
+@with_gate
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scale", [1e3, 1e6, 1e9, 1e18, 1e30, 3e38])
 def test_huge_scales_give_finite_results(mode, scale, dtype):
@@ -182,6 +190,7 @@ def test_an_infinite_colour_of_finite_coefficients_is_culled(mode):
     assert_close(rendering.color, render(scene.rows(others)).color, REORDERED, "colour")
 
 
+@with_gate
 def test_alpha_min_is_compared_before_the_clamp(mode):
     scene = one_gaussian(mode, (0.0, 0.0, 1.0), opacity=2.0, alpha_min=0.995)
     assert (assert_equals_reference(scene).color[0] > 0).any()
@@ -250,6 +259,7 @@ def test_a_covariance_that_is_not_positive_is_culled(mode, covariance):
     assert not assert_background_only(scene).radii.any()
 
 
+@with_gate
 @pytest.mark.parametrize("pixel", [15.0, 15.5, 16.0, 31.5, 32.0, -0.5, 0.0])
 def test_a_splat_on_a_tile_edge_is_drawn_on_both_sides(mode, pixel):
     width, depth = 64, 2.0

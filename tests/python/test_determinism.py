@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from scenes import gradients, random_scene
+from scenes import gradients, random_scene, with_gate
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -16,6 +16,7 @@ def restore_threads():
     torch.set_num_threads(threads)
 
 
+@with_gate
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("count", [700, 5000])
 def test_threads_and_repetition_change_no_bit(mode, dtype, count):

@@ -14,7 +14,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import op_arguments, random_scene
+from scenes import op_arguments, random_scene, with_gate
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
@@ -22,7 +22,7 @@ from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
 WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
 IMAGES = dict(color=0, gate_sum=2, depth=3, inverse_depth=4)  # which results of the op are differentiable images
-NUM_INPUTS = 13  # tensors among the arguments of the op
+NUM_INPUTS = 14  # tensors among the arguments of the op
 on_every_device = pytest.mark.usefixtures("device")
 
 
@@ -128,6 +128,7 @@ def test_stage_times_are_taken_while_profiling_is_on():
 
 
 @on_every_device
+@with_gate
 @pytest.mark.parametrize("outputs", [(), ("alpha", "inverse_depth"), OUTPUTS])
 def test_images_may_be_edited_in_place(mode, outputs):
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32)
@@ -165,6 +166,7 @@ def backward_arguments(mode):
 
 
 @on_every_device
+@with_gate
 @pytest.mark.skipif(not hasattr(torch.library, "opcheck"), reason=f"torch {torch.__version__} has no opcheck")
 def test_opcheck_of_rasterize_backward(mode):
     torch.library.opcheck(torch.ops.diff_smoe_rasterization.rasterize_backward.default, tuple(backward_arguments(mode)))
@@ -213,7 +215,7 @@ def test_the_backward_op_refuses_absent_inputs(row, name):
 @on_every_device
 def test_the_backward_op_refuses_gradients_of_absent_inputs():
     arguments = backward_arguments("smoe")
-    arguments[-1] = [True] * 13
+    arguments[-1] = [True] * NUM_INPUTS
     with pytest.raises(ValueError, match="gradient of dc is wanted, but that input is absent"):
         torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
 

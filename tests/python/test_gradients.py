@@ -9,7 +9,7 @@ import pytest
 import torch
 from comparison import threshold_margin
 from devices import on_the_cpu
-from scenes import CAMERA_FIELDS, random_scene
+from scenes import random_scene, with_gate
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -34,6 +34,7 @@ def check_gradients(function, leaves, device, **options):
         assert torch.autograd.gradcheck(function, list(leaves.values()), nondet_tol=tolerance, **options)
 
 
+@with_gate
 @pytest.mark.parametrize("outputs", [(), OUTPUTS], ids=["colour", "all_outputs"])
 @pytest.mark.parametrize("case", CASES)
 def test_gradients_equal_finite_differences(mode, case, outputs, device):
@@ -45,7 +46,7 @@ def test_gradients_equal_finite_differences(mode, case, outputs, device):
 
     def function(*tensors):
         tensors = dict(zip(leaves, tensors))
-        camera = {name: tensors.pop(name) for name in CAMERA_FIELDS}
+        camera = {name: tensors.pop(name) for name in scene.camera()}
         rendering = diff_smoe_rasterization.rasterize(settings=scene.settings._replace(**camera), outputs=outputs,
                                                       **tensors)
         return (rendering.color,) + tuple(getattr(rendering, name) for name in outputs)
@@ -55,6 +56,7 @@ def test_gradients_equal_finite_differences(mode, case, outputs, device):
     check_gradients(function, leaves, device, fast_mode=True)
 
 
+@with_gate
 def test_every_entry_of_the_jacobian(mode, device):
     scene = random_scene(mode, 4, 9, 8, seed=5, scale=0.5, opacity=(0.2, 0.8), degree=1)
     assert threshold_margin(scene).min() > 1e-4
@@ -62,6 +64,8 @@ def test_every_entry_of_the_jacobian(mode, device):
     leaves = {name: leaf for name, leaf in scene.leaves().items() if name != "means2D"}
 
     def function(*tensors):
-        return diff_smoe_rasterization.rasterize(settings=scene.settings, **dict(zip(leaves, tensors))).color
+        tensors = dict(zip(leaves, tensors))
+        settings = scene.settings._replace(background_gate=tensors.pop("background_gate", None))
+        return diff_smoe_rasterization.rasterize(settings=settings, **tensors).color
 
     check_gradients(function, leaves, device)

@@ -94,6 +94,26 @@ def test_two_blend_modes_are_refused(tmp_path):
     assert not (tmp_path / "a.ply").exists()
 
 
+@pytest.mark.parametrize("gate", [0.0, 0.1, float(np.float32(0.1)), 1 / 3])
+def test_background_gate_reads_back_exactly(tmp_path, gate):
+    io.write_gaussians(tmp_path / "a.ply", make_gaussians(1, 0, blend_mode="smoe", background_gate=gate))
+    assert io.read_gaussians(tmp_path / "a.ply").background_gate == gate
+
+
+def test_what_is_no_background_gate_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="a.ply: .*\"-1\".*0 or more"):
+        io.write_gaussians(tmp_path / "a.ply", make_gaussians(1, 0, background_gate=-1.0))
+    with pytest.raises(ValueError, match="two background gates"):
+        io.write_gaussians(tmp_path / "a.ply", make_gaussians(1, 0, background_gate=0.1,
+                                                              comments=("background_gate 0.2",)))
+    io.write_gaussians(tmp_path / "a.ply", make_gaussians(1, 0))
+    assert io.read_gaussians(tmp_path / "a.ply").background_gate is None
+    content = (tmp_path / "a.ply").read_bytes().replace(b"element", b"comment background_gate faint\nelement", 1)
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(ValueError, match='a.ply, line 3: .*"faint"'):
+        io.read_gaussians(tmp_path / "a.ply")
+
+
 def test_other_dtypes_and_layouts_are_converted(tmp_path):
     model = make_gaussians(4, 1)
     strided = {name: np.asfortranarray(getattr(model, name).astype(np.float64)) for name in ARRAYS}

@@ -8,7 +8,7 @@ import pytest
 import torch
 from by_hand import facing_camera, middle, on_axis
 from comparison import assert_all_close, assert_close, one_thread, threshold_margin
-from scenes import CAMERA_FIELDS, assert_not_empty, gradients, random_scene, random_weights
+from scenes import Scene, assert_not_empty, gate_of, gradients, random_scene, random_weights, with_gate, with_gates
 
 from diff_smoe_rasterization import reference
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -27,6 +27,7 @@ def single_threaded():
         yield
 
 
+@with_gates
 @pytest.mark.parametrize("covariance, antialiasing", [("scales", False), ("scales", True), ("cov3D", False)])
 def test_gradients_equal_finite_differences(mode, covariance, antialiasing):
     scene = random_scene(mode, 8, 20, 18, seed=3, scale=0.4, opacity=(0.1, 0.9), degree=1, covariance=covariance,
@@ -37,7 +38,7 @@ def test_gradients_equal_finite_differences(mode, covariance, antialiasing):
 
     def function(*tensors):
         tensors = dict(zip(leaves, tensors))
-        camera = {name: tensors.pop(name) for name in CAMERA_FIELDS}
+        camera = {name: tensors.pop(name) for name in scene.camera()}
         images = reference.rasterize(settings=scene.settings._replace(**camera), outputs=OUTPUTS, **tensors)
         return images.color, images.alpha, images.depth, images.inverse_depth
 
@@ -45,6 +46,7 @@ def test_gradients_equal_finite_differences(mode, covariance, antialiasing):
     assert torch.autograd.gradcheck(function, list(leaves.values()), fast_mode=True)
 
 
+@with_gates
 def test_one_gaussian_by_hand(mode):
     width, depth, opacity, variance, color, bg = 11, 2.0, 0.6, 0.04, [0.9, 0.5, 0.1], [0.1, 0.2, 0.3]
     settings = facing_camera(mode, width, width)
@@ -55,45 +57,44 @@ def test_one_gaussian_by_hand(mode):
         kernel = math.exp(-0.5 * distance ** 2 / variance2D)
         # 1/(w + 1e-7) moves the centre of a Gaussian on the axis by nothing.
         alpha = opacity * kernel
-        expected = [alpha * c + (1 - alpha) * b for c, b in zip(color, bg)] if mode == "alpha" else color
+        background = gate_of(mode) * (1 - alpha)
+        expected = [(alpha * c + background * b) / (alpha + background) for c, b in zip(color, bg)]
         assert image.color[:, 5, 5 + distance].tolist() == pytest.approx(expected, rel=EXACT)
         assert image.alpha[0, 5 + distance, 5].item() == pytest.approx(alpha, rel=EXACT)
         assert image.depth[0, 5, 5 - distance].item() == pytest.approx(depth, rel=EXACT)
-        weight = alpha if mode == "alpha" else 1
-        assert image.inverse_depth[0, 5, 5 - distance].item() == pytest.approx(weight / depth, rel=EXACT)
+        inverse_depth = alpha / depth / (alpha + background)
+        assert image.inverse_depth[0, 5, 5 - distance].item() == pytest.approx(inverse_depth, rel=EXACT)
     assert image.radii.tolist() == [math.ceil(3 * math.sqrt(variance2D + math.sqrt(0.1)))]
 
 
+@with_gates
 def test_two_gaussians_by_hand(mode):
     (o1, o2), (c1, c2), bg = (0.7, 0.4), (0.9, 0.2), 0.5
     inputs = on_axis([3.0, 2.0], [o2, o1], [[c2], [c1]])
     image = reference.rasterize(settings=facing_camera(mode, bg=(bg,)), outputs=OUTPUTS, **inputs)
     w1, w2 = o1, o2 * (1 - o1)
-    color, gate_sum = {
-        "alpha": (w1 * c1 + w2 * c2 + (1 - o1) * (1 - o2) * bg, w1 + w2),
-        "smoe": ((w1 * c1 + w2 * c2) / (w1 + w2), w1 + w2),
-        "smoe_tn": ((w1 * c1 + w2 * c2) / (o1 + o2), o1 + o2),
-        "smoe_std": ((o1 * c1 + o2 * c2) / (o1 + o2), o1 + o2),
-    }[mode]
     if mode == "smoe_std":
         w1, w2 = o1, o2
-    inverse_depth = w1 / 2 + w2 / 3 if mode == "alpha" else (w1 / 2 + w2 / 3) / gate_sum
+    gate_sum = o1 + o2 if mode in ("smoe_tn", "smoe_std") else w1 + w2
+    background = gate_of(mode) * (1 - o1) * (1 - o2)
+    color = (w1 * c1 + w2 * c2 + background * bg) / (gate_sum + background)
+    inverse_depth = (w1 / 2 + w2 / 3) / (gate_sum + background)
     assert middle(image.color) == pytest.approx([color], rel=EXACT)
     assert middle(image.alpha) == pytest.approx([gate_sum], rel=EXACT)
     assert middle(image.depth) == pytest.approx([(w1 * 2 + w2 * 3) / gate_sum], rel=EXACT)
     assert middle(image.inverse_depth) == pytest.approx([inverse_depth], rel=EXACT)
 
 
+@with_gate
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_second_opaque_gaussian_stops_the_pixel_and_is_excluded(mode, dtype):
     inputs = {name: tensor.to(dtype) for name, tensor in on_axis(
         [1.0, 2.0, 3.0], [2.0, 2.0, 0.5], [[0.8], [0.4], [0.2]]).items()}
     settings = facing_camera(mode, bg=(0.6,))
-    settings = settings._replace(**{name: getattr(settings, name).to(dtype) for name in CAMERA_FIELDS})
-    a = ALPHA_MAX
-    expected = {"alpha": a * 0.8 + (1 - a) * 0.6, "smoe": 0.8, "smoe_tn": a * 0.8 / (2 * a + 0.5),
-                "smoe_std": (a * 0.8 + a * 0.4 + 0.5 * 0.2) / (2 * a + 0.5)}[mode]
-    color = middle(reference.rasterize(settings=settings, **inputs).color)
+    a, background = ALPHA_MAX, gate_of(mode) * (1 - ALPHA_MAX)
+    expected = {"smoe_tn": a * 0.8 / (2 * a + 0.5), "smoe_std": (a * 0.8 + a * 0.4 + 0.5 * 0.2) / (2 * a + 0.5)}.get(
+        mode, (a * 0.8 + background * 0.6) / (a + background))
+    color = middle(render(Scene(inputs, settings).to(dtype)).color)
     assert color == pytest.approx([expected], rel=1e-6 if dtype == torch.float32 else EXACT)
 
 
@@ -202,6 +203,7 @@ def test_a_gaussian_that_is_not_finite_is_as_if_absent(mode, name, value):
         assert_close(gradient[name][others], expected[name], EXACT, name)
 
 
+@with_gate
 def test_float32_agrees_with_float64(mode):
     scene = random_scene(mode)
     safe = threshold_margin(scene) > 1e-3

@@ -7,6 +7,7 @@ import pytest
 import torch
 from by_hand import facing_camera, middle, on_axis
 from comparison import assert_close
+from scenes import gate_of, with_gate, with_gates
 
 from diff_smoe_rasterization import reference
 
@@ -30,20 +31,22 @@ def render(mode, inputs, outputs=(), **fields):
     return reference.rasterize(settings=settings, outputs=outputs, **inputs)
 
 
+@with_gates
 @pytest.mark.parametrize("excess, counts", [(1.01, True), (0.99, False)])
 def test_the_cut_off_of_a_pair(mode, excess, counts):
-    threshold = 1 / 255 if mode == "alpha" else 1e-5
     distance, opacity = 10, 0.5
-    kernel = excess * threshold / (opacity if mode == "alpha" else 1)
+    kernel = excess * max(1e-5, gate_of(mode) / 255 / opacity)
     inputs = splat_at(20, 31, distance ** 2 / (-2 * math.log(kernel)))
     inputs["opacities"][:] = opacity
     alpha = render(mode, inputs, ("alpha",)).alpha[0, 31]
+    assert kernel < math.exp(-4.5)  # beyond 3 sigma, where a background gate may cut
     # 1e-5: the position is divided by w + 1e-7, which moves it by 1e-6 px.
     assert alpha[30].item() == pytest.approx(opacity * kernel if counts else 0, rel=1e-5)
     assert alpha[10].item() == pytest.approx(opacity * kernel if counts else 0, rel=1e-5)
     assert alpha[29] > 0 and alpha[31] == 0
 
 
+@with_gate
 def test_alpha_min_cuts_the_smoe_modes_on_alpha(mode):
     inputs = splat_at(20, 31, 16.0)
     inputs["opacities"][:] = 0.5
@@ -52,6 +55,7 @@ def test_alpha_min_cuts_the_smoe_modes_on_alpha(mode):
     assert (alpha > 0).tolist() == [distance <= reach for distance in range(44)]
 
 
+@with_gate
 def test_alpha_stays_in_the_tile_rectangle_of_3dgs(mode):
     # Radius ceil(3 sqrt(100 + sqrt(0.1))) = 31: tiles floor((47.9 - 31) / 16) = 1 and up, so that pixel 15, at 32.9 px,
     # is left out although alpha is still 1/224 there. The other way, tiles below floor((16.1 + 31 + 15) / 16) = 3.
@@ -77,6 +81,7 @@ def test_the_truncation_of_3dgs_equals_the_floor_on_the_grid():
             assert past[0, 0].item() == min(4, max(0, int((x + reach + 15) / 16)))
 
 
+@with_gate
 @pytest.mark.parametrize("side", ["left", "right", "above", "below"])
 def test_the_footprint_decides_whether_a_radius_is_zero(mode, side):
     # Variance 9: the radius is ceil(3 sqrt(9 + sqrt(0.1))) = 10, G = 1e-5 lies at 3 sqrt(2 ln 1e5) = 14.395.
@@ -149,11 +154,12 @@ def test_the_clip_coordinates_are_divided_by_w_plus_1e_7():
     assert splat.position[0].tolist() == pytest.approx([expected, (WIDTH - 1) / 2], rel=EXACT)
 
 
+@with_gates
 def test_a_pixel_beyond_the_cut_off_shows_the_background(mode):
     settings = facing_camera(mode, 41, 41)
     image = reference.rasterize(settings=settings, **on_axis([2.0], [0.6], [[1.0, 1.0, 1.0]], variance=0.01)).color
     sigma = math.sqrt(0.01 * (41 / 4) ** 2 + 0.3)
-    reach = sigma * math.sqrt(2 * math.log(0.6 * 255 if mode == "alpha" else 1e5))
+    reach = sigma * math.sqrt(-2 * math.log(max(1e-5, gate_of(mode) / 255 / 0.6)))
     row = (image[0, 20, 20:] - 0.1).abs() > 1e-9
     assert row.tolist() == [distance <= reach for distance in range(21)]
 

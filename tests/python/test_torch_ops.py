@@ -5,10 +5,10 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import gradients, op_arguments, random_scene
+from scenes import gradients, op_arguments, random_scene, with_gate
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
+from diff_smoe_rasterization.settings import OUTPUTS
 
 RESULTS = [result.name for result in torch.ops.diff_smoe_rasterization.rasterize.default._schema.returns]
 NUM_IMAGES = 5  # results of the op that are the caller's: color, radii, gate_sum, depth, inverse_depth
@@ -61,6 +61,7 @@ def images_and_gradients(function, scene):
                     for (name, leaf), value in zip(leaves.items(), values)}
 
 
+@with_gate
 @pytest.mark.parametrize("case", [dict(degree=1), dict(degree=1, split_dc=True), dict(channels=5, covariance="cov3D")],
                          ids=["shs", "dc", "channels"])
 def test_opcheck_of_rasterize(mode, case):
@@ -79,16 +80,16 @@ def test_opcheck_of_mark_visible():
                           (scene.inputs["means3D"], scene.settings.viewmatrix, 0.2))
 
 
+@with_gate
 def test_opcheck_of_contributions(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
     saved = dict(zip(RESULTS, torch.ops.diff_smoe_rasterization.rasterize.default(*op_arguments(scene))))
     op, weights = torch.ops.diff_smoe_rasterization.contributions.default, random_normal((18, 20), 1, torch.float32)
-    arguments = [saved.get(argument.name) for argument in op._schema.arguments[1:-2]]
-    last = scene.settings.alpha_min, BLEND_MODES.index(mode)
+    arguments = op_arguments(scene, "contributions", **saved, pixel_weights=weights)
     # Sums by atomics differ in their last digits, which the last part of opcheck does not allow.
     parts = {} if weights.device.type == "cpu" else {
         "test_utils": ("test_schema", "test_autograd_registration", "test_faketensor")}
-    torch.library.opcheck(op, (weights, *arguments, *last), **parts)
+    torch.library.opcheck(op, arguments, **parts)
 
 
 def test_compiled_contributions_equal_eager(mode):
@@ -125,6 +126,7 @@ def test_compiled_renderings_without_gradients_have_no_backward_pass_to_come():
     assert wanted == [True, False]
 
 
+@with_gate
 @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
 def test_compiled_equals_eager(mode, backend):
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32, degree=1)

@@ -17,11 +17,11 @@ namespace {
 py::dict constants() {
   using namespace py::literals;
   return py::dict("alpha_max"_a = dsmoe::kAlphaMax, "alpha_cut"_a = dsmoe::kAlphaCut, "gate_cut"_a = dsmoe::kGateCut,
-                  "transmittance_cut"_a = dsmoe::kTransmittanceCut, "gate_sum_cut"_a = dsmoe::kGateSumCut,
-                  "radius_root_floor"_a = dsmoe::kRadiusRootFloor, "compensation_floor"_a = dsmoe::kCompensationFloor,
-                  "low_pass"_a = dsmoe::kLowPass, "frustum_margin"_a = dsmoe::kFrustumMargin,
-                  "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon, "tile_size"_a = dsmoe::kTileSize,
-                  "segment_length"_a = dsmoe::cuda::kSegmentLength);
+                  "core_kernel"_a = dsmoe::kCoreKernel, "transmittance_cut"_a = dsmoe::kTransmittanceCut,
+                  "gate_sum_cut"_a = dsmoe::kGateSumCut, "radius_root_floor"_a = dsmoe::kRadiusRootFloor,
+                  "compensation_floor"_a = dsmoe::kCompensationFloor, "low_pass"_a = dsmoe::kLowPass,
+                  "frustum_margin"_a = dsmoe::kFrustumMargin, "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon,
+                  "tile_size"_a = dsmoe::kTileSize, "segment_length"_a = dsmoe::cuda::kSegmentLength);
 }
 
 py::dict blend_modes() {

@@ -1,5 +1,5 @@
-// The blend modes. Each is a small policy: `accumulate` takes a pair front to back and returns its weight, the
-// `denominator` and the `background_weight` make the pixel of the sums, `backward` takes the pairs back to front.
+// The blend modes. Each is a small policy: `accumulate` takes a pair front to back and returns its weight,
+// `background_gate` and `kDivides` make the pixel of the sums, `backward` takes the pairs back to front.
 //
 // With alpha_i the gate logit, T_i = prod_{j<i} (1 - alpha_j) (Eq. 4), c_i the expert, w_i = alpha_i T_i, W = sum w_i
 // and T what is left behind the last pair:
@@ -112,31 +112,19 @@ struct FamilyBlend {
 };
 
 template <> struct Blend<BlendMode::kAlpha> : FamilyBlend {
-  static constexpr bool kDivides = false, kHasBackgroundGate = false;
-
-  template <class Real> static DSMOE_HD Real denominator(const PixelEnd<Real>&) { return Real(Scalar<Real>(1)); }
-  template <class Real> static DSMOE_HD Real background_weight(const PixelEnd<Real>& end) { return end.transmittance; }
+  static constexpr bool kDivides = false, kLearnsGate = false;
+  template <class S> static DSMOE_HD S background_gate(S) { return S(1); }
 };
 
 template <> struct Blend<BlendMode::kSmoe> : FamilyBlend {
-  static constexpr bool kDivides = true, kHasBackgroundGate = true;
-
-  template <class Real> static DSMOE_HD Real denominator(const PixelEnd<Real>& end) {
-    return end.gate_sum + background_weight(end);
-  }
-  template <class Real> static DSMOE_HD Real background_weight(const PixelEnd<Real>& end) {
-    return Real(end.background_gate) * end.transmittance;
-  }
+  static constexpr bool kDivides = true, kLearnsGate = true;
+  template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
 
-// The ablations leave the background out.
+// The ablations leave the background out, and their denominator runs on behind a full pixel.
 struct AblationBlend {
-  static constexpr bool kDivides = true, kHasBackgroundGate = false;
-  static constexpr bool kStopsEarly = false;  // the denominator runs on behind a full pixel
-  static constexpr bool kSuffixAboutBase = false;
-
-  template <class Real> static DSMOE_HD Real denominator(const PixelEnd<Real>& end) { return end.gate_sum; }
-  template <class Real> static DSMOE_HD Real background_weight(const PixelEnd<Real>&) { return Scalar<Real>(0); }
+  static constexpr bool kStopsEarly = false, kSuffixAboutBase = false, kDivides = true, kLearnsGate = false;
+  template <class S> static DSMOE_HD S background_gate(S) { return S(0); }
 };
 
 template <> struct Blend<BlendMode::kSmoeTn> : AblationBlend {
@@ -180,24 +168,26 @@ enum class FeatureRule {
   kAveraged,  // divided by the gate sum in every mode: expected depth
 };
 
-// D, and what of it is the background's. Where no gate is open, the feature is its background.
-template <class Real> struct Normaliser {
-  Real denominator, background_weight;
+// A feature of a pixel is (sum + weight background) / denominator where some gate is open, else its background.
+template <class Real> struct FeatureEnd {
+  Real weight, denominator;
   Mask<Real> open;
+  bool divides;
 };
 
 template <BlendMode kMode, class Real>
-DSMOE_HD Normaliser<Real> normaliser(FeatureRule rule, const PixelEnd<Real>& end) {
+DSMOE_HD FeatureEnd<Real> feature_end(FeatureRule rule, const PixelEnd<Real>& end) {
   using S = Scalar<Real>;
-  const Mask<Real> open = end.gate_sum >= Real(S(kGateSumCut));
-  if (rule == FeatureRule::kAveraged) return {end.gate_sum, Real(S(0)), open};
-  return {Blend<kMode>::denominator(end), Blend<kMode>::background_weight(end), open};
+  const bool averaged = rule == FeatureRule::kAveraged, divides = averaged || Blend<kMode>::kDivides;
+  const S gate = averaged ? S(0) : Blend<kMode>::background_gate(end.background_gate);
+  const Real weight = Real(gate) * end.transmittance;
+  return {weight, divides ? end.gate_sum + weight : Real(S(1)), end.gate_sum >= Real(S(kGateSumCut)), divides};
 }
 
 template <BlendMode kMode, class Real>
 DSMOE_HD Real finish_feature(FeatureRule rule, const PixelEnd<Real>& end, Real sum, Real background) {
-  const auto by = normaliser<kMode>(rule, end);
-  return select(by.open, (sum + by.background_weight * background) / by.denominator, background);
+  const auto by = feature_end<kMode>(rule, end);
+  return select(by.open, (sum + by.weight * background) / by.denominator, background);
 }
 
 // Starts a pixel's backward pass; the features join one by one through add_feature.
@@ -217,14 +207,13 @@ template <BlendMode kMode, class Real>
 DSMOE_HD FeatureBackward<Real> add_feature(FeatureRule rule, PixelBackward<Real>& pixel, const PixelEnd<Real>& end,
                                            Real dL_dvalue, Real value, Real background) {
   const Real zero = Scalar<Real>(0);
-  const auto by = normaliser<kMode>(rule, end);
-  const bool averaged = rule == FeatureRule::kAveraged, divides = Blend<kMode>::kDivides || averaged;
-  const Real scaled = select(by.open, dL_dvalue / by.denominator, zero), weighted = by.background_weight * scaled;
-  if (divides) pixel.base = pixel.base + scaled * value;
-  pixel.suffix = pixel.suffix + weighted * (divides ? background - value : background);
-  const bool gated = Blend<kMode>::kHasBackgroundGate && !averaged;
-  return {scaled, select(by.open, weighted, dL_dvalue),
-          gated ? end.transmittance * scaled * (background - value) : zero};
+  const auto by = feature_end<kMode>(rule, end);
+  const Real scaled = select(by.open, dL_dvalue / by.denominator, zero), weighted = by.weight * scaled;
+  const Real distance = background - value;
+  if (by.divides) pixel.base = pixel.base + scaled * value;
+  pixel.suffix = pixel.suffix + weighted * (by.divides ? distance : background);
+  const bool learns = Blend<kMode>::kLearnsGate && rule == FeatureRule::kBlended;
+  return {scaled, select(by.open, weighted, dL_dvalue), learns ? end.transmittance * scaled * distance : zero};
 }
 
 // Continues in front of pairs that another walk has taken: `transmittance` is what they met, `behind` their sum w g'.c.

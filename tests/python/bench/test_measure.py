@@ -84,7 +84,8 @@ def test_a_rendering_with_a_pixel_that_is_no_number_has_no_figures(value, metric
     broken[1, 3, 4] = value
     found = metrics(broken, target)
     assert all(math.isnan(found[name]) for name in ("psnr", "ssim", "psnr_float"))
-    views = [SimpleNamespace(camera=SimpleNamespace(name=name), image_float=lambda: target) for name in ("one", "two")]
+    views = [SimpleNamespace(camera=SimpleNamespace(name=name), image_float=lambda: target, mask=None)
+             for name in ("one", "two")]
 
     def renderer(camera):
         return SimpleNamespace(color=broken if camera.name == "two" else target)
@@ -92,6 +93,15 @@ def test_a_rendering_with_a_pixel_that_is_no_number_has_no_figures(value, metric
     with pytest.raises(TrainerError, match="^the rendering of two has NaN or infinite pixels$"):
         evaluate(renderer, views, "cpu", measure=metrics)
     assert evaluate(renderer, views[:1], "cpu", measure=metrics).metrics["psnr"] == math.inf
+
+
+def test_what_a_mask_ignores_changes_no_metric():
+    target = step_image()
+    mask = torch.zeros_like(target[:1])
+    mask[..., :target.shape[2] // 2 + 4] = 1  # with the edge
+    other = torch.where(mask > 0, target * 0.9, 1 - target)
+    assert Measures("cpu")(target * 0.9, target, mask) == Measures("cpu")(other, target, mask)
+    assert edge_psnr(other, target, torch.zeros_like(mask)) is None
 
 
 def test_psnr_of_what_is_no_number_is_none():

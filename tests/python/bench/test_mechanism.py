@@ -24,7 +24,9 @@ DENSIFICATIONS = list(range(40, 200, 20))
 
 
 def config_of(scene, output, blend_mode, **options):
-    """300 steps with densifications and resets as above, in which Gaussians are cloned, split and pruned."""
+    """300 steps with densifications and resets as above, in which Gaussians are cloned, split and pruned; Eq. 7."""
+    if blend_mode == "smoe":
+        options.setdefault("background_gate", 0.0)
     return TrainConfig(**{**dict(
         scene=scene, output=str(output), blend_mode=blend_mode, iterations=300, sh_degree_interval=100,
         densify_from_iter=20, densify_until_iter=200, densification_interval=20, opacity_reset_interval=60,

@@ -5,7 +5,7 @@ import pytest
 import torch
 from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
 from comparison import assert_all_close, assert_close, reference_gradients
-from scenes import camera_settings, gradients, op_arguments, random_scene
+from scenes import camera_settings, gradients, op_arguments, random_scene, with_gate, with_gates
 
 from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.extension import _C
@@ -63,6 +63,7 @@ def selected(names):
     return [pytest.param(name, marks=pytest.mark.sanitize) if name in SANITIZED else name for name in names]
 
 
+@with_gate
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, FLOAT32), (torch.float64, FLOAT64)],
                          ids=["float32", "float64"])
 @pytest.mark.parametrize("name", selected(SCENES))
@@ -74,6 +75,7 @@ def test_random_scenes(mode, name, dtype, tolerance, gpu):
     assert ((rendering.color - background).abs() > 1e-3).any(0).double().mean() > 0.3
 
 
+@with_gates
 @pytest.mark.sanitize
 @pytest.mark.parametrize("camera", [False, True], ids=["fixed_camera", "camera"])
 @pytest.mark.parametrize("split_dc", [False, True], ids=["harmonics", "split_harmonics"])
@@ -118,6 +120,7 @@ def captured(mode, width, height):
         torch.float32)
 
 
+@with_gate
 def test_a_real_capture(mode, gpu):
     rendering = compare(captured(mode, 800, 533), gpu, torch.float32, OUTPUTS, FLOAT32)
     assert (rendering.radii > 0).sum() > 20_000
@@ -157,6 +160,7 @@ def test_more_rows_of_tiles_than_a_grid_may_have(mode, gpu):
     compare(scene, gpu, torch.float32, (), Tolerance(2e-2, 2e-2, 1e-3))
 
 
+@with_gate
 @pytest.mark.parametrize("dtype, tolerance", [
     # Products and sums of a hundred thousand terms: 1e-5, and as much again in what cancels.
     (torch.float32, Tolerance(1e-4, 3e-4, 1e-5)), (torch.float64, FLOAT64)], ids=["float32", "float64"])
@@ -177,6 +181,7 @@ LONG_LISTS = {
 }
 
 
+@with_gates
 @pytest.mark.sanitize
 @pytest.mark.parametrize("name", LONG_LISTS)
 def test_lists_of_several_segments(mode, name, gpu):
@@ -191,6 +196,7 @@ def test_lists_of_several_segments(mode, name, gpu):
     assert (rendering.radii > 0).sum() > 2000
 
 
+@with_gate
 @pytest.mark.sanitize
 def test_renderings_without_gradients_keep_no_segments(mode, gpu):
     """They have no use for them. Images are the same bit for bit, and a backward pass would be right nevertheless."""
@@ -204,7 +210,7 @@ def test_renderings_without_gradients_keep_no_segments(mode, gpu):
     for image in (lean[0], rendering.color):
         assert torch.equal(image, kept[0])
 
-    names = [argument.name for argument in op.default._schema.arguments[:13]]  # the tensors
+    names = [argument.name for argument in op.default._schema.arguments[:14]]  # the tensors
     inputs = {name: value for name, value in zip(names, op_arguments(scene)) if value is not None}
     present = [name in inputs for name in names]
     gradient = torch.randn(kept[0].shape, generator=torch.Generator().manual_seed(1)).to(gpu)
@@ -215,6 +221,7 @@ def test_renderings_without_gradients_keep_no_segments(mode, gpu):
     assert_all_close(dict(zip(inputs, first)), dict(zip(inputs, second)), 1e-4)
 
 
+@with_gate
 @pytest.mark.skipif(not hasattr(torch.library, "opcheck"),
                     reason=f"torch {torch.__version__} has no torch.library.opcheck, so no fake kernels")
 def test_the_fake_kernel_knows_that_no_segments_are_kept(mode, gpu):
@@ -224,6 +231,7 @@ def test_the_fake_kernel_knows_that_no_segments_are_kept(mode, gpu):
                           test_utils=("test_schema", "test_faketensor"))
 
 
+@with_gate
 @pytest.mark.sanitize
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", ["no_gaussians", "behind_the_camera", "without_opacity", "beside_the_image"])
@@ -241,6 +249,7 @@ def test_nothing_is_drawn(mode, kind, dtype, gpu):
     assert torch.equal(rendering.color, background)
 
 
+@with_gate
 def test_the_reference_runs_on_a_gpu_too(mode, gpu):
     scene = random_scene(mode, degree=1)
     expected, expected_gradients = reference_gradients(scene, OUTPUTS)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from comparison import assert_close
 from devices import random_normal
-from scenes import op_arguments, random_scene
+from scenes import gate_of, op_arguments, random_scene, with_gate, with_gates
 from test_cuda_against_cpu import SCENES, selected
 from test_cuda_graphs import SLEEP, WARM_UP, list_size, scene_of
 
@@ -25,6 +25,7 @@ def scores(scene, device, dtype, pixel_weights, **settings):
     return rendering.radii, splats.centers, splats.depths, splats.contributions(pixel_weights.to(device, dtype))
 
 
+@with_gate
 @pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("name", selected(SCENES))
 def test_float64_equals_the_cpu(mode, name, deterministic, gpu):
@@ -43,6 +44,7 @@ def test_float64_equals_the_cpu(mode, name, deterministic, gpu):
     assert (expected[3].pixels > 0).sum() > 5
 
 
+@with_gate
 @pytest.mark.parametrize("name", selected(SCENES))
 def test_float32_is_near_the_cpu(mode, name, gpu):
     scene = SCENES[name](mode)
@@ -59,13 +61,14 @@ def test_float32_is_near_the_cpu(mode, name, gpu):
         assert_close(getattr(actual, name).cpu()[same], getattr(expected, name)[same], 1e-4, name)
 
 
+@with_gate
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_sums_account_for_every_pair_of_the_image(mode, dtype, gpu):
     """All blend weights together are the image of their sums; in `smoe_tn` the numerator of a constant colour is."""
     scene = random_scene(mode, 3000, 160, 107, scale=0.03, channels=1, bg=torch.zeros(1)).with_inputs(
         colors_precomp=torch.ones(3000, 1, dtype=torch.float64)).to(dtype).to(gpu)
     rendering, splats = rasterize_with_splats(settings=scene.settings, outputs=("alpha",), **scene.inputs)
-    weights = rendering.color[0] if mode == "alpha" else rendering.color[0] * rendering.alpha[0]
+    weights = rendering.color[0] * (rendering.alpha[0] + gate_of(mode) * (1 - rendering.alpha[0]))
     pixel_weights = map_for(scene.settings).to(gpu, dtype)
     sums = splats.contributions(pixel_weights)
     # Sums of some hundred thousand positive numbers.
@@ -73,6 +76,7 @@ def test_the_sums_account_for_every_pair_of_the_image(mode, dtype, gpu):
     assert_close(sums.blend_weights.double().sum(), weights.double().sum(), tolerance, "blend weights")
 
 
+@with_gates
 @pytest.mark.sanitize
 def test_lists_that_are_outgrown(mode, gpu):
     """A graph whose contents outgrow the lists it was captured with: the walk goes over the depth order then."""
@@ -123,6 +127,7 @@ def test_a_deterministic_rendering_has_its_sums(mode, gpu):
     torch.testing.assert_close(actual.distances, expected.distances, rtol=1e-5, atol=0)
 
 
+@with_gate
 def test_the_host_waits_for_nothing(mode, gpu):
     """The GPU is still busy with earlier work when the sums return."""
     scene = scene_of(mode).to(torch.float32).to(gpu)

@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 import torch
 from comparison import assert_all_close
-from scenes import gradients, random_scene
+from scenes import gradients, random_scene, with_gate
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -18,6 +18,7 @@ CASES = {
 }
 
 
+@with_gate
 @pytest.mark.parametrize("dtype, tolerance", [
     (torch.float32, 1e-5), (torch.float64, 1e-12)], ids=["float32", "float64"])  # sums in another order
 @pytest.mark.parametrize("case", [pytest.param(name, marks=pytest.mark.sanitize) if name == "split_harmonics" else name

@@ -8,7 +8,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import Scene, op_arguments, random_scene
+from scenes import Scene, op_arguments, random_scene, with_gate, with_gates
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -73,19 +73,26 @@ def scene_of(mode, seed=0, **options):
     return random_scene(mode, seed=seed, **options)
 
 
+def with_other_gate(scene, value):
+    """Returns the scene with a background gate of that value, where it has one that is a tensor."""
+    gate = scene.settings.background_gate
+    return scene.with_settings(background_gate=torch.full_like(gate, value)) if torch.is_tensor(gate) else scene
+
+
 def other_camera(scene, other):
     return scene.with_settings(viewmatrix=other.settings.viewmatrix, projmatrix=other.settings.projmatrix,
                                campos=other.settings.campos)
 
 
+@with_gates
 @pytest.mark.parametrize("options", [{}, dict(split_dc=True, antialiasing=True), dict(channels=5, covariance="cov3D")],
                          ids=["harmonics", "dc", "channels"])
 def test_a_replayed_graph_equals_a_call(mode, options, gpu):
     step = TrainingStep(scene_of(mode, **options), gpu)
     graph, results = step.captured()
     first = scene_of(mode, **options)
-    second = scene_of(mode, seed=1, **options)
-    turned = other_camera(first, scene_of(mode, position=(-3.0, 0.5, -2.0), **options))
+    second = with_other_gate(scene_of(mode, seed=1, **options), 0.6)
+    turned = with_other_gate(other_camera(first, scene_of(mode, position=(-3.0, 0.5, -2.0), **options)), 0.0)
     for scene in (first, second, turned, first):
         expected = TrainingStep(scene, gpu)()
         step.set_to(scene.to(torch.float32))
@@ -102,6 +109,7 @@ def list_size(scene, gpu):
     return len(instances), int(offsets[-1])
 
 
+@with_gates
 # Room for the lists is what earlier calls of the size and mode needed, and up to 65,536 more: only scenes of many
 # Gaussians outgrow it, and only at a size of their own.
 @pytest.mark.parametrize("outputs, degree, width", [(OUTPUTS, 1, 203), ((), 3, 219)],
@@ -123,6 +131,7 @@ def test_contents_that_outgrow_the_captured_lists(mode, outputs, degree, width, 
         assert_same(results, expected)
 
 
+@with_gate
 def test_a_graph_captured_while_nothing_is_visible(mode, gpu):
     scene = scene_of(mode)
     hidden = scene.with_inputs(means3D=scene.inputs["means3D"] + 30 * scene.settings.campos)
@@ -148,6 +157,7 @@ def test_eager_calls_between_replays(mode, gpu):
         assert_same(results, expected)
 
 
+@with_gates
 def test_torch_sees_no_synchronisation(mode, gpu):
     step = TrainingStep(scene_of(mode), gpu)
     step.warm_up()
@@ -162,6 +172,7 @@ def test_torch_sees_no_synchronisation(mode, gpu):
         assert_same(result, expected)
 
 
+@with_gate
 def test_the_host_waits_for_nothing(mode, gpu):
     """Synchronisations that torch does not know of: the GPU is still busy with earlier work when both passes return."""
     step = TrainingStep(scene_of(mode), gpu)
@@ -178,6 +189,7 @@ def test_the_host_waits_for_nothing(mode, gpu):
     assert_same(result, step())
 
 
+@with_gate
 @pytest.mark.sanitize
 def test_growing_contents_without_a_graph(mode, gpu):
     """Each call has more than the one before: what was learned from the last never limits the next."""

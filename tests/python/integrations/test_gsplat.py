@@ -10,7 +10,7 @@ from comparison import assert_all_close, assert_close, one_thread, threshold_mar
 from devices import on_the_cpu, random_normal
 from scenes import camera_settings, random_scene
 
-from diff_smoe_rasterization import reference
+from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.integrations.gsplat import rasterization
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -69,9 +69,9 @@ def test_the_order_of_arguments():
     """Those that gsplat's callers pass by position, and the names of the others."""
     names = list(inspect.signature(rasterization).parameters)
     assert names[:9] == ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height"]
-    assert names[9:27] == ["near_plane", "far_plane", "radius_clip", "eps2d", "sh_degree", "packed", "tile_size",
+    assert names[9:28] == ["near_plane", "far_plane", "radius_clip", "eps2d", "sh_degree", "packed", "tile_size",
                            "backgrounds", "render_mode", "sparse_grad", "absgrad", "rasterize_mode", "channel_chunk",
-                           "distributed", "camera_model", "segmented", "covars", "blend_mode"]
+                           "distributed", "camera_model", "segmented", "covars", "blend_mode", "background_gate"]
 
 
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
@@ -237,6 +237,21 @@ def test_an_opacity_above_one_and_the_environments_blend_mode(mode, monkeypatch)
     renders = rasterization(**arguments_of(scene, cameras))[0]
     expected = reference_renderings(scene.inputs, cameras)
     assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
+
+
+def test_the_background_gate_is_an_argument_or_in_the_environment(monkeypatch):
+    scene = random_scene("smoe", 60, seed=42, channels=3)
+    cameras, gate = make_cameras("smoe", 3), torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    arguments = arguments_of(scene, cameras)
+    renders = rasterization(**arguments, blend_mode="smoe", background_gate=gate)[0]
+    inputs = {**scene.inputs, "rotations": torch.nn.functional.normalize(scene.inputs["rotations"], dim=1)}
+    expected = [rasterize(settings=camera._replace(background_gate=0.3), **inputs).color for camera in cameras]
+    assert_close(renders, channels_last(expected), TOLERANCE, "renders")
+    assert (renders - rasterization(**arguments, blend_mode="smoe")[0]).abs().max() > 0.01
+    renders.sum().backward()
+    assert gate.grad != 0
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.3")
+    assert torch.equal(rasterization(**arguments, blend_mode="smoe")[0], renders)
 
 
 def test_inputs_need_not_be_contiguous(mode):

@@ -10,7 +10,7 @@ import torch
 from comparison import assert_all_close, assert_close, assert_same_gradients, reference_gradients
 from scenes import gradients, random_scene, random_weights
 
-from diff_smoe_rasterization import Rendering
+from diff_smoe_rasterization import Rendering, rasterize
 from diff_smoe_rasterization.integrations import c3dgs, inria, inria_2024, scaffold
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -163,6 +163,23 @@ def test_the_blend_mode_comes_from_the_settings_or_the_environment(flavour, mode
     assert torch.equal(color(blend_mode="alpha"), alpha)
     if mode != "alpha":
         assert (alpha - color()).abs().max() > 0.01
+
+
+def test_the_background_gate_comes_from_the_settings_or_the_environment(flavour, monkeypatch):
+    scene = random_scene("smoe", 60, 45, 30, seed=7)
+    expected = rasterize(settings=scene.settings._replace(background_gate=0.3), **scene.inputs).color
+
+    def color(**others):
+        return flavour.GaussianRasterizer(settings_of(flavour, scene.settings, blend_mode="smoe", **others))(
+            **scene.inputs)[0]
+
+    gate = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    given = color(background_gate=gate)
+    assert torch.equal(given, expected) and (given - color()).abs().max() > 0.01
+    given.sum().backward()
+    assert gate.grad != 0
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.3")
+    assert torch.equal(color(), expected)
 
 
 def test_an_unknown_blend_mode_is_refused(flavour, scene):

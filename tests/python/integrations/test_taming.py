@@ -11,7 +11,7 @@ from devices import on_the_cpu, random_normal
 from scenes import gradients, random_scene, random_weights
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization import Rendering, reference
+from diff_smoe_rasterization import Rendering, rasterize, reference
 from diff_smoe_rasterization.integrations import taming
 from diff_smoe_rasterization.integrations.taming import (
     GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam, fused_ssim)
@@ -290,6 +290,13 @@ def test_the_blend_mode_comes_from_the_settings_or_the_environment(mode, monkeyp
     assert torch.equal(call(scene, blend_mode="alpha")["color"], alpha)
     if mode != "alpha":
         assert (alpha - results["color"]).abs().max() > 0.01
+
+
+def test_the_background_gate_is_one_of_the_settings():
+    scene = random_scene("smoe", 60, 45, 30, seed=11)
+    expected = rasterize(settings=scene.settings._replace(background_gate=0.3), **scene.inputs).color
+    color = call(scene, loss_map(scene), background_gate=0.3)["color"]
+    assert torch.equal(color, expected) and (color - call(scene)["color"]).abs().max() > 0.01
 
 
 def test_mark_visible_is_the_near_plane():

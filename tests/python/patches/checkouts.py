@@ -112,6 +112,6 @@ def definitions(path):
 def environment(**more):
     """Of a process of a trainer: this package, what else trainers import, one thread."""
     kept = {name: value for name, value in os.environ.items()
-            if name not in ("PYTHONDONTWRITEBYTECODE", "DSMOE_BLEND_MODE")}
+            if name not in ("PYTHONDONTWRITEBYTECODE", "DSMOE_BLEND_MODE", "DSMOE_BACKGROUND_GATE")}
     above = Path(diff_smoe_rasterization.__file__).resolve().parent.parent  # where it is installed, or the source tree
     return {**kept, "PYTHONPATH": os.pathsep.join([str(PACKAGES), str(above)]), "OMP_NUM_THREADS": "1", **more}

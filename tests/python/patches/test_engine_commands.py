@@ -22,7 +22,7 @@ def test_a_dry_run_shows_what_is_still_to_be_done(tmp_path, dsmoe):
     assert said.status == 0 and "already patched" in said.out and "would be written" in said.out
     assert "+++" not in said.out
     said = dsmoe("patch", "apply", checkout, "--dry-run", "--modernise")
-    assert "+++ b/train.py" in said.out and "weights_only" in said.out and "blend_mode_of" not in "".join(
+    assert "+++ b/train.py" in said.out and "weights_only" in said.out and "blend_of" not in "".join(
         line for line in said.out.splitlines() if line[0] == "+")
     assert snapshot(checkout) == before
 
@@ -102,10 +102,6 @@ def test_a_file_with_a_null_byte_is_named_in_words(tmp_path, dsmoe):
 def test_an_option_that_there_is_not_shows_the_usage_of_the_command(tmp_path, dsmoe, words, usage):
     said = dsmoe(*words, tmp_path, "--modernize")
     assert said.status == 2 and usage in said.err and "--modernize" in said.err
-
-
-def test_run_takes_both_spellings_of_the_mode(dsmoe):
-    assert "there is no command" in dsmoe("run", "--blend_mode", "smoe").err
 
 
 def test_a_record_that_may_not_be_read_is_named(tmp_path, monkeypatch, dsmoe):

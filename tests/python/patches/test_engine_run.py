@@ -14,6 +14,7 @@ import pytest
 import diff_smoe_rasterization
 from diff_smoe_rasterization import cli, patches
 from diff_smoe_rasterization.patches import run
+from diff_smoe_rasterization.settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from test_patch_engine import GR, RENDERER, make, snapshot
 
 SHOW = """import importlib, os, sys
@@ -33,7 +34,7 @@ sys.exit(7)
 def environment():
     """This Python's package and programs, whether it is installed or not, and no blend mode."""
     above = str(Path(diff_smoe_rasterization.__file__).resolve().parent.parent)
-    return {**{name: value for name, value in os.environ.items() if name != "DSMOE_BLEND_MODE"},
+    return {**{name: value for name, value in os.environ.items() if not name.startswith("DSMOE_B")},
             "PYTHONPATH": os.pathsep.join(filter(None, [above, os.environ.get("PYTHONPATH")])),
             "PATH": os.path.dirname(sys.executable) + os.pathsep + os.environ["PATH"]}
 
@@ -49,7 +50,6 @@ def dsmoe(monkeypatch, capsys):
     """The command in this process, which has imported torch already."""
     for name in ("PYTHONPATH", "PATH"):
         monkeypatch.setenv(name, environment()[name])
-    monkeypatch.delenv("DSMOE_BLEND_MODE", raising=False)
 
     def call(*words, cwd):
         monkeypatch.chdir(cwd)
@@ -76,12 +76,14 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path):
                                              f"os.chdir({str(tmp_path / 'a trainer')!r})\n"
                                              "sys.exit(os.system(sys.executable + ' show.py') >> 8)\n"})
     before = snapshot(tmp_path)
-    result = dsmoe_alone("run", "--blend-mode", "smoe_tn", "--", sys.executable, checkout / "parent.py", cwd=tmp_path)
+    result = dsmoe_alone("run", "--blend-mode", "smoe", "--background-gate", "0.25", "--", sys.executable,
+                         checkout / "parent.py", cwd=tmp_path)
     assert result.returncode == 7, result.stderr
-    assert result.stdout.splitlines() == ["diff_smoe_rasterization.rasterizer smoe_tn", "no _C"]
+    assert result.stdout.splitlines() == ["diff_smoe_rasterization.rasterizer smoe", "no _C"]
     announced, *said = result.stderr.splitlines()
-    assert "3dgs-2023" in announced and "will be inria of this package, blend mode smoe_tn" in announced
-    assert said == ["diff_smoe_rasterization: the rasterizer is inria of this package, blend mode smoe_tn"]
+    words = "of this package, blend mode smoe, background gate 0.25"
+    assert "3dgs-2023" in announced and "will be inria " + words in announced
+    assert said == ["diff_smoe_rasterization: the rasterizer is inria " + words]
     assert snapshot(tmp_path) == before
 
 
@@ -140,6 +142,23 @@ def test_the_blend_mode_has_to_be_said(tmp_path, dsmoe):
     assert result.returncode == 2 and "--blend-mode" in result.stderr
     for spelling in ("--blend-mode", "--blend_mode"):  # the second is a patched trainer's
         refused(dsmoe("run", spelling, "smoe", "--", cwd=tmp_path), "there is no command")
+    refused(dsmoe("run", "--blend-mode", "smoe", "--background_gate", "0", "--", cwd=tmp_path), "there is no command")
+
+
+@pytest.mark.parametrize("mode", BLEND_MODES)
+def test_the_gate_of_the_children(mode, tmp_path, monkeypatch, dsmoe):
+    """That which is asked for, else the variable's, else the recommended one; and none in other modes than smoe."""
+    words = [sys.executable, "show.py"]
+    monkeypatch.setattr(run, "_ask_python", lambda *_: ({"usable": run.STAND_INS.values()}, []))  # takes seconds
+    for variable, asked, gate in (("", None, RECOMMENDED_BACKGROUND_GATE), ("0.25", None, 0.25), ("0.25", 0.0, 0.0)):
+        monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
+        if mode == "smoe" or asked is None:
+            made, lines = run.prepare(words, mode, "scaffold", dict(os.environ), asked)
+            assert made.get("DSMOE_BACKGROUND_GATE") == (str(gate) if mode == "smoe" else None)
+            assert (f"blend mode {mode}, background gate {gate};" in lines[0]) == (mode == "smoe")
+    for gate in ("-1", "nan") if mode == "smoe" else ("0.1",):
+        refused(dsmoe("run", "--blend-mode", mode, "--background-gate", gate, "--trainer", "scaffold", "--", *words,
+                      cwd=tmp_path), "background_gate is")
 
 
 def test_what_would_not_use_the_rasterizer_is_refused(tmp_path, dsmoe):

@@ -69,6 +69,6 @@ def test_scaffold_gs_renders_in_two_files(tmp_path):
     checkout = make(tmp_path, files)
     planned = patches.apply(checkout)
     assert planned.verdict.trainer == "scaffold-gs" and planned.notes == ()
-    assert (checkout / GR).read_text().count("blend_mode=pipe.blend_mode") == 2
+    assert (checkout / GR).read_text().count("**pipe.blend,") == 2
     for name, count in (("train.py", 2), ("render.py", 1)):
-        assert (checkout / name).read_text().count(".blend_mode = blend_mode_of(dataset)") == count
+        assert (checkout / name).read_text().count(".blend = blend_of(dataset)") == count

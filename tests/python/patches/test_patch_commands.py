@@ -115,13 +115,13 @@ def test_only_imports_settings_model_params_and_entries_change(story):
 
 
 def take_out_what_a_patch_adds(function, name):
-    """The settings' keyword from a renderer; the one statement about `blend_mode` from others."""
+    """The settings' keywords from a renderer; the one statement about `blend` from others."""
     if name in ("render", "prefilter_voxel"):
         for node in ast.walk(function):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "GaussianRasterizationSettings":
-                node.keywords = [keyword for keyword in node.keywords if keyword.arg != "blend_mode"]
+                node.keywords = [keyword for keyword in node.keywords if keyword.arg]
         return
-    mentions = [statement for statement in function.body if "'blend_mode'" in ast.dump(statement)]
+    mentions = [statement for statement in function.body if "'blend" in ast.dump(statement)]
     assert len(mentions) == 1, f"{name}: {len(mentions)} statements about the mode"
     function.body.remove(mentions[0])
 

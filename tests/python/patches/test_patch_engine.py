@@ -69,16 +69,16 @@ CHECKOUT = {GR: RENDERER, ARGS: ARGUMENTS, "train.py": TRAIN,
 PATCHED = {
     GR: RENDERER.replace(
         "from diff_gaussian_rasterization import", "from diff_smoe_rasterization.integrations.inria import").replace(
-        "# never\n", "# never\n        blend_mode=pipe.blend_mode,\n"),
+        "# never\n", "# never\n        **pipe.blend,\n"),
     ARGS:
-        "from diff_smoe_rasterization.patches.runtime import default_blend_mode\n" + ARGUMENTS.replace(
-            "sh_degree = 3\n", "sh_degree = 3\n        self.blend_mode = default_blend_mode()\n"),
+        "from diff_smoe_rasterization.patches.runtime import default_blend\n" + ARGUMENTS.replace(
+            "sh_degree = 3\n", "sh_degree = 3\n        self.blend_mode, self.background_gate = default_blend()\n"),
     "train.py": TRAIN.replace("import render\n", "import render\nfrom diff_smoe_rasterization.patches.runtime import "
-                              "blend_mode_of\n").replace(
-        "checkpoint):\n", "checkpoint):\n    pipe.blend_mode = blend_mode_of(dataset)\n"),
+                              "blend_of\n").replace(
+        "checkpoint):\n", "checkpoint):\n    pipe.blend = blend_of(dataset)\n"),
     "render.py": RENDER.replace("import render\n", "import render\nfrom diff_smoe_rasterization.patches.runtime import "
-                                "blend_mode_of\n").replace(
-        'sets."\n', 'sets."\n    pipeline.blend_mode = blend_mode_of(dataset)\n'),
+                                "blend_of\n").replace(
+        'sets."\n', 'sets."\n    pipeline.blend = blend_of(dataset)\n'),
 }
 
 
@@ -131,7 +131,7 @@ def test_every_form_of_text_comes_back(tmp_path, form):
     if form == "latin-1":
         assert (tmp_path / "train.py").read_bytes() == encoded(PATCHED["train.py"])
     if form == "tabs":
-        assert b"\n\tpipe.blend_mode = blend_mode_of(dataset)\n" in (tmp_path / "train.py").read_bytes()
+        assert b"\n\tpipe.blend = blend_of(dataset)\n" in (tmp_path / "train.py").read_bytes()
     for name in CHECKOUT:
         compile((tmp_path / name).read_bytes(), name, "exec")
     patches.revert(tmp_path)
@@ -149,7 +149,7 @@ def test_the_diff_is_the_same_before_and_after(tmp_path):
     make(tmp_path)
     before, text = snapshot(tmp_path), patches.diff(tmp_path)
     assert snapshot(tmp_path) == before
-    assert "+    pipe.blend_mode = blend_mode_of(dataset)\n" in text and "No newline at end of file" in text
+    assert "+    pipe.blend = blend_of(dataset)\n" in text and "No newline at end of file" in text
     patches.apply(tmp_path)
     assert patches.diff(tmp_path) == text
 
@@ -275,7 +275,7 @@ def test_a_disk_that_is_full_changes_nothing(tmp_path, monkeypatch):
     before = snapshot(tmp_path)
 
     def failing(root, path, data, replace=record_module.replace_file):
-        if path == tmp_path / "train.py" and b"blend_mode" in data:
+        if path == tmp_path / "train.py" and b"blend_of" in data:
             raise OSError(28, "No space left on device")
         replace(root, path, data)
 
@@ -307,6 +307,26 @@ def test_the_way_out_of_an_edit_is_the_one_that_is_named(tmp_path):
     for copy in (tmp_path / ".dsmoe_patch/originals").rglob("*.py"):
         shutil.copy(str(copy), str(tmp_path / copy.relative_to(tmp_path / ".dsmoe_patch/originals")))
     shutil.rmtree(str(tmp_path / ".dsmoe_patch"))
+    assert snapshot(tmp_path) == original
+
+
+def test_a_patch_by_rules_of_before_is_known_and_brought_up_to_date(tmp_path):
+    """Such as set `pipe.blend_mode` alone."""
+    original = snapshot(make(tmp_path))
+    former = {name: text.replace("**pipe.blend,", "blend_mode=pipe.blend_mode,").replace(".blend = ", ".blend_mode = ")
+              for name, text in PATCHED.items()}
+    record = record_module.Record.write(tmp_path, *({name: text.encode() for name, text in texts.items()}
+                                                    for texts in (CHECKOUT, former)),
+                                        {"version": "0", "trainer": "3dgs-2023", "options": []})
+    make(tmp_path, former)
+    record.completed()
+    verdict = patches.check(tmp_path)
+    assert verdict == "patched" and verdict.reasons[0] == "by version 0"
+    assert f"to bring it up to date, type: dsmoe patch apply {tmp_path}" in verdict.reasons[1]
+    assert patches.apply(tmp_path).written and not patches.apply(tmp_path).written
+    assert all((tmp_path / name).read_text() == text for name, text in PATCHED.items())
+    assert len(patches.check(tmp_path).reasons) == 1
+    patches.revert(tmp_path)
     assert snapshot(tmp_path) == original
 
 
@@ -369,7 +389,7 @@ def test_modes_links_and_blanks(tmp_path):
     patches.apply(folder)
     after = snapshot(folder)
     assert after["train.py"][0] == 0o755 and after["render.py"] == before["render.py"]
-    assert b"blend_mode_of" in after["render of mine.py"][1]
+    assert b"blend_of" in after["render of mine.py"][1]
     patches.revert(folder)
     assert snapshot(folder) == before
 
@@ -398,7 +418,7 @@ def test_what_may_not_be_written_is_refused(tmp_path):
 def test_scripts_of_the_user(tmp_path):
     """One that renders is named; one that imports the rasterizer gets the trainer's own."""
     folder = make(tmp_path, {"video.py": "from gaussian_renderer import render\n", "utils/score.py": "import math\n",
-                             "film.py": "from gaussian_renderer import render\npipe.blend_mode = 'smoe'\n",
+                             "film.py": "from gaussian_renderer import render\npipe.blend = {}\n",
                              "viewer.py": "from diff_gaussian_rasterization import GaussianRasterizer\n",
                              "python2.py": "print 'diff_gaussian_rasterization'\n",
                              "utils/loss.py": "try:\n    from diff_gaussian_rasterization._C import fusedssim\n"
@@ -440,7 +460,7 @@ def test_what_is_no_script_of_the_checkout_is_not_named(tmp_path):
                              "submodules/a/film.py": text, ".cache/film.py": text, "lib/film.py": text,
                              "train.py": "from lib import film\n" + TRAIN, "tools/gui.py":
                              "from gaussian_renderer import network_gui\n", "tools/mode.py": "from gaussian_renderer "
-                             "import render\npipe.blend_mode = 'smoe'\n"})
+                             "import render\npipe.blend = {}\n"})
     make(folder / "another")
     assert patches.plan(folder).notes == ()
 
@@ -469,10 +489,9 @@ def test_in_public_checkouts_only_the_statements_change(name):
     removed = [line[1:].strip() for line in lines if line[0] == "-"]
     added = [line[1:].strip() for line in lines if line[0] == "+"]
     assert removed and all(line.startswith("from diff_gaussian_rasterization import") for line in removed)
-    statements = ("from diff_smoe_rasterization.", "blend_mode=pipe.blend_mode,",
-                  "self.blend_mode = default_blend_mode()", "pipe.blend_mode = blend_mode_of(dataset)",
-                  "pipeline.blend_mode = blend_mode_of(dataset)",
-                  "pipeline_params.blend_mode = blend_mode_of(model_params)")
+    statements = ("from diff_smoe_rasterization.", "**pipe.blend,",
+                  "self.blend_mode, self.background_gate = default_blend()", "pipe.blend = blend_of(dataset)",
+                  "pipeline.blend = blend_of(dataset)", "pipeline_params.blend = blend_of(model_params)")
     assert all(line.startswith(statements) for line in added)
     assert digest == hashlib.sha256(repr(sorted(snapshot(folder).items())).encode()).hexdigest()
 

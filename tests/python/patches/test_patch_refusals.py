@@ -90,7 +90,7 @@ def test_no_settings_are_left_without_the_mode(tmp_path, dsmoe):
         assert refused(result, "gaussian_renderer/__init__.py") and contents(checkout) == before
     else:
         text = renderer.read_text()
-        assert text.count("blend_mode=") == text.count("GaussianRasterizationSettings(") == 2
+        assert text.count("**pipe.blend,") == text.count("GaussianRasterizationSettings(") == 2
 
 
 @pytest.mark.parametrize("name", ["3dgs-2024", "c3dgs", "hac-plus"])

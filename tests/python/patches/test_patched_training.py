@@ -10,6 +10,7 @@ import pytest
 from checkouts import TRAINERS, WITH_RENDER, contents, make_checkout
 
 from diff_smoe_rasterization import BLEND_MODES, patches
+from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
 
 pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
@@ -70,10 +71,10 @@ def test_a_run_writes_nothing_into_the_checkout(name, runs):
 
 
 @every_trainer
-def test_the_flag_is_saved(name, runs):
-    for mode in MODES:
+def test_mode_and_gate_are_saved(name, runs):
+    for mode, gate in zip(MODES, (None, RECOMMENDED_BACKGROUND_GATE)):
         saved = (runs(name).outputs["patched", mode] / "cfg_args").read_text()
-        assert f"blend_mode='{mode}'" in saved
+        assert f"blend_mode='{mode}'" in saved and f"background_gate={gate}" in saved
 
 
 def rendered(runs, name, output, *words, **env):
@@ -107,6 +108,18 @@ def test_render_uses_the_saved_mode_or_the_flag_or_alpha(name, runs):
     assert all(smoe[picture] != alpha[picture] for picture in smoe)
 
 
+def test_render_uses_the_saved_gate_or_the_flag_or_0(runs):
+    output = runs("3dgs-2023").outputs["patched", "smoe"]
+    old = shutil.copytree(output, runs.folder / "without a gate")
+    text, count = re.subn(r", background_gate=[0-9.]+|background_gate=[0-9.]+, ", "", (old / "cfg_args").read_text())
+    assert count == 1
+    (old / "cfg_args").write_text(text)
+    jobs = [rendered(runs, "3dgs-2023", output), rendered(runs, "3dgs-2023", output, "--background_gate", "0"),
+            rendered(runs, "3dgs-2023", old, DSMOE_BACKGROUND_GATE=str(RECOMMENDED_BACKGROUND_GATE))]
+    alone, eq_7, without_the_field = (job() for job in jobs)
+    assert eq_7 == without_the_field and all(alone[picture] != eq_7[picture] for picture in alone)
+
+
 @pytest.mark.parametrize("name", ["hac", "hac-plus"])
 def test_trainers_that_render_at_the_end_use_the_mode(name, runs):
     alpha, smoe = (pictures(runs(name).outputs["patched", mode]) for mode in MODES)
@@ -115,9 +128,9 @@ def test_trainers_that_render_at_the_end_use_the_mode(name, runs):
     assert smoe == pictures(runs(name).outputs["plain", "smoe"])
 
 
-def wrong_mode(result):
-    """Whether a process failed over a mode, with the names that there are, and not over something else."""
-    return result.status != 0 and all(mode in result.err for mode in BLEND_MODES) and "made_up.json" not in result.err
+def refused(result, *words):
+    """Whether a process failed with these words, before it read the scene."""
+    return result.status != 0 and all(word in result.err for word in words) and "made_up.json" not in result.err
 
 
 @every_trainer
@@ -132,8 +145,7 @@ def test_a_wrong_mode_is_refused_before_anything_is_loaded(name, runs, tmp_path)
                                          "--blend_mode", "smooth", cwd=patched))
     for job in jobs:
         result = job.result()
-        assert wrong_mode(result) and "smooth" in result.err, result.err
-        assert "loss" not in result.out
+        assert refused(result, "smooth", *BLEND_MODES) and "loss" not in result.out, result.err
     assert not list(tmp_path.rglob("point_cloud*"))
 
 
@@ -141,7 +153,7 @@ def test_a_wrong_mode_is_refused_before_anything_is_loaded(name, runs, tmp_path)
 def test_help_shows_the_flag(name, runs):
     patched = runs(name).patched
     help = runs.processes.run(patched / runs.script(name, "smoe")[0], "--help", cwd=patched)
-    assert help.status == 0 and "--blend_mode" in help.out
+    assert help.status == 0 and "--blend_mode" in help.out and "--background_gate" in help.out
     assert re.search(r"--feat_dim|--data_device", help.out), "the other options of the group"
 
 
@@ -150,17 +162,20 @@ def test_the_environment_gives_the_default(runs, tmp_path):
     words = [patched / "train.py", "-s", runs.scene, "--quiet", "-m"]
     jobs = [runs.processes.start(*words, tmp_path / "default", cwd=patched, DSMOE_BLEND_MODE="smoe"),
             runs.processes.start(*words, tmp_path / "flag", "--blend_mode", "alpha", cwd=patched,
-                                 DSMOE_BLEND_MODE="smoe"),
+                                 DSMOE_BLEND_MODE="smoe", DSMOE_BACKGROUND_GATE="0.5"),
             runs.processes.start(*words, tmp_path / "none", cwd=patched),
-            runs.processes.start(*words, tmp_path / "wrong", cwd=patched, DSMOE_BLEND_MODE="smooth")]
-    default, flag, none, wrong = (job.result() for job in jobs)
+            runs.processes.start(*words, tmp_path / "wrong", cwd=patched, DSMOE_BLEND_MODE="smooth"),
+            runs.processes.start(*words, tmp_path / "wrong", "--blend_mode", "smoe", "--background_gate", "-1",
+                                 cwd=patched)]
+    default, flag, none, wrong, wrong_gate = (job.result() for job in jobs)
     assert default.status == flag.status == none.status == 0, default.err + flag.err + none.err
     assert "blend_mode='smoe'" in (tmp_path / "default" / "cfg_args").read_text()
     for folder in ("flag", "none"):
         assert "blend_mode='alpha'" in (tmp_path / folder / "cfg_args").read_text()
         assert same_bits(model(tmp_path / folder), model(runs("3dgs-2024").outputs["patched", "alpha"]))
     assert same_bits(model(tmp_path / "default"), model(runs("3dgs-2024").outputs["patched", "smoe"]))
-    assert wrong_mode(wrong), wrong.err
+    assert refused(wrong, *BLEND_MODES), wrong.err
+    assert refused(wrong_gate, "background_gate is '-1'; it must be a number"), wrong_gate.err
 
 
 @pytest.mark.parametrize("name, words", [

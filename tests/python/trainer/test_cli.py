@@ -15,7 +15,9 @@ import torch
 from PIL import Image
 
 import diff_smoe_rasterization
+from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
 from diff_smoe_rasterization.trainer.loop import Trainer
 from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
 
@@ -57,6 +59,8 @@ def fails(capsys, *arguments):
 def test_training_leaves_results_config_and_model(trained):
     row, = results_of(trained)
     assert {"blend_mode", "psnr", "ssim", "num_gaussians", "train_seconds", "fps", "protocol"} <= set(row)
+    assert row["background_gate"] == RECOMMENDED_BACKGROUND_GATE
+    assert not {"background_gate_learned", "random_background", "masks"} & set(row["protocol"])
     assert row["blend_mode"] == "smoe" and 3 < row["psnr"] < 60 and 0 < row["ssim"] < 1
     assert row["train_seconds"] > 0 and row["fps"] > 0
     protocol = row["protocol"]
@@ -118,7 +122,9 @@ def test_render_never_guesses_or_changes_the_mode(trained, scene, tmp_path, caps
     with open(ply_of(trained), "rb") as file:
         content = file.read()
     bare = tmp_path / "bare.ply"
-    bare.write_bytes(content.replace(b"comment blend_mode smoe\n", b""))
+    gate = f"comment background_gate {RECOMMENDED_BACKGROUND_GATE}\n".encode()
+    assert gate in content
+    bare.write_bytes(content.replace(b"comment blend_mode smoe\n", b"").replace(gate, b""))
     text = fails(capsys, "render", str(bare), "-o", output, "--scene", scene)
     assert "bare.ply" in text and "--blend-mode" in text
     text = fails(capsys, "render", ply_of(trained), "-o", output, "--scene", scene, "--blend-mode", "alpha")
@@ -130,6 +136,73 @@ def test_render_never_guesses_or_changes_the_mode(trained, scene, tmp_path, caps
     assert main(["render", trained, "-o", output + "2", "--blend-mode", "smoe"]) == 0
     one, other = (open(os.path.join(folder, "view_000.png"), "rb").read() for folder in (output, output + "2"))
     assert one != other, "the two modes show different images"
+
+
+def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp_path, capsys):
+    with open(ply_of(trained), "rb") as file:
+        content = file.read()
+    gate = f"comment background_gate {RECOMMENDED_BACKGROUND_GATE}\n".encode()
+    older, bare = tmp_path / "older.ply", tmp_path / "bare.ply"
+    older.write_bytes(content.replace(gate, b""))
+    bare.write_bytes(content.replace(gate, b"").replace(b"comment blend_mode smoe\n", b""))
+
+    def render(source, name, *options):
+        arguments = ["render", str(source), "-o", str(tmp_path / name), *options]
+        assert main(arguments if source == trained else [*arguments, "--scene", scene]) == 0
+        return (tmp_path / name / "view_000.png").read_bytes()
+
+    for source in (trained, ply_of(trained)):
+        place = [] if source == trained else ["--scene", scene]
+        text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--background-gate", "0.5")
+        assert f"gate {RECOMMENDED_BACKGROUND_GATE}, not 0.5" in text
+    text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe")
+    assert "bare.ply" in text and "--background-gate" in text
+    assert "gate 0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
+                                      "--background-gate", "0.5")
+    assert not (tmp_path / "no").exists()
+    as_trained = render(trained, "run", "--background-gate", str(RECOMMENDED_BACKGROUND_GATE))
+    assert render(bare, "bare", "--blend-mode", "smoe", "--background-gate",
+                  str(RECOMMENDED_BACKGROUND_GATE)) == as_trained
+    of_the_paper = render(older, "older")
+    assert of_the_paper == render(bare, "bare_0", "--blend-mode", "smoe", "--background-gate", "0") != as_trained
+
+
+def test_a_run_from_before_the_background_gate_is_of_the_paper(scene, tmp_path, monkeypatch):
+    """Without a gate in config.json and .ply it evaluates as it did: with 0."""
+    output = str(tmp_path / "out")
+    assert main(["train", scene, "-o", output, "--blend-mode", "smoe", "--background-gate", "0", *SHORT]) == 0
+    before, = results_of(output)
+    path = os.path.join(output, "config.json")
+    with open(path, encoding="utf-8") as file:
+        config = {name: value for name, value in json.load(file).items() if not name.startswith("background_gate")}
+    with open(path, "w", encoding="utf-8") as file:
+        json.dump(config, file)
+    with open(ply_of(output), "r+b") as file:
+        content = file.read().replace(b"comment background_gate 0\n", b"")
+        file.seek(0)
+        file.write(content)
+        file.truncate()
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")
+    assert main(["eval", output]) == 0
+    after, = results_of(output)
+    assert (after["psnr"], after["background_gate"]) == (before["psnr"], 0.0)
+
+
+def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path, capsys):
+    output = str(tmp_path / "out")
+    assert main(["train", scene, "-o", output, "--blend-mode", "smoe", "--background-gate", "learned", *SHORT]) == 0
+    row, = results_of(output)
+    assert row["protocol"]["background_gate_learned"] is True and row["protocol"]["background_gate_bound"] == 0.03
+    gate = row["background_gate"]
+    assert 0.03 < gate < 2 and gate != 1.0
+    text = capsys.readouterr().out
+    assert "smoe learned" in text and f"\nsmoe {gate:.3g} " in text
+    assert io.read_gaussians(ply_of(output)).background_gate == gate
+    assert main(["eval", output]) == 0
+    after, = results_of(output)
+    assert (after["psnr"], after["background_gate"]) == (row["psnr"], gate)
+    assert main(["render", output, "-o", str(tmp_path / "images")]) == 0
+    assert "not 0.5" in fails(capsys, "render", output, "-o", str(tmp_path / "no"), "--background-gate", "0.5")
 
 
 def test_a_ply_and_a_config_that_disagree_are_refused(trained, tmp_path, capsys):

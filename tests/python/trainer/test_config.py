@@ -52,7 +52,8 @@ def test_blend_mode_follows_the_environment_unless_given(monkeypatch):
 
 def test_background_gate_of_each_mode(monkeypatch):
     modes = ("alpha", "smoe", "smoe_tn", "smoe_std")
-    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, RECOMMENDED_BACKGROUND_GATE, 0.0, 0.0]
+    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [
+        1.0, RECOMMENDED_BACKGROUND_GATE, 0.0, 0.0]
     assert parse("--blend-mode", "smoe", "--background-gate", "0").background_gate == 0.0, "the paper's"
     assert parse("--blend-mode", "smoe", "--background-gate", "learned").background_gate == "learned"
     assert parse("--blend-mode", "alpha", "--background-gate", "1").background_gate == 1.0

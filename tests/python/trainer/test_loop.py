@@ -7,8 +7,12 @@ import math
 import pytest
 import torch
 
+from diff_smoe_rasterization.losses import l1_ssim_loss
+from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient as l1_ssim
+from diff_smoe_rasterization.trainer import loop
 from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.loop import Run, Trainer
+from diff_smoe_rasterization.trainer.loop import Run, Trainer, train
+from diff_smoe_rasterization.trainer.rendering import package_rasterizer
 from diff_smoe_rasterization.trainer.scene import load_scene
 from diff_smoe_rasterization.trainer.strategy import STRATEGIES, Strategy
 
@@ -40,6 +44,132 @@ def test_the_position_rate_follows_the_iteration(tiny_config, scene):
         rates.append(trainer.optimizer.adam.param_groups[0]["lr"] / scene.extent)
     expected = [0.00016 * 0.01 ** (min(step, 4) / 4) for step in range(1, 6)]
     assert rates == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_learned_gate_is_stepped_by_adam_from_1(tiny_config, scene):
+    trainer = Trainer(tiny_config.changed(background_gate="learned", background_gate_bound=0.2), scene)
+    assert trainer.background_gate == pytest.approx(1, abs=1e-6)  # float32
+    trainer.step()
+    # Adam's first step is its rate, 0.01, in the logarithm of what lies above the bound.
+    expected = [0.2 + 0.8 * math.exp(sign * 0.01) for sign in (-1, 1)]
+    assert min(abs(trainer.background_gate - value) for value in expected) < 1e-5  # float32
+    assert trainer.gate.logarithm.grad is None and not trainer.renderer.background_gate.requires_grad
+
+
+@pytest.mark.parametrize("mode, gate, expected", [
+    ("smoe", "learned", 1.0), ("smoe", 0.3, 0.3), ("smoe", 0.0, 0.0), ("alpha", None, None), ("smoe_tn", None, None)])
+def test_the_rasterizer_is_told_the_gate(tiny_config, scene, mode, gate, expected):
+    seen = []
+
+    def rasterize(means3D, opacities, settings, **arguments):
+        seen.append(settings.background_gate)
+        return package_rasterizer()(means3D, opacities, settings, **arguments)
+
+    trainer = Trainer(tiny_config.changed(blend_mode=mode, background_gate=gate), scene, rasterize)
+    trainer.step()
+    trainer.evaluate()
+    if expected is None:
+        assert seen[0] is None
+    else:
+        assert float(torch.as_tensor(seen[0]).detach()) == pytest.approx(expected, abs=1e-6)  # float32
+    if gate == "learned":
+        assert seen[0].requires_grad and not any(value.requires_grad for value in seen[1:])
+
+
+def transparent_scene(scene):
+    """The scene, its images half transparent on the left."""
+    opacity = torch.full((1, 24, 32), 255, dtype=torch.uint8)
+    opacity[..., :16] = 102
+    black = torch.where(opacity == 255, 255, 102)
+
+    def seen(views):
+        return [dataclasses.replace(view, image=(view.image.int() * black // 255).to(torch.uint8), opacity=opacity)
+                for view in views]
+
+    return dataclasses.replace(scene, train=seen(scene.train), test=seen(scene.test))
+
+
+def test_random_backgrounds_are_behind_rendering_and_image(tiny_config, scene, monkeypatch):
+    """Each step has a colour of its own, which both show; evaluation is over black."""
+    backgrounds, targets = [], []
+
+    def rasterize(means3D, opacities, settings, **arguments):
+        backgrounds.append(settings.bg)
+        return package_rasterizer()(means3D, opacities, settings, **arguments)
+
+    monkeypatch.setattr(loop, "l1_ssim_loss_and_gradient",
+                        lambda image, target, weight: targets.append(target) or l1_ssim(image, target, weight))
+    scene = transparent_scene(scene)
+    trainer = Trainer(tiny_config.changed(blend_mode="alpha", random_background=True), scene, rasterize)
+    views = [trainer.step().camera for _ in range(4)]
+    assert len({tuple(color.tolist()) for color in backgrounds}) == 4
+    assert all(0 <= float(value) <= 1 for color in backgrounds for value in color)
+    for camera, color, target in zip(views, backgrounds, targets):
+        image = next(view.image for view in scene.train if view.camera is camera).float() / 255
+        torch.testing.assert_close(target[..., 16:], image[..., 16:])
+        behind = (1 - 102 / 255) * color[:, None, None]
+        torch.testing.assert_close(target[..., :16], image[..., :16] + behind)
+    backgrounds.clear()
+    trainer.evaluate()
+    assert not any(color.any() for color in backgrounds)
+
+
+@pytest.mark.parametrize("gate, warned", [(0.0, True), (0.05, False)])
+def test_random_backgrounds_that_are_hardly_seen_are_warned_of(tiny_config, capsys, gate, warned):
+    train(tiny_config.changed(background_gate=gate, random_background=True, iterations=1), progress=False)
+    assert capsys.readouterr().out.count("warning: --random-background") == warned
+
+
+def masked_scene(scene, mask):
+    """The scene with the mask on every view, whose ignored pixels hold noise."""
+
+    def seen(views):
+        noise = [torch.randint(0, 256, view.image.shape, dtype=torch.uint8) for view in views]
+        return [dataclasses.replace(view, image=torch.where(mask > 0, view.image, other), mask=mask)
+                for view, other in zip(views, noise)]
+
+    return dataclasses.replace(scene, train=seen(scene.train), test=seen(scene.test))
+
+
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_ignored_pixels_are_neither_learned_nor_measured(tiny_config, scene, mode):
+    mask = torch.zeros(1, 24, 32, dtype=torch.uint8)
+    mask[..., 12:] = 255
+    config, results = tiny_config.changed(blend_mode=mode), []
+    for seed in (1, 2):  # of what the ignored pixels hold
+        torch.manual_seed(seed)
+        trainer = Trainer(config, masked_scene(scene, mask))
+        steps = [trainer.step() for _ in range(9)]
+        results.append((raw_copy(trainer), [float(step.loss) for step in steps], trainer.training_psnr(),
+                        trainer.evaluate().metrics))
+    (raw, *rest), (other_raw, *other_rest) = results
+    assert rest == other_rest and all(torch.equal(raw[name], other_raw[name]) for name in raw)
+
+
+def test_the_gradient_of_a_masked_loss_is_masked(tiny_config, scene):
+    mask = torch.zeros(1, 24, 32, dtype=torch.uint8)
+    mask[..., 12:] = 255
+    mask[..., 20:] = 51
+    trainer = Trainer(tiny_config, masked_scene(scene, mask))
+    trainer.strategy.before_backward = lambda step: step.rendering.color.retain_grad()
+    step = trainer.step()
+    view = next(view for view in trainer.scene.train if view.camera is step.camera)
+    image, weights = step.rendering.color.detach().requires_grad_(), mask.float() / 255
+    loss = l1_ssim_loss(image * weights, view.image.float() / 255 * weights, tiny_config.lambda_dssim)
+    loss.backward()
+    torch.testing.assert_close(step.loss, loss.detach())
+    torch.testing.assert_close(step.rendering.color.grad, image.grad)
+    assert not image.grad[..., :12].any() and image.grad[..., 20:].any()
+
+
+def test_a_row_says_that_there_were_masks(tiny_config, scene):
+    mask = torch.full((1, 24, 32), 255, dtype=torch.uint8)
+    rows = [train(tiny_config.changed(iterations=2), overwrite=True, progress=False, scene=each)
+            for each in (scene, masked_scene(scene, mask))]
+    assert "masks" not in rows[0]["protocol"] and "kept pixels" in rows[1]["protocol"]["masks"]
+    # All is kept: the same figures, SSIM in doubles by another program.
+    assert rows[1]["psnr"] == pytest.approx(rows[0]["psnr"], abs=1e-4)
+    assert rows[1]["ssim"] == pytest.approx(rows[0]["ssim"], abs=1e-5)
 
 
 def test_the_last_iteration_does_not_step(tiny_config, scene):

@@ -6,7 +6,8 @@ import math
 import pytest
 import torch
 
-from diff_smoe_rasterization.trainer.metrics import image_metrics, psnr, quantised
+from diff_smoe_rasterization.losses import fused_ssim
+from diff_smoe_rasterization.trainer.metrics import image_metrics, masked_ssim, psnr, quantised
 
 
 def test_psnr_by_hand():
@@ -33,3 +34,30 @@ def test_metrics_use_quantised_images_for_the_headline():
     metrics = image_metrics(torch.full((3, 12, 12), 100.4 / 255), target)
     assert metrics["psnr"] > 100, "0.4 of a level is lost in the file"
     assert metrics["psnr_float"] == pytest.approx(-20 * math.log10(0.4 / 255), abs=0.01)
+
+
+def test_a_mask_says_which_pixels_count_and_how_much():
+    target = torch.zeros(3, 2, 2)
+    image = torch.tensor([[0.1, 0.2], [1.0, 0.0]]).expand(3, 2, 2)
+    mask = torch.tensor([[[1.0, 0.5], [0.0, 0.5]]])
+    # Squared errors 0.01 and 0.04, weights 1 and 0.5, of weights that sum to 2.
+    assert psnr(image, target, mask) == pytest.approx(-10 * math.log10((0.01 + 0.02) / 2), abs=1e-4)  # float32
+    assert psnr(image * mask.ceil(), target, mask.ceil()) == pytest.approx(-10 * math.log10(0.05 / 3), abs=1e-4)
+
+
+def test_masked_ssim_is_that_of_the_masked_pair_over_the_kept_pixels():
+    generator = torch.Generator().manual_seed(0)
+    image, target = torch.rand(2, 3, 30, 40, generator=generator).unbind(0)
+    # Everything kept: the kernel's own mean. float32 loses digits where moments are subtracted.
+    everything = torch.ones(1, 30, 40)
+    assert masked_ssim(image, target, everything) == pytest.approx(float(fused_ssim(image, target)), abs=1e-5)
+    # A kept rectangle in black: windows see zeros behind it, as behind the border of the rectangle alone.
+    mask = torch.zeros(1, 30, 40)
+    mask[:, 5:21, 8:33] = 1
+    inside = [picture[:, 5:21, 8:33] for picture in (image, target)]
+    assert masked_ssim(image, target, mask) == pytest.approx(float(fused_ssim(*inside)), abs=1e-5)
+    metrics = image_metrics(image, target, mask)
+    quantised_pair = (quantised(inside[0]), inside[1])
+    assert metrics["ssim"] == pytest.approx(float(fused_ssim(*quantised_pair)), abs=1e-5)
+    assert metrics["psnr"] == pytest.approx(psnr(*quantised_pair), abs=1e-9)  # the same doubles in another order
+    assert metrics["psnr_float"] == pytest.approx(psnr(*inside), abs=1e-9)

@@ -57,8 +57,9 @@ def test_a_fixed_set_of_gaussians_ends_as_good_as_on_the_cpu(tiny_config, scene,
     assert rows[1]["psnr"] == pytest.approx(rows[0]["psnr"], abs=0.1)
 
 
-def test_a_step_does_not_wait_for_the_device(config, scene):
-    trainer = Trainer(dataclasses.replace(config, densify_until_iter=0), scene)
+@pytest.mark.parametrize("options", [dict(), dict(background_gate="learned", random_background=True)])
+def test_a_step_does_not_wait_for_the_device(config, scene, options):
+    trainer = Trainer(dataclasses.replace(config, densify_until_iter=0, **options), scene)
     for _ in range(8):
         trainer.step()  # every view once: cameras are sent, memory is taken
     torch.cuda.set_sync_debug_mode("error")

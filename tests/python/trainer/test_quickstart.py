@@ -47,7 +47,8 @@ def test_pictures_show_truth_and_both_modes(output):
 def test_the_table_and_a_second_run(tiny_scene, output, capsys):
     assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "20", "--quiet"]) == 0
     text = capsys.readouterr().out
-    for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", f"\nsmoe {RECOMMENDED_BACKGROUND_GATE} ", "compare_view_000.png"):
+    for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", f"\nsmoe {RECOMMENDED_BACKGROUND_GATE} ",
+                 "compare_view_000.png"):
         assert word in text
 
 

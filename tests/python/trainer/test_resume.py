@@ -63,6 +63,34 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, bl
             assert torch.equal(torch.as_tensor(value), torch.as_tensor(states[1]["optimizer"][name][key])), (name, key)
 
 
+@pytest.mark.parametrize("options", [
+    dict(blend_mode="smoe", background_gate="learned"), dict(blend_mode="alpha", random_background=True)])
+def test_a_learned_gate_and_random_backgrounds_resume_bit_for_bit(tiny_config, tmp_path, monkeypatch, options):
+    straight = tiny_config.changed(output=str(tmp_path / "straight"), **options)
+    row = train(straight, progress=False)
+    broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
+    with monkeypatch.context() as patch:
+        kill_at(patch, 26)
+        with pytest.raises(Killed):
+            train(broken, progress=False)
+    torch.manual_seed(12345)
+    resumed = train(broken, resume=True, progress=False)
+    assert ply_bytes(broken) == ply_bytes(straight)
+    assert (resumed["psnr"], resumed["background_gate"]) == (row["psnr"], row["background_gate"])
+
+
+def test_a_checkpoint_of_a_version_without_gate_and_masks_is_one_of_the_paper(tiny_config):
+    config = tiny_config.changed(background_gate=0.0, iterations=2)
+    row = train(config, progress=False)
+    path = os.path.join(config.output, "checkpoint.pt")
+    state = load_checkpoint(path, "cpu")
+    del state["gate"], state["scene"]["number of masks"], state["config"]["background_gate"]
+    save_checkpoint(path, state)
+    assert train(config, resume=True, progress=False)["psnr"] == row["psnr"]
+    with pytest.raises(TrainerError, match="--background-gate is 0.0 .* 0.05"):
+        train(config.changed(background_gate=0.05), resume=True, progress=False)
+
+
 def test_resume_before_the_first_checkpoint_starts_anew(tiny_config, tmp_path, monkeypatch, capsys):
     straight = dataclasses.replace(tiny_config, output=str(tmp_path / "straight"))
     train(straight, progress=False)

@@ -8,6 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from diff_smoe_rasterization import io
@@ -216,6 +217,55 @@ def test_nerf_without_a_test_set(nerf_folder):
     assert len(load(nerf_folder).test) == 0
 
 
+def write_masks(folder, size=(32, 24), name="{}.png", value=255):
+    """masks/ of the tiny scene: the right half is kept."""
+    os.makedirs(os.path.join(folder, "masks"))
+    pixels = np.zeros(size[::-1], np.uint8)
+    pixels[:, size[0] // 2:] = value
+    for image in os.listdir(os.path.join(folder, "images")):
+        Image.fromarray(pixels).save(os.path.join(folder, "masks", name.format(image)))
+
+
+@pytest.mark.parametrize("behind", [True, False])
+def test_masks_lie_beside_the_images(colmap_folder, behind):
+    assert all(view.mask is None for view in load(colmap_folder).train)
+    write_masks(colmap_folder)
+    if not behind:  # in place of the image's extension
+        for name in os.listdir(os.path.join(colmap_folder, "masks")):
+            path = os.path.join(colmap_folder, "masks", name)
+            os.rename(path, path[:-len(".png")])
+    scene = load(colmap_folder)
+    for view in [*scene.train, *scene.test]:
+        assert view.mask.shape == (1, 24, 32) and view.mask.dtype == torch.uint8
+        assert not view.mask[..., :16].any() and (view.mask[..., 16:] == 255).all()
+        assert float(view.mask_float().mean()) == 0.5
+
+
+def test_masks_follow_the_size_of_their_images(colmap_folder):
+    write_masks(colmap_folder, size=(320, 240), value=128)
+    mask = load(colmap_folder, resolution=2).train[0].mask
+    assert mask.shape == (1, 12, 16) and not mask[..., :7].any() and (mask[..., 9:] == 128).all()
+
+
+def test_masks_of_a_nerf_scene(nerf_folder):
+    for split in ("train", "test"):
+        os.makedirs(nerf_folder / "masks" / split)
+        Image.new("RGB", (20, 10), (255, 255, 255)).save(nerf_folder / "masks" / split / "r_0.png")
+    assert load(nerf_folder).train[0].mask.shape == (1, 10, 20) and (load(nerf_folder).test[0].mask == 255).all()
+
+
+def test_transparency_is_kept_for_random_backgrounds_alone(nerf_folder, tiny_scene):
+    assert load(nerf_folder).train[0].opacity is None
+    assert load(tiny_scene, random_background=True).train[0].opacity is None, "no image of it has transparency"
+    color = torch.tensor([0.25, 0.5, 1.0])
+    for white in (False, True):
+        view = load(nerf_folder, random_background=True, white_background=white).train[0]
+        target = view.image_over(color, torch.full((3,), float(white)))
+        # Alpha 0.2 of red over the colour; half a level of the composited bytes.
+        np.testing.assert_allclose(target[:, 0, 0].tolist(), [0.2 + 0.8 * 0.25, 0.8 * 0.5, 0.8], rtol=0, atol=0.5 / 255)
+        assert target[:, 0, 19].tolist() == [0, 1, 0]
+
+
 # What is refused.
 
 def refused(folder, *words, **options):
@@ -234,6 +284,24 @@ def test_no_folder_and_no_scene(tmp_path):
 def test_a_missing_image(colmap_folder):
     os.remove(os.path.join(colmap_folder, "images", "view_003.png"))
     refused(colmap_folder, "view_003.png", "1 of 9 images are missing")
+
+
+def test_a_missing_mask(colmap_folder):
+    write_masks(colmap_folder)
+    os.remove(os.path.join(colmap_folder, "masks", "view_003.png.png"))
+    refused(colmap_folder, "masks", "image view_003.png has no mask", "view_003.png.png")
+
+
+def test_masks_that_do_not_fit(colmap_folder):
+    write_masks(colmap_folder, value=0)
+    refused(colmap_folder, ".png.png", "keeps no pixel of")
+    for name in os.listdir(os.path.join(colmap_folder, "masks")):
+        Image.new("L", (24, 32), 255).save(os.path.join(colmap_folder, "masks", name))
+    refused(colmap_folder, ".png.png", "the mask is 24x32", "32x24", "another shape")
+    for name in os.listdir(os.path.join(colmap_folder, "masks")):
+        with open(os.path.join(colmap_folder, "masks", name), "wb") as file:
+            file.write(b"no image")
+    refused(colmap_folder, ".png.png", "not a readable image")
 
 
 def test_a_missing_image_folder(colmap_folder):
