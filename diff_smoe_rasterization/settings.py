@@ -28,7 +28,7 @@ At 0, the default, this is Eq. 7, and the background is seen where no gate is op
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
-RECOMMENDED_BACKGROUND_GATE = 0.05  # what trainings in `smoe` take unless told otherwise: benchmarks/RESULTS.md
+RECOMMENDED_BACKGROUND_GATE = 0.03  # of captures, for trainers that cannot learn it: benchmarks/RESULTS.md
 
 BackgroundGate = Union[float, torch.Tensor]
 """lambda: a number, or a tensor of one element, which receives a gradient."""

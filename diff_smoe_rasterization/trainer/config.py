@@ -8,8 +8,7 @@ import os
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Sequence, Union
 
-from ..settings import (BLEND_MODES, RECOMMENDED_BACKGROUND_GATE, resolve_background_gate, resolve_blend_mode,
-                        training_background_gate)
+from ..settings import BACKGROUND_GATE_VARIABLE, BLEND_MODES, resolve_background_gate, resolve_blend_mode
 from .errors import ConfigError
 from .files import write_text_atomically
 
@@ -37,8 +36,8 @@ class TrainConfig:
         None, "how Gaussians make a pixel (default: $DSMOE_BLEND_MODE, else alpha)", choices=BLEND_MODES)
     background_gate: Union[float, str, None] = _option(
         None, "smoe: how much the background weighs against the Gaussians: 0 is the paper's Eq. 7, 1 alpha blending, "
-              "`learned` finds it (default: $DSMOE_BACKGROUND_GATE, else "
-              f"{RECOMMENDED_BACKGROUND_GATE})", metavar=f"X|{LEARNED}")
+              f"`{LEARNED}` finds it with the scene (default: $DSMOE_BACKGROUND_GATE, else {LEARNED})",
+        metavar=f"X|{LEARNED}")
     background_gate_bound: float = _option(0.03, "a learned background gate stays above this")
     iterations: int = _option(30_000, "optimisation steps")
     resolution: int = _option(
@@ -190,13 +189,15 @@ class TrainConfig:
 def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:
     """The background gate that a training takes: a number, 1 in `alpha` and 0 in the ablations, or LEARNED.
 
-    asked: None means in `smoe` $DSMOE_BACKGROUND_GATE, else the recommended one. Raises ValueError for a value that is
-    no gate, and for one that the mode does not know.
+    asked: None means in `smoe` $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is no gate, and
+    for one that the mode does not know.
     """
-    if blend_mode == "smoe":
-        return LEARNED if asked == LEARNED else training_background_gate(blend_mode, asked)
-    own = float(resolve_background_gate(blend_mode, None))
-    return own if asked == own else float(resolve_background_gate(blend_mode, asked))
+    if blend_mode != "smoe":
+        own = float(resolve_background_gate(blend_mode, None))
+        return own if asked in (None, own) else float(resolve_background_gate(blend_mode, asked))
+    if asked == LEARNED or asked is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
+        return LEARNED
+    return float(resolve_background_gate(blend_mode, asked))
 
 
 def _number_or_learned(text: str) -> Union[float, str]:

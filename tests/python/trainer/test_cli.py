@@ -17,12 +17,13 @@ from PIL import Image
 import diff_smoe_rasterization
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
 from diff_smoe_rasterization.trainer.loop import Trainer
 from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
          "--densification-interval", "4", "--quiet"]
+GATE = 0.25
+SMOE = ["--blend-mode", "smoe", "--background-gate", str(GATE), *SHORT]  # how `trained` was
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def scene(tiny_scene):
 def trained(scene, tmp_path_factory):
     """A finished smoe run."""
     output = str(tmp_path_factory.mktemp("run"))
-    assert main(["train", scene, "-o", output, "--blend-mode", "smoe", *SHORT]) == 0
+    assert main(["train", scene, "-o", output, *SMOE]) == 0
     return output
 
 
@@ -59,7 +60,7 @@ def fails(capsys, *arguments):
 def test_training_leaves_results_config_and_model(trained):
     row, = results_of(trained)
     assert {"blend_mode", "psnr", "ssim", "num_gaussians", "train_seconds", "fps", "protocol"} <= set(row)
-    assert row["background_gate"] == RECOMMENDED_BACKGROUND_GATE
+    assert row["background_gate"] == GATE
     assert not {"background_gate_learned", "random_background", "masks"} & set(row["protocol"])
     assert row["blend_mode"] == "smoe" and 3 < row["psnr"] < 60 and 0 < row["ssim"] < 1
     assert row["train_seconds"] > 0 and row["fps"] > 0
@@ -122,7 +123,7 @@ def test_render_never_guesses_or_changes_the_mode(trained, scene, tmp_path, caps
     with open(ply_of(trained), "rb") as file:
         content = file.read()
     bare = tmp_path / "bare.ply"
-    gate = f"comment background_gate {RECOMMENDED_BACKGROUND_GATE}\n".encode()
+    gate = f"comment background_gate {GATE}\n".encode()
     assert gate in content
     bare.write_bytes(content.replace(b"comment blend_mode smoe\n", b"").replace(gate, b""))
     text = fails(capsys, "render", str(bare), "-o", output, "--scene", scene)
@@ -141,7 +142,7 @@ def test_render_never_guesses_or_changes_the_mode(trained, scene, tmp_path, caps
 def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp_path, capsys):
     with open(ply_of(trained), "rb") as file:
         content = file.read()
-    gate = f"comment background_gate {RECOMMENDED_BACKGROUND_GATE}\n".encode()
+    gate = f"comment background_gate {GATE}\n".encode()
     older, bare = tmp_path / "older.ply", tmp_path / "bare.ply"
     older.write_bytes(content.replace(gate, b""))
     bare.write_bytes(content.replace(gate, b"").replace(b"comment blend_mode smoe\n", b""))
@@ -154,15 +155,15 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
     for source in (trained, ply_of(trained)):
         place = [] if source == trained else ["--scene", scene]
         text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--background-gate", "0.5")
-        assert f"gate {RECOMMENDED_BACKGROUND_GATE}, not 0.5" in text
+        assert f"gate {GATE}, not 0.5" in text
     text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe")
     assert "bare.ply" in text and "--background-gate" in text
     assert "gate 0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
                                       "--background-gate", "0.5")
     assert not (tmp_path / "no").exists()
-    as_trained = render(trained, "run", "--background-gate", str(RECOMMENDED_BACKGROUND_GATE))
+    as_trained = render(trained, "run", "--background-gate", str(GATE))
     assert render(bare, "bare", "--blend-mode", "smoe", "--background-gate",
-                  str(RECOMMENDED_BACKGROUND_GATE)) == as_trained
+                  str(GATE)) == as_trained
     of_the_paper = render(older, "older")
     assert of_the_paper == render(bare, "bare_0", "--blend-mode", "smoe", "--background-gate", "0") != as_trained
 
@@ -286,7 +287,7 @@ def ctrl_c_works():
 
 def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works):
     output = str(tmp_path / "out")
-    arguments = ["train", scene, "-o", output, "--blend-mode", "smoe", *SHORT]
+    arguments = ["train", scene, "-o", output, *SMOE]
     with monkeypatch.context() as patch:
         interrupt_at(patch, 7)
         assert main(arguments) == 130

@@ -6,7 +6,6 @@ import json
 
 import pytest
 
-from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
 from diff_smoe_rasterization.trainer.config import TrainConfig, add_arguments, config_from_arguments
 from diff_smoe_rasterization.trainer.errors import ConfigError
 
@@ -52,8 +51,7 @@ def test_blend_mode_follows_the_environment_unless_given(monkeypatch):
 
 def test_background_gate_of_each_mode(monkeypatch):
     modes = ("alpha", "smoe", "smoe_tn", "smoe_std")
-    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [
-        1.0, RECOMMENDED_BACKGROUND_GATE, 0.0, 0.0]
+    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, "learned", 0.0, 0.0]
     assert parse("--blend-mode", "smoe", "--background-gate", "0").background_gate == 0.0, "the paper's"
     assert parse("--blend-mode", "smoe", "--background-gate", "learned").background_gate == "learned"
     assert parse("--blend-mode", "alpha", "--background-gate", "1").background_gate == 1.0
@@ -79,8 +77,7 @@ def test_another_mode_takes_its_own_background_gate():
     config = TrainConfig(blend_mode="smoe", background_gate=0.3)
     assert config.changed(seed=1).background_gate == 0.3
     alpha = config.changed(blend_mode="alpha")
-    assert (alpha.background_gate, alpha.changed(blend_mode="smoe").background_gate) == (
-        1.0, RECOMMENDED_BACKGROUND_GATE)
+    assert (alpha.background_gate, alpha.changed(blend_mode="smoe").background_gate) == (1.0, "learned")
     assert alpha.changed(blend_mode="smoe", background_gate=0.2).background_gate == 0.2
 
 
