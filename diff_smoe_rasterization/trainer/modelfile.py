@@ -9,6 +9,7 @@ import torch
 from .. import io
 from ..settings import BLEND_MODES, resolve_background_gate
 from .errors import TrainerError
+from .files import is_file
 from .model import GaussianModel
 
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
@@ -29,7 +30,7 @@ def model_path(output: str, iteration: int) -> str:
 def trained_model_path(output: str, iterations: int) -> str:
     """The .ply that a run of so many iterations ends with. Raises TrainerError where it is not there."""
     path = model_path(output, iterations)
-    if not os.path.isfile(path):
+    if not is_file(path):
         raise TrainerError(f"{path}: no such file; the training in {output} has not ended (continue it with --resume)")
     return path
 
