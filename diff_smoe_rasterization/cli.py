@@ -9,7 +9,8 @@ from typing import List, Optional
 from .patches.errors import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.checkpoint import CHECKPOINT_NAME
-from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options, holds_run
+from .trainer.config import (PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options,
+                             holds_run)
 from .trainer.errors import TrainerError
 from .trainer.files import is_folder
 
@@ -29,10 +30,10 @@ def build_parser() -> argparse.ArgumentParser:
                        help="squeeze the recipe into --iterations: its milestones (densification, resets, learning "
                             "rate, SH degrees) keep their share of 30,000 steps, unless they are given")
     earlier_run = train.add_mutually_exclusive_group()
-    earlier_run.add_argument("--resume", action="store_true", 
+    earlier_run.add_argument("--resume", action="store_true",
                              help="continue the run in OUT from its last checkpoint with its own options; more "
                                   "--iterations extend it")
-    earlier_run.add_argument("--overwrite", action="store_true", 
+    earlier_run.add_argument("--overwrite", action="store_true",
                              help="replace the run in OUT, once this one can start")
     train.add_argument("--quiet", action="store_true", help="no progress bars")
     train.set_defaults(run=_train)
@@ -48,7 +49,8 @@ def build_parser() -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="write images of a trained run or a .ply",
                                  description="Writes one PNG for every camera of a scene.")
     render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
-    render.add_argument("-o", "--output", metavar="DIR", required=True, help="folder for the images: new, empty, or of an earlier rendering")
+    render.add_argument("-o", "--output", metavar="DIR", required=True,
+                        help="folder for the images: new, empty, or of an earlier rendering")
     render.add_argument("--scene", help="folder whose cameras are rendered (default: the run's; needed for a .ply)")
     render.add_argument("--split", choices=("test", "train", "all"), default="test",
                         help="which cameras (default: test)")

@@ -299,7 +299,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
 
     resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
     of threads); start it where it has no checkpoint yet. With more iterations than it had, it is extended: its
-    milestones stay, and so does what its last step left out, where it had ended. overwrite: replace a run that is
+    milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a run that is
     there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at hand. Raises
     TrainerError before training starts where anything does not fit, as where another run is at work in the folder.
     """

@@ -119,7 +119,7 @@ def write_record(folder: str, command: str, record: Record, earlier: Collection[
 
 
 def remove_files(folder: str, names: Collection[str]) -> None:
-    """Removes files of the folder where they are there, and folders in it that are empty then; links to folders stay."""
+    """Removes files of the folder that are there, and folders in it that are empty then; links to folders stay."""
     for name in names:
         path = os.path.join(folder, name)
         if os.path.lexists(path) and not os.path.isdir(path):

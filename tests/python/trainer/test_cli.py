@@ -354,7 +354,8 @@ def test_more_iterations_extend_a_run(trained, scene, tmp_path, capsys, monkeypa
     models = [open(ply_of(output, 20), "rb").read() for output in (straight, stopped, ended)]
     assert models[0] == models[1] != models[2], "what had ended had left out its last step"
     assert os.path.isfile(ply_of(ended))
-    assert "--iterations is 20 here and 12 there" in fails(capsys, "train", "--resume", "-o", ended, "--iterations", "12")
+    text = fails(capsys, "train", "--resume", "-o", ended, "--iterations", "12")
+    assert "--iterations is 20 here and 12 there" in text
     assert main(["train", scene, "-o", ended, *SMOE, "--overwrite"]) == 0
     assert os.listdir(os.path.join(ended, "point_cloud")) == ["iteration_12"], "nothing of the old run outlives it"
 

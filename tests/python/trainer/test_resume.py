@@ -199,8 +199,9 @@ def test_a_moved_scene_resumes(tiny_scene, tiny_config, tmp_path):
 def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, monkeypatch):
     config = dataclasses.replace(tiny_config, eval_every=10)
     train(config, progress=False)
-    assert sorted(os.listdir(config.output)) == [".dsmoe.json", ".dsmoe.lock", "checkpoint.pt", "config.json", "history.json",
-                                                 "per_view.json", "point_cloud", "results.json"]
+    assert sorted(os.listdir(config.output)) == [
+        ".dsmoe.json", ".dsmoe.lock", "checkpoint.pt", "config.json", "history.json", "per_view.json", "point_cloud",
+        "results.json"]
     kill_at(monkeypatch, 5)
     with pytest.raises(Killed):
         train(dataclasses.replace(config, seed=1), overwrite=True, progress=False)
