@@ -266,7 +266,7 @@ def _model_name(iterations: int) -> str:
     return model_path("", iterations).replace(os.sep, "/")
 
 
-def _earlier_models(config: TrainConfig, resume: bool, overwrite: bool) -> List[str]:
+def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = False) -> List[str]:
     """The models that earlier runs have written into config.output, their paths in it.
 
     Raises TrainerError where something is there that this run must not go on with, or replace.
@@ -307,11 +307,11 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
     config.validate()
     check_device(config.device)
-    _earlier_models(config, resume, overwrite)
+    earlier_models(config, resume, overwrite)
     layout = None if scene else read_layout(config)
     make_folder(config.output)  # a folder that cannot be made is told before images are read
     with only_one(config.output):
-        models = _earlier_models(config, resume, overwrite)  # again: another run may have been at work there
+        models = earlier_models(config, resume, overwrite)  # again: another run may have been at work there
         scene = scene or load_scene(config, progress, layout)
         if config.random_background and config.background_gate == 0:
             print("warning: --random-background with a background gate of 0: the background is seen only where no "
