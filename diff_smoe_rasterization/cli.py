@@ -11,6 +11,7 @@ from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.checkpoint import CHECKPOINT_NAME
 from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments
 from .trainer.errors import TrainerError
+from .trainer.interrupt import exit_status
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -91,7 +92,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Optional[List[str]] = None) -> int:
-    """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 when interrupted."""
+    """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 or 143 when interrupted."""
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
     if unknown:  # argparse would show the usage of `dsmoe` alone
@@ -106,13 +107,13 @@ def main(argv: Optional[List[str]] = None) -> int:
     except (TrainerError, PatchError, ImportError, OSError) as error:
         print(f"dsmoe {arguments.command}: error: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = "; continue it with --resume" if continues else ""
         if arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
-        return 130
+        return exit_status(stop)
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:

@@ -7,7 +7,6 @@ from typing import Any, Dict, List, Optional
 import numpy as np
 import torch
 from PIL import Image
-from tqdm import tqdm
 
 from .config import LEARNED, TrainConfig
 from .errors import TrainerError
@@ -17,6 +16,7 @@ from .loop import PER_VIEW_NAME, check_device
 from .metrics import quantised
 from .modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
 from .pictures import file_names
+from .progress import progress_bar
 from .rendering import Rasterize, Renderer, background_color
 from .results import read_results, result_row, write_results
 from .scene import load_cameras, load_scene
@@ -86,7 +86,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     os.makedirs(folder, exist_ok=True)
     paths = [os.path.join(folder, name + ".png") for name in file_names([camera.name for camera in cameras])]
     with torch.no_grad():
-        for camera, path in zip(tqdm(cameras, desc="images", unit="image", leave=False), paths):
+        for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
             to_image(renderer(camera).color).save(path)
     return paths
 

@@ -17,6 +17,7 @@ from .config import TrainConfig, add_arguments
 from .errors import TrainerError
 from .images import image_size
 from .inspection import open_renderer, to_image
+from .interrupt import exit_status
 from .loop import train
 from .metrics import psnr, quantised
 from .modelfile import model_path
@@ -50,9 +51,9 @@ def main(argv: Optional[List[str]] = None) -> int:
     except (TrainerError, ImportError, OSError) as error:
         print(f"quickstart: error: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         print("\nquickstart: interrupted", file=sys.stderr)
-        return 130
+        return exit_status(stop)
 
 
 def _parse(argv: Optional[List[str]]) -> argparse.Namespace:

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -130,6 +131,36 @@ def test_cuda_is_built_where_torch_and_the_toolkit_fit(tmp_path, monkeypatch, to
     else:
         with pytest.raises(SystemExit, match="DSMOE_BUILD_CUDA=1, but " + re.escape(reasons[0])):
             setup.reasons_against_cuda(["a.cu"], torch_of(torch_cuda), folder)
+
+
+def environment_sh(folder, commands):
+    """What bash prints for these commands after build_support/environment.sh, with a Python that sees no GPU."""
+    (folder / "bin").mkdir()
+    (folder / "bin" / "python").symlink_to("/bin/true")
+    unset = {name: value for name, value in os.environ.items()
+             if name not in ("DSMOE_BUILD_CUDA", "TORCH_CUDA_ARCH_LIST", "DSMOE_VENV")}
+    program = f'set -eu; source "{ROOT}/build_support/environment.sh"; venv="{folder}" log="{folder}/log"\n{commands}'
+    return subprocess.run(["bash", "-c", program], stdout=subprocess.PIPE, universal_newlines=True, env=unset,
+                          check=True).stdout
+
+
+def test_quickstart_builds_no_kernels_where_there_is_no_gpu_unless_asked(tmp_path):
+    said = environment_sh(tmp_path, """
+        pip_install() { echo "$DSMOE_BUILD_CUDA"; }
+        install_package
+        DSMOE_BUILD_CUDA=1 install_package
+        cuda_without_gpu=auto  # as ./check says
+        install_package""")
+    assert said.split() == ["0", "1", "auto"]
+
+
+def test_a_long_step_says_how_many_files_are_compiled(tmp_path):
+    said = environment_sh(tmp_path, """
+        sleep() { command sleep 0.02; }  # in place of a minute
+        compile() { echo "  [2/3] c++ -c a.cpp"; command sleep 0.5; }
+        echo "[9/9] earlier" >"$log"
+        step Compiling compile""")
+    assert "2 of 3 files compiled (0 s)" in said and "9 of" not in said and "... done (" in said
 
 
 def test_a_card_or_a_list_decides_for_which_cards_kernels_are_built(tmp_path, monkeypatch):

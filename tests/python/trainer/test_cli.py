@@ -265,13 +265,13 @@ def test_resume_and_overwrite_exclude_each_other(scene, tmp_path, capsys):
     assert "not allowed with" in capsys.readouterr().err
 
 
-def interrupt_at(monkeypatch, iteration):
-    """Presses Ctrl-C in the middle of that iteration's step."""
+def interrupt_at(monkeypatch, iteration, number):
+    """Sends this process a signal in the middle of that iteration's step."""
     step = Trainer.step
 
     def interrupted_step(self, *arguments):
         if self.iteration + 1 == iteration:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         return step(self, *arguments)
 
     monkeypatch.setattr(Trainer, "step", interrupted_step)
@@ -285,12 +285,15 @@ def ctrl_c_works():
     signal.signal(signal.SIGINT, before)
 
 
-def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works):
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works, number,
+                                                   status):
     output = str(tmp_path / "out")
     arguments = ["train", scene, "-o", output, *SMOE]
     with monkeypatch.context() as patch:
-        interrupt_at(patch, 7)
-        assert main(arguments) == 130
+        interrupt_at(patch, 7, number)
+        assert main(arguments) == status
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     assert capsys.readouterr().err.endswith("interrupted; continue it with --resume\n")
     assert main([*arguments, "--resume"]) == 0
     assert "resumed at iteration 7" in capsys.readouterr().out
