@@ -19,10 +19,11 @@ fail() {
 
 # step WHAT COMMAND...: runs the command quietly; where it fails, shows the end of what it said.
 step() {
-  local what=$1 begin=$SECONDS watcher status=0
+  local what=$1 begin=$SECONDS from watcher status=0
   shift
   printf '  %s ... ' "$what"
-  show_compiled "$what" "$(($(wc -c <"$log" 2>/dev/null || echo 0) + 1))" &
+  from=$(wc -c 2>/dev/null <"$log" || echo 0)
+  show_compiled "$what" "$((from + 1))" &
   watcher=$!
   "$@" >>"$log" 2>&1 || status=$?
   { kill $watcher && wait $watcher; } 2>/dev/null || true
@@ -38,7 +39,7 @@ step() {
 # show_compiled WHAT FROM: says how many files are compiled, by what ninja wrote into the log from byte FROM on: on a
 # terminal in place, else a line a minute. Ends with this script, however that ends.
 show_compiled() {
-  local every=60 format='\n    %s of %s files compiled (%d s) ... ' begin=$SECONDS now shown=
+  local every=60 format='\n    %s of %s files compiled (%d s) ... ' begin=$SECONDS now
   if [ -t 1 ]; then every=1 format="\r  $1 ... %s of %s files (%d s) ... "; fi
   while sleep "$every" >/dev/null 2>&1 && kill -0 $$ 2>/dev/null; do
     now=$(tail -c "+$2" "$log" | sed -n 's|^ *\[\([0-9]*\)/\([0-9]*\)\].*|\1 \2|p' | tail -n 1)

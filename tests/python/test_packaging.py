@@ -148,7 +148,7 @@ def test_quickstart_builds_no_kernels_where_there_is_no_gpu_unless_asked(tmp_pat
     said = environment_sh(tmp_path, """
         pip_install() { echo "$DSMOE_BUILD_CUDA"; }
         install_package
-        DSMOE_BUILD_CUDA=1 install_package
+        (export DSMOE_BUILD_CUDA=1; install_package)
         cuda_without_gpu=auto  # as ./check says
         install_package""")
     assert said.split() == ["0", "1", "auto"]
