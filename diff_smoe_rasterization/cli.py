@@ -4,11 +4,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import List, Optional
+from typing import Iterator, List, Optional, Tuple
 
+from ._version import __version__
 from .patches.errors import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
-from .trainer.checkpoint import CHECKPOINT_NAME
 from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments
 from .trainer.errors import TrainerError
 from .trainer.interrupt import exit_status
@@ -17,6 +17,7 @@ from .trainer.interrupt import exit_status
 def build_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     parser = argparse.ArgumentParser(prog="dsmoe", description="Gaussian splatting with alpha and SMoE blending.")
+    parser.add_argument("--version", action="version", version=f"dsmoe {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     train = commands.add_parser("train", help="train Gaussians on a scene",
@@ -86,7 +87,13 @@ def build_parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
     info.set_defaults(run=_info)
-    for command in (train, evaluate, render, run, info):
+
+    completion = commands.add_parser("completion", help="a script by which a shell completes commands and options",
+                                     description="Prints a script for the shell. In ~/.bashrc or, behind compinit, in "
+                                                 "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
+    completion.add_argument("shell", choices=("bash", "zsh"))
+    completion.set_defaults(run=_completion)
+    for command in (train, evaluate, render, run, info, completion):
         command.set_defaults(command_parser=command)
     return parser
 
@@ -108,6 +115,8 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
+        from .trainer.checkpoint import CHECKPOINT_NAME
+
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = "; continue it with --resume" if continues else ""
         if arguments.command == "bench" and arguments.action == "run":
@@ -168,6 +177,30 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     report.add_argument("results", metavar="RESULTS", help="folder of `dsmoe bench run`, or a file rows.jsonl")
     report.add_argument("-o", "--output", metavar="DIR", default="report", help="folder to write (default: report)")
     report.set_defaults(run=_bench_report)
+
+
+def _completion(arguments: argparse.Namespace) -> None:
+    cases = "\n".join(f"    {path}) words='{' '.join(words)}' ;;" for path, words in _words_of(build_parser()))
+    print(("autoload -U +X bashcompinit && bashcompinit\n" if arguments.shell == "zsh" else "") + f"""_dsmoe() {{
+  local words
+  case "${{COMP_WORDS[*]:1:COMP_CWORD-1}} " in
+{cases}
+  esac
+  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o bashdefault -o default -F _dsmoe dsmoe""")
+
+
+def _words_of(parser: argparse.ArgumentParser, path: str = "") -> Iterator[Tuple[str, List[str]]]:
+    """(pattern of what is typed before, words that may follow) of a parser's commands and then its own."""
+    words: List[str] = []
+    for action in parser._actions:
+        words += action.option_strings
+        if isinstance(action, argparse._SubParsersAction):
+            words += action.choices
+            for name, child in action.choices.items():
+                yield from _words_of(child, f"{path}{name}\\ ")
+    yield path + "*", words
 
 
 def _bench_run(arguments: argparse.Namespace) -> int:
