@@ -239,7 +239,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     from .trainer.loop import train
     from .trainer.process import set_up_process
-    from .trainer.results import blend_name, results_table
+    from .trainer.results import blend_name, results_table, viewer_warning
 
     config = config_from_arguments(arguments)
     set_up_process(config.device)
@@ -250,6 +250,8 @@ def _train(arguments: argparse.Namespace) -> None:
     print(results_table([row]))
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")
+    if viewer_warning(row):
+        print(viewer_warning(row))
 
 
 def _eval(arguments: argparse.Namespace) -> None:

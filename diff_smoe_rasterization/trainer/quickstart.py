@@ -23,7 +23,7 @@ from .metrics import psnr, quantised
 from .modelfile import model_path
 from .pictures import comparison, evenly_spaced, file_names
 from .process import set_up_process
-from .results import results_table, write_results
+from .results import results_table, viewer_warning, write_results
 from .scene import Scene, load_scene, read_layout
 from .synthetic import write_synthetic_scene
 
@@ -94,6 +94,7 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     print(results_table(rows))
     print(f"\n{len(scene.train)} training and {len(scene.test)} test views; "
           f"results and models: {output}; pictures: {', '.join(pictures)}")
+    print(viewer_warning(rows[1]))
     return rows
 
 

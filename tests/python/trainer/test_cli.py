@@ -18,6 +18,7 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.loop import Trainer
+from diff_smoe_rasterization.trainer.results import viewer_warning
 from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
@@ -189,6 +190,12 @@ def test_a_run_from_before_the_background_gate_is_of_the_paper(scene, tmp_path, 
     assert (after["psnr"], after["background_gate"]) == (before["psnr"], 0.0)
 
 
+@pytest.mark.parametrize("mode, gate, warns", [("alpha", 1, False), ("smoe", 1, False), ("smoe", 0.03, True),
+                                               ("smoe_std", 0, True)])
+def test_a_model_that_viewers_would_show_wrongly_is_named(mode, gate, warns):
+    assert bool(viewer_warning({"blend_mode": mode, "background_gate": gate})) == warns
+
+
 def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path, capsys):
     output = str(tmp_path / "out")
     assert main(["train", scene, "-o", output, "--blend-mode", "smoe", "--background-gate", "learned", *SHORT]) == 0
@@ -197,6 +204,7 @@ def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path
     gate = row["background_gate"]
     assert 0.03 < gate < 2 and gate != 1.0
     text = capsys.readouterr().out
+    assert "viewers of 3DGS blend them by alpha" in text
     assert "smoe learned" in text and f"\nsmoe {gate:.3g} " in text
     assert io.read_gaussians(ply_of(output)).background_gate == gate
     assert main(["eval", output]) == 0
