@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Any, NamedTuple, Optional, Union
+from typing import TYPE_CHECKING, Any, NamedTuple, Optional, Tuple, Union
 
 if TYPE_CHECKING:
     import torch  # which takes seconds to load: the command line reads this file for its names
@@ -140,6 +140,16 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 
 def _is_tensor(value: Any) -> bool:
     return hasattr(value, "numel")
+
+
+def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, BackgroundGate]:
+    """Returns the blend mode and the background's gate of a rendering.
+
+    `smoe` with the number 1 is `alpha`, bit for bit. Raises ValueError as the two functions above do.
+    """
+    mode = resolve_blend_mode(settings.blend_mode)
+    gate = resolve_background_gate(mode, settings.background_gate)
+    return "alpha" if not _is_tensor(gate) and gate == 1 else mode, gate
 
 
 def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:
