@@ -4,7 +4,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import Iterator, List, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 
 from ._version import __version__
 from .patches.errors import PatchError
@@ -12,6 +12,9 @@ from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments
 from .trainer.errors import TrainerError
 from .trainer.interrupt import exit_status
+
+if TYPE_CHECKING:
+    from .trainer.evaluation import Measure
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -37,6 +40,9 @@ def build_parser() -> argparse.ArgumentParser:
     evaluate.add_argument("output", metavar="OUT", help="output folder of `dsmoe train`")
     evaluate.add_argument("--split", choices=("test", "train"), default="test", help="which views (default: test)")
     evaluate.add_argument("--scene", help="where the scene lies now, if it has moved")
+    evaluate.add_argument("--lpips", choices=("vgg", "alex"),
+                          help="also LPIPS with this network; weights: $DSMOE_LPIPS_VGG or $DSMOE_LPIPS_ALEX, else "
+                               "torchmetrics downloads them")
     _add_device(evaluate)
     evaluate.set_defaults(run=_eval)
 
@@ -57,6 +63,10 @@ def build_parser() -> argparse.ArgumentParser:
                         help="as in train (default: the run's, for a .ply scene)")
     render.add_argument("--white-background", action="store_true", default=None,
                         help="white background (default: the run's, for a .ply black)")
+    render.add_argument("--depth", action="store_true",
+                        help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
+    render.add_argument("--alpha", action="store_true",
+                        help="also NAME.alpha.png: how much of a pixel Gaussians cover, 8 bits")
     _add_device(render)
     render.set_defaults(run=_render)
 
@@ -256,11 +266,36 @@ def _train(arguments: argparse.Namespace) -> None:
 
 def _eval(arguments: argparse.Namespace) -> None:
     from .trainer.inspection import evaluate_run
+    from .trainer.metrics import image_metrics
     from .trainer.results import results_table
 
-    row = evaluate_run(arguments.output, arguments.device, arguments.split, arguments.scene)
+    measure = _with_lpips(arguments.lpips, arguments.device) if arguments.lpips else image_metrics
+    row = evaluate_run(arguments.output, arguments.device, arguments.split, arguments.scene, measure=measure)
     print(f"{arguments.split} views")
     print(results_table([row]))
+    if arguments.lpips:
+        print(f"LPIPS ({arguments.lpips}, v0.1, 8-bit images in [-1, 1]): {row['lpips_' + arguments.lpips]:.4f}")
+
+
+def _with_lpips(net: str, device: str) -> Measure:
+    """The trainer's metrics and LPIPS of images without a mask. Raises TrainerError where its weights are not there."""
+    from .benchmarks.errors import BenchError
+    from .benchmarks.lpips import check_weights, lpips_network
+    from .trainer.metrics import image_metrics, quantised
+
+    kind = {"vgg": "lpips_vgg_std", "alex": "lpips_alex"}[net]
+    try:
+        check_weights([kind])
+        distance = lpips_network(kind, device)
+    except (BenchError, ImportError, ValueError) as error:
+        raise TrainerError(f"--lpips {net}: {error}") from error
+
+    def measure(image: Any, target: Any, mask: Any = None) -> Dict[str, Optional[float]]:
+        if mask is not None:
+            raise TrainerError("--lpips: the scene has masks, and LPIPS of a part of an image is not defined")
+        return {**image_metrics(image, target), "lpips_" + net: distance(quantised(image), target)}
+
+    return measure
 
 
 def _render(arguments: argparse.Namespace) -> None:
@@ -277,7 +312,8 @@ def _render(arguments: argparse.Namespace) -> None:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
-                          background_gate=arguments.background_gate)
+                          background_gate=arguments.background_gate,
+                          outputs=[name for name in ("depth", "alpha") if getattr(arguments, name)])
     print(f"{len(paths)} images in {arguments.output}")
 
 

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List, Optional, Sequence
 
 import numpy as np
 import torch
@@ -10,10 +10,10 @@ from PIL import Image
 
 from .config import LEARNED, TrainConfig
 from .errors import TrainerError
-from .evaluation import evaluate
+from .evaluation import Measure, evaluate
 from .files import write_json_atomically
 from .loop import PER_VIEW_NAME, check_device
-from .metrics import quantised
+from .metrics import image_metrics, quantised
 from .modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
 from .pictures import file_names
 from .progress import progress_bar
@@ -23,10 +23,11 @@ from .scene import load_cameras, load_scene
 
 
 def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_folder: Optional[str] = None,
-                 progress: bool = True, rasterize: Optional[Rasterize] = None) -> Dict[str, Any]:
+                 progress: bool = True, rasterize: Optional[Rasterize] = None,
+                 measure: Measure = image_metrics) -> Dict[str, Any]:
     """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
 
-    scene_folder: where the scene lies, if not where it was trained. Raises TrainerError.
+    scene_folder: where the scene lies, if not where it was trained. measure: as in `evaluate`. Raises TrainerError.
     """
     config = TrainConfig.load(output).changed(device=device, **({"scene": scene_folder} if scene_folder else {}))
     check_device(device)
@@ -37,7 +38,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
         raise TrainerError(f"scene {config.scene} has no {split} views")
-    evaluation = evaluate(renderer, views, device, progress)
+    evaluation = evaluate(renderer, views, device, progress, measure)
     seconds = earlier[0].get("train_seconds") if earlier else None
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
     if split == "test":
@@ -66,8 +67,12 @@ def _gate_of(config: TrainConfig) -> Optional[float]:
 
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
                   blend_mode: Optional[str] = None, device: str = "cpu",
-                  rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None) -> List[str]:
+                  rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None,
+                  outputs: Sequence[str] = ()) -> List[str]:
     """Writes a PNG per camera of config.scene into `folder`; returns the paths.
+
+    outputs: "depth" and "alpha" are written beside each, as NAME.depth.npy [H, W] float32, which is the expected view
+    depth in the scene's units, 0 where nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
 
     ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: the model of the
     run that config is of, whose record these two must not contradict. Raises TrainerError.
@@ -87,7 +92,12 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     paths = [os.path.join(folder, name + ".png") for name in file_names([camera.name for camera in cameras])]
     with torch.no_grad():
         for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
-            to_image(renderer(camera).color).save(path)
+            rendering = renderer(camera, outputs=tuple(outputs))
+            to_image(rendering.color).save(path)
+            if rendering.depth is not None:
+                np.save(path[:-len("png")] + "depth.npy", rendering.depth[0].cpu().numpy())
+            if rendering.alpha is not None:
+                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path[:-len("png")] + "alpha.png")
     return paths
 
 

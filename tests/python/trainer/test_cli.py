@@ -110,6 +110,30 @@ def test_render_writes_what_eval_measures(trained, scene, tmp_path):
         assert 10 * np.log10(255**2 / ((rendered - truth) ** 2).mean()) == pytest.approx(psnr, abs=1e-4)
 
 
+def test_eval_measures_lpips_where_asked(trained, tmp_path, capsys, monkeypatch):
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
+    monkeypatch.setenv("DSMOE_LPIPS_VGG", str(tmp_path / "nowhere.npz"))
+    assert "nowhere.npz: no such file" in fails(capsys, "eval", run, "--lpips", "vgg")
+    monkeypatch.delenv("DSMOE_LPIPS_VGG")
+    asked = []
+    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.lpips.lpips_network",
+                        lambda kind, device: asked.append((kind, device)) or (lambda image, target: 0.25))
+    assert main(["eval", run, "--lpips", "vgg"]) == 0
+    assert "LPIPS (vgg, v0.1, 8-bit images in [-1, 1]): 0.2500\n" in capsys.readouterr().out
+    assert asked == [("lpips_vgg_std", "cpu")] and results_of(run)[0]["lpips_vgg"] == 0.25
+
+
+def test_render_writes_depth_and_alpha_where_asked(trained, tmp_path):
+    assert main(["render", trained, "-o", str(tmp_path), "--depth", "--alpha"]) == 0
+    ends = ("alpha.png", "depth.npy", "png")
+    assert sorted(os.listdir(tmp_path)) == [f"view_00{view}.{end}" for view in "08" for end in ends]
+    depth, alpha = np.load(tmp_path / "view_000.depth.npy"), np.asarray(Image.open(tmp_path / "view_000.alpha.png"))
+    assert depth.shape == alpha.shape == (24, 32) and (depth.dtype, alpha.dtype) == (np.float32, np.uint8)
+    assert np.all((depth > 0.2) | (depth == 0)) and alpha.max() > 200
+    assert np.all(depth[alpha > 0] > 0), "what covers a pixel has a depth"
+
+
 def test_render_a_ply_with_the_mode_that_it_records(trained, scene, tmp_path):
     assert main(["render", trained, "-o", str(tmp_path / "run"), "--split", "all"]) == 0
     assert main(["render", ply_of(trained), "-o", str(tmp_path / "ply"), "--scene", scene, "--split", "all"]) == 0
