@@ -201,7 +201,10 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
 
 
 def _number_or_learned(text: str) -> Union[float, str]:
-    return text if text == LEARNED else float(text)
+    try:
+        return text if text == LEARNED else float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
 
 
 def _flag(option: "dataclasses.Field[Any]") -> str:

@@ -56,6 +56,8 @@ def with_masks(folder: str, layout: Layout) -> Layout:
     """
     masks = os.path.join(folder, MASKS)
     if not os.path.isdir(masks):
+        if os.path.lexists(masks):
+            raise SceneError(f"{masks} is no folder; masks must lie in one, one image each")
         return layout
 
     def with_mask(image: PosedImage) -> PosedImage:

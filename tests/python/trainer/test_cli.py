@@ -183,7 +183,7 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
         assert f"gate {GATE}, not 0.5" in text
     text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe")
     assert "bare.ply" in text and "--background-gate" in text
-    assert "gate 0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
+    assert "gate 0.0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
                                       "--background-gate", "0.5")
     assert not (tmp_path / "no").exists()
     as_trained = render(trained, "run", "--background-gate", str(GATE))
