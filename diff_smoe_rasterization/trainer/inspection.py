@@ -43,6 +43,11 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
         raise TrainerError(f"scene {config.scene} has no {split} views")
+    masked = bool(earlier) and "masks" in earlier[0].get("protocol", {})
+    if masked != any(view.mask is not None for view in views) and earlier:
+        raise TrainerError(f"{config.scene} has {'no masks' if masked else 'masks'}, but the run was measured "
+                           f"{'with' if masked else 'without'} them: figures of other pixels are no figures of the run; "
+                           f"{'put them back' if masked else 'rename the folder'}, or name another --scene")
     evaluation = evaluate(renderer, views, device, progress, measure)
     seconds = earlier[0].get("train_seconds") if earlier else None
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)

@@ -216,6 +216,15 @@ def test_eval_measures_lpips_where_asked(trained, tmp_path, capsys, monkeypatch)
     assert asked == [("lpips_vgg_std", "cpu")] and results_of(run)[0]["lpips_vgg"] == 0.25
 
 
+def test_eval_measures_the_pixels_that_training_did(trained, scene, tmp_path, capsys):
+    masked = str(tmp_path / "scene")
+    shutil.copytree(scene, masked)
+    os.mkdir(os.path.join(masked, "masks"))
+    for name in os.listdir(os.path.join(masked, "images")):
+        Image.new("L", (32, 24), 255).save(os.path.join(masked, "masks", name + ".png"))
+    assert "has masks, but the run was measured without them" in fails(capsys, "eval", trained, "--scene", masked)
+
+
 def test_render_writes_depth_and_alpha_where_asked(trained, tmp_path):
     assert main(["render", trained, "-o", str(tmp_path), "--depth", "--alpha"]) == 0
     ends = ("alpha.png", "depth.npy", "png")
