@@ -7,7 +7,7 @@ from comparison import assert_close
 from devices import random_normal
 from scenes import gate_of, op_arguments, random_scene, with_gate, with_gates
 from test_cuda_against_cpu import SCENES, selected
-from test_cuda_graphs import SLEEP, WARM_UP, list_size, scene_of
+from test_cuda_graphs import SLEEP, WARM_UP, list_size, own_width, scene_of
 
 from diff_smoe_rasterization import Contributions, rasterize_with_splats
 
@@ -80,7 +80,8 @@ def test_the_sums_account_for_every_pair_of_the_image(mode, dtype, gpu):
 @pytest.mark.sanitize
 def test_lists_that_are_outgrown(mode, gpu):
     """A graph whose contents outgrow the lists it was captured with: the walk goes over the depth order then."""
-    small = scene_of(mode, num_gaussians=20_000, width=227, height=151, scale=0.004, opacity=(0.02, 0.2))
+    small = scene_of(mode, num_gaussians=20_000, width=own_width(mode, 227), height=151, scale=0.004,
+                     opacity=(0.02, 0.2))
     larger = small.with_inputs(scales=small.inputs["scales"] * 30)
     pixel_weights = map_for(small.settings).to(gpu)
     held = small.to(torch.float32).to(gpu)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import Scene, op_arguments, random_scene, with_gate, with_gates
+from scenes import BACKGROUND_GATES, Scene, op_arguments, random_scene, with_gate, with_gates
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -101,6 +101,11 @@ def test_a_replayed_graph_equals_a_call(mode, options, gpu):
         assert_same(results, expected)
 
 
+def own_width(mode, width):
+    """Returns the width of an image that no other mode renders: what is known of a size, `smoe` and its gates share."""
+    return width + 1 + list(BACKGROUND_GATES).index(mode) if mode in BACKGROUND_GATES else width
+
+
 def list_size(scene, gpu):
     """Returns for how many tile instances a call has room, and how many there are."""
     results = torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene.to(torch.float32).to(gpu)))
@@ -116,8 +121,8 @@ def list_size(scene, gpu):
                          ids=["all_images", "colour_alone"])
 def test_contents_that_outgrow_the_captured_lists(mode, outputs, degree, width, gpu):
     """Scales grow until many times the tiles are touched, and shrink again."""
-    small = scene_of(mode, num_gaussians=20_000, width=width, height=151, scale=0.004, opacity=(0.02, 0.2),
-                     degree=degree)
+    small = scene_of(mode, num_gaussians=20_000, width=own_width(mode, width), height=151, scale=0.004,
+                     opacity=(0.02, 0.2), degree=degree)
     larger = small.with_inputs(scales=small.inputs["scales"] * 30)
     in_one_tile = small.with_inputs(means3D=small.inputs["means3D"] * 1e-3)
     step = TrainingStep(small, gpu, outputs)
@@ -193,7 +198,7 @@ def test_the_host_waits_for_nothing(mode, gpu):
 @pytest.mark.sanitize
 def test_growing_contents_without_a_graph(mode, gpu):
     """Each call has more than the one before: what was learned from the last never limits the next."""
-    base = scene_of(mode, num_gaussians=20_000, width=235, height=151, opacity=(0.02, 0.2))
+    base = scene_of(mode, num_gaussians=20_000, width=own_width(mode, 235), height=151, opacity=(0.02, 0.2))
     scenes = [base.with_inputs(scales=base.inputs["scales"] * factor) for factor in (0.1, 1.0, 4.0, 0.1)]
     step, results = TrainingStep(base, gpu), []
     for index, scene in enumerate(scenes):
