@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ..losses import l1_ssim_loss_and_gradient
 from .background_gate import LearnedGate
-from .checkpoint import CHECKPOINT_NAME, load_checkpoint, save_checkpoint
+from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
 from .config import CONFIG_NAME, LEARNED, TrainConfig
 from .environment import extension_info
 from .errors import TrainerError
@@ -179,9 +179,10 @@ class Run:
         path = self._path(CHECKPOINT_NAME)
         if not os.path.isfile(path):
             return False
-        state = load_checkpoint(path, self.trainer.config.device)
-        self.trainer.load_state_dict(state)
-        self.history = list(state["history"])
+        with damage_named(path):
+            state = load_checkpoint(path, self.trainer.config.device)
+            self.trainer.load_state_dict(state)
+            self.history = list(state["history"])
         return True
 
     def train(self) -> Dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any, Dict, List, Optional
 import torch
 
 from .config import TrainConfig, add_arguments
-from .errors import TrainerError
+from .errors import in_one_line
 from .images import image_size
 from .inspection import open_renderer, to_image
 from .loop import train
@@ -47,8 +47,11 @@ def main(argv: Optional[List[str]] = None) -> int:
     try:
         run(arguments)
         return 0
-    except (TrainerError, ImportError, OSError) as error:
-        print(f"quickstart: error: {error}", file=sys.stderr)
+    except Exception as error:
+        text = in_one_line(error)
+        if text is None:
+            raise
+        print(f"quickstart: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("\nquickstart: interrupted", file=sys.stderr)
