@@ -272,6 +272,7 @@ def refused(folder, *words, **options):
     """Loading raises a SceneError that has all these words."""
     with pytest.raises(SceneError) as error:
         load(folder, **options)
+    assert str(error.value).isprintable()
     for word in words:
         assert word in str(error.value), str(error.value)
 
@@ -411,11 +412,18 @@ def frame(**values):
     (frame(fl_x=0), ["frame 0", "`fl_x` is 0", "positive"]),
     (frame(fl_x=20, fl_y=-20), ["`fl_y` is -20", "positive"]),
     (frame(fl_x=True), ["`fl_x` is True", "number"]),
-    (frame(fl_x=10**400), ["`fl_x`", "finite number"]),
+    (frame(fl_x=10**400), ["`fl_x`", "number of at most 1e+09"]),
     (frame(fl_x=None), ["`fl_x` is None", "number"]),
+    (lambda content: content.update(camera_angle_x=5e-324), ["camera_angle_x", "5e-324"]),
+    (lambda content: content.update(w=1, h=1e308), ["`h` is 1e+308", "at most 1e+09"]),
+    (frame(transform_matrix=np.diag([1e200, 1e200, 1, 1]).tolist()), ["frame 0", "at most 1e+09"]),
+    (frame(file_path="./train/\0\x1b[2J\n\u202e"), ["train/\\x00\\x1b[2J\\n\\u202e.png: no such image"]),
+    (frame(transform_matrix="DEEP"), ["transforms_train.json: not valid json"]),
 ])
 def test_a_wrong_json(nerf_folder, edit, words):
-    edit_json(nerf_folder / "transforms_train.json", edit)
+    path = nerf_folder / "transforms_train.json"
+    edit_json(path, edit)
+    path.write_text(path.read_text().replace('"DEEP"', "[" * 100_000 + "]" * 100_000))
     refused(nerf_folder, *words)
 
 
