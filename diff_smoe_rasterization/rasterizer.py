@@ -7,8 +7,7 @@ import torch
 
 from .autograd import rasterize_op
 from .extension import BACKENDS, build_info
-from .settings import (
-    BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_background_gate, resolve_blend_mode)
+from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 from .splats import Splats
 
 
@@ -68,8 +67,7 @@ def _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scal
     """Returns the Rendering, and the results of the op that are no images: what it saved."""
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
-    blend_mode = resolve_blend_mode(settings.blend_mode)
-    background_gate = resolve_background_gate(blend_mode, settings.background_gate)
+    blend_mode, background_gate = resolve_blend(settings)
     required, optional = _checks("rasterize", "means3D", means3D)
     tensor_gate, fixed_gate = None, background_gate
     if isinstance(background_gate, torch.Tensor):

@@ -13,7 +13,7 @@ What the paper leaves open is decided here:
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
 - Opacity plays no part in culling or in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
-- The background of a pixel without a gate (denominator under 1e-30) replaces its colour in the SMoE modes.
+- The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
 - In `smoe` a background gate that is the number 1 is the mode `alpha`, with its tile rectangle and its cut; a tensor of
   value 1 keeps the footprints of `smoe`. Where the background has a gate, opacity cuts pairs too: see `pair_counts`.
 - The value of `means2D` is ignored; it only receives a gradient.
@@ -26,7 +26,7 @@ from typing import NamedTuple, Optional
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from .settings import OUTPUTS, Contributions, Rendering, resolve_background_gate, resolve_blend_mode
+from .settings import OUTPUTS, Contributions, Rendering, resolve_blend
 
 
 def _float32(value):
@@ -145,11 +145,8 @@ def contributions(means3D, opacities, settings, pixel_weights, dc=None, shs=None
 
 def mode_and_gate(settings):
     """Returns the blend mode and the background's gate lambda, a number or a tensor of shape []."""
-    mode = resolve_blend_mode(settings.blend_mode)
-    gate = resolve_background_gate(mode, settings.background_gate)
-    if isinstance(gate, torch.Tensor):
-        return mode, gate.reshape(())
-    return "alpha" if gate == 1 else mode, gate
+    mode, gate = resolve_blend(settings)
+    return mode, gate.reshape(()) if isinstance(gate, torch.Tensor) else gate
 
 
 def _gather(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp):
@@ -406,15 +403,18 @@ def blend(alpha, color, depth, bg, mode, gate):
     # in weight and gate_sum, and the background has a gate in smoe alone.
     total = torch.ones_like(gate_sum) if mode == "alpha" else gate_sum + background
 
-    image = _quotient(color.T @ weight + background * bg[:, None], total, bg[:, None])
-    expected_depth = _quotient(depth @ weight, gate_sum, 0)
-    inverse_depth = _quotient((1 / depth) @ weight, total, 0)
+    blended = color.T @ weight
+    if isinstance(gate, torch.Tensor) or gate:  # else a background that is NaN must not reach other pixels
+        blended = blended + background * bg[:, None]
+    without = gate_sum < GATE_SUM_MIN
+    image = _quotient(blended, total, without, bg[:, None])
+    expected_depth = _quotient(depth @ weight, gate_sum, without, 0)
+    inverse_depth = _quotient((1 / depth) @ weight, total, without, 0)
     return torch.cat([image, torch.stack([gate_sum, expected_depth, inverse_depth])])
 
 
-def _quotient(numerator, gates, otherwise):
-    """Returns numerator / gates, and what is to stand where there are none."""
-    without = gates < GATE_SUM_MIN
+def _quotient(numerator, gates, without, otherwise):
+    """Returns numerator / gates, and what is to stand where there are no gates."""
     return torch.where(without, torch.as_tensor(otherwise).to(gates), numerator / gates.masked_fill(without, 1))
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import NamedTuple, Optional, Union
+from typing import NamedTuple, Optional, Tuple, Union
 
 import torch
 
@@ -135,6 +135,16 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     if not 0 <= value < math.inf:
         raise ValueError(f"{source} is {background_gate!r}; it must be a number, 0 or more and finite")
     return value
+
+
+def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, BackgroundGate]:
+    """Returns the blend mode and the background's gate of a rendering.
+
+    `smoe` with the number 1 is `alpha`, bit for bit. Raises ValueError as the two functions above do.
+    """
+    mode = resolve_blend_mode(settings.blend_mode)
+    gate = resolve_background_gate(mode, settings.background_gate)
+    return "alpha" if not isinstance(gate, torch.Tensor) and gate == 1 else mode, gate
 
 
 def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:

@@ -6,8 +6,7 @@ from typing import Sequence
 import torch
 
 from .extension import _C  # noqa: F401  (loading it registers the ops)
-from .settings import (
-    BLEND_MODES, Contributions, GaussianRasterizationSettings, resolve_background_gate, resolve_blend_mode)
+from .settings import BLEND_MODES, Contributions, GaussianRasterizationSettings, resolve_blend
 
 _OPS = torch.ops.diff_smoe_rasterization
 
@@ -23,8 +22,7 @@ class Splats:
         (self._projected, _, self._instance_offsets, self._tile_offsets, self._instances, _, self._last_contributor,
          self._order, *_) = (tensor.detach() for tensor in saved)
         self._radii = radii
-        blend_mode = resolve_blend_mode(settings.blend_mode)
-        gate = resolve_background_gate(blend_mode, settings.background_gate)
+        blend_mode, gate = resolve_blend(settings)
         # A tensor is copied: an optimizer may change it before anybody asks for contributions.
         tensor_gate, fixed_gate = (gate.detach().clone(), 0.0) if isinstance(gate, torch.Tensor) else (None, gate)
         self._blend = (tensor_gate, float(settings.alpha_min), fixed_gate, BLEND_MODES.index(blend_mode))

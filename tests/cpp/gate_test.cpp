@@ -145,12 +145,6 @@ TEST(AlphaCut, CutsFaintPairsOutsideThreeSigmaAlone) {
   EXPECT_EQ((AlphaCut<float>(0, 0.1f).faint), static_cast<float>((AlphaCut<double>(0, 0.1).faint)));
 }
 
-TEST(Gate, TheFamilysMemberWithGateOneIsAlpha) {
-  EXPECT_EQ(family_member(BlendMode::kSmoe, 1.0), BlendMode::kAlpha);
-  EXPECT_EQ(family_member(BlendMode::kSmoe, 0.999), BlendMode::kSmoe);
-  EXPECT_EQ(family_member(BlendMode::kSmoeTn, 1.0), BlendMode::kSmoeTn);
-}
-
 TEST(Gate, APairThatDoesNotCountHandsBackZeroWhateverItsExponent) {
   // An indefinite covariance (cov3D_precomp is the caller's) gives exponents without bound.
   for (const double power : {1.0, 100.0, 1000.0}) {

@@ -251,6 +251,19 @@ TYPED_TEST(RasterizeIn, AnAbsentImageGradientIsZero) {
   }
 }
 
+TEST(Rasterize, TheBackgroundsGateMayBeANumberOrLieInMemory) {
+  const Scene<float> scene = in_mode(convert<float>(make_scene(31, 60, 37, 29)), BlendMode::kSmoe);
+  Rendering<float> in_memory = render(scene);
+  RasterConfig<float> config = scene.raster_config();
+  config.background_gate = *config.background_gate_at;
+  ASSERT_GT(config.background_gate, 0);
+  config.background_gate_at = nullptr;
+  Rendering<float> number = render(scene);
+  std::fill(number.color.begin(), number.color.end(), -1);
+  cpu::blend(scene.camera, config, number.saved(), number.images());
+  EXPECT_EQ(number.color, in_memory.color);
+}
+
 // ---- Threads, lists, memory ----
 
 TYPED_TEST(RasterizeIn, ResultsDoNotDependOnTheNumberOfThreadsBitForBit) {

@@ -201,6 +201,19 @@ def test_where_all_gates_are_closed_the_background_takes_pixel_and_gradient(func
     assert not rendering.depth.any() and not rendering.inverse_depth.any()
 
 
+@pytest.mark.parametrize("mode", ["smoe", "smoe_tn", "smoe_std"])
+@pytest.mark.parametrize("background", [math.nan, math.inf])
+def test_without_a_gate_a_background_that_is_no_number_shows_in_empty_pixels_alone(function, mode, background):
+    scene = random_scene(mode, 60, scale=0.05, degree=1, bg=torch.full((3,), background, dtype=torch.float64))
+    scene = scene.requiring_grad()
+    rendering = function(settings=scene.settings, outputs=("alpha",), **scene.inputs)
+    empty = rendering.alpha[0] == 0
+    assert torch.equal(torch.isfinite(rendering.color).all(0), ~empty) and empty.any() and not empty.all()
+    leaves = {name: leaf for name, leaf in scene.leaves().items() if name != "bg"}
+    for values in torch.autograd.grad(rendering.color[:, ~empty].sum(), list(leaves.values()), allow_unused=True):
+        assert values is None or torch.isfinite(values).all()
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_an_empty_pixel_is_the_background_itself(dtype):
     """Not lambda b / lambda, which is another number after rounding."""

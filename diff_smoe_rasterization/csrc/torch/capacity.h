@@ -1,6 +1,6 @@
 // How much memory the tile instances of a rendering get, before the GPU has counted them. The counts of earlier
 // renderings of the same size, mode and order of N are a good guess; a bad one costs time, never correctness
-// (rasterize_cuda.h).
+// (rasterize_cuda.h). The background's gate is no part of the key: of a tensor the host does not know it.
 // This table of sizes is all that outlives a call.
 #pragma once
 

@@ -158,9 +158,7 @@ template <class S> Camera<S> camera(const Inputs& inputs, const Options& options
 
 // What decides which pairs count and how they are blended; background_gate may be undefined.
 template <class S> void set_blend(RasterConfig<S>& out, const at::Tensor& background_gate, const Options& options) {
-  const BlendMode mode = static_cast<BlendMode>(options.blend_mode);
-  const bool fixed = !background_gate.defined();
-  out.mode = fixed ? family_member(mode, options.fixed_background_gate) : mode;
+  out.mode = static_cast<BlendMode>(options.blend_mode);
   out.background_gate = static_cast<S>(options.fixed_background_gate);
   out.background_gate_at = data<S>(background_gate);
   out.alpha_min = static_cast<float>(options.alpha_min);

@@ -90,13 +90,15 @@ DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, const 
   return {select(contributes, gamma, Real(S(0))), weight};
 }
 
-template <BlendMode kMode> struct Blend;
-
-// What alpha and smoe share, whatever lambda.
-struct FamilyBlend {
+// The family, alpha and smoe; the ablations are specialisations.
+template <BlendMode kMode> struct Blend {
   static constexpr bool kNeedsDepthOrder = true;
-  static constexpr bool kStopsEarly = true;       // once full, a pixel is done
-  static constexpr bool kSuffixAboutBase = true;  // u_i = g'.c_i - b; else g'.c_i
+  static constexpr bool kStopsEarly = true;                    // once full, a pixel is done
+  static constexpr bool kSuffixAboutBase = true;               // u_i = g'.c_i - b; else g'.c_i
+  static constexpr bool kDivides = kMode == BlendMode::kSmoe;  // in alpha D is 1, and never formed
+  static constexpr bool kLearnsGate = kDivides;                // lambda is a variable
+
+  template <class S> static DSMOE_HD S background_gate(S lambda) { return kDivides ? lambda : S(1); }
 
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
     const auto pair = transmit(state, gate);
@@ -109,16 +111,6 @@ struct FamilyBlend {
                                               Mask<Real> contributes) {
     return transmit_backward(pixel, gate, value - pixel.base, contributes);
   }
-};
-
-template <> struct Blend<BlendMode::kAlpha> : FamilyBlend {
-  static constexpr bool kDivides = false, kLearnsGate = false;
-  template <class S> static DSMOE_HD S background_gate(S) { return S(1); }
-};
-
-template <> struct Blend<BlendMode::kSmoe> : FamilyBlend {
-  static constexpr bool kDivides = true, kLearnsGate = true;
-  template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
 
 // The ablations leave the background out, and their denominator runs on behind a full pixel.
@@ -157,8 +149,8 @@ template <> struct Blend<BlendMode::kSmoeStd> : AblationBlend {
   template <class Real>
   static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
                                               Mask<Real> contributes) {
-    const Real weight = select(contributes, gate.alpha, Real(Scalar<Real>(0)));
-    return {weight * (value - pixel.base), weight};
+    const Real zero = Scalar<Real>(0);
+    return {select(contributes, gate.alpha * (value - pixel.base), zero), select(contributes, gate.alpha, zero)};
   }
 };
 
@@ -173,6 +165,11 @@ template <class Real> struct FeatureEnd {
   Real weight, denominator;
   Mask<Real> open;
   bool divides;
+
+  // The background's share: 0 without a gate, even where the background is NaN or infinite.
+  DSMOE_HD Real if_gated(Real share) const {
+    return select(weight > Real(Scalar<Real>(0)), share, Real(Scalar<Real>(0)));
+  }
 };
 
 template <BlendMode kMode, class Real>
@@ -187,7 +184,7 @@ DSMOE_HD FeatureEnd<Real> feature_end(FeatureRule rule, const PixelEnd<Real>& en
 template <BlendMode kMode, class Real>
 DSMOE_HD Real finish_feature(FeatureRule rule, const PixelEnd<Real>& end, Real sum, Real background) {
   const auto by = feature_end<kMode>(rule, end);
-  return select(by.open, (sum + by.weight * background) / by.denominator, background);
+  return select(by.open, (sum + by.if_gated(by.weight * background)) / by.denominator, background);
 }
 
 // Starts a pixel's backward pass; the features join one by one through add_feature.
@@ -211,7 +208,7 @@ DSMOE_HD FeatureBackward<Real> add_feature(FeatureRule rule, PixelBackward<Real>
   const Real scaled = select(by.open, dL_dvalue / by.denominator, zero), weighted = by.weight * scaled;
   const Real distance = background - value;
   if (by.divides) pixel.base = pixel.base + scaled * value;
-  pixel.suffix = pixel.suffix + weighted * (by.divides ? distance : background);
+  pixel.suffix = pixel.suffix + by.if_gated(weighted * (by.divides ? distance : background));
   const bool learns = Blend<kMode>::kLearnsGate && rule == FeatureRule::kBlended;
   return {scaled, select(by.open, weighted, dL_dvalue), learns ? end.transmittance * scaled * distance : zero};
 }

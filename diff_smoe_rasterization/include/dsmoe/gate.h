@@ -18,11 +18,6 @@ constexpr int kNumBlendModes = 4;
 // Which pairs count. By alpha: those of 3DGS, alpha >= 1/255 in whole tiles about the Gaussian. Else the paper's, by G.
 DSMOE_HD constexpr bool cuts_by_alpha(BlendMode mode) { return mode == BlendMode::kAlpha; }
 
-// The member of the family alpha - smoe with this background gate: 1 is alpha, bit for bit.
-template <class S> DSMOE_HD constexpr BlendMode family_member(BlendMode mode, S background_gate) {
-  return mode == BlendMode::kSmoe && background_gate == S(1) ? BlendMode::kAlpha : mode;
-}
-
 // The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels: d = pixel - mean, d.x fixed, d.y free.
 template <class Real, class S> struct ColumnExponent {
   Real constant, linear;

@@ -29,7 +29,7 @@ template <class S> struct RasterConfig {
   const S* background = nullptr;  // [C]
   S scale_modifier = 1;
   S alpha_min = 0;                        // SMoE modes: also skip alpha below this
-  S background_gate = 0;                  // lambda of kSmoe; 1 is kAlpha: family_member
+  S background_gate = 0;                  // lambda of kSmoe; 1 is kAlpha, but for rounding and the cuts
   const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
   bool antialiasing = false;
   bool clamp_color = true;  // colours from shs are at least 0

@@ -130,9 +130,8 @@ void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& ca
                       const GaussianGradients<S>& gradients, Scratch& scratch, cudaStream_t stream);
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
-// may differ in their last digits from call to call. pixel_weights: [H, W]. Of config it reads the mode, alpha_min
-// and the background's gate;
-// of saved neither features nor images but last_contributor; of images the radii.
+// may differ in their last digits from call to call. pixel_weights: [H, W]. Of config it reads the mode, alpha_min and
+// the background's gate; of saved neither features nor images but last_contributor; of images the radii.
 template <class S>
 void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
                    const SavedForward<S>& saved, const ImageOutputs<S>& images, const S* pixel_weights,
