@@ -58,7 +58,8 @@ def damage_named(path: str) -> Iterator[None]:
             raise
         text = f"{path}: not a readable checkpoint; remove it, and --resume starts the run anew"
         if not SAFE_LOAD:
-            text += f" (torch {torch.__version__} may run code from a file that was made for it: load none of strangers)"
+            text += (f" (load no stranger's: torch {torch.__version__} may run code from a file that was made for it, "
+                     "2.6 and later do not)")
         raise TrainerError(text) from error
 
 

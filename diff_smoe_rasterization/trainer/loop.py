@@ -269,8 +269,8 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     """Trains a scene into config.output; returns the row of results.json.
 
     resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
-    of threads); start it where it has no checkpoint yet. overwrite: replace a run that is there. scene: a loaded
-    scene, where one is at hand. Raises TrainerError before training starts where anything does not fit.
+    of threads and the same SIMD level); start it where it has no checkpoint yet. overwrite: replace a run that is
+    there. scene: a loaded scene, where one is at hand. Raises TrainerError before training starts where anything does not fit.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")

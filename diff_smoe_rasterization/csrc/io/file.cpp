@@ -10,23 +10,6 @@ namespace dsmoe::io {
 
 namespace fs = std::filesystem;
 
-namespace {
-
-std::string without_controls(const std::string& message) {
-  std::string result;
-  for (const char c : message) {
-    const auto byte = static_cast<unsigned char>(c);
-    char escaped[5] = {c, '\0'};
-    if (byte < ' ' || byte == 0x7f) std::snprintf(escaped, sizeof(escaped), "\\x%02x", byte);
-    result += escaped;
-  }
-  return result;
-}
-
-}  // namespace
-
-IoError::IoError(const std::string& message) : std::runtime_error(without_controls(message)) {}
-
 std::string read_file(const std::string& path) {
   std::error_code error;
   const fs::file_status status = fs::status(path, error);

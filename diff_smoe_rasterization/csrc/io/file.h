@@ -10,10 +10,9 @@
 namespace dsmoe::io {
 
 /// Base of everything that reading and writing throws; the message names the file, what was read and the reason.
-/// It is one line: control characters of names in files, and of paths, are written as \xNN.
 class IoError : public std::runtime_error {
  public:
-  explicit IoError(const std::string& message);
+  using std::runtime_error::runtime_error;
 };
 
 /// A file that cannot be found, opened, read or written.
