@@ -2,15 +2,33 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import math
 import os
 from typing import Any, BinaryIO, Callable, Optional
 
 
-def write_atomically(path: str, write: Callable[[BinaryIO], None]) -> None:
-    """Calls `write` with an open binary file that becomes `path` only once it is complete.
+class _PatientFile:
+    """A file that notes its first error instead of raising: torch 1.13 ends the process where a write raises."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file = file
+        self.error: Optional[OSError] = None
+
+    def write(self, data: Any) -> int:
+        try:
+            if self.error is None:
+                self.file.write(data)
+        except OSError as error:
+            self.error = error
+        return memoryview(data).nbytes
+
+    def flush(self) -> None:
+        """Nothing: the file is flushed when it is whole."""
+
+
+def write_atomically(path: str, write: Callable[[Any], None]) -> None:
+    """Calls `write` with an object that has `write` and `flush`; what it is given becomes `path` once it is complete.
 
     Where that fails, an earlier `path` stays as it was. Raises OSError, which names `path`.
     """
@@ -21,7 +39,10 @@ def write_atomically(path: str, write: Callable[[BinaryIO], None]) -> None:
         os.remove(temporary)
     try:
         with open(temporary, "xb") as file:  # a new file: "x" follows no link
-            write(file)
+            patient = _PatientFile(file)
+            write(patient)
+            if patient.error:
+                raise patient.error
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -29,21 +50,9 @@ def write_atomically(path: str, write: Callable[[BinaryIO], None]) -> None:
         if not isinstance(error, FileExistsError):
             with contextlib.suppress(OSError):
                 os.remove(temporary)
-        failed = _system_error(error)
-        if failed is None:
+        if not isinstance(error, OSError):
             raise
-        raise OSError(failed.errno, failed.strerror or str(failed), path) from error
-
-
-def _system_error(error: BaseException) -> Optional[OSError]:
-    """The OSError that was the reason: torch.save raises RuntimeError where the disk is full."""
-    if isinstance(error, OSError):
-        return error
-    if not isinstance(error, RuntimeError):
-        return None
-    if error.__context__ is not None:
-        return _system_error(error.__context__)
-    return OSError(errno.EIO, "could not be written whole") if "inline_container" in str(error) else None
+        raise OSError(error.errno, error.strerror or str(error), path) from error
 
 
 def write_text_atomically(path: str, text: str) -> None:

@@ -181,8 +181,8 @@ def test_nerf_cameras_look_along_minus_z_with_y_up(nerf_folder):
 def test_nerf_names_are_paths(nerf_folder):
     scene = load(nerf_folder)
     assert (scene.train[0].camera.name, scene.test[0].camera.name) == ("train/r_0.png", "test/r_0.png")
-    assert file_names(["cam1/0001.jpg", "cam2/0001.jpg", "cam1/0001.png", "cam1_0001_2.png"]) == [
-        "cam1_0001", "cam2_0001", "cam1_0001_2", "cam1_0001_2_2"]
+    assert file_names(["cam1/0001.jpg", "cam2/0001.jpg", "cam1/0001.png", "cam1_0001_2.png", "\x1b.png"]) == [
+        "cam1_0001", "cam2_0001", "cam1_0001_2", "cam1_0001_2_2", "\\x1b"]
 
 
 def test_nerf_random_points(nerf_folder):
