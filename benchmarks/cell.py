@@ -22,7 +22,7 @@ from typing import IO, Any, Dict, List, Optional, Tuple
 
 from ..trainer.errors import TrainerError
 from ..trainer.files import write_json_atomically
-from .errors import BenchError
+from ..trainer.output_folder import locked
 from .log import last_line
 from .processes import die_with_parent
 from .results_folder import ROW_NAME
@@ -188,19 +188,6 @@ def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: floa
         time.sleep(poll_seconds)
 
 
-def hold(path: str) -> IO[str]:
-    """The file, locked together with whoever else holds it. Raises BenchError where somebody has it alone."""
-    import fcntl
-
-    file = open(path, "a+")
-    try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError as error:
-        file.close()
-        raise BenchError(f"{path}: another run is at work there") from error
-    return file
-
-
 def at_least_one(text: str) -> int:
     """The number that a word of the command is. Raises ArgumentTypeError."""
     number = int(text)
@@ -245,12 +232,12 @@ def main(argv: Optional[List[str]] = None) -> int:
     try:
         if arguments.hold:
             die_with_parent()
-            held = hold(arguments.hold)
+            held = locked(arguments.hold, shared=True)
         if arguments.gpus:
             per_device = per_device or 1
             gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_device)
         row = supervise(arguments.cell, arguments.output, gpu, per_device, held)
-    except BenchError as error:
+    except TrainerError as error:
         print(f"{arguments.cell}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -11,12 +11,12 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
 from functools import partial
 from types import MappingProxyType
-from typing import IO, Any, Dict, Iterator, List, Mapping, Optional, Sequence
+from typing import IO, Any, Dict, List, Mapping, Optional, Sequence
 
 from ..trainer.files import write_json_atomically, write_text_atomically
+from ..trainer.output_folder import make_folder, only_one
 from .cell import SHARING, identity, shown
 from .errors import BenchError
 from .lpips import check_weights, files_of_weights
@@ -25,8 +25,7 @@ from .preparation import given, made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .report.rows import ReportError, check_row
-from .results_folder import (CELL_NAME, CELLS_FOLDER, LOCK_NAME, ROW_NAME, ROWS_NAME, SUITE_NAME, make_folder,
-                             read_object)
+from .results_folder import CELL_NAME, CELLS_FOLDER, ROW_NAME, ROWS_NAME, SUITE_NAME, read_object
 from .selection import SAID_BY_THE_ID, chosen, earlier_rows, plan
 from .suite import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, missing
 
@@ -114,24 +113,8 @@ def check_folder(suite: Suite, results: str) -> None:
                          f"{'; '.join(differ)}. Choose another folder with -o")
 
 
-@contextmanager
-def only_one(results: str) -> Iterator[IO[str]]:
-    """Keeps a second run away from the same results, until Snakemake and its cells have ended too.
-
-    The lock that is yielded is for Snakemake to inherit; cells share it (cell.py, --hold).
-    """
-    import fcntl
-
-    with open(os.path.join(results, LOCK_NAME), "a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise BenchError(f"{results}: another run is at work there") from error
-        yield file
-
-
 def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
-    """Runs Snakemake, which shares the lock with its cells; returns its status.
+    """Runs Snakemake, which inherits the lock and shares it with its cells (cell.py, --hold); returns its status.
 
     Where this process is interrupted or ends, however it ends, Snakemake is killed, since on a signal that it can catch
     it waits for the cells that run here. Those of a queue it is to cancel (is_queued): it gets one SIGINT. A second one

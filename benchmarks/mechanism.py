@@ -29,10 +29,10 @@ from typing import Any, Dict, Iterator, List, Optional, Sequence
 
 import torch
 
-from ..trainer.config import CONFIG_NAME, TrainConfig, add_arguments, config_from_arguments
+from ..trainer.config import TrainConfig, add_arguments, config_from_arguments, holds_run
 from ..trainer.errors import TrainerError
 from ..trainer.files import write_text_atomically
-from ..trainer.loop import Run, Trainer, check_device
+from ..trainer.loop import Run, Trainer, check_device, earlier_models
 from ..trainer.process import set_up_process
 from ..trainer.scene import Scene, load_scene
 from ..trainer.stopwatch import Stopwatch
@@ -171,15 +171,16 @@ def run(config: TrainConfig, progress: bool = True, scene: Optional[Scene] = Non
     """Trains a scene into config.output, watched; writes the record there and returns it.
 
     scene: a loaded scene, where one is at hand. Raises TrainerError where the options or the scene do not fit, where
-    config.output already holds a training run, or where it lies in the scene's folder.
+    config.output already holds a training run or another program's output, or where it lies in the scene's folder.
     """
     if inside(config.output, config.scene):
         raise BenchError(f"{config.output} lies in the scene's folder {config.scene}, which stays as it is; choose "
                          "another folder")
     config = config.changed(checkpoint_every=0)  # a record cannot be continued
     check_device(config.device)
-    if os.path.isfile(os.path.join(config.output, CONFIG_NAME)):
+    if holds_run(config.output):
         raise TrainerError(f"{config.output} already holds a training run; choose another folder")
+    earlier_models(config)
     os.makedirs(config.output, exist_ok=True)
     trainer = Trainer(config, require_test_views(scene or load_scene(config, progress), config))
     recorder = Recorder(trainer)

@@ -16,18 +16,6 @@ CELLS_FOLDER = "cells"  # a folder for each cell, by its name
 CELL_NAME = "cell.json"  # in it: what is trained on what
 ROW_NAME = "row.json"  # in it too: what came out
 SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its cells, run or not
-LOCK_NAME = ".lock"  # held by the one run that is at work
-
-
-def make_folder(path: str) -> None:
-    """Makes a folder where it is not there. Raises BenchError where nothing can be written in it."""
-    reason = ""
-    try:
-        os.makedirs(path, exist_ok=True)
-    except OSError as error:
-        reason = f" ({error.strerror})"
-    if reason or not os.access(path, os.W_OK | os.X_OK):
-        raise BenchError(f"{path}: nothing can be written there{reason}; choose another folder with -o")
 
 
 def read_object(path: str, needed: Mapping[str, type] = MappingProxyType({})) -> Optional[Dict[str, Any]]:

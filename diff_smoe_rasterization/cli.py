@@ -9,8 +9,10 @@ from typing import List, Optional
 from .patches.errors import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.checkpoint import CHECKPOINT_NAME
-from .trainer.config import PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments
+from .trainer.config import (PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options,
+                             holds_run)
 from .trainer.errors import TrainerError, in_one_line
+from .trainer.files import is_folder
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -20,13 +22,19 @@ def build_parser() -> argparse.ArgumentParser:
 
     train = commands.add_parser("train", help="train Gaussians on a scene",
                                 description="Trains Gaussians on a COLMAP or NeRF-synthetic scene.")
-    add_arguments(train)
+    train.add_argument("scene", metavar="SCENE", nargs="?", default=argparse.SUPPRESS,
+                       help="folder of a COLMAP or NeRF-synthetic scene; --resume finds it in OUT")
+    train.add_argument("-o", "--output", metavar="OUT", default=argparse.SUPPRESS, help="folder to write")
+    add_arguments(train, skip=("scene", "output"))
     train.add_argument("--scale-recipe", action="store_true",
                        help="squeeze the recipe into --iterations: its milestones (densification, resets, learning "
                             "rate, SH degrees) keep their share of 30,000 steps, unless they are given")
     earlier_run = train.add_mutually_exclusive_group()
-    earlier_run.add_argument("--resume", action="store_true", help="continue the run in OUT from its last checkpoint")
-    earlier_run.add_argument("--overwrite", action="store_true", help="replace a run that is in OUT")
+    earlier_run.add_argument("--resume", action="store_true",
+                             help="continue the run in OUT from its last checkpoint with its own options; more "
+                                  "--iterations extend it")
+    earlier_run.add_argument("--overwrite", action="store_true",
+                             help="replace the run in OUT, once this one can start")
     train.add_argument("--quiet", action="store_true", help="no progress bars")
     train.set_defaults(run=_train)
 
@@ -41,7 +49,8 @@ def build_parser() -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="write images of a trained run or a .ply",
                                  description="Writes one PNG for every camera of a scene.")
     render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
-    render.add_argument("-o", "--output", metavar="DIR", required=True, help="folder for the images")
+    render.add_argument("-o", "--output", metavar="DIR", required=True,
+                        help="folder for the images: new, empty, or of an earlier rendering")
     render.add_argument("--scene", help="folder whose cameras are rendered (default: the run's; needed for a .ply)")
     render.add_argument("--split", choices=("test", "train", "all"), default="test",
                         help="which cameras (default: test)")
@@ -210,7 +219,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from .trainer.process import set_up_process
     from .trainer.results import blend_name, results_table
 
-    config = config_from_arguments(arguments)
+    config = _train_config(arguments)
     set_up_process(config.device)
     print(f"{config.scene} -> {config.output}: blend mode {blend_name(config.blend_mode, config.background_gate)}, "
           f"schedule {config.schedule}, "
@@ -219,6 +228,20 @@ def _train(arguments: argparse.Namespace) -> None:
     print(results_table([row]))
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")
+
+
+def _train_config(arguments: argparse.Namespace) -> TrainConfig:
+    """The options of a training: those that are given, and for --resume the run's own."""
+    given = given_options(arguments)
+    if arguments.resume and set(given) & {"scene", "output"} == {"scene"}:  # dsmoe train --resume OUT
+        given["output"] = arguments.output = given.pop("scene")
+        del arguments.scene
+    if "output" not in given or "scene" not in given and not arguments.resume:
+        arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs OUT alone")
+    run = given.pop("output")
+    if not arguments.resume or "scene" in given and (arguments.scale_recipe or not holds_run(run)):
+        return config_from_arguments(arguments)
+    return TrainConfig.of_run(run, "SCENE", **given)
 
 
 def _eval(arguments: argparse.Namespace) -> None:
@@ -236,9 +259,8 @@ def _render(arguments: argparse.Namespace) -> None:
     overrides = {name: getattr(arguments, name) for name in ("scene", "resolution", "principal_point",
                                                              "white_background")
                  if getattr(arguments, name) is not None}
-    if os.path.isdir(arguments.source):
-        config, ply = TrainConfig.load(arguments.source), None
-        config = config.changed(**overrides)
+    if is_folder(arguments.source):
+        config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
     else:
         if not arguments.scene:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")

@@ -29,9 +29,13 @@ At 0, the default, this is Eq. 7, and the background is seen where no gate is op
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
 RECOMMENDED_BACKGROUND_GATE = 0.03  # of captures, for trainers that cannot learn it: benchmarks/RESULTS.md
+MAX_BACKGROUND_GATE = 1e30  # that and a background's colour still make a float32 number
 
 BackgroundGate = Union[float, torch.Tensor]
-"""lambda: a number, or a tensor of one element, which receives a gradient."""
+"""lambda: a number, or a tensor of one element, which receives a gradient.
+
+The number 1 is alpha blending bit for bit. A tensor of 1 keeps the footprints of `smoe`: where tiles end, pixels differ.
+"""
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -133,8 +137,9 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
         value = float(background_gate)
     except (TypeError, ValueError):
         value = math.nan
-    if not 0 <= value < math.inf:
-        raise ValueError(f"{source} is {background_gate!r}; it must be a number, 0 or more and finite")
+    if not 0 <= value <= MAX_BACKGROUND_GATE:
+        raise ValueError(f"{source} is {background_gate!r}; it must be a number, 0 or more and at most "
+                         f"{MAX_BACKGROUND_GATE:g}")
     return value
 
 

@@ -12,7 +12,8 @@ import shutil
 import tempfile
 from typing import Any, Callable, Dict, List, Sequence
 
-from ..results_folder import CELLS_FOLDER, SUITE_NAME, make_folder
+from ...trainer.output_folder import make_folder
+from ..results_folder import CELLS_FOLDER, SUITE_NAME
 from .rows import ReportError, Row, at_once, grouped, read_rows, safe_name, shared, some
 
 __all__ = ["ReportError", "report"]
@@ -29,7 +30,7 @@ def report(results: str, output: str) -> str:
 
     OUTPUT/index.html, report.md, tables/, figures/, images/, survey/; an earlier report there is replaced once the new
     one is whole. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged, where
-    rows cannot be compared or where OUTPUT has such files of someone else, BenchError where nothing can be written
+    rows cannot be compared or where OUTPUT has such files of someone else, TrainerError where nothing can be written
     there, and ImportError where a library is missing.
     """
     try:

@@ -10,7 +10,7 @@ from typing import Any, Dict, List, Optional, Sequence, Union
 
 from ..settings import BACKGROUND_GATE_VARIABLE, BLEND_MODES, resolve_background_gate, resolve_blend_mode
 from .errors import ConfigError
-from .files import write_text_atomically
+from .files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
 SCHEDULES = ("3dgs", "steady")
@@ -137,8 +137,9 @@ class TrainConfig:
                                             if getattr(self, name) == getattr(default, name)})
 
     def save(self, folder: str) -> None:
-        """Writes OUT/config.json."""
-        text = json.dumps(dataclasses.asdict(self), indent=2) + "\n"
+        """Writes OUT/config.json, with the scene's absolute path."""
+        scene = os.path.abspath(self.scene) if self.scene else ""
+        text = json.dumps({**dataclasses.asdict(self), "scene": scene}, indent=2) + "\n"
         write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
 
     @classmethod
@@ -151,7 +152,7 @@ class TrainConfig:
     def load(cls, folder: str) -> "TrainConfig":
         """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
-        if not os.path.isfile(path):
+        if not holds_run(folder):
             raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`")
         try:
             with open(path, encoding="utf-8") as file:
@@ -174,16 +175,36 @@ class TrainConfig:
         except (TypeError, ConfigError) as error:
             raise ConfigError(f"{path}: {error}") from error
 
-    def differences(self, other: "TrainConfig") -> List[str]:
-        """Options that would change the result and differ from those of `other`, one text each."""
+    @classmethod
+    def of_run(cls, folder: str, scene_option: str, **options: Any) -> "TrainConfig":
+        """The options of the run in a folder with some set. Raises ConfigError, also where its scene is not there.
+
+        scene_option: what says where the scene lies now, for that error.
+        """
+        config = cls.load(folder).changed(**options)
+        if "scene" not in options and not is_folder(config.scene):
+            here = "" if os.path.isabs(config.scene) else " here, and the path is relative to where it was trained"
+            raise ConfigError(f"scene {config.scene}, on which {folder} was trained: no such folder{here}; "
+                              f"name with {scene_option} where it lies now")
+        return config
+
+    def differences(self, later: "TrainConfig") -> List[str]:
+        """Options that keep `later` from continuing this run, one text each; more iterations do not."""
         # These alter when something is written or where, never the trained Gaussians.
         harmless = {"scene", "output", "eval_every", "checkpoint_every"}
+        if later.iterations > self.iterations:
+            harmless.add("iterations")
         texts = []
         for option in dataclasses.fields(self):
-            mine, theirs = getattr(self, option.name), getattr(other, option.name)
+            mine, theirs = getattr(self, option.name), getattr(later, option.name)
             if option.name not in harmless and mine != theirs:
                 texts.append(f"{_flag(option)} is {mine!r} here and {theirs!r} there")
         return texts
+
+
+def holds_run(folder: str) -> bool:
+    """Whether OUT/config.json is there. Raises TrainerError where that cannot be seen."""
+    return is_file(os.path.join(folder, CONFIG_NAME))
 
 
 def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:
@@ -201,7 +222,10 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
 
 
 def _number_or_learned(text: str) -> Union[float, str]:
-    return text if text == LEARNED else float(text)
+    try:
+        return text if text == LEARNED else float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
 
 
 def _flag(option: "dataclasses.Field[Any]") -> str:

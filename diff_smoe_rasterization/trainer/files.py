@@ -1,11 +1,33 @@
-"""Files that are whole or absent: written beside their place, flushed to disk, then renamed."""
+"""Files that are whole or absent, written beside their place, flushed and renamed; and whether one is there."""
 from __future__ import annotations
 
 import contextlib
 import json
 import math
 import os
+import stat
 from typing import Any, BinaryIO, Callable, Optional
+
+from .errors import TrainerError
+
+
+def is_file(path: str) -> bool:
+    """Whether a file is there. Raises TrainerError where that cannot be seen, as in a folder that must not be read."""
+    return stat.S_ISREG(_mode(path))
+
+
+def is_folder(path: str) -> bool:
+    """Whether a folder is there. Raises TrainerError where that cannot be seen."""
+    return stat.S_ISDIR(_mode(path))
+
+
+def _mode(path: str) -> int:
+    try:
+        return os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return 0
+    except (OSError, ValueError) as error:
+        raise TrainerError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
 
 
 class _PatientFile:

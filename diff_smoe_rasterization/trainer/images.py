@@ -112,6 +112,8 @@ def _mask(path: str, image_path: str, size: Tuple[int, int], camera: Camera) -> 
     if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > MAX_ASPECT_ERROR:
         raise SceneError(f"{path}: the mask is {mask.width}x{mask.height}, its image {image_path} "
                          f"{size[0]}x{size[1]}: another shape")
+    if mask.getextrema()[1] == 1:
+        raise SceneError(f"{path}: the mask has the values 0 and 1; white, which counts, must be 255")
     planes = _planes(mask, camera, Image.BILINEAR)  # which does not overshoot at edges
     if not bool(planes.any()):
         raise SceneError(f"{path}: the mask keeps no pixel of {image_path}; white is what counts, black is ignored")

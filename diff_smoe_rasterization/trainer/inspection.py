@@ -16,19 +16,24 @@ from .files import write_json_atomically
 from .loop import PER_VIEW_NAME, check_device
 from .metrics import quantised
 from .modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
+from .output_folder import Record, make_folder, own_record, write_record
 from .pictures import file_names
 from .rendering import Rasterize, Renderer, background_color
 from .results import read_results, result_row, write_results
 from .scene import load_cameras, load_scene
+
+RENDER = "dsmoe render"  # in its folders' records
 
 
 def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_folder: Optional[str] = None,
                  progress: bool = True, rasterize: Optional[Rasterize] = None) -> Dict[str, Any]:
     """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
 
-    scene_folder: where the scene lies, if not where it was trained. Raises TrainerError.
+    scene_folder: where the scene lies, if not where it was trained. A folder that cannot be written to is told, no
+    error. Raises TrainerError.
     """
-    config = TrainConfig.load(output).changed(device=device, **({"scene": scene_folder} if scene_folder else {}))
+    options = {"scene": scene_folder} if scene_folder else {}
+    config = TrainConfig.of_run(output, "--scene", device=device, **options)
     check_device(device)
     ply = trained_model_path(output, config.iterations)
     earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
@@ -41,8 +46,11 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     seconds = earlier[0].get("train_seconds") if earlier else None
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
     if split == "test":
-        write_results(output, [row])
-        write_json_atomically(os.path.join(output, PER_VIEW_NAME), evaluation.per_view)
+        try:
+            write_results(output, [row])
+            write_json_atomically(os.path.join(output, PER_VIEW_NAME), evaluation.per_view)
+        except OSError as error:
+            print(f"warning: {output}: its results could not be written anew ({error.strerror}); the figures hold")
     return row
 
 
@@ -69,10 +77,14 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
                   rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None) -> List[str]:
     """Writes a PNG per camera of config.scene into `folder`; returns the paths.
 
+    folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed.
+
     ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: the model of the
     run that config is of, whose record these two must not contradict. Raises TrainerError.
     """
     check_device(device)
+    earlier = own_record(folder, RENDER)
+    of = os.path.abspath(ply or config.output) + " on " + os.path.abspath(config.scene)
     if ply is None:
         ply = trained_model_path(config.output, config.iterations)
         blend_mode = agreed_blend_mode(config.output, config.blend_mode, blend_mode)
@@ -83,8 +95,11 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     cameras = load_cameras(config, split)
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views")
-    os.makedirs(folder, exist_ok=True)
-    paths = [os.path.join(folder, name + ".png") for name in file_names([camera.name for camera in cameras])]
+    names = [name + ".png" for name in file_names([camera.name for camera in cameras])]
+    make_folder(folder)
+    kept = earlier.files if of == earlier.of else []  # those of another split
+    write_record(folder, RENDER, Record(of, sorted({*kept, *names})), earlier.files)
+    paths = [os.path.join(folder, name) for name in names]
     with torch.no_grad():
         for camera, path in zip(tqdm(cameras, desc="images", unit="image", leave=False), paths):
             to_image(renderer(camera).color).save(path)

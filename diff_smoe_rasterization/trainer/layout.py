@@ -8,6 +8,7 @@ from typing import List, Optional, Sequence, Tuple
 
 from .cameras import Camera
 from .errors import SceneError
+from .files import is_file, is_folder
 from .pointcloud import PointCloud
 
 MASKS = "masks"  # folder of a scene, beside its images
@@ -43,7 +44,7 @@ def hold_out(images: Sequence[PosedImage]) -> Tuple[List[PosedImage], List[Posed
 
 def check_files(paths: Sequence[str]) -> None:
     """Raises SceneError naming the first missing image and how many are missing."""
-    missing = [path for path in paths if not os.path.isfile(path)]
+    missing = [path for path in paths if not is_file(path)]
     if missing:
         raise SceneError(f"{missing[0]}: no such image ({len(missing)} of {len(paths)} images are missing)")
 
@@ -55,13 +56,15 @@ def with_masks(folder: str, layout: Layout) -> Layout:
     Raises SceneError where an image has none.
     """
     masks = os.path.join(folder, MASKS)
-    if not os.path.isdir(masks):
+    if not is_folder(masks):
+        if os.path.lexists(masks):
+            raise SceneError(f"{masks} is no folder; masks must lie in one, one image each")
         return layout
 
     def with_mask(image: PosedImage) -> PosedImage:
         names = [image.camera.name + ".png", os.path.splitext(image.camera.name)[0] + ".png"]
         for name in names:
-            if os.path.isfile(os.path.join(masks, name)):
+            if is_file(os.path.join(masks, name)):
                 return dataclasses.replace(image, mask=os.path.join(masks, name))
         raise SceneError(f"{masks}: the image {image.camera.name} has no mask there; it must be {names[0]} or "
                          f"{names[1]} (without masks, every pixel counts: rename the folder)")

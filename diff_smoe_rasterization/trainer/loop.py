@@ -4,7 +4,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-import shutil
 from typing import Any, Callable, Dict, List, Optional
 
 import torch
@@ -13,17 +12,18 @@ from tqdm import tqdm
 from ..losses import l1_ssim_loss_and_gradient
 from .background_gate import LearnedGate
 from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
-from .config import CONFIG_NAME, LEARNED, TrainConfig
+from .config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
 from .environment import extension_info
 from .errors import TrainerError
 from .evaluation import Evaluation, evaluate
-from .files import write_json_atomically
+from .files import is_file, write_json_atomically
 from .images import as_float
 from .interrupt import DelayedInterrupt
 from .metrics import psnr
 from .model import GaussianModel, GaussianOptimizer
 from .modelfile import FOLDER, model_path, save_model
 from .order import ViewOrder
+from .output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
 from .randomness import random_state, restore_random_state, seed_everything
 from .rendering import Rasterize, Renderer, background_color
 from .results import RESULTS_NAME, result_row, write_results
@@ -33,6 +33,8 @@ from .strategy import STRATEGIES, Step, StrategyContext
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
 PER_VIEW_NAME = "per_view.json"
+PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME)  # beside config.json and the models
+TRAIN = "dsmoe train"  # in its folders' records
 PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
 
 
@@ -177,12 +179,17 @@ class Run:
     def resume(self) -> bool:
         """Continues from the folder's checkpoint; False where there is none yet."""
         path = self._path(CHECKPOINT_NAME)
-        if not os.path.isfile(path):
+        if not is_file(path):
             return False
         with damage_named(path):
             state = load_checkpoint(path, self.trainer.config.device)
             self.trainer.load_state_dict(state)
             self.history = list(state["history"])
+        before, config = state["config"]["iterations"], self.trainer.config
+        if before < config.iterations:
+            print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
+                  f"{config.densify_until_iter}, falling learning rate of positions until "
+                  f"{config.position_lr_max_steps}")
         return True
 
     def train(self) -> Dict[str, Any]:
@@ -255,13 +262,36 @@ def _is_due(iteration: int, interval: int) -> bool:
     return interval > 0 and iteration % interval == 0
 
 
-def _remove_products(output: str) -> None:
-    """Removes what a run leaves in its folder, so that no file of an old run outlives its config."""
-    for name in (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME):
-        if os.path.isfile(os.path.join(output, name)):
-            os.remove(os.path.join(output, name))
-    if os.path.isdir(os.path.join(output, FOLDER)):
-        shutil.rmtree(os.path.join(output, FOLDER))
+def _model_name(iterations: int) -> str:
+    """Where in its folder a run of so many iterations keeps its model."""
+    return model_path("", iterations).replace(os.sep, "/")
+
+
+def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = False) -> List[str]:
+    """The models that earlier runs have written into config.output, their paths in it.
+
+    Raises TrainerError where something is there that this run must not go on with, or replace.
+    """
+    output = config.output
+    record = read_record(output, TRAIN)
+    models = os.path.join(output, FOLDER)
+    if not holds_run(output):
+        there = [name for name in (*PRODUCTS, FOLDER) if os.path.lexists(os.path.join(output, name))]
+        if there:
+            raise TrainerError(f"{output} holds {', '.join(there)} but no {CONFIG_NAME}: no run of {TRAIN} "
+                               "is known to have written them; choose another folder")
+    elif not resume and not overwrite:
+        raise TrainerError(f"{output} already holds a training run; continue it with --resume, "
+                           "replace it with --overwrite, or choose another folder")
+    elif resume or not record:  # a record is enough to be replaced
+        earlier = TrainConfig.load(output)
+        differences = earlier.differences(config) if resume else []
+        if differences:
+            raise TrainerError(f"{output} holds a run with other options: " + "; ".join(differences))
+        record = record or Record(earlier.scene, [_model_name(earlier.iterations)])
+    if os.path.lexists(models) and not os.path.isdir(models):
+        raise TrainerError(f"{models} is no folder; a run writes its model there")
+    return record.files if record else []
 
 
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
@@ -269,32 +299,33 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     """Trains a scene into config.output; returns the row of results.json.
 
     resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
-    of threads and the same SIMD level); start it where it has no checkpoint yet. overwrite: replace a run that is
-    there. scene: a loaded scene, where one is at hand. Raises TrainerError before training starts where anything does not fit.
+    of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
+    is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
+    run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
+    hand. Raises TrainerError before training starts where anything does not fit, as where another run is at work in
+    the folder.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
     config.validate()
     check_device(config.device)
-    if os.path.isfile(os.path.join(config.output, CONFIG_NAME)):
-        if resume:
-            differences = TrainConfig.load(config.output).differences(config)
-            if differences:
-                raise TrainerError(f"{config.output} holds a run with other options: " + "; ".join(differences))
-        elif not overwrite:
-            raise TrainerError(f"{config.output} already holds a training run; continue it with --resume, "
-                               "replace it with --overwrite, or choose another folder")
+    earlier_models(config, resume, overwrite)
     layout = None if scene else read_layout(config)
-    os.makedirs(config.output, exist_ok=True)  # a folder that cannot be made is told before images are read
-    scene = scene or load_scene(config, progress, layout)
-    if config.random_background and config.background_gate == 0:
-        print("warning: --random-background with a background gate of 0: the background is seen only where no Gaussian "
-              "is, so little is learned of transparency")
-    run = Run(Trainer(config, scene, rasterize), progress)
-    if resume:
-        resumed = run.resume()
-        print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
-    elif overwrite:
-        _remove_products(config.output)
-    config.save(config.output)
-    return run.train()
+    make_folder(config.output)  # a folder that cannot be made is told before images are read
+    with only_one(config.output):
+        models = earlier_models(config, resume, overwrite)  # again: another run may have been at work there
+        scene = scene or load_scene(config, progress, layout)
+        if config.random_background and config.background_gate == 0:
+            print("warning: --random-background with a background gate of 0: the background is seen only where no "
+                  "Gaussian is, so little is learned of transparency")
+        run = Run(Trainer(config, scene, rasterize), progress)
+        if resume:
+            resumed = run.resume()
+            print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
+        model = _model_name(config.iterations)
+        record = Record(os.path.abspath(config.scene), sorted({*(models if resume else ()), model}))
+        write_record(config.output, TRAIN, record, models)
+        if overwrite:
+            remove_files(config.output, [*PRODUCTS, model])
+        config.save(config.output)
+        return run.train()

@@ -9,6 +9,7 @@ import torch
 from .. import io
 from ..settings import BLEND_MODES, resolve_background_gate
 from .errors import TrainerError
+from .files import is_file
 from .model import GaussianModel
 
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
@@ -29,7 +30,7 @@ def model_path(output: str, iteration: int) -> str:
 def trained_model_path(output: str, iterations: int) -> str:
     """The .ply that a run of so many iterations ends with. Raises TrainerError where it is not there."""
     path = model_path(output, iterations)
-    if not os.path.isfile(path):
+    if not is_file(path):
         raise TrainerError(f"{path}: no such file; the training in {output} has not ended (continue it with --resume)")
     return path
 
@@ -87,19 +88,19 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
         own = float(resolve_background_gate(blend_mode, None))
         for said in (recorded.background_gate, asked):
             if said not in (None, own):
-                raise TrainerError(f"{path}: the background gate is {said:g}; in the blend mode {blend_mode} it is "
+                raise TrainerError(f"{path}: the background gate is {said!r}; in the blend mode {blend_mode} it is "
                                    f"{own:g}")
         return own
     gate = recorded.background_gate
     if gate is None and recorded.blend_mode is not None:
         gate = 0.0
     if gate is not None and asked is not None and asked != gate:
-        raise TrainerError(f"{path} was trained with the background gate {gate:g}, not {asked:g}; "
+        raise TrainerError(f"{path} was trained with the background gate {gate!r}, not {asked!r}; "
                            "with another one its Gaussians show another scene")
     if gate is None and asked is None:
         raise TrainerError(f"{path} does not say which background gate it was trained with (no `comment "
                            "background_gate`); pass --background-gate, which is 0 for the paper's Eq. 7")
     try:
-        return gate if gate is not None else float(resolve_background_gate(blend_mode, asked))
+        return float(resolve_background_gate(blend_mode, asked if gate is None else gate))
     except ValueError as error:
         raise TrainerError(str(error)) from error

@@ -14,21 +14,24 @@ from typing import Any, Dict, List, Optional
 import torch
 
 from .config import TrainConfig, add_arguments
-from .errors import in_one_line
-from .images import image_size
+from .errors import TrainerError, in_one_line
+from .images import View, image_size
 from .inspection import open_renderer, to_image
-from .loop import train
+from .loop import check_device, train
 from .metrics import psnr, quantised
 from .modelfile import model_path
+from .output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .pictures import comparison, evenly_spaced, file_names
 from .process import set_up_process
-from .results import results_table, write_results
+from .results import RESULTS_NAME, results_table, write_results
 from .scene import Scene, load_scene, read_layout
 from .synthetic import write_synthetic_scene
 
 MODES = ("alpha", "smoe")
 PICTURES = 3  # test views that are shown
 DEFAULT_OUTPUT = "quickstart_output"
+PROGRAM = "quickstart"  # in its folder's record
+MADE_UP = "the one that it makes itself"
 
 # A few thousand steps are too few to recover from an opacity reset, so neither kind of scene gets one. The threshold
 # is higher than that of full-size images: in NDC units, small images have larger gradients.
@@ -66,7 +69,8 @@ def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
     parser.add_argument("scene", nargs="?", metavar="SCENE", default=None,
                         help="folder of a COLMAP or NeRF-synthetic scene (default: a small one made on the spot)")
     parser.add_argument("-o", "--output", metavar="OUT", default=DEFAULT_OUTPUT,
-                        help=f"folder to write (default: {DEFAULT_OUTPUT})")
+                        
+                        help=f"folder to write: new, empty, or of the same scene (default: {DEFAULT_OUTPUT})")
     parser.add_argument("--quiet", action="store_true", default=False, help="no progress bars")
     add_arguments(parser, skip=FIXED, defaults=False)
     return parser.parse_args(argv)
@@ -76,27 +80,47 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     """Makes the scene where none is named, trains both modes, writes results and pictures; returns the rows."""
     given = {name: value for name, value in vars(arguments).items() if name not in ("scene", "output", "quiet")}
     output, progress = arguments.output, not arguments.quiet
-    folder = arguments.scene
-    if folder is None:
-        folder = os.path.join(output, "scene")
-        print(f"making a scene in {folder}")
-        write_synthetic_scene(folder)
-    config = choose_options(folder, given)
-    set_up_process(config.device)
-    os.makedirs(output, exist_ok=True)  # a folder that cannot be made is told before images are read
-    scene = load_scene(config, progress)
-    rows = []
-    for mode in MODES:
-        rows.append(train(config.changed(blend_mode=mode, output=os.path.join(output, mode)), overwrite=True,
-                          progress=progress, scene=scene))
-        shutil.copyfile(model_path(os.path.join(output, mode), config.iterations), os.path.join(output, mode + ".ply"))
-    write_results(output, rows)
-    pictures = write_pictures(config, scene, output)
+    config = choose_options(arguments.scene, given) if arguments.scene else None
+    of = os.path.abspath(arguments.scene) if arguments.scene else MADE_UP
+    _earlier_files(output, of)
+    make_folder(output)  # a folder that cannot be made is told before images are read
+    with only_one(output):
+        earlier = _earlier_files(output, of)  # again: another run may have been at work there
+        if config is None:
+            folder = os.path.join(output, "scene")
+            print(f"making a scene in {folder}")
+            write_record(output, PROGRAM, Record(of, earlier), earlier)  # the scene is its own
+            write_synthetic_scene(folder)
+            config = choose_options(folder, given)
+        check_device(config.device)
+        set_up_process(config.device)
+        scene = load_scene(config, progress)
+        views = shown_views(scene)
+        files = [RESULTS_NAME, *(mode + ".ply" for mode in MODES), *views]
+        write_record(output, PROGRAM, Record(of, files), earlier)
+        remove_files(output, files)
+        rows = []
+        for mode in MODES:
+            rows.append(train(config.changed(blend_mode=mode, output=os.path.join(output, mode)), overwrite=True,
+                              progress=progress, scene=scene))
+            shutil.copyfile(model_path(os.path.join(output, mode), config.iterations),
+                            os.path.join(output, mode + ".ply"))
+        write_results(output, rows)
+        pictures = write_pictures(config, views, output)
     print()
     print(results_table(rows))
     print(f"\n{len(scene.train)} training and {len(scene.test)} test views; "
           f"results and models: {output}; pictures: {', '.join(pictures)}")
     return rows
+
+
+def _earlier_files(output: str, of: str) -> List[str]:
+    """What an earlier comparison on the same scene has written. Raises TrainerError where `output` holds another's."""
+    record = own_record(output, PROGRAM)
+    if record.of not in ("", of):
+        raise TrainerError(f"{output} holds the models and pictures of another scene, {record.of}; choose another "
+                           "folder with -o, or remove it")
+    return record.files
 
 
 def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
@@ -119,21 +143,26 @@ def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
     return base.changed(**{**chosen, **given}).shortened().changed(**given)
 
 
-def write_pictures(config: TrainConfig, scene: Scene, output: str) -> List[str]:
-    """Ground truth, alpha and smoe beside each other for some test views; returns the paths."""
-    renderers = [(mode, open_renderer(config, os.path.join(output, mode + ".ply"), mode, config.device))
-                 for mode in MODES]
+def shown_views(scene: Scene) -> Dict[str, View]:
+    """Some test views, by the names of their pictures."""
     views = scene.test or scene.train
     names = file_names([view.camera.name for view in views])
+    return {f"compare_{names[index]}.png": views[index] for index in evenly_spaced(len(views), PICTURES)}
+
+
+def write_pictures(config: TrainConfig, views: Dict[str, View], output: str) -> List[str]:
+    """Ground truth, alpha and smoe beside each other for each view; returns the paths."""
+    renderers = [(mode, open_renderer(config, os.path.join(output, mode + ".ply"), mode, config.device))
+                 for mode in MODES]
     paths = []
-    for index in evenly_spaced(len(views), PICTURES):
-        view, labelled = views[index], []
+    for name, view in views.items():
+        labelled = []
         truth, mask = view.image_float(), view.mask_float()
         for mode, renderer in renderers:
             with torch.no_grad():
                 color = renderer(view.camera).color.cpu()
             labelled.append((f"{mode}  {psnr(quantised(color), truth, mask):.2f} dB", to_image(color)))
-        paths.append(os.path.join(output, f"compare_{names[index]}.png"))
+        paths.append(os.path.join(output, name))
         comparison(to_image(truth), labelled).save(paths[-1])
     return paths
 

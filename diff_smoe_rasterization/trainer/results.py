@@ -9,7 +9,7 @@ from .config import LEARNED, TrainConfig
 from .environment import machine, versions
 from .errors import TrainerError
 from .evaluation import Evaluation
-from .files import write_json_atomically
+from .files import is_file, write_json_atomically
 from .images import DOWNSCALER
 from .scene import Scene
 
@@ -33,7 +33,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     if views[0].mask is not None:
         unusual["masks"] = "metrics over the kept pixels; SSIM of images times their masks"
     return {
-        "scene": os.path.basename(os.path.normpath(config.scene)),
+        "scene": os.path.basename(os.path.abspath(config.scene)),
         "blend_mode": config.blend_mode,
         "background_gate": config.background_gate if background_gate is None else background_gate,
         **evaluation.metrics,
@@ -73,7 +73,7 @@ def write_results(folder: str, rows: List[Dict[str, Any]]) -> None:
 def read_results(folder: str) -> List[Dict[str, Any]]:
     """The rows of OUT/results.json; none where the file is absent. Raises TrainerError where it is damaged."""
     path = os.path.join(folder, RESULTS_NAME)
-    if not os.path.isfile(path):
+    if not is_file(path):
         return []
     try:
         with open(path, encoding="utf-8") as file:

@@ -16,6 +16,7 @@ import numpy as np
 from .cameras import Camera, scene_extent
 from .config import TrainConfig
 from .errors import SceneError
+from .files import is_file, is_folder
 from .images import View, fitted_camera, image_size, load_views
 from .layout import Layout, check_files, with_masks
 from .pointcloud import PointCloud
@@ -57,11 +58,11 @@ def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layo
 def read_layout(config: TrainConfig) -> Layout:
     """Reads everything of a scene folder but its images, whose presence it checks."""
     folder = config.scene
-    if not os.path.isdir(folder):
+    if not is_folder(folder):
         raise SceneError(f"scene {folder}: no such folder")
-    if os.path.isfile(os.path.join(folder, "transforms_train.json")):
+    if is_file(os.path.join(folder, "transforms_train.json")):
         layout = read_nerf_layout(folder, config)
-    elif os.path.isdir(os.path.join(folder, "sparse")):
+    elif is_folder(os.path.join(folder, "sparse")):
         layout = read_colmap_layout(folder, config)
     else:
         raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor transforms_train.json "

@@ -10,6 +10,7 @@ from .. import io
 from .cameras import Camera
 from .config import TrainConfig
 from .errors import SceneError
+from .files import is_folder
 from .layout import HOLD_OUT, Layout, PosedImage, hold_out
 from .pointcloud import PointCloud
 
@@ -23,7 +24,7 @@ def read_colmap_layout(folder: str, config: TrainConfig) -> Layout:
     for camera in model.cameras.values():
         _refuse_distortion(model.folder, camera)
     image_folder = os.path.join(folder, config.images)
-    if not os.path.isdir(image_folder):
+    if not is_folder(image_folder):
         raise SceneError(f"{image_folder}: no such folder of images (--images names another)")
     images = [
         PosedImage(_camera(image, model.cameras[image.camera_id]), os.path.join(image_folder, image.name))

@@ -13,6 +13,7 @@ from .. import io
 from .cameras import Camera
 from .config import TrainConfig
 from .errors import SceneError
+from .files import is_file
 from .images import image_size
 from .layout import Layout, PosedImage
 from .model import SH_C0
@@ -31,10 +32,10 @@ def read_nerf_layout(folder: str, config: TrainConfig) -> Layout:
     """Reads both json files and points3d.ply where there is one; else points are random. Raises SceneError."""
     train = _read_transforms(folder, "transforms_train.json")
     test = []
-    if os.path.isfile(os.path.join(folder, "transforms_test.json")):
+    if is_file(os.path.join(folder, "transforms_test.json")):
         test = _read_transforms(folder, "transforms_test.json")
     path = os.path.join(folder, "points3d.ply")
-    if os.path.isfile(path):
+    if is_file(path):
         points = _read_points(path)
     else:
         points = random_points(config.init_points or RANDOM_POINTS, config.seed)
@@ -90,7 +91,7 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
     image_path = os.path.join(folder, frame["file_path"])
     if not os.path.splitext(image_path)[1]:
         image_path += ".png"
-    if not os.path.isfile(image_path):
+    if not is_file(image_path):
         raise SceneError(f"{image_path}: no such image (named by frame {index} of {json_path})")
     width, height = image_size(image_path)
 

@@ -287,7 +287,7 @@ def test_splats_keep_the_gate_of_their_rendering(monkeypatch):
 
 
 @pytest.mark.parametrize("mode, gate", [
-    ("smoe", -0.1), ("smoe", math.nan), ("smoe", math.inf), ("smoe", "much"), ("smoe", (0.1, 0.2)),
+    ("smoe", -0.1), ("smoe", math.nan), ("smoe", math.inf), ("smoe", 1e39), ("smoe", "much"), ("smoe", (0.1, 0.2)),
     ("smoe", torch.ones(2, device="cpu")), ("smoe", torch.ones(0, device="cpu")), ("alpha", 0.5), ("alpha", 0),
     ("alpha", torch.tensor(1.0, device="cpu")), ("smoe_tn", 0.0), ("smoe_tn", 0.05),
     ("smoe_std", 1.0)], ids=lambda value: str(value).replace(" ", ""))

@@ -19,6 +19,7 @@ from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.methods.names import blend_of
 from diff_smoe_rasterization.benchmarks.suite import expand
 from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.errors import TrainerError
 
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
@@ -436,7 +437,7 @@ def is_free(results):
     try:
         with engine.only_one(str(results)):
             return True
-    except BenchError:
+    except TrainerError:
         return False
 
 
@@ -453,7 +454,7 @@ def processes_with(words):
 
 def test_a_second_run_on_the_same_results_is_refused(tmp_path):
     with engine.only_one(str(tmp_path)):
-        with pytest.raises(BenchError, match="another run"):
+        with pytest.raises(TrainerError, match=f"another run .*process {os.getpid()} on "):
             with engine.only_one(str(tmp_path)):
                 pass
 
@@ -555,7 +556,7 @@ def test_cells_are_told_the_gpus(content, tmp_path, monkeypatch):
 
     def reasons():
         lines = (tmp_path / "results" / "rows.jsonl").read_text().splitlines()
-        reasons = [json.loads(line)["reason"].partition(" --hold .lock") for line in lines]
+        reasons = [json.loads(line)["reason"].partition(" --hold .dsmoe.lock") for line in lines]
         return {reason[0].partition(" -m")[0] + reason[2] for reason in reasons}
 
     two = {"3 threads --gpus 0 --locks .locks --per-device 2"}

@@ -240,9 +240,12 @@ def test_the_net_pull_is_over_the_steps_since_the_last_state(tiny_scene, tmp_pat
     assert [state["net_pull"] for state in recorder.states] == pytest.approx([(1 - 0.5) / (1 + 0.5), -1])
 
 
-def test_a_folder_with_a_run_is_not_overwritten(watched_run):
+def test_a_folder_with_a_run_is_not_overwritten(watched_run, tmp_path):
     with pytest.raises(TrainerError, match="already holds"):
         mechanism.run(watched_run[0], progress=False)
+    (tmp_path / "results.json").touch()
+    with pytest.raises(TrainerError, match="holds results.json but no config.json"):
+        mechanism.run(watched_run[0].changed(output=str(tmp_path)), progress=False)
 
 
 @pytest.mark.parametrize("below", ["", "out"])

@@ -15,8 +15,8 @@ from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images,
 
 pytest.importorskip("matplotlib", reason="a report needs matplotlib")
 pytest.importorskip("jinja2", reason="a report needs jinja2")
-from diff_smoe_rasterization.benchmarks.errors import BenchError  # noqa: E402
 from diff_smoe_rasterization.benchmarks.report import ReportError, report, sliders, survey  # noqa: E402
+from diff_smoe_rasterization.trainer.errors import TrainerError  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_files_of_others_are_left_alone(tmp_path):
 def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path):
     results = write_rows(tmp_path / "results", [row()])
     (tmp_path / "file").touch()
-    with pytest.raises(BenchError, match="file: nothing can be written there .* choose another folder with -o"):
+    with pytest.raises(TrainerError, match="file: nothing can be written there .* choose another folder with -o"):
         report(results, str(tmp_path / "file"))
     report(results, str(tmp_path / "report"))
     (tmp_path / "elsewhere").mkdir()

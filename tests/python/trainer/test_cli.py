@@ -1,6 +1,7 @@
 """The `dsmoe` command from end to end, on a tiny ray-traced scene."""
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -17,6 +18,7 @@ from PIL import Image
 import diff_smoe_rasterization
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer import inspection
 from diff_smoe_rasterization.trainer.loop import Trainer
 from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
 
@@ -39,8 +41,8 @@ def trained(scene, tmp_path_factory):
     return output
 
 
-def ply_of(output):
-    return os.path.join(output, "point_cloud", "iteration_12", "point_cloud.ply")
+def ply_of(output, iterations=12):
+    return os.path.join(output, "point_cloud", f"iteration_{iterations}", "point_cloud.ply")
 
 
 def results_of(output):
@@ -85,6 +87,96 @@ def test_eval_measures_the_same_again(trained, capsys):
         assert after[name] == before[name], name
 
 
+def test_eval_of_a_run_that_cannot_be_written_to_prints_its_figures(trained, capsys, monkeypatch):
+    before, = results_of(trained)
+
+    def refuses(*_):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(inspection, "write_results", refuses)
+    assert main(["eval", trained]) == 0
+    text = capsys.readouterr().out
+    assert f"{before['psnr']:.2f}" in text and "could not be written anew (Read-only file system)" in text
+
+
+def test_a_run_knows_its_scene_from_any_folder(trained, scene, tmp_path, capsys, monkeypatch):
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
+    monkeypatch.chdir(os.path.dirname(scene))
+    for record in (os.path.basename(scene), "nowhere"):  # of an earlier version, which wrote the path as typed
+        edit_config(run, scene=record)
+        status = main(["eval", run])
+        assert status == (0 if record != "nowhere" else 1)
+    assert "--scene" in capsys.readouterr().err
+    relative = str(tmp_path / "relative")
+    assert main(["train", os.path.basename(scene), "-o", relative, *SHORT]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["eval", relative]) == 0 and main(["render", relative, "-o", "images"]) == 0
+    row, = results_of(relative)
+    assert row["scene"] == os.path.basename(scene)
+    edit_config(run, scene=os.path.basename(scene))
+    for command in (["eval", run], ["render", run, "-o", "no"]):
+        assert "relative to where it was trained; name with --scene" in fails(capsys, *command)
+    assert "name with SCENE" in fails(capsys, "train", "--resume", "-o", run)
+
+
+def edit_config(run, **options):
+    path = os.path.join(run, "config.json")
+    with open(path, encoding="utf-8") as file:
+        config = {**json.load(file), **options}
+    with open(path, "w", encoding="utf-8") as file:
+        json.dump(config, file)
+
+
+def test_what_cannot_be_read_is_not_called_missing(trained, scene, tmp_path, capsys):
+    """A link to itself stands for a folder that must not be read, which the superuser may read."""
+    loop = str(tmp_path / "loop")
+    os.symlink(loop, loop)
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
+    for name in ("results.json", "config.json"):
+        os.remove(os.path.join(run, name))
+        os.symlink(loop, os.path.join(run, name))
+        assert f"{name}: cannot be read (Too many levels" in fails(capsys, "eval", run)
+    assert "loop: cannot be read" in fails(capsys, "train", loop, "-o", str(tmp_path / "out"))
+    assert "loop: cannot be read" in fails(capsys, "render", loop, "-o", str(tmp_path / "out"))
+    resumed = str(tmp_path / "resumed")
+    shutil.copytree(trained, resumed)
+    os.remove(os.path.join(resumed, "checkpoint.pt"))
+    os.symlink(loop, os.path.join(resumed, "checkpoint.pt"))
+    assert "checkpoint.pt: cannot be read" in fails(capsys, "train", "--resume", "-o", resumed)
+
+
+def test_render_writes_into_its_own_folder_alone(trained, scene, tmp_path, capsys):
+    photographs = tmp_path / "scene" / "images"
+    shutil.copytree(os.path.join(scene, "images"), str(photographs))
+    before = {path.name: path.read_bytes() for path in photographs.iterdir()}
+    text = fails(capsys, "render", trained, "-o", str(photographs))
+    assert f"{photographs} is not empty (view_000.png)" in text and "-o" in text
+    assert before == {path.name: path.read_bytes() for path in photographs.iterdir()}
+    assert "dsmoe train wrote" in fails(capsys, "render", trained, "-o", trained)
+
+    own = tmp_path / "own"
+    own.mkdir()
+    assert main(["render", trained, "-o", str(own)]) == 0
+    (own / "view_003.png").write_bytes(b"mine")
+    assert "view_003.png is there" in fails(capsys, "render", trained, "-o", str(own), "--split", "all")
+    assert (own / "view_003.png").read_bytes() == b"mine"
+    (own / "view_003.png").unlink()
+    assert main(["render", trained, "-o", str(own), "--split", "train"]) == 0
+    assert len(list(own.glob("*.png"))) == 9, "the other split's images stay"
+    assert main(["render", ply_of(trained), "--scene", scene, "-o", str(own)]) == 0
+    assert [path.name for path in sorted(own.glob("*.png"))] == ["view_000.png", "view_008.png"], "no other model's"
+
+
+def test_records_that_name_files_elsewhere_are_refused(trained, tmp_path, capsys):
+    (tmp_path / "own").mkdir()
+    for name in ("../mine", "/mine"):
+        (tmp_path / "own" / ".dsmoe.json").write_text(json.dumps(
+            {"command": "dsmoe render", "of": "a scene", "files": [name]}))
+        assert "names files elsewhere" in fails(capsys, "render", trained, "-o", str(tmp_path / "own"))
+
+
 def test_eval_of_a_moved_run_and_a_moved_scene(trained, scene, tmp_path, capsys):
     run, moved = str(tmp_path / "run"), str(tmp_path / "scene")
     shutil.copytree(trained, run)
@@ -98,7 +190,7 @@ def test_eval_of_a_moved_run_and_a_moved_scene(trained, scene, tmp_path, capsys)
 def test_render_writes_what_eval_measures(trained, scene, tmp_path):
     folder = tmp_path / "images"
     assert main(["render", trained, "-o", str(folder)]) == 0
-    assert sorted(os.listdir(folder)) == ["view_000.png", "view_008.png"]
+    assert sorted(os.listdir(folder)) == [".dsmoe.json", "view_000.png", "view_008.png"]
     main(["eval", trained])
     with open(os.path.join(trained, "per_view.json"), encoding="utf-8") as file:
         per_view = {row["name"]: row["psnr"] for row in json.load(file)}
@@ -113,8 +205,8 @@ def test_render_a_ply_with_the_mode_that_it_records(trained, scene, tmp_path):
     assert main(["render", trained, "-o", str(tmp_path / "run"), "--split", "all"]) == 0
     assert main(["render", ply_of(trained), "-o", str(tmp_path / "ply"), "--scene", scene, "--split", "all"]) == 0
     names = sorted(os.listdir(tmp_path / "run"))
-    assert len(names) == 9 and names == sorted(os.listdir(tmp_path / "ply"))
-    for name in names:
+    assert len(names) == 10 and names == sorted(os.listdir(tmp_path / "ply"))
+    for name in names[1:]:  # the first is the record of what was written
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
 
 
@@ -158,7 +250,7 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
         assert f"gate {GATE}, not 0.5" in text
     text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe")
     assert "bare.ply" in text and "--background-gate" in text
-    assert "gate 0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
+    assert "gate 0.0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
                                       "--background-gate", "0.5")
     assert not (tmp_path / "no").exists()
     as_trained = render(trained, "run", "--background-gate", str(GATE))
@@ -226,6 +318,46 @@ def test_resume_on_the_command_line(scene, tmp_path, capsys):
     assert "resumed at iteration 12" in capsys.readouterr().out
     assert "--seed" in fails(capsys, *arguments, "--resume", "--seed", "7")
     assert main([*arguments, "--overwrite", "--seed", "7"]) == 0
+
+
+@pytest.mark.parametrize("words", [["--resume", "-o"], ["--resume"]])
+def test_resume_of_a_folder_alone_has_the_options_of_the_run(trained, tmp_path, capsys, monkeypatch, words):
+    output = str(tmp_path / "out")
+    shutil.copytree(trained, output)
+    os.remove(os.path.join(output, "checkpoint.pt"))  # so that it trains
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "alpha")
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "--quiet", *words, output]) == 0
+    with open(ply_of(output), "rb") as mine, open(ply_of(trained), "rb") as theirs:
+        assert mine.read() == theirs.read()
+    assert "--seed is 0 here and 7 there" in fails(capsys, "train", *words, output, "--seed", "7")
+    assert "config.json" in fails(capsys, "train", *words, str(tmp_path / "none"))
+    with pytest.raises(SystemExit):
+        main(["train", "-o", output])
+    assert "SCENE and -o OUT are needed" in capsys.readouterr().err
+
+
+def test_more_iterations_extend_a_run(trained, scene, tmp_path, capsys, monkeypatch, ctrl_c_works):
+    straight, stopped, ended = (str(tmp_path / name) for name in ("straight", "stopped", "ended"))
+    more = ["--iterations", "20"]
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 7)
+        assert main(["train", scene, "-o", stopped, *SMOE]) == 130
+    shutil.copytree(trained, ended)
+    assert main(["train", scene, "-o", straight, *SMOE, *more]) == 0
+    for output in (stopped, ended):
+        capsys.readouterr()
+        assert main(["train", "--resume", "-o", output, "--quiet", *more]) == 0
+        assert "extended from 12 to 20 iterations; milestones stay: densification until 10" in capsys.readouterr().out
+        row, = results_of(output)
+        assert row["protocol"]["iterations"] == 20
+    models = [open(ply_of(output, 20), "rb").read() for output in (straight, stopped, ended)]
+    assert models[0] == models[1] != models[2], "what had ended had left out its last step"
+    assert os.path.isfile(ply_of(ended))
+    text = fails(capsys, "train", "--resume", "-o", ended, "--iterations", "12")
+    assert "--iterations is 20 here and 12 there" in text
+    assert main(["train", scene, "-o", ended, *SMOE, "--overwrite"]) == 0
+    assert os.listdir(os.path.join(ended, "point_cloud")) == ["iteration_12"], "nothing of the old run outlives it"
 
 
 def test_errors_come_before_anything_is_written(scene, tmp_path, capsys):

@@ -131,7 +131,7 @@ def test_blend_mode_of_a_file_is_never_guessed():
     ("smoe", ("smoe", 0.1), 0.1, 0.1),
     ("smoe", ("smoe", 0.1), 0.2, r"a\.ply was trained with the background gate 0\.1, not 0\.2"),
     ("smoe", ("smoe", None), None, 0.0),  # older files are of Eq. 7
-    ("smoe", ("smoe", None), 0.05, "background gate 0, not 0.05"),
+    ("smoe", ("smoe", None), 0.05, "background gate 0.0, not 0.05"),
     ("smoe", (None, None), None, r"a\.ply does not say which background gate.*--background-gate"),
     ("smoe", (None, None), 0.2, 0.2),
     ("smoe", (None, None), -1.0, "background_gate is -1.0"),

@@ -2,13 +2,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.trainer import quickstart
+from diff_smoe_rasterization.trainer import files, quickstart
 from diff_smoe_rasterization.trainer.pictures import busiest_window, comparison, evenly_spaced
 
 
@@ -49,6 +50,25 @@ def test_the_table_and_a_second_run(tiny_scene, output, capsys):
     for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", "\nsmoe 0.",
                  "compare_view_000.png"):
         assert word in text
+
+
+def test_another_scene_is_refused_and_no_picture_is_stale(tiny_scene, output, tmp_path, capsys):
+    other = shutil.copytree(tiny_scene, str(tmp_path / "other"))
+    before = {path.name: path.stat().st_mtime_ns for path in output.iterdir()}
+    for scene in ([other], []):
+        assert quickstart.main([*scene, "-o", str(output), "--quiet"]) == 1
+        text = capsys.readouterr().err
+        assert tiny_scene in text and "-o" in text and text.count("\n") == 1
+    assert quickstart.main([tiny_scene, "-o", other, "--quiet"]) == 1
+    assert "is not empty (images)" in capsys.readouterr().err
+    assert before == {path.name: path.stat().st_mtime_ns for path in output.iterdir()}
+    files.write_json_atomically(str(output / ".dsmoe.json"), {"command": "quickstart", "of": tiny_scene, "files": [
+        "alpha.ply", "smoe.ply", "results.json", "compare_view_000.png", "compare_view_008.png", "compare_old.png"]})
+    (output / "compare_old.png").write_bytes(b"stale")
+    (output / "mine.png").write_bytes(b"mine")
+    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "10", "--quiet"]) == 0
+    assert sorted(path.name for path in output.glob("*.png")) == ["compare_view_000.png", "compare_view_008.png",
+                                                                  "mine.png"]
 
 
 def test_given_options_win_over_chosen_ones(tiny_scene):

@@ -200,12 +200,13 @@ def test_a_moved_scene_resumes(tiny_scene, tiny_config, tmp_path):
 def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, monkeypatch):
     config = dataclasses.replace(tiny_config, eval_every=10)
     train(config, progress=False)
-    assert sorted(os.listdir(config.output)) == ["checkpoint.pt", "config.json", "history.json", "per_view.json",
-                                                 "point_cloud", "results.json"]
+    assert sorted(os.listdir(config.output)) == [
+        ".dsmoe.json", ".dsmoe.lock", "checkpoint.pt", "config.json", "history.json", "per_view.json", "point_cloud",
+        "results.json"]
     kill_at(monkeypatch, 5)
     with pytest.raises(Killed):
         train(dataclasses.replace(config, seed=1), overwrite=True, progress=False)
-    assert os.listdir(config.output) == ["config.json"]
+    assert sorted(os.listdir(config.output)) == [".dsmoe.json", ".dsmoe.lock", "config.json"]
     with pytest.raises(TrainerError, match="choose one"):
         train(config, overwrite=True, resume=True, progress=False)
 
@@ -226,6 +227,76 @@ def test_a_run_is_not_overwritten_unasked(tiny_config):
     before = ply_bytes(tiny_config)
     train(changed, overwrite=True, progress=False)
     assert ply_bytes(changed) != before
+
+
+@pytest.mark.parametrize("name", ["results.json", "per_view.json", "point_cloud"])
+def test_the_output_of_another_program_is_not_written_over(tiny_config, name):
+    os.makedirs(tiny_config.output)
+    if name == "point_cloud":
+        os.makedirs(os.path.join(tiny_config.output, name))
+    else:
+        files.write_text_atomically(os.path.join(tiny_config.output, name), "{}")
+    for options in ({}, {"overwrite": True}, {"resume": True}):
+        with pytest.raises(TrainerError, match=f"out holds {name} but no config.json"):
+            train(tiny_config, progress=False, **options)
+    assert os.listdir(tiny_config.output) == [name]
+
+
+def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tiny_config, tmp_path):
+    config = dataclasses.replace(tiny_config, iterations=3)
+    output, elsewhere = config.output, tmp_path / "elsewhere"
+    (elsewhere / "iteration_7000").mkdir(parents=True)
+    os.makedirs(output)
+    train(config, progress=False)
+    shutil.move(os.path.join(output, "point_cloud", "iteration_3"), str(elsewhere))
+    os.rmdir(os.path.join(output, "point_cloud"))
+    os.symlink(str(elsewhere), os.path.join(output, "point_cloud"))
+    mine = [str(elsewhere / "iteration_7000" / "point_cloud.ply"), str(elsewhere / "notes.txt"),
+            os.path.join(output, "notes.txt")]
+    for path in mine:
+        files.write_text_atomically(path, "mine")
+    before = {name: os.path.getmtime(os.path.join(output, name)) for name in ("checkpoint.pt", "results.json")}
+    with pytest.raises(TrainerError, match="no such folder"):
+        train(dataclasses.replace(config, scene=str(tmp_path / "nowhere")), overwrite=True, progress=False)
+    broken = copied_scene(config.scene, tmp_path / "broken")
+    files.write_text_atomically(os.path.join(broken, "images", "view_001.png"), "no image")
+    with pytest.raises(TrainerError, match="view_001.png: not a readable image"):
+        train(dataclasses.replace(config, scene=broken), overwrite=True, progress=False)
+    with pytest.raises(TrainerError, match="iteration_7000.point_cloud.ply is there"):
+        train(dataclasses.replace(config, iterations=7000), overwrite=True, progress=False)
+    assert before == {name: os.path.getmtime(os.path.join(output, name)) for name in before}
+    train(dataclasses.replace(config, iterations=2), overwrite=True, progress=False)
+    assert os.path.islink(os.path.join(output, "point_cloud"))
+    assert sorted(os.listdir(elsewhere)) == ["iteration_2", "iteration_7000", "notes.txt"]
+    for path in mine:
+        with open(path, encoding="utf-8") as file:
+            assert file.read() == "mine"
+    os.remove(os.path.join(output, "point_cloud"))
+    os.symlink(str(tmp_path / "nowhere"), os.path.join(output, "point_cloud"))
+    with pytest.raises(TrainerError, match="point_cloud is no folder"):
+        train(config, overwrite=True, progress=False)
+
+
+def test_a_run_has_its_folder_alone(tiny_config, monkeypatch):
+    config, refused = dataclasses.replace(tiny_config, iterations=3), []
+    step = Trainer.step
+
+    def step_beside_others(self, *arguments):
+        for options in ({"resume": True}, {"overwrite": True}):
+            with pytest.raises(TrainerError, match=f"another run .*process {os.getpid()} on "):
+                train(config, progress=False, **options)
+            refused.append(options)
+        return step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", step_beside_others)
+        train(config, progress=False)
+    assert len(refused) == 6
+    files.write_text_atomically(os.path.join(config.output, ".dsmoe.lock"), "process 1 on this machine, which crashed")
+    train(config, resume=True, progress=False)
+    os.remove(os.path.join(config.output, ".dsmoe.json"))  # the run is of an earlier version
+    train(dataclasses.replace(config, iterations=2), overwrite=True, progress=False)
+    assert os.listdir(os.path.join(config.output, "point_cloud")) == ["iteration_2"]
 
 
 class Stranger:
@@ -260,6 +331,7 @@ def test_a_damaged_checkpoint_is_named(tiny_config, tmp_path, monkeypatch):
     refused("remove it.*load no stranger")
     torch.save({"format": -1}, path)
     refused("another version")
+    tiny_config.save(tiny_config.output)
     save_checkpoint(os.path.join(tiny_config.output, "checkpoint.pt"), {"config": {}})
     with pytest.raises(TrainerError, match="checkpoint.pt: not a readable checkpoint"):
         train(tiny_config, resume=True, progress=False)
@@ -323,7 +395,7 @@ def test_a_loss_that_is_not_finite_is_not_saved(tiny_config, monkeypatch):
     monkeypatch.setattr(Trainer, "step", diverging_step)
     with pytest.raises(TrainerError, match="iteration 3: the loss is nan"):
         train(dataclasses.replace(tiny_config, checkpoint_every=3), progress=False)
-    assert os.listdir(tiny_config.output) == ["config.json"]
+    assert sorted(os.listdir(tiny_config.output)) == [".dsmoe.json", ".dsmoe.lock", "config.json"]
 
 
 def test_views_come_once_each_in_random_order():

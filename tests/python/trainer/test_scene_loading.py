@@ -297,12 +297,19 @@ def test_masks_that_do_not_fit(colmap_folder):
     write_masks(colmap_folder, value=0)
     refused(colmap_folder, ".png.png", "keeps no pixel of")
     for name in os.listdir(os.path.join(colmap_folder, "masks")):
+        Image.new("L", (32, 24), 1).save(os.path.join(colmap_folder, "masks", name))
+    refused(colmap_folder, ".png.png", "values 0 and 1", "255")
+    for name in os.listdir(os.path.join(colmap_folder, "masks")):
         Image.new("L", (24, 32), 255).save(os.path.join(colmap_folder, "masks", name))
     refused(colmap_folder, ".png.png", "the mask is 24x32", "32x24", "another shape")
     for name in os.listdir(os.path.join(colmap_folder, "masks")):
         with open(os.path.join(colmap_folder, "masks", name), "wb") as file:
             file.write(b"no image")
     refused(colmap_folder, ".png.png", "not a readable image")
+    shutil.rmtree(os.path.join(colmap_folder, "masks"))
+    with open(os.path.join(colmap_folder, "masks"), "w", encoding="utf-8") as file:
+        file.write("not a folder")
+    refused(colmap_folder, "masks", "is no folder")
 
 
 def test_a_missing_image_folder(colmap_folder):
@@ -417,7 +424,7 @@ def frame(**values):
     (lambda content: content.update(camera_angle_x=5e-324), ["camera_angle_x", "5e-324"]),
     (lambda content: content.update(w=1, h=1e308), ["`h` is 1e+308", "at most 1e+09"]),
     (frame(transform_matrix=np.diag([1e200, 1e200, 1, 1]).tolist()), ["frame 0", "at most 1e+09"]),
-    (frame(file_path="./train/\0\x1b[2J\n\u202e"), ["train/\\x00\\x1b[2J\\n\\u202e.png: no such image"]),
+    (frame(file_path="./train/\x1b[2J\n\u202e"), ["train/\\x1b[2J\\n\\u202e.png: no such image"]),
     (frame(transform_matrix="DEEP"), ["transforms_train.json: not valid json"]),
 ])
 def test_a_wrong_json(nerf_folder, edit, words):
