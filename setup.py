@@ -162,7 +162,7 @@ def packages():
     names = list(folders)
     for name, folder in folders.items():
         names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
-    data = {PACKAGE: ["include/dsmoe/*.h"], f"{PACKAGE}.patches": ["shims/*/*/*.py"],  # shims are no packages of ours
+    data = {PACKAGE: ["include/dsmoe/*.h", "py.typed"], f"{PACKAGE}.patches": ["shims/*/*/*.py"],  # shims are no packages of ours
             f"{PACKAGE}.benchmarks": ["Snakefile", "suites/*.yaml", "suites/scenes/*.yaml"],
             f"{PACKAGE}.benchmarks.report": ["*.json", "*.html"]}
     return {"packages": names, "package_dir": folders, "package_data": data}

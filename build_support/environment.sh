@@ -4,8 +4,11 @@
 #   DSMOE_VENV    the environment's folder           (.venv in the repository)
 #   DSMOE_PYTHON  the Python that it is made of      (python3)
 #   DSMOE_TORCH   what pip is asked to install       (torch)
+#   DSMOE_BUILD_CUDA, TORCH_CUDA_ARCH_LIST   as in setup.py; where neither is set and there is no GPU, ./quickstart leaves
+#                                            the CUDA kernels out, and ./check compiles them
 
 unset PYTHONPATH PYTHONHOME
+cuda_without_gpu=0  # what DSMOE_BUILD_CUDA is by default; ./check says auto
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 case "${DSMOE_VENV-}" in '' | /*) ;; *) DSMOE_VENV=$PWD/$DSMOE_VENV ;; esac
 
@@ -16,16 +19,33 @@ fail() {
 
 # step WHAT COMMAND...: runs the command quietly; where it fails, shows the end of what it said.
 step() {
-  local what=$1 begin=$SECONDS
+  local what=$1 begin=$SECONDS from watcher status=0
   shift
   printf '  %s ... ' "$what"
-  if "$@" >>"$log" 2>&1; then
+  from=$(wc -c 2>/dev/null <"$log" || echo 0)
+  show_compiled "$what" "$((from + 1))" &
+  watcher=$!
+  "$@" >>"$log" 2>&1 || status=$?
+  { kill $watcher && wait $watcher; } 2>/dev/null || true
+  if [ $status -eq 0 ]; then
     printf 'done (%d s)\n' $((SECONDS - begin))
   else
     printf 'failed\n\n'
     tail -n 30 "$log" >&2
     fail "\"$what\" failed; the lines above are the end of $log"
   fi
+}
+
+# show_compiled WHAT FROM: says how many files are compiled, by what ninja wrote into the log from byte FROM on: on a
+# terminal in place, else a line a minute. Ends with this script, however that ends.
+show_compiled() {
+  local every=60 format='\n    %s of %s files compiled (%d s) ... ' begin=$SECONDS now
+  if [ -t 1 ]; then every=1 format="\r  $1 ... %s of %s files (%d s) ... "; fi
+  while sleep "$every" >/dev/null 2>&1 && kill -0 $$ 2>/dev/null; do
+    now=$(tail -c "+$2" "$log" | sed -n 's|^ *\[\([0-9]*\)/\([0-9]*\)\].*|\1 \2|p' | tail -n 1)
+    # shellcheck disable=SC2059,SC2086
+    if [ -n "$now" ]; then printf "$format" $now $((SECONDS - begin)); fi
+  done
 }
 
 processors() { getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1; }
@@ -54,7 +74,7 @@ fingerprint() {
         -type f ! -name '*.py[co]' ! -name '*.so' ! -name _build_info.py -exec cksum {} + || true
       cat "$venv"/lib/python*/site-packages/torch/version.py || true
     } 2>/dev/null | LC_ALL=C sort
-    echo "${torch_request[@]}" "${DSMOE_BUILD_CUDA-}" "${TORCH_CUDA_ARCH_LIST-}"
+    echo "${torch_request[@]}" "${DSMOE_BUILD_CUDA:-$cuda_without_gpu}" "${TORCH_CUDA_ARCH_LIST-}"
   ) | cksum
 }
 
@@ -66,12 +86,13 @@ sys.exit(tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 3))' && numpy=
   # Objects stay for the next build; assembled packages do not, or deleted modules would live on in them.
   rm -rf "$venv"/build/lib* "$venv"/build/bdist*
   printf '[build]\nbuild_base = %s\n' "$venv/build" >"$venv/build.cfg"
-  # Without a GPU its kernels cannot run here: it is enough that they compile, for one card.
+  # Without a GPU its kernels cannot run here: they are left out, or, where they are asked for, compiled for one card.
   if [ -z "${TORCH_CUDA_ARCH_LIST-}" ] &&
     "$venv/bin/python" -I -W ignore -c 'import sys, torch; sys.exit(torch.cuda.device_count() > 0)'; then
-    local -x TORCH_CUDA_ARCH_LIST=8.0+PTX
+    local -x TORCH_CUDA_ARCH_LIST=8.0+PTX DSMOE_BUILD_CUDA=${DSMOE_BUILD_CUDA:-$cuda_without_gpu}
   fi
-  DIST_EXTRA_CONFIG=$venv/build.cfg pip_install --no-build-isolation "$root" "$numpy"
+  # -v: the log gets each file as it is compiled.
+  DIST_EXTRA_CONFIG=$venv/build.cfg pip_install -v --no-build-isolation "$root" "$numpy"
 }
 
 # prepare_environment FOLDER [WORD...]: makes, updates or reuses the environment in FOLDER; sets `venv` to its path.
@@ -87,7 +108,8 @@ prepare_environment() {
     fail "$venv holds $("$venv/bin/python" --version), but DSMOE_PYTHON is $("$python" --version):" \
       "remove that folder, or name another one in DSMOE_VENV"
   fi
-  if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$(fingerprint)" ]; then
+  if [ -f "$stamp" ] && { [ "$(cat "$stamp")" = "$(fingerprint)" ] ||
+    [ "$(cat "$stamp")" = "$(cuda_without_gpu=auto fingerprint)" ]; }; then  # which has more than is needed
     echo "Reusing the environment $venv: nothing has changed since it was built."
     return
   fi

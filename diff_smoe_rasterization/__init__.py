@@ -5,31 +5,45 @@
 as with Inria's rasterizer of 2023; `blend_mode` in the settings is the one addition. `rasterize` is the full function.
 """
 import os
+import sys
+from typing import TYPE_CHECKING, Any
 
 from ._version import __version__
 from .settings import BLEND_MODES, OUTPUTS, Contributions, GaussianRasterizationSettings, Rendering
 
-try:
+_HOMES = {"build_info": "extension", "set_profiling": "extension", "stage_times": "extension", "fused_ssim": "losses",
+          "distCUDA2": "neighbors", "FusedAdam": "optimizers", "SparseGaussianAdam": "optimizers",
+          "GaussianRasterizer": "rasterizer", "rasterize": "rasterizer", "rasterize_gaussians": "rasterizer",
+          "rasterize_with_splats": "rasterizer", "settings_from_camera": "camera", "Splats": "splats"}
+
+if TYPE_CHECKING:
+    from .camera import settings_from_camera
     from .extension import build_info, set_profiling, stage_times
     from .losses import fused_ssim
     from .neighbors import distCUDA2
     from .optimizers import FusedAdam, SparseGaussianAdam
     from .rasterizer import GaussianRasterizer, rasterize, rasterize_gaussians, rasterize_with_splats
     from .splats import Splats
-except ImportError:
-    # What is plain Python (settings, reference, the `dsmoe` command's help) works without the compiled part. The other
-    # names say why they cannot be had when they are asked for: importing them again raises the same error.
-    _HOMES = {"build_info": "extension", "set_profiling": "extension", "stage_times": "extension",
-              "fused_ssim": "losses", "distCUDA2": "neighbors", "FusedAdam": "optimizers",
-              "SparseGaussianAdam": "optimizers", "GaussianRasterizer": "rasterizer", "rasterize": "rasterizer",
-              "rasterize_gaussians": "rasterizer", "rasterize_with_splats": "rasterizer", "Splats": "splats"}
 
-    def __getattr__(name):
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        import importlib
 
-        return getattr(importlib.import_module("." + _HOMES[name], __name__), name)
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    value = globals()[name] = getattr(importlib.import_module("." + _HOMES[name], __name__), name)
+    return value
+
+
+# What is plain Python (settings, reference, the `dsmoe` command's help) works without the compiled part: the names above
+# say why they cannot be had when they are asked for. To load it takes seconds, and registers torch's ops: the command
+# `dsmoe` does that where it renders, every other program here.
+if os.path.basename((getattr(sys, "argv", None) or [""])[0]) != "dsmoe":
+    try:
+        for _name in _HOMES:
+            __getattr__(_name)
+    except ImportError:
+        pass
 
 # setup.py installs the folders integrations, patches and benchmarks inside the package. In a source tree they lie
 # beside it, where its submodules are then looked for too. Beside an installed package such folders are a stranger's.
@@ -39,4 +53,5 @@ if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",
 
 __all__ = ["BLEND_MODES", "Contributions", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer",
            "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info", "distCUDA2",
-           "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling", "stage_times"]
+           "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
+           "settings_from_camera", "stage_times"]

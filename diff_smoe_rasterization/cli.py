@@ -4,20 +4,25 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import List, Optional
+from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 
+from ._version import __version__
 from .patches.errors import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
-from .trainer.checkpoint import CHECKPOINT_NAME
 from .trainer.config import (PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options,
                              holds_run)
 from .trainer.errors import TrainerError, in_one_line
 from .trainer.files import is_folder
+from .trainer.interrupt import exit_status
+
+if TYPE_CHECKING:
+    from .trainer.evaluation import Measure
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     parser = argparse.ArgumentParser(prog="dsmoe", description="Gaussian splatting with alpha and SMoE blending.")
+    parser.add_argument("--version", action="version", version=f"dsmoe {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     train = commands.add_parser("train", help="train Gaussians on a scene",
@@ -43,6 +48,9 @@ def build_parser() -> argparse.ArgumentParser:
     evaluate.add_argument("output", metavar="OUT", help="output folder of `dsmoe train`")
     evaluate.add_argument("--split", choices=("test", "train"), default="test", help="which views (default: test)")
     evaluate.add_argument("--scene", help="where the scene lies now, if it has moved")
+    evaluate.add_argument("--lpips", choices=("vgg", "alex"),
+                          help="also LPIPS with this network; weights: $DSMOE_LPIPS_VGG or $DSMOE_LPIPS_ALEX, else "
+                               "torchmetrics downloads them")
     _add_device(evaluate)
     evaluate.set_defaults(run=_eval)
 
@@ -64,6 +72,10 @@ def build_parser() -> argparse.ArgumentParser:
                         help="as in train (default: the run's, for a .ply scene)")
     render.add_argument("--white-background", action="store_true", default=None,
                         help="white background (default: the run's, for a .ply black)")
+    render.add_argument("--depth", action="store_true",
+                        help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
+    render.add_argument("--alpha", action="store_true",
+                        help="also NAME.alpha.png: how much of a pixel Gaussians cover, 8 bits")
     _add_device(render)
     render.set_defaults(run=_render)
 
@@ -94,13 +106,19 @@ def build_parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
     info.set_defaults(run=_info)
-    for command in (train, evaluate, render, run, info):
+
+    completion = commands.add_parser("completion", help="a script by which a shell completes commands and options",
+                                     description="Prints a script for the shell. In ~/.bashrc or, behind compinit, in "
+                                                 "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
+    completion.add_argument("shell", choices=("bash", "zsh"))
+    completion.set_defaults(run=_completion)
+    for command in (train, evaluate, render, run, info, completion):
         command.set_defaults(command_parser=command)
     return parser
 
 
 def main(argv: Optional[List[str]] = None) -> int:
-    """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 when interrupted."""
+    """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 or 143 if interrupted."""
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
     if unknown:  # argparse would show the usage of `dsmoe` alone
@@ -118,13 +136,15 @@ def main(argv: Optional[List[str]] = None) -> int:
             raise
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        from .trainer.checkpoint import CHECKPOINT_NAME
+
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = "; continue it with --resume" if continues else ""
         if arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
-        return 130
+        return exit_status(stop)
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
@@ -181,6 +201,30 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
     report.set_defaults(run=_bench_report)
 
 
+def _completion(arguments: argparse.Namespace) -> None:
+    cases = "\n".join(f"    {path}) words='{' '.join(words)}' ;;" for path, words in _words_of(build_parser()))
+    print(("autoload -U +X bashcompinit && bashcompinit\n" if arguments.shell == "zsh" else "") + f"""_dsmoe() {{
+  local words
+  case "${{COMP_WORDS[*]:1:COMP_CWORD-1}} " in
+{cases}
+  esac
+  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o bashdefault -o default -F _dsmoe dsmoe""")
+
+
+def _words_of(parser: argparse.ArgumentParser, path: str = "") -> Iterator[Tuple[str, List[str]]]:
+    """(pattern of what is typed before, words that may follow) of a parser's commands and then its own."""
+    words: List[str] = []
+    for action in parser._actions:
+        words += action.option_strings
+        if isinstance(action, argparse._SubParsersAction):
+            words += action.choices
+            for name, child in action.choices.items():
+                yield from _words_of(child, f"{path}{name}\\ ")
+    yield path + "*", words
+
+
 def _bench_run(arguments: argparse.Namespace) -> int:
     from .benchmarks.engine import rows_table, run_suite
 
@@ -217,7 +261,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     from .trainer.loop import train
     from .trainer.process import set_up_process
-    from .trainer.results import blend_name, results_table
+    from .trainer.results import blend_name, results_table, viewer_warning
 
     config = _train_config(arguments)
     set_up_process(config.device)
@@ -228,6 +272,8 @@ def _train(arguments: argparse.Namespace) -> None:
     print(results_table([row]))
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")
+    if viewer_warning(row):
+        print(viewer_warning(row))
 
 
 def _train_config(arguments: argparse.Namespace) -> TrainConfig:
@@ -246,11 +292,36 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
 
 def _eval(arguments: argparse.Namespace) -> None:
     from .trainer.inspection import evaluate_run
+    from .trainer.metrics import image_metrics
     from .trainer.results import results_table
 
-    row = evaluate_run(arguments.output, arguments.device, arguments.split, arguments.scene)
+    measure = _with_lpips(arguments.lpips, arguments.device) if arguments.lpips else image_metrics
+    row = evaluate_run(arguments.output, arguments.device, arguments.split, arguments.scene, measure=measure)
     print(f"{arguments.split} views")
     print(results_table([row]))
+    if arguments.lpips:
+        print(f"LPIPS ({arguments.lpips}, v0.1, 8-bit images in [-1, 1]): {row['lpips_' + arguments.lpips]:.4f}")
+
+
+def _with_lpips(net: str, device: str) -> Measure:
+    """The trainer's metrics and LPIPS of images without a mask. Raises TrainerError where its weights are not there."""
+    from .benchmarks.errors import BenchError
+    from .benchmarks.lpips import check_weights, lpips_network
+    from .trainer.metrics import image_metrics, quantised
+
+    kind = {"vgg": "lpips_vgg_std", "alex": "lpips_alex"}[net]
+    try:
+        check_weights([kind])
+        distance = lpips_network(kind, device)
+    except (BenchError, ImportError, ValueError) as error:
+        raise TrainerError(f"--lpips {net}: {error}") from error
+
+    def measure(image: Any, target: Any, mask: Any = None) -> Dict[str, Optional[float]]:
+        if mask is not None:
+            raise TrainerError("--lpips: the scene has masks, and LPIPS of a part of an image is not defined")
+        return {**image_metrics(image, target), "lpips_" + net: distance(quantised(image), target)}
+
+    return measure
 
 
 def _render(arguments: argparse.Namespace) -> None:
@@ -266,7 +337,8 @@ def _render(arguments: argparse.Namespace) -> None:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
-                          background_gate=arguments.background_gate)
+                          background_gate=arguments.background_gate,
+                          outputs=[name for name in ("depth", "alpha") if getattr(arguments, name)])
     print(f"{len(paths)} images in {arguments.output}")
 
 

@@ -123,8 +123,12 @@ def _without_batch(tensor, dim):
     return tensor[0] if tensor.dim() == dim + 1 and tensor.shape[0] == 1 else tensor
 
 
-def rasterize_gaussians(means3D, means2D, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp,
-                        raster_settings):
+_Absent = Optional[torch.Tensor]
+
+
+def rasterize_gaussians(means3D: torch.Tensor, means2D: _Absent, sh: _Absent, colors_precomp: _Absent,
+                        opacities: torch.Tensor, scales: _Absent, rotations: _Absent, cov3Ds_precomp: _Absent,
+                        raster_settings: GaussianRasterizationSettings) -> Tuple[torch.Tensor, torch.Tensor]:
     """Renders as `rasterize`, with the arguments of Inria's function of 2023 in its order.
 
     Returns: color [C, H, W], radii [N] int32.
@@ -137,7 +141,7 @@ def rasterize_gaussians(means3D, means2D, sh, colors_precomp, opacities, scales,
 class GaussianRasterizer(torch.nn.Module):
     """Renders as `rasterize`, as Inria's module of 2023 does. raster_settings: GaussianRasterizationSettings."""
 
-    def __init__(self, raster_settings: GaussianRasterizationSettings):
+    def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
         super().__init__()
         self.raster_settings = raster_settings
 
@@ -148,8 +152,9 @@ class GaussianRasterizer(torch.nn.Module):
         viewmatrix = _without_batch(required("viewmatrix", self.raster_settings.viewmatrix), 2)
         return torch.ops.diff_smoe_rasterization.mark_visible(positions, viewmatrix, float(self.raster_settings.near))
 
-    def forward(self, means3D, means2D, opacities, shs=None, colors_precomp=None, scales=None, rotations=None,
-                cov3D_precomp=None, dc=None):
+    def forward(self, means3D: torch.Tensor, means2D: _Absent, opacities: torch.Tensor, shs: _Absent = None,
+                colors_precomp: _Absent = None, scales: _Absent = None, rotations: _Absent = None,
+                cov3D_precomp: _Absent = None, dc: _Absent = None) -> Tuple[torch.Tensor, torch.Tensor]:
         """Returns color [C, H, W], radii [N] int32. Arguments and errors are those of `rasterize`."""
         rendering = rasterize(means3D, opacities, self.raster_settings, means2D=means2D, dc=dc, shs=shs,
                               colors_precomp=colors_precomp, scales=scales, rotations=rotations,

@@ -21,12 +21,12 @@ What the paper leaves open is decided here:
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Optional
+from typing import NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from .settings import OUTPUTS, Contributions, Rendering, resolve_blend
+from .settings import OUTPUTS, Contributions, GaussianRasterizationSettings, Rendering, resolve_blend
 
 
 def _float32(value):
@@ -76,8 +76,13 @@ def _rows(table, index):
     return type(table)(*(None if column is None else column[index] for column in table))
 
 
-def rasterize(means3D, opacities, settings, means2D=None, dc=None, shs=None, colors_precomp=None, scales=None,
-              rotations=None, cov3D_precomp=None, outputs=()):
+_Absent = Optional[torch.Tensor]
+
+
+def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
+              means2D: _Absent = None, dc: _Absent = None, shs: _Absent = None, colors_precomp: _Absent = None,
+              scales: _Absent = None, rotations: _Absent = None, cov3D_precomp: _Absent = None,
+              outputs: Sequence[str] = ()) -> Rendering:
     """Renders Gaussians; the arguments, shapes and results of `diff_smoe_rasterization.rasterize`.
 
     Args:
@@ -111,8 +116,10 @@ def rasterize(means3D, opacities, settings, means2D=None, dc=None, shs=None, col
     return Rendering(image[:channels], radii, **{name: images[name] for name in outputs})
 
 
-def contributions(means3D, opacities, settings, pixel_weights, dc=None, shs=None, colors_precomp=None, scales=None,
-                  rotations=None, cov3D_precomp=None):
+def contributions(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
+                  pixel_weights: torch.Tensor, dc: _Absent = None, shs: _Absent = None, colors_precomp: _Absent = None,
+                  scales: _Absent = None, rotations: _Absent = None,
+                  cov3D_precomp: _Absent = None) -> Tuple[torch.Tensor, torch.Tensor, Contributions]:
     """Scores Gaussians by their pixels; what `diff_smoe_rasterization.Splats` returns, without gradients.
 
     pixel_weights: [height, width]. The others are the arguments of `rasterize`.

@@ -3,9 +3,10 @@ from __future__ import annotations
 
 import math
 import os
-from typing import NamedTuple, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Any, NamedTuple, Optional, Tuple, Union
 
-import torch
+if TYPE_CHECKING:
+    import torch  # which takes seconds to load: the command line reads this file for its names
 
 BLEND_MODES = ("alpha", "smoe", "smoe_tn", "smoe_std")
 """The blend modes, by number in the C++ core.
@@ -31,7 +32,7 @@ BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
 RECOMMENDED_BACKGROUND_GATE = 0.03  # of captures, for trainers that cannot learn it: benchmarks/RESULTS.md
 MAX_BACKGROUND_GATE = 1e30  # that and a background's colour still make a float32 number
 
-BackgroundGate = Union[float, torch.Tensor]
+BackgroundGate = Union[float, "torch.Tensor"]
 """lambda: a number, or a tensor of one element, which receives a gradient.
 
 The number 1 is alpha blending bit for bit. A tensor of 1 keeps the footprints of `smoe`: where tiles end, pixels differ.
@@ -121,7 +122,7 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     """
     if blend_mode != "smoe":
         of_mode = 1.0 if blend_mode == "alpha" else 0.0
-        if background_gate is None or (blend_mode == "alpha" and not isinstance(background_gate, torch.Tensor)
+        if background_gate is None or (blend_mode == "alpha" and not _is_tensor(background_gate)
                                        and background_gate == 1):
             return of_mode
         raise ValueError(f"background_gate is given, but blend_mode is {blend_mode!r}; only 'smoe' knows it")
@@ -129,7 +130,7 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     if background_gate is None:
         background_gate = os.environ.get(BACKGROUND_GATE_VARIABLE) or 0.0
         source = BACKGROUND_GATE_VARIABLE
-    if isinstance(background_gate, torch.Tensor):
+    if _is_tensor(background_gate):
         if background_gate.numel() != 1:
             raise ValueError(f"background_gate has shape {list(background_gate.shape)}; it must have one element")
         return background_gate
@@ -143,6 +144,10 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     return value
 
 
+def _is_tensor(value: Any) -> bool:
+    return hasattr(value, "numel")
+
+
 def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, BackgroundGate]:
     """Returns the blend mode and the background's gate of a rendering.
 
@@ -150,7 +155,7 @@ def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, Backgro
     """
     mode = resolve_blend_mode(settings.blend_mode)
     gate = resolve_background_gate(mode, settings.background_gate)
-    return "alpha" if not isinstance(gate, torch.Tensor) and gate == 1 else mode, gate
+    return "alpha" if not _is_tensor(gate) and gate == 1 else mode, gate
 
 
 def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:

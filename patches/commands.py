@@ -84,7 +84,8 @@ def diff(arguments: argparse.Namespace) -> int:
 def revert(arguments: argparse.Namespace) -> int:
     """Puts every file back."""
     names = engine.revert(arguments.path)
-    print(f"{arguments.path}: as it was before the patch ({len(names)} files)")
+    print(f"{arguments.path}: as it was before the patch ({len(names)} files)"
+          + (f", with your edits of {', '.join(names.edited)}" if names.edited else ""))
     return 0
 
 

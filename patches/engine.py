@@ -16,6 +16,7 @@ from diff_smoe_rasterization._version import __version__
 
 from . import facts, source
 from .errors import PatchError
+from .merge import without_patch
 from .record import FOLDER, Record, check_writable, remove_rest, replace_file
 from .rules import GR, Trainer
 from .scope import build_files, notes_on_scripts, other_files, python_files
@@ -152,29 +153,41 @@ def _outcome(planned: Plan) -> Dict[str, Tuple[bytes, bytes]]:
     return made
 
 
-def revert(path: PathLike) -> Tuple[str, ...]:
-    """Puts every file that is patched back byte for byte and removes the record; returns the files' names.
+class Reverted(Tuple[str, ...]):
+    """Names of files that were put back; `edited` are those in which edits were kept."""
 
-    Raises PatchError, and touches nothing, where a patched file was changed since or where there is no record.
+    edited: Tuple[str, ...] = ()
+
+
+def revert(path: PathLike) -> Reverted:
+    """Puts every file that is patched back and removes the record; returns the files' names.
+
+    Files come back byte for byte; of one that was edited since, the edit stays. Raises PatchError, and touches nothing,
+    where an edit is of the patch's own lines, where a patched file is gone, and where there is no record.
     """
     root = _root(path)
     record = Record.load(root)
     if record is None and remove_rest(root):
-        return ()
+        return Reverted()
     if record is None:
         raise PatchError(f"{root}: there is no {FOLDER}, so nothing can be put back: it was not patched, or by hand")
     states = record.states() if Record.in_force(root) else {}
+    back = {name: record.original(name) for name, state in states.items() if state in ("patched", "changed")}
+    edited = {name: record.patched(name) for name in back if states[name] == "changed"}
     for name, state in states.items():
-        if state in ("changed", "gone"):
+        if state == "gone" or name in edited and edited[name] is None:
             raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. Undo your edit; or copy what lies in "
                              f"{FOLDER}/originals over the checkout, by which your edit is lost, and delete {FOLDER}")
-    patched = [name for name, state in states.items() if state == "patched"]
-    for name in patched:
+    for name, patched in edited.items():
+        back[name] = without_patch(name, back[name], patched, (root / name).read_bytes())
+    for name in back:
         check_writable(root, name)
-    for name in patched:
-        replace_file(root, root / name, record.original(name))
+    for name, data in back.items():
+        replace_file(root, root / name, data)
     record.remove()
-    return tuple(patched)
+    names = Reverted(back)
+    names.edited = tuple(edited)
+    return names
 
 
 _SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",

@@ -2,6 +2,7 @@
 
     .dsmoe_patch/manifest.json     {"files": {name: {"before": sha256, "after": [...], ...}}, "trainer": ..., ...}
     .dsmoe_patch/originals/NAME    the file as it was
+    .dsmoe_patch/patched/NAME      the file as it became, by which `revert` tells the user's edits from the patch
 
 The last of "after" is what the file became; earlier ones are of a patch that this one took over from, so that whatever
 moment an interruption came at, each file is known to be the original, patched, or changed by someone else.
@@ -80,9 +81,10 @@ class Record:
             new = sha256(after[name])
             files[name] = {"before": sha256(data), "after": [known for known in before if known != new] + [new],
                            "imports_ours": PACKAGE in after[name]}
-            copy = root / FOLDER / "originals" / name
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(root, copy, data)
+            for folder, content in (("originals", data), ("patched", after[name])):
+                copy = root / FOLDER / folder / name
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                replace_file(root, copy, content)
         replace_file(root, root / FOLDER / ".gitignore", b"*\n")
         record = cls(root, {"format": FORMAT, "complete": False, **notes, "files": files})
         record._write_manifest()
@@ -98,6 +100,14 @@ class Record:
 
     def original(self, name: str) -> bytes:
         return (self.folder / "originals" / name).read_bytes()
+
+    def patched(self, name: str) -> Optional[bytes]:
+        """The file as it became; None where an earlier version wrote the record, or where the copy is another."""
+        try:
+            data = (self.folder / "patched" / name).read_bytes()
+        except OSError:
+            return None
+        return data if sha256(data) == self.files[name]["after"][-1] else None
 
     def states(self) -> Dict[str, str]:
         """Returns of each file whether it is "original", "patched", or "changed", "replaced" or "gone" since."""

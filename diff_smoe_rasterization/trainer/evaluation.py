@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence
 
 import torch
-from tqdm import tqdm
 
 from .errors import TrainerError
 from .images import View
 from .metrics import image_metrics
+from .progress import progress_bar
 from .rendering import Renderer
 from .stopwatch import synchronised_time
 
@@ -39,7 +39,7 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
     with torch.no_grad():
         for view in views[:WARM_UP_VIEWS]:
             renderer(view.camera)
-        for view in tqdm(views, desc="evaluation", unit="view", disable=not progress, leave=False):
+        for view in progress_bar(views, desc="evaluation", unit="view", disable=not progress, leave=False):
             started = synchronised_time(device)
             color = renderer(view.camera).color
             elapsed = synchronised_time(device) - started

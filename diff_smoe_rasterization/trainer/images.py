@@ -10,12 +10,12 @@ from typing import List, Optional, Sequence, Tuple
 import numpy as np
 import torch
 from PIL import Image
-from tqdm import tqdm
 
 from .cameras import Camera
 from .config import TrainConfig
 from .errors import SceneError
 from .layout import PosedImage
+from .progress import progress_bar
 
 MAX_WIDTH = 1600  # of images at resolution -1
 MAX_PIXELS = 2**27  # of an image to train on, beyond which --resolution is taken for a mistake
@@ -79,7 +79,8 @@ def load_views(images: Sequence[PosedImage], config: TrainConfig, progress: bool
     """Reads images in parallel threads, in order, with a progress bar."""
     with ThreadPoolExecutor(min(16, 2 * (os.cpu_count() or 1))) as pool:
         loading = pool.map(lambda image: load_view(image, config), images)
-        return list(tqdm(loading, total=len(images), desc="images", unit="image", disable=not progress, leave=False))
+        return list(progress_bar(loading, total=len(images), desc="images", unit="image", disable=not progress,
+                                 leave=False))
 
 
 def load_view(posed: PosedImage, config: TrainConfig) -> View:

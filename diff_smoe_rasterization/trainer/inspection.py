@@ -2,22 +2,22 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List, Optional, Sequence
 
 import numpy as np
 import torch
 from PIL import Image
-from tqdm import tqdm
 
 from .config import LEARNED, TrainConfig
 from .errors import TrainerError
-from .evaluation import evaluate
+from .evaluation import Measure, evaluate
 from .files import write_json_atomically
 from .loop import PER_VIEW_NAME, check_device
-from .metrics import quantised
+from .metrics import image_metrics, quantised
 from .modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
 from .output_folder import Record, make_folder, own_record, write_record
 from .pictures import file_names
+from .progress import progress_bar
 from .rendering import Rasterize, Renderer, background_color
 from .results import read_results, result_row, write_results
 from .scene import load_cameras, load_scene
@@ -26,11 +26,12 @@ RENDER = "dsmoe render"  # in its folders' records
 
 
 def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_folder: Optional[str] = None,
-                 progress: bool = True, rasterize: Optional[Rasterize] = None) -> Dict[str, Any]:
+                 progress: bool = True, rasterize: Optional[Rasterize] = None,
+                 measure: Measure = image_metrics) -> Dict[str, Any]:
     """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
 
-    scene_folder: where the scene lies, if not where it was trained. A folder that cannot be written to is told, no
-    error. Raises TrainerError.
+    scene_folder: where the scene lies, if not where it was trained. measure: as in `evaluate`. A folder that cannot be
+    written to is told, no error. Raises TrainerError.
     """
     options = {"scene": scene_folder} if scene_folder else {}
     config = TrainConfig.of_run(output, "--scene", device=device, **options)
@@ -42,7 +43,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
         raise TrainerError(f"scene {config.scene} has no {split} views")
-    evaluation = evaluate(renderer, views, device, progress)
+    evaluation = evaluate(renderer, views, device, progress, measure)
     seconds = earlier[0].get("train_seconds") if earlier else None
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
     if split == "test":
@@ -74,10 +75,13 @@ def _gate_of(config: TrainConfig) -> Optional[float]:
 
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
                   blend_mode: Optional[str] = None, device: str = "cpu",
-                  rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None) -> List[str]:
+                  rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None,
+                  outputs: Sequence[str] = ()) -> List[str]:
     """Writes a PNG per camera of config.scene into `folder`; returns the paths.
 
     folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed.
+    outputs: "depth" and "alpha" are written beside each, as NAME.depth.npy [H, W] float32, which is the expected view
+    depth in the scene's units, 0 where nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
 
     ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: the model of the
     run that config is of, whose record these two must not contradict. Raises TrainerError.
@@ -98,11 +102,18 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     names = [name + ".png" for name in file_names([camera.name for camera in cameras])]
     make_folder(folder)
     kept = earlier.files if of == earlier.of else []  # those of another split
-    write_record(folder, RENDER, Record(of, sorted({*kept, *names})), earlier.files)
+    beside = {"depth": ".depth.npy", "alpha": ".alpha.png"}
+    written = [name[:-len(".png")] + ending for name in names for ending in (".png", *map(beside.get, outputs))]
+    write_record(folder, RENDER, Record(of, sorted({*kept, *written})), earlier.files)
     paths = [os.path.join(folder, name) for name in names]
     with torch.no_grad():
-        for camera, path in zip(tqdm(cameras, desc="images", unit="image", leave=False), paths):
-            to_image(renderer(camera).color).save(path)
+        for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
+            rendering = renderer(camera, outputs=tuple(outputs))
+            to_image(rendering.color).save(path)
+            if rendering.depth is not None:
+                np.save(path[:-len(".png")] + beside["depth"], rendering.depth[0].cpu().numpy())
+            if rendering.alpha is not None:
+                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path[:-len(".png")] + beside["alpha"])
     return paths
 
 

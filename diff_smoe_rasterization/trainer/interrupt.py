@@ -1,32 +1,43 @@
-"""Ctrl-C that waits for the end of a training step, so that what is saved then is whole."""
+"""Ctrl-C and SIGTERM that wait for the end of a training step, so that what is saved then is whole."""
 from __future__ import annotations
 
 import signal
 import threading
-from typing import Any
+from typing import Any, Dict, Optional
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM has asked for the end, as a queue's time limit does."""
+
+
+def exit_status(stop: KeyboardInterrupt) -> int:
+    """What a command returns that ends so: 130 after Ctrl-C, 143 after SIGTERM."""
+    return 143 if isinstance(stop, Terminated) else 130
 
 
 class DelayedInterrupt:
-    """A context in which the first Ctrl-C sets `asked` and a second one raises KeyboardInterrupt at once.
+    """A context in which the first Ctrl-C or SIGTERM sets `asked`; a second one acts at once, as it does elsewhere.
 
-    Does nothing outside the main thread, which alone may handle signals, or where Ctrl-C has a handler already.
+    Does nothing outside the main thread, which alone may handle signals, and leaves a signal that has a handler of
+    somebody else's.
     """
 
     def __init__(self) -> None:
-        self.asked = False
-        self._active = False
+        self.asked: Optional[KeyboardInterrupt] = None  # what is to be raised once all is saved
+        self._usual: Dict[int, Any] = {}
 
     def __enter__(self) -> "DelayedInterrupt":
-        self._active = (threading.current_thread() is threading.main_thread()
-                        and signal.getsignal(signal.SIGINT) is signal.default_int_handler)
-        if self._active:
-            signal.signal(signal.SIGINT, self._ask)
+        if threading.current_thread() is threading.main_thread():
+            usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+            self._usual = {number: handler for number, handler in usual.items() if signal.getsignal(number) == handler}
+        for number in self._usual:
+            signal.signal(number, self._ask)
         return self
 
     def __exit__(self, *error: Any) -> None:
-        if self._active:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in self._usual.items():
+            signal.signal(number, handler)
 
     def _ask(self, number: int, frame: Any) -> None:
-        self.asked = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self.asked = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+        self.__exit__()

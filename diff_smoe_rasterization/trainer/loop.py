@@ -7,7 +7,6 @@ import os
 from typing import Any, Callable, Dict, List, Optional
 
 import torch
-from tqdm import tqdm
 
 from ..losses import l1_ssim_loss_and_gradient
 from .background_gate import LearnedGate
@@ -24,6 +23,7 @@ from .model import GaussianModel, GaussianOptimizer
 from .modelfile import FOLDER, model_path, save_model
 from .order import ViewOrder
 from .output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
+from .progress import progress_bar
 from .randomness import random_state, restore_random_state, seed_everything
 from .rendering import Rasterize, Renderer, background_color
 from .results import RESULTS_NAME, result_row, write_results
@@ -195,8 +195,8 @@ class Run:
     def train(self) -> Dict[str, Any]:
         """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
         trainer, config = self.trainer, self.trainer.config
-        with tqdm(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
-                  disable=not self.progress, dynamic_ncols=True) as bar, DelayedInterrupt() as interrupt:
+        with progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
+                          disable=not self.progress, dynamic_ncols=True) as bar, DelayedInterrupt() as interrupt:
             trainer.watch.start()
             ends = trainer.iteration >= config.iterations
             while not ends:
@@ -206,15 +206,15 @@ class Run:
                 bar.update()
                 if trainer.iteration % PROGRESS_EVERY[config.device] == 0:
                     self._show(bar, _check_loss(step))
-                ends = trainer.iteration >= config.iterations or interrupt.asked
+                ends = trainer.iteration >= config.iterations or interrupt.asked is not None
                 if ends or _is_due(trainer.iteration, config.checkpoint_every):
                     trainer.watch.stop()
                     _check_loss(step)
                     self.save_checkpoint()
                     trainer.watch.start()
             trainer.watch.stop()
-        if interrupt.asked:
-            raise KeyboardInterrupt
+        if interrupt.asked is not None:
+            raise interrupt.asked
         gate = trainer.background_gate
         save_model(model_path(config.output, trainer.iteration), trainer.model, str(config.blend_mode), gate)
         evaluation = trainer.evaluate(self.progress)

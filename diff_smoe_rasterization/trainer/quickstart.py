@@ -17,13 +17,14 @@ from .config import TrainConfig, add_arguments
 from .errors import TrainerError, in_one_line
 from .images import View, image_size
 from .inspection import open_renderer, to_image
+from .interrupt import exit_status
 from .loop import check_device, train
 from .metrics import psnr, quantised
 from .modelfile import model_path
 from .output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .pictures import comparison, evenly_spaced, file_names
 from .process import set_up_process
-from .results import RESULTS_NAME, results_table, write_results
+from .results import RESULTS_NAME, results_table, viewer_warning, write_results
 from .scene import Scene, load_scene, read_layout
 from .synthetic import write_synthetic_scene
 
@@ -56,9 +57,9 @@ def main(argv: Optional[List[str]] = None) -> int:
             raise
         print(f"quickstart: error: {text}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         print("\nquickstart: interrupted", file=sys.stderr)
-        return 130
+        return exit_status(stop)
 
 
 def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
@@ -111,6 +112,7 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     print(results_table(rows))
     print(f"\n{len(scene.train)} training and {len(scene.test)} test views; "
           f"results and models: {output}; pictures: {', '.join(pictures)}")
+    print(viewer_warning(rows[1]))
     return rows
 
 

@@ -104,5 +104,13 @@ def blend_name(blend_mode: str, background_gate: Union[float, str, None]) -> str
     return f"smoe {background_gate if isinstance(background_gate, str) else format(background_gate, '.3g')}"
 
 
+def viewer_warning(row: Dict[str, Any]) -> str:
+    """What whoever opens the row's .ply in a viewer has to know; empty where it is blended by alpha."""
+    if row["blend_mode"] == "alpha" or row.get("background_gate") == 1:
+        return ""
+    return (f"note: the {row['blend_mode']} .ply holds gates; viewers of 3DGS blend them by alpha and show another "
+            "image, mostly too dark: use `dsmoe render`")
+
+
 def _number(value: Optional[float], digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"

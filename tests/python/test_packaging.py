@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import inspect
+import os
 import re
 import subprocess
 import sys
@@ -13,7 +15,7 @@ import pytest
 import torch
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization import extension
+from diff_smoe_rasterization import extension, reference
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "diff_smoe_rasterization"
@@ -34,6 +36,15 @@ def test_the_package_brings_every_public_header():
     names = {path.name for path in (SOURCE / "include" / "dsmoe").iterdir()}
     assert "rasterize.h" in names
     assert names == {path.name for path in (INSTALLED / "include" / "dsmoe").iterdir()}
+
+
+def test_type_checkers_find_the_types_of_public_functions():
+    assert (INSTALLED / "py.typed").is_file() and "py.typed" in load_setup().packages()["package_data"][SOURCE.name]
+    functions = [diff_smoe_rasterization.GaussianRasterizer.forward, reference.rasterize, reference.contributions,
+                 *(getattr(diff_smoe_rasterization, name) for name in diff_smoe_rasterization.__all__)]
+    for function in filter(inspect.isfunction, functions):
+        unknown = set(inspect.signature(function).parameters) - set(function.__annotations__) - {"self"}
+        assert not unknown and "return" in function.__annotations__, (function, unknown)
 
 
 def test_the_build_wrote_down_its_torch():
@@ -132,6 +143,36 @@ def test_cuda_is_built_where_torch_and_the_toolkit_fit(tmp_path, monkeypatch, to
             setup.reasons_against_cuda(["a.cu"], torch_of(torch_cuda), folder)
 
 
+def environment_sh(folder, commands):
+    """What bash prints for these commands after build_support/environment.sh, with a Python that sees no GPU."""
+    (folder / "bin").mkdir()
+    (folder / "bin" / "python").symlink_to("/bin/true")
+    unset = {name: value for name, value in os.environ.items()
+             if name not in ("DSMOE_BUILD_CUDA", "TORCH_CUDA_ARCH_LIST", "DSMOE_VENV")}
+    program = f'set -eu; source "{ROOT}/build_support/environment.sh"; venv="{folder}" log="{folder}/log"\n{commands}'
+    return subprocess.run(["bash", "-c", program], stdout=subprocess.PIPE, universal_newlines=True, env=unset,
+                          check=True).stdout
+
+
+def test_quickstart_builds_no_kernels_where_there_is_no_gpu_unless_asked(tmp_path):
+    said = environment_sh(tmp_path, """
+        pip_install() { echo "$DSMOE_BUILD_CUDA"; }
+        install_package
+        (export DSMOE_BUILD_CUDA=1; install_package)
+        cuda_without_gpu=auto  # as ./check says
+        install_package""")
+    assert said.split() == ["0", "1", "auto"]
+
+
+def test_a_long_step_says_how_many_files_are_compiled(tmp_path):
+    said = environment_sh(tmp_path, """
+        sleep() { command sleep 0.02; }  # in place of a minute
+        compile() { echo "  [2/3] c++ -c a.cpp"; command sleep 0.5; }
+        echo "[9/9] earlier" >"$log"
+        step Compiling compile""")
+    assert "2 of 3 files compiled (0 s)" in said and "9 of" not in said and "... done (" in said
+
+
 def test_a_card_or_a_list_decides_for_which_cards_kernels_are_built(tmp_path, monkeypatch):
     """Without such a flag torch builds for the cards that it sees, or for the list."""
     setup, (_, nvcc) = load_setup(), toolkit(tmp_path, "12.0", 80, 90)
@@ -159,6 +200,23 @@ def test_extension_of_another_torch_explains_itself(tmp_path):
     assert run.returncode != 0
     for word in ("ImportError", "built against torch 0.4.1", f"torch {torch.__version__} is running", "pip install"):
         assert word in run.stderr
+
+
+@pytest.mark.parametrize("words", [["--version"], ["--help"], ["train", "--help"], ["completion", "bash"]])
+def test_the_command_answers_without_loading_torch(tmp_path, words):
+    (tmp_path / "dsmoe").write_text(f"""import atexit, sys
+sys.path.insert(0, {str(INSTALLED.parent)!r})
+atexit.register(lambda: print("numpy" in sys.modules or "torch" in sys.modules, file=sys.stderr))
+from diff_smoe_rasterization.cli import main
+sys.exit(main(sys.argv[1:]))""")
+    run = subprocess.run([sys.executable, str(tmp_path / "dsmoe"), *words], stdout=subprocess.PIPE,
+                         stderr=subprocess.PIPE, universal_newlines=True)
+    assert (run.returncode, run.stderr) == (0, "False\n")
+    if words[0] == "--version":
+        assert run.stdout == f"dsmoe {diff_smoe_rasterization.__version__}\n"
+    if words[0] == "completion":
+        program = run.stdout + "COMP_WORDS=(dsmoe patch apply --mo) COMP_CWORD=3; _dsmoe; echo ${COMPREPLY[*]}"
+        assert subprocess.run(["bash", "-c", program], stdout=subprocess.PIPE).stdout == b"--modernise\n"
 
 
 def import_in(folder, name):

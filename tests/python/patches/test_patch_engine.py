@@ -231,7 +231,7 @@ def test_a_patch_by_hand_is_half_or_whole(tmp_path):
     refused(half, "train.py: rule pipe-blend-mode: is not applied", "render.py: rule pipe-blend-mode: is applied")
 
 
-@pytest.mark.parametrize("until", range(1, 13))
+@pytest.mark.parametrize("until", range(1, 17))
 def test_an_interruption_leaves_what_can_be_finished_or_put_back(tmp_path, monkeypatch, until):
     """The power fails before the n-th file is in its place."""
     make(tmp_path)
@@ -254,8 +254,9 @@ def test_an_interruption_leaves_what_can_be_finished_or_put_back(tmp_path, monke
         pass
     monkeypatch.undo()
     changed = [name for name in CHECKOUT if (tmp_path / name).read_bytes() != original[name][1]]
-    assert patches.check(tmp_path) == ("patched" if len(changed) == 4 else "half-patched" if until > 6 else "patchable")
-    if until > 6:  # the record is complete
+    state = "patched" if len(changed) == 4 else "half-patched" if until > 10 else "patchable"
+    assert patches.check(tmp_path) == state
+    if until > 10:  # the record is complete
         other = tmp_path.parent / f"reverted{until}"
         os.rename(str(tmp_path), str(other))
         if until % 2:
@@ -292,16 +293,45 @@ def test_a_file_that_changed_since_is_not_overwritten(tmp_path):
     verdict = patches.check(tmp_path)  # every rule is applied
     assert verdict == "patched" and verdict.reasons[1].startswith("train.py: was edited since")
     assert not patches.apply(tmp_path).written
-    refused(tmp_path, "train.py", "changed", "Undo your edit", "delete .dsmoe_patch", call=patches.revert)
     refused(tmp_path, "train.py", "changed", modernise=True)
     (tmp_path / "train.py").write_text(TRAIN + "# mine\n")  # the edit is kept, the patch is not
     refused(tmp_path, "train.py", "changed")
 
 
+def test_revert_keeps_edits_of_other_lines_than_the_patchs(tmp_path):
+    """Beside the patch's lines too."""
+    before = snapshot(make(tmp_path))
+    patches.apply(tmp_path)
+    edits = [("import torch\n", "import os\nimport torch\n"), ("first_iter = 0\n", "first_iter = 1\n"),
+             ("    # the first iteration is 1\n", "    print(dataset)\n"),
+             ("first_iter\n", "first_iter\n\n\nprint()\n")]
+    text, mine = (tmp_path / "train.py").read_text(), TRAIN
+    for old, new in edits:
+        text, mine = new.join(text.rsplit(old, 1)), new.join(mine.rsplit(old, 1))
+    (tmp_path / "train.py").write_text(text)
+    names = patches.revert(tmp_path)
+    assert names.edited == ("train.py",) and set(names) == set(PATCHED)
+    assert snapshot(tmp_path) == {**before, "train.py": (before["train.py"][0], mine.encode())}
+
+
+def test_an_edit_of_the_patchs_own_lines_is_shown(tmp_path):
+    patches.apply(make(tmp_path))
+    train, text = tmp_path / "train.py", (tmp_path / "train.py").read_text()
+    train.write_text(text.replace("blend_of(dataset)", "blend_of(other)"))
+    refused(tmp_path, "train.py: line 7: ", "nothing was touched", "\n  -    pipe.blend = blend_of(dataset)",
+            "\n  +    pipe.blend = blend_of(other)", call=patches.revert)
+    train.write_text(text.replace("    pipe.blend", "    if 1:\n        pipe.blend"))
+    refused(tmp_path, "train.py: line 7: ", call=patches.revert)
+    train.write_text(text.replace("    pipe.blend", "    if 1:\n      \\\n    pipe.blend"))
+    refused(tmp_path, "train.py: your edit needs statements of the patch", call=patches.revert)
+
+
 def test_the_way_out_of_an_edit_is_the_one_that_is_named(tmp_path):
+    """Where an earlier version, which kept no copy of the patched files, wrote the record."""
     original = snapshot(make(tmp_path))
     patches.apply(tmp_path)
     (tmp_path / "train.py").write_text((tmp_path / "train.py").read_text() + "# mine\n")
+    shutil.rmtree(str(tmp_path / ".dsmoe_patch/patched"))
     with pytest.raises(patches.PatchError, match="copy what lies in .dsmoe_patch/originals over the checkout"):
         patches.revert(tmp_path)
     for copy in (tmp_path / ".dsmoe_patch/originals").rglob("*.py"):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization import rasterize, settings_from_camera
 from diff_smoe_rasterization.trainer.cameras import Camera, scene_extent
 from diff_smoe_rasterization.trainer.synthetic import look_at
 
@@ -51,6 +51,22 @@ def test_viewmatrix_and_campos(camera):
     ahead = torch.tensor(camera.center + 2 * camera.rotation[2])
     depth = torch.cat([ahead, torch.ones(1, dtype=torch.float64)]) @ settings.viewmatrix
     np.testing.assert_allclose(depth[:3].numpy(), [0, 0, 2], rtol=0, atol=1e-12)
+
+
+def test_settings_of_tensors_have_gradients_and_bad_ones_are_named(camera):
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    leaves = [torch.tensor(value, requires_grad=True) for value in (K, camera.rotation, camera.translation)]
+    settings = settings_from_camera(*leaves, camera.width, camera.height, blend_mode="smoe")
+    same = camera.settings(torch.zeros(3), 3, "smoe")
+    for name, value in settings._asdict().items():
+        assert torch.equal(value, getattr(same, name)) if torch.is_tensor(value) else value == getattr(same, name), name
+    (settings.projmatrix.sum() + settings.campos.sum()).backward()
+    assert all(float(leaf.grad.abs().sum()) > 0 for leaf in leaves)
+    R, t = camera.rotation, camera.translation
+    for words, arguments in {"K is": (K + [[0, 1, 0]] * 3, R, t), "R is": (K, -R, t),
+                             r"t has shape \[3, 1\]": (K, R, t[:, None])}.items():
+        with pytest.raises(ValueError, match=words):
+            settings_from_camera(*arguments, 534, 948)
 
 
 def test_tangents_give_back_the_focal_lengths(camera):

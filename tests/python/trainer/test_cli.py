@@ -20,6 +20,7 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer import inspection
 from diff_smoe_rasterization.trainer.loop import Trainer
+from diff_smoe_rasterization.trainer.results import viewer_warning
 from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
@@ -201,6 +202,30 @@ def test_render_writes_what_eval_measures(trained, scene, tmp_path):
         assert 10 * np.log10(255**2 / ((rendered - truth) ** 2).mean()) == pytest.approx(psnr, abs=1e-4)
 
 
+def test_eval_measures_lpips_where_asked(trained, tmp_path, capsys, monkeypatch):
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
+    monkeypatch.setenv("DSMOE_LPIPS_VGG", str(tmp_path / "nowhere.npz"))
+    assert "nowhere.npz: no such file" in fails(capsys, "eval", run, "--lpips", "vgg")
+    monkeypatch.delenv("DSMOE_LPIPS_VGG")
+    asked = []
+    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.lpips.lpips_network",
+                        lambda kind, device: asked.append((kind, device)) or (lambda image, target: 0.25))
+    assert main(["eval", run, "--lpips", "vgg"]) == 0
+    assert "LPIPS (vgg, v0.1, 8-bit images in [-1, 1]): 0.2500\n" in capsys.readouterr().out
+    assert asked == [("lpips_vgg_std", "cpu")] and results_of(run)[0]["lpips_vgg"] == 0.25
+
+
+def test_render_writes_depth_and_alpha_where_asked(trained, tmp_path):
+    assert main(["render", trained, "-o", str(tmp_path), "--depth", "--alpha"]) == 0
+    ends = ("alpha.png", "depth.npy", "png")
+    assert sorted(os.listdir(tmp_path))[1:] == [f"view_00{view}.{end}" for view in "08" for end in ends]
+    depth, alpha = np.load(tmp_path / "view_000.depth.npy"), np.asarray(Image.open(tmp_path / "view_000.alpha.png"))
+    assert depth.shape == alpha.shape == (24, 32) and (depth.dtype, alpha.dtype) == (np.float32, np.uint8)
+    assert np.all((depth > 0.2) | (depth == 0)) and alpha.max() > 200
+    assert np.all(depth[alpha > 0] > 0), "what covers a pixel has a depth"
+
+
 def test_render_a_ply_with_the_mode_that_it_records(trained, scene, tmp_path):
     assert main(["render", trained, "-o", str(tmp_path / "run"), "--split", "all"]) == 0
     assert main(["render", ply_of(trained), "-o", str(tmp_path / "ply"), "--scene", scene, "--split", "all"]) == 0
@@ -281,6 +306,12 @@ def test_a_run_from_before_the_background_gate_is_of_the_paper(scene, tmp_path, 
     assert (after["psnr"], after["background_gate"]) == (before["psnr"], 0.0)
 
 
+@pytest.mark.parametrize("mode, gate, warns", [("alpha", 1, False), ("smoe", 1, False), ("smoe", 0.03, True),
+                                               ("smoe_std", 0, True)])
+def test_a_model_that_viewers_would_show_wrongly_is_named(mode, gate, warns):
+    assert bool(viewer_warning({"blend_mode": mode, "background_gate": gate})) == warns
+
+
 def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path, capsys):
     output = str(tmp_path / "out")
     assert main(["train", scene, "-o", output, "--blend-mode", "smoe", "--background-gate", "learned", *SHORT]) == 0
@@ -289,6 +320,7 @@ def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path
     gate = row["background_gate"]
     assert 0.03 < gate < 2 and gate != 1.0
     text = capsys.readouterr().out
+    assert "viewers of 3DGS blend them by alpha" in text
     assert "smoe learned" in text and f"\nsmoe {gate:.3g} " in text
     assert io.read_gaussians(ply_of(output)).background_gate == gate
     assert main(["eval", output]) == 0
@@ -341,7 +373,7 @@ def test_more_iterations_extend_a_run(trained, scene, tmp_path, capsys, monkeypa
     straight, stopped, ended = (str(tmp_path / name) for name in ("straight", "stopped", "ended"))
     more = ["--iterations", "20"]
     with monkeypatch.context() as patch:
-        interrupt_at(patch, 7)
+        interrupt_at(patch, 7, signal.SIGINT)
         assert main(["train", scene, "-o", stopped, *SMOE]) == 130
     shutil.copytree(trained, ended)
     assert main(["train", scene, "-o", straight, *SMOE, *more]) == 0
@@ -420,13 +452,13 @@ def test_resume_and_overwrite_exclude_each_other(scene, tmp_path, capsys):
     assert "not allowed with" in capsys.readouterr().err
 
 
-def interrupt_at(monkeypatch, iteration):
-    """Presses Ctrl-C in the middle of that iteration's step."""
+def interrupt_at(monkeypatch, iteration, number):
+    """Sends this process a signal in the middle of that iteration's step."""
     step = Trainer.step
 
     def interrupted_step(self, *arguments):
         if self.iteration + 1 == iteration:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         return step(self, *arguments)
 
     monkeypatch.setattr(Trainer, "step", interrupted_step)
@@ -440,12 +472,15 @@ def ctrl_c_works():
     signal.signal(signal.SIGINT, before)
 
 
-def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works):
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works, number,
+                                                   status):
     output = str(tmp_path / "out")
     arguments = ["train", scene, "-o", output, *SMOE]
     with monkeypatch.context() as patch:
-        interrupt_at(patch, 7)
-        assert main(arguments) == 130
+        interrupt_at(patch, 7, number)
+        assert main(arguments) == status
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     assert capsys.readouterr().err.endswith("interrupted; continue it with --resume\n")
     assert main([*arguments, "--resume"]) == 0
     assert "resumed at iteration 7" in capsys.readouterr().out

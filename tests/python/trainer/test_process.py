@@ -1,9 +1,11 @@
-"""What a command sets for the whole process of a training."""
+"""What a command sets for the whole process of a training, and what its log gets of progress."""
 from __future__ import annotations
+
+import io
 
 import torch
 
-from diff_smoe_rasterization.trainer import process
+from diff_smoe_rasterization.trainer import process, progress
 
 
 def test_a_training_on_a_gpu_has_one_thread_of_the_host_and_one_on_the_cpu_has_all(monkeypatch):
@@ -19,3 +21,14 @@ def test_a_training_on_a_gpu_has_one_thread_of_the_host_and_one_on_the_cpu_has_a
         assert len(called) == 2
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_bar_in_a_file_is_a_line_a_minute(monkeypatch):
+    log, now = io.StringIO(), [0.0]
+    monkeypatch.setattr("sys.stderr", log)
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    for leave in (False, True):
+        for _ in progress.progress_bar(range(150), desc="images", mininterval=0, leave=leave):
+            now[0] += 1
+    lines = log.getvalue().splitlines()
+    assert len(lines) == 4 and all(line.startswith("images: ") and "/150" in line for line in lines)

@@ -1,0 +1,63 @@
+"""From a calibrated pinhole camera to the settings of a rendering."""
+from __future__ import annotations
+
+from typing import Any, Optional
+
+import torch
+
+from .settings import GaussianRasterizationSettings
+
+# Clip range of the projection matrix. Nothing reads clip z (culling uses view depth), so it only has to be finite.
+CLIP_NEAR = 0.01
+CLIP_FAR = 100.0
+
+
+def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Optional[torch.Tensor] = None,
+                         sh_degree: int = 3, scale_modifier: float = 1.0, dtype: Optional[torch.dtype] = None,
+                         **options: Any) -> GaussianRasterizationSettings:
+    """The settings of a pinhole camera, transposed matrices included.
+
+    Args:
+        K: [3, 3] intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. As in COLMAP, the centre of the top left
+            pixel is (0.5, 0.5); where it is (0, 0), as in OpenCV, add 0.5 to cx and cy.
+        R, t: [3, 3] and [3], world to view: x_view = R x_world + t, with x right, y down, z forward.
+        width, height: of the image in pixels.
+        bg: [C] background colour; black where it is None. The matrices are on its device.
+        dtype: of the matrices, by default that of bg, else float32.
+        options: further fields of the settings, such as blend_mode.
+    K, R and t are tensors, arrays or lists. The matrices have gradients with respect to R, t and, in the projection, K.
+
+    Returns: GaussianRasterizationSettings. Raises ValueError where a shape does not fit, K has skew or focal lengths
+    that are not positive, or R is no rotation.
+    """
+    dtype = dtype or (torch.float32 if bg is None else bg.dtype)
+    bg = torch.zeros(3, dtype=dtype) if bg is None else bg
+    device = R.device if isinstance(R, torch.Tensor) else "cpu"  # computed there: elsewhere to check values would wait
+    K, R, t = (torch.as_tensor(value, dtype=torch.float64, device=device) for value in (K, R, t))
+    for name, value, shape in (("K", K, [3, 3]), ("R", R, [3, 3]), ("t", t, [3])):
+        if list(value.shape) != shape:
+            raise ValueError(f"settings_from_camera: {name} has shape {list(value.shape)}; it must be {shape}")
+    rows = K.detach().tolist()
+    fx, fy = rows[0][0], rows[1][1]
+    if not (fx > 0 and fy > 0 and [rows[0][1], rows[1][0], *rows[2]] == [0, 0, 0, 0, 1]):
+        raise ValueError(f"settings_from_camera: K is {rows}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx "
+                         "and fy above 0")
+    rotation = R.detach()
+    error = (rotation @ rotation.T - torch.eye(3).to(rotation)).abs().max()
+    if not (error < 1e-3 and torch.linalg.det(rotation) > 0):
+        raise ValueError(f"settings_from_camera: R is {rotation.tolist()}; it must be a rotation")
+    last = K.new_tensor([[0.0, 0.0, 0.0, 1.0]])
+    view = torch.cat([torch.cat([R, t[:, None]], dim=1), last])
+    # The rasterizer puts NDC x at pixel index ((x + 1) width - 1) / 2, so that a point at fx X/Z + cx (COLMAP's
+    # coordinates, half a pixel above the index) needs x = 2 fx/width X/Z + 2 cx/width - 1; y likewise.
+    size = K.new_tensor([width, height])[:, None]
+    image = 2 * K[:2] / size - K.new_tensor([[0.0, 0.0, 1.0]])
+    depth = CLIP_FAR / (CLIP_FAR - CLIP_NEAR)
+    clip = torch.cat([torch.cat([image, K.new_zeros(2, 1)], dim=1),
+                      K.new_tensor([[0.0, 0.0, depth, -CLIP_NEAR * depth], [0.0, 0.0, 1.0, 0.0]])])
+    view, projection, center = (matrix.contiguous().to(bg.device, dtype)
+                                for matrix in (view.T, (clip @ view).T, -R.T @ t))
+    return GaussianRasterizationSettings(
+        image_height=height, image_width=width, tanfovx=width / (2 * fx), tanfovy=height / (2 * fy), bg=bg,
+        scale_modifier=scale_modifier, viewmatrix=view, projmatrix=projection, sh_degree=sh_degree, campos=center,
+        **options)

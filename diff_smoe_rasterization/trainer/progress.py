@@ -1,0 +1,33 @@
+"""Progress bars: drawn in place on a terminal; in a file, such as a job's log, a line a minute at most."""
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any, TextIO
+
+from tqdm import tqdm
+
+SECONDS = 60.0  # between two lines
+
+
+class _Lines:
+    """Stands for a stream that is no terminal: of all that a bar draws it writes a line a minute, the first after one.
+
+    So what takes less than that leaves nothing.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream, self.written = stream, time.monotonic()
+
+    def write(self, text: str) -> None:
+        if text.strip() and time.monotonic() - self.written >= SECONDS:
+            self.written = time.monotonic()
+            self.stream.write(text.strip() + "\n")
+
+    def flush(self) -> None:
+        self.stream.flush()
+
+
+def progress_bar(*arguments: Any, **options: Any) -> "tqdm[Any]":
+    """A tqdm with these arguments, on stderr."""
+    return tqdm(*arguments, file=sys.stderr if sys.stderr.isatty() else _Lines(sys.stderr), **options)
