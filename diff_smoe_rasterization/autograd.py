@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 
 import torch
+from torch.autograd import forward_ad
 
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 
@@ -26,6 +27,18 @@ _ALPHA = 0  # BLEND_MODES.index("alpha")
 _below_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", None)
 if not hasattr(_below_autograd, "__enter__"):  # torch 1.13 has it, but not as a context manager
     _below_autograd = contextlib.nullcontext
+
+
+def refuse_forward_mode(function, values):
+    """Raises NotImplementedError where a tensor among the values carries a tangent: the ops would drop it."""
+    if forward_ad._current_level < 0:  # nobody takes a forward-mode derivative; unpack_dual would cost time
+        return
+    # Tensors that torch.compile traces do not always show their tangents.
+    compiling = _CAN_REGISTER and torch.compiler.is_compiling()
+    for value in values:
+        if isinstance(value, torch.Tensor) and (compiling or forward_ad.unpack_dual(value).tangent is not None):
+            raise NotImplementedError(f"{function}: forward-mode derivatives (torch.func.jvp, jacfwd, dual tensors) "
+                                      "are not implemented; take those of backward mode (torch.autograd.grad)")
 
 
 def _remember(ctx, inputs, output):
@@ -46,6 +59,7 @@ def _keep(ctx, inputs, output):
 def _input_gradients(ctx, gradients, outputs, inputs, op):
     wanted = list(ctx.needs_input_grad[:_NUM_INPUTS])
     image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
+    refuse_forward_mode("rasterize", [*gradients, *inputs])
     results = iter(op(*image_gradients, inputs, ctx.present, outputs, *ctx.options, wanted))
     no_tensors = len(ctx.needs_input_grad) - _NUM_INPUTS
     return tuple(next(results) if want else None for want in wanted) + (None,) * no_tensors
@@ -90,6 +104,7 @@ class _Rasterize(torch.autograd.Function):
 
 def rasterize_op(*inputs):
     """Calls the op `rasterize` differentiably. Arguments and results: csrc/torch/schema.cpp."""
+    refuse_forward_mode("rasterize", inputs)
     if _CAN_REGISTER and torch.compiler.is_compiling():
         return _OPS.rasterize(*inputs, torch.is_grad_enabled())  # for_backward
     if torch.is_grad_enabled() and any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs):

@@ -11,7 +11,7 @@ from .patches.errors import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.config import (PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options,
                              holds_run)
-from .trainer.errors import TrainerError
+from .trainer.errors import TrainerError, in_one_line
 from .trainer.files import is_folder
 from .trainer.interrupt import exit_status
 
@@ -130,8 +130,11 @@ def main(argv: Optional[List[str]] = None) -> int:
     except BrokenPipeError:  # whoever read the output, such as `head`, has enough of it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (TrainerError, PatchError, ImportError, OSError) as error:
-        print(f"dsmoe {arguments.command}: error: {error}", file=sys.stderr)
+    except Exception as error:
+        text = str(error) if isinstance(error, PatchError) else in_one_line(error)
+        if text is None:
+            raise
+        print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
         from .trainer.checkpoint import CHECKPOINT_NAME

@@ -5,6 +5,7 @@ from typing import Any, Tuple
 
 import torch
 
+from .autograd import refuse_forward_mode
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -18,6 +19,7 @@ def activate(opacities: torch.Tensor, scales: torch.Tensor,
     sigmoid(.), scales exp(.), rotations of length 1 (a quaternion shorter than 1e-12 is divided by that).
     Raises ValueError or TypeError where shapes, types or devices do not fit.
     """
+    refuse_forward_mode("activate", (opacities, scales, rotations))
     if torch.is_grad_enabled() and (opacities.requires_grad or scales.requires_grad or rotations.requires_grad):
         return _Activate.apply(opacities, scales, rotations)
     return _OPS.activate(opacities, scales, rotations)

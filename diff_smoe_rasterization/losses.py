@@ -5,6 +5,7 @@ from typing import Any, Tuple
 
 import torch
 
+from .autograd import refuse_forward_mode
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -49,6 +50,7 @@ def _refuse_gradient(function: str, name: str, tensor: torch.Tensor) -> None:
 
 
 def _image_loss(image: torch.Tensor, *arguments: Any) -> torch.Tensor:
+    refuse_forward_mode("SSIM and the image loss", [image, *arguments])
     if image.requires_grad and torch.is_grad_enabled():
         return _ImageLoss.apply(image, *arguments)
     return _OPS.image_loss(image, *arguments, False)[0]

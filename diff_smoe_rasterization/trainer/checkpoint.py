@@ -1,19 +1,21 @@
 """Checkpoints: everything that the rest of a run depends on, in one file that is whole or absent."""
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import pickle
 import zipfile
-from typing import Any, Dict
+from typing import Any, Dict, Iterator
 
 import torch
 
-from .errors import TrainerError
+from .errors import TrainerError, out_of_memory
 from .files import write_atomically
 
 CHECKPOINT_NAME = "checkpoint.pt"
 TENSOR = "__tensor__"  # marks where a tensor was
+# Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
+SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
 FORMAT = 2  # raised when the content changes so that older files cannot be resumed
 
 
@@ -29,13 +31,36 @@ def load_checkpoint(path: str, device: str) -> Dict[str, Any]:
     """Reads what `save_checkpoint` wrote, tuples as lists, without running code from the file. Raises TrainerError."""
     if not os.path.isfile(path):
         raise TrainerError(f"{path}: no such checkpoint")
-    try:
+    with damage_named(path):
+        with zipfile.ZipFile(path) as archive:
+            if archive.testzip():  # torch compares no checksum: a flipped bit would be another number
+                raise zipfile.BadZipFile
         content = torch.load(path, map_location=device, weights_only=True)
-    except (RuntimeError, OSError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
-        raise TrainerError(f"{path}: not a readable checkpoint ({error})") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise TrainerError(f"{path}: a checkpoint of another version; it cannot be resumed")
-    return _with_tensors(json.loads(content["plain"]), content["tensors"])
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise TrainerError(f"{path}: a checkpoint of another version; it cannot be resumed")
+        return _with_tensors(json.loads(content["plain"]), content["tensors"])
+
+
+@contextlib.contextmanager
+def damage_named(path: str) -> Iterator[None]:
+    """Makes a TrainerError of whatever a damaged checkpoint causes while it is read and taken over.
+
+    Its text is not torch's, which advises to read such a file with weights_only=False, and so to run code from it.
+    """
+    try:
+        yield
+    except TrainerError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.strerror:
+            raise TrainerError(f"{path}: cannot be read: {error.strerror}") from error
+        if out_of_memory(error):
+            raise
+        text = f"{path}: not a readable checkpoint; remove it, and --resume starts the run anew"
+        if not SAFE_LOAD:
+            text += (f" (load no stranger's: torch {torch.__version__} may run code from a file that was made for it, "
+                     "2.6 and later do not)")
+        raise TrainerError(text) from error
 
 
 def _without_tensors(value: Any, name: str, tensors: Dict[str, torch.Tensor]) -> Any:

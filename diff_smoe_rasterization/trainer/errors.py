@@ -1,9 +1,20 @@
 """The errors a user can cause; the command prints their text and no traceback."""
 from __future__ import annotations
 
+import re
+from typing import Optional
+
+
+def printable(text: str) -> str:
+    """The text on one line; what a terminal would obey or hide is written as its escape, such as \\x1b or \\n."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
 
 class TrainerError(ValueError):
-    """Something asked of the trainer cannot be done; the text says what and why."""
+    """Something asked of the trainer cannot be done; the text says what and why, and is printable."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(printable(text))
 
 
 class SceneError(TrainerError):
@@ -12,3 +23,22 @@ class SceneError(TrainerError):
 
 class ConfigError(TrainerError):
     """An option, or a file of options, has a value that it must not have."""
+
+
+def in_one_line(error: BaseException) -> Optional[str]:
+    """What a command prints of an error in place of a traceback; None where the error is no user's."""
+    if isinstance(error, (TrainerError, ImportError, OSError)):
+        return str(error)
+    return out_of_memory(error)
+
+
+def out_of_memory(error: BaseException) -> Optional[str]:
+    """Whose memory did not suffice, and for how much; None where the error is another one."""
+    text = str(error)
+    if not isinstance(error, MemoryError) and not (
+            isinstance(error, RuntimeError) and re.search("out of memory|can't allocate memory|bad_alloc", text)):
+        return None
+    size = re.search(r"(?:tried to|unable to) allocate ([\d.]+ ?\w+)", text, re.IGNORECASE)
+    return (f"the {'GPU' if 'CUDA' in text else 'machine'} is out of memory"
+            f"{f', {size.group(1)} more were asked for' if size else ''}; "
+            "take smaller images (--resolution) or fewer Gaussians (a higher --densify-grad-threshold)")

@@ -1,11 +1,12 @@
 """Files that are whole or absent, written beside their place, flushed and renamed; and whether one is there."""
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import stat
-from typing import Any, BinaryIO, Callable
+from typing import Any, BinaryIO, Callable, Optional
 
 from .errors import TrainerError
 
@@ -29,16 +30,51 @@ def _mode(path: str) -> int:
         raise TrainerError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
 
 
-def write_atomically(path: str, write: Callable[[BinaryIO], None]) -> None:
-    """Calls `write` with an open binary file that becomes `path` only once it is complete."""
+class _PatientFile:
+    """A file that notes its first error instead of raising: torch 1.13 ends the process where a write raises."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file = file
+        self.error: Optional[OSError] = None
+
+    def write(self, data: Any) -> int:
+        try:
+            if self.error is None:
+                self.file.write(data)
+        except OSError as error:
+            self.error = error
+        return memoryview(data).nbytes
+
+    def flush(self) -> None:
+        """Nothing: the file is flushed when it is whole."""
+
+
+def write_atomically(path: str, write: Callable[[Any], None]) -> None:
+    """Calls `write` with an object that has `write` and `flush`; what it is given becomes `path` once it is complete.
+
+    Where that fails, an earlier `path` stays as it was. Raises OSError, which names `path`.
+    """
     folder = os.path.dirname(os.path.abspath(path))
     os.makedirs(folder, exist_ok=True)
     temporary = path + ".part"
-    with open(temporary, "wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    if os.path.lexists(temporary):  # of a killed run, or a link to another file, which stays
+        os.remove(temporary)
+    try:
+        with open(temporary, "xb") as file:  # a new file: "x" follows no link
+            patient = _PatientFile(file)
+            write(patient)
+            if patient.error:
+                raise patient.error
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException as error:
+        if not isinstance(error, FileExistsError):
+            with contextlib.suppress(OSError):
+                os.remove(temporary)
+        if not isinstance(error, OSError):
+            raise
+        raise OSError(error.errno, error.strerror or str(error), path) from error
 
 
 def write_text_atomically(path: str, text: str) -> None:

@@ -21,7 +21,8 @@ MAX_WIDTH = 1600  # of images at resolution -1
 MAX_PIXELS = 2**27  # of an image to train on, beyond which --resolution is taken for a mistake
 # An image may have another size than its camera (images_4 beside a full-size model) but not another shape.
 MAX_ASPECT_ERROR = 0.02
-UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)  # what Pillow raises for damaged files
+# What Pillow raises for damaged files.
+UNREADABLE = (OSError, ValueError, SyntaxError, NotImplementedError, Image.DecompressionBombError)
 DOWNSCALER = "pillow bicubic"
 
 

@@ -10,7 +10,7 @@ import torch
 
 from ..losses import l1_ssim_loss_and_gradient
 from .background_gate import LearnedGate
-from .checkpoint import CHECKPOINT_NAME, load_checkpoint, save_checkpoint
+from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
 from .config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
 from .environment import extension_info
 from .errors import TrainerError
@@ -181,9 +181,10 @@ class Run:
         path = self._path(CHECKPOINT_NAME)
         if not is_file(path):
             return False
-        state = load_checkpoint(path, self.trainer.config.device)
-        self.trainer.load_state_dict(state)
-        self.history = list(state["history"])
+        with damage_named(path):
+            state = load_checkpoint(path, self.trainer.config.device)
+            self.trainer.load_state_dict(state)
+            self.history = list(state["history"])
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
@@ -298,10 +299,11 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     """Trains a scene into config.output; returns the row of results.json.
 
     resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
-    of threads); start it where it has no checkpoint yet. With more iterations than it had, it is extended: its
-    milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a run that is
-    there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at hand. Raises
-    TrainerError before training starts where anything does not fit, as where another run is at work in the folder.
+    of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
+    is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
+    run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
+    hand. Raises TrainerError before training starts where anything does not fit, as where another run is at work in
+    the folder.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")

@@ -7,6 +7,8 @@ from typing import List, Sequence, Tuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from .errors import printable
+
 MARGIN = 6  # pixels between pictures
 LABEL_HEIGHT = 18
 WINDOW_SHARE = 4  # a window is this part of the picture's width and height, and magnified as much
@@ -15,10 +17,10 @@ FRAME = (255, 60, 0)
 
 
 def file_names(camera_names: Sequence[str]) -> List[str]:
-    """A file name without extension for each camera: folders joined by "_", equal ones numbered."""
+    """A file name without extension for each camera: folders joined by "_", equal ones numbered, printable."""
     names: List[str] = []
     for camera_name in camera_names:
-        stem = os.path.splitext(camera_name)[0].replace("/", "_").replace(os.sep, "_")
+        stem = printable(os.path.splitext(camera_name)[0]).replace("/", "_").replace(os.sep, "_")
         name, number = stem, 1
         while name in names:
             number += 1

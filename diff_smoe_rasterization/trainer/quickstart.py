@@ -14,7 +14,7 @@ from typing import Any, Dict, List, Optional
 import torch
 
 from .config import TrainConfig, add_arguments
-from .errors import TrainerError
+from .errors import TrainerError, in_one_line
 from .images import View, image_size
 from .inspection import open_renderer, to_image
 from .interrupt import exit_status
@@ -51,8 +51,11 @@ def main(argv: Optional[List[str]] = None) -> int:
     try:
         run(arguments)
         return 0
-    except (TrainerError, ImportError, OSError) as error:
-        print(f"quickstart: error: {error}", file=sys.stderr)
+    except Exception as error:
+        text = in_one_line(error)
+        if text is None:
+            raise
+        print(f"quickstart: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
         print("\nquickstart: interrupted", file=sys.stderr)

@@ -4,7 +4,7 @@ from __future__ import annotations
 import json
 import math
 import os
-import sys
+import reprlib
 from typing import Any, Dict, List
 
 import numpy as np
@@ -21,6 +21,7 @@ from .pointcloud import PointCloud
 
 RANDOM_POINTS = 100_000  # as 3DGS
 HALF_SIDE = 1.3  # of the cube that random points fill: the extent of the NeRF-synthetic scenes
+LARGEST = 1e9  # of all numbers, pixels or world units: with larger ones float32 overflows
 MAX_SKEW = 1e-3  # of a rotation, as far as rounded json numbers may leave it
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 # From OpenGL's camera axes (y up, z backward) to ours (y down, z forward).
@@ -64,7 +65,7 @@ def _read_transforms(folder: str, name: str) -> List[PosedImage]:
             content = json.load(file)
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SceneError(f"{path}: not valid json ({error})") from error
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise SceneError(f"{path}: expected an object with a list `frames`")
@@ -85,8 +86,8 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
         matrix = np.array(frame.get("transform_matrix"), np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise SceneError(f"{where}: `transform_matrix` must be 4 rows of 4 finite numbers")
+    if matrix.shape != (4, 4) or not np.abs(matrix).max() <= LARGEST:
+        raise SceneError(f"{where}: `transform_matrix` must be 4 rows of 4 numbers of at most {LARGEST:g}")
     image_path = os.path.join(folder, frame["file_path"])
     if not os.path.splitext(image_path)[1]:
         image_path += ".png"
@@ -97,13 +98,13 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
     def number(key: str, default: float) -> float:
         value = frame.get(key, content.get(key, default))
         if not _is_number(value):
-            raise SceneError(f"{where}: `{key}` is {value!r}; it must be a finite number")
+            raise SceneError(f"{where}: `{key}` is {reprlib.repr(value)}; it must be a number of at most {LARGEST:g}")
         return float(value)
 
     def positive(key: str, default: float) -> float:
         value = number(key, default)
-        if value <= 0:
-            raise SceneError(f"{where}: `{key}` is {value:g}; it must be positive")
+        if value < 1 / LARGEST:
+            raise SceneError(f"{where}: `{key}` is {value:g}; it must be positive, {1 / LARGEST:g} at least")
         return value
 
     def whole(key: str, default: int) -> int:
@@ -133,11 +134,12 @@ def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: in
 def _focal(content: Dict[str, Any], frame: Dict[str, Any], width: int, where: str) -> float:
     """Focal length in pixels of an image that wide from `camera_angle_x`."""
     angle = frame.get("camera_angle_x", content.get("camera_angle_x"))
-    if not _is_number(angle) or not 0 < angle < math.pi:
-        raise SceneError(f"{where}: `camera_angle_x` is {angle!r}; it must be an angle between 0 and pi")
+    if not _is_number(angle) or not 1 / LARGEST < angle < math.pi:
+        raise SceneError(f"{where}: `camera_angle_x` is {reprlib.repr(angle)}; it must be an angle between "
+                         f"{1 / LARGEST:g} and pi")
     return width / (2 * math.tan(angle / 2))
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a json value is a finite number; true and false, which Python counts among the integers, are not."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    """Whether a json value is a number in range; true and false, which Python counts among the integers, are not."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST

@@ -167,6 +167,14 @@ def test_path_that_is_not_utf8(tmp_path):
     assert len(io.read_gaussians(name).means3D) == 1
 
 
+def test_an_unfinished_file_is_not_written_through_a_link(tmp_path):
+    (tmp_path / "precious").write_text("mine")
+    os.symlink(tmp_path / "precious", tmp_path / "a.ply.partial")
+    io.write_gaussians(tmp_path / "a.ply", make_gaussians(1, 0))
+    assert (tmp_path / "precious").read_text() == "mine" and len(io.read_gaussians(tmp_path / "a.ply").means3D) == 1
+    assert sorted(os.listdir(tmp_path)) == ["a.ply", "precious"]
+
+
 def test_malformed_model_names_file_and_reason(tmp_path):
     path = tmp_path / "a.ply"
     io.write_gaussians(path, make_gaussians(3, 0))

@@ -8,8 +8,11 @@ import torch
 from comparison import assert_same_gradients
 from devices import random_normal
 from scenes import gradients, random_scene
+from torch.autograd import forward_ad
 
-from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization import fused_ssim, rasterize
+from diff_smoe_rasterization.gaussians import activate
+from diff_smoe_rasterization.losses import l1_ssim_loss
 from diff_smoe_rasterization.settings import OUTPUTS
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -115,6 +118,37 @@ def test_second_derivatives_are_refused(mode):
     with pytest.raises(RuntimeError, match="twice|double|second|once"):
         first, = torch.autograd.grad((color ** 2).sum(), scene.inputs["means3D"], create_graph=True)
         first.sum().backward()
+
+
+def test_forward_mode_is_refused():
+    """Where it were not, every tangent would be zero. Plain tensors may be rendered meanwhile."""
+    scene = random_scene("smoe", 20, 20, 18, degree=1, dtype=torch.float32)
+    image = rasterize(settings=scene.settings, **scene.inputs).color
+
+    def render(scales, settings=scene.settings):
+        return rasterize(settings=settings, **{**scene.inputs, "scales": scales}).color
+
+    def refused(function, *arguments):
+        with pytest.raises(NotImplementedError, match="forward-mode derivatives .* are not implemented"):
+            function(*arguments)
+
+    scales = scene.inputs["scales"]
+    leaf = scales.clone().requires_grad_(True)
+    color = render(leaf)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(scales, torch.ones_like(scales))
+        assert torch.equal(render(scales), image)
+        refused(render, dual)
+        refused(render, forward_ad.make_dual(leaf, scales))
+        refused(render, scales, scene.settings._replace(bg=forward_ad.make_dual(scene.settings.bg, scales[0])))
+        refused(torch.autograd.grad, color, leaf, forward_ad.make_dual(image, image))
+        refused(activate, scene.inputs["opacities"].view(-1, 1), dual, scene.inputs["rotations"])
+        refused(fused_ssim, forward_ad.make_dual(image, image), image)
+        refused(l1_ssim_loss, forward_ad.make_dual(image, image), image)
+    if hasattr(torch, "func"):
+        for function in [render] + [torch.compile(render, backend="eager")] * hasattr(torch.library, "opcheck"):
+            refused(torch.func.jvp, function, (scales,), (scales,))
+            refused(torch.func.jacfwd(function), scales)
 
 
 def test_backward_can_run_again_on_a_retained_graph(mode):

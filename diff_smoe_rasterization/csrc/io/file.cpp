@@ -1,6 +1,7 @@
 #include "io/file.h"
 
 #include <cerrno>
+#include <cstdio>
 #include <cstring>
 #include <filesystem>
 #include <system_error>
@@ -40,9 +41,13 @@ OutputFile::OutputFile(const std::string& path) {
   const fs::file_status status = fs::status(path_, error);
   if (fs::exists(status) && !fs::is_regular_file(status)) throw FileError(path, "is not a regular file", EINVAL);
   partial_path_ = path_ + ".partial";
+  fs::remove(partial_path_, error);  // of a killed run, or a link to another file, which stays
   errno = 0;
-  stream_.open(partial_path_, std::ios::binary | std::ios::trunc);
-  if (!stream_) {
+  if (std::FILE* created = std::fopen(partial_path_.c_str(), "wbx")) {  // a new file: x follows no link
+    std::fclose(created);
+    stream_.open(partial_path_, std::ios::binary);
+  }
+  if (!stream_.is_open()) {
     const int number = errno != 0 ? errno : EIO;
     throw FileError(path, std::string("cannot be written: ") + std::strerror(number), number);
   }
@@ -57,7 +62,7 @@ OutputFile::~OutputFile() {
 
 void OutputFile::commit() {
   stream_.close();
-  if (!stream_) throw FileError(path_, "could not be written whole", EIO);
+  if (!stream_) throw FileError(path_, "could not be written whole; is the disk full?", EIO);
   std::error_code error;
   fs::rename(partial_path_, path_, error);
   if (error) throw FileError(path_, "cannot be written: " + error.message(), error.value());

@@ -422,6 +422,29 @@ def test_an_output_that_cannot_be_written_is_one_line(trained, scene, tmp_path, 
         assert path in fails(capsys, *arguments)
 
 
+def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
+    def cuda(*arguments):
+        raise RuntimeError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of 8 GiB\n...")
+
+    def cpu(*arguments):
+        torch.empty(2**50, dtype=torch.uint8)
+
+    def array(*arguments):
+        np.empty(2**50, np.uint8)
+
+    def defect(*arguments):
+        raise RuntimeError("another one")
+
+    arguments = ["train", scene, "-o", str(tmp_path / "out"), *SHORT]
+    for function, words in ((cuda, "the GPU is out of memory, 20.00 GiB"), (array, "out of memory, 1.00 PiB"),
+                            (cpu, f"the machine is out of memory, {2**50} bytes more were asked for")):
+        monkeypatch.setattr("diff_smoe_rasterization.trainer.loop.load_scene", function)
+        assert words in fails(capsys, *arguments)
+    monkeypatch.setattr("diff_smoe_rasterization.trainer.loop.load_scene", defect)
+    with pytest.raises(RuntimeError, match="another one"):
+        main(arguments)
+
+
 def test_damaged_results_are_named(trained, tmp_path, capsys):
     run = str(tmp_path / "run")
     shutil.copytree(trained, run)

@@ -4,13 +4,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import resource
 import shutil
 
 import pytest
 import torch
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.trainer import files
+from diff_smoe_rasterization.trainer import checkpoint, files
 from diff_smoe_rasterization.trainer.checkpoint import load_checkpoint, save_checkpoint
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.loop import Trainer, train
@@ -298,18 +299,42 @@ def test_a_run_has_its_folder_alone(tiny_config, monkeypatch):
     assert os.listdir(os.path.join(config.output, "point_cloud")) == ["iteration_2"]
 
 
-def test_a_damaged_checkpoint_is_named(tmp_path):
+class Stranger:
+    """What loading with weights_only=False would run."""
+
+    def __reduce__(self):
+        return exec, ("raise SystemExit",)
+
+
+def test_a_damaged_checkpoint_is_named(tiny_config, tmp_path, monkeypatch):
     path = str(tmp_path / "checkpoint.pt")
-    with pytest.raises(TrainerError, match="no such checkpoint"):
-        load_checkpoint(path, "cpu")
+
+    def refused(words="checkpoint.pt: not a readable checkpoint; remove it"):
+        with pytest.raises(TrainerError, match=words) as error:
+            load_checkpoint(path, "cpu")
+        assert "weights_only" not in str(error.value)
+
+    refused("no such checkpoint")
     save_checkpoint(path, {"tensor": torch.ones(1000)})
-    with open(path, "r+b") as file:
-        file.truncate(os.path.getsize(path) // 2)
-    with pytest.raises(TrainerError, match="checkpoint.pt: not a readable checkpoint"):
-        load_checkpoint(path, "cpu")
+    with open(path, "rb") as file:
+        content = file.read()
+    middle = content.index(torch.ones(10).numpy().tobytes())
+    flipped = content[:middle] + b"\1" + content[middle + 1:]
+    for damaged in (b"", content[:len(content) // 2], flipped):
+        with open(path, "wb") as file:
+            file.write(damaged)
+        refused()
+    for strange in ({"format": 2, "plain": "{", "tensors": {}}, Stranger()):
+        torch.save(strange, path)
+        refused()
+    monkeypatch.setattr(checkpoint, "SAFE_LOAD", False)
+    refused("remove it.*load no stranger")
     torch.save({"format": -1}, path)
-    with pytest.raises(TrainerError, match="another version"):
-        load_checkpoint(path, "cpu")
+    refused("another version")
+    tiny_config.save(tiny_config.output)
+    save_checkpoint(os.path.join(tiny_config.output, "checkpoint.pt"), {"config": {}})
+    with pytest.raises(TrainerError, match="checkpoint.pt: not a readable checkpoint"):
+        train(tiny_config, resume=True, progress=False)
 
 
 def test_a_checkpoint_returns_what_it_was_given(tmp_path):
@@ -329,10 +354,27 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
         file.write(b"new, but not whole")
         raise OSError("disk full")
 
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(OSError, match=f"disk full: '{path}'"):
         files.write_atomically(path, fails)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # as a full disk, of which torch has its own error
+    try:
+        with pytest.raises(OSError, match=f"File too large: '{path}'"):
+            save_checkpoint(path, {"tensor": torch.ones(10_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     with open(path, encoding="utf-8") as file:
         assert file.read() == "old"
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_no_unfinished_file_is_written_through_a_link(tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    os.symlink(precious, tmp_path / "file.part")
+    files.write_text_atomically(str(tmp_path / "file"), "new")
+    assert precious.read_text() == "mine" and (tmp_path / "file").read_text() == "new"
+    assert sorted(os.listdir(tmp_path)) == ["file", "precious"]
 
 
 def test_json_holds_null_where_it_has_no_number(tmp_path):

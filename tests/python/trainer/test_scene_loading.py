@@ -181,8 +181,8 @@ def test_nerf_cameras_look_along_minus_z_with_y_up(nerf_folder):
 def test_nerf_names_are_paths(nerf_folder):
     scene = load(nerf_folder)
     assert (scene.train[0].camera.name, scene.test[0].camera.name) == ("train/r_0.png", "test/r_0.png")
-    assert file_names(["cam1/0001.jpg", "cam2/0001.jpg", "cam1/0001.png", "cam1_0001_2.png"]) == [
-        "cam1_0001", "cam2_0001", "cam1_0001_2", "cam1_0001_2_2"]
+    assert file_names(["cam1/0001.jpg", "cam2/0001.jpg", "cam1/0001.png", "cam1_0001_2.png", "\x1b.png"]) == [
+        "cam1_0001", "cam2_0001", "cam1_0001_2", "cam1_0001_2_2", "\\x1b"]
 
 
 def test_nerf_random_points(nerf_folder):
@@ -272,6 +272,7 @@ def refused(folder, *words, **options):
     """Loading raises a SceneError that has all these words."""
     with pytest.raises(SceneError) as error:
         load(folder, **options)
+    assert str(error.value).isprintable()
     for word in words:
         assert word in str(error.value), str(error.value)
 
@@ -418,11 +419,18 @@ def frame(**values):
     (frame(fl_x=0), ["frame 0", "`fl_x` is 0", "positive"]),
     (frame(fl_x=20, fl_y=-20), ["`fl_y` is -20", "positive"]),
     (frame(fl_x=True), ["`fl_x` is True", "number"]),
-    (frame(fl_x=10**400), ["`fl_x`", "finite number"]),
+    (frame(fl_x=10**400), ["`fl_x`", "number of at most 1e+09"]),
     (frame(fl_x=None), ["`fl_x` is None", "number"]),
+    (lambda content: content.update(camera_angle_x=5e-324), ["camera_angle_x", "5e-324"]),
+    (lambda content: content.update(w=1, h=1e308), ["`h` is 1e+308", "at most 1e+09"]),
+    (frame(transform_matrix=np.diag([1e200, 1e200, 1, 1]).tolist()), ["frame 0", "at most 1e+09"]),
+    (frame(file_path="./train/\x1b[2J\n\u202e"), ["train/\\x1b[2J\\n\\u202e.png: no such image"]),
+    (frame(transform_matrix="DEEP"), ["transforms_train.json: not valid json"]),
 ])
 def test_a_wrong_json(nerf_folder, edit, words):
-    edit_json(nerf_folder / "transforms_train.json", edit)
+    path = nerf_folder / "transforms_train.json"
+    edit_json(path, edit)
+    path.write_text(path.read_text().replace('"DEEP"', "[" * 100_000 + "]" * 100_000))
     refused(nerf_folder, *words)
 
 
