@@ -75,6 +75,7 @@ fingerprint() {
       cat "$venv"/lib/python*/site-packages/torch/version.py || true
     } 2>/dev/null | LC_ALL=C sort
     echo "${torch_request[@]}" "${DSMOE_BUILD_CUDA:-$cuda_without_gpu}" "${TORCH_CUDA_ARCH_LIST-}"
+    if nvidia-smi -L 2>/dev/null | grep -q .; then echo "a GPU"; fi  # for which the kernels are compiled
   ) | cksum
 }
 

@@ -11,7 +11,7 @@ from .patches.errors import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.config import (PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options,
                              holds_run)
-from .trainer.errors import TrainerError, in_one_line
+from .trainer.errors import TrainerError, in_one_line, printable
 from .trainer.files import is_folder
 from .trainer.interrupt import exit_status
 
@@ -265,7 +265,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
     config = _train_config(arguments)
     set_up_process(config.device)
-    print(f"{config.scene} -> {config.output}: blend mode {blend_name(config.blend_mode, config.background_gate)}, "
+    print(f"{printable(config.scene)} -> {printable(config.output)}: blend mode {blend_name(config.blend_mode, config.background_gate)}, "
           f"schedule {config.schedule}, "
           f"{config.iterations} iterations, seed {config.seed}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)
@@ -284,6 +284,8 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
         del arguments.scene
     if "output" not in given or "scene" not in given and not arguments.resume:
         arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs OUT alone")
+    if arguments.resume and arguments.scale_recipe and "scene" not in given:
+        arguments.command_parser.error("--scale-recipe needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")
     if not arguments.resume or "scene" in given and (arguments.scale_recipe or not holds_run(run)):
         return config_from_arguments(arguments)

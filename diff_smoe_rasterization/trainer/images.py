@@ -93,7 +93,11 @@ def load_view(posed: PosedImage, config: TrainConfig) -> View:
         raise SceneError(f"{posed.path}: not a readable image ({error})") from error
     camera = fitted_camera(posed, image.size, config)
     mask = None if posed.mask is None else _mask(posed.mask, posed.path, image.size, camera)
-    return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask)
+    try:
+        return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask)
+    except MemoryError as error:  # Pillow's says nothing
+        raise SceneError(f"{posed.path}: the machine is out of memory at {camera.width}x{camera.height}; take smaller "
+                         "images (--resolution)") from error
 
 
 def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -> torch.Tensor:

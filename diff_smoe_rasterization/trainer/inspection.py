@@ -15,7 +15,7 @@ from .files import write_json_atomically
 from .loop import PER_VIEW_NAME, check_device
 from .metrics import image_metrics, quantised
 from .modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
-from .output_folder import Record, make_folder, own_record, write_record
+from .output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .pictures import file_names
 from .progress import progress_bar
 from .rendering import Rasterize, Renderer, background_color
@@ -92,8 +92,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     run that config is of, whose record these two must not contradict. Raises TrainerError.
     """
     check_device(device)
-    earlier = own_record(folder, RENDER)
-    of = os.path.abspath(ply or config.output) + " on " + os.path.abspath(config.scene)
+    own_record(folder, RENDER)  # refused before anything is read
     if ply is None:
         ply = trained_model_path(config.output, config.iterations)
         blend_mode = agreed_blend_mode(config.output, config.blend_mode, blend_mode)
@@ -104,22 +103,35 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     cameras = load_cameras(config, split)
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views")
-    names = [name + ".png" for name in file_names([camera.name for camera in cameras])]
-    make_folder(folder)
-    kept = earlier.files if of == earlier.of else []  # those of another split
     beside = {"depth": ".depth.npy", "alpha": ".alpha.png"}
-    written = [name[:-len(".png")] + ending for name in names for ending in (".png", *map(beside.get, outputs))]
-    write_record(folder, RENDER, Record(of, sorted({*kept, *written})), earlier.files)
-    paths = [os.path.join(folder, name) for name in names]
-    with torch.no_grad():
+    stems = file_names([camera.name for camera in cameras])
+    written = [stem + ending for stem in stems for ending in (".png", *map(beside.get, outputs))]
+    if len({*written}) < len(written):
+        raise TrainerError(f"{config.scene}: names of cameras differ only by {' or '.join(beside.values())}; rename one")
+    make_folder(folder)
+    with only_one(folder), torch.no_grad():
+        earlier = own_record(folder, RENDER)
+        of = _said_of_images(config, ply, renderer)
+        kept = earlier.files if of == earlier.of else []  # those of another split
+        write_record(folder, RENDER, Record(of, sorted({*kept, *written})), earlier.files)
+        remove_files(folder, written)  # a link in their place would be followed
+        paths = [os.path.join(folder, stem) for stem in stems]
         for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
             rendering = renderer(camera, outputs=tuple(outputs))
-            to_image(rendering.color).save(path)
+            to_image(rendering.color).save(path + ".png")
             if rendering.depth is not None:
-                np.save(path[:-len(".png")] + beside["depth"], rendering.depth[0].cpu().numpy())
+                np.save(path + beside["depth"], rendering.depth[0].cpu().numpy())
             if rendering.alpha is not None:
-                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path[:-len(".png")] + beside["alpha"])
-    return paths
+                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path + beside["alpha"])
+    return [path + ".png" for path in paths]
+
+
+def _said_of_images(config: TrainConfig, ply: str, renderer: Renderer) -> str:
+    """What images show, for their folder's record: other words, and they are not kept beside each other."""
+    model = os.stat(ply)
+    return (f"{os.path.abspath(ply)}, {model.st_size} bytes of {model.st_mtime_ns}, on {os.path.abspath(config.scene)}: "
+            f"{renderer.blend_mode} {renderer.background_gate}, resolution {config.resolution}, principal point "
+            f"{config.principal_point}, {'white' if config.white_background else 'black'} background")
 
 
 def to_image(color: torch.Tensor) -> Image.Image:

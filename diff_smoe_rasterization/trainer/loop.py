@@ -4,6 +4,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import re
 from typing import Any, Callable, Dict, List, Optional
 
 import torch
@@ -291,7 +292,9 @@ def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = 
         record = record or Record(earlier.scene, [_model_name(earlier.iterations)])
     if os.path.lexists(models) and not os.path.isdir(models):
         raise TrainerError(f"{models} is no folder; a run writes its model there")
-    return record.files if record else []
+    # A record may be a stranger's, and point_cloud a link: nothing but models is removed by it.
+    model = _model_name(0).replace("0", r"\d+").replace(".", r"\.")
+    return [name for name in record.files if re.fullmatch(model, name)] if record else []
 
 
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,

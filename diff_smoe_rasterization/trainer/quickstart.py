@@ -70,7 +70,6 @@ def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
     parser.add_argument("scene", nargs="?", metavar="SCENE", default=None,
                         help="folder of a COLMAP or NeRF-synthetic scene (default: a small one made on the spot)")
     parser.add_argument("-o", "--output", metavar="OUT", default=DEFAULT_OUTPUT,
-                        
                         help=f"folder to write: new, empty, or of the same scene (default: {DEFAULT_OUTPUT})")
     parser.add_argument("--quiet", action="store_true", default=False, help="no progress bars")
     add_arguments(parser, skip=FIXED, defaults=False)

@@ -335,7 +335,7 @@ def test_rows_from_before_there_were_gates_are_of_todays_cells(monkeypatch):
     monkeypatch.setenv("DSMOE_DATA", "/somewhere")
     monkeypatch.setenv("DSMOE_TRAINERS", "/somewhere")
     rows = str(Path(__file__).resolve().parents[3] / "benchmarks" / "results" / "captures_h200.jsonl")
-    for name, lacking in (("captures", set()), ("gate", {0.05, 0.3, "learned"})):
+    for name, lacking in (("captures", set()), ("gate", {0.03, 0.3, "learned"})):
         cells = [cell for cell in load_suite(find_suite(name)).cells if cell["seed"] == 0]
         found = earlier_rows(rows, cells)
         assert {cell["background_gate"] for cell in cells if cell["id"] not in found} == lacking

@@ -166,7 +166,8 @@ def test_render_writes_into_its_own_folder_alone(trained, scene, tmp_path, capsy
     (own / "view_003.png").unlink()
     assert main(["render", trained, "-o", str(own), "--split", "train"]) == 0
     assert len(list(own.glob("*.png"))) == 9, "the other split's images stay"
-    assert main(["render", ply_of(trained), "--scene", scene, "-o", str(own)]) == 0
+    other = shutil.copy(ply_of(trained), str(tmp_path / "other.ply"))
+    assert main(["render", other, "--scene", scene, "-o", str(own)]) == 0
     assert [path.name for path in sorted(own.glob("*.png"))] == ["view_000.png", "view_008.png"], "no other model's"
 
 
@@ -191,7 +192,7 @@ def test_eval_of_a_moved_run_and_a_moved_scene(trained, scene, tmp_path, capsys)
 def test_render_writes_what_eval_measures(trained, scene, tmp_path):
     folder = tmp_path / "images"
     assert main(["render", trained, "-o", str(folder)]) == 0
-    assert sorted(os.listdir(folder)) == [".dsmoe.json", "view_000.png", "view_008.png"]
+    assert sorted(os.listdir(folder)) == [".dsmoe.json", ".dsmoe.lock", "view_000.png", "view_008.png"]
     main(["eval", trained])
     with open(os.path.join(trained, "per_view.json"), encoding="utf-8") as file:
         per_view = {row["name"]: row["psnr"] for row in json.load(file)}
@@ -216,6 +217,30 @@ def test_eval_measures_lpips_where_asked(trained, tmp_path, capsys, monkeypatch)
     assert asked == [("lpips_vgg_std", "cpu")] and results_of(run)[0]["lpips_vgg"] == 0.25
 
 
+def test_render_follows_no_link_and_keeps_no_image_of_another_size(trained, tmp_path):
+    images, photo = tmp_path / "images", tmp_path / "photo.png"
+    assert main(["render", trained, "-o", str(images), "--depth"]) == 0
+    os.replace(images / "view_000.png", photo)
+    os.symlink(photo, images / "view_000.png")
+    before = photo.read_bytes()
+    assert main(["render", trained, "-o", str(images), "--resolution", "2"]) == 0
+    assert photo.read_bytes() == before and not (images / "view_000.png").is_symlink()
+    assert not (images / "view_000.depth.npy").exists(), "of another size"
+
+
+def test_overwrite_removes_models_alone_whatever_a_record_names(scene, tmp_path):
+    output, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    assert main(["train", scene, "-o", str(output), *SMOE]) == 0
+    os.replace(output / "point_cloud", elsewhere)
+    os.symlink(elsewhere, output / "point_cloud")
+    (elsewhere / "key").write_text("mine")
+    record = json.loads((output / ".dsmoe.json").read_text())
+    record["files"].append("point_cloud/key")
+    (output / ".dsmoe.json").write_text(json.dumps(record))
+    assert main(["train", scene, "-o", str(output), *SMOE, "--overwrite"]) == 0
+    assert (elsewhere / "key").read_text() == "mine"
+
+
 def test_eval_measures_the_pixels_that_training_did(trained, scene, tmp_path, capsys):
     masked = str(tmp_path / "scene")
     shutil.copytree(scene, masked)
@@ -228,7 +253,7 @@ def test_eval_measures_the_pixels_that_training_did(trained, scene, tmp_path, ca
 def test_render_writes_depth_and_alpha_where_asked(trained, tmp_path):
     assert main(["render", trained, "-o", str(tmp_path), "--depth", "--alpha"]) == 0
     ends = ("alpha.png", "depth.npy", "png")
-    assert sorted(os.listdir(tmp_path))[1:] == [f"view_00{view}.{end}" for view in "08" for end in ends]
+    assert sorted(os.listdir(tmp_path))[2:] == [f"view_00{view}.{end}" for view in "08" for end in ends]
     depth, alpha = np.load(tmp_path / "view_000.depth.npy"), np.asarray(Image.open(tmp_path / "view_000.alpha.png"))
     assert depth.shape == alpha.shape == (24, 32) and (depth.dtype, alpha.dtype) == (np.float32, np.uint8)
     assert np.all((depth > 0.2) | (depth == 0)) and alpha.max() > 200
@@ -239,8 +264,8 @@ def test_render_a_ply_with_the_mode_that_it_records(trained, scene, tmp_path):
     assert main(["render", trained, "-o", str(tmp_path / "run"), "--split", "all"]) == 0
     assert main(["render", ply_of(trained), "-o", str(tmp_path / "ply"), "--scene", scene, "--split", "all"]) == 0
     names = sorted(os.listdir(tmp_path / "run"))
-    assert len(names) == 10 and names == sorted(os.listdir(tmp_path / "ply"))
-    for name in names[1:]:  # the first is the record of what was written
+    assert len(names) == 11 and names == sorted(os.listdir(tmp_path / "ply"))
+    for name in names[2:]:  # behind the record of what was written and the lock
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
 
 
@@ -376,6 +401,9 @@ def test_resume_of_a_folder_alone_has_the_options_of_the_run(trained, tmp_path, 
     with pytest.raises(SystemExit):
         main(["train", "-o", output])
     assert "SCENE and -o OUT are needed" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["train", "--resume", output, "--scale-recipe"])
+    assert "--scale-recipe needs SCENE" in capsys.readouterr().err
 
 
 def test_more_iterations_extend_a_run(trained, scene, tmp_path, capsys, monkeypatch, ctrl_c_works):
