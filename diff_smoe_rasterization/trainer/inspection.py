@@ -46,7 +46,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     masked = bool(earlier) and "masks" in earlier[0].get("protocol", {})
     if masked != any(view.mask is not None for view in views) and earlier:
         raise TrainerError(f"{config.scene} has {'no masks' if masked else 'masks'}, but the run was measured "
-                           f"{'with' if masked else 'without'} them: figures of other pixels are no figures of the run; "
+                           f"{'with' if masked else 'without'} them: these would be figures of other pixels; "
                            f"{'put them back' if masked else 'rename the folder'}, or name another --scene")
     evaluation = evaluate(renderer, views, device, progress, measure)
     seconds = earlier[0].get("train_seconds") if earlier else None
@@ -107,7 +107,8 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     stems = file_names([camera.name for camera in cameras])
     written = [stem + ending for stem in stems for ending in (".png", *map(beside.get, outputs))]
     if len({*written}) < len(written):
-        raise TrainerError(f"{config.scene}: names of cameras differ only by {' or '.join(beside.values())}; rename one")
+        raise TrainerError(f"{config.scene}: names of cameras differ only by {' or '.join(beside.values())}; "
+                           "rename one")
     make_folder(folder)
     with only_one(folder), torch.no_grad():
         earlier = own_record(folder, RENDER)
@@ -129,9 +130,10 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
 def _said_of_images(config: TrainConfig, ply: str, renderer: Renderer) -> str:
     """What images show, for their folder's record: other words, and they are not kept beside each other."""
     model = os.stat(ply)
-    return (f"{os.path.abspath(ply)}, {model.st_size} bytes of {model.st_mtime_ns}, on {os.path.abspath(config.scene)}: "
-            f"{renderer.blend_mode} {renderer.background_gate}, resolution {config.resolution}, principal point "
-            f"{config.principal_point}, {'white' if config.white_background else 'black'} background")
+    return (f"{os.path.abspath(ply)}, {model.st_size} bytes of {model.st_mtime_ns}, on "
+            f"{os.path.abspath(config.scene)}: {renderer.blend_mode} {renderer.background_gate}, resolution "
+            f"{config.resolution}, principal point {config.principal_point}, "
+            f"{'white' if config.white_background else 'black'} background")
 
 
 def to_image(color: torch.Tensor) -> Image.Image:

@@ -5,7 +5,7 @@ import dataclasses
 import math
 import os
 import re
-from typing import Any, Callable, Dict, List, Optional
+from typing import Any, Callable, Dict, List, Optional, Tuple
 
 import torch
 
@@ -16,7 +16,7 @@ from .config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
 from .environment import extension_info
 from .errors import TrainerError
 from .evaluation import Evaluation, evaluate
-from .files import is_file, write_json_atomically
+from .files import is_file, write_atomically, write_json_atomically
 from .images import as_float
 from .interrupt import DelayedInterrupt
 from .metrics import psnr
@@ -24,6 +24,7 @@ from .model import GaussianModel, GaussianOptimizer
 from .modelfile import FOLDER, model_path, save_model
 from .order import ViewOrder
 from .output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
+from .pictures import loss_plot
 from .progress import progress_bar
 from .randomness import random_state, restore_random_state, seed_everything
 from .rendering import Rasterize, Renderer, background_color
@@ -33,8 +34,9 @@ from .stopwatch import Stopwatch
 from .strategy import STRATEGIES, Step, StrategyContext
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
+LOSS_NAME = "loss.png"
 PER_VIEW_NAME = "per_view.json"
-PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME)  # beside config.json and the models
+PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME)  # beside config.json and the models
 TRAIN = "dsmoe train"  # in its folders' records
 PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
 
@@ -176,6 +178,7 @@ class Run:
         self.trainer = trainer
         self.progress = progress
         self.history: List[Dict[str, Any]] = []
+        self.losses: List[Tuple[int, float]] = []  # iteration and loss, as often as the loss is looked at
 
     def resume(self) -> bool:
         """Continues from the folder's checkpoint; False where there is none yet."""
@@ -186,6 +189,7 @@ class Run:
             state = load_checkpoint(path, self.trainer.config.device)
             self.trainer.load_state_dict(state)
             self.history = list(state["history"])
+            self.losses = [(int(iteration), float(loss)) for iteration, loss in state.get("losses", [])]
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
@@ -205,8 +209,10 @@ class Run:
                              and _is_due(trainer.iteration + 1, config.eval_every))
                 step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
                 bar.update()
-                if trainer.iteration % PROGRESS_EVERY[config.device] == 0:
-                    self._show(bar, _check_loss(step))
+                last = trainer.iteration == config.iterations
+                if last or _is_due(trainer.iteration, PROGRESS_EVERY[config.device]):
+                    self.losses.append((trainer.iteration, _check_loss(step)))
+                    self._show(bar, self.losses[-1][1])
                 ends = trainer.iteration >= config.iterations or interrupt.asked is not None
                 if ends or _is_due(trainer.iteration, config.checkpoint_every):
                     trainer.watch.stop()
@@ -222,11 +228,14 @@ class Run:
         row = result_row(config, trainer.scene, trainer.model.num_gaussians, trainer.watch.seconds, evaluation, gate)
         write_results(config.output, [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
+        if self.losses:
+            write_atomically(self._path(LOSS_NAME), lambda file: loss_plot(self.losses).save(file, "PNG"))
         return row
 
     def save_checkpoint(self) -> None:
-        """Writes the state of trainer and history."""
-        save_checkpoint(self._path(CHECKPOINT_NAME), {**self.trainer.state_dict(), "history": self.history})
+        """Writes the state of trainer, history and losses."""
+        save_checkpoint(self._path(CHECKPOINT_NAME), {**self.trainer.state_dict(), "history": self.history,
+                                                      "losses": self.losses})
 
     def _show(self, bar: Any, loss: float) -> None:
         if self.progress:

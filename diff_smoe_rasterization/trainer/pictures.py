@@ -49,6 +49,23 @@ def comparison(truth: Image.Image, renderings: Sequence[Tuple[str, Image.Image]]
     return sheet
 
 
+def loss_plot(losses: Sequence[Tuple[int, float]]) -> Image.Image:
+    """The loss, upward, over the iterations: pairs of both, in order."""
+    width, height, edge = 640, 320, 40
+    picture = Image.new("RGB", (width, height), (255, 255, 255))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default()
+    last, top = losses[-1][0], max(loss for _, loss in losses) or 1.0
+    for share in (0.0, 0.5, 1.0):
+        y, x = height - edge - share * (height - 2 * edge), edge + share * (width - 2 * edge)
+        draw.line([(edge, y), (width - edge, y)], fill=(220, 220, 220))
+        draw.text((4, y - 6), f"{share * top:.3f}", fill=(0, 0, 0), font=font)
+        draw.text((x - 12, height - edge + 6), f"{share * last:.0f}", fill=(0, 0, 0), font=font)
+    draw.line([(edge + iteration / last * (width - 2 * edge), height - edge - loss / top * (height - 2 * edge))
+               for iteration, loss in losses], fill=(0, 114, 178))
+    draw.text((width // 2 - 60, 12), "loss over iterations", fill=(0, 0, 0), font=font)
+    return picture
+
+
 def busiest_window(image: Image.Image) -> Tuple[int, int, int, int]:
     """(left, top, right, bottom) of the window with the most edges in the ground truth, whatever the renderings."""
     gray = np.asarray(image.convert("L"), np.float64)

@@ -521,8 +521,9 @@ def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, mon
     assert capsys.readouterr().err.endswith("interrupted; continue it with --resume\n")
     assert main([*arguments, "--resume"]) == 0
     assert "resumed at iteration 7" in capsys.readouterr().out
-    with open(ply_of(output), "rb") as mine, open(ply_of(trained), "rb") as theirs:
-        assert mine.read() == theirs.read()
+    for path in (ply_of, lambda run: os.path.join(run, "loss.png")):
+        with open(path(output), "rb") as mine, open(path(trained), "rb") as theirs:
+            assert mine.read() == theirs.read()
 
 
 def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monkeypatch, capsys):
