@@ -117,8 +117,8 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 
     In `smoe` an explicit value wins; None means the environment variable DSMOE_BACKGROUND_GATE, for callers that
     cannot be edited, and 0 (Eq. 7) where that is unset. `alpha` is the family's member with 1; the ablations have none.
-    Raises ValueError for a number that is negative, NaN or infinite, a tensor that has not one element, and for a value
-    in a mode that knows none.
+    Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor that has not one element,
+    and for a value in a mode that knows none.
     """
     if blend_mode != "smoe":
         of_mode = 1.0 if blend_mode == "alpha" else 0.0
