@@ -5,7 +5,7 @@ import pytest
 import torch
 from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
 from comparison import assert_all_close, assert_close, reference_gradients
-from scenes import camera_settings, gradients, op_arguments, random_scene, with_gate, with_gates
+from scenes import Scene, camera_settings, gradients, op_arguments, random_scene, with_gate, with_gates
 
 from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.extension import _C
@@ -115,9 +115,9 @@ def captured(mode, width, height):
     inputs = dict(means3D=model.raw["means3D"], means2D=torch.zeros(model.num_gaussians, 3), shs=model.raw["shs"],
                   dc=model.raw["dc"], opacities=model.opacities, scales=model.scales, rotations=model.rotations)
     camera = load_cameras(config, "test")[0].resized(width, height)
-    scene = random_scene(mode, 1)
-    return scene._replace(inputs=inputs, settings=camera.settings(torch.tensor([0.2, 0.5, 0.8]), 1, mode)).to(
-        torch.float32)
+    blend = {name: getattr(random_scene(mode, 1).settings, name) for name in ("blend_mode", "background_gate")}
+    settings = camera.settings(torch.tensor([0.2, 0.5, 0.8]), 1, "alpha")._replace(**blend)
+    return Scene(inputs, settings).to(torch.float32)
 
 
 @with_gate
