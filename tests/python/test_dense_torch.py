@@ -6,10 +6,10 @@ import sys
 
 import pytest
 import torch
+from scenes import assert_not_empty, gradients, random_scene
 
 from diff_smoe_rasterization.reference import rasterize as reference_rasterize
 from diff_smoe_rasterization.settings import BLEND_MODES
-from scenes import assert_not_empty, gradients, random_scene
 
 sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks"))
 import dense_torch  # noqa: E402
