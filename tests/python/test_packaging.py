@@ -227,9 +227,10 @@ sys.exit(main(sys.argv[1:]))""")
         assert subprocess.run(["bash", "-c", program], stdout=subprocess.PIPE).stdout == b"--modernise\n"
 
 
-def import_in(folder, name):
-    """Imports a module in a new Python, with `folder` first on its path; returns what it printed and its status."""
-    program = f"import sys; sys.path.insert(0, {str(folder)!r}); import {name}; print({name}.__file__)"
+def import_in(folder, *names):
+    """Imports modules in a new Python, with `folder` first on its path; returns what it printed, and its status."""
+    program = f"import sys; sys.path.insert(0, {str(folder)!r})\n"
+    program += "\n".join(f"import {name}; print({name}.__file__)" for name in names)
     run = subprocess.run([sys.executable, "-I", "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                          universal_newlines=True)
     return run.stdout + run.stderr, run.returncode
@@ -239,9 +240,8 @@ def test_folders_installed_inside_are_imported_in_place_too():
     """Nothing has to be installed or built: the path of the source tree is enough."""
     folders = [name for name in load_setup().FOLDERS_INSTALLED_INSIDE if (ROOT / name / "__init__.py").is_file()]
     assert "integrations" in folders
-    for name in folders:
-        printed, status = import_in(ROOT, f"diff_smoe_rasterization.{name}")
-        assert status == 0 and Path(printed.strip()) == ROOT / name / "__init__.py", printed
+    printed, status = import_in(ROOT, *(f"diff_smoe_rasterization.{name}" for name in folders))
+    assert status == 0 and printed.split() == [str(ROOT / name / "__init__.py") for name in folders], printed
 
 
 def test_a_strangers_folder_beside_the_installed_package_is_not_imported(tmp_path):
