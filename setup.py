@@ -1,6 +1,7 @@
 """Builds the torch extension. Metadata: pyproject.toml; files and compiler flags: sources.txt.
 
-Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA), TORCH_CUDA_ARCH_LIST, MAX_JOBS.
+Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA), TORCH_CUDA_ARCH_LIST, MAX_JOBS;
+DSMOE_CUDA_ARCH=all compiles for every card where none is seen; DSMOE_CORE_LIBRARY is a libdsmoe.a that CMake has built.
 """
 import os
 import re
@@ -13,9 +14,11 @@ import setuptools
 
 ROOT = Path(__file__).resolve().parent
 PACKAGE = "diff_smoe_rasterization"
-# What is compiled for where no card is seen: what torch's own builds are for, and 11.0. A kernel runs on later cards of
-# the same major number too; cards after the last compile its PTX when they first run it.
-CAPABILITIES = (70, 75, 80, 86, 90, 100, 110, 120)
+# What is compiled for where no card is seen. A kernel runs on later cards of the same major number too; cards after the
+# last compile its PTX when they first run it. EVERY_CARD: what torch's own builds are for, and 11.0. The usual ones are
+# the oldest that the toolkit knows, for its major number, and these.
+EVERY_CARD = (70, 75, 80, 86, 90, 100, 110, 120)
+USUAL_CARDS = (80, 90)
 FOLDERS_INSTALLED_INSIDE = ("integrations", "patches", "benchmarks")
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
 
@@ -90,16 +93,33 @@ def reasons_against_cuda(cuda_sources, torch, cuda_home):
 
 
 def architecture_flags(nvcc, torch):
-    """Returns nvcc's flags for every card that it and the package know, as torch has no default where no card is seen.
+    """Returns nvcc's flags where no card is seen, as torch has no default there: DSMOE_CUDA_ARCH=usual or all, and PTX.
 
     Empty where TORCH_CUDA_ARCH_LIST says for which cards, or where torch sees some: it compiles for those.
     """
     if os.environ.get("TORCH_CUDA_ARCH_LIST") or torch.cuda.device_count() > 0:
         return []
+    wish = os.environ.get("DSMOE_CUDA_ARCH", "usual")
+    if wish not in ("usual", "all"):
+        sys.exit(f"DSMOE_CUDA_ARCH is {wish!r}; it must be usual or all (TORCH_CUDA_ARCH_LIST takes any list)")
     known = answer(nvcc, "--list-gpu-arch").split()
-    chosen = [number for number in CAPABILITIES if f"compute_{number}" in known]
+    chosen = [number for number in EVERY_CARD if f"compute_{number}" in known]
+    if wish == "usual":
+        chosen = chosen[:1] + [number for number in chosen[1:] if number in USUAL_CARDS]
+    print(f"No GPU is seen: the kernels are compiled for compute capability "
+          f"{', '.join(str(number / 10) for number in chosen)}, and as PTX for later cards, which compile it when they "
+          "first run it. DSMOE_CUDA_ARCH=all compiles for every card, TORCH_CUDA_ARCH_LIST for those that it names.")
     kinds = [(number, f"sm_{number}") for number in chosen] + [(chosen[-1], f"compute_{chosen[-1]}")]
     return [f"-gencode=arch=compute_{number},code={kind}" for number, kind in kinds]
+
+
+def compiled_core(torch):
+    """Returns [path] of the library that holds the groups core and io already; [] where they are compiled here.
+
+    Torch releases of the older C++ ABI cannot link it.
+    """
+    path = os.environ.get("DSMOE_CORE_LIBRARY")
+    return [path] if path and torch.compiled_with_cxx11_abi() else []
 
 
 def extension():
@@ -107,7 +127,8 @@ def extension():
     torch, cpp_extension = import_build_tools()
     sources = read_sources()
     without_cuda = reasons_against_cuda(sources["cuda"], torch, cpp_extension.CUDA_HOME)
-    groups = ["core", "io", "torch"] + ([] if without_cuda else ["cuda"])
+    core = compiled_core(torch)
+    groups = ([] if core else ["core", "io"]) + ["torch"] + ([] if without_cuda else ["cuda"])
     flags = sources["flags"] + ["-g0", "-fvisibility=hidden", "-pthread"]
     if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
         flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
@@ -122,6 +143,7 @@ def extension():
         include_dirs=folders,
         define_macros=[] if without_cuda else [("DSMOE_WITH_CUDA", None)],
         extra_compile_args={"cxx": flags, "nvcc": nvcc_flags},
+        extra_objects=core,
         extra_link_args=["-pthread"],
     )
     built_against = {
@@ -162,7 +184,8 @@ def packages():
     names = list(folders)
     for name, folder in folders.items():
         names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
-    data = {PACKAGE: ["include/dsmoe/*.h", "py.typed"], f"{PACKAGE}.patches": ["shims/*/*/*.py"],  # shims are no packages of ours
+    data = {PACKAGE: ["include/dsmoe/*.h", "py.typed"],
+            f"{PACKAGE}.patches": ["shims/*/*/*.py"],  # shims are no packages of ours
             f"{PACKAGE}.benchmarks": ["Snakefile", "suites/*.yaml", "suites/scenes/*.yaml"],
             f"{PACKAGE}.benchmarks.report": ["*.json", "*.html"]}
     return {"packages": names, "package_dir": folders, "package_data": data}

@@ -87,34 +87,38 @@ sys.exit(tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 3))' && numpy=
   # Objects stay for the next build; assembled packages do not, or deleted modules would live on in them.
   rm -rf "$venv"/build/lib* "$venv"/build/bdist*
   printf '[build]\nbuild_base = %s\n' "$venv/build" >"$venv/build.cfg"
-  # Without a GPU its kernels cannot run here: they are left out, or, where they are asked for, compiled for one card.
+  # Without a GPU its kernels cannot run here: they are left out, or, where they are asked for, compiled for two
+  # cards: some code is chosen by __CUDA_ARCH__ >= 800.
   if [ -z "${TORCH_CUDA_ARCH_LIST-}" ] &&
     "$venv/bin/python" -I -W ignore -c 'import sys, torch; sys.exit(torch.cuda.device_count() > 0)'; then
-    local -x TORCH_CUDA_ARCH_LIST=8.0+PTX DSMOE_BUILD_CUDA=${DSMOE_BUILD_CUDA:-$cuda_without_gpu}
+    local -x TORCH_CUDA_ARCH_LIST="7.5;8.0+PTX" DSMOE_BUILD_CUDA=${DSMOE_BUILD_CUDA:-$cuda_without_gpu}
   fi
   # -v: the log gets each file as it is compiled.
   DIST_EXTRA_CONFIG=$venv/build.cfg pip_install -v --no-build-isolation "$root" "$numpy"
 }
 
-# prepare_environment FOLDER [WORD...]: makes, updates or reuses the environment in FOLDER; sets `venv` to its path.
+# use_environment FOLDER [WORD...]: which environment the functions below mean; sets `venv`, `log` and `stamp`.
 # The words ask pip for PyTorch; without any, the environment uses the packages of DSMOE_PYTHON, torch included.
-prepare_environment() {
-  venv=$1
+use_environment() {
+  venv=$1 log=$1/install.log stamp=$1/dsmoe.stamp
   shift
   torch_request=("$@")
-  log=$venv/install.log
-  local stamp=$venv/dsmoe.stamp python=${DSMOE_PYTHON:-python3} over_system=()
+}
+
+up_to_date() {
+  [ -f "$stamp" ] && { [ "$(cat "$stamp")" = "$(fingerprint)" ] ||
+    [ "$(cat "$stamp")" = "$(cuda_without_gpu=auto fingerprint)" ]; }  # which has more than is needed
+}
+
+# Makes the environment where there is none, and installs what was asked for as PyTorch.
+install_torch() {
+  local python=${DSMOE_PYTHON:-python3} over_system=()
   if [ -n "${DSMOE_PYTHON-}" ] && [ -x "$venv/bin/python" ] &&
     [ "$("$python" --version)" != "$("$venv/bin/python" --version)" ]; then
     fail "$venv holds $("$venv/bin/python" --version), but DSMOE_PYTHON is $("$python" --version):" \
       "remove that folder, or name another one in DSMOE_VENV"
   fi
-  if [ -f "$stamp" ] && { [ "$(cat "$stamp")" = "$(fingerprint)" ] ||
-    [ "$(cat "$stamp")" = "$(cuda_without_gpu=auto fingerprint)" ]; }; then  # which has more than is needed
-    echo "Reusing the environment $venv: nothing has changed since it was built."
-    return
-  fi
-  [ $# -gt 0 ] || over_system=(--system-site-packages)
+  [ ${#torch_request[@]} -gt 0 ] || over_system=(--system-site-packages)
   if [ -x "$venv/bin/pip" ]; then
     echo "Reusing the environment $venv and bringing it up to date (log: $log)"
   else
@@ -124,10 +128,26 @@ prepare_environment() {
     step "Creating it" "$python" -m venv "${over_system[@]}" "$venv"
   fi
   rm -f "$stamp"
-  if [ $# -gt 0 ]; then
-    step "Installing PyTorch and build tools" pip_install "$@" "setuptools>=61,<82" wheel ninja
+  if [ ${#torch_request[@]} -gt 0 ]; then
+    # --no-compile: Python compiles the modules that it imports, which are few of torch's.
+    step "Installing PyTorch and build tools" \
+      pip_install --no-compile "${torch_request[@]}" "setuptools>=61,<82" wheel ninja
   fi
+}
+
+build_package() {
   step "Compiling and installing diff_smoe_rasterization" install_package
   step "Loading it" "$venv/bin/python" -I -c 'import diff_smoe_rasterization.rasterizer'
   fingerprint >"$stamp"
+}
+
+# prepare_environment FOLDER [WORD...]: makes, updates or reuses the environment, with this package in it.
+prepare_environment() {
+  use_environment "$@"
+  if up_to_date; then
+    echo "Reusing the environment $venv: nothing has changed since it was built."
+    return
+  fi
+  install_torch
+  build_package
 }

@@ -35,7 +35,7 @@ def __getattr__(name: str) -> Any:
     return value
 
 
-# What is plain Python (settings, reference, the `dsmoe` command's help) works without the compiled part: the names above
+# What is plain Python (settings, reference, the help of `dsmoe`) works without the compiled part; the names above
 # say why they cannot be had when they are asked for. To load it takes seconds, and registers torch's ops: the command
 # `dsmoe` does that where it renders, every other program here.
 if os.path.basename((getattr(sys, "argv", None) or [""])[0]) != "dsmoe":

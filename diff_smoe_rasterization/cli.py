@@ -9,8 +9,14 @@ from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 from ._version import __version__
 from .patches.errors import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
-from .trainer.config import (PRINCIPAL_POINTS, TrainConfig, add_arguments, config_from_arguments, given_options,
-                             holds_run)
+from .trainer.config import (
+    PRINCIPAL_POINTS,
+    TrainConfig,
+    add_arguments,
+    config_from_arguments,
+    given_options,
+    holds_run,
+)
 from .trainer.errors import TrainerError, in_one_line, printable
 from .trainer.files import is_folder
 from .trainer.interrupt import exit_status

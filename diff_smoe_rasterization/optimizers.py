@@ -14,9 +14,9 @@ _OPS = torch.ops.diff_smoe_rasterization
 class FusedAdam(torch.optim.Adam):
     """Adam as torch.optim.Adam computes it, but for rounding: one kernel launch a step for each precision and device.
 
-    Groups and state are torch.optim.Adam's but for state["step"], an int here; each takes the state_dict() of the other.
-    Where a group asks for weight_decay, amsgrad or maximize, or a gradient is sparse or neither float32 nor float64, the
-    step is torch.optim.Adam's own.
+    Groups and state are torch.optim.Adam's but for state["step"], an int here. Each takes the state_dict() of the
+    other. Where a group asks for weight_decay, amsgrad or maximize, or a gradient is sparse or neither float32 nor
+    float64, the step is torch.optim.Adam's own.
     """
 
     def __init__(self, params: Iterable[Any], lr: float = 1e-3, betas: Any = (0.9, 0.999), eps: float = 1e-8) -> None:
@@ -126,10 +126,11 @@ class _Launch:
 
 def _launch_of(launches: Dict[Any, _Launch], parameter: torch.Tensor, group: Dict[str, Any]) -> _Launch:
     """The launch that the parameter may join."""
-    key = (parameter.dtype, parameter.device, *group["betas"], group["eps"])
+    beta1, beta2 = group["betas"]
+    key = (parameter.dtype, parameter.device, beta1, beta2, group["eps"])
     launch = launches.get(key)
     if launch is None:
-        launch = launches[key] = _Launch(*group["betas"], group["eps"])
+        launch = launches[key] = _Launch(beta1, beta2, group["eps"])
     return launch
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Any, NamedTuple, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Any, NamedTuple, Optional, Tuple, Union, cast
 
 if TYPE_CHECKING:
     import torch  # which takes seconds to load: the command line reads this file for its names
@@ -35,7 +35,8 @@ MAX_BACKGROUND_GATE = 1e30  # that and a background's colour still make a float3
 BackgroundGate = Union[float, "torch.Tensor"]
 """lambda: a number, or a tensor of one element, which receives a gradient.
 
-The number 1 is alpha blending bit for bit. A tensor of 1 keeps the footprints of `smoe`: where tiles end, pixels differ.
+The number 1 is alpha blending bit for bit. A tensor of 1 keeps the footprints of `smoe`, and pixels differ
+where tiles end.
 """
 
 
@@ -117,8 +118,8 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
 
     In `smoe` an explicit value wins; None means the environment variable DSMOE_BACKGROUND_GATE, for callers that
     cannot be edited, and 0 (Eq. 7) where that is unset. `alpha` is the family's member with 1; the ablations have none.
-    Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor that has not one element,
-    and for a value in a mode that knows none.
+    Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor of not one element, and
+    for a value in a mode that knows none.
     """
     if blend_mode != "smoe":
         of_mode = 1.0 if blend_mode == "alpha" else 0.0
@@ -131,8 +132,9 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
         background_gate = os.environ.get(BACKGROUND_GATE_VARIABLE) or 0.0
         source = BACKGROUND_GATE_VARIABLE
     if _is_tensor(background_gate):
-        if background_gate.numel() != 1:
-            raise ValueError(f"background_gate has shape {list(background_gate.shape)}; it must have one element")
+        tensor = cast("torch.Tensor", background_gate)
+        if tensor.numel() != 1:
+            raise ValueError(f"background_gate has shape {list(tensor.shape)}; it must have one element")
         return background_gate
     try:
         value = float(background_gate)

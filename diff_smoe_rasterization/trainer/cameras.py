@@ -34,13 +34,13 @@ class Camera:
         """[3] the camera's position in the world."""
         return -self.rotation.T @ self.translation
 
-    def resized(self, width: int, height: int) -> "Camera":
+    def resized(self, width: int, height: int) -> Camera:
         """The same view at another image size; intrinsics scale with the axes."""
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(self, fx=self.fx * sx, cx=self.cx * sx, fy=self.fy * sy, cy=self.cy * sy,
                                    width=width, height=height)
 
-    def centred(self) -> "Camera":
+    def centred(self) -> Camera:
         """The same view with the principal point moved to the image centre."""
         return dataclasses.replace(self, cx=self.width / 2, cy=self.height / 2)
 

@@ -88,7 +88,7 @@ class TrainConfig:
         except ValueError as error:
             raise ConfigError(str(error)) from error
 
-    def validate(self) -> "TrainConfig":
+    def validate(self) -> TrainConfig:
         """Checks every option that needs no file; returns self."""
         for option in dataclasses.fields(self):
             value, choices = getattr(self, option.name), option.metadata.get("choices")
@@ -115,13 +115,13 @@ class TrainConfig:
             flag = "--" + name.replace("_", "-")
             raise ConfigError(f"{flag} is {getattr(self, name)!r}; it must be {requirement}")
 
-    def changed(self, **options: Any) -> "TrainConfig":
+    def changed(self, **options: Any) -> TrainConfig:
         """A validated copy with some options set; another blend mode takes its own background gate."""
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
             options = {"background_gate": None, **options}
         return dataclasses.replace(self, **options).validate()
 
-    def shortened(self) -> "TrainConfig":
+    def shortened(self) -> TrainConfig:
         """The same recipe squeezed into `iterations` steps: each milestone keeps its share of the 30,000 of 3DGS.
 
         The densification interval stays, as far as ten densifications fit. What is not at its default is kept.
@@ -143,13 +143,13 @@ class TrainConfig:
         write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
 
     @classmethod
-    def of_record(cls, values: Dict[str, Any]) -> "TrainConfig":
+    def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
         """The options of an earlier run; one that names no background gate was trained with 0."""
         gate = values.get("background_gate")
         return cls(**{**values, "background_gate": 0.0 if gate is None and values["blend_mode"] == "smoe" else gate})
 
     @classmethod
-    def load(cls, folder: str) -> "TrainConfig":
+    def load(cls, folder: str) -> TrainConfig:
         """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
         if not holds_run(folder):
@@ -176,7 +176,7 @@ class TrainConfig:
             raise ConfigError(f"{path}: {error}") from error
 
     @classmethod
-    def of_run(cls, folder: str, scene_option: str, **options: Any) -> "TrainConfig":
+    def of_run(cls, folder: str, scene_option: str, **options: Any) -> TrainConfig:
         """The options of the run in a folder with some set. Raises ConfigError, also where its scene is not there.
 
         scene_option: what says where the scene lies now, for that error.
@@ -188,7 +188,7 @@ class TrainConfig:
                               f"name with {scene_option} where it lies now")
         return config
 
-    def differences(self, later: "TrainConfig") -> List[str]:
+    def differences(self, later: TrainConfig) -> List[str]:
         """Options that keep `later` from continuing this run, one text each; more iterations do not."""
         # These alter when something is written or where, never the trained Gaussians.
         harmless = {"scene", "output", "eval_every", "checkpoint_every"}
@@ -228,7 +228,7 @@ def _number_or_learned(text: str) -> Union[float, str]:
         raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
 
 
-def _flag(option: "dataclasses.Field[Any]") -> str:
+def _flag(option: dataclasses.Field[Any]) -> str:
     return "--" + option.name.replace("_", "-")
 
 

@@ -48,7 +48,7 @@ class View:
         """[1, H, W] in [0, 1]; None where every pixel counts."""
         return None if self.mask is None else as_float(self.mask)
 
-    def to(self, device: str) -> "View":
+    def to(self, device: str) -> View:
         """The same view with its images on `device`."""
         planes = {name: getattr(self, name) for name in ("image", "opacity", "mask")}
         return dataclasses.replace(self, **{name: plane.to(device) for name, plane in planes.items()

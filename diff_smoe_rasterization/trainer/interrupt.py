@@ -26,7 +26,7 @@ class DelayedInterrupt:
         self.asked: Optional[KeyboardInterrupt] = None  # what is to be raised once all is saved
         self._usual: Dict[int, Any] = {}
 
-    def __enter__(self) -> "DelayedInterrupt":
+    def __enter__(self) -> DelayedInterrupt:
         if threading.current_thread() is threading.main_thread():
             usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
             self._usual = {number: handler for number, handler in usual.items() if signal.getsignal(number) == handler}

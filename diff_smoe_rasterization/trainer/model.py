@@ -49,7 +49,7 @@ class GaussianModel:
         self.raw = {name: raw[name].detach().clone().contiguous().requires_grad_() for name in PARAMETERS}
 
     @classmethod
-    def from_points(cls, points: PointCloud, sh_degree: int, device: str) -> "GaussianModel":
+    def from_points(cls, points: PointCloud, sh_degree: int, device: str) -> GaussianModel:
         """Initialises as 3DGS: round Gaussians as wide as the distance to their neighbours, opacity 0.1."""
         count = len(points.positions)
         positions = torch.tensor(points.positions, device=device)

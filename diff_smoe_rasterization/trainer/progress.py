@@ -28,6 +28,6 @@ class _Lines:
         self.stream.flush()
 
 
-def progress_bar(*arguments: Any, **options: Any) -> "tqdm[Any]":
+def progress_bar(*arguments: Any, **options: Any) -> tqdm[Any]:
     """A tqdm with these arguments, on stderr."""
     return tqdm(*arguments, file=sys.stderr if sys.stderr.isatty() else _Lines(sys.stderr), **options)

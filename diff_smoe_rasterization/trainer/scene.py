@@ -35,7 +35,7 @@ class Scene:
     extent: float  # world units
     split: str
 
-    def to(self, device: str) -> "Scene":
+    def to(self, device: str) -> Scene:
         """The same scene with its images on `device`."""
 
         return dataclasses.replace(self, train=[view.to(device) for view in self.train],

@@ -123,22 +123,24 @@ def build(name, mode):
         shape = (len(scene.settings.bg) + len(outputs), scene.settings.image_height, scene.settings.image_width)
         weights = random_normal(shape, 1)
         safe = threshold_margin(scene) > FLOAT32_MARGIN
-        expected = render(reference.rasterize, scene, outputs, weights)
-        expected_safe = render(reference.rasterize, scene, outputs, weights * safe)[2]
+        *expected, expected_safe = render(reference.rasterize, scene, outputs, weights, weights * safe)
     return scene, outputs, weights, safe, expected, expected_safe
 
 
-def render(function, scene, outputs, weights):
-    """Returns (rendering, images by name, gradients by name)."""
+def render(function, scene, outputs, *weights):
+    """Returns (rendering, images by name, gradients by name for each of the weights)."""
     scene = scene.requiring_grad()
     rendering = function(settings=scene.settings, outputs=outputs, **scene.inputs)
     images = {"color": rendering.color, **{name: getattr(rendering, name) for name in outputs}}
     leaves = scene.leaves()
     stacked = torch.cat(list(images.values()))
-    values = torch.autograd.grad(stacked, list(leaves.values()), weights.to(stacked), allow_unused=True)
-    gradients = {name: torch.zeros_like(leaf) if value is None else value
-                 for (name, leaf), value in zip(leaves.items(), values)}
-    return rendering, {name: image.detach() for name, image in images.items()}, gradients
+    gradients = []
+    for weight in weights:
+        values = torch.autograd.grad(stacked, list(leaves.values()), weight.to(stacked), allow_unused=True,
+                                     retain_graph=weight is not weights[-1])
+        gradients.append({name: torch.zeros_like(leaf) if value is None else value
+                          for (name, leaf), value in zip(leaves.items(), values)})
+    return (rendering, {name: image.detach() for name, image in images.items()}, *gradients)
 
 
 @pytest.mark.parametrize("mode, name", CASES)

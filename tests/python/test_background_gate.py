@@ -204,7 +204,8 @@ def test_where_all_gates_are_closed_the_background_takes_pixel_and_gradient(func
 @pytest.mark.parametrize("mode", ["smoe", "smoe_tn", "smoe_std"])
 @pytest.mark.parametrize("background", [math.nan, math.inf])
 def test_without_a_gate_a_background_that_is_no_number_shows_in_empty_pixels_alone(function, mode, background):
-    scene = random_scene(mode, 60, scale=0.05, degree=1, bg=torch.full((3,), background, dtype=torch.float64))
+    scene = random_scene(mode, 20, 24, 20, scale=0.05, degree=1,
+                         bg=torch.full((3,), background, dtype=torch.float64))
     scene = scene.requiring_grad()
     rendering = function(settings=scene.settings, outputs=("alpha",), **scene.inputs)
     empty = rendering.alpha[0] == 0
@@ -257,7 +258,7 @@ def test_the_common_factor_of_all_opacities_has_a_gradient():
 
 
 def test_the_environment_is_for_smoe_alone(function, monkeypatch):
-    scene = random_scene("smoe", 60, degree=1)
+    scene = random_scene("smoe", 30, 24, 20, degree=1)
 
     def color(mode, **fields):
         return function(settings=scene.settings._replace(blend_mode=mode, **fields), **scene.inputs).color

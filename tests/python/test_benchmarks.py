@@ -28,8 +28,8 @@ def same_number_of_threads_afterwards():
 
 def test_the_command_measures_every_case(tmp_path, capsys):
     path = tmp_path / "out.json"
-    assert cpu_rasterizer.main(["--synthetic", "300", "--repeats", "1", "--threads", "1,2", "--modes", "alpha,smoe,smoe:0.5",
-                                "--no-memory", "--json", str(path)]) == 0
+    assert cpu_rasterizer.main(["--synthetic", "300", "--repeats", "1", "--threads", "1,2",
+                                "--modes", "alpha,smoe,smoe:0.5", "--no-memory", "--json", str(path)]) == 0
     rows = {(row["mode"], row["threads"]): row for row in json.loads(path.read_text(encoding="utf-8"))["rows"]}
     assert sorted(rows) == [(mode, threads) for mode in ("alpha", "smoe", "smoe:0.5") for threads in (1, 2)]
     for row in rows.values():

@@ -91,7 +91,7 @@ def test_image_sizes(mode, width, height):
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe_learned_gate"])  # the two kinds of footprint
 def test_few_gaussians_on_many_tiles(mode):
-    scene = random_scene(mode, 6, 520, 300, scale=0.05)
+    scene = random_scene(mode, 6, 264, 152, scale=0.05)
     assert (assert_equals_reference(scene).radii > 0).any()
 
 

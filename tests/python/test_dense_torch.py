@@ -6,10 +6,10 @@ import sys
 
 import pytest
 import torch
+from scenes import assert_not_empty, gradients, random_scene
 
 from diff_smoe_rasterization.reference import rasterize as reference_rasterize
 from diff_smoe_rasterization.settings import BLEND_MODES
-from scenes import assert_not_empty, gradients, random_scene
 
 sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks"))
 import dense_torch  # noqa: E402
@@ -45,7 +45,7 @@ def test_image_and_gradients_are_those_of_the_reference(mode, gate):
     compare(mode, gate)
 
 
-@pytest.mark.parametrize("mode", BLEND_MODES)
+@pytest.mark.parametrize("mode", ["alpha", *(pytest.param(mode, marks=pytest.mark.slow) for mode in BLEND_MODES[1:])])
 def test_pixels_that_saturate_stop_where_the_reference_stops(mode):
     compare(mode, num_gaussians=300, opacity=(0.9, 1.2), scale=0.3, seed=3)
 

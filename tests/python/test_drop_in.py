@@ -10,7 +10,13 @@ from comparison import assert_close, threshold_margin
 from scenes import camera_settings, gradients, random_scene, random_weights
 
 from diff_smoe_rasterization import (
-    BLEND_MODES, GaussianRasterizationSettings, GaussianRasterizer, Rendering, rasterize, rasterize_gaussians)
+    BLEND_MODES,
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    Rendering,
+    rasterize,
+    rasterize_gaussians,
+)
 
 pytestmark = pytest.mark.usefixtures("device")
 

@@ -113,14 +113,19 @@ def runs_on(capability, flags):
             or any(number <= capability for number in intermediate))
 
 
+@pytest.mark.parametrize("wish", ["usual", "all"])
 @pytest.mark.parametrize("release, known, oldest", [
+    ("11.4", (35, 50, 52, 60, 61, 62, 70, 72, 75, 80, 86, 87), 70),
     ("12.0", (50, 52, 60, 61, 70, 72, 75, 80, 86, 87, 89, 90), 70),
     ("13.0", (75, 80, 86, 87, 88, 89, 90, 100, 110, 103, 120, 121), 75),
 ])
-def test_without_a_card_kernels_are_built_for_all(tmp_path, monkeypatch, release, known, oldest):
-    """Those that the toolkit knows from 7.0 on, and those that come later."""
+def test_without_a_card_kernels_are_built_for_all(tmp_path, monkeypatch, capsys, release, known, oldest, wish):
+    """Those that the toolkit knows from 7.0 on, and those that come later; by default with fewer binaries, and PTX."""
     monkeypatch.delenv("TORCH_CUDA_ARCH_LIST", raising=False)
+    monkeypatch.setenv("DSMOE_CUDA_ARCH", wish)
     flags = load_setup().architecture_flags(toolkit(tmp_path, release, *known)[1], torch_of(release))
+    assert f"compute capability {oldest / 10}, " in capsys.readouterr().out
+    assert wish == "all" or len(flags) <= 4
     assert all(flag.startswith("-gencode=arch=compute_") for flag in flags)
     built = [int(flag.rpartition("_")[2]) for flag in flags]
     assert set(built) <= set(known) and min(built) == oldest
@@ -178,6 +183,9 @@ def test_a_card_or_a_list_decides_for_which_cards_kernels_are_built(tmp_path, mo
     setup, (_, nvcc) = load_setup(), toolkit(tmp_path, "12.0", 80, 90)
     monkeypatch.delenv("TORCH_CUDA_ARCH_LIST", raising=False)
     assert setup.architecture_flags(nvcc, torch_of("12.0", cards=1)) == []
+    monkeypatch.setenv("DSMOE_CUDA_ARCH", "some")
+    with pytest.raises(SystemExit, match="DSMOE_CUDA_ARCH is 'some'"):
+        setup.architecture_flags(nvcc, torch_of("12.0"))
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6")
     assert setup.architecture_flags(nvcc, torch_of("12.0")) == []
 
@@ -219,9 +227,10 @@ sys.exit(main(sys.argv[1:]))""")
         assert subprocess.run(["bash", "-c", program], stdout=subprocess.PIPE).stdout == b"--modernise\n"
 
 
-def import_in(folder, name):
-    """Imports a module in a new Python, with `folder` first on its path; returns what it printed and its status."""
-    program = f"import sys; sys.path.insert(0, {str(folder)!r}); import {name}; print({name}.__file__)"
+def import_in(folder, *names):
+    """Imports modules in a new Python, with `folder` first on its path; returns what it printed, and its status."""
+    program = f"import sys; sys.path.insert(0, {str(folder)!r})\n"
+    program += "\n".join(f"import {name}; print({name}.__file__)" for name in names)
     run = subprocess.run([sys.executable, "-I", "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                          universal_newlines=True)
     return run.stdout + run.stderr, run.returncode
@@ -231,9 +240,8 @@ def test_folders_installed_inside_are_imported_in_place_too():
     """Nothing has to be installed or built: the path of the source tree is enough."""
     folders = [name for name in load_setup().FOLDERS_INSTALLED_INSIDE if (ROOT / name / "__init__.py").is_file()]
     assert "integrations" in folders
-    for name in folders:
-        printed, status = import_in(ROOT, f"diff_smoe_rasterization.{name}")
-        assert status == 0 and Path(printed.strip()) == ROOT / name / "__init__.py", printed
+    printed, status = import_in(ROOT, *(f"diff_smoe_rasterization.{name}" for name in folders))
+    assert status == 0 and printed.split() == [str(ROOT / name / "__init__.py") for name in folders], printed
 
 
 def test_a_strangers_folder_beside_the_installed_package_is_not_imported(tmp_path):

@@ -1,5 +1,8 @@
-"""The reference rasterizer against finite differences and against pixels computed by hand; test_reference_rules.py
-has its single rules."""
+"""The reference rasterizer against pixels computed by hand; test_reference_rules.py has its single rules.
+
+Its gradients are those of the package (test_against_reference.py), which equal finite differences
+(test_gradients.py).
+"""
 from __future__ import annotations
 
 import math
@@ -25,25 +28,6 @@ def render(scene, outputs=()):
 def single_threaded():
     with one_thread():
         yield
-
-
-@with_gates
-@pytest.mark.parametrize("covariance, antialiasing", [("scales", False), ("scales", True), ("cov3D", False)])
-def test_gradients_equal_finite_differences(mode, covariance, antialiasing):
-    scene = random_scene(mode, 8, 20, 18, seed=3, scale=0.4, opacity=(0.1, 0.9), degree=1, covariance=covariance,
-                         antialiasing=antialiasing)
-    assert threshold_margin(scene).min() > 1e-4  # far more than the step of 1e-6 can cross
-    scene = scene.requiring_grad()
-    leaves = {name: leaf for name, leaf in scene.leaves().items() if name != "means2D"}
-
-    def function(*tensors):
-        tensors = dict(zip(leaves, tensors))
-        camera = {name: tensors.pop(name) for name in scene.camera()}
-        images = reference.rasterize(settings=scene.settings._replace(**camera), outputs=OUTPUTS, **tensors)
-        return images.color, images.alpha, images.depth, images.inverse_depth
-
-    # The fast mode compares random projections of both Jacobians: an error in any input shows.
-    assert torch.autograd.gradcheck(function, list(leaves.values()), fast_mode=True)
 
 
 @with_gates

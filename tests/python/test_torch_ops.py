@@ -5,10 +5,10 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import gradients, op_arguments, random_scene, with_gate
+from scenes import gradients, op_arguments, random_scene
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization.settings import OUTPUTS
+from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
 RESULTS = [result.name for result in torch.ops.diff_smoe_rasterization.rasterize.default._schema.returns]
 NUM_IMAGES = 5  # results of the op that are the caller's: color, radii, gate_sum, depth, inverse_depth
@@ -61,14 +61,19 @@ def images_and_gradients(function, scene):
                     for (name, leaf), value in zip(leaves.items(), values)}
 
 
-@with_gate
-@pytest.mark.parametrize("case", [dict(degree=1), dict(degree=1, split_dc=True), dict(channels=5, covariance="cov3D")],
-                         ids=["shs", "dc", "channels"])
+# With and without a tensor for the background's gate, with and without depth order: other modes have the same shapes.
+SHAPES = pytest.mark.parametrize("mode", ["smoe", "smoe_std", "smoe_learned_gate"])
+
+
+@pytest.mark.parametrize("mode, case", [
+    ("smoe", dict(degree=1)), ("smoe_std", dict(degree=1)), ("smoe_learned_gate", dict(degree=1)),
+    ("alpha", dict(degree=1, split_dc=True)), ("smoe", dict(channels=5, covariance="cov3D"))])
 def test_opcheck_of_rasterize(mode, case):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32, **case).requiring_grad()
     opcheck_rasterize(scene)
 
 
+@SHAPES
 def test_opcheck_of_rasterize_on_no_gaussians(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32).rows(slice(0, 0)).requiring_grad()
     opcheck_rasterize(scene)
@@ -80,7 +85,7 @@ def test_opcheck_of_mark_visible():
                           (scene.inputs["means3D"], scene.settings.viewmatrix, 0.2))
 
 
-@with_gate
+@SHAPES
 def test_opcheck_of_contributions(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
     saved = dict(zip(RESULTS, torch.ops.diff_smoe_rasterization.rasterize.default(*op_arguments(scene))))
@@ -126,8 +131,8 @@ def test_compiled_renderings_without_gradients_have_no_backward_pass_to_come():
     assert wanted == [True, False]
 
 
-@with_gate
-@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+@pytest.mark.parametrize("mode, backend", [
+    *((mode, "aot_eager") for mode in BLEND_MODES + ("smoe_learned_gate",)), ("smoe", "eager")])
 def test_compiled_equals_eager(mode, backend):
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32, degree=1)
     expected, expected_gradients = gradients(diff_smoe_rasterization.rasterize, scene, OUTPUTS)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
 from comparison import assert_all_close, assert_close, reference_gradients
+from real_data import folder
 from scenes import Scene, camera_settings, gradients, op_arguments, random_scene, with_gate, with_gates
 
 from diff_smoe_rasterization import rasterize, reference
@@ -13,7 +14,6 @@ from diff_smoe_rasterization.settings import OUTPUTS
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.model import GaussianModel
 from diff_smoe_rasterization.trainer.scene import load_cameras, read_layout
-from real_data import folder
 
 
 def crowd(mode, **options):

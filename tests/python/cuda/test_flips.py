@@ -1,6 +1,7 @@
 """What flips.py tells apart, on the CPU: float32 against float64, and colours that are wrong."""
 from __future__ import annotations
 
+import functools
 import os
 import sys
 
@@ -13,9 +14,11 @@ from diff_smoe_rasterization import rasterize
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "..", "benchmarks"))
 import models  # noqa: E402
 
+MODES = pytest.mark.parametrize("mode", ["alpha", pytest.param("smoe", marks=pytest.mark.slow)])
 CUT = {"alpha": 0.0, "smoe": 1 / 255}
 
 
+@functools.lru_cache(maxsize=None)
 def rendered(mode):
     """A model of small splats in float32 and in float64: images with the sum of the weights, inputs, settings."""
     model = models.synthetic(40_000, 320, 208)
@@ -28,7 +31,7 @@ def rendered(mode):
     return *(torch.cat([image.color, image.alpha]).double() for image in (first, second)), model.inputs, settings
 
 
-@pytest.mark.parametrize("mode", list(CUT))
+@MODES
 def test_float32_flips_and_rounds_and_nothing_else(mode):
     first, second, inputs, settings = rendered(mode)
     different = ((first - second).abs() > 5e-6).any(0)
@@ -37,7 +40,7 @@ def test_float32_flips_and_rounds_and_nothing_else(mode):
     assert counts["flipped"] > 0 and counts["rounded"] > 0 and counts["unexplained"] == 0
 
 
-@pytest.mark.parametrize("mode", list(CUT))
+@MODES
 def test_a_wrong_colour_is_neither(mode):
     """1e-3 is a quarter of what a pair at the cut can bring; few pixels have a close decision that could bring it."""
     first, _, inputs, settings = rendered(mode)

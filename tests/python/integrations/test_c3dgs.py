@@ -15,7 +15,11 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import Rendering, reference
 from diff_smoe_rasterization.integrations import c3dgs
 from diff_smoe_rasterization.integrations.c3dgs import (
-    GaussianRasterizationSettings, GaussianRasterizer, GaussianRasterizerIndexed, rasterize_gaussians_indexed)
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    GaussianRasterizerIndexed,
+    rasterize_gaussians_indexed,
+)
 
 pytestmark = pytest.mark.usefixtures("device")
 

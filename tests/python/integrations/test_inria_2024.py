@@ -12,7 +12,11 @@ from scenes import gradients, random_scene
 from diff_smoe_rasterization import Rendering
 from diff_smoe_rasterization.integrations import inria_2024
 from diff_smoe_rasterization.integrations.inria_2024 import (
-    GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam, fused_ssim)
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    SparseGaussianAdam,
+    fused_ssim,
+)
 
 pytestmark = pytest.mark.usefixtures("device")
 

@@ -14,7 +14,11 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import Rendering, rasterize, reference
 from diff_smoe_rasterization.integrations import taming
 from diff_smoe_rasterization.integrations.taming import (
-    GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam, fused_ssim)
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    SparseGaussianAdam,
+    fused_ssim,
+)
 
 pytestmark = pytest.mark.usefixtures("device")
 

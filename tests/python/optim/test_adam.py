@@ -153,7 +153,7 @@ def test_a_group_may_ask_for_more_later(device):
         for seed, decay in enumerate((0, 0.1, 0)):
             optimizer.param_groups[0]["weight_decay"] = decay
             set_gradients(parameters, seed)
-            assert optimizer.step(lambda: seed) == seed
+            assert optimizer.step(lambda seed=seed: seed) == seed
     torch.testing.assert_close(ours[0], theirs[0], rtol=1e-14, atol=1e-14)
 
 

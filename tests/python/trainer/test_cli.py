@@ -21,7 +21,6 @@ from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer import inspection
 from diff_smoe_rasterization.trainer.loop import Trainer
 from diff_smoe_rasterization.trainer.results import viewer_warning
-from diff_smoe_rasterization.trainer.synthetic import write_synthetic_scene
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
          "--densification-interval", "4", "--quiet"]
