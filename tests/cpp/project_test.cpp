@@ -7,6 +7,7 @@
 #include <limits>
 #include <vector>
 
+#include "all_modes.h"
 #include "test_scene.h"
 
 namespace dsmoe {
@@ -179,7 +180,7 @@ TEST(ProjectGaussian, RadiusDoesNotDependOnModeOpacityOrAntialiasing) {
   EXPECT_EQ(project(scene).radius, radius);
   for (const double opacity : {-1.0, 0.0, 1e-9, 3.0}) {
     scene.opacities = {opacity};
-    for (const auto mode : {BlendMode::kAlpha, BlendMode::kSmoe, BlendMode::kSmoeTn, BlendMode::kSmoeStd}) {
+    for (const auto mode : all_modes()) {
       scene.config.mode = mode;
       EXPECT_EQ(project(scene).radius, radius);
     }

@@ -4,8 +4,8 @@
 
 #include <cstdint>
 
+#include "dsmoe/blend.h"
 #include "dsmoe/camera.h"
-#include "dsmoe/gate.h"
 
 namespace dsmoe {
 

@@ -62,10 +62,10 @@ template <class S> DSMOE_HD bool attributes_finite(const GaussianInputs<S>& in, 
   return shape_finite(in, i) && color_finite(in, num_channels, i);
 }
 
-// The tiles that may hold pairs of a Gaussian.
+// The tiles that may hold pairs of a Gaussian; the radius counts where the mode is within_radius().
 template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, const Camera<S>& camera, Vec2<S> mean, S radius) {
   const TileGrid grid(camera.width, camera.height);
-  if (cuts_by_alpha(mode)) return radius_rect(mean, radius, grid);
+  if (within_radius(mode)) return radius_rect(mean, radius, grid);
   return {0, 0, grid.columns, grid.rows};
 }
 
@@ -84,14 +84,15 @@ DSMOE_HD int32_t project_shape(const GaussianInputs<S>& in, const Camera<S>& cam
   const S radius = screen_radius(conic);
   if (!is_ellipse(conic) || !is_finite(radius)) return 0;
   if (!is_finite(pixel.x) || !is_finite(pixel.y)) return 0;
-  const S widest_reach = squared_reach(config.mode, S(1), S(0));
-  const bool seen = cuts_by_alpha(config.mode)
+  const Cut cut = cut_of(config.mode);
+  const S widest_reach = squared_reach(cut, S(1), S(0));
+  const bool seen = within_radius(config.mode)
                         ? !tile_bounds(config.mode, camera, pixel, radius).empty()
                         : meets_image(conic.inverse, pixel, widest_reach, camera.width, camera.height);
   if (!seen) return 0;
   S opacity = in.opacities[i];
   if (config.antialiasing) opacity *= opacity_compensation(cov2d, conic);
-  const S reach = squared_reach(config.mode, opacity, config.alpha_cut().of(opacity));
+  const S reach = squared_reach(cut, opacity, config.alpha_cut().of(opacity));
   out = {pixel, conic.inverse, opacity, reach, view.z};
   return static_cast<int32_t>(min(radius, S(1 << 30)));
 }
