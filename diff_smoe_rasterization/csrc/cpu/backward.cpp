@@ -63,15 +63,11 @@ void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const Ra
     const int64_t tiles = num_tiles(camera.width, camera.height);
     const int background = config.num_channels + 1;  // numbers: its colour and its gate
     std::vector<S> dL_dbackground(gradients.background != nullptr ? tiles * background : 0);
-    const int64_t pairs = for_each_tile<S>(
-        config.num_threads, camera.width, camera.height, config.num_features(),
-        [&](int64_t tile, int x, int y, S* scratch) {
-          S* tile_background = dL_dbackground.empty() ? nullptr : dL_dbackground.data() + tile * background;
-          return kernels.backward(
-              {config, saved, images, image_gradients, camera.width, camera.height, x, y, saved.tile_offsets[tile],
-               saved.tile_offsets[tile + 1], dL_dinstances.get(), tile_background},
-              scratch);
-        });
+    const TileGradients<S> tile_gradients = {images, image_gradients, dL_dinstances.get(),
+                                             dL_dbackground.empty() ? nullptr : dL_dbackground.data()};
+    const int64_t pairs =
+        for_each_tile(config, saved, camera.width, camera.height, config.num_features(),
+                      [&](const Tile<S>& tile, S* scratch) { return kernels.backward(tile, tile_gradients, scratch); });
     if (times != nullptr) times->backward_pairs += pairs;
     if (gradients.background != nullptr) {
       std::vector<double> wide(background);
