@@ -8,9 +8,9 @@
 #include <vector>
 
 #include "dispatch.h"
+#include "dsmoe/arrays.h"
 #include "dsmoe/contribution.h"
 #include "dsmoe/pixel.h"
-#include "dsmoe/project.h"
 #include "test_scene.h"
 
 namespace dsmoe {
@@ -40,7 +40,9 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
   std::vector<S> features(scene.count * num_features);
   BruteForce<S> out;
   for (int64_t i = 0; i < scene.count; ++i) {
-    out.radii.push_back(project_gaussian(inputs, camera, config, i, projected[i], &features[i * num_features]));
+    const auto projection = project_gaussian(inputs, camera, config, i, &features[i * num_features]);
+    out.radii.push_back(projection.radius);
+    projected[i] = projection.gaussian;
   }
   out.contributions.resize(scene.count, no_contribution<double>());
   std::vector<int64_t> order;

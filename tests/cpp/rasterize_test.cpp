@@ -14,6 +14,7 @@
 
 #include "all_modes.h"
 #include "brute_force.h"
+#include "dsmoe/arrays.h"
 #include "test_scene.h"
 
 namespace dsmoe {
