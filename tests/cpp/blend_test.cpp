@@ -1,12 +1,11 @@
 // The blend modes against the paper's sums, written out, and against finite differences of those sums.
-#include "dsmoe/blend.h"
-
 #include <gtest/gtest.h>
 
 #include <cmath>
 #include <vector>
 
 #include "all_modes.h"
+#include "dsmoe/pixel.h"
 #include "finite_difference.h"
 
 namespace dsmoe {

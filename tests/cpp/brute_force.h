@@ -8,9 +8,9 @@
 #include <vector>
 
 #include "dispatch.h"
-#include "dsmoe/blend.h"
+#include "dsmoe/arrays.h"
 #include "dsmoe/contribution.h"
-#include "dsmoe/project.h"
+#include "dsmoe/pixel.h"
 #include "test_scene.h"
 
 namespace dsmoe {
@@ -40,7 +40,9 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
   std::vector<S> features(scene.count * num_features);
   BruteForce<S> out;
   for (int64_t i = 0; i < scene.count; ++i) {
-    out.radii.push_back(project_gaussian(inputs, camera, config, i, projected[i], &features[i * num_features]));
+    const auto projection = project_gaussian(inputs, camera, config, i, &features[i * num_features]);
+    out.radii.push_back(projection.radius);
+    projected[i] = projection.gaussian;
   }
   out.contributions.resize(scene.count, no_contribution<double>());
   std::vector<int64_t> order;
@@ -64,7 +66,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
     for (const int64_t i : order) {
       const auto& g = projected[i];
       if (!(g.opacity > S(0))) continue;
-      if (kMode == BlendMode::kAlpha) {
+      if (Blend<kMode>::kWithinRadius) {
         const TileRect rect = radius_rect(g.mean, S(out.radii[i]), grid);
         const int tile_x = x / kTileSize, tile_y = y / kTileSize;
         if (tile_x < rect.x0 || tile_x >= rect.x1 || tile_y < rect.y0 || tile_y >= rect.y1) continue;
@@ -75,7 +77,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
       const auto gate = evaluate_gate<kMode>(power, g.opacity, least_alpha);
       const double terms = double(g.conic.xx) * dx * dx + double(g.conic.yy) * dy * dy;
       if (terms > 0) margin = std::min(margin, std::abs(double(power)) / terms);
-      if (kMode == BlendMode::kAlpha) {
+      if (Blend<kMode>::kCut == Cut::kAlpha) {
         decide(gate.alpha, kAlphaCut);
       } else {
         decide(exp(power), kGateCut);
@@ -83,7 +85,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
       }
       if (gate.counts) {
         ++out.num_pairs;
-        if (state.is_open() && kMode != BlendMode::kSmoeStd) {
+        if (state.is_open() && Blend<kMode>::kNeedsDepthOrder) {
           decide(state.transmittance * (S(1) - gate.alpha), kTransmittanceCut);
         }
       }

@@ -31,6 +31,14 @@ TEST(TransformPoint, IsARowVectorTimesTheMatrix) {
   EXPECT_EQ(out.z, 3 + 70 + 1100 + 15);
 }
 
+// The gradients of the camera's numbers, of one share.
+std::vector<double> flat(const CameraGradient<double>& g) {
+  std::vector<double> out(g.view, g.view + 16);
+  out.insert(out.end(), g.projection, g.projection + 16);
+  out.insert(out.end(), g.position, g.position + 3);
+  return out;
+}
+
 // x: point, then matrix.
 TEST(TransformPoint, BackwardIsTheDerivative) {
   Random random(1);
@@ -38,26 +46,28 @@ TEST(TransformPoint, BackwardIsTheDerivative) {
   auto loss = [&](const std::vector<double>& v) {
     return dot(vec3(weights.data()), transform_point(&v[3], vec3(&v[0])));
   };
-  double dL_dm[16] = {};
-  const Vec3<double> dL_dp = transform_point_backward(&x[3], vec3(&x[0]), vec3(weights.data()), dL_dm);
+  const Vec3<double> dL_dp = transform_point_backward(&x[3], vec3(weights.data()));
+  CameraShare<double> share = {};
+  share.point = vec3(&x[0]), share.dL_dview = vec3(weights.data());
+  CameraGradient<double> by_camera;
+  by_camera.add(share);
   std::vector<double> actual = {dL_dp.x, dL_dp.y, dL_dp.z};
-  actual.insert(actual.end(), dL_dm, dL_dm + 16);
+  actual.insert(actual.end(), by_camera.view, by_camera.view + 16);
   expect_gradient(actual, loss, x);
 }
 
-TEST(TransformPoint, BackwardAddsToTheMatrixGradientAndNeedsNone) {
+TEST(CameraGradient, AddsSharesAndOthersOfItsKind) {
   Random random(2);
-  const auto m = random.uniforms(16);
-  const Vec3<double> p = {1, 2, 3}, g = {1, -1, 2};
-  double once[16] = {}, twice[16] = {};
-  const auto with = transform_point_backward(m.data(), p, g, once);
-  transform_point_backward(m.data(), p, g, twice);
-  transform_point_backward(m.data(), p, g, twice);
-  for (int i = 0; i < 16; ++i) EXPECT_EQ(twice[i], 2 * once[i]);
-  const auto without = transform_point_backward<double>(m.data(), p, g, nullptr);
-  EXPECT_EQ(with.x, without.x);
-  EXPECT_EQ(with.y, without.y);
-  EXPECT_EQ(with.z, without.z);
+  const auto x = random.uniforms(21);
+  const CameraShare<double> share = {
+      vec3(&x[0]), vec3(&x[3]), {vec3(&x[6]), vec3(&x[9]), vec3(&x[12])}, vec3(&x[15]), vec3(&x[18])};
+  CameraGradient<double> once, shares, whole;
+  once.add(share);
+  for (int i = 0; i < 2; ++i) shares.add(share), whole.add(once);
+  for (int i = 0; i < 35; ++i) {
+    EXPECT_EQ(flat(whole)[i], 2 * flat(once)[i]);
+    EXPECT_NEAR(flat(shares)[i], 2 * flat(once)[i], 1e-15);  // sums of four numbers below 1
+  }
 }
 
 TEST(ViewRotation, TurnsDirectionsAsTransformPointDoes) {
@@ -79,9 +89,11 @@ TEST(ViewRotation, BackwardIsTheDerivative) {
     const auto r = view_rotation(m.data());
     return dot(vec3(&w[0]), r.r0) + dot(vec3(&w[3]), r.r1) + dot(vec3(&w[6]), r.r2);
   };
-  std::vector<double> actual(16);
-  view_rotation_backward<double>({vec3(&w[0]), vec3(&w[3]), vec3(&w[6])}, actual.data());
-  expect_gradient(actual, loss, x);
+  CameraShare<double> share = {};
+  share.dL_drotation = {vec3(&w[0]), vec3(&w[3]), vec3(&w[6])};
+  CameraGradient<double> actual;
+  actual.add(share);
+  expect_gradient(std::vector<double>(actual.view, actual.view + 16), loss, x);
 }
 
 TEST(ProjectToPixel, PutsTheEdgesOfNdcOnTheEdgesOfTheBorderPixels) {
@@ -111,10 +123,13 @@ TEST(ProjectToPixel, BackwardIsTheDerivative) {
     const auto pixel = project_to_pixel(camera, vec3(&v[0]));
     return 0.7 * pixel.x - 0.4 * pixel.y;
   };
-  double dL_dprojection[16] = {};
-  const auto dL_dp = project_to_pixel_backward<double>(camera, vec3(&x[0]), {0.7, -0.4}, dL_dprojection);
-  std::vector<double> actual = {dL_dp.x, dL_dp.y, dL_dp.z};
-  actual.insert(actual.end(), dL_dprojection, dL_dprojection + 16);
+  const auto by = project_to_pixel_backward<double>(camera, vec3(&x[0]), {0.7, -0.4});
+  CameraShare<double> share = {};
+  share.point = vec3(&x[0]), share.dL_dclip = by.clip;
+  CameraGradient<double> by_camera;
+  by_camera.add(share);
+  std::vector<double> actual = {by.point.x, by.point.y, by.point.z};
+  actual.insert(actual.end(), by_camera.projection, by_camera.projection + 16);
   expect_gradient(actual, loss, x);
 }
 

@@ -100,12 +100,10 @@ TEST(Covariance3D, BackwardIsTheDerivative) {
   Random random(4);
   const Vector x = random.uniforms(12), w = random.uniforms(6);
   auto loss = [&](const Vector& v) { return weighted_sum(w, flat(covariance_3d(vec3(&v[0]), mat3(&v[3])))); };
-  Vec3<double> dL_dscale;
-  Mat3<double> dL_drotation;
-  covariance_3d_backward(vec3(&x[0]), mat3(&x[3]), sym3(w.data()), dL_dscale, dL_drotation);
+  const auto g = covariance_3d_backward(vec3(&x[0]), mat3(&x[3]), sym3(w.data()));
   Vector actual;
-  append(actual, dL_dscale);
-  for (const double entry : flat(dL_drotation)) actual.push_back(entry);
+  append(actual, g.scale);
+  for (const double entry : flat(g.rotation)) actual.push_back(entry);
   expect_gradient(actual, loss, x);
 }
 
@@ -197,11 +195,9 @@ TEST(Covariance2D, BackwardIsTheDerivative) {
   Random random(8);
   const Vector x = random.uniforms(12), w = random.uniforms(3);
   auto loss = [&](const Vector& v) { return weighted_sum(w, flat(covariance_2d(mat23(&v[0]), sym3(&v[6])))); };
-  Sym3<double> dL_dcov;
-  Mat23<double> dL_daxes;
-  covariance_2d_backward(mat23(&x[0]), sym3(&x[6]), sym2(w.data()), dL_dcov, dL_daxes);
-  Vector actual = flat(dL_daxes);
-  for (const double entry : flat(dL_dcov)) actual.push_back(entry);
+  const auto g = covariance_2d_backward(mat23(&x[0]), sym3(&x[6]), sym2(w.data()));
+  Vector actual = flat(g.axes);
+  for (const double entry : flat(g.cov)) actual.push_back(entry);
   expect_gradient(actual, loss, x);
 }
 

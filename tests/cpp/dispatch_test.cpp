@@ -3,13 +3,16 @@
 
 #include <gtest/gtest.h>
 
+#include <set>
+#include <string>
+
 #include "all_modes.h"
 
 namespace dsmoe {
 namespace {
 
 TEST(DispatchBlend, HandsOnEveryModeAndTheFastNumberOfFeatures) {
-  for (const BlendMode wanted : kAllModes) {
+  for (const BlendMode wanted : all_modes()) {
     for (const int features : {1, 2, 3, 4, 32}) {
       int calls = 0;
       dispatch_blend(wanted, features, [&](auto mode, auto num_features) {
@@ -20,6 +23,17 @@ TEST(DispatchBlend, HandsOnEveryModeAndTheFastNumberOfFeatures) {
       EXPECT_EQ(calls, 1);
     }
   }
+}
+
+TEST(BlendModes, AreInTheOrderOfTheirNumbersAndHaveNamesOfTheirOwn) {
+  std::set<std::string> names;
+  int number = 0;
+  BlendModes::for_each([&](auto mode) {
+    EXPECT_EQ(static_cast<int>(mode()), number++);
+    names.insert(Blend<mode()>::kName);
+  });
+  EXPECT_EQ(number, BlendModes::kSize);
+  EXPECT_EQ(static_cast<int>(names.size()), BlendModes::kSize);
 }
 
 }  // namespace

@@ -52,7 +52,7 @@ template <BlendMode kMode, class S> void expect_squared_reach_is_exact(S margin)
   int bounded = 0, without = 0;
   for (const S opacity : test_opacities<S>()) {
     for (const S alpha_min : {S(0), S(1e-4), S(0.01), S(0.5)}) {
-      const S reach = squared_reach(kMode, opacity, alpha_min);
+      const S reach = squared_reach(Blend<kMode>::kCut, opacity, alpha_min);
       auto counts = [&](S squared_distance) {
         return evaluate_gate<kMode>(S(-0.5) * squared_distance, opacity, alpha_min).counts;
       };
@@ -80,11 +80,11 @@ TYPED_TEST(GateOfMode, SquaredReachBoundsExactlyThePairsThatCount) {
 
 template <class S> void expect_the_threshold_is_inclusive() {
   const S cut = S(kAlphaCut);
-  EXPECT_EQ(squared_reach(BlendMode::kAlpha, cut, S(0)), 0);
-  EXPECT_TRUE((evaluate_gate<BlendMode::kAlpha>(S(0), cut, S(0)).counts)) << "alpha = 1/255 counts";
+  EXPECT_EQ(squared_reach(Cut::kAlpha, cut, S(0)), 0);
+  EXPECT_TRUE((evaluate_gate<Cut::kAlpha>(S(0), cut, S(0)).counts)) << "alpha = 1/255 counts";
   const S below = std::nextafter(cut, S(0));
-  EXPECT_FALSE((evaluate_gate<BlendMode::kAlpha>(S(0), below, S(0)).counts));
-  EXPECT_LE(squared_reach(BlendMode::kAlpha, below, S(0)), 0);
+  EXPECT_FALSE((evaluate_gate<Cut::kAlpha>(S(0), below, S(0)).counts));
+  EXPECT_LE(squared_reach(Cut::kAlpha, below, S(0)), 0);
 }
 
 TEST(Gate, AnOpacityOfExactlyOneIn255CountsAtTheCentreOnly) {
@@ -94,8 +94,8 @@ TEST(Gate, AnOpacityOfExactlyOneIn255CountsAtTheCentreOnly) {
 
 TYPED_TEST(GateOfMode, OpacityNotAboveZeroReachesNothing) {
   for (const double opacity : {0.0, -0.0, -1.0, std::nan("")}) {
-    EXPECT_LT(squared_reach(TypeParam::value, opacity, 0.0), 0);
-    EXPECT_LT(squared_reach(TypeParam::value, opacity, 0.5), 0);
+    EXPECT_LT(squared_reach(Blend<TypeParam::value>::kCut, opacity, 0.0), 0);
+    EXPECT_LT(squared_reach(Blend<TypeParam::value>::kCut, opacity, 0.5), 0);
   }
 }
 
@@ -115,7 +115,7 @@ TYPED_TEST(GateOfMode, APositiveExponentNeverCounts) {
 }
 
 TYPED_TEST(GateOfMode, GateCutOffIsOnTheKernelAndAlphaCutOffOnTheAlpha) {
-  const bool smoe = !cuts_by_alpha(TypeParam::value);
+  const bool smoe = Blend<TypeParam::value>::kCut == Cut::kKernel;
   // o G = 1e-6, G = 1e-3.
   EXPECT_EQ((evaluate_gate<TypeParam::value>(std::log(1e-3), 1e-3, 0.0).counts), smoe);
   // G = 0.9e-5 and o G = 9e-3 at an opacity of 1000.
@@ -136,9 +136,9 @@ TYPED_TEST(GateOfMode, ClampPassesTheGradientStraightThrough) {
 TEST(AlphaCut, CutsFaintPairsOutsideThreeSigmaAlone) {
   const AlphaCut<double> cut(0, 0.255f);
   EXPECT_NEAR(cut.of(1), 1e-3, 1e-9);
-  EXPECT_NEAR(squared_reach(BlendMode::kSmoe, 1.0, cut.of(1)), -2 * std::log(1e-3), 1e-5);
+  EXPECT_NEAR(squared_reach(Cut::kKernel, 1.0, cut.of(1)), -2 * std::log(1e-3), 1e-5);
   for (const double opacity : {0.05, 1e-3, 1e-9}) {  // 1e-3 is reached inside 3 sigma
-    EXPECT_NEAR(squared_reach(BlendMode::kSmoe, opacity, cut.of(opacity)), 9, 1e-5);
+    EXPECT_NEAR(squared_reach(Cut::kKernel, opacity, cut.of(opacity)), 9, 1e-5);
   }
   EXPECT_EQ(AlphaCut<double>(0.5, 0.255f).of(1e-9), 0.5) << "the caller's alpha_min cuts everywhere";
   EXPECT_EQ(AlphaCut<double>(0, 0).of(0.7), 0) << "Eq. 7 cuts on G alone";
@@ -148,10 +148,10 @@ TEST(AlphaCut, CutsFaintPairsOutsideThreeSigmaAlone) {
 TEST(Gate, APairThatDoesNotCountHandsBackZeroWhateverItsExponent) {
   // An indefinite covariance (cov3D_precomp is the caller's) gives exponents without bound.
   for (const double power : {1.0, 100.0, 1000.0}) {
-    const auto gate = evaluate_gate<BlendMode::kSmoe>(power, 0.5, 0.0);
+    const auto gate = evaluate_gate<Cut::kKernel>(power, 0.5, 0.0);
     ASSERT_FALSE(gate.counts);
     EXPECT_EQ(gate_backward(gate, 0.0), 0) << "power " << power;
-    const auto narrow = evaluate_gate<BlendMode::kSmoe>(static_cast<float>(power), 0.5f, 0.0f);
+    const auto narrow = evaluate_gate<Cut::kKernel>(static_cast<float>(power), 0.5f, 0.0f);
     EXPECT_EQ(gate_backward(narrow, 0.0f), 0) << "power " << power;
   }
 }

@@ -2,11 +2,16 @@
 #include "cpu/parallel.h"
 
 #include <gtest/gtest.h>
+#include <sys/wait.h>
+#include <unistd.h>
 
 #include <atomic>
+#include <chrono>
+#include <ctime>
 #include <set>
 #include <stdexcept>
 #include <string>
+#include <thread>
 #include <utility>
 #include <vector>
 
@@ -85,6 +90,72 @@ TEST(ParallelFor, PassesAnExceptionOnAndStillJoins) {
 
 TEST(RunThreads, PassesOneOfSeveralExceptionsOn) {
   EXPECT_THROW(run_threads(7, [](int) { throw std::runtime_error("each"); }), std::runtime_error);
+}
+
+// ---- The pool ----
+
+// The threads that run `count` workers, each of which waits for the others; fewer where that takes 10 seconds.
+std::set<pid_t> threads_that_meet(int count) {
+  std::atomic<int> arrived{0};
+  std::vector<pid_t> threads(count);
+  const auto give_up = std::chrono::steady_clock::now() + std::chrono::seconds(10);
+  run_threads(count, [&](int index) {
+    threads[index] = gettid();
+    ++arrived;
+    while (arrived < count && std::chrono::steady_clock::now() < give_up) std::this_thread::yield();
+  });
+  return std::set<pid_t>(threads.begin(), threads.end());
+}
+
+TEST(RunThreads, HasAThreadForEachWorkerAndKeepsIt) {
+  const int more_than_elsewhere = 16;  // or the pool would have threads to choose from
+  const auto first = threads_that_meet(more_than_elsewhere);
+  EXPECT_EQ(first.size(), 16u);
+  EXPECT_EQ(first.count(gettid()), 1u);
+  EXPECT_EQ(threads_that_meet(more_than_elsewhere), first);
+}
+
+TEST(RunThreads, MayBeCalledFromManyThreadsAndFromAWorker) {
+  std::atomic<int> runs{0};
+  std::vector<std::thread> callers;
+  for (int caller = 0; caller < 4; ++caller) {
+    callers.emplace_back([&] {
+      for (int call = 0; call < 50; ++call) {
+        run_threads(3, [&](int) { run_threads(3, [&](int) { ++runs; }); });
+      }
+    });
+  }
+  for (auto& caller : callers) caller.join();
+  EXPECT_EQ(runs, 4 * 50 * 3 * 3);
+}
+
+TEST(RunThreads, TakesNoProcessorTimeBetweenCalls) {
+  threads_that_meet(4);
+  const std::clock_t start = std::clock();
+  std::this_thread::sleep_for(std::chrono::milliseconds(300));
+  // Three threads that waited busily would take 900 ms of processor time where there are as many cores, 300 on one.
+  EXPECT_LT(double(std::clock() - start) / CLOCKS_PER_SEC, 0.1);
+}
+
+TEST(RunThreads, WorksInAForkedChild) {
+  threads_that_meet(3);
+  std::atomic<bool> stop{false};
+  std::thread busy([&] {  // so that the fork may happen while the pool is in use
+    while (!stop) run_threads(3, [](int) {});
+  });
+  for (int child = 0; child < 20; ++child) {
+    const pid_t pid = fork();
+    ASSERT_GE(pid, 0);
+    if (pid == 0) {
+      alarm(30);  // ends a child that hangs
+      _exit(threads_that_meet(3).size() == 3 ? 0 : 1);
+    }
+    int status = 0;
+    waitpid(pid, &status, 0);
+    EXPECT_TRUE(WIFEXITED(status) && WEXITSTATUS(status) == 0) << "child " << child << " ended with " << status;
+  }
+  stop = true;
+  busy.join();
 }
 
 }  // namespace

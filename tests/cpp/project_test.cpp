@@ -1,12 +1,12 @@
 // One Gaussian from world to image plane and its gradient back, and which Gaussians are culled.
-#include "dsmoe/project.h"
-
 #include <gtest/gtest.h>
 
 #include <cmath>
 #include <limits>
 #include <vector>
 
+#include "all_modes.h"
+#include "dsmoe/arrays.h"
 #include "test_scene.h"
 
 namespace dsmoe {
@@ -27,21 +27,16 @@ Scene<double> single_gaussian() {
   return scene;
 }
 
-struct Projection {
-  int32_t radius = 0;
-  ProjectedGaussian<double> gaussian = {};
+struct Projected : Projection<double> {
   Vector features;
 };
 
-Projection project(const Scene<double>& scene) {
-  Projection out;
-  out.features.resize(scene.config.num_features());
-  out.radius =
-      project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, out.gaussian, out.features.data());
-  return out;
+Projected project(const Scene<double>& scene) {
+  Vector features(scene.config.num_features());
+  return {project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, features.data()), features};
 }
 
-Vector flat(const Projection& p) {
+Vector flat(const Projected& p) {
   const auto& g = p.gaussian;
   Vector out = {g.mean.x, g.mean.y, g.conic.xx, g.conic.xy, g.conic.yy, g.opacity};
   out.insert(out.end(), p.features.begin(), p.features.end());
@@ -50,7 +45,7 @@ Vector flat(const Projection& p) {
 
 // All outputs, weighted, by all inputs and the camera.
 void expect_backward_is_the_derivative(Scene<double> scene) {
-  const Projection forward = project(scene);
+  const Projected forward = project(scene);
   ASSERT_GT(forward.radius, 0);
   Vector w = Random(3).uniforms(6 + scene.config.num_features());
   for (int k = 2; k < 5; ++k) w[k] *= 10;  // the conic is small: let it weigh
@@ -66,8 +61,9 @@ void expect_backward_is_the_derivative(Scene<double> scene) {
   gradient.camera = {};
   std::fill(gradient.by.background.begin(), gradient.by.background.end(), 0);
   std::fill(gradient.by.shs.begin(), gradient.by.shs.end(), 0);  // written for the active degree only
-  project_gaussian_backward(scene.inputs(), scene.camera, scene.raster_config(), 0, forward.features.data(),
-                            {{{w[0], w[1]}, {w[2], w[3], w[4]}, w[5]}, &w[6]}, gradient.gradients(), &gradient.camera);
+  gradient.camera.add(project_gaussian_backward(scene.inputs(), scene.camera, scene.raster_config(), 0,
+                                                forward.features.data(), {{w[0], w[1]}, {w[2], w[3], w[4]}, w[5]},
+                                                &w[6], gradient.gradients()));
   // Steps of 1e-4 and pixel coordinates of 20 round at 1e-11.
   expect_near_all(gradient.flat(), expected, kGradientTolerance);
 }
@@ -179,7 +175,7 @@ TEST(ProjectGaussian, RadiusDoesNotDependOnModeOpacityOrAntialiasing) {
   EXPECT_EQ(project(scene).radius, radius);
   for (const double opacity : {-1.0, 0.0, 1e-9, 3.0}) {
     scene.opacities = {opacity};
-    for (const auto mode : {BlendMode::kAlpha, BlendMode::kSmoe, BlendMode::kSmoeTn, BlendMode::kSmoeStd}) {
+    for (const auto mode : all_modes()) {
       scene.config.mode = mode;
       EXPECT_EQ(project(scene).radius, radius);
     }
@@ -235,11 +231,10 @@ TEST(ProjectGaussian, IsCulledWhereTheCovarianceIsNoCovariance) {
 
 TEST(ProjectGaussian, IsCulledWhereTheImagePlaneOverflows) {
   Scene<float> scene = convert<float>(single_gaussian());
-  ProjectedGaussian<float> out;
   float features[5];
   for (const float huge : {1e20f, 1e38f}) {
     scene.scales = {huge, huge, huge};
-    EXPECT_EQ(project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, out, features), 0);
+    EXPECT_EQ(project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, features).radius, 0);
   }
 }
 
@@ -255,11 +250,10 @@ TEST(ProjectGaussian, RadiusIsPositiveExactlyWhereTheFootprintMeetsTheImage) {
       for (int k = 0; k < 3; ++k) {
         scene.means3D[k] = camera.position[k] + shift * camera.view[4 * k] + 3 * camera.view[4 * k + 2];
       }
-      const Vec3<double> mean = load3(scene.means3D.data());
-      const auto jacobian = projection_jacobian(camera, transform_point(camera.view, mean)).jacobian;
-      const auto conic = make_conic(covariance_2d(image_axes(jacobian, view_rotation(camera.view)),
-                                                  world_covariance(scene.inputs(), 1.0, 0).cov));
-      const auto pixel = project_to_pixel(camera, mean);
+      const Gaussian<double> gaussian = load_gaussian(scene.inputs(), 0);
+      const auto view = transform_point(camera.view, gaussian.mean);
+      const auto conic = make_conic(covariances(gaussian, camera, view, 1.0).image);
+      const auto pixel = project_to_pixel(camera, gaussian.mean);
       bool expected = false;
       if (mode == BlendMode::kAlpha) {  // x range of Inria's rectangle against 3 columns of tiles; y is on the image
         const double r = screen_radius(conic);

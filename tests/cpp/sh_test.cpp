@@ -3,10 +3,12 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <vector>
 
+#include "dsmoe/arrays.h"
 #include "finite_difference.h"
 
 namespace dsmoe {
@@ -30,8 +32,7 @@ std::vector<Vec3<double>> random_directions(int count) {
 #if defined(__STDCPP_MATH_SPEC_FUNCS__) || __cpp_lib_math_special_functions >= 201603L
 TEST(ShBasis, IsTheRealHarmonicsWithTheCondonShortleyPhase) {
   for (const auto& d : random_directions(50)) {
-    double basis[kMaxShCoefficients];
-    sh_basis(kMaxShDegree, d, basis);
+    const auto basis = sh_basis(kMaxShDegree, d);
     const double theta = std::acos(d.z), phi = std::atan2(d.y, d.x);
     for (int l = 0; l <= kMaxShDegree; ++l) {
       for (int m = -l; m <= l; ++m) {
@@ -52,11 +53,14 @@ TEST(ShBasis, BackwardIsTheDerivativeAtEveryDegree) {
   for (int degree = 0; degree <= kMaxShDegree; ++degree) {
     const Vector d = random.uniforms(3), w = random.uniforms(kMaxShCoefficients);
     auto loss = [&](const Vector& v) {
-      double basis[kMaxShCoefficients] = {};
-      sh_basis(degree, vec3(v.data()), basis);
-      return weighted_sum(w, Vector(basis, basis + kMaxShCoefficients));
+      const auto basis = sh_basis(degree, vec3(v.data()));
+      double sum = 0;
+      for (int k = 0; k < sh_coefficients(degree); ++k) sum += w[k] * basis[k];
+      return sum;
     };
-    const auto g = sh_basis_backward(degree, vec3(d.data()), w.data());
+    ShNumbers<double> dL_dbasis;
+    std::copy(w.begin(), w.end(), dL_dbasis.values);
+    const auto g = sh_basis_backward(degree, vec3(d.data()), dL_dbasis);
     if (degree == 0) {
       EXPECT_EQ(dot(g, g), 0);
     } else {
@@ -68,12 +72,14 @@ TEST(ShBasis, BackwardIsTheDerivativeAtEveryDegree) {
 // x: mean 3, camera position 3, then 16 x 3 coefficients.
 constexpr int kCoefficients = 6;
 
-ShCoefficients<const double> joint(const double* sh) { return {sh, sh + 3}; }
+ShReader<double> joint(const double* sh) { return {sh, sh + 3}; }
+
+ShRules<double> rules_of(int degree, const Vector& x, bool clamp) { return {degree, clamp, vec3(&x[3])}; }
+
+Vector flat(Vec3<double> v) { return {v.x, v.y, v.z}; }
 
 Vector color_of(int degree, const Vector& x, bool clamp = true) {
-  Vector color(3);
-  sh_color(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]), clamp, color.data());
-  return color;
+  return flat(sh_color(rules_of(degree, x, clamp), vec3(&x[0]), joint(&x[kCoefficients])));
 }
 
 // Colours near 1/2 unless the degree 0 coefficient says otherwise.
@@ -87,8 +93,9 @@ Vector random_color_inputs(unsigned seed) {
 Vector color_gradient(int degree, const Vector& x, const Vector& dL_dcolor, bool clamp = true) {
   Vector out(x.size());
   const Vector color = color_of(degree, x, clamp);
-  const auto mean = sh_color_backward<double>(degree, vec3(&x[0]), &x[3], joint(&x[kCoefficients]), clamp, color.data(),
-                                              dL_dcolor.data(), {&out[kCoefficients], &out[kCoefficients + 3]});
+  const ShWriter<double> write = {&out[kCoefficients], &out[kCoefficients + 3]};
+  const auto mean = sh_color_backward(rules_of(degree, x, clamp), vec3(&x[0]), joint(&x[kCoefficients]),
+                                      vec3(color.data()), vec3(dL_dcolor.data()), write);
   out[0] = mean.x, out[1] = mean.y, out[2] = mean.z;
   for (int k = 0; k < 3; ++k) out[3 + k] = -out[k];
   return out;
@@ -126,12 +133,12 @@ TEST(ShColor, DegreeZeroMayLieApart) {
   const Vector x = random_color_inputs(11), w = {0.7, -1.1, 0.4};
   const Vector dc(x.begin() + kCoefficients, x.begin() + kCoefficients + 3),
       rest(x.begin() + kCoefficients + 3, x.end());
-  const ShCoefficients<const double> apart = {dc.data(), rest.data()};
-  Vector color(3), dL_ddc(3), dL_drest(45);
-  sh_color(3, vec3(&x[0]), &x[3], apart, true, color.data());
-  EXPECT_EQ(color, color_of(3, x));
-  sh_color_backward<double>(3, vec3(&x[0]), &x[3], apart, true, color.data(), w.data(),
-                            {dL_ddc.data(), dL_drest.data()});
+  const ShReader<double> apart = {dc.data(), rest.data()};
+  Vector dL_ddc(3), dL_drest(45);
+  const auto color = sh_color(rules_of(3, x, true), vec3(&x[0]), apart);
+  EXPECT_EQ(flat(color), color_of(3, x));
+  sh_color_backward(rules_of(3, x, true), vec3(&x[0]), apart, color, vec3(w.data()),
+                    ShWriter<double>{dL_ddc.data(), dL_drest.data()});
   Vector joined = dL_ddc;
   joined.insert(joined.end(), dL_drest.begin(), dL_drest.end());
   const Vector expected = color_gradient(3, x, w);
@@ -141,8 +148,8 @@ TEST(ShColor, DegreeZeroMayLieApart) {
 TEST(ShColor, EitherCoefficientGradientMayBeLeftOut) {
   const Vector x = random_color_inputs(12), w = {0.7, -1.1, 0.4};
   const Vector color = color_of(3, x), expected = color_gradient(3, x, w);
-  const auto sh = joint(&x[kCoefficients]);
-  const auto g = sh_color_backward<double>(3, vec3(&x[0]), &x[3], sh, true, color.data(), w.data(), {nullptr, nullptr});
+  const auto g = sh_color_backward(rules_of(3, x, true), vec3(&x[0]), joint(&x[kCoefficients]), vec3(color.data()),
+                                   vec3(w.data()), ShWriter<double>{nullptr, nullptr});
   EXPECT_EQ(g.x, expected[0]);
   EXPECT_EQ(g.y, expected[1]);
   EXPECT_EQ(g.z, expected[2]);

@@ -37,12 +37,8 @@ template <class S> Rendering<S> render_at(const SimdLevel& level, const Scene<S>
   const auto config = scene.raster_config();
   const auto saved = out.saved();
   const auto images = out.images();
-  const auto& camera = scene.camera;
-  for_each_tile<S>(1, camera.width, camera.height, config.num_features(), [&](int64_t tile, int x, int y, S* scratch) {
-    return kernels_of<S>(level).forward({config, saved, images, camera.width, camera.height, x, y,
-                                         saved.tile_offsets[tile], saved.tile_offsets[tile + 1]},
-                                        scratch);
-  });
+  for_each_tile(config, saved, scene.camera.width, scene.camera.height, config.num_features(),
+                [&](const Tile<S>& tile, S* scratch) { return kernels_of<S>(level).forward(tile, images, scratch); });
   return out;
 }
 
@@ -53,16 +49,14 @@ std::vector<S> backward_at(const SimdLevel& level, const Scene<S>& scene, Render
   const auto config = scene.raster_config();
   const auto saved = r.saved();
   const auto images = r.images();
-  const auto gradients = weights.gradients();
+  const auto dL_dimages = weights.gradients();
   const auto& camera = scene.camera;
   std::vector<S> out(r.instances.size() * (kNumGateMoments + config.num_features()), S(-12345));
-  std::vector<S> background(config.num_channels + 1);
-  for_each_tile<S>(1, camera.width, camera.height, config.num_features(), [&](int64_t tile, int x, int y, S* scratch) {
-    return kernels_of<S>(level).backward(
-        {config, saved, images, gradients, camera.width, camera.height, x, y, saved.tile_offsets[tile],
-         saved.tile_offsets[tile + 1], out.data(), background.data()},
-        scratch);
-  });
+  std::vector<S> background(num_tiles(camera.width, camera.height) * (config.num_channels + 1));
+  const TileGradients<S> gradients = {images, dL_dimages, out.data(), background.data()};
+  for_each_tile(
+      config, saved, camera.width, camera.height, config.num_features(),
+      [&](const Tile<S>& tile, S* scratch) { return kernels_of<S>(level).backward(tile, gradients, scratch); });
   out.insert(out.end(), background.begin(), background.end());
   return out;
 }
@@ -75,10 +69,9 @@ template <class S> std::vector<S> contributions_at(const SimdLevel& level, const
   std::vector<S> pixel_weights;
   for (int64_t pixel = 0; pixel < scene.pixels(); ++pixel) pixel_weights.push_back(brute_force_pixel_weight<S>(pixel));
   std::vector<Contribution<S>> out(r.instances.size(), Contribution<S>{-1, -1, -1, -1});
-  for_each_tile<S>(1, camera.width, camera.height, 0, [&](int64_t tile, int x, int y, S* scratch) {
-    return kernels_of<S>(level).contributions({config, saved, pixel_weights.data(), camera.width, camera.height, x, y,
-                                               saved.tile_offsets[tile], saved.tile_offsets[tile + 1], out.data()},
-                                              scratch);
+  const TileContributions<S> contributions = {pixel_weights.data(), out.data()};
+  for_each_tile(config, saved, camera.width, camera.height, 0, [&](const Tile<S>& tile, S* scratch) {
+    return kernels_of<S>(level).contributions(tile, contributions, scratch);
   });
   std::vector<S> flat;
   for (const auto& c : out) flat.insert(flat.end(), {c.pixel_weight, c.pixels, c.blend_weight, c.distance});

@@ -8,6 +8,8 @@ import pytest
 import torch
 from devices import without_cuda_because
 
+from diff_smoe_rasterization.settings import BLEND_MODES
+
 
 def pytest_addoption(parser):
     parser.addoption("--device", choices=("all", "cpu", "cuda"), default="all",
@@ -52,7 +54,7 @@ def device(request):
     torch.set_default_device(None)
 
 
-@pytest.fixture(params=["alpha", "smoe", "smoe_tn", "smoe_std"])
+@pytest.fixture(params=BLEND_MODES)
 def mode(request):
     return request.param
 

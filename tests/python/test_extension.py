@@ -105,7 +105,8 @@ def test_build_info_tells_what_runs():
 
 
 def test_the_blend_modes_have_the_numbers_of_the_core():
-    assert diff_smoe_rasterization.extension._C.blend_modes == {mode: i for i, mode in enumerate(BLEND_MODES)}
+    modes = diff_smoe_rasterization.extension._C.blend_modes
+    assert {name: facts["number"] for name, facts in modes.items()} == {mode: i for i, mode in enumerate(BLEND_MODES)}
 
 
 @on_every_device

@@ -3,7 +3,7 @@
 #include <memory>
 #include <vector>
 
-#include "dsmoe/project.h"
+#include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
 #include "parallel.h"
 #include "stopwatch.h"
@@ -16,25 +16,6 @@ namespace {
 
 constexpr int64_t kChunk = 512;  // Gaussians; also fixes the order in which the camera's gradient is summed
 
-template <class S> void set_zero(S* values, int64_t stride, int64_t i) {
-  if (values == nullptr) return;
-  for (int64_t k = 0; k < stride; ++k) values[i * stride + k] = S(0);
-}
-
-template <class S>
-void set_zero(const GaussianInputs<S>& inputs, const RasterConfig<S>& config, const GaussianGradients<S>& g,
-              int64_t i) {
-  set_zero(g.means3D, 3, i);
-  set_zero(g.means2D, 3, i);
-  set_zero(g.opacities, 1, i);
-  set_zero(g.scales, 3, i);
-  set_zero(g.rotations, 4, i);
-  set_zero(g.cov3D_precomp, 6, i);
-  set_zero(g.colors_precomp, config.num_channels, i);
-  set_zero(g.dc, 3, i);
-  set_zero(g.shs, 3 * inputs.num_sh, i);
-}
-
 // Sums the records of one Gaussian in double: a large Gaussian has thousands.
 template <class S> void sum_records(const S* records, int64_t count, int size, double* wide, S* sum) {
   for (int k = 0; k < size; ++k) wide[k] = 0;
@@ -42,10 +23,6 @@ template <class S> void sum_records(const S* records, int64_t count, int size, d
     for (int k = 0; k < size; ++k) wide[k] += records[n * size + k];
   }
   for (int k = 0; k < size; ++k) sum[k] = static_cast<S>(wide[k]);
-}
-
-template <class S> void add(const S* from, S* to, int count) {
-  for (int k = 0; k < count; ++k) to[k] += from[k];
 }
 
 }  // namespace
@@ -63,15 +40,11 @@ void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const Ra
     const int64_t tiles = num_tiles(camera.width, camera.height);
     const int background = config.num_channels + 1;  // numbers: its colour and its gate
     std::vector<S> dL_dbackground(gradients.background != nullptr ? tiles * background : 0);
-    const int64_t pairs = for_each_tile<S>(
-        config.num_threads, camera.width, camera.height, config.num_features(),
-        [&](int64_t tile, int x, int y, S* scratch) {
-          S* tile_background = dL_dbackground.empty() ? nullptr : dL_dbackground.data() + tile * background;
-          return kernels.backward(
-              {config, saved, images, image_gradients, camera.width, camera.height, x, y, saved.tile_offsets[tile],
-               saved.tile_offsets[tile + 1], dL_dinstances.get(), tile_background},
-              scratch);
-        });
+    const TileGradients<S> tile_gradients = {images, image_gradients, dL_dinstances.get(),
+                                             dL_dbackground.empty() ? nullptr : dL_dbackground.data()};
+    const int64_t pairs =
+        for_each_tile(config, saved, camera.width, camera.height, config.num_features(),
+                      [&](const Tile<S>& tile, S* scratch) { return kernels.backward(tile, tile_gradients, scratch); });
     if (times != nullptr) times->backward_pairs += pairs;
     if (gradients.background != nullptr) {
       std::vector<double> wide(background);
@@ -87,25 +60,21 @@ void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const Ra
     std::vector<double> wide(record);
     CameraGradient<S>* share = camera_shares.empty() ? nullptr : &camera_shares[begin / kChunk];
     for (int64_t i = begin; i < end; ++i) {
-      set_zero(inputs, config, gradients, i);
+      store_zeros(gradients, config.num_channels, inputs.num_sh, i);
       const int64_t first = saved.instance_offsets[i], count = saved.instance_offsets[i + 1] - first;
       if (count == 0) continue;
       sum_records(dL_dinstances.get() + first * record, count, record, wide.data(), sum.data());
       const ProjectedGaussian<S>& gaussian = saved.projected[i];
       const GateMoments<S> moments = {sum[0], sum[1], sum[2], sum[3], sum[4], sum[5]};
-      project_gaussian_backward(
+      const auto to_camera = project_gaussian_backward(
           inputs, camera, config, i, saved.features + i * config.num_features(),
-          {moments_backward(gaussian.conic, gaussian.opacity, moments), sum.data() + kNumGateMoments}, gradients,
-          share);
+          moments_backward(gaussian.conic, gaussian.opacity, moments), sum.data() + kNumGateMoments, gradients);
+      if (share != nullptr) share->add(to_camera);
     }
   });
   if (gradients.camera == nullptr) return;
   *gradients.camera = {};
-  for (const auto& share : camera_shares) {
-    add(share.view, gradients.camera->view, 16);
-    add(share.projection, gradients.camera->projection, 16);
-    add(share.position, gradients.camera->position, 3);
-  }
+  for (const auto& share : camera_shares) gradients.camera->add(share);
 }
 
 #define DSMOE_INSTANTIATE(S)                                                                                         \

@@ -13,12 +13,8 @@ void blend(const Camera<S>& camera, const RasterConfig<S>& config, const SavedFo
   const Stopwatch stopwatch(times, &StageTimes::blend);
   const auto& kernels = tile_kernels<S>();
   const int64_t pairs =
-      for_each_tile<S>(config.num_threads, camera.width, camera.height, config.num_features(),
-                       [&](int64_t tile, int x, int y, S* scratch) {
-                         return kernels.forward({config, saved, images, camera.width, camera.height, x, y,
-                                                 saved.tile_offsets[tile], saved.tile_offsets[tile + 1]},
-                                                scratch);
-                       });
+      for_each_tile(config, saved, camera.width, camera.height, config.num_features(),
+                    [&](const Tile<S>& tile, S* scratch) { return kernels.forward(tile, images, scratch); });
   if (times != nullptr) times->forward_pairs += pairs;
 }
 

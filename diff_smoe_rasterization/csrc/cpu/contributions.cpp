@@ -21,11 +21,9 @@ void contributions(int64_t num_gaussians, int width, int height, const RasterCon
                    const SavedForward<S>& saved, const S* pixel_weights, const ContributionSums<S>& sums) {
   const std::unique_ptr<Contribution<S>[]> instances(new Contribution<S>[saved.instance_offsets[num_gaussians]]);
   const auto& kernels = tile_kernels<S>();
-  for_each_tile<S>(config.num_threads, width, height, 0, [&](int64_t tile, int x, int y, S* scratch) {
-    return kernels.contributions({config, saved, pixel_weights, width, height, x, y, saved.tile_offsets[tile],
-                                  saved.tile_offsets[tile + 1], instances.get()},
-                                 scratch);
-  });
+  const TileContributions<S> out = {pixel_weights, instances.get()};
+  for_each_tile(config, saved, width, height, 0,
+                [&](const Tile<S>& tile, S* scratch) { return kernels.contributions(tile, out, scratch); });
   parallel_for(config.num_threads, num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       auto sum = no_contribution<double>();  // a large Gaussian has thousands of instances

@@ -1,42 +1,18 @@
-// Threads for one call: started, joined and forgotten, so that there is no pool to configure, fork or leak.
+// Threads of the CPU backend: one pool for the process, shared by all calls.
 #pragma once
 
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
-#include <exception>
-#include <thread>
-#include <vector>
+#include <functional>
 
 namespace dsmoe {
 namespace cpu {
 
-// Runs worker(0) ... worker(num_threads - 1), at least worker(0), at once, the last on the calling thread; rethrows the
-// first exception.
-template <class Worker> void run_threads(int num_threads, Worker worker) {
-  num_threads = std::max(1, num_threads);
-  std::exception_ptr failure;
-  std::atomic_flag failed = ATOMIC_FLAG_INIT;
-  auto guarded = [&](int index) {
-    try {
-      worker(index);
-    } catch (...) {
-      if (!failed.test_and_set()) failure = std::current_exception();
-    }
-  };
-  std::vector<std::thread> threads;
-  int started = 0;
-  try {
-    threads.reserve(num_threads - 1);
-    for (; started < num_threads - 1; ++started) threads.emplace_back(guarded, started);
-  } catch (...) {
-    // No more threads to be had: the calling thread does their share.
-    for (int index = started; index < num_threads - 1; ++index) guarded(index);
-  }
-  guarded(num_threads - 1);
-  for (auto& thread : threads) thread.join();
-  if (failure) std::rethrow_exception(failure);
-}
+// Calls worker(0) ... worker(num_threads - 1), at least worker(0), each once, on the calling thread and on threads of
+// the pool that are free. Returns when all have ended, and rethrows the first exception. Workers must not wait for
+// each other: one thread may run them all.
+void run_threads(int num_threads, const std::function<void(int index)>& worker);
 
 // Calls body(begin, end) for chunks of [0, count), each taken by the next free thread. The chunks do not depend on the
 // number of threads.

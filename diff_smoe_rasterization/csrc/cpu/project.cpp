@@ -1,11 +1,10 @@
 // Stage 1: every Gaussian to the image plane, and how many tiles each meets.
-#include "dsmoe/project.h"
-
 #include <algorithm>
 #include <limits>
 #include <stdexcept>
 #include <string>
 
+#include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
 #include "parallel.h"
 #include "stopwatch.h"
@@ -26,16 +25,16 @@ int64_t project(const GaussianInputs<S>& inputs, const Camera<S>& camera, const 
   int64_t* counts = saved.instance_offsets + 1;
   parallel_for(config.num_threads, inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
-      ProjectedGaussian<S>& gaussian = saved.projected[i];
       S* features = saved.features + i * num_features;
-      const int32_t radius = project_gaussian(inputs, camera, config, i, gaussian, features);
+      const auto [radius, gaussian] = project_gaussian(inputs, camera, config, i, features);
       images.radii[i] = radius;
       counts[i] = 0;
       if (radius == 0) {
-        gaussian = {};
+        saved.projected[i] = {};
         std::fill_n(features, num_features, S(0));
         continue;
       }
+      saved.projected[i] = gaussian;
       const TileRect bounds = tile_bounds(config.mode, camera, gaussian.mean, S(radius));
       for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds,
                         [&](int x0, int x1, int) { counts[i] += x1 - x0; });
@@ -60,7 +59,7 @@ template <class S> void mark_visible(int64_t num_gaussians, const S* means3D, co
 
 template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int num_channels) {
   for (int64_t i = 0; i < inputs.num_gaussians; ++i) {
-    if (!attributes_finite(inputs, num_channels, i)) return i;
+    if (!is_finite(load_gaussian(inputs, i)) || !is_finite(colors_of(inputs, num_channels, i), num_channels)) return i;
   }
   return -1;
 }

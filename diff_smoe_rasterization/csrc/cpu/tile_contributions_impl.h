@@ -1,69 +1,85 @@
 // One tile's share of what is summed over the pixels of each Gaussian: the forward walk once more, without features.
-// Included once per instruction set, as tile_kernels_impl.h is, whose walk this is; the formulas are the math headers'.
+// Included once per instruction set.
 #pragma once
 
 #include "dsmoe/contribution.h"
-#include "tile_kernels_impl.h"
+#include "tile_walk_impl.h"
 
 namespace dsmoe {
 namespace cpu {
 namespace DSMOE_SIMD {
 
-template <class S, BlendMode kMode> int64_t sum_tile(const ContributionTile<S>& tile, S* memory) {
+template <class S, BlendMode kBlendMode> class ContributionVisitor {
+ public:
   using P = Pack<S>;
-  const TileExtent extent(tile);
-  Scratch<S> scratch{memory};
-  const auto transmittance = scratch.pixels(), gate_sum = scratch.pixels(), last = scratch.pixels(),
-             pixel_weight = scratch.pixels();
-  for (int i = 0; i < kTilePixels; ++i) transmittance.values[i] = S(1);
-  for (int i = 0; i < 3 * kTilePixels; ++i) gate_sum.values[i] = S(0);
-  int64_t num_seen = 0;  // entries of the list that some numerator has seen
-  extent.for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
-    last.pixel(x, y) = S(tile.saved.last_contributor[index]);
-    pixel_weight.pixel(x, y) = tile.pixel_weights[index];
-    num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
-  });
+  static constexpr BlendMode kMode = kBlendMode;
+  static constexpr bool kBackToFront = false;
 
-  const int64_t end = tile.begin + num_seen;
-  for (int64_t i = end; i < tile.end; ++i) tile.instances[tile.saved.instances[i].slot] = no_contribution<S>();
-  const AlphaCut<S> cut = tile.config.alpha_cut();
-  int64_t pairs = 0;
-  for (int64_t i = tile.begin; i < end; ++i) {
-    prefetch_gaussian(tile.saved, tile.saved.instances[min(i + kPrefetchDistance, end - 1)], 0);
-    const TileInstance& instance = tile.saved.instances[i];
-    const ProjectedGaussian<S>& gaussian = tile.saved.projected[instance.gaussian];
-    const RowRange rows = rows_of(gaussian, extent);
-    const S faintest = least_power(gaussian), position = S(i - tile.begin);
-    const S least_alpha = cut.of(gaussian.opacity);
-    auto sum = no_contribution<P>();
-    for (int strip = 0; strip < kStrips<S>; ++strip) {
-      const P dx = P::iota() + P(S(extent.x0 + strip * P::kLanes) - gaussian.mean.x);
-      const ColumnExponent<P, S> exponent(gaussian.conic, dx);
-      for (int row = rows.begin; row < rows.end; ++row) {
-        const auto not_past = P(position) < last.load(strip, row);
-        if (!any(not_past)) continue;
-        pairs += P::kLanes;
-        const S dy = S(extent.y0 + row) - gaussian.mean.y;
-        const P power = exponent.at(dy);
-        if (!kRowsAreExact<S> && !any(power >= P(faintest))) continue;
-        const auto gate = evaluate_gate<kMode>(power, gaussian.opacity, least_alpha);
-        PixelState<P> state = {transmittance.load(strip, row), gate_sum.load(strip, row)};
-        const auto pair = Blend<kMode>::accumulate(state, gate);
-        transmittance.store(strip, row, state.transmittance);
-        gate_sum.store(strip, row, state.gate_sum);
-        add_pair(sum, pair.contributes & not_past, pixel_weight.load(strip, row), pair.weight, dx, P(dy));
-      }
-    }
-    tile.instances[instance.slot] = {sum_lanes(sum.pixel_weight), sum_lanes(sum.pixels), sum_lanes(sum.blend_weight),
-                                     sum_lanes(sum.distance)};
+  DSMOE_HD ContributionVisitor(Scratch<S> scratch, const TileContributions<S>& out)
+      : transmittance_(scratch.pixels()),
+        gate_sum_(scratch.pixels()),
+        last_(scratch.pixels()),
+        pixel_weight_(scratch.pixels()),
+        out_(out) {
+    for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(1);
+    for (int i = 0; i < 3 * kTilePixels; ++i) gate_sum_.values[i] = S(0);
   }
-  return pairs;
+
+  // Returns how many entries of the list some numerator has seen.
+  DSMOE_HD int64_t read(const Tile<S>& tile) const {
+    int64_t num_seen = 0;
+    TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
+      last_.pixel(x, y) = S(tile.saved.last_contributor[index]);
+      pixel_weight_.pixel(x, y) = out_.pixel_weights[index];
+      num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
+    });
+    return num_seen;
+  }
+
+  DSMOE_HD bool done() const { return false; }
+  DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
+    position_ = P(gaussian.position);
+    sum_ = no_contribution<P>();
+  }
+  DSMOE_HD void begin_strip() {}
+  DSMOE_HD bool wants(int strip, int row) {
+    not_past_ = position_ < last_.load(strip, row);
+    return any(not_past_);
+  }
+
+  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P dx, S dy) {
+    PixelState<P> state = {transmittance_.load(strip, row), gate_sum_.load(strip, row)};
+    const auto pair = Blend<kMode>::accumulate(state, gate);
+    transmittance_.store(strip, row, state.transmittance);
+    gate_sum_.store(strip, row, state.gate_sum);
+    add_pair(sum_, pair.contributes & not_past_, pixel_weight_.load(strip, row), pair.weight, dx, P(dy));
+  }
+
+  DSMOE_HD void end_strip(P) {}
+  DSMOE_HD void end(const ListedGaussian<S>& gaussian) const {
+    out_.instances[gaussian.slot] = {sum_lanes(sum_.pixel_weight), sum_lanes(sum_.pixels), sum_lanes(sum_.blend_weight),
+                                     sum_lanes(sum_.distance)};
+  }
+
+ private:
+  const PixelArray<S> transmittance_, gate_sum_, last_, pixel_weight_;
+  const TileContributions<S>& out_;
+  P position_;
+  Mask<P> not_past_;
+  Contribution<P> sum_;
+};
+
+template <class S, BlendMode kMode> int64_t sum_tile(const Tile<S>& tile, const TileContributions<S>& out, S* memory) {
+  ContributionVisitor<S, kMode> visitor({memory}, out);
+  const int64_t end = tile.begin + visitor.read(tile);
+  for (int64_t i = end; i < tile.end; ++i) out.instances[tile.saved.instances[i].slot] = no_contribution<S>();
+  return walk_tile(tile, tile.begin, end, 0, visitor);
 }
 
-template <class S> int64_t contributions(const ContributionTile<S>& tile, S* scratch) {
+template <class S> int64_t contributions(const Tile<S>& tile, const TileContributions<S>& out, S* scratch) {
   int64_t pairs = 0;
   dispatch_blend(tile.config.mode, kAnyFeatures,
-                 [&](auto mode, auto) { pairs = sum_tile<S, decltype(mode)::value>(tile, scratch); });
+                 [&](auto mode, auto) { pairs = sum_tile<S, decltype(mode)::value>(tile, out, scratch); });
   return pairs;
 }
 

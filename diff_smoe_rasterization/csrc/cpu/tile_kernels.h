@@ -12,34 +12,27 @@ namespace cpu {
 
 constexpr int kTilePixels = kTileSize * kTileSize;
 
-template <class S> struct ForwardTile {
+// A tile and its list.
+template <class S> struct Tile {
   const RasterConfig<S>& config;
   const SavedForward<S>& saved;
-  const ImageOutputs<S>& images;
-  int width, height;
-  int tile_x, tile_y;
-  int64_t begin, end;  // the tile's instances
+  int width, height;   // of the image, pixels
+  int x, y;            // of the tile, tiles
+  int64_t index;       // of the tile
+  int64_t begin, end;  // its instances
 };
 
-template <class S> struct BackwardTile {
-  const RasterConfig<S>& config;
-  const SavedForward<S>& saved;
+// What the backward pass of a tile reads and writes besides.
+template <class S> struct TileGradients {
   const ImageOutputs<S>& images;
   const ImageGradients<S>& dL_dimages;
-  int width, height;
-  int tile_x, tile_y;
-  int64_t begin, end;
   S* dL_dinstances;   // [I, kNumGateMoments + F] by slot; the tile's are written whole
-  S* dL_dbackground;  // [C + 1] the tile's share, or null
+  S* dL_dbackground;  // [tiles, C + 1] the shares of all tiles, zero before; or null
 };
 
-template <class S> struct ContributionTile {
-  const RasterConfig<S>& config;
-  const SavedForward<S>& saved;
-  const S* pixel_weights;  // [H, W]
-  int width, height;
-  int tile_x, tile_y;
-  int64_t begin, end;
+// What is summed over a tile's pixels, from a map of the caller's.
+template <class S> struct TileContributions {
+  const S* pixel_weights;      // [H, W]
   Contribution<S>* instances;  // [I] by slot; the tile's are written whole
 };
 
@@ -50,9 +43,9 @@ inline int64_t tile_scratch_size(int num_features) {
 
 // All return the number of (Gaussian, pixel) pairs whose exponent they evaluated. scratch: 64-byte aligned.
 template <class S> struct TileKernels {
-  int64_t (*forward)(const ForwardTile<S>& tile, S* scratch);
-  int64_t (*backward)(const BackwardTile<S>& tile, S* scratch);
-  int64_t (*contributions)(const ContributionTile<S>& tile, S* scratch);
+  int64_t (*forward)(const Tile<S>& tile, const ImageOutputs<S>& images, S* scratch);
+  int64_t (*backward)(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch);
+  int64_t (*contributions)(const Tile<S>& tile, const TileContributions<S>& contributions, S* scratch);
 };
 
 // One of these per instruction set that the compiler can build for.

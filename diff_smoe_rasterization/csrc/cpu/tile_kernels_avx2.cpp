@@ -16,8 +16,9 @@
 
 #define DSMOE_SIMD avx2
 #define DSMOE_SIMD_BYTES 32
+#include "tile_backward_impl.h"
 #include "tile_contributions_impl.h"
-#include "tile_kernels_impl.h"
+#include "tile_forward_impl.h"
 
 namespace dsmoe {
 namespace cpu {

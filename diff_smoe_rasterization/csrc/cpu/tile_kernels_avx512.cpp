@@ -18,8 +18,9 @@
 
 #define DSMOE_SIMD avx512
 #define DSMOE_SIMD_BYTES 64
+#include "tile_backward_impl.h"
 #include "tile_contributions_impl.h"
-#include "tile_kernels_impl.h"
+#include "tile_forward_impl.h"
 
 namespace dsmoe {
 namespace cpu {

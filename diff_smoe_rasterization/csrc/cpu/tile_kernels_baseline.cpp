@@ -1,8 +1,9 @@
 // The tile kernels for any machine: 16-byte packs, which SSE2 and NEON have.
 #define DSMOE_SIMD baseline
 #define DSMOE_SIMD_BYTES 16
+#include "tile_backward_impl.h"
 #include "tile_contributions_impl.h"
-#include "tile_kernels_impl.h"
+#include "tile_forward_impl.h"
 
 namespace dsmoe {
 namespace cpu {

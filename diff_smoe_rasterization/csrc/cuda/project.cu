@@ -12,18 +12,18 @@ __device__ uint64_t depth_bits(double depth) { return __double_as_longlong(depth
 // The features of a Gaussian, as one row of saved.features; where their number is known they stay in registers until
 // they are written.
 template <int kFeatures, class S>
-__device__ bool write_features(const GaussianInputs<S>& in, const Camera<S>& camera, const RasterConfig<S>& config,
-                               S depth, S* out) {
+__device__ bool store_features(const Colors<S>& colors, Vec3<S> mean, const Camera<S>& camera,
+                               const RasterConfig<S>& config, S depth, S* out) {
   if constexpr (kFeatures == 3) {
     RasterConfig<S> known = config;
     known.num_channels = 3, known.depth = false, known.inverse_depth = false;
     S features[3];
-    if (!project_features(in, camera, known, 0, depth, features)) return false;
+    if (!write_features(colors, mean, camera, known, depth, features)) return false;
     *reinterpret_cast<float4*>(out) = make_float4(features[0], features[1], features[2], 0);
     return true;
   } else {
     for (int f = config.num_features(); f < feature_stride(config.num_features()); ++f) out[f] = S(0);
-    return project_features(in, camera, config, 0, depth, out);
+    return write_features(colors, mean, camera, config, depth, out);
   }
 }
 
@@ -36,37 +36,41 @@ __global__ void __launch_bounds__(kRowsBlock)
   const int64_t i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const bool exists = i < inputs.num_gaussians;
-  auto own = inputs_of(inputs, config.num_channels, exists ? i : 0);
-  Rows::specialise(own);
-  InputRegisters<S, Rows> registers;
-  registers.take(own, true);
+  const int64_t own = exists ? i : 0;
+  const Gaussian<S> gaussian = Rows::gaussian(inputs, own);
+  S dc[3];
+  if constexpr (Rows::kDcApart) store3(dc, load3(inputs.dc + 3 * own));
   load_camera(device_camera, camera);
   __syncthreads();
-  ProjectedGaussian<S> gaussian;
-  int32_t radius = exists ? project_shape(own, camera, config, 0, gaussian) : 0;
+  Projection<S> projection;
+  projection.radius = 0;
+  if (exists) projection = project(gaussian, camera, config.projection_rules());
+  int32_t radius = projection.radius;
+  auto colors = colors_of(inputs, config.num_channels, own);
   S sh[Rows::kKnown ? Rows::kLength : 1];
   if constexpr (Rows::kStaged) {
-    const int length = 3 * own.num_sh;
+    const int length = 3 * inputs.num_sh;
     const int64_t first = i - lane;
     const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length,
                     static_cast<int>(min<int64_t>(kWarp, inputs.num_gaussians - first)), lane);
     rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, radius > 0));
     wait_for_copies();
-    own.shs = rows.own();
+    colors.shs = rows.own();
     if constexpr (Rows::kKnown) {
       rows.read(sh);
-      own.shs = sh;
+      colors = Rows::known_colors(dc, sh);
     }
   }
   if (!exists) return;
+  const S depth = projection.gaussian.depth;
   if (radius > 0) {
     S* features = saved.features + i * feature_stride(config.num_features());
-    if (!write_features<kFeatures>(own, camera, config, gaussian.depth, features)) radius = 0;
-    saved.projected[i] = gaussian;
+    if (!store_features<kFeatures>(colors, gaussian.mean, camera, config, depth, features)) radius = 0;
+    saved.projected[i] = projection.gaussian;
   }
   radii[i] = radius;
   keys.gaussians[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
-  if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(gaussian.depth) : ~DepthBits<S>(0);
+  if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);
 }
 
 template <class S>

@@ -1,5 +1,4 @@
 // From one record per Gaussian to the gradients of every input. Also writes the zeros of Gaussians that no pixel saw.
-#include "dsmoe/project.h"
 #include "reduce.cuh"
 #include "sh_rows.cuh"
 
@@ -23,33 +22,19 @@ template <class S> struct ProjectBackwardArguments {
   S* dL_dfeature_rows;  // [N, F] scratch, where slots are summed and the number of features is not known
 };
 
-template <class S> __device__ void set_zero(S* values, int size) {
-  if (values == nullptr) return;
-  for (int k = 0; k < size; ++k) values[k] = S(0);
-}
-
-template <class S> __device__ void set_zero(const GaussianGradients<S>& g, int num_channels, int num_sh) {
-  set_zero(g.means3D, 3);
-  set_zero(g.means2D, 3);
-  set_zero(g.opacities, 1);
-  set_zero(g.scales, 3);
-  set_zero(g.rotations, 4);
-  set_zero(g.cov3D_precomp, 6);
-  set_zero(g.colors_precomp, num_channels);
-  set_zero(g.dc, 3);
-  set_zero(g.shs, 3 * num_sh);
-}
-
 // The sum over the warp of the camera's gradients.
 template <class S>
 __device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, int64_t i,
                                  const CameraGradient<S>& dL_dcamera, int lane) {
-  const S* numbers = dL_dcamera.view;
   S* out = arguments.camera_rows + (i / kWarp) * kCameraGradientSize;
-  for (int k = 0; k < kCameraGradientSize; ++k) {
-    const S sum = sum_lanes(numbers[k]);
-    if (lane == 0) out[k] = sum;
-  }
+  const auto store_sums = [&](const auto& numbers) {
+    for (const S number : numbers) {
+      const S sum = sum_lanes(number);
+      if (lane == 0) *out = sum;
+      ++out;
+    }
+  };
+  store_sums(dL_dcamera.view), store_sums(dL_dcamera.projection), store_sums(dL_dcamera.position);
 }
 
 // Adds a Gaussian's slots to its record, numbers `first` to first + kCount of `size`, where there are slots and as many
@@ -85,41 +70,33 @@ constexpr int kRecordLength = kNumGateMoments + 3;    // of three features
 constexpr int kMostRecordLength = kRecordLength + 2;  // with depth and inverse depth
 using RecordRows = WarpRows<kRecordLength>;
 
-// A Gaussian's gradients in registers, zero where nothing is written, and those of its SH rows in shared memory: all
-// lanes hand theirs on together.
-template <class Rows> struct GradientRegisters {
-  float mean[3], mean2D[3], opacity[1], scale[3], rotation[4], dc[3];
-
-  __device__ GaussianGradients<float> pointers(float* sh) {
-    GaussianGradients<float> out;
-    out.means3D = mean, out.means2D = mean2D, out.opacities = opacity, out.scales = scale, out.rotations = rotation;
-    if (Rows::kLength == kShRestLength) out.dc = dc;
-    out.shs = sh;
-    return out;
-  }
-
-  // first: the warp's first Gaussian; rows: of shared memory, which serves the others too.
-  __device__ void store(const GaussianGradients<float>& to, int64_t first, const Rows& rows, int exist,
-                        int lane) const {
-    if (to.shs != nullptr) rows.store(to.shs + first * Rows::kLength);
-    if (lane < exist) {
-      if (to.opacities != nullptr) to.opacities[first + lane] = opacity[0];
-      if (to.rotations != nullptr) {
-        reinterpret_cast<float4*>(to.rotations)[first + lane] =
-            make_float4(rotation[0], rotation[1], rotation[2], rotation[3]);
-      }
+// Stores the gradients of a warp's Gaussians, zeros included, of those that exist. first: the warp's first Gaussian.
+// rows: of shared memory, with the gradients of the SH rows; it serves the others too: all lanes hand theirs on
+// together.
+template <class Rows>
+__device__ void store_gradients(const GaussianGradient<float>& own, const float (&dL_ddc)[3],
+                                const GaussianGradients<float>& to, int64_t first, const Rows& rows, int exist,
+                                int lane) {
+  if (to.shs != nullptr) rows.store(to.shs + first * Rows::kLength);
+  if (lane < exist) {
+    if (to.opacities != nullptr) to.opacities[first + lane] = own.opacity;
+    if (to.rotations != nullptr) {
+      reinterpret_cast<float4*>(to.rotations)[first + lane] =
+          make_float4(own.rotation.x, own.rotation.y, own.rotation.z, own.rotation.w);
     }
-    __syncwarp();
-    const auto store3 = [&](float* array, const float(&values)[3], int place) {
-      if (array == nullptr) return;
-      const WarpRows<3> threes(rows.memory() + place * 3 * kWarp, 3, exist, lane);
-      threes.write(values);
-      threes.store(array + 3 * first);
-    };
-    store3(to.means3D, mean, 0), store3(to.means2D, mean2D, 1), store3(to.scales, scale, 2);
-    if (Rows::kLength == kShRestLength) store3(to.dc, dc, 3);
   }
-};
+  __syncwarp();
+  const auto store_threes = [&](float* array, Vec3<float> value, int place) {
+    if (array == nullptr) return;
+    const WarpRows<3> threes(rows.memory() + place * 3 * kWarp, 3, exist, lane);
+    threes.write({value.x, value.y, value.z});
+    threes.store(array + 3 * first);
+  };
+  store_threes(to.means3D, own.mean, 0);
+  store_threes(to.means2D, {own.mean2D.x, own.mean2D.y, 0}, 1);
+  store_threes(to.scales, own.scale, 2);
+  if (Rows::kDcApart) store_threes(to.dc, load3(dL_ddc), 3);
+}
 
 // The common case: SH rows and the records of colours alone come through shared memory, everything else lives in
 // registers.
@@ -139,8 +116,6 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
   RasterConfig<float> config = arguments.config;
   config.num_channels = 3;
   if constexpr (kColorsAlone) config.depth = false, config.inverse_depth = false;
-  auto inputs = inputs_of(arguments.inputs, config.num_channels, seen ? i : 0);
-  Rows::specialise(inputs);
   float* memory = reinterpret_cast<float*>(shared_rows) +
                   warp * kWarp * (Rows::stride(Rows::kLength) + RecordRows::stride(kRecordLength));
   const Rows rows(memory, Rows::kLength, exist, lane);
@@ -148,22 +123,22 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
   const unsigned all_seen = __ballot_sync(kAllLanes, seen);
   if constexpr (kColorsAlone) records.load(arguments.dL_dgaussians + first * kRecordLength, all_seen);
   rows.load(arguments.inputs.shs + first * Rows::kLength, all_seen);
-  InputRegisters<float, Rows> registers;
-  registers.take(inputs, seen);
-  ProjectedGaussian<float> gaussian;
+  Gaussian<float> own;
+  float dc[3];
+  ProjectedGaussian<float> projected;
   float4 features;
   if (seen) {
-    gaussian = arguments.saved.projected[i];
+    own = Rows::gaussian(arguments.inputs, i);
+    if constexpr (Rows::kDcApart) store3(dc, load3(arguments.inputs.dc + 3 * i));
+    projected = arguments.saved.projected[i];
     features = *reinterpret_cast<const float4*>(arguments.saved.features + i * feature_stride(config.num_features()));
   }
   wait_for_copies();
 
-  GradientRegisters<Rows> gradients = {};
+  GaussianGradient<float> gradient = {};
   CameraGradient<float> dL_dcamera = {};
-  float sh[Rows::kLength], dL_dsh[Rows::kLength] = {};
+  float sh[Rows::kLength], dL_dsh[Rows::kLength] = {}, dL_ddc[3] = {};
   if (seen) {
-    CameraGradient<float>* to_camera = kCamera ? &dL_dcamera : nullptr;
-    const auto to = gradients.pointers(dL_dsh);
     const int size = kNumGateMoments + config.num_features();
     float record[kColorsAlone ? kRecordLength : kMostRecordLength];
     if constexpr (kColorsAlone) {
@@ -174,18 +149,18 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
     add_slots(arguments, i, size, 0, record);
     const float color[3] = {features.x, features.y, features.z};
     rows.read(sh);
-    inputs.shs = sh;
     const auto from_color =
-        project_color_backward(inputs, camera, config, 0, color, record + kNumGateMoments, to, to_camera);
+        write_color_gradients(Rows::known_colors(dc, sh), own.mean, camera, config, color, record + kNumGateMoments,
+                              {nullptr, Rows::kDcApart ? dL_ddc : nullptr, dL_dsh});
     rows.write(dL_dsh);  // the row's registers are free from here on
-    project_shape_backward(
-        inputs, camera, config, 0,
-        {moments_backward(gaussian.conic, gaussian.opacity, moments_of(record)), record + kNumGateMoments}, from_color,
-        to, to_camera);
+    const auto gate = moments_backward(projected.conic, projected.opacity, moments_of(record));
+    gradient = project_backward(own, camera, config.projection_rules(),
+                                projected_gradient(gate, record + kNumGateMoments, from_color, config));
+    if constexpr (kCamera) dL_dcamera.add(gradient.camera);
   } else {
     rows.write(dL_dsh);
   }
-  gradients.store(arguments.gradients, first, rows, exist, lane);
+  store_gradients(gradient, dL_ddc, arguments.gradients, first, rows, exist, lane);
   if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
 }
 
@@ -202,22 +177,23 @@ __global__ void __launch_bounds__(kRowsBlock)
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const bool exists = i < count;
   const RasterConfig<S>& config = arguments.config;
-  const int num_features = config.num_features();
-  auto inputs = inputs_of(arguments.inputs, config.num_channels, exists ? i : 0);
-  const int length = 3 * inputs.num_sh;
-  auto gradients = gradients_of(arguments.gradients, config.num_channels, inputs.num_sh, exists ? i : 0);
+  const GaussianInputs<S>& inputs = arguments.inputs;
+  const int num_features = config.num_features(), length = 3 * inputs.num_sh;
+  auto colors = colors_of(inputs, config.num_channels, exists ? i : 0);
+  auto to_colors = color_gradients_of(arguments.gradients, config.num_channels, inputs.num_sh, exists ? i : 0);
   const bool seen = exists && arguments.radii[i] > 0;
   const int64_t first = i - lane;
   const Rows rows(reinterpret_cast<float*>(shared_rows) + warp * kWarp * Rows::stride(length), length,
                   static_cast<int>(max<int64_t>(0, min<int64_t>(kWarp, count - first))), lane);
   if constexpr (Rows::kStaged) {
-    rows.load(arguments.inputs.shs + first * length, __ballot_sync(kAllLanes, seen));
-    inputs.shs = rows.own();
-    if (gradients.shs != nullptr) gradients.shs = rows.own();
+    rows.load(inputs.shs + first * length, __ballot_sync(kAllLanes, seen));
+    colors.shs = rows.own();
+    if (to_colors.shs != nullptr) to_colors.shs = rows.own();
   }
 
-  ProjectedGaussian<S> gaussian = {};
-  if (seen) gaussian = arguments.saved.projected[i];
+  Gaussian<S> own = {};
+  ProjectedGaussian<S> projected = {};
+  if (seen) own = load_gaussian(inputs, i), projected = arguments.saved.projected[i];
   const S* features = arguments.saved.features + i * feature_stride(num_features);
   S moments[kNumGateMoments];
   S* dL_dfeatures = arguments.dL_dfeature_rows + i * num_features;
@@ -238,14 +214,18 @@ __global__ void __launch_bounds__(kRowsBlock)
     if constexpr (Rows::kStaged) {
       const int active = 3 * (sh_coefficients(inputs.sh_degree) - (inputs.dc != nullptr));
       for (int k = active; k < length; ++k) rows.own()[k] = 0.0f;
-    } else if (gradients.shs != nullptr) {
-      set_zero(gradients.shs, length);
+    } else {
+      store_zeros(ColorGradients<S>{nullptr, nullptr, to_colors.shs}, 0, inputs.num_sh);
     }
-    project_gaussian_backward(inputs, camera, config, 0, features,
-                              {moments_backward(gaussian.conic, gaussian.opacity, moments_of(moments)), dL_dfeatures},
-                              gradients, kCamera ? &dL_dcamera : nullptr);
+    const auto from_color = write_color_gradients(colors, own.mean, camera, config, features, dL_dfeatures, to_colors);
+    const auto gate = moments_backward(projected.conic, projected.opacity, moments_of(moments));
+    const auto gradient = project_backward(own, camera, config.projection_rules(),
+                                           projected_gradient(gate, dL_dfeatures, from_color, config));
+    store_gradient(gradient, arguments.gradients, i);
+    if constexpr (kCamera) dL_dcamera.add(gradient.camera);
   } else if (exists) {
-    set_zero(gradients, config.num_channels, inputs.num_sh);
+    store_gradient(GaussianGradient<S>{}, arguments.gradients, i);
+    store_zeros(to_colors, config.num_channels, inputs.num_sh);
   }
   if constexpr (Rows::kStaged) {
     if (arguments.gradients.shs != nullptr) rows.store(arguments.gradients.shs + first * length);

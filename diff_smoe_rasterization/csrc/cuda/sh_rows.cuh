@@ -2,7 +2,7 @@
 // straight from global memory. What trainers use most is compiled in.
 #pragma once
 
-#include "dsmoe/sh.h"
+#include "dsmoe/arrays.h"
 #include "warp_rows.cuh"
 
 namespace dsmoe {
@@ -18,39 +18,22 @@ template <bool kStagedRows, int kRowLength> struct ShRows : WarpRows<kRowLength>
   static constexpr bool kStaged = kStagedRows, kKnown = kRowLength > 0;
   static constexpr int kLength = kRowLength;
 
-  // Puts what is known in the place of what was given.
-  template <class S> static __device__ void specialise(GaussianInputs<S>& inputs) {
+  // Whether degree 0 lies apart, where that is known.
+  static constexpr bool kDcApart = kLength == kShRestLength;
+
+  // Gaussian i. Where it is known what there is, all numbers are read at once, before any is used.
+  template <class S> static __device__ Gaussian<S> gaussian(const GaussianInputs<S>& in, int64_t i) {
     if constexpr (kKnown) {
-      inputs.sh_degree = kMaxShDegree, inputs.num_sh = kLength / 3;
-      inputs.cov3D_precomp = inputs.colors_precomp = nullptr;
-      if (kLength == kAllShLength) inputs.dc = nullptr;
-      inputs.rotations = static_cast<const S*>(__builtin_assume_aligned(inputs.rotations, 16));
-    }
-  }
-};
-
-// A Gaussian's numbers in registers: read at once, where each use of one would wait for memory of its own.
-template <class S, class Rows> struct InputRegisters {
-  S mean[3], opacity[1], scale[3], rotation[4], dc[3];
-
-  // Points the inputs at them, and reads them where they are wanted.
-  __device__ void take(GaussianInputs<S>& inputs, bool wanted) {
-    const GaussianInputs<S> from = inputs;
-    inputs.means3D = mean;
-    if constexpr (Rows::kKnown) inputs.opacities = opacity, inputs.scales = scale, inputs.rotations = rotation;
-    if constexpr (Rows::kLength == kShRestLength) inputs.dc = dc;
-    if (!wanted) return;
-    copy(mean, from.means3D);
-    if constexpr (Rows::kKnown) {
-      copy(opacity, from.opacities), copy(scale, from.scales), copy(rotation, from.rotations);
-      if constexpr (Rows::kLength == kShRestLength) copy(dc, from.dc);
+      const float4 q = reinterpret_cast<const float4*>(in.rotations)[i];
+      return {load3(in.means3D + 3 * i), in.opacities[i], false, load3(in.scales + 3 * i), {q.x, q.y, q.z, q.w}, {}};
+    } else {
+      return load_gaussian(in, i);
     }
   }
 
- private:
-  template <int kCount> static __device__ void copy(S (&to)[kCount], const S* from) {
-#pragma unroll
-    for (int k = 0; k < kCount; ++k) to[k] = from[k];
+  // The colours of known rows, whose numbers lie in registers; dc: degree 0, where it lies apart.
+  static __device__ Colors<float> known_colors(const float* dc, const float* sh) {
+    return {nullptr, kDcApart ? dc : nullptr, sh, kLength / 3, kMaxShDegree};
   }
 };
 

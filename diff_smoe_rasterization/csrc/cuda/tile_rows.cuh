@@ -16,7 +16,7 @@ __device__ TileRect footprint_bounds(BlendMode mode, int width, int height, Vec2
                                      int32_t gaussian) {
   Camera<S> camera;
   camera.width = width, camera.height = height;
-  return tile_bounds(mode, camera, mean, cuts_by_alpha(mode) ? S(radii[gaussian]) : S(0));
+  return tile_bounds(mode, camera, mean, within_radius(mode) ? S(radii[gaussian]) : S(0));
 }
 
 template <class T> __device__ T from_lane(T value, int lane) { return __shfl_sync(kAllLanes, value, lane); }

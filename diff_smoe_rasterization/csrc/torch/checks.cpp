@@ -148,8 +148,8 @@ void check_sh_degree(const Inputs& inputs, int64_t degree) {
 }
 
 void check_blend_mode(const char* function, int64_t blend_mode) {
-  TORCH_CHECK_VALUE(0 <= blend_mode && blend_mode < kNumBlendModes, function, ": blend_mode is ", blend_mode,
-                    "; it must be 0 to ", kNumBlendModes - 1);
+  TORCH_CHECK_VALUE(0 <= blend_mode && blend_mode < BlendModes::kSize, function, ": blend_mode is ", blend_mode,
+                    "; it must be 0 to ", BlendModes::kSize - 1);
 }
 
 // What a rendering saved: unchanged, and of that rendering.

@@ -3,8 +3,8 @@
 #include <pybind11/pybind11.h>
 #include <torch/version.h>
 
+#include "dsmoe/blend.h"
 #include "dsmoe/constants.h"
-#include "dsmoe/gate.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "io/python_bindings.h"
 #include "profiling.h"
@@ -24,12 +24,18 @@ py::dict constants() {
                   "tile_size"_a = dsmoe::kTileSize, "segment_length"_a = dsmoe::cuda::kSegmentLength);
 }
 
+// The core's list, for Python's own: names in the order of their numbers, each with its facts.
 py::dict blend_modes() {
-  using dsmoe::BlendMode;
   using namespace py::literals;
-  return py::dict("alpha"_a = static_cast<int>(BlendMode::kAlpha), "smoe"_a = static_cast<int>(BlendMode::kSmoe),
-                  "smoe_tn"_a = static_cast<int>(BlendMode::kSmoeTn),
-                  "smoe_std"_a = static_cast<int>(BlendMode::kSmoeStd));
+  py::dict modes;
+  dsmoe::BlendModes::for_each([&](auto mode) {
+    using Policy = dsmoe::Blend<decltype(mode)::value>;
+    modes[Policy::kName] = py::dict("number"_a = static_cast<int>(decltype(mode)::value),
+                                    "cuts_by_alpha"_a = Policy::kCut == dsmoe::Cut::kAlpha,
+                                    "needs_depth_order"_a = Policy::kNeedsDepthOrder,
+                                    "stops_early"_a = Policy::kStopsEarly, "learns_gate"_a = Policy::kLearnsGate);
+  });
+  return modes;
 }
 
 py::dict build_info() {

@@ -1,5 +1,6 @@
 // The blend modes. Each is a small policy: `accumulate` takes a pair front to back and returns its weight,
-// `background_gate` and `kDivides` make the pixel of the sums, `backward` takes the pairs back to front.
+// `background_gate` and `kDivides` make the pixel of the sums (pixel.h), `backward` takes the pairs back to front. A
+// policy also carries every fact of its mode. All other code asks the policy, or iterates BlendModes.
 //
 // With alpha_i the gate logit, T_i = prod_{j<i} (1 - alpha_j) (Eq. 4), c_i the expert, w_i = alpha_i T_i, W = sum w_i
 // and T what is left behind the last pair:
@@ -19,12 +20,34 @@
 //   gamma_i = w_i u_i - alpha_i / (1 - alpha_i) R_i,   dL/dc_i = w_i g'
 //
 // where b is g'.C: the pixel's own colour is what each expert is measured against. At lambda = 1 all terms in b cancel,
-// and alpha leaves them out. DEVELOPING.md says what else a new mode needs.
+// and alpha leaves them out.
 #pragma once
+
+#include <type_traits>
 
 #include "dsmoe/gate.h"
 
 namespace dsmoe {
+
+enum class BlendMode : int { kAlpha, kSmoe, kSmoeTn, kSmoeStd };  // the numbers are the callers'
+
+template <BlendMode kMode> using ModeConstant = std::integral_constant<BlendMode, kMode>;
+
+template <BlendMode... kModes> struct ModeList {
+  static constexpr int kSize = sizeof...(kModes);
+
+  // Calls body(ModeConstant<kMode>{}) for each mode.
+  template <class Body> static DSMOE_HD constexpr void for_each(Body body) { (body(ModeConstant<kModes>{}), ...); }
+};
+using BlendModes = ModeList<BlendMode::kAlpha, BlendMode::kSmoe, BlendMode::kSmoeTn, BlendMode::kSmoeStd>;
+
+// The policy of a mode.
+template <BlendMode kMode> struct Blend;
+
+template <BlendMode kMode, class Real, class S>
+DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
+  return evaluate_gate<Blend<kMode>::kCut>(power, opacity, least_alpha);
+}
 
 // A pixel behind its last pair.
 template <class Real> struct PixelEnd {
@@ -90,127 +113,71 @@ DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, const 
   return {select(contributes, gamma, Real(S(0))), weight};
 }
 
-// The family, alpha and smoe; the ablations are specialisations.
-template <BlendMode kMode> struct Blend {
-  static constexpr bool kNeedsDepthOrder = true;
-  static constexpr bool kStopsEarly = true;                    // once full, a pixel is done
-  static constexpr bool kSuffixAboutBase = true;               // u_i = g'.c_i - b; else g'.c_i
-  static constexpr bool kDivides = kMode == BlendMode::kSmoe;  // in alpha D is 1, and never formed
-  static constexpr bool kLearnsGate = kDivides;                // lambda is a variable
-
-  template <class S> static DSMOE_HD S background_gate(S lambda) { return kDivides ? lambda : S(1); }
+// The arithmetic of all modes: whether w_i holds T_i, or is alpha_i; and whether the denominator sums w_i, or alpha_i
+// of every pair that counts, seen or hidden. And the facts that the modes have in common.
+template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
+  static constexpr Cut kCut = Cut::kKernel;                  // which pairs count
+  static constexpr bool kWithinRadius = false;               // and only in the tiles of the 3-sigma square
+  static constexpr bool kNeedsDepthOrder = kTInNumerator;    // pairs are taken front to back
+  static constexpr bool kStopsEarly = kTInDenominator;       // once full, a pixel is done
+  static constexpr bool kSuffixAboutBase = kTInDenominator;  // u_i = g'.c_i - b; else g'.c_i
+  static constexpr bool kDivides = true;                     // by D; else D is 1, and never formed
+  static constexpr bool kLearnsGate = false;                 // lambda is a variable
+  template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda
 
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
-    const auto pair = transmit(state, gate);
-    state.gate_sum = state.gate_sum + pair.weight;
+    PairWeight<Real> pair = {select(gate.counts, gate.alpha, Real(Scalar<Real>(0))), gate.counts};
+    if (kTInNumerator && !kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
+    if (kTInNumerator) pair = transmit(state, gate);
+    if (kTInNumerator == kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
     return pair;
-  }
-
-  template <class Real>
-  static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
-                                              Mask<Real> contributes) {
-    return transmit_backward(pixel, gate, value - pixel.base, contributes);
-  }
-};
-
-// The ablations leave the background out, and their denominator runs on behind a full pixel.
-struct AblationBlend {
-  static constexpr bool kStopsEarly = false, kSuffixAboutBase = false, kDivides = true, kLearnsGate = false;
-  template <class S> static DSMOE_HD S background_gate(S) { return S(0); }
-};
-
-template <> struct Blend<BlendMode::kSmoeTn> : AblationBlend {
-  static constexpr bool kNeedsDepthOrder = true;
-
-  template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
-    state.gate_sum = state.gate_sum + select(gate.counts, gate.alpha, Real(Scalar<Real>(0)));
-    return transmit(state, gate);
-  }
-
-  // The denominator's share, -alpha_i g'.C, comes from every pair that counts, seen or hidden.
-  template <class Real>
-  static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
-                                              Mask<Real> contributes) {
-    auto pair = transmit_backward(pixel, gate, value, contributes);
-    pair.gamma = pair.gamma - select(gate.counts, gate.alpha * pixel.base, Real(Scalar<Real>(0)));
-    return pair;
-  }
-};
-
-template <> struct Blend<BlendMode::kSmoeStd> : AblationBlend {
-  static constexpr bool kNeedsDepthOrder = false;
-
-  template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
-    const Real weight = select(gate.counts, gate.alpha, Real(Scalar<Real>(0)));
-    state.gate_sum = state.gate_sum + weight;
-    return {weight, gate.counts};
   }
 
   template <class Real>
   static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
                                               Mask<Real> contributes) {
     const Real zero = Scalar<Real>(0);
+    if constexpr (kTInNumerator) {
+      auto pair = transmit_backward(pixel, gate, kSuffixAboutBase ? value - pixel.base : value, contributes);
+      if (!kTInDenominator) pair.gamma = pair.gamma - select(gate.counts, gate.alpha * pixel.base, zero);
+      return pair;
+    }
     return {select(contributes, gate.alpha * (value - pixel.base), zero), select(contributes, gate.alpha, zero)};
   }
 };
 
-// A feature is what a pixel blends: colour channels and, on request, z and 1 / z. This says how one is finished.
-enum class FeatureRule {
-  kBlended,   // by the mode: colour, and inverse depth over background 0
-  kAveraged,  // divided by the gate sum in every mode: expected depth
+template <> struct Blend<BlendMode::kAlpha> : GateBlend<true, true> {
+  static constexpr const char* kName = "alpha";
+  static constexpr Cut kCut = Cut::kAlpha;
+  static constexpr bool kWithinRadius = true, kDivides = false;
+  template <class S> static DSMOE_HD S background_gate(S) { return S(1); }
 };
 
-// A feature of a pixel is (sum + weight background) / denominator where some gate is open, else its background.
-template <class Real> struct FeatureEnd {
-  Real weight, denominator;
-  Mask<Real> open;
-  bool divides;
-
-  // The background's share: 0 without a gate, even where the background is NaN or infinite.
-  DSMOE_HD Real if_gated(Real share) const {
-    return select(weight > Real(Scalar<Real>(0)), share, Real(Scalar<Real>(0)));
-  }
+template <> struct Blend<BlendMode::kSmoe> : GateBlend<true, true> {
+  static constexpr const char* kName = "smoe";
+  static constexpr bool kLearnsGate = true;
+  template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
 
-template <BlendMode kMode, class Real>
-DSMOE_HD FeatureEnd<Real> feature_end(FeatureRule rule, const PixelEnd<Real>& end) {
-  using S = Scalar<Real>;
-  const bool averaged = rule == FeatureRule::kAveraged, divides = averaged || Blend<kMode>::kDivides;
-  const S gate = averaged ? S(0) : Blend<kMode>::background_gate(end.background_gate);
-  const Real weight = Real(gate) * end.transmittance;
-  return {weight, divides ? end.gate_sum + weight : Real(S(1)), end.gate_sum >= Real(S(kGateSumCut)), divides};
-}
-
-template <BlendMode kMode, class Real>
-DSMOE_HD Real finish_feature(FeatureRule rule, const PixelEnd<Real>& end, Real sum, Real background) {
-  const auto by = feature_end<kMode>(rule, end);
-  return select(by.open, (sum + by.if_gated(by.weight * background)) / by.denominator, background);
-}
-
-// Starts a pixel's backward pass; the features join one by one through add_feature.
-template <class Real> DSMOE_HD PixelBackward<Real> begin_backward(const PixelEnd<Real>& end, Real dL_dgate_sum) {
-  return {end.transmittance, Real(Scalar<Real>(0)), -dL_dgate_sum};
-}
-
-// What one feature of a pixel hands on.
-template <class Real> struct FeatureBackward {
-  Real scaled;           // g', to the experts
-  Real background;       // dL/dbackground
-  Real background_gate;  // dL/dlambda
+template <> struct Blend<BlendMode::kSmoeTn> : GateBlend<true, false> {
+  static constexpr const char* kName = "smoe_tn";
 };
 
-// Adds one feature's share to b and R. value is the finished feature of the pixel.
-template <BlendMode kMode, class Real>
-DSMOE_HD FeatureBackward<Real> add_feature(FeatureRule rule, PixelBackward<Real>& pixel, const PixelEnd<Real>& end,
-                                           Real dL_dvalue, Real value, Real background) {
-  const Real zero = Scalar<Real>(0);
-  const auto by = feature_end<kMode>(rule, end);
-  const Real scaled = select(by.open, dL_dvalue / by.denominator, zero), weighted = by.weight * scaled;
-  const Real distance = background - value;
-  if (by.divides) pixel.base = pixel.base + scaled * value;
-  pixel.suffix = pixel.suffix + by.if_gated(weighted * (by.divides ? distance : background));
-  const bool learns = Blend<kMode>::kLearnsGate && rule == FeatureRule::kBlended;
-  return {scaled, select(by.open, weighted, dL_dvalue), learns ? end.transmittance * scaled * distance : zero};
+template <> struct Blend<BlendMode::kSmoeStd> : GateBlend<false, false> {
+  static constexpr const char* kName = "smoe_std";
+};
+
+// Facts of a mode that is known at run time.
+DSMOE_HD constexpr Cut cut_of(BlendMode mode) {
+  Cut cut = Cut::kKernel;
+  BlendModes::for_each([&](auto of) { cut = decltype(of)::value == mode ? Blend<decltype(of)::value>::kCut : cut; });
+  return cut;
+}
+DSMOE_HD constexpr bool within_radius(BlendMode mode) {
+  bool within = false;
+  BlendModes::for_each(
+      [&](auto of) { within |= decltype(of)::value == mode && Blend<decltype(of)::value>::kWithinRadius; });
+  return within;
 }
 
 // Continues in front of pairs that another walk has taken: `transmittance` is what they met, `behind` their sum w g'.c.

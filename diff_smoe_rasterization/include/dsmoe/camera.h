@@ -17,10 +17,41 @@ template <class S> struct Camera {
   S near = S(0.2);                 // view depth; nearer Gaussians are culled
 };
 
+// What one Gaussian adds to the gradient of its camera, as the vectors that it is made of.
+template <class S> struct CameraShare {
+  Vec3<S> point;         // the Gaussian's mean, world
+  Vec3<S> dL_dview;      // by the point in view space
+  Mat3<S> dL_drotation;  // by the rotation part of the view matrix
+  Vec3<S> dL_dclip;      // by x, y and w of the point in clip space
+  Vec3<S> dL_dposition;
+};
+
 template <class S> struct CameraGradient {
   S view[16] = {};
   S projection[16] = {};
   S position[3] = {};
+
+  DSMOE_HD void add(const CameraShare<S>& share) {
+    const S point[4] = {share.point.x, share.point.y, share.point.z, S(1)};
+    for (int i = 0; i < 4; ++i) {
+      view[4 * i + 0] += point[i] * share.dL_dview.x;
+      view[4 * i + 1] += point[i] * share.dL_dview.y;
+      view[4 * i + 2] += point[i] * share.dL_dview.z;
+      projection[4 * i + 0] += point[i] * share.dL_dclip.x;
+      projection[4 * i + 1] += point[i] * share.dL_dclip.y;
+      projection[4 * i + 3] += point[i] * share.dL_dclip.z;
+    }
+    const auto& [x, y, z] = share.dL_drotation;
+    view[0] += x.x, view[4] += x.y, view[8] += x.z;
+    view[1] += y.x, view[5] += y.y, view[9] += y.z;
+    view[2] += z.x, view[6] += z.y, view[10] += z.z;
+    position[0] += share.dL_dposition.x, position[1] += share.dL_dposition.y, position[2] += share.dL_dposition.z;
+  }
+
+  DSMOE_HD void add(const CameraGradient& other) {
+    for (int k = 0; k < 16; ++k) view[k] += other.view[k], projection[k] += other.projection[k];
+    for (int k = 0; k < 3; ++k) position[k] += other.position[k];
+  }
 };
 
 template <class S> DSMOE_HD Vec3<S> transform_point(const S* m, Vec3<S> p) {
@@ -28,16 +59,8 @@ template <class S> DSMOE_HD Vec3<S> transform_point(const S* m, Vec3<S> p) {
           m[2] * p.x + m[6] * p.y + m[10] * p.z + m[14]};
 }
 
-// Adds to dL_dm where it is given; returns dL/dp.
-template <class S> DSMOE_HD Vec3<S> transform_point_backward(const S* m, Vec3<S> p, Vec3<S> dL_dout, S* dL_dm) {
-  if (dL_dm != nullptr) {
-    const S point[4] = {p.x, p.y, p.z, S(1)};
-    for (int i = 0; i < 4; ++i) {
-      dL_dm[4 * i + 0] += point[i] * dL_dout.x;
-      dL_dm[4 * i + 1] += point[i] * dL_dout.y;
-      dL_dm[4 * i + 2] += point[i] * dL_dout.z;
-    }
-  }
+// dL/dp. What the matrix gets is CameraShare's.
+template <class S> DSMOE_HD Vec3<S> transform_point_backward(const S* m, Vec3<S> dL_dout) {
   return {m[0] * dL_dout.x + m[1] * dL_dout.y + m[2] * dL_dout.z,
           m[4] * dL_dout.x + m[5] * dL_dout.y + m[6] * dL_dout.z,
           m[8] * dL_dout.x + m[9] * dL_dout.y + m[10] * dL_dout.z};
@@ -46,12 +69,6 @@ template <class S> DSMOE_HD Vec3<S> transform_point_backward(const S* m, Vec3<S>
 // The rotation part of the world-to-view matrix.
 template <class S> DSMOE_HD Mat3<S> view_rotation(const S* m) {
   return {{m[0], m[4], m[8]}, {m[1], m[5], m[9]}, {m[2], m[6], m[10]}};
-}
-
-template <class S> DSMOE_HD void view_rotation_backward(const Mat3<S>& dL_drotation, S* dL_dm) {
-  dL_dm[0] += dL_drotation.r0.x, dL_dm[4] += dL_drotation.r0.y, dL_dm[8] += dL_drotation.r0.z;
-  dL_dm[1] += dL_drotation.r1.x, dL_dm[5] += dL_drotation.r1.y, dL_dm[9] += dL_drotation.r1.z;
-  dL_dm[2] += dL_drotation.r2.x, dL_dm[6] += dL_drotation.r2.y, dL_dm[10] += dL_drotation.r2.z;
 }
 
 // World to pixel coordinates; pixel centres are integers, NDC -1 and 1 are the outer edges of the border pixels.
@@ -64,9 +81,13 @@ template <class S> DSMOE_HD Vec2<S> project_to_pixel(const Camera<S>& camera, Ve
           ((clip.y * inverse_w + S(1)) * S(camera.height) - S(1)) * S(0.5)};
 }
 
-// Adds to dL_dprojection where it is given; returns dL/dp.
+template <class S> struct PixelGradient {
+  Vec3<S> point;  // dL/dp
+  Vec3<S> clip;   // by x, y and w of the point in clip space
+};
+
 template <class S>
-DSMOE_HD Vec3<S> project_to_pixel_backward(const Camera<S>& camera, Vec3<S> p, Vec2<S> dL_dpixel, S* dL_dprojection) {
+DSMOE_HD PixelGradient<S> project_to_pixel_backward(const Camera<S>& camera, Vec3<S> p, Vec2<S> dL_dpixel) {
   const S* m = camera.projection;
   const Vec3<S> clip = transform_point(m, p);
   const S w = m[3] * p.x + m[7] * p.y + m[11] * p.z + m[15];
@@ -74,16 +95,9 @@ DSMOE_HD Vec3<S> project_to_pixel_backward(const Camera<S>& camera, Vec3<S> p, V
   const S dL_dx = dL_dpixel.x * S(0.5) * S(camera.width) * inverse_w;
   const S dL_dy = dL_dpixel.y * S(0.5) * S(camera.height) * inverse_w;
   const S dL_dw = -(dL_dx * clip.x + dL_dy * clip.y) * inverse_w;
-  if (dL_dprojection != nullptr) {
-    const S point[4] = {p.x, p.y, p.z, S(1)};
-    for (int i = 0; i < 4; ++i) {
-      dL_dprojection[4 * i + 0] += point[i] * dL_dx;
-      dL_dprojection[4 * i + 1] += point[i] * dL_dy;
-      dL_dprojection[4 * i + 3] += point[i] * dL_dw;
-    }
-  }
-  return {m[0] * dL_dx + m[1] * dL_dy + m[3] * dL_dw, m[4] * dL_dx + m[5] * dL_dy + m[7] * dL_dw,
-          m[8] * dL_dx + m[9] * dL_dy + m[11] * dL_dw};
+  return {{m[0] * dL_dx + m[1] * dL_dy + m[3] * dL_dw, m[4] * dL_dx + m[5] * dL_dy + m[7] * dL_dw,
+           m[8] * dL_dx + m[9] * dL_dy + m[11] * dL_dw},
+          {dL_dx, dL_dy, dL_dw}};
 }
 
 }  // namespace dsmoe

@@ -34,10 +34,15 @@ template <class S> DSMOE_HD Sym3<S> covariance_3d(Vec3<S> scale, const Mat3<S>& 
   return {entry(a, a), entry(a, b), entry(a, c), entry(b, b), entry(b, c), entry(c, c)};
 }
 
+template <class S> struct Covariance3dGradient {
+  Vec3<S> scale;
+  Mat3<S> rotation;
+};
+
 // dL_dcov holds the derivative by each of the six stored numbers: an off-diagonal one stands for two matrix entries.
 template <class S>
-DSMOE_HD void covariance_3d_backward(Vec3<S> scale, const Mat3<S>& rotation, const Sym3<S>& dL_dcov, Vec3<S>& dL_dscale,
-                                     Mat3<S>& dL_drotation) {
+DSMOE_HD Covariance3dGradient<S> covariance_3d_backward(Vec3<S> scale, const Mat3<S>& rotation,
+                                                        const Sym3<S>& dL_dcov) {
   const S half = S(0.5);
   const Sym3<S> g = {dL_dcov.xx, half * dL_dcov.xy, half * dL_dcov.xz, dL_dcov.yy, half * dL_dcov.yz, dL_dcov.zz};
   // Column k of R contributes scale_k^2 r_k r_k^T; g r_k serves both derivatives.
@@ -45,10 +50,9 @@ DSMOE_HD void covariance_3d_backward(Vec3<S> scale, const Mat3<S>& rotation, con
   const Vec3<S> ry = {rotation.r0.y, rotation.r1.y, rotation.r2.y};
   const Vec3<S> rz = {rotation.r0.z, rotation.r1.z, rotation.r2.z};
   const Vec3<S> gx = g * rx, gy = g * ry, gz = g * rz;
-  dL_dscale = {S(2) * scale.x * dot(rx, gx), S(2) * scale.y * dot(ry, gy), S(2) * scale.z * dot(rz, gz)};
   const S vx = S(2) * scale.x * scale.x, vy = S(2) * scale.y * scale.y, vz = S(2) * scale.z * scale.z;
-  dL_drotation = {
-      {vx * gx.x, vy * gy.x, vz * gz.x}, {vx * gx.y, vy * gy.y, vz * gz.y}, {vx * gx.z, vy * gy.z, vz * gz.z}};
+  return {{S(2) * scale.x * dot(rx, gx), S(2) * scale.y * dot(ry, gy), S(2) * scale.z * dot(rz, gz)},
+          {{vx * gx.x, vy * gy.x, vz * gz.x}, {vx * gx.y, vy * gy.y, vz * gz.y}, {vx * gx.z, vy * gy.z, vz * gz.z}}};
 }
 
 // The local affine approximation of the perspective projection (EWA splatting): J W, 2x3. The slopes x/z and y/z are
@@ -103,18 +107,21 @@ template <class S> DSMOE_HD Sym2<S> covariance_2d(const Mat23<S>& axes, const Sy
   return {dot(axes.r0, u), dot(axes.r0, v), dot(axes.r1, v)};
 }
 
+template <class S> struct Covariance2dGradient {
+  Sym3<S> cov;
+  Mat23<S> axes;
+};
+
 template <class S>
-DSMOE_HD void covariance_2d_backward(const Mat23<S>& axes, const Sym3<S>& cov, const Sym2<S>& g, Sym3<S>& dL_dcov,
-                                     Mat23<S>& dL_daxes) {
-  const Vec3<S> a = axes.r0, b = axes.r1;
-  dL_dcov = {g.xx * a.x * a.x + g.xy * a.x * b.x + g.yy * b.x * b.x,
-             S(2) * g.xx * a.x * a.y + g.xy * (a.x * b.y + a.y * b.x) + S(2) * g.yy * b.x * b.y,
-             S(2) * g.xx * a.x * a.z + g.xy * (a.x * b.z + a.z * b.x) + S(2) * g.yy * b.x * b.z,
-             g.xx * a.y * a.y + g.xy * a.y * b.y + g.yy * b.y * b.y,
-             S(2) * g.xx * a.y * a.z + g.xy * (a.y * b.z + a.z * b.y) + S(2) * g.yy * b.y * b.z,
-             g.xx * a.z * a.z + g.xy * a.z * b.z + g.yy * b.z * b.z};
-  const Vec3<S> u = cov * a, v = cov * b;
-  dL_daxes = {S(2) * g.xx * u + g.xy * v, g.xy * u + S(2) * g.yy * v};
+DSMOE_HD Covariance2dGradient<S> covariance_2d_backward(const Mat23<S>& axes, const Sym3<S>& cov, const Sym2<S>& g) {
+  const Vec3<S> a = axes.r0, b = axes.r1, u = cov * a, v = cov * b;
+  return {{g.xx * a.x * a.x + g.xy * a.x * b.x + g.yy * b.x * b.x,
+           S(2) * g.xx * a.x * a.y + g.xy * (a.x * b.y + a.y * b.x) + S(2) * g.yy * b.x * b.y,
+           S(2) * g.xx * a.x * a.z + g.xy * (a.x * b.z + a.z * b.x) + S(2) * g.yy * b.x * b.z,
+           g.xx * a.y * a.y + g.xy * a.y * b.y + g.yy * b.y * b.y,
+           S(2) * g.xx * a.y * a.z + g.xy * (a.y * b.z + a.z * b.y) + S(2) * g.yy * b.y * b.z,
+           g.xx * a.z * a.z + g.xy * a.z * b.z + g.yy * b.z * b.z},
+          {S(2) * g.xx * u + g.xy * v, g.xy * u + S(2) * g.yy * v}};
 }
 
 // The conic, the inverse of Sigma2D + low-pass, with what the radius and antialiasing need.

@@ -1,8 +1,8 @@
 // The features of a rendering by number: colour channels, then z and 1 / z where they are asked for.
 #pragma once
 
-#include "dsmoe/blend.h"
 #include "dsmoe/params.h"
+#include "dsmoe/pixel.h"
 
 namespace dsmoe {
 

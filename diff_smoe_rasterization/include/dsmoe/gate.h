@@ -7,16 +7,11 @@
 
 namespace dsmoe {
 
-enum class BlendMode : int {
-  kAlpha = 0,    // Eq. 3, 3DGS: the background's gate is 1
-  kSmoe = 1,     // Eq. 7, the method: it is 0, or any other number
-  kSmoeTn = 2,   // Eq. 8, ablation "-T_d"
-  kSmoeStd = 3,  // Eq. 6, ablation "-T_n,d", classic SMoE
+// Which pairs count.
+enum class Cut {
+  kAlpha,   // 3DGS: those of alpha >= 1/255
+  kKernel,  // the paper: those of G >= 1e-5, and of the least alpha below
 };
-constexpr int kNumBlendModes = 4;
-
-// Which pairs count. By alpha: those of 3DGS, alpha >= 1/255 in whole tiles about the Gaussian. Else the paper's, by G.
-DSMOE_HD constexpr bool cuts_by_alpha(BlendMode mode) { return mode == BlendMode::kAlpha; }
 
 // The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels: d = pixel - mean, d.x fixed, d.y free.
 template <class Real, class S> struct ColumnExponent {
@@ -40,10 +35,10 @@ template <class S> struct AlphaCut {
 };
 
 // The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. Negative: none does.
-template <class S> DSMOE_HD S squared_reach(BlendMode mode, S opacity, S least_alpha) {
+template <class S> DSMOE_HD S squared_reach(Cut cut, S opacity, S least_alpha) {
   if (!(opacity > S(0))) return S(-1);
-  const S by_alpha = S(2) * log(opacity / (cuts_by_alpha(mode) ? S(kAlphaCut) : least_alpha));
-  if (cuts_by_alpha(mode)) return by_alpha;
+  const S by_alpha = S(2) * log(opacity / (cut == Cut::kAlpha ? S(kAlphaCut) : least_alpha));
+  if (cut == Cut::kAlpha) return by_alpha;
   const S by_gate = S(-2) * log(S(kGateCut));
   return least_alpha > S(0) ? min(by_gate, by_alpha) : by_gate;
 }
@@ -54,14 +49,13 @@ template <class Real> struct Gate {
   Mask<Real> counts;  // the pair takes part
 };
 
-template <BlendMode kMode, class Real, class S>
-DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
+template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
   // Above 0 the conic is no ellipse, and the pair does not count: it must not overflow either.
   const Real kernel = exp(min(power, Real(S(0))));
   Gate<Real> gate;
   gate.logit = Real(opacity) * kernel;
   gate.alpha = min(gate.logit, Real(S(kAlphaMax)));
-  if constexpr (cuts_by_alpha(kMode)) {
+  if constexpr (kCut == Cut::kAlpha) {
     gate.counts = (power <= Real(S(0))) & (gate.alpha >= Real(S(kAlphaCut)));
   } else {
     gate.counts = (power <= Real(S(0))) & (kernel >= Real(S(kGateCut))) & (gate.logit >= Real(least_alpha));

@@ -4,8 +4,7 @@
 
 #include <cstdint>
 
-#include "dsmoe/camera.h"
-#include "dsmoe/gate.h"
+#include "dsmoe/project.h"
 
 namespace dsmoe {
 
@@ -41,18 +40,11 @@ template <class S> struct RasterConfig {
     return background_gate_at != nullptr ? *background_gate_at : background_gate;
   }
   DSMOE_HD AlphaCut<S> alpha_cut() const { return {alpha_min, gate_of_background()}; }
+  DSMOE_HD ProjectionRules<S> projection_rules() const {
+    return {mode, scale_modifier, alpha_cut(), antialiasing, depth, inverse_depth};
+  }
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
 };
-
-// One Gaussian on the image plane: all that the blend reads of it besides its features. Aligned to load as vectors.
-template <class S> struct alignas(16) ProjectedGaussian {
-  Vec2<S> mean;     // pixels
-  Sym2<S> conic;    // per px^2
-  S opacity;        // after antialiasing
-  S squared_reach;  // k^2 of the footprint
-  S depth;          // view z
-};
-constexpr int kProjectedGaussianSize = 8;
 
 // One (Gaussian, tile) pair, in a tile's list from front to back.
 struct TileInstance {

@@ -26,21 +26,29 @@ constexpr double kSh3_4 = -0.4570457994644658;
 constexpr double kSh3_5 = 1.445305721320277;
 constexpr double kSh3_6 = -0.5900435899266435;
 
-template <class S> DSMOE_HD void sh_basis(int degree, Vec3<S> d, S* basis) {
+// One number per coefficient; those above the degree in use mean nothing.
+template <class S> struct ShNumbers {
+  S values[kMaxShCoefficients];
+  DSMOE_HD S& operator[](int k) { return values[k]; }
+  DSMOE_HD S operator[](int k) const { return values[k]; }
+};
+
+template <class S> DSMOE_HD ShNumbers<S> sh_basis(int degree, Vec3<S> d) {
+  ShNumbers<S> basis;
   basis[0] = S(kSh0);
-  if (degree < 1) return;
+  if (degree < 1) return basis;
   const S x = d.x, y = d.y, z = d.z;
   basis[1] = -S(kSh1) * y;
   basis[2] = S(kSh1) * z;
   basis[3] = -S(kSh1) * x;
-  if (degree < 2) return;
+  if (degree < 2) return basis;
   const S xx = x * x, yy = y * y, zz = z * z;
   basis[4] = S(kSh2_0) * x * y;
   basis[5] = S(kSh2_1) * y * z;
   basis[6] = S(kSh2_2) * (S(2) * zz - xx - yy);
   basis[7] = S(kSh2_3) * x * z;
   basis[8] = S(kSh2_4) * (xx - yy);
-  if (degree < 3) return;
+  if (degree < 3) return basis;
   basis[9] = S(kSh3_0) * y * (S(3) * xx - yy);
   basis[10] = S(kSh3_1) * x * y * z;
   basis[11] = S(kSh3_2) * y * (S(4) * zz - xx - yy);
@@ -48,10 +56,11 @@ template <class S> DSMOE_HD void sh_basis(int degree, Vec3<S> d, S* basis) {
   basis[13] = S(kSh3_4) * x * (S(4) * zz - xx - yy);
   basis[14] = S(kSh3_5) * z * (xx - yy);
   basis[15] = S(kSh3_6) * x * (xx - S(3) * yy);
+  return basis;
 }
 
 // dL/dd from dL/dbasis.
-template <class S> DSMOE_HD Vec3<S> sh_basis_backward(int degree, Vec3<S> d, const S* g) {
+template <class S> DSMOE_HD Vec3<S> sh_basis_backward(int degree, Vec3<S> d, const ShNumbers<S>& g) {
   Vec3<S> out = {S(0), S(0), S(0)};
   if (degree < 1) return out;
   const S x = d.x, y = d.y, z = d.z;
@@ -75,57 +84,54 @@ template <class S> DSMOE_HD Vec3<S> sh_basis_backward(int degree, Vec3<S> d, con
   return out;
 }
 
-// Where a Gaussian's coefficients lie: degree 0 apart from the rest, or all in one array (then dc == rest - 3 in
-// effect).
-template <class S> struct ShCoefficients {
-  S* dc;    // [3]
-  S* rest;  // [coefficients - 1, 3]
+// The viewing direction; a Gaussian at the camera centre has none and is seen as degree 0 sees it.
+template <class S> struct ViewDirection {
+  Vec3<S> unit;
+  S inverse_length;  // of the offset from the camera
 };
 
-// The viewing direction; a Gaussian at the camera centre has none and is seen as degree 0 sees it.
-template <class S> DSMOE_HD Vec3<S> view_direction(Vec3<S> mean, const S* position, S& inverse_length) {
-  const Vec3<S> offset = mean - Vec3<S>{position[0], position[1], position[2]};
+template <class S> DSMOE_HD ViewDirection<S> view_direction(Vec3<S> mean, Vec3<S> position) {
+  const Vec3<S> offset = mean - position;
   const S squared = dot(offset, offset);
-  inverse_length = squared > S(0) ? S(1) / sqrt(squared) : S(0);
-  return inverse_length * offset;
+  const S inverse_length = squared > S(0) ? S(1) / sqrt(squared) : S(0);
+  return {inverse_length * offset, inverse_length};
 }
 
-// colour = 1/2 + sum_k basis_k sh_k, and with `clamp` max(0, that)
-template <class S>
-DSMOE_HD void sh_color(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh, bool clamp, S* color) {
-  S inverse_length, basis[kMaxShCoefficients];
-  sh_basis(degree, view_direction(mean, position, inverse_length), basis);
-  for (int c = 0; c < 3; ++c) color[c] = S(0.5) + basis[0] * sh.dc[c];
-  for (int k = 1; k < sh_coefficients(degree); ++k) {
-    for (int c = 0; c < 3; ++c) color[c] += basis[k] * sh.rest[3 * (k - 1) + c];
-  }
-  for (int c = 0; c < 3; ++c) color[c] = clamp && color[c] < S(0) ? S(0) : color[c];  // NaN stays, and is culled
+template <class S> struct ShRules {
+  int degree;        // active, 0 to 3
+  bool clamp;        // colours are at least 0
+  Vec3<S> position;  // of the camera, world
+};
+
+// colour = 1/2 + sum_k basis_k sh_k, and with `clamp` max(0, that). sh(k): coefficient k, a Vec3.
+template <class S, class Coefficients>
+DSMOE_HD Vec3<S> sh_color(const ShRules<S>& rules, Vec3<S> mean, Coefficients sh) {
+  const auto basis = sh_basis(rules.degree, view_direction(mean, rules.position).unit);
+  Vec3<S> color = Vec3<S>{S(0.5), S(0.5), S(0.5)} + basis[0] * sh(0);
+  for (int k = 1; k < sh_coefficients(rules.degree); ++k) color = color + basis[k] * sh(k);
+  const auto clamped = [&](S c) { return rules.clamp && c < S(0) ? S(0) : c; };  // NaN stays, and is culled
+  return {clamped(color.x), clamped(color.y), clamped(color.z)};
 }
 
-// Writes dL/dsh for the active degree, where the outputs are given; returns dL/dmean (dL/dposition is its negative).
-// color is the forward's result: with `clamp` 0 means clamped, and a clamped channel passes no gradient.
-template <class S>
-DSMOE_HD Vec3<S> sh_color_backward(int degree, Vec3<S> mean, const S* position, ShCoefficients<const S> sh, bool clamp,
-                                   const S* color, const S* dL_dcolor, ShCoefficients<S> dL_dsh) {
-  S inverse_length, basis[kMaxShCoefficients], dL_dbasis[kMaxShCoefficients];
-  const Vec3<S> direction = view_direction(mean, position, inverse_length);
-  sh_basis(degree, direction, basis);
-  S g[3];
-  for (int c = 0; c < 3; ++c) g[c] = !clamp || color[c] > S(0) ? dL_dcolor[c] : S(0);
-  if (dL_dsh.dc != nullptr) {
-    for (int c = 0; c < 3; ++c) dL_dsh.dc[c] = basis[0] * g[c];
-  }
+// Hands dL/dsh_k of the active degree to store(k, Vec3), each after sh(k) was read; returns dL/dmean, whose negative is
+// dL/dposition. color is the forward's result: with `clamp` 0 means clamped, and a clamped channel passes no gradient.
+template <class S, class Coefficients, class Store>
+DSMOE_HD Vec3<S> sh_color_backward(const ShRules<S>& rules, Vec3<S> mean, Coefficients sh, Vec3<S> color,
+                                   Vec3<S> dL_dcolor, Store store) {
+  const auto direction = view_direction(mean, rules.position);
+  const auto basis = sh_basis(rules.degree, direction.unit);
+  const auto passed = [&](S c, S dL_dc) { return !rules.clamp || c > S(0) ? dL_dc : S(0); };
+  const Vec3<S> g = {passed(color.x, dL_dcolor.x), passed(color.y, dL_dcolor.y), passed(color.z, dL_dcolor.z)};
+  store(0, basis[0] * g);
+  ShNumbers<S> dL_dbasis;
   dL_dbasis[0] = S(0);
-  for (int k = 1; k < sh_coefficients(degree); ++k) {
-    const S* row = sh.rest + 3 * (k - 1);
-    dL_dbasis[k] = row[0] * g[0] + row[1] * g[1] + row[2] * g[2];
-    if (dL_dsh.rest != nullptr) {
-      for (int c = 0; c < 3; ++c) dL_dsh.rest[3 * (k - 1) + c] = basis[k] * g[c];
-    }
+  for (int k = 1; k < sh_coefficients(rules.degree); ++k) {
+    dL_dbasis[k] = dot(sh(k), g);
+    store(k, basis[k] * g);
   }
-  const Vec3<S> dL_ddirection = sh_basis_backward(degree, direction, dL_dbasis);
+  const Vec3<S> dL_ddirection = sh_basis_backward(rules.degree, direction.unit, dL_dbasis);
   // d(v / |v|) = (I - n n^T) / |v|
-  return inverse_length * (dL_ddirection - dot(dL_ddirection, direction) * direction);
+  return direction.inverse_length * (dL_ddirection - dot(dL_ddirection, direction.unit) * direction.unit);
 }
 
 }  // namespace dsmoe

@@ -1,0 +1,154 @@
+// From the image gradients of one tile to a record per instance. Included once per instruction set.
+#pragma once
+
+#include "tile_walk_impl.h"
+
+namespace dsmoe {
+namespace cpu {
+namespace DSMOE_SIMD {
+
+template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
+ public:
+  using P = Pack<S>;
+  static constexpr BlendMode kMode = kBlendMode;
+  static constexpr bool kBackToFront = true;
+
+  DSMOE_HD BackwardVisitor(int num_features, Scratch<S> scratch, S* dL_dinstances)
+      : num_features_(num_features),
+        transmittance_(scratch.pixels()),
+        suffix_(scratch.pixels()),
+        base_(scratch.pixels()),
+        last_(scratch.pixels()),
+        scaled_{scratch.next},
+        dL_dinstances_(dL_dinstances) {
+    for (int i = 0; i < kTilePixels * (4 + num_features); ++i) transmittance_.values[i] = S(0);
+    for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(1);
+  }
+
+  // Starts every pixel. Returns how many entries of the list some numerator has seen.
+  DSMOE_HD int64_t read(const Tile<S>& tile, const TileExtent& extent, const TileGradients<S>& gradients) const {
+    const int64_t pixels = static_cast<int64_t>(tile.width) * tile.height;
+    const S background_gate = tile.config.gate_of_background();
+    const int num_channels = tile.config.num_channels;
+    S* dL_dbackground =
+        gradients.dL_dbackground != nullptr ? gradients.dL_dbackground + tile.index * (num_channels + 1) : nullptr;
+    int64_t num_seen = 0;
+    extent.for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
+      const PixelEnd<S> end = {tile.saved.final_transmittance[index], tile.saved.gate_sum[index], background_gate};
+      const S* dL_dgate_sum = gradients.dL_dimages.gate_sum;
+      auto pixel = begin_backward(end, dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
+      for (int f = 0; f < num_features_; ++f) {
+        const S* gradient = feature_image(tile.config, gradients.dL_dimages, f, pixels);
+        if (gradient == nullptr) continue;
+        const S value = feature_image(tile.config, gradients.images, f, pixels)[index];
+        const auto share = add_feature<kMode>(feature_rule(tile.config, f), pixel, end, gradient[index], value,
+                                              feature_background(tile.config, f));
+        scaled_of(f).pixel(x, y) = share.scaled;
+        if (dL_dbackground == nullptr) continue;
+        if (f < num_channels) dL_dbackground[f] += share.background;
+        dL_dbackground[num_channels] += share.background_gate;
+      }
+      transmittance_.pixel(x, y) = pixel.transmittance;
+      suffix_.pixel(x, y) = pixel.suffix;
+      base_.pixel(x, y) = pixel.base;
+      last_.pixel(x, y) = S(tile.saved.last_contributor[index]);
+      num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
+    });
+    return num_seen;
+  }
+
+  DSMOE_HD bool done() const { return false; }
+  DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
+    features_ = gaussian.features;
+    position_ = P(gaussian.position);
+    one_ = x_ = y_ = xx_ = xy_ = yy_ = P(S(0));
+    for (int f = 0; f < num_features_; ++f) dL_dfeatures()[f] = P(S(0));
+  }
+  DSMOE_HD void begin_strip() { column_one_ = column_y_ = column_yy_ = P(S(0)); }
+  DSMOE_HD bool wants(int strip, int row) {
+    not_past_ = position_ < last_.load(strip, row);
+    return !Blend<kMode>::kStopsEarly || any(not_past_);
+  }
+
+  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P, S dy) {
+    const auto contributes = gate.counts & not_past_;
+    P value = S(0);
+    for (int f = 0; f < num_features_; ++f) value = fma(scaled_of(f).load(strip, row), P(features_[f]), value);
+    PixelBackward<P> pixel = {transmittance_.load(strip, row), suffix_.load(strip, row), base_.load(strip, row)};
+    const auto pair = Blend<kMode>::backward(pixel, gate, value, contributes);
+    transmittance_.store(strip, row, pixel.transmittance);
+    suffix_.store(strip, row, pixel.suffix);
+    for (int f = 0; f < num_features_; ++f) {
+      dL_dfeatures()[f] = fma(pair.weight, scaled_of(f).load(strip, row), dL_dfeatures()[f]);
+    }
+    const P dL_dpower = gate_backward(gate, pair.gamma);
+    column_one_ = column_one_ + dL_dpower;
+    column_y_ = fma(dL_dpower, P(dy), column_y_);
+    column_yy_ = fma(dL_dpower, P(dy * dy), column_yy_);
+  }
+
+  DSMOE_HD void end_strip(P dx) {
+    one_ = one_ + column_one_;
+    y_ = y_ + column_y_;
+    yy_ = yy_ + column_yy_;
+    x_ = fma(column_one_, dx, x_);
+    xx_ = fma(column_one_ * dx, dx, xx_);
+    xy_ = fma(column_y_, dx, xy_);
+  }
+
+  DSMOE_HD void end(const ListedGaussian<S>& gaussian) {
+    S* out = record(gaussian.slot);
+    *reinterpret_cast<GateMoments<S>*>(out) = {sum_lanes(one_), sum_lanes(x_),  sum_lanes(y_),
+                                               sum_lanes(xx_),  sum_lanes(xy_), sum_lanes(yy_)};
+    for (int f = 0; f < num_features_; ++f) out[kNumGateMoments + f] = sum_lanes(dL_dfeatures()[f]);
+  }
+
+  DSMOE_HD void write_zeros(uint32_t slot) const {
+    S* out = record(slot);
+    for (int k = 0; k < kNumGateMoments + num_features_; ++k) out[k] = S(0);
+  }
+
+ private:
+  DSMOE_HD PixelArray<S> scaled_of(int f) const { return {scaled_.values + f * kTilePixels}; }
+  DSMOE_HD S* record(uint32_t slot) const {
+    return dL_dinstances_ + slot * static_cast<int64_t>(kNumGateMoments + num_features_);
+  }
+  // dL/dfeature of the current Gaussian; in registers where their number is known.
+  DSMOE_HD P* dL_dfeatures() {
+    if (kFeatures != kAnyFeatures) return dL_dfeatures_in_registers_;
+    return reinterpret_cast<P*>(scaled_.values + num_features_ * kTilePixels);
+  }
+
+  const int num_features_;
+  const PixelArray<S> transmittance_, suffix_, base_, last_;
+  const PixelArray<S> scaled_;  // g', one array a feature
+  S* const dL_dinstances_;
+  const S* features_ = nullptr;
+  P position_;
+  Mask<P> not_past_;
+  P one_, x_, y_, xx_, xy_, yy_;         // the moments of the current Gaussian
+  P column_one_, column_y_, column_yy_;  // of the current strip: dx is the same down the column, it joins at the end
+  P dL_dfeatures_in_registers_[kFeatures != kAnyFeatures ? kFeatures : 1];
+};
+
+template <class S, BlendMode kMode, int kFeatures>
+int64_t blend_tile_backward(const Tile<S>& tile, const TileGradients<S>& gradients, S* memory) {
+  const int num_features = kFeatures != kAnyFeatures ? kFeatures : tile.config.num_features();
+  BackwardVisitor<S, kMode, kFeatures> visitor(num_features, {memory}, gradients.dL_dinstances);
+  const int64_t num_seen = visitor.read(tile, TileExtent(tile), gradients);
+  const int64_t end = Blend<kMode>::kStopsEarly ? tile.begin + num_seen : tile.end;
+  for (int64_t i = end; i < tile.end; ++i) visitor.write_zeros(tile.saved.instances[i].slot);
+  return walk_tile(tile, tile.begin, end, num_features, visitor);
+}
+
+template <class S> int64_t backward(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch) {
+  int64_t pairs = 0;
+  dispatch_blend(tile.config.mode, tile.config.num_features(), [&](auto mode, auto features) {
+    pairs = blend_tile_backward<S, decltype(mode)::value, decltype(features)::value>(tile, gradients, scratch);
+  });
+  return pairs;
+}
+
+}  // namespace DSMOE_SIMD
+}  // namespace cpu
+}  // namespace dsmoe

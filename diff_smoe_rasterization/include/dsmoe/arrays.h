@@ -1,0 +1,197 @@
+// One Gaussian between the arrays of params.h and the values of project.h and sh.h, for both backends.
+#pragma once
+
+#include "dsmoe/params.h"
+#include "dsmoe/project.h"
+#include "dsmoe/sh.h"
+
+namespace dsmoe {
+
+template <class S> DSMOE_HD Vec3<S> load3(const S* p) { return {p[0], p[1], p[2]}; }
+template <class S> DSMOE_HD void store3(S* p, Vec3<S> v) { p[0] = v.x, p[1] = v.y, p[2] = v.z; }
+
+template <class S> DSMOE_HD Gaussian<S> load_gaussian(const GaussianInputs<S>& in, int64_t i) {
+  Gaussian<S> out = {};
+  out.mean = load3(in.means3D + 3 * i);
+  out.opacity = in.opacities[i];
+  out.has_covariance = in.cov3D_precomp != nullptr;
+  if (out.has_covariance) {
+    const S* c = in.cov3D_precomp + 6 * i;
+    out.covariance = {c[0], c[1], c[2], c[3], c[4], c[5]};
+  } else {
+    const S* q = in.rotations + 4 * i;
+    out.scale = load3(in.scales + 3 * i);
+    out.rotation = {q[0], q[1], q[2], q[3]};
+  }
+  return out;
+}
+
+// Coefficients of spherical harmonics, read by number: degree 0 apart from the rest, or all in one array.
+template <class S> struct ShReader {
+  const S* dc;    // [3]
+  const S* rest;  // [K - 1, 3]
+  DSMOE_HD Vec3<S> operator()(int k) const { return k == 0 ? load3(dc) : load3(rest + 3 * (k - 1)); }
+};
+
+// Their gradients, written likewise. Either may be null: that gradient is not wanted.
+template <class S> struct ShWriter {
+  S* dc;
+  S* rest;
+  DSMOE_HD void operator()(int k, Vec3<S> value) const {
+    if (k == 0 && dc != nullptr) store3(dc, value);
+    if (k > 0 && rest != nullptr) store3(rest + 3 * (k - 1), value);
+  }
+};
+
+// The colours of one Gaussian: either given, or coefficients of spherical harmonics.
+template <class S> struct Colors {
+  const S* given;  // [C], or null
+  const S* dc;     // [3], or null where shs holds degree 0
+  const S* shs;    // [num_sh, 3], or null
+  int num_sh;
+  int sh_degree;
+
+  DSMOE_HD ShReader<S> sh() const { return dc != nullptr ? ShReader<S>{dc, shs} : ShReader<S>{shs, shs + 3}; }
+};
+
+template <class S> DSMOE_HD Colors<S> colors_of(const GaussianInputs<S>& in, int num_channels, int64_t i) {
+  const auto at = [i](const S* base, int size) { return base == nullptr ? nullptr : base + i * size; };
+  return {at(in.colors_precomp, num_channels), at(in.dc, 3), at(in.shs, 3 * in.num_sh), in.num_sh, in.sh_degree};
+}
+
+// Where the gradients of a Gaussian's colours go. Any may be null.
+template <class S> struct ColorGradients {
+  S* given;  // [C]
+  S* dc;     // [3]
+  S* shs;    // [num_sh, 3]
+};
+
+template <class S>
+DSMOE_HD ColorGradients<S> color_gradients_of(const GaussianGradients<S>& g, int num_channels, int num_sh, int64_t i) {
+  const auto at = [i](S* base, int size) { return base == nullptr ? nullptr : base + i * size; };
+  return {at(g.colors_precomp, num_channels), at(g.dc, 3), at(g.shs, 3 * num_sh)};
+}
+
+// Whether every number that colours a Gaussian is finite; one with a number that is not is culled.
+template <class S> DSMOE_HD bool is_finite(const Colors<S>& colors, int num_channels) {
+  bool finite = true;
+  if (colors.given != nullptr) finite = finite && all_finite(colors.given, num_channels);
+  if (colors.shs != nullptr) finite = finite && all_finite(colors.shs, 3 * colors.num_sh);
+  if (colors.dc != nullptr) finite = finite && all_finite(colors.dc, 3);
+  return finite;
+}
+
+template <class S>
+DSMOE_HD ShRules<S> sh_rules(const Colors<S>& colors, const Camera<S>& camera, const RasterConfig<S>& config) {
+  return {colors.sh_degree, config.clamp_color, load3(camera.position)};
+}
+
+// Writes what the pixels blend of a Gaussian, [F]; depth is its view z. False where it is culled.
+template <class S>
+DSMOE_HD bool write_features(const Colors<S>& colors, Vec3<S> mean, const Camera<S>& camera,
+                             const RasterConfig<S>& config, S depth, S* features) {
+  if (!is_finite(colors, config.num_channels)) return false;
+  if (colors.given != nullptr) {
+    for (int c = 0; c < config.num_channels; ++c) features[c] = colors.given[c];
+  } else {
+    store3(features, sh_color(sh_rules(colors, camera, config), mean, colors.sh()));
+  }
+  S* extra = features + config.num_channels;
+  if (config.depth) *extra++ = depth;
+  if (config.inverse_depth) *extra = S(1) / depth;
+  // Finite coefficients can add up to an infinite colour; times a weight of 0 it would reach pixels next to the
+  // Gaussian.
+  return all_finite(features, config.num_features());
+}
+
+// Writes the gradients of a Gaussian's colours, of the active degree; returns dL/dmean by way of them.
+// features, dL_dfeatures: [F].
+template <class S>
+DSMOE_HD Vec3<S> write_color_gradients(const Colors<S>& colors, Vec3<S> mean, const Camera<S>& camera,
+                                       const RasterConfig<S>& config, const S* features, const S* dL_dfeatures,
+                                       const ColorGradients<S>& out) {
+  if (colors.given != nullptr) {
+    if (out.given != nullptr) {
+      for (int c = 0; c < config.num_channels; ++c) out.given[c] = dL_dfeatures[c];
+    }
+    return {S(0), S(0), S(0)};
+  }
+  ShWriter<S> write = {out.dc, out.shs};
+  if (colors.dc == nullptr && out.shs != nullptr) write = {out.shs, out.shs + 3};
+  return sh_color_backward(sh_rules(colors, camera, config), mean, colors.sh(), load3(features), load3(dL_dfeatures),
+                           write);
+}
+
+// What a Gaussian's pixels hand back. dL_dfeatures: [F]. color: what write_color_gradients returned.
+template <class S>
+DSMOE_HD ProjectedGradient<S> projected_gradient(const GateGradient<S>& gate, const S* dL_dfeatures, Vec3<S> color,
+                                                 const RasterConfig<S>& config) {
+  ProjectedGradient<S> out = {gate, S(0), S(0), color};
+  const S* extra = dL_dfeatures + config.num_channels;
+  if (config.depth) out.depth = *extra++;
+  if (config.inverse_depth) out.inverse_depth = *extra;
+  return out;
+}
+
+// Writes the gradients of Gaussian i, but for those of its colours.
+template <class S>
+DSMOE_HD void store_gradient(const GaussianGradient<S>& g, const GaussianGradients<S>& out, int64_t i) {
+  if (out.means3D != nullptr) store3(out.means3D + 3 * i, g.mean);
+  if (out.means2D != nullptr) store3<S>(out.means2D + 3 * i, {g.mean2D.x, g.mean2D.y, S(0)});
+  if (out.opacities != nullptr) out.opacities[i] = g.opacity;
+  if (out.scales != nullptr) store3(out.scales + 3 * i, g.scale);
+  if (out.rotations != nullptr) {
+    S* q = out.rotations + 4 * i;
+    q[0] = g.rotation.x, q[1] = g.rotation.y, q[2] = g.rotation.z, q[3] = g.rotation.w;
+  }
+  if (out.cov3D_precomp != nullptr) {
+    S* c = out.cov3D_precomp + 6 * i;
+    c[0] = g.covariance.xx, c[1] = g.covariance.xy, c[2] = g.covariance.xz;
+    c[3] = g.covariance.yy, c[4] = g.covariance.yz, c[5] = g.covariance.zz;
+  }
+}
+
+template <class S> DSMOE_HD void store_zeros(const ColorGradients<S>& out, int num_channels, int num_sh) {
+  const auto clear = [](S* values, int size) {
+    for (int k = 0; values != nullptr && k < size; ++k) values[k] = S(0);
+  };
+  clear(out.given, num_channels), clear(out.dc, 3), clear(out.shs, 3 * num_sh);
+}
+
+// Writes zeros for every gradient of Gaussian i.
+template <class S> DSMOE_HD void store_zeros(const GaussianGradients<S>& out, int num_channels, int num_sh, int64_t i) {
+  store_gradient(GaussianGradient<S>{}, out, i);
+  store_zeros(color_gradients_of(out, num_channels, num_sh, i), num_channels, num_sh);
+}
+
+// Projects Gaussian i, shape and features; features: [F]. The radius is 0 where it is culled, and then the rest means
+// nothing.
+template <class S>
+DSMOE_HD Projection<S> project_gaussian(const GaussianInputs<S>& in, const Camera<S>& camera,
+                                        const RasterConfig<S>& config, int64_t i, S* features) {
+  const Gaussian<S> gaussian = load_gaussian(in, i);
+  Projection<S> out = project(gaussian, camera, config.projection_rules());
+  if (out.radius > 0 && !write_features(colors_of(in, config.num_channels, i), gaussian.mean, camera, config,
+                                        out.gaussian.depth, features)) {
+    out.radius = 0;
+  }
+  return out;
+}
+
+// Writes the gradients of Gaussian i, but for coefficients above the active degree; returns its share of the camera's.
+template <class S>
+DSMOE_HD CameraShare<S> project_gaussian_backward(const GaussianInputs<S>& in, const Camera<S>& camera,
+                                                  const RasterConfig<S>& config, int64_t i, const S* features,
+                                                  const GateGradient<S>& gate, const S* dL_dfeatures,
+                                                  const GaussianGradients<S>& out) {
+  const Gaussian<S> gaussian = load_gaussian(in, i);
+  const Vec3<S> color =
+      write_color_gradients(colors_of(in, config.num_channels, i), gaussian.mean, camera, config, features,
+                            dL_dfeatures, color_gradients_of(out, config.num_channels, in.num_sh, i));
+  const auto gradient = project_backward(gaussian, camera, config.projection_rules(),
+                                         projected_gradient(gate, dL_dfeatures, color, config));
+  store_gradient(gradient, out, i);
+  return gradient.camera;
+}
+
+}  // namespace dsmoe
