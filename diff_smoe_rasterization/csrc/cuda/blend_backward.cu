@@ -1,6 +1,7 @@
 // From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures.
 #include "../dispatch.h"
 #include "dsmoe/rasterize.h"
+#include "gradient_sinks.cuh"
 #include "reduce.cuh"
 #include "segments.cuh"
 #include "tensor_sums.cuh"
@@ -10,13 +11,15 @@ namespace cuda {
 namespace {
 
 template <class S> struct BackwardArguments : BlendArguments<S> {
-  ImageGradients<S> dL_dimages;
-  S* dL_dgaussians;        // [N, record]
-  S* slots;                // [capacity, kSlotsPerInstance, record], or null
-  S* dL_dbackground_rows;  // [tiles * kWarpsPerTile, C + 1] of each warp, or null
-  S* scaled;               // [F, H, W] g', where the number of features is not known
-  int num_features;
-  int tiles;
+  ImageGradients<S> dL_dimages;  // [features, H, W], and of the gate sum [H, W]; any may be null
+  S* dL_dbackground_rows;        // [tiles * kWarpsPerTile, C + 1] of each warp, or null
+  S* scaled;                     // [F, H, W] g', where the number of features is not known
+  int num_features;              // F
+  int tiles;                     // of the image
+};
+
+template <class S, class Sink> struct BackwardWork : BackwardArguments<S> {
+  Sink sink;  // where each warp's sums go
 };
 
 // g' of one lane's pixels: in registers where the number of features is known, else in memory.
@@ -37,19 +40,10 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Whether gradients go to slots, one for each warp that lists a Gaussian, instead of records that warps share.
-template <class S> __device__ bool has_slots(const BackwardArguments<S>& arguments, const WarpTile<S>& tile) {
-  return arguments.slots != nullptr && tile.listed;
-}
-
-template <class S> __device__ int64_t slot_of(const WarpTile<S>& tile, int32_t position) {
-  const uint32_t of_tile = static_cast<uint32_t>(tile.list[2 * int64_t(position) + 1]);
-  return int64_t(of_tile) * kSlotsPerInstance + tile.quarter;
-}
-
-// Adds the first `count` Gaussians of a batch to their records.
-[[maybe_unused]] __device__ void add_batch(const BackwardArguments<float>& arguments, const WarpTile<float>& tile,
-                                           const TensorStage& stage, const TensorBasis& basis, int count) {
+// Hands the sums of the first `count` Gaussians of a batch on.
+template <class Sink>
+__device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
+                          const TensorBasis& basis, int count) {
   __syncwarp();
   TensorSums sums = sum_pixels(stage, basis, tile.lane);
   const TensorLane at(tile.lane);
@@ -57,31 +51,21 @@ template <class S> __device__ int64_t slot_of(const WarpTile<S>& tile, int32_t p
   recentre(sums, {gaussian.x, gaussian.y}, tile.lane);
   __syncwarp();
   if (at.row >= count || at.column >= kTensorFeatures) return;
-  const int moment = 2 * at.column, feature = kNumGateMoments + at.column;
-  if (has_slots(arguments, tile)) {
-    float* record = arguments.slots + slot_of(tile, __float_as_int(gaussian.w)) * kTensorRecord;
-    record[moment] = sums.moments[0], record[moment + 1] = sums.moments[1], record[feature] = sums.feature;
-  } else {
-    float* record = arguments.dL_dgaussians + int64_t(__float_as_int(gaussian.z)) * kTensorRecord;
-    atomicAdd(record + moment, sums.moments[0]);
-    atomicAdd(record + moment + 1, sums.moments[1]);
-    atomicAdd(record + feature, sums.feature);
-  }
+  sink.to_record(tile, __float_as_int(gaussian.z), __float_as_int(gaussian.w), kTensorRecord, [&](auto add) {
+    add(2 * at.column, sums.moments[0]);
+    add(2 * at.column + 1, sums.moments[1]);
+    add(kNumGateMoments + at.column, sums.feature);
+  });
 }
 
-// Adds numbers that one warp has summed to the record of a Gaussian, `first` numbers into it.
-template <class S, int kCount>
-__device__ void add_to_record(const BackwardArguments<S>& arguments, const TransposedSum<kCount>& sum,
-                              S (&values)[kCount], const WarpTile<S>& tile, int32_t gaussian, int32_t position,
-                              int first, int wanted) {
+// Sums `values` over the warp, and hands the first `wanted` sums on, as numbers `first`, first + 1, ... of a Gaussian.
+template <class S, int kCount, class Sink>
+__device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values)[kCount], int32_t gaussian,
+                           int32_t position, int first, int wanted) {
+  const TransposedSum<kCount> sum(tile.lane);
   sum(values);
   if (!sum.holds || sum.number >= wanted) return;
-  const int record = kNumGateMoments + arguments.num_features;
-  if (has_slots(arguments, tile)) {
-    arguments.slots[slot_of(tile, position) * record + first + sum.number] = values[0];
-  } else {
-    atomicAdd(arguments.dL_dgaussians + int64_t(gaussian) * record + first + sum.number, values[0]);
-  }
+  sink.to_record(tile, gaussian, position, sink.length, [&](auto add) { add(first + sum.number, values[0]); });
 }
 
 // The six moments of a lane's pixels, one below the other.
@@ -113,7 +97,7 @@ struct TensorShare {
 };
 
 // Back to front: of each Gaussian the moments of dL/dpower and the gradients of its features.
-template <class S, BlendMode kMode, int kFeatures> struct BackwardVisitor {
+template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kReadsIndices = true;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
@@ -165,7 +149,7 @@ template <class S, BlendMode kMode, int kFeatures> struct BackwardVisitor {
   // Adds what still waits in the tensor stage.
   __device__ __forceinline__ void finish() {
     if constexpr (kTensor) {
-      if (batch > 0) add_batch(arguments, tile, tensors.stage, tensors.moment_basis, batch);
+      if (batch > 0) add_batch(sink, tile, tensors.stage, tensors.moment_basis, batch);
     }
   }
 
@@ -179,7 +163,7 @@ template <class S, BlendMode kMode, int kFeatures> struct BackwardVisitor {
           make_float4(dx + kWarpTileCentre, dy + kWarpTileCentre, __int_as_float(index), __int_as_float(position));
     }
     if (++batch == kTensorBatch) {
-      add_batch(arguments, tile, tensors.stage, tensors.moment_basis, batch);
+      add_batch(sink, tile, tensors.stage, tensors.moment_basis, batch);
       batch = 0;
     }
   }
@@ -195,10 +179,8 @@ template <class S, BlendMode kMode, int kFeatures> struct BackwardVisitor {
         values[kNumGateMoments + f] = share;
       }
     }
-    const TransposedSum<kTogether> sum(tile.lane);
-    add_to_record(arguments, sum, values, tile, index, position, 0, kTogether);
+    add_values(sink, tile, values, index, position, 0, kTogether);
     if constexpr (kFeatures == kAnyFeatures) {
-      const TransposedSum<kFeatureChunk> sum_features(tile.lane);
       for (int first = 0; first < num_features(); first += kFeatureChunk) {
         S shares[kFeatureChunk];
         for (int f = 0; f < kFeatureChunk; ++f) {
@@ -208,13 +190,13 @@ template <class S, BlendMode kMode, int kFeatures> struct BackwardVisitor {
             shares[f] = fma(weight[k], pixels.scaled.get(arguments, tile, k, first + f), shares[f]);
           }
         }
-        add_to_record(arguments, sum_features, shares, tile, index, position, kNumGateMoments + first,
-                      num_features() - first);
+        add_values(sink, tile, shares, index, position, kNumGateMoments + first, num_features() - first);
       }
     }
   }
 
   const BackwardArguments<S>& arguments;
+  const Sink& sink;
   const WarpTile<S>& tile;
   BackwardPixels<S, kFeatures>& pixels;
   TensorShare tensors;
@@ -305,15 +287,16 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
   return range;
 }
 
-template <class S, BlendMode kMode, int kFeatures>
+template <class S, BlendMode kMode, int kFeatures, class Sink>
 __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks
                                                                                           : kGeneralBackwardBlocks)
-    blend_backward_kernel(const __grid_constant__ BackwardArguments<S> arguments) {
-  using Visitor = BackwardVisitor<S, kMode, kFeatures>;
+    blend_backward_kernel(const __grid_constant__ BackwardWork<S, Sink> arguments) {
+  using Visitor = BackwardVisitor<S, kMode, kFeatures, Sink>;
   __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
   __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
   __shared__ TensorStage tensor_stages[Visitor::kTensor ? kWarpsPerTile : 1];
   __shared__ TensorBasis moment_basis;
+  if (Sink::kOnlyOutgrown && !overflows(arguments.saved)) return;
   if (is_idle_block(arguments.saved, arguments.tiles)) return;
   if constexpr (Visitor::kTensor) {
     fill_moment_basis(moment_basis);
@@ -325,18 +308,71 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   const int warp = threadIdx.x / kWarp;
 
   BackwardPixels<S, kFeatures> pixels;
-  begin_pixels<kMode>(arguments, tile, place, pixels);
-  if (tile.empty) return;
-  const WalkRange range = range_of_segment<kMode>(arguments, tile, place.segment, pixels);
+  begin_pixels<kMode, S>(arguments, tile, place, pixels);
+  if (tile.empty || !arguments.sink.takes(tile)) return;
+  const WalkRange range = range_of_segment<kMode, S>(arguments, tile, place.segment, pixels);
   if (range.begin >= range.end) return;
 
   TensorStage& tensor_stage = tensor_stages[Visitor::kTensor ? warp : 0];
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
-  Visitor visitor = {arguments, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(), 0};
+  Visitor visitor = {
+      arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(), 0};
   const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
-  const unsigned met = walk_tile(stage, range, visitor);
+  const unsigned met = walk_tile<S>(stage, range, visitor);
   visitor.finish();
   count_pairs(arguments, tile.lane, met);
+}
+
+template <class S> S* allocate_scaled(const BackwardArguments<S>& arguments, Scratch& scratch) {
+  return allocate<S>(scratch, int64_t(arguments.width) * arguments.height * arguments.num_features);
+}
+
+template <class S, int kFeatures, class Sink>
+void launch_backward(const BackwardWork<S, Sink>& work, int64_t blocks, cudaStream_t stream) {
+  dispatch_blend(work.config.mode, kFeatures, [&](auto mode, auto) {
+    blend_backward_kernel<S, decltype(mode)::value, kFeatures>
+        <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(work);
+    DSMOE_CHECK_LAUNCH("blend_backward");
+  });
+}
+
+template <class S> struct OutgrownRecords {
+  int64_t size;           // N * length
+  SavedForward<S> saved;  // says whether the instances outgrew their memory
+  OutgrownSink<S> sink;   // read
+  S* records;             // [N, length] written
+};
+
+template <class S> __global__ void store_outgrown_kernel(const __grid_constant__ OutgrownRecords<S> arguments) {
+  if (!overflows(arguments.saved)) return;
+  const int64_t at = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
+  if (at < arguments.size) arguments.records[at] = arguments.sink.sum(at);
+}
+
+// Where the instances outgrew their memory, fills the records by walks over all Gaussians; does nothing elsewhere.
+template <class S>
+void backward_outgrown(const BackwardWork<S, RecordSink<S>>& work, Scratch& scratch, cudaStream_t stream) {
+  BackwardWork<S, OutgrownSink<S>> outgrown = {};
+  static_cast<BackwardArguments<S>&>(outgrown) = work;
+  outgrown.dL_dbackground_rows = nullptr;  // the usual kernel has written them
+  if (outgrown.scaled == nullptr) outgrown.scaled = allocate_scaled(work, scratch);
+  const int64_t size = work.num_gaussians * work.sink.length;
+  OutgrownSink<S>& sink = outgrown.sink;
+  sink.exponents = allocate<int32_t>(scratch, size);
+  sink.sums = allocate<unsigned long long>(scratch, size);
+  sink.length = work.sink.length;
+  sink.term_bits = 62;
+  for (int64_t warps = int64_t(work.tiles) * kWarpsPerTile; warps > 0; warps /= 2) --sink.term_bits;
+  check(cudaMemsetAsync(sink.exponents, 0, size * sizeof(*sink.exponents), stream), "clearing gradients");
+  check(cudaMemsetAsync(sink.sums, 0, size * sizeof(*sink.sums), stream), "clearing gradients");
+  for (const bool measures : {true, false}) {
+    sink.measures = measures;
+    launch_backward<S, kAnyFeatures>(outgrown, work.tiles, stream);
+    outgrown.pairs = nullptr;  // counted once
+  }
+  OutgrownRecords<S> stored = {size, work.saved, sink, work.sink.records};
+  store_outgrown_kernel<<<blocks_for(size, kStoreBlock), kStoreBlock, 0, stream>>>(stored);
+  DSMOE_CHECK_LAUNCH("store_outgrown");
 }
 
 }  // namespace
@@ -346,30 +382,31 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
                     const SavedForward<S>& saved, const ImageOutputs<S>& images,
                     const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
                     Scratch& scratch, unsigned long long* pairs, cudaStream_t stream) {
-  const int64_t tiles = num_tiles(camera.width, camera.height);
-  const bool known = sizeof(S) == 4 && config.num_features() == 3;
-  BackwardArguments<S> arguments{blend_arguments(num_gaussians, camera, config, saved, images, pairs)};
-  arguments.dL_dimages = image_gradients;
-  arguments.dL_dgaussians = dL_dgaussians;
-  arguments.slots = slots;
-  arguments.num_features = config.num_features();
-  arguments.tiles = static_cast<int>(tiles);
-  const int64_t blocks = tiles + (known && saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0);
-  const int64_t warps = tiles * kWarpsPerTile;
+  const int64_t tiles = num_tiles(camera.width, camera.height), warps = tiles * kWarpsPerTile;
+  BackwardWork<S, RecordSink<S>> work = {};
+  static_cast<BlendArguments<S>&>(work) = blend_arguments(num_gaussians, camera, config, saved, images, pairs);
+  work.dL_dimages = image_gradients;
+  work.num_features = config.num_features();
+  work.tiles = static_cast<int>(tiles);
+  work.sink.records = dL_dgaussians;
+  work.sink.slots = slots;
+  work.sink.length = kNumGateMoments + work.num_features;
   if (dL_dbackground != nullptr) {
-    arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+    work.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+  }
+  bool known = false;                          // the number of features, when compiling
+  if constexpr (sizeof(S) == sizeof(float)) {  // double is for checking: it has only the general kernel
+    known = work.num_features == kSegmentFeatures;
+    const int64_t segment_blocks = saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0;
+    if (known) launch_backward<S, kSegmentFeatures>(work, tiles + segment_blocks, stream);
   }
   if (!known) {
-    arguments.scaled = allocate<S>(scratch, int64_t(camera.width) * camera.height * arguments.num_features);
+    work.scaled = allocate_scaled(work, scratch);
+    launch_backward<S, kAnyFeatures>(work, tiles, stream);
   }
-  dispatch_blend(config.mode, known ? 3 : kAnyFeatures, [&](auto mode, auto features) {
-    constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
-    blend_backward_kernel<S, decltype(mode)::value, kFeatures>
-        <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(arguments);
-    DSMOE_CHECK_LAUNCH("blend_backward");
-  });
+  if (slots != nullptr && num_gaussians > 0) backward_outgrown(work, scratch, stream);
   if (dL_dbackground != nullptr) {
-    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
+    sum_columns(work.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
   }
 }
 

@@ -43,6 +43,9 @@ constexpr int kKeptRows = 96;
 // that it can hold, enough to hide the latency of loads.
 constexpr int kEnoughWarpsPerMultiprocessor = 32;
 
+// Threads a block of a kernel that writes one number a thread.
+constexpr int kStoreBlock = 256;
+
 // Threads of the block that sums one column of a matrix.
 constexpr int kColumnBlock = 256;
 
