@@ -1,5 +1,5 @@
 // Stage 2: the depth order, and the tile lists front to back. One sort of the Gaussians by depth, then a stable sort of
-// their instances by tile, so that the second sort's keys are short.
+// their instances by tile, so that the second sort's keys are short (Faster-GS, arXiv:2602.09999, sorts so too).
 #include <cub/device/device_radix_sort.cuh>
 #include <limits>
 
@@ -10,15 +10,11 @@
 #include "look_back.cuh"
 #include "reduce.cuh"
 #include "tile_rows.cuh"
+#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
-
-constexpr int kBlock = 256;
-constexpr int kWarps = kBlock / kWarp;
-constexpr int kKeptRows = 96;               // rows of tiles of a warp that are kept between counting and listing
-constexpr int64_t kEnoughWarps = 32 * 132;  // where fewer warps would do, each takes fewer Gaussians
 
 // Runs a CUB algorithm: it says how much memory it needs, gets it, and works.
 template <class Algorithm> void with_temporary(Scratch& scratch, const char* what, Algorithm algorithm) {
@@ -28,13 +24,14 @@ template <class Algorithm> void with_temporary(Scratch& scratch, const char* wha
 }
 
 template <class S, class Key> struct ListArguments {
-  int64_t num_gaussians;
-  int gaussians_per_warp;
-  BlendMode mode;
-  int width, height, columns;
-  SavedForward<S> saved;
-  const int32_t* radii;
-  LookBack look_back;
+  int64_t num_gaussians;   // N
+  int gaussians_per_warp;  // 1 to 32
+  BlendMode mode;          // decides the bounds of footprints
+  int width, height;       // of the image, pixels
+  int columns;             // tiles side by side
+  SavedForward<S> saved;   // projected and order are read; num_instances and slot_ranges are written
+  const int32_t* radii;    // [N] pixels
+  LookBack look_back;      // zero before
   // Null where the instances are only counted:
   Key* keys;             // [capacity] tile
   int32_t* values;       // [capacity] what goes along: the Gaussian, or the slot where gradients go by slot
@@ -84,19 +81,20 @@ __device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row,
 }
 
 template <class S, class Key>
-__global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_constant__ ListArguments<S, Key> list) {
-  __shared__ typename WarpTileRows<S>::Shared tiles[kBlock];
-  __shared__ TileRow kept_rows[kKeptRows / kWarp][kBlock];
+__global__ void __launch_bounds__(kListBlock)
+    list_instances_kernel(const __grid_constant__ ListArguments<S, Key> list) {
+  __shared__ typename WarpTileRows<S>::Shared tiles[kListBlock];
+  __shared__ TileRow kept_rows[kKeptRows / kWarp][kListBlock];
   __shared__ unsigned shared_block;
-  __shared__ unsigned long long counts[kWarps], shared_before;
+  __shared__ unsigned long long counts[kListWarps], shared_before;
   if (threadIdx.x == 0) shared_block = take_block_number(list.look_back);
   __syncthreads();
   const unsigned block = shared_block;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const auto rows =
-      rows_at(list, (int64_t(block) * kWarps + warp) * list.gaussians_per_warp + lane, tiles + warp * kWarp, lane);
+      rows_at(list, (int64_t(block) * kListWarps + warp) * list.gaussians_per_warp + lane, tiles + warp * kWarp, lane);
 
-  // Twice over the rows: to count their tiles, then to list them. One loop serves both, so that both find the same.
+  // Twice over the rows: to count their tiles, then to list them. One loop does both, so that both find the same rows.
   int64_t slot = 0, end = 0;
 #pragma unroll 1
   for (bool listing = false;; listing = true) {
@@ -119,7 +117,7 @@ __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_con
     if (lane == 0) counts[warp] = count;
     __syncthreads();
     unsigned long long before = 0, total = 0;
-    for (int w = 0; w < kWarps; ++w) {
+    for (int w = 0; w < kListWarps; ++w) {
       if (w == warp) before = total;
       total += counts[w];
     }
@@ -137,41 +135,64 @@ __global__ void __launch_bounds__(kBlock) list_instances_kernel(const __grid_con
   }
 }
 
-// The first instance of each tile, and the queue of segments emptied for the blend. A warp looks for one of them: it
-// cuts what is left of the sorted keys into 32 parts, and goes on in the first that ends at the tile or behind.
-template <class Key>
-__global__ void tile_offsets_kernel(int64_t tiles, int64_t capacity, const Key* keys, int64_t* offsets,
-                                    int32_t* segment_queue) {
-  if (segment_queue != nullptr && blockIdx.x == 0 && threadIdx.x == 0) segment_queue[0] = 0;
-  const int64_t tile = (int64_t(blockIdx.x) * kBlock + threadIdx.x) / kWarp;
+template <class Key> struct OffsetArguments {
+  int64_t tiles;           // of the image
+  int64_t capacity;        // keys
+  const Key* keys;         // [capacity] sorted
+  int64_t* offsets;        // [tiles + 1] written
+  int32_t* segment_queue;  // its counter is set to 0; or null
+};
+
+// The first instance of each tile, and an empty queue of segments for the blend. A warp looks for one instance: it cuts
+// what is left of the sorted keys into 32 parts, and goes on in the first part that ends at the tile or behind.
+template <class Key> __global__ void tile_offsets_kernel(const __grid_constant__ OffsetArguments<Key> arguments) {
+  if (arguments.segment_queue != nullptr && blockIdx.x == 0 && threadIdx.x == 0) arguments.segment_queue[0] = 0;
+  const int64_t tile = (int64_t(blockIdx.x) * kListBlock + threadIdx.x) / kWarp;
   const int lane = threadIdx.x % kWarp;
-  if (tile > tiles) return;
-  int64_t low = 0, high = capacity;
+  if (tile > arguments.tiles) return;
+  int64_t low = 0, high = arguments.capacity;
   while (low < high) {
     const int64_t part = (high - low + kWarp - 1) / kWarp, last = min(low + (lane + 1) * part, high) - 1;
-    const bool before = static_cast<int64_t>(keys[last]) < tile;
+    const bool before = static_cast<int64_t>(arguments.keys[last]) < tile;
     const int parts_before = __popc(__ballot_sync(kAllLanes, before));
     low = min(low + parts_before * part, high);
     high = min(low + part - 1, high);
   }
-  if (lane == 0) offsets[tile] = low;
+  if (lane == 0) arguments.offsets[tile] = low;
 }
 
-__global__ void pair_with_slots_kernel(int64_t capacity, const int64_t* num_instances, const int32_t* slots,
-                                       const int32_t* slot_owners, int32_t* instances) {
-  const int64_t i = int64_t(blockIdx.x) * kBlock + threadIdx.x;
-  if (i >= *num_instances || *num_instances > capacity) return;
-  instances[2 * i] = slot_owners[static_cast<uint32_t>(slots[i])];
-  instances[2 * i + 1] = slots[i];
+struct SlotArguments {
+  int64_t capacity;              // instances there is room for
+  const int64_t* num_instances;  // [1]
+  const int32_t* slots;          // [capacity] by tile, front to back
+  const int32_t* owners;         // [capacity] Gaussian of each slot
+  int32_t* instances;            // [capacity, 2] written: Gaussian, slot
+};
+
+// Nothing is written where the instances do not fit: then no list is read.
+__global__ void pair_with_slots_kernel(const __grid_constant__ SlotArguments arguments) {
+  const int64_t i = int64_t(blockIdx.x) * kListBlock + threadIdx.x, count = *arguments.num_instances;
+  if (i >= count || count > arguments.capacity) return;
+  arguments.instances[2 * i] = arguments.owners[static_cast<uint32_t>(arguments.slots[i])];
+  arguments.instances[2 * i + 1] = arguments.slots[i];
+}
+
+// How many warps are enough to keep the current device busy.
+int64_t enough_warps() {
+  int device = 0, multiprocessors = 0;
+  check(cudaGetDevice(&device), "asking for the device");
+  check(cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount, device), "asking for its size");
+  return int64_t(kEnoughWarpsPerMultiprocessor) * multiprocessors;
 }
 
 // Lists the instances into the memory that `list` has, or only counts them.
 template <class Key, class S> void list_instances(ListArguments<S, Key> list, Scratch& scratch, cudaStream_t stream) {
+  const int64_t enough = enough_warps();
   list.gaussians_per_warp = kWarp;
-  while (list.gaussians_per_warp > 1 && list.num_gaussians < kEnoughWarps * list.gaussians_per_warp) {
+  while (list.gaussians_per_warp > 1 && list.num_gaussians < enough * list.gaussians_per_warp) {
     list.gaussians_per_warp /= 2;
   }
-  const unsigned blocks = blocks_for(list.num_gaussians, kWarps * list.gaussians_per_warp);
+  const unsigned blocks = blocks_for(list.num_gaussians, kListWarps * list.gaussians_per_warp);
   if (blocks == 0) {
     check(cudaMemsetAsync(list.saved.num_instances, 0, sizeof(int64_t), stream), "counting instances");
     return;
@@ -180,12 +201,12 @@ template <class Key, class S> void list_instances(ListArguments<S, Key> list, Sc
   auto* states = allocate<unsigned long long>(scratch, int64_t(blocks) + 1);
   check(cudaMemsetAsync(states, 0, (size_t(blocks) + 1) * sizeof(*states), stream), "listing instances");
   list.look_back = {states, reinterpret_cast<unsigned*>(states + blocks)};
-  list_instances_kernel<<<blocks, kBlock, 0, stream>>>(list);
+  list_instances_kernel<<<blocks, kListBlock, 0, stream>>>(list);
   DSMOE_CHECK_LAUNCH("list_instances");
 }
 
-// Calls launch with a key of the type that holds every tile, and one above them. Whoever counts and whoever lists get
-// the same, so that they run the same code.
+// Calls launch with a key of the type that holds every tile, and one number above them. Counting and listing must use
+// the same kernel, so that both find the same instances; so both choose its key here.
 template <class Launch> void dispatch_keys(int64_t tiles, Launch launch) {
   tiles < std::numeric_limits<uint16_t>::max() ? launch(uint16_t()) : launch(uint32_t());
 }
@@ -215,7 +236,7 @@ void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCo
   list.slot_owners = slots ? allocate<int32_t>(scratch, capacity) : nullptr;
   Key* sorted_keys = allocate<Key>(scratch, capacity);
   int32_t* sorted_values = slots ? allocate<int32_t>(scratch, capacity) : saved.instances;
-  // Behind the last instance: keys above every tile.
+  // Keys behind the last instance are above every tile.
   check(cudaMemsetAsync(list.keys, 0xff, capacity * sizeof(Key), stream), "listing instances");
   list_instances(list, scratch, stream);
   if (capacity > 0) {
@@ -226,13 +247,23 @@ void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCo
                                              capacity, 0, bits, stream);
     });
     if (slots) {
-      pair_with_slots_kernel<<<blocks_for(capacity, kBlock), kBlock, 0, stream>>>(
-          capacity, saved.num_instances, sorted_values, list.slot_owners, saved.instances);
+      SlotArguments pairs = {};
+      pairs.capacity = capacity;
+      pairs.num_instances = saved.num_instances;
+      pairs.slots = sorted_values;
+      pairs.owners = list.slot_owners;
+      pairs.instances = saved.instances;
+      pair_with_slots_kernel<<<blocks_for(capacity, kListBlock), kListBlock, 0, stream>>>(pairs);
       DSMOE_CHECK_LAUNCH("pair_with_slots");
     }
   }
-  tile_offsets_kernel<<<blocks_for((tiles + 1) * kWarp, kBlock), kBlock, 0, stream>>>(
-      tiles, capacity, sorted_keys, saved.tile_offsets, saved.segment_queue);
+  OffsetArguments<Key> offsets = {};
+  offsets.tiles = tiles;
+  offsets.capacity = capacity;
+  offsets.keys = sorted_keys;
+  offsets.offsets = saved.tile_offsets;
+  offsets.segment_queue = saved.segment_queue;
+  tile_offsets_kernel<<<blocks_for((tiles + 1) * kWarp, kListBlock), kListBlock, 0, stream>>>(offsets);
   DSMOE_CHECK_LAUNCH("tile_offsets");
 }
 

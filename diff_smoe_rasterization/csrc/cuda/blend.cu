@@ -37,96 +37,105 @@ __device__ void end_segments(const BlendArguments<S>& arguments, const WarpTile<
   }
 }
 
-// Blends kSums features from `first_feature` on.
-template <class S, BlendMode kMode, int kSums>
-__device__ void blend_features(const BlendArguments<S>& arguments, const WarpTile<S>& tile, StagedGaussian<S>* staged,
-                               int first_feature) {
-  const RasterConfig<S>& config = arguments.config;
+// What a lane's pixels have blended so far.
+template <class S, int kSums> struct BlendedPixels {
   PixelState<S> state[kLanePixels];
-  S sums[kLanePixels][kSums];
-  int32_t last[kLanePixels];
-  for (int k = 0; k < kLanePixels; ++k) {
-    state[k] = PixelState<S>::open();
-    if (!tile.inside(arguments, k)) state[k].transmittance = -state[k].transmittance;  // closed
-    for (int f = 0; f < kSums; ++f) sums[k][f] = S(0);
-    last[k] = 0;
-  }
-  const AlphaCut<S> cut = config.alpha_cut();
-  unsigned hits = 0;
-  constexpr bool kSegments = kWalksSegments<S, kSums>;
-  const bool segments = kSegments && has_segments(arguments.saved, tile);
-  int segment = 0;
+  S sums[kLanePixels][kSums];  // of weighted features
+  int32_t last[kLanePixels];   // entries of the list that the numerator has seen
+};
 
-  auto next = load_entry(arguments, tile, tile.lane, first_feature);
-  for (int32_t chunk = 0; chunk < tile.length; chunk += kWarp) {
+// Blends kSums features, front to back.
+template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
+  static constexpr bool kBackToFront = false, kStopsEarly = Blend<kMode>::kStopsEarly;
+  static constexpr bool kReadsFeatures = true, kReadsIndices = false;
+  static constexpr bool kSegments = kWalksSegments<S, kSums>;
+
+  __device__ __forceinline__ void begin_chunk(int32_t position) {
     if constexpr (kSegments) {
-      if (segments && chunk == (segment + 1) * kSegmentLength) {
-        begin_segment(arguments, tile, ++segment, state, sums);
+      if (segments && position == (segment + 1) * kSegmentLength) {
+        begin_segment(arguments, tile, ++segment, pixels.state, pixels.sums);
       }
-    }
-    const bool meets = meets_pixels(next, tile);
-    if (meets) staged[tile.lane] = next.staged;
-    unsigned left = __ballot_sync(kAllLanes, meets);
-    __syncwarp();
-    next = load_entry(arguments, tile, chunk + kWarp + tile.lane, first_feature);
-    hits += __popc(left);
-    for (; left != 0; left &= left - 1) {
-      const int j = __ffs(left) - 1;
-      const StagedGaussian<S> current = staged[j];
-      const ProjectedGaussian<S>& gaussian = current.gaussian;
-      const ColumnExponent<S, S> exponent(gaussian.conic, S(tile.x) - gaussian.mean.x);
-      const S dy = S(tile.y) - gaussian.mean.y, least_alpha = cut.of(gaussian.opacity);
-#pragma unroll
-      for (int k = 0; k < kLanePixels; ++k) {
-        const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
-        const auto pair = Blend<kMode>::accumulate(state[k], gate);
-        for (int f = 0; f < kSums; ++f) sums[k][f] = fma(pair.weight, current.features[f], sums[k][f]);
-        last[k] = pair.contributes ? chunk + j + 1 : last[k];
-      }
-    }
-    __syncwarp();
-    if (Blend<kMode>::kStopsEarly) {
-      bool open = false;
-      for (int k = 0; k < kLanePixels; ++k) open |= state[k].is_open();
-      if (!__any_sync(kAllLanes, open)) break;
     }
   }
-  if constexpr (kSegments) end_segments(arguments, tile, segment, sums);
+
+  __device__ __forceinline__ void visit(const WarpStage<S, BlendVisitor>& stage, int j, int32_t position) {
+    const auto current = stage.gaussians[j];
+    const ProjectedGaussian<S>& gaussian = current.gaussian;
+    const ColumnExponent<S, S> exponent(gaussian.conic, S(tile.x) - gaussian.mean.x);
+    const S dy = S(tile.y) - gaussian.mean.y, least_alpha = cut.of(gaussian.opacity);
+#pragma unroll
+    for (int k = 0; k < kLanePixels; ++k) {
+      const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
+      const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
+      for (int f = 0; f < kSums; ++f) pixels.sums[k][f] = fma(pair.weight, current.features[f], pixels.sums[k][f]);
+      pixels.last[k] = pair.contributes ? position + 1 : pixels.last[k];
+    }
+  }
+
+  __device__ __forceinline__ bool is_done() const {
+    bool open = false;
+    for (int k = 0; k < kLanePixels; ++k) open |= pixels.state[k].is_open();
+    return !__any_sync(kAllLanes, open);
+  }
+
+  const BlendArguments<S>& arguments;
+  const WarpTile<S>& tile;
+  BlendedPixels<S, kSums>& pixels;
+  AlphaCut<S> cut;
+  bool segments;  // the list is long enough to be noted in segments
+  int segment;    // the one that the walk is in
+};
+
+// Blends kSums features from `first_feature` on, and writes them.
+template <class S, BlendMode kMode, int kSums>
+__device__ void blend_features(const BlendArguments<S>& arguments, const WarpTile<S>& tile,
+                               const WarpStage<S, BlendVisitor<S, kMode, kSums>>& stage, int first_feature) {
+  const RasterConfig<S>& config = arguments.config;
+  BlendedPixels<S, kSums> blended;
+  for (int k = 0; k < kLanePixels; ++k) {
+    blended.state[k] = PixelState<S>::open();
+    if (!tile.inside(arguments, k)) blended.state[k].transmittance = -blended.state[k].transmittance;  // closed
+    for (int f = 0; f < kSums; ++f) blended.sums[k][f] = S(0);
+    blended.last[k] = 0;
+  }
+  using Visitor = BlendVisitor<S, kMode, kSums>;
+  const bool segments = Visitor::kSegments && has_segments(arguments.saved, tile);
+  Visitor visitor = {arguments, tile, blended, config.alpha_cut(), segments, 0};
+  const unsigned met = walk_tile(stage, {0, tile.length, first_feature}, visitor);
+  if constexpr (Visitor::kSegments) end_segments(arguments, tile, visitor.segment, blended.sums);
 
   const int64_t pixels = int64_t(arguments.width) * arguments.height;
   for (int k = 0; k < kLanePixels; ++k) {
     if (!tile.inside(arguments, k)) continue;
     const int64_t index = tile.pixel_index(arguments, k);
-    const auto end = state[k].end(config.gate_of_background());
+    const auto end = blended.state[k].end(config.gate_of_background());
     if (first_feature == 0) {
       arguments.saved.final_transmittance[index] = end.transmittance;
       arguments.saved.gate_sum[index] = end.gate_sum;
-      arguments.saved.last_contributor[index] = last[k];
+      arguments.saved.last_contributor[index] = blended.last[k];
     }
     for (int f = 0; f < kSums; ++f) {
       const int feature = first_feature + f;
       if (kSums == kFeatureChunk && feature >= config.num_features()) break;
-      feature_image(config, arguments.images, feature, pixels)[index] =
-          finish_feature<kMode>(feature_rule(config, feature), end, sums[k][f], feature_background(config, feature));
+      feature_image(config, arguments.images, feature, pixels)[index] = finish_feature<kMode>(
+          feature_rule(config, feature), end, blended.sums[k][f], feature_background(config, feature));
     }
   }
-  if (arguments.pairs != nullptr && first_feature == 0 && tile.lane == 0) {
-    atomicAdd(arguments.pairs, static_cast<unsigned long long>(hits) * (kWarpTile * kWarpTile));
-  }
+  if (first_feature == 0) count_pairs(arguments, tile.lane, met);
 }
 
 template <class S, BlendMode kMode, int kFeatures>
-__global__ void __launch_bounds__(kWarpsPerTile* kWarp)
-    blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
-  __shared__ StagedGaussian<S> staged[kWarpsPerTile][kWarp];
+__global__ void __launch_bounds__(kWalkBlock) blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
+  constexpr int kSums = kFeatures != kAnyFeatures ? kFeatures : kFeatureChunk;
+  __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
   const WarpTile<S> tile(arguments);
   if (tile.empty) return;
-  StagedGaussian<S>* mine = staged[threadIdx.x / kWarp];
+  const WarpStage<S, BlendVisitor<S, kMode, kSums>> stage = {staged[threadIdx.x / kWarp], nullptr};
   if constexpr (kFeatures != kAnyFeatures) {
-    blend_features<S, kMode, kFeatures>(arguments, tile, mine, 0);
+    blend_features<S, kMode, kSums>(arguments, tile, stage, 0);
   } else {
-    for (int feature = 0; feature < arguments.config.num_features(); feature += kFeatureChunk) {
-      blend_features<S, kMode, kFeatureChunk>(arguments, tile, mine, feature);
+    for (int feature = 0; feature < arguments.config.num_features(); feature += kSums) {
+      blend_features<S, kMode, kSums>(arguments, tile, stage, feature);
     }
   }
 }
@@ -139,10 +148,10 @@ void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCon
            cudaStream_t stream) {
   const auto arguments = blend_arguments(num_gaussians, camera, config, saved, images, pairs);
   const unsigned tiles = static_cast<unsigned>(num_tiles(camera.width, camera.height));
-  // Double is for checking: it has the general kernel alone.
+  // Double is for checking: it has only the general kernel.
   dispatch_blend(config.mode, sizeof(S) == 4 ? config.num_features() : kAnyFeatures, [&](auto mode, auto features) {
     constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
-    blend_kernel<S, decltype(mode)::value, kFeatures><<<tiles, kWarpsPerTile * kWarp, 0, stream>>>(arguments);
+    blend_kernel<S, decltype(mode)::value, kFeatures><<<tiles, kWalkBlock, 0, stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("blend");
   });
 }

@@ -1,6 +1,7 @@
 // From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures.
 #include "../dispatch.h"
 #include "dsmoe/rasterize.h"
+#include "gradient_sinks.cuh"
 #include "reduce.cuh"
 #include "segments.cuh"
 #include "tensor_sums.cuh"
@@ -10,13 +11,15 @@ namespace cuda {
 namespace {
 
 template <class S> struct BackwardArguments : BlendArguments<S> {
-  ImageGradients<S> dL_dimages;
-  S* dL_dgaussians;        // [N, record]
-  S* slots;                // [capacity, kSlotsPerInstance, record], or null
-  S* dL_dbackground_rows;  // [tiles * kWarpsPerTile, C + 1] of each warp, or null
-  S* scaled;               // [F, H, W] g', where the number of features is not known
-  int num_features;
-  int tiles;
+  ImageGradients<S> dL_dimages;  // [features, H, W], and of the gate sum [H, W]; any may be null
+  S* dL_dbackground_rows;        // [tiles * kWarpsPerTile, C + 1] of each warp, or null
+  S* scaled;                     // [F, H, W] g', where the number of features is not known
+  int num_features;              // F
+  int tiles;                     // of the image
+};
+
+template <class S, class Sink> struct BackwardWork : BackwardArguments<S> {
+  Sink sink;  // where each warp's sums go
 };
 
 // g' of one lane's pixels: in registers where the number of features is known, else in memory.
@@ -37,19 +40,10 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Whether gradients go to slots, one for each warp that lists a Gaussian, instead of records that warps share.
-template <class S> __device__ bool has_slots(const BackwardArguments<S>& arguments, const WarpTile<S>& tile) {
-  return arguments.slots != nullptr && tile.listed;
-}
-
-template <class S> __device__ int64_t slot_of(const WarpTile<S>& tile, int32_t position) {
-  const uint32_t of_tile = static_cast<uint32_t>(tile.list[2 * int64_t(position) + 1]);
-  return int64_t(of_tile) * kSlotsPerInstance + tile.quarter;
-}
-
-// Adds the first `count` Gaussians of a batch to their records.
-[[maybe_unused]] __device__ void add_batch(const BackwardArguments<float>& arguments, const WarpTile<float>& tile,
-                                           const TensorStage& stage, const TensorBasis& basis, int count) {
+// Hands the sums of the first `count` Gaussians of a batch on.
+template <class Sink>
+__device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
+                          const TensorBasis& basis, int count) {
   __syncwarp();
   TensorSums sums = sum_pixels(stage, basis, tile.lane);
   const TensorLane at(tile.lane);
@@ -57,31 +51,21 @@ template <class S> __device__ int64_t slot_of(const WarpTile<S>& tile, int32_t p
   recentre(sums, {gaussian.x, gaussian.y}, tile.lane);
   __syncwarp();
   if (at.row >= count || at.column >= kTensorFeatures) return;
-  const int moment = 2 * at.column, feature = kNumGateMoments + at.column;
-  if (has_slots(arguments, tile)) {
-    float* record = arguments.slots + slot_of(tile, __float_as_int(gaussian.w)) * kTensorRecord;
-    record[moment] = sums.moments[0], record[moment + 1] = sums.moments[1], record[feature] = sums.feature;
-  } else {
-    float* record = arguments.dL_dgaussians + int64_t(__float_as_int(gaussian.z)) * kTensorRecord;
-    atomicAdd(record + moment, sums.moments[0]);
-    atomicAdd(record + moment + 1, sums.moments[1]);
-    atomicAdd(record + feature, sums.feature);
-  }
+  sink.to_record(tile, __float_as_int(gaussian.z), __float_as_int(gaussian.w), kTensorRecord, [&](auto add) {
+    add(2 * at.column, sums.moments[0]);
+    add(2 * at.column + 1, sums.moments[1]);
+    add(kNumGateMoments + at.column, sums.feature);
+  });
 }
 
-// Adds numbers that one warp has summed to the record of a Gaussian, `first` numbers into it.
-template <class S, int kCount>
-__device__ void add_to_record(const BackwardArguments<S>& arguments, const TransposedSum<kCount>& sum,
-                              S (&values)[kCount], const WarpTile<S>& tile, int32_t gaussian, int32_t position,
-                              int first, int wanted) {
+// Sums `values` over the warp, and hands the first `wanted` sums on, as numbers `first`, first + 1, ... of a Gaussian.
+template <class S, int kCount, class Sink>
+__device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values)[kCount], int32_t gaussian,
+                           int32_t position, int first, int wanted) {
+  const TransposedSum<kCount> sum(tile.lane);
   sum(values);
   if (!sum.holds || sum.number >= wanted) return;
-  const int record = kNumGateMoments + arguments.num_features;
-  if (has_slots(arguments, tile)) {
-    arguments.slots[slot_of(tile, position) * record + first + sum.number] = values[0];
-  } else {
-    atomicAdd(arguments.dL_dgaussians + int64_t(gaussian) * record + first + sum.number, values[0]);
-  }
+  sink.to_record(tile, gaussian, position, sink.length, [&](auto add) { add(first + sum.number, values[0]); });
 }
 
 // The six moments of a lane's pixels, one below the other.
@@ -99,61 +83,166 @@ template <class S> __device__ void column_moments(const S (&dL_dpower)[kLanePixe
   moments[3] = sums.xx, moments[4] = sums.xy, moments[5] = sums.yy;
 }
 
-template <class S, BlendMode kMode, int kFeatures>
-__global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatures != kAnyFeatures ? 5 : 1)
-    blend_backward_kernel(const __grid_constant__ BackwardArguments<S> arguments) {
-  __shared__ StagedGaussian<S> staged[kWarpsPerTile][kWarp];
-  __shared__ int32_t staged_gaussian[kWarpsPerTile][kWarp];
-  constexpr bool kTensor = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kTensorFeatures;
-  __shared__ TensorStage tensor_stages[kTensor ? kWarpsPerTile : 1];
-  __shared__ TensorBasis moment_basis;
-  if (is_idle_block(arguments.saved, arguments.tiles)) return;
-  if constexpr (kTensor) {
-    fill_moment_basis(moment_basis);
-    __syncthreads();
+// What the walk knows of a lane's pixels.
+template <class S, int kFeatures> struct BackwardPixels {
+  PixelBackward<S> state[kLanePixels];
+  ScaledGradients<S, kFeatures> scaled;  // g'
+  int32_t last[kLanePixels];             // entries of the list that the numerator has seen
+};
+
+// A warp's part in the sums by tensor cores, in shared memory.
+struct TensorShare {
+  TensorStage& stage;               // the warp's own
+  const TensorBasis& moment_basis;  // the block's
+};
+
+// Back to front: of each Gaussian the moments of dL/dpower and the gradients of its features.
+template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVisitor {
+  static constexpr bool kBackToFront = true, kStopsEarly = false;
+  static constexpr bool kReadsFeatures = true, kReadsIndices = true;
+  static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
+  static constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
+
+  __device__ __forceinline__ int num_features() const {
+    return kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
   }
-  const auto [tile_index, quarter, segment] = segment_of_warp(arguments.saved, arguments.tiles);
-  if (tile_index < 0) return;
-  const WarpTile<S> tile(arguments, tile_index, quarter);
-  const int warp = threadIdx.x / kWarp;
+
+  __device__ __forceinline__ void begin_chunk(int32_t) {}
+
+  __device__ __forceinline__ void visit(const WarpStage<S, BackwardVisitor>& stage, int j, int32_t position) {
+    const auto current = stage.gaussians[j];
+    const ProjectedGaussian<S>& gaussian = current.gaussian;
+    const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
+    const ColumnExponent<S, S> exponent(gaussian.conic, dx);
+    const S least_alpha = cut.of(gaussian.opacity);
+    Gate<S> gate[kLanePixels];
+    bool contributes[kLanePixels], any = false;
+#pragma unroll
+    for (int k = 0; k < kLanePixels; ++k) {
+      gate[k] = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
+      contributes[k] = gate[k].counts && position < pixels.last[k];
+      any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
+    }
+    if (!__any_sync(kAllLanes, any)) return;
+
+    const int32_t index = stage.indices[j];
+    const S* features = arguments.saved.features + int64_t(index) * feature_stride(num_features());
+    const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? current.features[f] : features[f]; };
+    S weight[kLanePixels], dL_dpower[kLanePixels];
+#pragma unroll
+    for (int k = 0; k < kLanePixels; ++k) {
+      S value = S(0);
+      for (int f = 0; f < num_features(); ++f) {
+        value = fma(pixels.scaled.get(arguments, tile, k, f), feature(f), value);
+      }
+      const auto pair = Blend<kMode>::backward(pixels.state[k], gate[k], value, contributes[k]);
+      weight[k] = pair.weight;
+      dL_dpower[k] = gate_backward(gate[k], pair.gamma);
+    }
+    if constexpr (kTensor) {
+      add_by_tensors(dL_dpower, weight, dx, dy, index, position);
+    } else {
+      add_by_shuffles(dL_dpower, weight, dx, dy, index, position);
+    }
+  }
+
+  // Adds what still waits in the tensor stage.
+  __device__ __forceinline__ void finish() {
+    if constexpr (kTensor) {
+      if (batch > 0) add_batch(sink, tile, tensors.stage, tensors.moment_basis, batch);
+    }
+  }
+
+  __device__ __forceinline__ void add_by_tensors(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
+                                                 S dx, S dy, int32_t index, int32_t position) {
+    *reinterpret_cast<float2*>(&tensors.stage.values[batch][2 * tile.lane]) = make_float2(dL_dpower[0], dL_dpower[1]);
+    *reinterpret_cast<float2*>(&tensors.stage.values[kTensorBatch + batch][2 * tile.lane]) =
+        make_float2(weight[0], weight[1]);
+    if (tile.lane == 0) {
+      tensors.stage.gaussians[batch] =
+          make_float4(dx + kWarpTileCentre, dy + kWarpTileCentre, __int_as_float(index), __int_as_float(position));
+    }
+    if (++batch == kTensorBatch) {
+      add_batch(sink, tile, tensors.stage, tensors.moment_basis, batch);
+      batch = 0;
+    }
+  }
+
+  __device__ __forceinline__ void add_by_shuffles(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
+                                                  S dx, S dy, int32_t index, int32_t position) {
+    S values[kTogether];
+    column_moments(dL_dpower, dx, dy, values);
+    if constexpr (kFeatures != kAnyFeatures) {
+      for (int f = 0; f < kFeatures; ++f) {
+        S share = S(0);
+        for (int k = 0; k < kLanePixels; ++k) share = fma(weight[k], pixels.scaled.values[k][f], share);
+        values[kNumGateMoments + f] = share;
+      }
+    }
+    add_values(sink, tile, values, index, position, 0, kTogether);
+    if constexpr (kFeatures == kAnyFeatures) {
+      for (int first = 0; first < num_features(); first += kFeatureChunk) {
+        S shares[kFeatureChunk];
+        for (int f = 0; f < kFeatureChunk; ++f) {
+          shares[f] = S(0);
+          if (first + f >= num_features()) continue;
+          for (int k = 0; k < kLanePixels; ++k) {
+            shares[f] = fma(weight[k], pixels.scaled.get(arguments, tile, k, first + f), shares[f]);
+          }
+        }
+        add_values(sink, tile, shares, index, position, kNumGateMoments + first, num_features() - first);
+      }
+    }
+  }
+
+  const BackwardArguments<S>& arguments;
+  const Sink& sink;
+  const WarpTile<S>& tile;
+  BackwardPixels<S, kFeatures>& pixels;
+  TensorShare tensors;
+  AlphaCut<S> cut;
+  int batch;  // Gaussians that wait in the tensor stage
+};
+
+// The gradients that a warp's pixels start with, before any pair. Also writes the warp's row of the background's
+// gradients, where they are wanted: once, in the first segment of the list.
+template <BlendMode kMode, class S, int kFeatures>
+__device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
+                                             const WarpSegment& place, BackwardPixels<S, kFeatures>& pixels) {
   const RasterConfig<S>& config = arguments.config;
   const int num_features = kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
-  const int64_t pixels = int64_t(arguments.width) * arguments.height;
-
-  PixelBackward<S> pixel[kLanePixels];
-  PixelEnd<S> pixel_end[kLanePixels];
-  ScaledGradients<S, kFeatures> scaled;
-  int32_t last[kLanePixels];
+  const int64_t size = int64_t(arguments.width) * arguments.height;
+  PixelEnd<S> end[kLanePixels];
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
-    pixel_end[k] = {S(1), S(0), config.gate_of_background()};
+    end[k] = {S(1), S(0), config.gate_of_background()};
     if (inside) {
-      pixel_end[k].transmittance = arguments.saved.final_transmittance[index];
-      pixel_end[k].gate_sum = arguments.saved.gate_sum[index];
+      end[k].transmittance = arguments.saved.final_transmittance[index];
+      end[k].gate_sum = arguments.saved.gate_sum[index];
     }
     const S* dL_dgate_sum = arguments.dL_dimages.gate_sum;
-    pixel[k] = begin_backward(pixel_end[k], inside && dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
-    last[k] = inside ? arguments.saved.last_contributor[index] : 0;
+    pixels.state[k] = begin_backward(end[k], inside && dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
+    pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
   }
   S* dL_dbackground = nullptr;  // the warp's row
-  if (arguments.dL_dbackground_rows != nullptr && segment == 0) {
-    dL_dbackground =
-        arguments.dL_dbackground_rows + (int64_t(tile_index) * kWarpsPerTile + quarter) * (config.num_channels + 1);
+  if (arguments.dL_dbackground_rows != nullptr && place.segment == 0) {
+    dL_dbackground = arguments.dL_dbackground_rows +
+                     (int64_t(place.tile) * kWarpsPerTile + place.quarter) * (config.num_channels + 1);
   }
   S dL_dbackground_gate = S(0);
   for (int f = 0; f < num_features; ++f) {
-    const S* gradient = feature_image(config, arguments.dL_dimages, f, pixels);
+    const S* gradient = feature_image(config, arguments.dL_dimages, f, size);
     S share = S(0);
     for (int k = 0; k < kLanePixels; ++k) {
       S value = S(0), dL_dvalue = S(0);
       if (gradient != nullptr && tile.inside(arguments, k)) {
         const int64_t index = tile.pixel_index(arguments, k);
-        value = feature_image(config, arguments.images, f, pixels)[index], dL_dvalue = gradient[index];
+        value = feature_image(config, arguments.images, f, size)[index], dL_dvalue = gradient[index];
       }
-      const auto feature = add_feature<kMode>(feature_rule(config, f), pixel[k], pixel_end[k], dL_dvalue, value,
+      const auto feature = add_feature<kMode>(feature_rule(config, f), pixels.state[k], end[k], dL_dvalue, value,
                                               feature_background(config, f));
-      scaled.set(arguments, tile, k, f, feature.scaled);
+      pixels.scaled.set(arguments, tile, k, f, feature.scaled);
       share += feature.background, dL_dbackground_gate += feature.background_gate;
     }
     if (dL_dbackground == nullptr || f >= config.num_channels) continue;
@@ -164,131 +253,126 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
     const S share = sum_lanes(dL_dbackground_gate);
     if (tile.lane == 0) dL_dbackground[config.num_channels] = share;
   }
-  if (tile.empty) return;
+}
 
-  int32_t end = tile.length;
+// The part of the list that a warp walks: up to the last pair that some pixel has taken, and of a list with segments
+// only the warp's own. Empty where nothing is left there. Where another segment follows, the pixels continue in front
+// of it.
+template <BlendMode kMode, class S, int kFeatures>
+__device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
+                                                      int segment, BackwardPixels<S, kFeatures>& pixels) {
+  WalkRange range = {0, tile.length};
   if (Blend<kMode>::kStopsEarly) {
     int32_t seen = 0;
-    for (int k = 0; k < kLanePixels; ++k) seen = seen > last[k] ? seen : last[k];
-    end = max_over_lanes(seen);
+    for (int k = 0; k < kLanePixels; ++k) seen = seen > pixels.last[k] ? seen : pixels.last[k];
+    range.end = max_over_lanes(seen);
   }
-  int32_t begin = 0;
   if (kWalksSegments<S, kFeatures> && has_segments(arguments.saved, tile)) {
-    begin = segment * kSegmentLength;
-    if (begin >= end) return;
-    const int segments = (end + kSegmentLength - 1) / kSegmentLength;
+    range.begin = segment * kSegmentLength;
+    if (range.begin >= range.end) return range;
+    const int segments = (range.end + kSegmentLength - 1) / kSegmentLength;
     if (segment + 1 < segments) {
       for (int k = 0; k < kLanePixels; ++k) {
         if (!tile.inside(arguments, k)) continue;
         const SegmentPixel<S> next_begin = segment_pixel(arguments.saved, tile, segment + 1, k);
         S behind = S(0);
         for (int f = 0; f < kSegmentFeatures; ++f) {
-          behind = fma(scaled.get(arguments, tile, k, f), next_begin.sums[f], behind);
+          behind = fma(pixels.scaled.get(arguments, tile, k, f), next_begin.sums[f], behind);
         }
-        resume_backward<kMode>(pixel[k], next_begin.transmittance, behind);
+        resume_backward<kMode>(pixels.state[k], next_begin.transmittance, behind);
       }
-      end = begin + kSegmentLength;
+      range.end = range.begin + kSegmentLength;
     }
   }
-  TensorStage& tensor_stage = tensor_stages[kTensor ? warp : 0];
-  int batch = 0;  // Gaussians that wait in the stage
-  if constexpr (kTensor) fill_gradient_basis(tensor_stage, scaled.values, tile.lane);
-  constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
-  const TransposedSum<kTogether> sum(tile.lane);
-  const AlphaCut<S> cut = config.alpha_cut();
-  unsigned hits = 0;
+  return range;
+}
 
-  // Back to front: lane 0 takes the last entry of a chunk.
-  auto next = load_entry(arguments, tile, end - 1 - tile.lane, 0, begin);
-  for (int32_t chunk = end - 1; chunk >= begin; chunk -= kWarp) {
-    const bool meets = meets_pixels(next, tile);
-    if (meets) {
-      staged[warp][tile.lane] = next.staged;
-      staged_gaussian[warp][tile.lane] = next.gaussian;
-    }
-    unsigned left = __ballot_sync(kAllLanes, meets);
-    __syncwarp();
-    next = load_entry(arguments, tile, chunk - kWarp - tile.lane, 0, begin);
-    hits += __popc(left);
-    for (; left != 0; left &= left - 1) {
-      const int j = __ffs(left) - 1;
-      const StagedGaussian<S> current = staged[warp][j];
-      const ProjectedGaussian<S>& gaussian = current.gaussian;
-      const int32_t position = chunk - j;
-      const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
-      const ColumnExponent<S, S> exponent(gaussian.conic, dx);
-      const S least_alpha = cut.of(gaussian.opacity);
-      Gate<S> gate[kLanePixels];
-      bool contributes[kLanePixels], any = false;
-#pragma unroll
-      for (int k = 0; k < kLanePixels; ++k) {
-        gate[k] = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
-        contributes[k] = gate[k].counts && position < last[k];
-        any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
-      }
-      if (!__any_sync(kAllLanes, any)) continue;
+template <class S, BlendMode kMode, int kFeatures, class Sink>
+__global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks
+                                                                                          : kGeneralBackwardBlocks)
+    blend_backward_kernel(const __grid_constant__ BackwardWork<S, Sink> arguments) {
+  using Visitor = BackwardVisitor<S, kMode, kFeatures, Sink>;
+  __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
+  __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
+  __shared__ TensorStage tensor_stages[Visitor::kTensor ? kWarpsPerTile : 1];
+  __shared__ TensorBasis moment_basis;
+  if (Sink::kOnlyOutgrown && !overflows(arguments.saved)) return;
+  if (is_idle_block(arguments.saved, arguments.tiles)) return;
+  if constexpr (Visitor::kTensor) {
+    fill_moment_basis(moment_basis);
+    __syncthreads();
+  }
+  const WarpSegment place = segment_of_warp(arguments.saved, arguments.tiles);
+  if (place.tile < 0) return;
+  const WarpTile<S> tile(arguments, place.tile, place.quarter);
+  const int warp = threadIdx.x / kWarp;
 
-      const int32_t index = staged_gaussian[warp][j];
-      const S* features = arguments.saved.features + int64_t(index) * feature_stride(num_features);
-      const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? current.features[f] : features[f]; };
-      S weight[kLanePixels], dL_dpower[kLanePixels];
-#pragma unroll
-      for (int k = 0; k < kLanePixels; ++k) {
-        S value = S(0);
-        for (int f = 0; f < num_features; ++f) value = fma(scaled.get(arguments, tile, k, f), feature(f), value);
-        const auto pair = Blend<kMode>::backward(pixel[k], gate[k], value, contributes[k]);
-        weight[k] = pair.weight;
-        dL_dpower[k] = gate_backward(gate[k], pair.gamma);
-      }
-      if constexpr (kTensor) {
-        *reinterpret_cast<float2*>(&tensor_stage.values[batch][2 * tile.lane]) =
-            make_float2(dL_dpower[0], dL_dpower[1]);
-        *reinterpret_cast<float2*>(&tensor_stage.values[kTensorBatch + batch][2 * tile.lane]) =
-            make_float2(weight[0], weight[1]);
-        if (tile.lane == 0) {
-          tensor_stage.gaussians[batch] =
-              make_float4(dx + kWarpTileCentre, dy + kWarpTileCentre, __int_as_float(index), __int_as_float(position));
-        }
-        if (++batch == kTensorBatch) {
-          add_batch(arguments, tile, tensor_stage, moment_basis, batch);
-          batch = 0;
-        }
-        continue;
-      }
-      S values[kTogether];
-      column_moments(dL_dpower, dx, dy, values);
-      if constexpr (kFeatures != kAnyFeatures) {
-        for (int f = 0; f < kFeatures; ++f) {
-          S share = S(0);
-          for (int k = 0; k < kLanePixels; ++k) share = fma(weight[k], scaled.values[k][f], share);
-          values[kNumGateMoments + f] = share;
-        }
-      }
-      add_to_record(arguments, sum, values, tile, index, position, 0, kTogether);
-      if constexpr (kFeatures == kAnyFeatures) {
-        const TransposedSum<kFeatureChunk> sum_features(tile.lane);
-        for (int first = 0; first < num_features; first += kFeatureChunk) {
-          S shares[kFeatureChunk];
-          for (int f = 0; f < kFeatureChunk; ++f) {
-            shares[f] = S(0);
-            if (first + f >= num_features) continue;
-            for (int k = 0; k < kLanePixels; ++k) {
-              shares[f] = fma(weight[k], scaled.get(arguments, tile, k, first + f), shares[f]);
-            }
-          }
-          add_to_record(arguments, sum_features, shares, tile, index, position, kNumGateMoments + first,
-                        num_features - first);
-        }
-      }
-    }
-    __syncwarp();
+  BackwardPixels<S, kFeatures> pixels;
+  begin_pixels<kMode, S>(arguments, tile, place, pixels);
+  if (tile.empty || !arguments.sink.takes(tile)) return;
+  const WalkRange range = range_of_segment<kMode, S>(arguments, tile, place.segment, pixels);
+  if (range.begin >= range.end) return;
+
+  TensorStage& tensor_stage = tensor_stages[Visitor::kTensor ? warp : 0];
+  if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
+  Visitor visitor = {
+      arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(), 0};
+  const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
+  const unsigned met = walk_tile<S>(stage, range, visitor);
+  visitor.finish();
+  count_pairs(arguments, tile.lane, met);
+}
+
+template <class S> S* allocate_scaled(const BackwardArguments<S>& arguments, Scratch& scratch) {
+  return allocate<S>(scratch, int64_t(arguments.width) * arguments.height * arguments.num_features);
+}
+
+template <class S, int kFeatures, class Sink>
+void launch_backward(const BackwardWork<S, Sink>& work, int64_t blocks, cudaStream_t stream) {
+  dispatch_blend(work.config.mode, kFeatures, [&](auto mode, auto) {
+    blend_backward_kernel<S, decltype(mode)::value, kFeatures>
+        <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(work);
+    DSMOE_CHECK_LAUNCH("blend_backward");
+  });
+}
+
+template <class S> struct OutgrownRecords {
+  int64_t size;           // N * length
+  SavedForward<S> saved;  // says whether the instances outgrew their memory
+  OutgrownSink<S> sink;   // read
+  S* records;             // [N, length] written
+};
+
+template <class S> __global__ void store_outgrown_kernel(const __grid_constant__ OutgrownRecords<S> arguments) {
+  if (!overflows(arguments.saved)) return;
+  const int64_t at = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
+  if (at < arguments.size) arguments.records[at] = arguments.sink.sum(at);
+}
+
+// Where the instances outgrew their memory, fills the records by walks over all Gaussians; does nothing elsewhere.
+template <class S>
+void backward_outgrown(const BackwardWork<S, RecordSink<S>>& work, Scratch& scratch, cudaStream_t stream) {
+  BackwardWork<S, OutgrownSink<S>> outgrown = {};
+  static_cast<BackwardArguments<S>&>(outgrown) = work;
+  outgrown.dL_dbackground_rows = nullptr;  // the usual kernel has written them
+  if (outgrown.scaled == nullptr) outgrown.scaled = allocate_scaled(work, scratch);
+  const int64_t size = work.num_gaussians * work.sink.length;
+  OutgrownSink<S>& sink = outgrown.sink;
+  sink.exponents = allocate<int32_t>(scratch, size);
+  sink.sums = allocate<unsigned long long>(scratch, size);
+  sink.length = work.sink.length;
+  sink.term_bits = 62;
+  for (int64_t warps = int64_t(work.tiles) * kWarpsPerTile; warps > 0; warps /= 2) --sink.term_bits;
+  check(cudaMemsetAsync(sink.exponents, 0, size * sizeof(*sink.exponents), stream), "clearing gradients");
+  check(cudaMemsetAsync(sink.sums, 0, size * sizeof(*sink.sums), stream), "clearing gradients");
+  for (const bool measures : {true, false}) {
+    sink.measures = measures;
+    launch_backward<S, kAnyFeatures>(outgrown, work.tiles, stream);
+    outgrown.pairs = nullptr;  // counted once
   }
-  if constexpr (kTensor) {
-    if (batch > 0) add_batch(arguments, tile, tensor_stage, moment_basis, batch);
-  }
-  if (arguments.pairs != nullptr && tile.lane == 0) {
-    atomicAdd(arguments.pairs, static_cast<unsigned long long>(hits) * (kWarpTile * kWarpTile));
-  }
+  OutgrownRecords<S> stored = {size, work.saved, sink, work.sink.records};
+  store_outgrown_kernel<<<blocks_for(size, kStoreBlock), kStoreBlock, 0, stream>>>(stored);
+  DSMOE_CHECK_LAUNCH("store_outgrown");
 }
 
 }  // namespace
@@ -298,29 +382,31 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
                     const SavedForward<S>& saved, const ImageOutputs<S>& images,
                     const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
                     Scratch& scratch, unsigned long long* pairs, cudaStream_t stream) {
-  const int64_t tiles = num_tiles(camera.width, camera.height);
-  const bool known = sizeof(S) == 4 && config.num_features() == 3;
-  BackwardArguments<S> arguments{blend_arguments(num_gaussians, camera, config, saved, images, pairs)};
-  arguments.dL_dimages = image_gradients;
-  arguments.dL_dgaussians = dL_dgaussians;
-  arguments.slots = slots;
-  arguments.num_features = config.num_features();
-  arguments.tiles = static_cast<int>(tiles);
-  const int64_t blocks = tiles + (known && saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0);
-  const int64_t warps = tiles * kWarpsPerTile;
-  if (dL_dbackground != nullptr)
-    arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
-  if (!known) {
-    arguments.scaled = allocate<S>(scratch, int64_t(camera.width) * camera.height * arguments.num_features);
-  }
-  dispatch_blend(config.mode, known ? 3 : kAnyFeatures, [&](auto mode, auto features) {
-    constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
-    blend_backward_kernel<S, decltype(mode)::value, kFeatures>
-        <<<static_cast<unsigned>(blocks), kWarpsPerTile * kWarp, 0, stream>>>(arguments);
-    DSMOE_CHECK_LAUNCH("blend_backward");
-  });
+  const int64_t tiles = num_tiles(camera.width, camera.height), warps = tiles * kWarpsPerTile;
+  BackwardWork<S, RecordSink<S>> work = {};
+  static_cast<BlendArguments<S>&>(work) = blend_arguments(num_gaussians, camera, config, saved, images, pairs);
+  work.dL_dimages = image_gradients;
+  work.num_features = config.num_features();
+  work.tiles = static_cast<int>(tiles);
+  work.sink.records = dL_dgaussians;
+  work.sink.slots = slots;
+  work.sink.length = kNumGateMoments + work.num_features;
   if (dL_dbackground != nullptr) {
-    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
+    work.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+  }
+  bool known = false;                          // the number of features, when compiling
+  if constexpr (sizeof(S) == sizeof(float)) {  // double is for checking: it has only the general kernel
+    known = work.num_features == kSegmentFeatures;
+    const int64_t segment_blocks = saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0;
+    if (known) launch_backward<S, kSegmentFeatures>(work, tiles + segment_blocks, stream);
+  }
+  if (!known) {
+    work.scaled = allocate_scaled(work, scratch);
+    launch_backward<S, kAnyFeatures>(work, tiles, stream);
+  }
+  if (slots != nullptr && num_gaussians > 0) backward_outgrown(work, scratch, stream);
+  if (dL_dbackground != nullptr) {
+    sum_columns(work.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
   }
 }
 

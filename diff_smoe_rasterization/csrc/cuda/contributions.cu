@@ -11,8 +11,8 @@ namespace cuda {
 namespace {
 
 template <class S> struct ContributionArguments : BlendArguments<S> {
-  const S* pixel_weights;  // [H, W]
-  ContributionSums<S> sums;
+  const S* pixel_weights;    // [H, W] a map of the caller's
+  ContributionSums<S> sums;  // [N] each
 };
 
 // Adds number `number` of a Contribution to its Gaussian's sums.
@@ -24,64 +24,73 @@ template <class S> __device__ void add_number(const ContributionSums<S>& sums, i
   }
 }
 
-template <class S, BlendMode kMode>
-__global__ void __launch_bounds__(kWarpsPerTile* kWarp)
-    contributions_kernel(const __grid_constant__ ContributionArguments<S> arguments) {
-  __shared__ ProjectedGaussian<S> staged[kWarpsPerTile][kWarp];
-  __shared__ int32_t staged_gaussian[kWarpsPerTile][kWarp];
-  WarpTile<S> tile(arguments);
-  if (tile.empty) return;
-  const int warp = threadIdx.x / kWarp;
-
+// What the walk knows of a lane's pixels.
+template <class S> struct ScoredPixels {
   PixelState<S> state[kLanePixels];
-  S pixel_weight[kLanePixels];
-  int32_t last[kLanePixels], seen = 0;  // entries of the list that the pixels' numerators have seen
+  S weight[kLanePixels];      // in the caller's map
+  int32_t last[kLanePixels];  // entries of the list that the numerator has seen
+};
+
+// Front to back, as the blend goes; up to the last pair that the blend took.
+template <class S, BlendMode kMode> struct ContributionVisitor {
+  static constexpr bool kBackToFront = false, kStopsEarly = false;
+  static constexpr bool kReadsFeatures = false, kReadsIndices = true;
+
+  __device__ __forceinline__ void begin_chunk(int32_t) {}
+
+  __device__ __forceinline__ void visit(const WarpStage<S, ContributionVisitor>& stage, int j, int32_t position) {
+    const ProjectedGaussian<S> gaussian = stage.gaussians[j].gaussian;
+    const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
+    const ColumnExponent<S, S> exponent(gaussian.conic, dx);
+    const S least_alpha = cut.of(gaussian.opacity);
+    auto sum = no_contribution<S>();
+    bool any = false;
+#pragma unroll
+    for (int k = 0; k < kLanePixels; ++k) {
+      const S below = dy + S(k * kLaneStep);
+      const auto gate = evaluate_gate<kMode>(exponent.at(below), gaussian.opacity, least_alpha);
+      const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
+      const bool contributes = pair.contributes && position < pixels.last[k];
+      any |= contributes;
+      add_pair(sum, contributes, pixels.weight[k], pair.weight, dx, below);
+    }
+    if (!__any_sync(kAllLanes, any)) return;
+    S numbers[kNumContributions] = {sum.pixel_weight, sum.pixels, sum.blend_weight, sum.distance};
+    sum_pixels(numbers);
+    if (sum_pixels.holds) add_number(arguments.sums, stage.indices[j], sum_pixels.number, numbers[0]);
+  }
+
+  const ContributionArguments<S>& arguments;
+  const WarpTile<S>& tile;
+  ScoredPixels<S>& pixels;
+  AlphaCut<S> cut;
+  TransposedSum<kNumContributions> sum_pixels;
+};
+
+template <class S, BlendMode kMode>
+__global__ void __launch_bounds__(kWalkBlock)
+    contributions_kernel(const __grid_constant__ ContributionArguments<S> arguments) {
+  __shared__ StagedGaussian<S, false> staged[kWarpsPerTile][kWarp];
+  __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
+  const WarpTile<S> tile(arguments);
+  if (tile.empty) return;
+
+  ScoredPixels<S> pixels;
+  int32_t seen = 0;
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
-    state[k] = PixelState<S>::open();
-    pixel_weight[k] = inside ? arguments.pixel_weights[index] : S(0);
-    last[k] = inside ? arguments.saved.last_contributor[index] : 0;
-    seen = seen > last[k] ? seen : last[k];
+    pixels.state[k] = PixelState<S>::open();
+    pixels.weight[k] = inside ? arguments.pixel_weights[index] : S(0);
+    pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
+    seen = seen > pixels.last[k] ? seen : pixels.last[k];
   }
-  tile.length = max_over_lanes(seen);
-  const TransposedSum<kNumContributions> sum_pixels(tile.lane);
-  const AlphaCut<S> cut = arguments.config.alpha_cut();
-
-  auto next = load_entry<false>(arguments, tile, tile.lane, 0);
-  for (int32_t chunk = 0; chunk < tile.length; chunk += kWarp) {
-    const bool meets = meets_pixels(next, tile);
-    if (meets) {
-      staged[warp][tile.lane] = next.staged.gaussian;
-      staged_gaussian[warp][tile.lane] = next.gaussian;
-    }
-    unsigned left = __ballot_sync(kAllLanes, meets);
-    __syncwarp();
-    next = load_entry<false>(arguments, tile, chunk + kWarp + tile.lane, 0);
-    for (; left != 0; left &= left - 1) {
-      const int j = __ffs(left) - 1;
-      const ProjectedGaussian<S> gaussian = staged[warp][j];
-      const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
-      const ColumnExponent<S, S> exponent(gaussian.conic, dx);
-      const S least_alpha = cut.of(gaussian.opacity);
-      auto sum = no_contribution<S>();
-      bool any = false;
-#pragma unroll
-      for (int k = 0; k < kLanePixels; ++k) {
-        const S below = dy + S(k * kLaneStep);
-        const auto gate = evaluate_gate<kMode>(exponent.at(below), gaussian.opacity, least_alpha);
-        const auto pair = Blend<kMode>::accumulate(state[k], gate);
-        const bool contributes = pair.contributes && chunk + j < last[k];
-        any |= contributes;
-        add_pair(sum, contributes, pixel_weight[k], pair.weight, dx, below);
-      }
-      if (!__any_sync(kAllLanes, any)) continue;
-      S numbers[kNumContributions] = {sum.pixel_weight, sum.pixels, sum.blend_weight, sum.distance};
-      sum_pixels(numbers);
-      if (sum_pixels.holds) add_number(arguments.sums, staged_gaussian[warp][j], sum_pixels.number, numbers[0]);
-    }
-    __syncwarp();
-  }
+  using Visitor = ContributionVisitor<S, kMode>;
+  Visitor visitor = {arguments, tile, pixels, arguments.config.alpha_cut(),
+                     TransposedSum<kNumContributions>(tile.lane)};
+  const int warp = threadIdx.x / kWarp;
+  const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
+  walk_tile(stage, {0, max_over_lanes(seen)}, visitor);
 }
 
 }  // namespace
@@ -102,7 +111,7 @@ void contributions(int64_t num_gaussians, int width, int height, const RasterCon
   arguments.sums = sums;
   const unsigned tiles = static_cast<unsigned>(num_tiles(width, height));
   dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
-    contributions_kernel<S, decltype(mode)::value><<<tiles, kWarpsPerTile * kWarp, 0, stream>>>(arguments);
+    contributions_kernel<S, decltype(mode)::value><<<tiles, kWalkBlock, 0, stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("contributions");
   });
 }

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "device.cuh"
+#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {
@@ -70,23 +71,35 @@ inline __device__ int32_t max_over_lanes(int32_t value) {
   return value;
 }
 
-constexpr int kColumnBlock = 256;
+template <class S> struct ColumnSums {
+  const S* rows;  // [count, columns]
+  int64_t count;
+  int columns;
+  S* sums;  // [columns]
+};
 
 // sums[c] = sum_r rows[r, c], in double; one block a column.
-template <class S> __global__ void sum_columns_kernel(const S* rows, int64_t count, int columns, S* sums) {
+template <class S> __global__ void sum_columns_kernel(const __grid_constant__ ColumnSums<S> matrix) {
   __shared__ double shared[kColumnBlock];
   double sum = 0;
-  for (int64_t r = threadIdx.x; r < count; r += kColumnBlock) sum += double(rows[r * columns + blockIdx.x]);
+  for (int64_t r = threadIdx.x; r < matrix.count; r += kColumnBlock) {
+    sum += double(matrix.rows[r * matrix.columns + blockIdx.x]);
+  }
   shared[threadIdx.x] = sum;
   for (int half = kColumnBlock / 2; half > 0; half /= 2) {
     __syncthreads();
     if (threadIdx.x < half) shared[threadIdx.x] += shared[threadIdx.x + half];
   }
-  if (threadIdx.x == 0) sums[blockIdx.x] = static_cast<S>(shared[0]);
+  if (threadIdx.x == 0) matrix.sums[blockIdx.x] = static_cast<S>(shared[0]);
 }
 
 template <class S> void sum_columns(const S* rows, int64_t count, int columns, S* sums, cudaStream_t stream) {
-  sum_columns_kernel<<<columns, kColumnBlock, 0, stream>>>(rows, count, columns, sums);
+  ColumnSums<S> matrix = {};
+  matrix.rows = rows;
+  matrix.count = count;
+  matrix.columns = columns;
+  matrix.sums = sums;
+  sum_columns_kernel<<<columns, kColumnBlock, 0, stream>>>(matrix);
   DSMOE_CHECK_LAUNCH("sum_columns");
 }
 

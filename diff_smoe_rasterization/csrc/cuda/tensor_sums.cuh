@@ -20,8 +20,10 @@ constexpr bool kHasTensorSums = true;
 constexpr bool kHasTensorSums = false;
 #endif
 
-constexpr int kTensorBatch = 8;  // Gaussians
 constexpr int kTensorFeatures = 3;
+// Which kernels sum by tensor cores.
+template <class S, int kFeatures>
+constexpr bool kSumsByTensors = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kTensorFeatures;
 constexpr int kTensorSteps = 8;  // of 8 pixels each
 // Numbers between rows: the quads of a warp that read two rows at once meet different banks.
 constexpr int kTensorRow = kWarpTile * kWarpTile + 16;

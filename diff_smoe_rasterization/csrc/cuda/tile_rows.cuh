@@ -1,4 +1,5 @@
 // The rows of tiles that the Gaussians of a warp meet, dealt out evenly to its lanes, however many each Gaussian has.
+// The tiles of a row are exact: where the ellipse enters and leaves it (Speedy-Splat's AccuTile, arXiv:2412.00578).
 #pragma once
 
 #include <cstring>

@@ -1,47 +1,54 @@
-// How a warp walks a tile's list. A warp owns 8x8 pixels, a quarter of a tile: each lane two of them, one below the
-// other, so that a Gaussian's terms in x are shared. It takes 32 instances at a time, one a lane, tests each footprint
-// against its pixels, and stages those that meet them in shared memory, for all lanes to read. Warps do not wait for
-// each other.
+// The tile walk: how a warp goes through the list of a tile. Every pass over pixels is a visitor of it.
+//
+// A warp owns a square of pixels, a quarter of a tile; each lane owns two of them, one below the other, so that they
+// share a Gaussian's terms in x. (Small squares for warps, inside larger tiles for the lists: HiGS, arXiv:2606.00352.)
+// The warp takes 32 entries of the list at a time, one a lane:
+//
+//   prefetch  each lane loads its entry of the next chunk, while the current one is visited
+//   ballot    each lane tests the footprint of its entry against the warp's pixels
+//   stage     the entries that meet them go to shared memory
+//   visit     all lanes read the staged entries one after the other, and the visitor does the work of its pass
+//
+// Warps do not wait for each other.
 #pragma once
 
 #include "device.cuh"
 #include "dsmoe/features.h"
 #include "tile_rows.cuh"
+#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {
 
-constexpr int kWarpTile = 8;  // pixels, each way
-constexpr int kWarpsPerTile = (kTileSize / kWarpTile) * (kTileSize / kWarpTile);
-constexpr int kLanePixels = kWarpTile * kWarpTile / kWarp;  // one below the other
-constexpr int kLaneStep = kWarpTile / kLanePixels;          // rows between them
-constexpr int kFeatureChunk = 4;                            // features that load as one vector
-static_assert(kWarpsPerTile == kSlotsPerInstance, "each quarter of a tile has its slot");
-
+// What every walk needs to know of a rendering.
 template <class S> struct BlendArguments {
-  int64_t num_gaussians;
-  int width, height;
-  int tile_columns;
-  RasterConfig<S> config;
-  SavedForward<S> saved;
-  ImageOutputs<S> images;
-  unsigned long long* pairs;
+  int64_t num_gaussians;      // N
+  int width, height;          // of the image, pixels
+  int tile_columns;           // tiles side by side
+  RasterConfig<S> config;     // mode, features, background
+  SavedForward<S> saved;      // what the forward pass leaves, and reads itself
+  ImageOutputs<S> images;     // [features, H, W], and the radii [N]
+  unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
 template <class S>
 BlendArguments<S> blend_arguments(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
                                   const SavedForward<S>& saved, const ImageOutputs<S>& images,
                                   unsigned long long* pairs) {
-  const TileGrid grid(camera.width, camera.height);
-  return {num_gaussians, camera.width, camera.height, grid.columns, config, saved, images, pairs};
+  BlendArguments<S> arguments = {};
+  arguments.num_gaussians = num_gaussians;
+  arguments.width = camera.width;
+  arguments.height = camera.height;
+  arguments.tile_columns = TileGrid(camera.width, camera.height).columns;
+  arguments.config = config;
+  arguments.saved = saved;
+  arguments.images = images;
+  arguments.pairs = pairs;
+  return arguments;
 }
 
-// A Gaussian that meets the warp's pixels.
-template <class S> struct alignas(16) StagedGaussian {
-  ProjectedGaussian<S> gaussian;
-  S features[kFeatureChunk];
-};
-
+// The pixels of a warp, and the source of its entries: the tile's list, or, where the instances outgrew their memory,
+// the depth order of all Gaussians.
 template <class S> class WarpTile {
  public:
   __device__ explicit WarpTile(const BlendArguments<S>& arguments)
@@ -71,44 +78,64 @@ template <class S> class WarpTile {
     return int64_t(y + k * kLaneStep) * arguments.width + x;
   }
 
-  int quarter;
-  int lane, tile_x, tile_y;
-  int x, y;  // of the lane's first pixel
-  bool empty;
-  PixelRect<S> rect;    // the warp's pixels
-  bool listed;          // the tile has a list; else the depth order serves
+  int quarter;  // of the tile, row by row
+  int lane;
+  int tile_x, tile_y;   // of the tile, in tiles
+  int x, y;             // of the lane's first pixel
+  bool empty;           // no pixel of the warp lies in the image
+  PixelRect<S> rect;    // the warp's pixels in the image
+  bool listed;          // the entries are the tile's list; else the depth order
   int64_t begin;        // the list's first instance
-  const int32_t* list;  // Gaussians, front to back
+  const int32_t* list;  // [length, stride] Gaussians, front to back
   int stride;           // numbers an entry
-  int32_t length;
+  int32_t length;       // entries
+};
+
+// A Gaussian that meets the warp's pixels.
+template <class S, bool kWithFeatures> struct alignas(16) StagedGaussian {
+  ProjectedGaussian<S> gaussian;
+  S features[kFeatureChunk];
+};
+template <class S> struct alignas(16) StagedGaussian<S, false> { ProjectedGaussian<S> gaussian; };
+
+// Where a warp stages what it visits, in shared memory.
+template <class S, class Visitor> struct WarpStage {
+  StagedGaussian<S, Visitor::kReadsFeatures>* gaussians;  // [32]
+  int32_t* indices;                                       // [32] of the Gaussians; null where the visitor reads none
+};
+
+// The part of a list that a warp walks.
+struct WalkRange {
+  int32_t begin, end;     // entries of the list, half-open
+  int first_feature = 0;  // the kFeatureChunk features from here on come along, where the visitor reads features
 };
 
 // One entry of a list, as its lane loads it.
-template <class S> struct ListEntry {
-  StagedGaussian<S> staged;
+template <class S, bool kWithFeatures> struct ListEntry {
+  StagedGaussian<S, kWithFeatures> staged;
   int32_t gaussian;
   bool valid;
 };
 
-// Four features from `first_feature` on come along, where the kernel has a use for them. Entries in front of `first`
-// are not wanted.
-template <bool kWithFeatures = true, class S>
-__device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int32_t position,
-                                   int first_feature, int32_t first = 0) {
+// Positions behind the end of the walk give an entry that is not valid.
+template <class Visitor, class S>
+__device__ auto load_entry(const Visitor& visitor, int32_t position, const WalkRange& range) {
+  const BlendArguments<S>& arguments = visitor.arguments;
+  const WarpTile<S>& tile = visitor.tile;
   const SavedForward<S>& saved = arguments.saved;
-  ListEntry<S> entry;
-  entry.valid = first <= position && position < tile.length;
+  ListEntry<S, Visitor::kReadsFeatures> entry;
+  entry.valid = Visitor::kBackToFront ? position >= range.begin : position < range.end;
   if (!entry.valid) return entry;
   entry.gaussian = tile.list[int64_t(position) * tile.stride];
   entry.valid = entry.gaussian >= 0;  // the depth order has culled Gaussians too, below 0
   if (!entry.valid) return entry;
   entry.staged.gaussian = saved.projected[entry.gaussian];
-  if constexpr (kWithFeatures) {
+  if constexpr (Visitor::kReadsFeatures) {
     const S* features = saved.features + int64_t(entry.gaussian) * feature_stride(arguments.config.num_features());
     struct alignas(16) Chunk {
       S values[kFeatureChunk];
     };
-    *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + first_feature);
+    *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
   }
   if (!tile.listed) {  // the entries of the depth order know nothing of tiles
     const TileRect bounds = footprint_bounds(arguments.config.mode, arguments.width, arguments.height,
@@ -119,9 +146,56 @@ __device__ ListEntry<S> load_entry(const BlendArguments<S>& arguments, const War
   return entry;
 }
 
-template <class S> __device__ bool meets_pixels(const ListEntry<S>& entry, const WarpTile<S>& tile) {
+template <class S, bool kWithFeatures>
+__device__ bool meets_pixels(const ListEntry<S, kWithFeatures>& entry, const WarpTile<S>& tile) {
   const auto& gaussian = entry.staged.gaussian;
   return entry.valid && may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
+}
+
+// The walk itself. Returns how many entries met the warp's pixels. A visitor has
+//
+//   kBackToFront, kStopsEarly, kReadsFeatures, kReadsIndices   what it wants of the walk, static
+//   arguments, tile                                   the rendering, and the warp's place in it
+//   begin_chunk(position)                             called before the chunk whose first entry is at `position`
+//   visit(stage, j, position)                         entry j of the stage, at `position` of the list, for all lanes
+//   is_done()                                         the walk may end; called behind each chunk
+template <class S, class Visitor>
+__device__ __forceinline__ unsigned walk_tile(const WarpStage<S, Visitor>& stage, const WalkRange& range,
+                                              Visitor& visitor) {
+  const auto at = [](int32_t chunk, int j) { return Visitor::kBackToFront ? chunk - j : chunk + j; };
+  const auto load = [&](int32_t position) { return load_entry<Visitor, S>(visitor, position, range); };
+  const int lane = visitor.tile.lane;
+  unsigned met = 0;
+  int32_t chunk = Visitor::kBackToFront ? range.end - 1 : range.begin;
+  auto next = load(at(chunk, lane));
+  for (; Visitor::kBackToFront ? chunk >= range.begin : chunk < range.end; chunk = at(chunk, kWarp)) {
+    visitor.begin_chunk(chunk);
+    const bool meets = meets_pixels(next, visitor.tile);
+    if (meets) {
+      stage.gaussians[lane] = next.staged;
+      if constexpr (Visitor::kReadsIndices) stage.indices[lane] = next.gaussian;
+    }
+    unsigned left = __ballot_sync(kAllLanes, meets);
+    __syncwarp();
+    next = load(at(at(chunk, kWarp), lane));
+    met += __popc(left);
+    for (; left != 0; left &= left - 1) {
+      const int j = __ffs(left) - 1;
+      visitor.visit(stage, j, at(chunk, j));
+    }
+    __syncwarp();
+    if constexpr (Visitor::kStopsEarly) {
+      if (visitor.is_done()) break;
+    }
+  }
+  return met;
+}
+
+// Adds the pairs of the entries that a warp has met to the count of the rendering.
+template <class S> __device__ void count_pairs(const BlendArguments<S>& arguments, int lane, unsigned met) {
+  if (arguments.pairs != nullptr && lane == 0) {
+    atomicAdd(arguments.pairs, static_cast<unsigned long long>(met) * (kWarpTile * kWarpTile));
+  }
 }
 
 }  // namespace cuda

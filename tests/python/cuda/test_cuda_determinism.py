@@ -5,6 +5,7 @@ import pytest
 import torch
 from comparison import assert_all_close
 from scenes import gradients, random_scene, with_gate
+from test_cuda_graphs import TrainingStep, list_size, own_width
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -55,3 +56,36 @@ def test_nothing_visible(mode, gpu):
     rendering, gradient = gradients(rasterize, scene, OUTPUTS)
     assert not rendering.radii.any()
     assert not any(values.any() for name, values in gradient.items() if name != "bg")
+
+
+@with_gate
+@pytest.mark.parametrize("dtype, tolerance", [
+    # As in test_cuda_graphs: whole lists instead of segments, T rounded in other places.
+    (torch.float32, 1e-4),
+    # Terms, some hundred a sum, are rounded at 2^-52 of the largest one.
+    (torch.float64, 1e-11)], ids=["float32", "float64"])
+@pytest.mark.parametrize("outputs, degree, width", [(OUTPUTS, 1, 267), ((), 3, 283)],
+                         ids=["all_images", "colour_alone"])
+def test_a_captured_graph_that_outgrew_its_lists(mode, outputs, degree, width, dtype, tolerance, gpu):
+    """No slot waits for its instances then; at a size of its own, as the tests of graphs have it."""
+    width = own_width(mode, width) + 7 * (dtype == torch.float64)
+    small = random_scene(mode, 20_000, width, 151, scale=0.004, opacity=(0.02, 0.2), degree=degree, dtype=dtype)
+    larger = small.with_inputs(scales=small.inputs["scales"] * 30)
+    step = TrainingStep(small.with_settings(deterministic=True), gpu, outputs, dtype)
+    graph, results = step.captured()
+    room = list_size(small, gpu)[0]
+    assert list_size(larger, gpu)[1] > room, "nothing is outgrown"
+    expected = TrainingStep(larger.with_settings(deterministic=True), gpu, outputs, dtype)()
+    step.set_to(larger)
+    graph.replay()
+    first = {name: values.clone() for name, values in results[2].items()}
+    for _ in range(9):
+        graph.replay()
+        for name, values in first.items():
+            assert torch.equal(results[2][name], values), name
+    assert_all_close(first, expected[2], tolerance)
+    step.set_to(small)  # with room again, from its slots
+    graph.replay()
+    expected = TrainingStep(small.with_settings(deterministic=True), gpu, outputs, dtype)()
+    for name, values in expected[2].items():
+        assert torch.equal(results[2][name], values), name

@@ -20,12 +20,12 @@ SLEEP = 2_000_000_000  # GPU cycles, about a second: far longer than the host ne
 class TrainingStep:
     """Forward and backward of a scene whose tensors stay where they are."""
 
-    def __init__(self, scene, gpu, outputs=OUTPUTS):
-        self.scene = scene.to(torch.float32).to(gpu).requiring_grad()
+    def __init__(self, scene, gpu, outputs=OUTPUTS, dtype=torch.float32):
+        self.scene = scene.to(dtype).to(gpu).requiring_grad()
         self.outputs = outputs
         settings = self.scene.settings
         shape = (len(settings.bg) + len(outputs), settings.image_height, settings.image_width)
-        self.weights = random_normal(shape, 1, torch.float32).to(gpu)
+        self.weights = random_normal(shape, 1, dtype).to(gpu)
 
     def __call__(self):
         """Returns (images, radii, gradients by name)."""
