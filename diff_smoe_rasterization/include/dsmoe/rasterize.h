@@ -1,7 +1,11 @@
-// The rasterizer's public C++ interface, CPU backend: no torch, no allocation of results, float and double.
+// The rasterizer's public C++ interface, CPU backend: no torch, float and double.
 //
-//   SavedForward and ImageOutputs point to memory of the caller's, sized as params.h says, except `instances`, whose
-//   size the first stage returns:
+//     cpu::Frame<float> frame;                    // fill inputs, camera, config and images
+//     cpu::Heap heap;                             // or an Allocator of your own
+//     cpu::forward(frame, heap);                  // the images, and what the backward pass needs
+//     cpu::backward(frame, gradients);            // from gradients by the images to gradients by the inputs
+//
+// The stages that these two run can be called one by one. Then the caller allocates what `saved` points to:
 //
 //     int64_t count = cpu::project(inputs, camera, config, saved, images);   // projected, features, offsets, radii
 //     saved.instances = ... [count];
@@ -14,24 +18,64 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
+#include <vector>
 
+#include "dsmoe/memory.h"
 #include "dsmoe/params.h"
-#include "dsmoe/tiles.h"
 
 namespace dsmoe {
-
-inline int64_t num_tiles(int width, int height) {
-  const TileGrid grid(width, height);
-  return static_cast<int64_t>(grid.columns) * grid.rows;
-}
-
 namespace cpu {
 
-// Seconds of each stage, and the work the blend did, of the calls that were given this struct.
-struct StageTimes {
-  double project = 0, sort = 0, bin = 0, blend = 0;
-  double blend_backward = 0, project_backward = 0;
-  int64_t forward_pairs = 0, backward_pairs = 0;  // (Gaussian, pixel) pairs whose exponent was evaluated
+using dsmoe::StageTimes;
+
+// One rendering, from its inputs to what it leaves for the backward pass.
+template <class S> struct Frame {
+  GaussianInputs<S> inputs;
+  Camera<S> camera;
+  RasterConfig<S> config;
+  ImageOutputs<S> images;  // where the results go
+  SavedForward<S> saved;   // filled by `forward`
+};
+
+// What a backward pass is given and what it writes.
+template <class S> struct Gradients {
+  ImageGradients<S> images;
+  GaussianGradients<S> inputs;
+};
+
+// Renders frame.inputs to frame.images and fills frame.saved. times: is added to, or null.
+// Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
+template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* times = nullptr);
+
+// Writes gradients.inputs. `frame` is as `forward` left it.
+template <class S> void backward(const Frame<S>& frame, const Gradients<S>& gradients, StageTimes* times = nullptr);
+
+// Fills frame.images.radii as `forward` does, and nothing else.
+template <class S> void radii(const Frame<S>& frame, Scratch& scratch);
+
+// The sizes of what `forward` keeps; how many instances there are is not known yet.
+template <class S> SavedSizes saved_sizes(const Frame<S>& frame) {
+  SavedSizes sizes;
+  sizes.num_gaussians = frame.inputs.num_gaussians;
+  sizes.num_features = frame.config.num_features();
+  sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
+  sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
+  return sizes;
+}
+
+// Keeps everything until it is destroyed.
+class Heap final : public Allocator {
+ public:
+  void* allocate(size_t bytes) override {
+    blocks_.emplace_back(new char[bytes]);
+    return blocks_.back().get();
+  }
+  void* keep(int, const SavedArray& array) override { return allocate(array.bytes()); }
+  void release() override {}
+
+ private:
+  std::vector<std::unique_ptr<char[]>> blocks_;
 };
 
 // Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.

@@ -1,13 +1,12 @@
 // The rasterizer's public C++ interface, CUDA backend: no torch, float and double, every call asynchronous on the
 // caller's stream. All pointers are device pointers, to memory of the caller's.
 //
-//     cuda::project(inputs, camera, config, saved, images, keys, stream);                     // footprints, colours
-//     cuda::sort_by_depth(inputs.num_gaussians, keys, saved.order, scratch, stream);
-//     saved.instances = ... [capacity, saved.instance_width]; saved.capacity = capacity;
-//     cuda::bin(inputs.num_gaussians, camera, config, saved, images.radii, scratch, stream);  // tile lists
-//     cuda::blend(inputs.num_gaussians, camera, config, saved, images, pairs, stream);        // the images
-//     cuda::blend_backward(...); cuda::project_backward(...);                                 // the gradients
-//     cuda::contributions(...);                                                               // scores of Gaussians
+//     cuda::Frame<float> frame;                   // fill inputs, camera, config and images
+//     cuda::StreamMemory memory(stream);          // or an Allocator of your own
+//     cuda::forward(frame, {stream}, memory);     // the images, and what the backward pass needs
+//     cuda::backward(frame, gradients, {stream}, memory);
+//
+// The stages that these two run, in their order, are declared below and can be called one by one.
 //
 // A capacity that turns out too small costs time, not correctness: where the instances do not fit, the blend reads the
 // depth order itself instead of the tile lists. So the host never has to wait, and a captured graph stays right when
@@ -19,7 +18,9 @@
 #include <cstddef>
 #include <cstdint>
 #include <type_traits>
+#include <vector>
 
+#include "dsmoe/memory.h"
 #include "dsmoe/params.h"
 
 using cudaStream_t = struct CUstream_st*;  // as CUDA's own headers have it, which callers without CUDA lack
@@ -60,18 +61,109 @@ template <class S> struct SavedForward {
   int64_t* slot_ranges = nullptr;    // [N, 2] each Gaussian's slots, begin and end; null without slots
   S* segments = nullptr;             // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
   int32_t* segment_queue = nullptr;  // [num_queue_entries(capacity), 2] which segments some pixel has reached, or null
-  S* final_transmittance = nullptr;
-  S* gate_sum = nullptr;
+  S* final_transmittance = nullptr;  // [H, W] T_{N+1}
+  S* gate_sum = nullptr;             // [H, W] the denominator: the caller's image
   int32_t* last_contributor = nullptr;  // [H, W] how many entries of the list the numerator has seen
 };
 
-// Memory for the duration of one call, or null where there is none left; the caller frees it in the stream's order.
-class Scratch {
- public:
-  virtual void* allocate(size_t bytes) = 0;
+// What the lengths of those arrays follow from.
+struct SavedSizes {
+  int64_t num_gaussians = 0;  // N
+  int64_t num_features = 0;   // F; -1: not known
+  int64_t tiles = 0;          // of the image
+  int64_t pixels = 0;         // H W
+  int64_t capacity = -1;      // of `instances`; -1: not known yet
+  bool slots = false;         // gradients are bitwise reproducible
+  bool segments = false;      // the backward pass walks long lists in segments
+};
 
- protected:
-  ~Scratch() = default;
+// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. Whoever
+// allocates, checks or passes on these arrays goes by this list and its order. tile_offsets has num_instances behind
+// it.
+template <class S, class Visit> void for_each_array(SavedForward<S>& saved, const SavedSizes& sizes, Visit visit) {
+  const bool known = sizes.capacity >= 0;
+  const int64_t stride = sizes.num_features < 0 ? -1 : feature_stride(static_cast<int>(sizes.num_features));
+  visit("projected", saved.projected, sizes.num_gaussians);
+  visit("features", saved.features, stride < 0 ? -1 : sizes.num_gaussians * stride);
+  visit("order", saved.order, sizes.num_gaussians);
+  visit("tile_offsets", saved.tile_offsets, sizes.tiles + 2);
+  visit("slot_ranges", saved.slot_ranges, sizes.slots ? 2 * sizes.num_gaussians : 0);
+  visit("final_transmittance", saved.final_transmittance, sizes.pixels);
+  visit("last_contributor", saved.last_contributor, sizes.pixels);
+  visit("instances", saved.instances, known ? sizes.capacity * (sizes.slots ? 2 : 1) : -1);
+  visit("segments", saved.segments, !sizes.segments ? 0 : known ? num_segment_rows(sizes.capacity) * kSegmentRow : -1);
+  visit("segment_queue", saved.segment_queue, !sizes.segments ? 0 : known ? 2 * num_queue_entries(sizes.capacity) : -1);
+}
+
+// Sets what is no array of its own, once the arrays are there.
+template <class S> void complete(SavedForward<S>& saved, const SavedSizes& sizes) {
+  saved.num_instances = saved.tile_offsets + sizes.tiles + 1;
+  saved.capacity = sizes.capacity;
+  saved.instance_width = sizes.slots ? 2 : 1;
+}
+
+// One rendering, from its inputs to what it leaves for the backward pass.
+template <class S> struct Frame {
+  GaussianInputs<S> inputs;
+  DeviceCamera<S> camera;
+  RasterConfig<S> config;
+  ImageOutputs<S> images;  // where the results go
+  SavedForward<S> saved;   // filled by `forward`
+};
+
+// What a backward pass is given and what it writes.
+template <class S> struct Gradients {
+  ImageGradients<S> images;
+  GaussianGradients<S> inputs;
+};
+
+// How a pass runs.
+struct Run {
+  cudaStream_t stream = nullptr;
+  bool deterministic = false;   // gradients are equal bit for bit from run to run; slower
+  bool for_backward = true;     // false: what only makes a backward pass faster is left out
+  StageTimes* times = nullptr;  // is added to, or null; the pass then waits for its kernels
+};
+
+// Renders frame.inputs to frame.images and fills frame.saved. The first call of a size, mode and order of N waits for
+// the number of instances, and so does every call with `deterministic`; no other waits.
+// Throws std::overflow_error where `deterministic` has more instances than fit 32-bit slots.
+template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory);
+
+// Writes gradients.inputs. `frame` is as `forward` left it, and run.deterministic as it was there.
+template <class S>
+void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory);
+
+// Fills frame.images.radii as `forward` does, and nothing else.
+template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory);
+
+// The sizes of what `forward` keeps; the capacity is not known yet.
+template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run) {
+  SavedSizes sizes;
+  sizes.num_gaussians = frame.inputs.num_gaussians;
+  sizes.num_features = frame.config.num_features();
+  sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
+  sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
+  sizes.slots = run.deterministic;
+  sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kSegmentFeatures;
+  return sizes;
+}
+
+// Memory of the current device, from the pool of the stream. What is kept lasts as long as the object.
+class StreamMemory final : public Allocator {
+ public:
+  explicit StreamMemory(cudaStream_t stream) : stream_(stream) {}
+  StreamMemory(const StreamMemory&) = delete;
+  StreamMemory& operator=(const StreamMemory&) = delete;
+  ~StreamMemory();
+
+  void* allocate(size_t bytes) override;
+  void* keep(int index, const SavedArray& array) override;
+  void release() override;
+
+ private:
+  cudaStream_t stream_;
+  std::vector<void*> scratch_, kept_;
 };
 
 // The bits of a positive float, read as an integer, are in the order of the float.
