@@ -40,16 +40,22 @@ template <class S> __device__ void set_zero(const GaussianGradients<S>& g, int n
   set_zero(g.shs, 3 * num_sh);
 }
 
+// The sums over the warp of kCount numbers a lane.
+template <int kCount, class S> __device__ void store_sums(const S (&numbers)[kCount], S* out, int lane) {
+  for (int k = 0; k < kCount; ++k) {
+    const S sum = sum_lanes(numbers[k]);
+    if (lane == 0) out[k] = sum;
+  }
+}
+
 // The sum over the warp of the camera's gradients.
 template <class S>
 __device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, int64_t i,
                                  const CameraGradient<S>& dL_dcamera, int lane) {
-  const S* numbers = dL_dcamera.view;
   S* out = arguments.camera_rows + (i / kWarp) * kCameraGradientSize;
-  for (int k = 0; k < kCameraGradientSize; ++k) {
-    const S sum = sum_lanes(numbers[k]);
-    if (lane == 0) out[k] = sum;
-  }
+  store_sums(dL_dcamera.view, out, lane);
+  store_sums(dL_dcamera.projection, out + 16, lane);
+  store_sums(dL_dcamera.position, out + 32, lane);
 }
 
 // Adds a Gaussian's slots to its record, numbers `first` to first + kCount of `size`, where there are slots and as many
@@ -290,7 +296,7 @@ void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& ca
     });
   }
   if (with_camera) {
-    sum_columns(arguments.camera_rows, warps, kCameraGradientSize, gradients.camera->view, stream);
+    sum_columns(arguments.camera_rows, warps, kCameraGradientSize, reinterpret_cast<S*>(gradients.camera), stream);
   }
 }
 

@@ -11,78 +11,8 @@ namespace dsmoe {
 namespace binding {
 namespace {
 
-std::string dtype_name(at::ScalarType type) {
-  switch (type) {
-    case at::kHalf:
-      return "float16";
-    case at::kBFloat16:
-      return "bfloat16";
-    case at::kFloat:
-      return "float32";
-    case at::kDouble:
-      return "float64";
-    case at::kInt:
-      return "int32";
-    case at::kLong:
-      return "int64";
-    default:
-      return c10::toString(type);
-  }
-}
-
-// One size of an expected shape: a number, or a letter (or -1) for any.
-struct Size {
-  Size(int64_t size) : size(size), letter(size < 0 ? "any" : nullptr) {}
-  Size(const char* letter) : size(-1), letter(letter) {}
-  int64_t size;
-  const char* letter;
-};
-using Shape = std::vector<Size>;
-
-std::string to_string(const Shape& shape) {
-  std::ostringstream out;
-  for (size_t i = 0; i < shape.size(); ++i) {
-    out << (i == 0 ? "[" : ", ");
-    if (shape[i].letter != nullptr) {
-      out << shape[i].letter;
-    } else {
-      out << shape[i].size;
-    }
-  }
-  out << "]";
-  return out.str();
-}
-
-bool matches(const at::Tensor& tensor, const Shape& shape) {
-  if (tensor.dim() != static_cast<int64_t>(shape.size())) return false;
-  for (size_t i = 0; i < shape.size(); ++i) {
-    if (shape[i].letter == nullptr && tensor.size(i) != shape[i].size) return false;
-  }
-  return true;
-}
-
-void check_shape(const char* function, const char* name, const at::Tensor& tensor, const Shape& shape) {
-  TORCH_CHECK_VALUE(matches(tensor, shape), function, ": ", name, " has shape ", tensor.sizes(), "; it must be ",
-                    to_string(shape));
-}
-
 void check_shape(Input input, const Inputs& inputs, const Shape& shape) {
   if (inputs[input].defined()) check_shape("rasterize", kInputNames[input], inputs[input], shape);
-}
-
-void check_real(const char* function, const char* name, const at::Tensor& tensor) {
-  const at::ScalarType type = tensor.scalar_type();
-  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, function, ": ", name, " is ", dtype_name(type),
-                   "; it must be float32 or float64: cast it, for instance with ", name, ".float()");
-}
-
-void check_like(const char* function, const char* name, const at::Tensor& tensor, const char* other_name,
-                const at::Tensor& other) {
-  TORCH_CHECK_TYPE(tensor.scalar_type() == other.scalar_type(), function, ": ", name, " is ",
-                   dtype_name(tensor.scalar_type()), "; it must be ", dtype_name(other.scalar_type()), ", as ",
-                   other_name, " is");
-  TORCH_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
-                   "; it must be on ", other.device(), ", as ", other_name, " is");
 }
 
 void check_either(bool first, bool second, const char* names) {
@@ -177,7 +107,9 @@ void check_options(const char* function, const Options& options) {
 void check_arguments(const Inputs& inputs, const Options& options) {
   check_real("rasterize", "means3D", inputs[kMeans3D]);
   for (int i = 0; i < kNumInputs; ++i) {
-    if (inputs[i].defined()) check_like("rasterize", kInputNames[i], inputs[i], "means3D", inputs[kMeans3D]);
+    if (!inputs[i].defined()) continue;
+    check_like("rasterize", kInputNames[i], inputs[i], "means3D", inputs[kMeans3D]);
+    refuse_tangent("rasterize", inputs[i]);
   }
   check_options("rasterize", options);
   check_present(inputs);
@@ -195,6 +127,7 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
     check_result(function, kImageNames[i], images[i], shape, i == kRadii ? at::kInt : like.scalar_type(),
                  like.device());
     if (!image_gradients[i].defined()) continue;
+    refuse_tangent(function, image_gradients[i]);
     const std::string name = std::string("dL_d") + kImageNames[i];
     check_like(function, name.c_str(), image_gradients[i], "means3D", like);
     check_shape(function, name.c_str(), image_gradients[i], {shape.begin(), shape.end()});

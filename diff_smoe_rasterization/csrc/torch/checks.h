@@ -7,6 +7,7 @@
 #include <type_traits>
 #include <vector>
 
+#include "check_tensor.h"
 #include "tensors.h"
 
 namespace dsmoe {

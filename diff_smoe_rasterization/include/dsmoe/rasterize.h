@@ -21,7 +21,7 @@
 #include <memory>
 #include <vector>
 
-#include "dsmoe/memory.h"
+#include "dsmoe/allocator.h"
 #include "dsmoe/params.h"
 
 namespace dsmoe {

@@ -20,7 +20,7 @@
 #include <type_traits>
 #include <vector>
 
-#include "dsmoe/memory.h"
+#include "dsmoe/allocator.h"
 #include "dsmoe/params.h"
 
 using cudaStream_t = struct CUstream_st*;  // as CUDA's own headers have it, which callers without CUDA lack
