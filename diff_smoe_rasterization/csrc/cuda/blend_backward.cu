@@ -293,17 +293,19 @@ __global__ void __launch_bounds__(kWarpsPerTile* kWarp, sizeof(S) == 4 && kFeatu
 
 }  // namespace
 
-template <class S>
-void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                    const SavedForward<S>& saved, const ImageOutputs<S>& images,
-                    const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
-                    Scratch& scratch, unsigned long long* pairs, cudaStream_t stream) {
+template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work) {
+  const DeviceCamera<S>& camera = frame.camera;
+  const RasterConfig<S>& config = frame.config;
+  const SavedForward<S>& saved = frame.saved;
+  S* dL_dbackground = pass.gradients.inputs.background;
+  Scratch& scratch = *work.scratch;
+  const cudaStream_t stream = work.stream;
   const int64_t tiles = num_tiles(camera.width, camera.height);
   const bool known = sizeof(S) == 4 && config.num_features() == 3;
-  BackwardArguments<S> arguments{blend_arguments(num_gaussians, camera, config, saved, images, pairs)};
-  arguments.dL_dimages = image_gradients;
-  arguments.dL_dgaussians = dL_dgaussians;
-  arguments.slots = slots;
+  BackwardArguments<S> arguments{blend_arguments(frame, work)};
+  arguments.dL_dimages = pass.gradients.images;
+  arguments.dL_dgaussians = pass.dL_dgaussians;
+  arguments.slots = pass.slots;
   arguments.num_features = config.num_features();
   arguments.tiles = static_cast<int>(tiles);
   const int64_t blocks = tiles + (known && saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0);
@@ -324,10 +326,7 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
   }
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                    \
-  template void blend_backward(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
-                               const ImageOutputs<S>&, const ImageGradients<S>&, S*, S*, S*, Scratch&,          \
-                               unsigned long long*, cudaStream_t);
+#define DSMOE_INSTANTIATE(S) template void blend_backward(const Frame<S>&, const BackwardPass<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

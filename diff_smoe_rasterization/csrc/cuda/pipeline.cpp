@@ -43,6 +43,11 @@ template <class T> T read(const T* number, const char* what, cudaStream_t stream
   return value;
 }
 
+// Adds the pairs that were counted. Waits for them.
+void add_pairs(const Work& work, int64_t* sum) {
+  if (sum != nullptr) *sum += static_cast<int64_t>(read(work.pairs, "counting pairs", work.stream));
+}
+
 template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
   int device = 0;
   check(cudaGetDevice(&device), "asking for the device");
@@ -52,21 +57,19 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
 
 // For how many instances there will be room.
 template <class S>
-int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, Allocator& memory) {
+int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
   const int64_t likely = InstanceCapacities::shared().likely(key);
   if (is_capturing(run.stream)) return likely < 0 ? 8 * frame.inputs.num_gaussians + 1024 : likely;
   if (likely >= 0 && !run.deterministic) return likely;
-  count_instances(frame.inputs.num_gaussians, frame.camera, frame.config, frame.saved, frame.images.radii, memory,
-                  run.stream);
+  count_instances(frame, work);
   return read(frame.saved.num_instances, "projecting Gaussians", run.stream);
 }
 
 }  // namespace
 
 template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory) {
-  const auto& inputs = frame.inputs;
   auto& saved = frame.saved;
-  const int64_t count = inputs.num_gaussians;
+  Work work = {run.stream, &memory};
   EventClock clock(run.times, run.stream);
 
   SavedSizes sizes = saved_sizes(frame, run);
@@ -75,14 +78,14 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
   allocate_saved(saved, sizes, memory);
   complete(saved, sizes);
   const DepthKeys<S> keys = depth_keys(frame, memory);
-  project(inputs, frame.camera, frame.config, saved, frame.images, keys, run.stream);
+  project(frame, keys, work);
   clock.end(&StageTimes::project);
-  if (keys.depths != nullptr) sort_by_depth(count, keys, saved.order, memory, run.stream);
+  if (keys.depths != nullptr) sort_by_depth(frame, keys, work);
   clock.end(&StageTimes::sort);
   memory.release();
 
   const auto key = capacity_key(frame);
-  sizes.capacity = choose_capacity(frame, key, run, memory);
+  sizes.capacity = choose_capacity(frame, key, run, work);
   memory.release();
   if (run.deterministic && sizes.capacity > std::numeric_limits<uint32_t>::max()) {
     throw std::overflow_error("rasterize: " + std::to_string(sizes.capacity) +
@@ -91,16 +94,16 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
   }
   allocate_saved(saved, sizes, memory);
   complete(saved, sizes);
-  bin(count, frame.camera, frame.config, saved, frame.images.radii, memory, run.stream);
+  bin(frame, work);
   memory.release();
   InstanceCapacities::shared().learn(key, saved.num_instances, run.stream);
   clock.end(&StageTimes::bin);
 
-  auto* pairs = run.times != nullptr ? allocate_zeros<unsigned long long>(memory, 1, run.stream) : nullptr;
-  blend(count, frame.camera, frame.config, saved, frame.images, pairs, run.stream);
+  if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);
+  blend(frame, work);
   clock.end(&StageTimes::blend);
   clock.finish();
-  if (pairs != nullptr) run.times->forward_pairs += static_cast<int64_t>(read(pairs, "counting pairs", run.stream));
+  add_pairs(work, run.times != nullptr ? &run.times->forward_pairs : nullptr);
   memory.release();
 }
 
@@ -108,32 +111,32 @@ template <class S>
 void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory) {
   const int64_t count = frame.inputs.num_gaussians;
   const int64_t record = kNumGateMoments + frame.config.num_features();
-  auto* pairs = run.times != nullptr ? allocate_zeros<unsigned long long>(memory, 1, run.stream) : nullptr;
+  Work work = {run.stream, &memory};
+  if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);
   EventClock clock(run.times, run.stream);
-  S* dL_dgaussians = allocate_zeros<S>(memory, count * record, run.stream);
-  S* slots = nullptr;
+  BackwardPass<S> pass;
+  pass.gradients = gradients;
+  pass.dL_dgaussians = allocate_zeros<S>(memory, count * record, run.stream);
   if (run.deterministic) {
-    slots = allocate_zeros<S>(memory, frame.saved.capacity * kSlotsPerInstance * record, run.stream);
+    pass.slots = allocate_zeros<S>(memory, frame.saved.capacity * kSlotsPerInstance * record, run.stream);
   }
-  blend_backward(count, frame.camera, frame.config, frame.saved, frame.images, gradients.images, dL_dgaussians, slots,
-                 gradients.inputs.background, memory, pairs, run.stream);
+  blend_backward(frame, pass, work);
   clock.end(&StageTimes::blend_backward);
-  project_backward(frame.inputs, frame.camera, frame.config, frame.saved, frame.images.radii, dL_dgaussians, slots,
-                   gradients.inputs, memory, run.stream);
+  project_backward(frame, pass, work);
   clock.end(&StageTimes::project_backward);
   clock.finish();
-  if (pairs != nullptr) run.times->backward_pairs += static_cast<int64_t>(read(pairs, "counting pairs", run.stream));
+  add_pairs(work, run.times != nullptr ? &run.times->backward_pairs : nullptr);
   memory.release();
 }
 
 template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory) {
   const int64_t count = frame.inputs.num_gaussians;
-  SavedForward<S> unused;
-  unused.projected = allocate<ProjectedGaussian<S>>(memory, count);
-  unused.features = allocate<S>(memory, count * feature_stride(frame.config.num_features()));
+  Frame<S> projected = frame;
+  projected.saved.projected = allocate<ProjectedGaussian<S>>(memory, count);
+  projected.saved.features = allocate<S>(memory, count * feature_stride(frame.config.num_features()));
   DepthKeys<S> keys;
   keys.gaussians = allocate<int32_t>(memory, count);
-  project(frame.inputs, frame.camera, frame.config, unused, frame.images, keys, run.stream);
+  project(projected, keys, {run.stream, &memory});
   memory.release();
 }
 

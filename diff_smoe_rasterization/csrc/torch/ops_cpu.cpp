@@ -71,18 +71,19 @@ struct Cpu {
     SavedSizes sizes = cpu::saved_sizes(own);
     sizes.num_features = -1;
     own.saved = unpack<S>("contributions", saved, sizes, radii.device());
-    cpu::contributions(own.inputs.num_gaussians, own.camera.width, own.camera.height, own.config, own.saved,
-                       data<S>(pixel_weights), sums);
+    cpu::contributions(own, {data<S>(pixel_weights), sums});
   }
 
   static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {
     const at::Tensor visible = at::empty({positions.size(0)}, at::kBool);
     dispatch(positions, [&](auto zero) {
       using S = decltype(zero);
-      Camera<S> camera;
-      std::copy_n(view.data_ptr<S>(), 16, camera.view);
-      camera.near = static_cast<float>(near);
-      cpu::mark_visible(positions.size(0), positions.data_ptr<S>(), camera, visible.data_ptr<bool>());
+      cpu::Frame<S> frame;
+      frame.inputs.num_gaussians = positions.size(0);
+      frame.inputs.means3D = positions.data_ptr<S>();
+      std::copy_n(view.data_ptr<S>(), 16, frame.camera.view);
+      frame.camera.near = static_cast<float>(near);
+      cpu::mark_visible(frame, visible.data_ptr<bool>());
     });
     return visible;
   }

@@ -82,16 +82,19 @@ struct Cuda {
     auto sizes = cuda::saved_sizes(own, how);
     sizes.num_features = -1;
     own.saved = unpack<S>("contributions", saved, sizes, radii.device());
-    cuda::contributions(own.inputs.num_gaussians, own.camera.width, own.camera.height, own.config, own.saved,
-                        own.images, data<S>(pixel_weights), sums, how.stream);
+    cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream});
   }
 
   static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {
     const at::Tensor visible = at::empty({positions.size(0)}, positions.options().dtype(at::kBool));
     dispatch(positions, [&](auto zero) {
       using S = decltype(zero);
-      cuda::mark_visible<S>(positions.size(0), positions.data_ptr<S>(), view.data_ptr<S>(), static_cast<float>(near),
-                            visible.data_ptr<bool>(), at::cuda::getCurrentCUDAStream());
+      cuda::Frame<S> frame;
+      frame.inputs.num_gaussians = positions.size(0);
+      frame.inputs.means3D = positions.data_ptr<S>();
+      frame.camera.view = view.data_ptr<S>();
+      frame.camera.near = static_cast<float>(near);
+      cuda::mark_visible(frame, visible.data_ptr<bool>(), {at::cuda::getCurrentCUDAStream()});
     });
     return visible;
   }

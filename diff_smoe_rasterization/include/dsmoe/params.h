@@ -123,6 +123,12 @@ template <class S> struct ContributionSums {
   S* distances = nullptr;      // [N] pixels
 };
 
+// From a map of the image to sums over the pixels of each Gaussian.
+template <class S> struct ContributionMap {
+  const S* pixel_weights = nullptr;  // [H, W]
+  ContributionSums<S> sums;
+};
+
 // Any of these may be null: that output was not used.
 template <class S> struct ImageGradients {
   const S* color = nullptr;          // [C, H, W]

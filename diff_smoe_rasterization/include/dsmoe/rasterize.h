@@ -5,14 +5,8 @@
 //     cpu::forward(frame, heap);                  // the images, and what the backward pass needs
 //     cpu::backward(frame, gradients);            // from gradients by the images to gradients by the inputs
 //
-// The stages that these two run can be called one by one. Then the caller allocates what `saved` points to:
-//
-//     int64_t count = cpu::project(inputs, camera, config, saved, images);   // projected, features, offsets, radii
-//     saved.instances = ... [count];
-//     cpu::bin(inputs.num_gaussians, camera, config, saved, images.radii);   // tile lists, front to back
-//     cpu::blend(camera, config, saved, images);                             // the images
-//     cpu::backward(inputs, camera, config, saved, images, image_gradients, gradients);
-//     cpu::contributions(inputs.num_gaussians, width, height, config, saved, pixel_weights, sums);  // of each Gaussian
+// The stages that these two run, in their order, are declared below and can be called one by one. Then the caller
+// allocates what `saved` points to.
 //
 // Results do not depend on config.num_threads, bit for bit.
 #pragma once
@@ -78,33 +72,24 @@ class Heap final : public Allocator {
   std::vector<std::unique_ptr<char[]>> blocks_;
 };
 
+// Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are.
 // Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
-template <class S>
-int64_t project(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
-                const SavedForward<S>& saved, const ImageOutputs<S>& images, StageTimes* times = nullptr);
+template <class S> int64_t project(const Frame<S>& frame, StageTimes* times = nullptr);
 
-template <class S>
-void bin(int64_t num_gaussians, const Camera<S>& camera, const RasterConfig<S>& config, const SavedForward<S>& saved,
-         const int32_t* radii, StageTimes* times = nullptr);
+// Fills saved.tile_offsets and saved.instances: the tile lists, front to back.
+template <class S> void bin(const Frame<S>& frame, StageTimes* times = nullptr);
 
-template <class S>
-void blend(const Camera<S>& camera, const RasterConfig<S>& config, const SavedForward<S>& saved,
-           const ImageOutputs<S>& images, StageTimes* times = nullptr);
+// Fills frame.images but the radii, and what saved has for each pixel.
+template <class S> void blend(const Frame<S>& frame, StageTimes* times = nullptr);
 
-template <class S>
-void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
-              const SavedForward<S>& saved, const ImageOutputs<S>& images, const ImageGradients<S>& image_gradients,
-              const GaussianGradients<S>& gradients, StageTimes* times = nullptr);
+// Walks the tile lists once more, and sums what the pixels of each Gaussian say. Of the frame it reads the number of
+// Gaussians, the image's size, of config the mode, alpha_min, the background's gate and num_threads, and of saved
+// neither features nor images but last_contributor.
+template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map);
 
-// Walks the tile lists once more, and sums what the pixels of each Gaussian say. pixel_weights: [H, W]. Of config it
-// reads the mode, alpha_min, the background's gate and num_threads; of saved neither features nor images but
-// last_contributor.
-template <class S>
-void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
-                   const SavedForward<S>& saved, const S* pixel_weights, const ContributionSums<S>& sums);
-
-// Marks the Gaussians in front of the near plane. visible: [N].
-template <class S> void mark_visible(int64_t num_gaussians, const S* means3D, const Camera<S>& camera, bool* visible);
+// Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
+// visible: [N].
+template <class S> void mark_visible(const Frame<S>& frame, bool* visible);
 
 // The first Gaussian with an attribute that is NaN or infinite, or -1.
 template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int num_channels);

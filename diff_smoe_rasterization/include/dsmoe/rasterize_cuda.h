@@ -179,59 +179,54 @@ template <class S> struct DepthKeys {
 // culled ones keep their places.
 bool needs_depth_order(BlendMode mode);
 
-// Fills saved.projected, saved.features, images.radii and keys.
-template <class S>
-void project(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-             const SavedForward<S>& saved, const ImageOutputs<S>& images, const DepthKeys<S>& keys,
-             cudaStream_t stream);
+// How a stage runs.
+struct Work {
+  cudaStream_t stream = nullptr;
+  Scratch* scratch = nullptr;           // for memory between its kernels
+  unsigned long long* pairs = nullptr;  // in device memory; (Gaussian, pixel) pairs evaluated are added to it; or null
+};
 
-// Fills order [N].
-template <class S>
-void sort_by_depth(int64_t num_gaussians, const DepthKeys<S>& keys, int32_t* order, Scratch& scratch,
-                   cudaStream_t stream);
+// Fills frame.saved.projected, frame.saved.features, frame.images.radii and keys.
+template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
 
-// Fills saved.num_instances alone, for a caller that wants exactly as much memory as is needed.
-template <class S>
-void count_instances(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                     const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream);
+// Fills frame.saved.order.
+template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
 
-// Fills saved.num_instances, instances, tile_offsets and slot_ranges, and empties segment_queue.
-template <class S>
-void bin(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-         const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream);
+// Fills only frame.saved.num_instances, for a caller that wants exactly as much memory as is needed.
+template <class S> void count_instances(const Frame<S>& frame, const Work& work);
 
-// pairs: where not null, the number of (Gaussian, pixel) pairs that were evaluated is added to it.
-template <class S>
-void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-           const SavedForward<S>& saved, const ImageOutputs<S>& images, unsigned long long* pairs, cudaStream_t stream);
+// Fills saved.num_instances, instances, tile_offsets and slot_ranges of the frame, and empties segment_queue.
+template <class S> void bin(const Frame<S>& frame, const Work& work);
 
-// From image gradients to one record per Gaussian: the sums over its pixels, [N, kNumGateMoments + F], which must be
-// zero before. slots: [capacity, kSlotsPerInstance, kNumGateMoments + F], also zero, which take the place of the
-// records where the instances fit; or null. dL_dbackground: [C + 1], or null. pairs: as above.
-template <class S>
-void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                    const SavedForward<S>& saved, const ImageOutputs<S>& images,
-                    const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
-                    Scratch& scratch, unsigned long long* pairs, cudaStream_t stream);
+// Fills frame.images but the radii, and what saved has for each pixel.
+template <class S> void blend(const Frame<S>& frame, const Work& work);
+
 constexpr int kSlotsPerInstance = 4;  // one for each quarter of a tile
 
-// From the records to the gradients of every input.
-template <class S>
-void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                      const SavedForward<S>& saved, const int32_t* radii, const S* dL_dgaussians, const S* slots,
-                      const GaussianGradients<S>& gradients, Scratch& scratch, cudaStream_t stream);
+// What goes through both stages of a backward pass.
+template <class S> struct BackwardPass {
+  Gradients<S> gradients;      // given by the images, wanted by the inputs
+  S* dL_dgaussians = nullptr;  // [N, kNumGateMoments + F] a Gaussian's record: the sums over its pixels; zero before
+  // [capacity, kSlotsPerInstance, kNumGateMoments + F], zero before, in place of the records where the instances fit;
+  // or null.
+  S* slots = nullptr;
+};
+
+// From image gradients to the records, and to the gradient by the background.
+template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
+
+// From the records to the gradients of every other input.
+template <class S> void project_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
-// may differ in their last digits from call to call. pixel_weights: [H, W]. Of config it reads the mode, alpha_min and
-// the background's gate; of saved neither features nor images but last_contributor; of images the radii.
-template <class S>
-void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
-                   const SavedForward<S>& saved, const ImageOutputs<S>& images, const S* pixel_weights,
-                   const ContributionSums<S>& sums, cudaStream_t stream);
+// may differ in their last digits from call to call. Of the frame it reads the number of Gaussians, the image's size,
+// of config the mode, alpha_min and the background's gate, of images the radii, and of saved neither features nor
+// images but last_contributor.
+template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work);
 
-// Marks the Gaussians in front of the near plane. visible: [N].
-template <class S>
-void mark_visible(int64_t num_gaussians, const S* means3D, const S* view, S near, bool* visible, cudaStream_t stream);
+// Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
+// visible: [N].
+template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work);
 
 }  // namespace cuda
 }  // namespace dsmoe
