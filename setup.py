@@ -128,7 +128,7 @@ def extension():
     sources = read_sources()
     without_cuda = reasons_against_cuda(sources["cuda"], torch, cpp_extension.CUDA_HOME)
     core = compiled_core(torch)
-    groups = ([] if core else ["core", "io"]) + ["torch"] + ([] if without_cuda else ["cuda"])
+    groups = ([] if core else ["core", "io"]) + ["torch"] + ([] if without_cuda else ["cuda", "torch_cuda"])
     flags = sources["flags"] + ["-g0", "-fvisibility=hidden", "-pthread"]
     if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
         flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need

@@ -57,7 +57,7 @@ def per_unit(counts: Counts, kept) -> Dict[str, float]:
     for shape, size in kept:
         if shape[0] == counts.instances:
             by_unit["tile instance"] += size / counts.instances
-        elif shape[0] in (counts.gaussians, counts.gaussians + 1):
+        elif shape[0] in (counts.gaussians, counts.gaussians + 1, 3 * counts.gaussians):  # three features side by side
             by_unit["Gaussian"] += size / counts.gaussians
         elif int(np.prod(shape)) % counts.pixels == 0:
             by_unit["pixel"] += size / counts.pixels

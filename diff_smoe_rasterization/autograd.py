@@ -11,15 +11,22 @@ import contextlib
 import torch
 from torch.autograd import forward_ad
 
-from .extension import _C  # noqa: F401  (loading it registers the ops)
+from .extension import _C  # loading it registers the ops
 
 _OPS = torch.ops.diff_smoe_rasterization
 _CAN_REGISTER = hasattr(torch.library, "register_autograd")
-_NUM_INPUTS = 14  # tensors before the options
-_NUM_OPTIONS = 16  # options that the backward op takes too
-_NUM_IMAGES = 5  # results that are the caller's: color, radii, gate_sum, depth, inverse_depth
-_RADII, _DEPTH = 1, 3
-_BLEND_MODE = _NUM_INPUTS + 9  # among the op's arguments
+
+INPUTS, IMAGES = _C.inputs, _C.images
+"""The names of the op's tensors, and of the images among its results. csrc/torch/fields.h lists them."""
+
+_PYTHON_TYPES = {"SymInt": int, "int": int, "float": float, "bool": bool}
+OPTIONS = {name: _PYTHON_TYPES[kind] for name, kind in _C.options.items()}
+"""The op's other arguments with their types, in order: what `csrc/torch/fields.h` lists."""
+
+_NUM_INPUTS, _NUM_IMAGES = len(INPUTS), len(IMAGES)
+_RADII, _DEPTH = IMAGES.index("radii"), IMAGES.index("depth")
+_BLEND_MODE = list(OPTIONS).index("blend_mode")
+_FOR_BACKWARD = list(OPTIONS).index("for_backward")
 _ALPHA = 0  # BLEND_MODES.index("alpha")
 
 
@@ -41,34 +48,38 @@ def refuse_forward_mode(function, values):
                                       "are not implemented; take those of backward mode (torch.autograd.grad)")
 
 
-def _remember(ctx, inputs, output):
+def _remember(ctx, inputs, options, radii):
     """Notes what is no tensor, and what needs no gradient. Returns the tensors that were given."""
     ctx.set_materialize_grads(False)
-    ctx.mark_non_differentiable(output[_RADII], *output[_NUM_IMAGES:])
-    ctx.options = inputs[_NUM_INPUTS:_NUM_INPUTS + _NUM_OPTIONS]
-    ctx.present = [tensor is not None for tensor in inputs[:_NUM_INPUTS]]
-    return [tensor for tensor in inputs[:_NUM_INPUTS] if tensor is not None]
+    ctx.mark_non_differentiable(radii)
+    ctx.options = options
+    ctx.present = [tensor is not None for tensor in inputs]
+    return [tensor for tensor in inputs if tensor is not None]
 
 
 def _keep(ctx, inputs, output):
     """Keeps what the backward pass needs. The images are the caller's to edit in place, so they are copied."""
-    images = [image if i == _RADII else image.clone() for i, image in enumerate(output[:_NUM_IMAGES])]
-    ctx.save_for_backward(*_remember(ctx, inputs, output), *images, *output[_NUM_IMAGES:])
+    *images, saved = output
+    given = _remember(ctx, inputs[:_NUM_INPUTS], inputs[_NUM_INPUTS:], images[_RADII])
+    ctx.mark_non_differentiable(images[_RADII], *saved)
+    images = [image if i == _RADII else image.clone() for i, image in enumerate(images)]
+    ctx.save_for_backward(*given, *images, *saved)
 
 
-def _input_gradients(ctx, gradients, outputs, inputs, op):
-    wanted = list(ctx.needs_input_grad[:_NUM_INPUTS])
+def _input_gradients(ctx, wanted, gradients, inputs, images, saved, op):
+    """Returns a gradient for each input, None where it is not wanted."""
     image_gradients = [gradient for i, gradient in enumerate(gradients[:_NUM_IMAGES]) if i != _RADII]
-    refuse_forward_mode("rasterize", [*gradients, *inputs])
-    results = iter(op(*image_gradients, inputs, ctx.present, outputs, *ctx.options, wanted))
-    no_tensors = len(ctx.needs_input_grad) - _NUM_INPUTS
-    return tuple(next(results) if want else None for want in wanted) + (None,) * no_tensors
+    refuse_forward_mode("rasterize", [*image_gradients, *inputs])
+    results = iter(op(*image_gradients, inputs, ctx.present, images, saved, *ctx.options, wanted))
+    return [next(results) if want else None for want in wanted]
 
 
 def _backward(ctx, *gradients):
-    saved = list(ctx.saved_tensors)
-    count = sum(ctx.present)
-    return _input_gradients(ctx, gradients, saved[count:], saved[:count], _OPS.rasterize_backward)
+    kept, count = list(ctx.saved_tensors), sum(ctx.present)
+    inputs, images, saved = kept[:count], kept[count:count + _NUM_IMAGES], kept[count + _NUM_IMAGES:]
+    by_input = _input_gradients(ctx, list(ctx.needs_input_grad[:_NUM_INPUTS]), gradients, inputs, images, saved,
+                                _OPS.rasterize_backward)
+    return (*by_input, *(None for _ in OPTIONS))
 
 
 def _refuse_second_derivative(ctx, *gradients):
@@ -80,98 +91,88 @@ class _Rasterize(torch.autograd.Function):
     """The same formula for eager calls: nothing between Python and the kernels that they do not need."""
 
     @staticmethod
-    def forward(ctx, *inputs):
+    def forward(ctx, options, *inputs):
         with _below_autograd():
-            output = _OPS.rasterize.default(*inputs)
+            *images, saved = _OPS.rasterize.default(*inputs, *options)
         # In `alpha` mode the backward pass reads the images for an expected depth alone; else the caller may edit them.
-        read = inputs[_BLEND_MODE] != _ALPHA or output[_DEPTH].numel() > 0
+        read = options[_BLEND_MODE] != _ALPHA or images[_DEPTH].numel() > 0
         ctx.images = [image.clone() if read and image.numel() > 0 else image.detach()
-                      for i, image in enumerate(output[:_NUM_IMAGES]) if i != _RADII]
-        ctx.save_for_backward(*_remember(ctx, inputs, output), output[_RADII], *output[_NUM_IMAGES:])
-        return output
+                      for i, image in enumerate(images) if i != _RADII]
+        given = _remember(ctx, inputs, options, images[_RADII])
+        ctx.save_for_backward(*given, images[_RADII], *saved)
+        return (*images, saved)
 
     def backward(ctx, *gradients):
-        saved = list(ctx.saved_tensors)
-        count = sum(ctx.present)
-        radii, *internal = saved[count:]
-        outputs = [*ctx.images[:_RADII], radii, *ctx.images[_RADII:], *internal]
+        kept, count = list(ctx.saved_tensors), sum(ctx.present)
+        images = [*ctx.images[:_RADII], kept[count], *ctx.images[_RADII:]]
         # Under create_graph=True the op itself is called, which refuses to be differentiated when somebody tries.
         with contextlib.nullcontext() if torch.is_grad_enabled() else _below_autograd():
-            return _input_gradients(ctx, gradients, outputs, saved[:count], _OPS.rasterize_backward.default)
+            return (None, *_input_gradients(ctx, list(ctx.needs_input_grad[1:]), gradients, kept[:count], images,
+                                            kept[count + 1:], _OPS.rasterize_backward.default))
 
     backward = staticmethod(backward if _CAN_REGISTER else torch.autograd.function.once_differentiable(backward))
 
 
-def rasterize_op(*inputs):
-    """Calls the op `rasterize` differentiably. Arguments and results: csrc/torch/schema.cpp."""
+def rasterize_op(inputs, options):
+    """Calls the op `rasterize` differentiably. Returns the images of IMAGES, and the list of what it saved.
+
+    inputs: a tensor or None for each of INPUTS. options: a value for each of OPTIONS; the last, `for_backward`, is left
+    out.
+    """
     refuse_forward_mode("rasterize", inputs)
     if _CAN_REGISTER and torch.compiler.is_compiling():
-        return _OPS.rasterize(*inputs, torch.is_grad_enabled())  # for_backward
-    if torch.is_grad_enabled() and any(isinstance(value, torch.Tensor) and value.requires_grad for value in inputs):
-        return _Rasterize.apply(*inputs)
+        return _OPS.rasterize(*inputs, *options, torch.is_grad_enabled())
+    if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs):
+        return _Rasterize.apply((*options, True), *inputs)
     with _below_autograd():
-        return _OPS.rasterize.default(*inputs, for_backward=False)
+        return _OPS.rasterize.default(*inputs, *options, False)
 
 
-def _fake_rasterize(means3D, means2D, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-                    viewmatrix, projmatrix, campos, background_gate, image_height, image_width, tanfovx, tanfovy,
-                    scale_modifier, near, alpha_min, fixed_background_gate, sh_degree, blend_mode, antialiasing, depth,
-                    inverse_depth, deterministic, debug, clamp_color, strict, prefiltered, for_backward=True):
-    """The results' shapes and types, as csrc/torch/tensors.cpp allocates them."""
-    count = means3D.shape[0]
-    channels = 3 if colors_precomp is None else colors_precomp.shape[1]
-    tile = _C.constants["tile_size"]
-    tiles = ((image_width + tile - 1) // tile) * ((image_height + tile - 1) // tile)
-    num_instances = torch.library.get_ctx().new_dynamic_size()
-    num_features = channels + int(depth) + int(inverse_depth)
-    if means3D.device.type == "cuda":
-        feature_row, num_tile_offsets, instance_row, in_order = (num_features + 3) // 4 * 4, tiles + 2, 1, count
-        instance_offsets, segments, segment_queue = (0,), (0,), (0,)
-        if means3D.dtype == torch.float32 and num_features == 3:
-            rows = num_instances // _C.constants["segment_length"] + 1 if for_backward else 0
-            segments, segment_queue = (rows, 4 * tile * tile), (1 + 4 * rows if for_backward else 0, 2)
-        if deterministic:
-            instance_row, instance_offsets = 2, (count, 2)
-    else:
-        feature_row, num_tile_offsets, instance_row, in_order = num_features, tiles + 1, 2, 0
-        instance_offsets, segments, segment_queue = (count + 1,), (0,), (0,)
-
-    def image(wanted=True):
-        return means3D.new_empty((1, image_height, image_width) if wanted else (0,))
-
-    return (means3D.new_empty((channels, image_height, image_width)), means3D.new_empty((count,), dtype=torch.int32),
-            image(), image(depth), image(inverse_depth), means3D.new_empty((count, 8)),
-            means3D.new_empty((count, feature_row)), means3D.new_empty(instance_offsets, dtype=torch.int64),
-            means3D.new_empty((num_tile_offsets,), dtype=torch.int64),
-            means3D.new_empty((num_instances, instance_row), dtype=torch.int32),
-            means3D.new_empty((image_height, image_width)),
-            means3D.new_empty((image_height, image_width), dtype=torch.int32),
-            means3D.new_empty((in_order,), dtype=torch.int32), means3D.new_empty(segments),
-            means3D.new_empty(segment_queue, dtype=torch.int32))
+def _fake_rasterize(*arguments):
+    """The results' shapes and types. How much a backend saves, only its kernels know."""
+    given = dict(zip((*INPUTS, *OPTIONS), arguments))
+    means3D, colors = given["means3D"], given["colors_precomp"]
+    count, height, width = means3D.shape[0], given["image_height"], given["image_width"]
+    shapes = {"color": (3 if colors is None else colors.shape[1], height, width), "radii": (count,)}
+    images = []
+    for name in IMAGES:
+        wanted = given.get(name, True)  # the options say so of depth and inverse_depth
+        shape = shapes.get(name, (1, height, width)) if wanted else (0,)
+        images.append(means3D.new_empty(shape, dtype=torch.int32 if name == "radii" else means3D.dtype))
+    saved = []
+    for name, kind, columns in _C.saved["cuda" if means3D.device.type == "cuda" else "cpu"]:
+        rows = count if name == "projected" else torch.library.get_ctx().new_dynamic_size()
+        saved.append(means3D.new_empty((rows,) if columns == 1 else (rows, columns),
+                                       dtype=means3D.dtype if kind == "real" else getattr(torch, kind)))
+    return (*images, saved)
 
 
-def _fake_rasterize_backward(dL_dcolor, dL_dgate_sum, dL_ddepth, dL_dinverse_depth, inputs, present, outputs,
-                             *options_and_wanted):
+def _fake_radii(means3D, *others):
+    return means3D.new_empty((means3D.shape[0],), dtype=torch.int32)
+
+
+def _fake_rasterize_backward(dL_dcolor, dL_dgate_sum, dL_ddepth, dL_dinverse_depth, inputs, present, *others):
     given = iter(inputs)
     all_inputs = [next(given) if here else None for here in present]
-    return [tensor.new_empty(tensor.shape) for tensor, want in zip(all_inputs, options_and_wanted[-1]) if want]
+    return [tensor.new_empty(tensor.shape) for tensor, want in zip(all_inputs, others[-1]) if want]
 
 
 def _fake_mark_visible(positions, viewmatrix, near):
     return positions.new_empty((positions.shape[0],), dtype=torch.bool)
 
 
-def _fake_contributions(pixel_weights, radii, projected, *others):
+def _fake_contributions(pixel_weights, radii, *others):
     def sums():
-        return projected.new_empty((projected.shape[0],))
+        return pixel_weights.new_empty(radii.shape)
 
-    return sums(), radii.new_empty((projected.shape[0],)), sums(), sums()
+    return sums(), torch.empty_like(radii), sums(), sums()
 
 
 if _CAN_REGISTER:
     _NAME = "diff_smoe_rasterization::"
     torch.library.register_fake(_NAME + "rasterize", _fake_rasterize)
     torch.library.register_fake(_NAME + "rasterize_backward", _fake_rasterize_backward)
+    torch.library.register_fake(_NAME + "radii", _fake_radii)
     torch.library.register_fake(_NAME + "mark_visible", _fake_mark_visible)
     torch.library.register_fake(_NAME + "contributions", _fake_contributions)
     torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)

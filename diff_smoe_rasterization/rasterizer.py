@@ -5,7 +5,7 @@ from typing import Optional, Sequence, Tuple
 
 import torch
 
-from .autograd import rasterize_op
+from .autograd import INPUTS, OPTIONS, rasterize_op
 from .extension import BACKENDS, build_info
 from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 from .splats import Splats
@@ -44,8 +44,10 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
 
     On CUDA the value of a tensor background_gate is not checked: the host would have to wait for it.
     """
-    return _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scales, rotations, cov3D_precomp,
-                   outputs)[0]
+    inputs, options = _arguments(settings, outputs, means3D=means3D, means2D=means2D, opacities=opacities, dc=dc,
+                                 shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+                                 cov3D_precomp=cov3D_precomp)
+    return _rendering(rasterize_op(inputs, options)[:-1], outputs)
 
 
 def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
@@ -58,35 +60,58 @@ def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settin
 
     Arguments and errors are those of `rasterize`. Splats hold on to memory of the rendering as long as they live.
     """
-    rendering, saved = _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scales, rotations,
-                               cov3D_precomp, outputs)
-    return rendering, Splats(rendering.radii, saved, settings)
+    inputs, options = _arguments(settings, outputs, means3D=means3D, opacities=opacities, means2D=means2D,
+                                 dc=dc, shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+                                 cov3D_precomp=cov3D_precomp)
+    *images, saved = rasterize_op(inputs, options)
+    return _rendering(images, outputs), Splats(images[1], saved, inputs[-1], options)
 
 
-def _render(means3D, opacities, settings, means2D, dc, shs, colors_precomp, scales, rotations, cov3D_precomp, outputs):
-    """Returns the Rendering, and the results of the op that are no images: what it saved."""
+def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings,
+                  scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
+                  cov3D_precomp: Optional[torch.Tensor] = None) -> torch.Tensor:
+    """Returns the radii [N] int32 in pixels that `rasterize` would return for Gaussians of finite colours; blends none.
+
+    Arguments and errors are those of `rasterize`; there is no gradient.
+    """
+    # A radius depends neither on the opacity nor on the colour.
+    inputs, options = _arguments(settings._replace(bg=means3D.new_zeros(1)), (), means3D=means3D,
+                                 opacities=means3D.new_zeros(len(means3D)),
+                                 colors_precomp=means3D.new_zeros(len(means3D), 1), scales=scales,
+                                 rotations=rotations, cov3D_precomp=cov3D_precomp)
+    with torch.no_grad():
+        return torch.ops.diff_smoe_rasterization.radii(*inputs, *options, False)
+
+
+def _rendering(images, outputs):
+    color, radii, gate_sum, depth, inverse_depth = images
+    return Rendering(color, radii, alpha=gate_sum if "alpha" in outputs else None,
+                     depth=depth if "depth" in outputs else None,
+                     inverse_depth=inverse_depth if "inverse_depth" in outputs else None)
+
+
+def _arguments(settings, outputs, **tensors):
+    """Returns the tensors and the options of a rendering in the order of the op; all options but the last one."""
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     blend_mode, background_gate = resolve_blend(settings)
-    required, optional = _checks("rasterize", "means3D", means3D)
-    tensor_gate, fixed_gate = None, background_gate
+    required, optional = _checks("rasterize", "means3D", tensors["means3D"])
+    inputs = {name: required(name, tensors[name]) if name in ("means3D", "opacities") else optional(name, tensor)
+              for name, tensor in tensors.items()}
+    fixed_gate = background_gate
     if isinstance(background_gate, torch.Tensor):
-        tensor_gate, fixed_gate = required("background_gate", background_gate), 0.0
-    color, radii, gate_sum, depth, inverse_depth, *saved = rasterize_op(
-        means3D, optional("means2D", means2D), required("opacities", opacities), optional("dc", dc),
-        optional("shs", shs), optional("colors_precomp", colors_precomp), optional("scales", scales),
-        optional("rotations", rotations), optional("cov3D_precomp", cov3D_precomp), required("bg", settings.bg),
-        _without_batch(required("viewmatrix", settings.viewmatrix), 2),
-        _without_batch(required("projmatrix", settings.projmatrix), 2),
-        _without_batch(required("campos", settings.campos), 1), tensor_gate,
-        int(settings.image_height), int(settings.image_width), float(settings.tanfovx), float(settings.tanfovy),
-        float(settings.scale_modifier), float(settings.near), float(settings.alpha_min), fixed_gate,
-        int(settings.sh_degree), BLEND_MODES.index(blend_mode), bool(settings.antialiasing), "depth" in outputs,
-        "inverse_depth" in outputs, bool(settings.deterministic), bool(settings.debug), bool(settings.clamp_color),
-        bool(settings.strict), bool(settings.prefiltered))
-    return Rendering(color, radii, alpha=gate_sum if "alpha" in outputs else None,
-                     depth=depth if "depth" in outputs else None,
-                     inverse_depth=inverse_depth if "inverse_depth" in outputs else None), saved
+        inputs["background_gate"], fixed_gate = required("background_gate", background_gate), 0.0
+    inputs["bg"] = required("bg", settings.bg)
+    for name, dim in (("viewmatrix", 2), ("projmatrix", 2), ("campos", 1)):
+        inputs[name] = _without_batch(required(name, getattr(settings, name)), dim)
+    computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
+                "depth": "depth" in outputs, "inverse_depth": "inverse_depth" in outputs}
+    return ([inputs.get(name) for name in INPUTS],
+            [kind(computed[name] if name in computed else getattr(settings, name)) for name, kind in _GIVEN_OPTIONS])
+
+
+# All but for_backward, which `rasterize_op` decides.
+_GIVEN_OPTIONS = tuple(OPTIONS.items())[:-1]
 
 
 def _checks(function, first_name, first):

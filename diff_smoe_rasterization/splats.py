@@ -1,12 +1,12 @@
 """What one rendering knows of each Gaussian: its place on the image, and what its pixels say of it."""
 from __future__ import annotations
 
-from typing import Sequence
+from typing import Any, Optional, Sequence
 
 import torch
 
 from .extension import _C  # noqa: F401  (loading it registers the ops)
-from .settings import BLEND_MODES, Contributions, GaussianRasterizationSettings, resolve_blend
+from .settings import Contributions
 
 _OPS = torch.ops.diff_smoe_rasterization
 
@@ -17,15 +17,15 @@ class Splats:
     Nothing here has a gradient. What a culled Gaussian (radius 0) has is 0 everywhere.
     """
 
-    def __init__(self, radii: torch.Tensor, saved: Sequence[torch.Tensor], settings: GaussianRasterizationSettings):
-        """saved: the results of the op `rasterize` behind its images, in the order of csrc/torch/schema.cpp."""
-        (self._projected, _, self._instance_offsets, self._tile_offsets, self._instances, _, self._last_contributor,
-         self._order, *_) = (tensor.detach() for tensor in saved)
+    def __init__(self, radii: torch.Tensor, saved: Sequence[torch.Tensor], background_gate: Optional[torch.Tensor],
+                 options: Sequence[Any]):
+        """saved: what the op `rasterize` saved. background_gate, options: what it was given, for_backward left out."""
         self._radii = radii
-        blend_mode, gate = resolve_blend(settings)
+        self._saved = [tensor.detach() for tensor in saved]
+        self._projected = self._saved[0]
         # A tensor is copied: an optimizer may change it before anybody asks for contributions.
-        tensor_gate, fixed_gate = (gate.detach().clone(), 0.0) if isinstance(gate, torch.Tensor) else (None, gate)
-        self._blend = (tensor_gate, float(settings.alpha_min), fixed_gate, BLEND_MODES.index(blend_mode))
+        self._background_gate = None if background_gate is None else background_gate.detach().clone()
+        self._options = (*options, False)
 
     @property
     def centers(self) -> torch.Tensor:
@@ -48,9 +48,8 @@ class Splats:
         if not isinstance(pixel_weights, torch.Tensor):
             raise TypeError(f"contributions: pixel_weights is of type {type(pixel_weights).__name__}; it must be a "
                             "torch.Tensor")
-        return Contributions(*_OPS.contributions(
-            pixel_weights.detach(), self._radii, self._projected, self._instance_offsets, self._tile_offsets,
-            self._instances, self._last_contributor, self._order, *self._blend))
+        return Contributions(*_OPS.contributions(pixel_weights.detach(), self._radii, self._saved,
+                                                 self._background_gate, *self._options))
 
     def _of_visible(self, values: torch.Tensor) -> torch.Tensor:
         """Returns a copy with zeros for culled Gaussians, whose rows may hold anything."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 import torch
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, rasterize_gaussians
+from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize_gaussians
+from diff_smoe_rasterization.rasterizer import visible_radii
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -20,8 +21,4 @@ class GaussianRasterizer(diff_smoe_rasterization.GaussianRasterizer):
         taken as they are. Which radii are 0 depends on the blend mode: the anchors need that of their rendering.
         Raises ValueError or TypeError where arguments do not fit, as `rasterize` does.
         """
-        # A Gaussian's radius takes no part of its opacity, and without opacity no pixel looks at it.
-        transparent, color = means3D.new_zeros(len(means3D)), means3D.new_zeros(len(means3D), 1)
-        settings = self.raster_settings._replace(bg=means3D.new_zeros(1))
-        return rasterize(means3D, transparent, settings, colors_precomp=color, scales=scales, rotations=rotations,
-                         cov3D_precomp=cov3D_precomp).radii
+        return visible_radii(means3D, self.raster_settings, scales, rotations, cov3D_precomp)

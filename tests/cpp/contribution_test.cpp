@@ -47,17 +47,17 @@ template <class S> struct Sums {
 // Unwritten numbers are none that a sum is.
 template <class S> Sums<S> sums_of(const Scene<S>& scene, int num_threads) {
   Rendering<S> rendering = render(scene);
-  auto config = scene.raster_config();
-  config.num_threads = num_threads;
+  cpu::Frame<S> frame = frame_of(scene, rendering);
+  frame.config.num_threads = num_threads;
   std::vector<S> pixel_weights;
   for (int64_t pixel = 0; pixel < scene.pixels(); ++pixel) pixel_weights.push_back(brute_force_pixel_weight<S>(pixel));
   const S unwritten = S(-12345);
   Sums<S> out;
   for (auto* sum : {&out.pixel_weights, &out.blend_weights, &out.distances}) sum->resize(scene.count, unwritten);
   out.pixels.resize(scene.count, -1);
-  cpu::contributions(scene.count, scene.camera.width, scene.camera.height, config, rendering.saved(),
-                     pixel_weights.data(),
-                     {out.pixel_weights.data(), out.pixels.data(), out.blend_weights.data(), out.distances.data()});
+  cpu::contributions(frame,
+                     {pixel_weights.data(),
+                      {out.pixel_weights.data(), out.pixels.data(), out.blend_weights.data(), out.distances.data()}});
   return out;
 }
 

@@ -227,8 +227,7 @@ TYPED_TEST(RasterizeIn, GradientsMayBeAskedForOneByOne) {
   auto ask_for = [&](auto... members) {
     GaussianGradients<float> wanted;
     ((wanted.*members = everything.*members), ...);
-    cpu::backward(scene.inputs(), scene.camera, scene.raster_config(), rendering.saved(), rendering.images(),
-                  weights.gradients(), wanted);
+    cpu::backward(frame_of(scene, rendering), {weights.gradients(), wanted});
   };
   using G = GaussianGradients<float>;
   ask_for(&G::means3D), ask_for(&G::means2D), ask_for(&G::opacities), ask_for(&G::scales), ask_for(&G::rotations);
@@ -255,13 +254,13 @@ TYPED_TEST(RasterizeIn, AnAbsentImageGradientIsZero) {
 TEST(Rasterize, TheBackgroundsGateMayBeANumberOrLieInMemory) {
   const Scene<float> scene = in_mode(convert<float>(make_scene(31, 60, 37, 29)), BlendMode::kSmoe);
   Rendering<float> in_memory = render(scene);
-  RasterConfig<float> config = scene.raster_config();
-  config.background_gate = *config.background_gate_at;
-  ASSERT_GT(config.background_gate, 0);
-  config.background_gate_at = nullptr;
   Rendering<float> number = render(scene);
+  cpu::Frame<float> frame = frame_of(scene, number);
+  frame.config.background_gate = *frame.config.background_gate_at;
+  ASSERT_GT(frame.config.background_gate, 0);
+  frame.config.background_gate_at = nullptr;
   std::fill(number.color.begin(), number.color.end(), -1);
-  cpu::blend(scene.camera, config, number.saved(), number.images());
+  cpu::blend(frame);
   EXPECT_EQ(number.color, in_memory.color);
 }
 
@@ -437,22 +436,45 @@ TEST(Rasterize, SaysHowManyInstancesAreTooMany) {
   std::vector<float> features(3 * scene.count);
   std::vector<int64_t> offsets(scene.count + 1);
   std::vector<int32_t> radii(scene.count);
-  SavedForward<float> saved;
-  saved.projected = projected.data(), saved.features = features.data(), saved.instance_offsets = offsets.data();
-  ImageOutputs<float> images;
-  images.radii = radii.data();
+  cpu::Frame<float> frame;
+  frame.inputs = scene.inputs(), frame.camera = scene.camera, frame.config = scene.raster_config();
+  frame.saved.projected = projected.data(), frame.saved.features = features.data();
+  frame.saved.instance_offsets = offsets.data();
+  frame.images.radii = radii.data();
   try {
-    cpu::project(scene.inputs(), scene.camera, scene.raster_config(), saved, images);
+    cpu::project(frame);
     FAIL() << "nothing was thrown";
   } catch (const std::overflow_error& error) {
     EXPECT_NE(std::string(error.what()).find("2181038080 tile instances"), std::string::npos) << error.what();
   }
 }
 
+TYPED_TEST(RasterizeIn, ThePipelineDoesWhatItsStagesDo) {
+  const Scene<float> scene = in_mode(convert<float>(make_scene(37, 80, 37, 29)), TypeParam::value);
+  Rendering<float> stages = render(scene), whole(scene);
+  cpu::Frame<float> frame = frame_of(scene, whole);
+  cpu::Heap heap;
+  cpu::forward(frame, heap);
+  EXPECT_EQ(whole.color, stages.color);
+  EXPECT_EQ(whole.gate_sum, stages.gate_sum);
+  EXPECT_EQ(whole.radii, stages.radii);
+
+  const ImageWeights<float> weights(scene, 38);
+  SceneGradient<float> expected = render_backward(scene, stages, weights.gradients()), actual(scene);
+  cpu::backward(frame, {weights.gradients(), actual.gradients()});
+  EXPECT_EQ(actual.flat(), expected.flat());
+
+  std::fill(whole.radii.begin(), whole.radii.end(), -1);
+  cpu::radii(frame, heap);
+  EXPECT_EQ(whole.radii, stages.radii);
+}
+
 TEST(MarkVisible, IsTheNearPlaneTest) {
   const Scene<double> scene = make_scene(34, 200, 37, 29);
   const std::unique_ptr<bool[]> visible(new bool[scene.count]);
-  cpu::mark_visible(scene.count, scene.means3D.data(), scene.camera, visible.get());
+  cpu::Frame<double> frame;
+  frame.inputs = scene.inputs(), frame.camera = scene.camera;
+  cpu::mark_visible(frame, visible.get());
   int behind = 0;
   for (int64_t i = 0; i < scene.count; ++i) {
     double z = scene.camera.view[14];
@@ -477,7 +499,7 @@ TEST(StageTimes, CountThePairsThatWereEvaluated) {
   Scene<float> scene = convert<float>(make_scene(36, 60, 37, 29));
   Rendering<float> r = project_and_bin(scene);
   cpu::StageTimes times;
-  cpu::blend(scene.camera, scene.raster_config(), r.saved(), r.images(), &times);
+  cpu::blend(frame_of(scene, r), &times);
   // Whole packs of the rows that a footprint meets: at least the pairs that count before a pixel is full.
   int64_t seen = 0;
   for (const int32_t last : r.last_contributor) seen += last > 0;

@@ -179,21 +179,24 @@ template <class S> struct Rendering {
   }
   ImageOutputs<S> images() {
     return {color.data(), depth.empty() ? nullptr : depth.data(),
-            inverse_depth.empty() ? nullptr : inverse_depth.data(), radii.data()};
+            inverse_depth.empty() ? nullptr : inverse_depth.data(), radii.data(), gate_sum.data()};
   }
 };
 
+template <class S> cpu::Frame<S> frame_of(const Scene<S>& scene, Rendering<S>& rendering) {
+  return {scene.inputs(), scene.camera, scene.raster_config(), rendering.images(), rendering.saved()};
+}
+
 template <class S> Rendering<S> project_and_bin(const Scene<S>& scene) {
   Rendering<S> out(scene);
-  const auto config = scene.raster_config();
-  out.instances.resize(cpu::project(scene.inputs(), scene.camera, config, out.saved(), out.images()));
-  cpu::bin(scene.count, scene.camera, config, out.saved(), out.radii.data());
+  out.instances.resize(cpu::project(frame_of(scene, out)));
+  cpu::bin(frame_of(scene, out));
   return out;
 }
 
 template <class S> Rendering<S> render(const Scene<S>& scene) {
   Rendering<S> out = project_and_bin(scene);
-  cpu::blend(scene.camera, scene.raster_config(), out.saved(), out.images());
+  cpu::blend(frame_of(scene, out));
   return out;
 }
 
@@ -267,8 +270,7 @@ template <class S> struct SceneGradient {
 template <class S>
 SceneGradient<S> render_backward(const Scene<S>& scene, Rendering<S>& rendering, const ImageGradients<S>& weights) {
   SceneGradient<S> out(scene);
-  cpu::backward(scene.inputs(), scene.camera, scene.raster_config(), rendering.saved(), rendering.images(), weights,
-                out.gradients());
+  cpu::backward(frame_of(scene, rendering), {weights, out.gradients()});
   return out;
 }
 

@@ -173,3 +173,12 @@ def op_arguments(scene, op="rasterize", **others):
               "for_backward": True, **scene.inputs, **others}
     schema = getattr(torch.ops.diff_smoe_rasterization, op).default._schema
     return tuple(values.get(argument.name) for argument in schema.arguments)
+
+
+def op_results(scene, **others):
+    """Calls the op `rasterize` as `op_arguments` says. Returns its images and its saved tensors, each by name."""
+    from diff_smoe_rasterization.extension import _C
+
+    *images, saved = torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene, **others))
+    names = [name for name, _, _ in _C.saved[images[0].device.type]]
+    return dict(zip(_C.images, images)), dict(zip(names, saved))

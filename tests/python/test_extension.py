@@ -14,15 +14,15 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import op_arguments, random_scene, with_gate
+from scenes import op_arguments, op_results, random_scene, with_gate
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
+from diff_smoe_rasterization.extension import _C
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
 WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
-IMAGES = dict(color=0, gate_sum=2, depth=3, inverse_depth=4)  # which results of the op are differentiable images
-NUM_INPUTS = 14  # tensors among the arguments of the op
+DIFFERENTIABLE = ("color", "gate_sum", "depth", "inverse_depth")  # images of the op
 on_every_device = pytest.mark.usefixtures("device")
 
 
@@ -154,49 +154,57 @@ def test_radii_changed_in_place_before_backward_are_noticed(mode):
         rendering.color.sum().backward()
 
 
-def backward_arguments(mode):
-    """Returns the arguments of the op rasterize_backward, by position."""
+def backward_arguments(mode, **others):
+    """Returns the arguments of the op rasterize_backward by name."""
     scene = random_scene(mode, 20, 20, 18, degree=1, dtype=torch.float32)
-    arguments = op_arguments(scene)
-    tensors = arguments[:NUM_INPUTS]
-    results = torch.ops.diff_smoe_rasterization.rasterize(*arguments)
+    tensors = op_arguments(scene)[:len(_C.inputs)]
+    images, saved = op_results(scene)
     present = [tensor is not None for tensor in tensors]
-    image_gradients = {"dL_d" + name: random_normal(results[i].shape, i, torch.float32) for name, i in IMAGES.items()}
-    return list(op_arguments(scene, "rasterize_backward", **image_gradients, present=present, wanted=present,
-                             inputs=[tensor for tensor in tensors if tensor is not None], outputs=list(results)))
+    given = {"dL_d" + name: random_normal(images[name].shape, seed, torch.float32)
+             for seed, name in enumerate(DIFFERENTIABLE)}
+    given.update(inputs=[tensor for tensor in tensors if tensor is not None], images=list(images.values()),
+                 saved=list(saved.values()), present=present, wanted=present)
+    names = [argument.name for argument in torch.ops.diff_smoe_rasterization.rasterize_backward.default._schema.arguments]
+    return dict(zip(names, op_arguments(scene, "rasterize_backward", **given, **others)))
+
+
+def call_backward(arguments):
+    return torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments.values())
 
 
 @on_every_device
 @pytest.mark.parametrize("mode", ["smoe", "smoe_std", "smoe_learned_gate"])  # others have the same shapes
 @pytest.mark.skipif(not hasattr(torch.library, "opcheck"), reason=f"torch {torch.__version__} has no opcheck")
 def test_opcheck_of_rasterize_backward(mode):
-    torch.library.opcheck(torch.ops.diff_smoe_rasterization.rasterize_backward.default, tuple(backward_arguments(mode)))
+    torch.library.opcheck(torch.ops.diff_smoe_rasterization.rasterize_backward.default,
+                          tuple(backward_arguments(mode).values()))
 
 
-@pytest.mark.parametrize("result, name", list(enumerate([
-    "color", "radii", "gate_sum", "depth", "inverse_depth", "projected", "features", "instance_offsets", "tile_offsets",
-    "instances", "final_transmittance", "last_contributor"])))
-def test_the_backward_op_refuses_results_that_were_cut(result, name):
+@pytest.mark.parametrize("name", [*_C.images, *(name for name, _, _ in _C.saved["cpu"])])
+def test_the_backward_op_refuses_results_that_were_cut(name):
     arguments = backward_arguments("smoe")
-    arguments[6][result] = arguments[6][result][:-1]
+    results, names = ((arguments["images"], _C.images) if name in _C.images
+                      else (arguments["saved"], [name for name, _, _ in _C.saved["cpu"]]))
+    index = list(names).index(name)
+    results[index] = results[index][:-1]
     with pytest.raises(ValueError, match=rf"rasterize_backward: {name} has "):
-        torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+        call_backward(arguments)
 
 
 def test_the_backward_op_refuses_results_of_another_type():
     arguments = backward_arguments("smoe")
-    arguments[6][5] = arguments[6][5].double()
+    arguments["saved"][0] = arguments["saved"][0].double()
     with pytest.raises(TypeError, match="rasterize_backward: projected .*float32"):
-        torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+        call_backward(arguments)
 
 
 @on_every_device
-def test_the_backward_op_refuses_lists_of_the_wrong_length():
-    for position, name in ((4, "inputs"), (6, "outputs")):
-        arguments = backward_arguments("smoe")
-        arguments[position] = arguments[position][:-1]
-        with pytest.raises(ValueError, match=f"rasterize_backward: {name} has length"):
-            torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+@pytest.mark.parametrize("name", ["inputs", "present", "images", "saved", "wanted"])
+def test_the_backward_op_refuses_lists_of_the_wrong_length(name):
+    arguments = backward_arguments("smoe")
+    arguments[name] = arguments[name][:-1]
+    with pytest.raises(ValueError, match=f"rasterize_backward: {name} has length"):
+        call_backward(arguments)
 
 
 @on_every_device
@@ -204,21 +212,30 @@ def test_the_backward_op_refuses_lists_of_the_wrong_length():
                                        (-1, "campos")])
 def test_the_backward_op_refuses_absent_inputs(row, name):
     arguments = backward_arguments("smoe")
-    inputs, present = list(arguments[4]), list(arguments[5])
+    inputs, present = list(arguments["inputs"]), list(arguments["present"])
     given = [i for i, here in enumerate(present) if here and i != 1]  # without means2D, which may be absent
     del inputs[1]
     present[1] = present[given[row]] = False
     del inputs[row]
     with pytest.raises(ValueError, match=f"rasterize_backward: {name} is absent"):
-        torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments[:4], inputs, present, *arguments[6:])
+        call_backward({**arguments, "inputs": inputs, "present": present})
 
 
 @on_every_device
 def test_the_backward_op_refuses_gradients_of_absent_inputs():
     arguments = backward_arguments("smoe")
-    arguments[-1] = [True] * NUM_INPUTS
     with pytest.raises(ValueError, match="gradient of dc is wanted, but that input is absent"):
-        torch.ops.diff_smoe_rasterization.rasterize_backward(*arguments)
+        call_backward({**arguments, "wanted": [True] * len(_C.inputs)})
+
+
+@on_every_device
+@pytest.mark.parametrize("op", ["rasterize", "radii"])
+def test_the_raw_ops_refuse_colours_without_channels(op):
+    """On CUDA nothing would write what the backward pass reads."""
+    scene = random_scene("smoe", 20, 20, 18, channels=1, dtype=torch.float32)
+    arguments = op_arguments(scene, op, colors_precomp=torch.empty(20, 0), bg=torch.empty(0))
+    with pytest.raises(ValueError, match=r"colors_precomp has shape \[20, 0\]"):
+        getattr(torch.ops.diff_smoe_rasterization, op)(*arguments)
 
 
 @on_every_device

@@ -5,12 +5,11 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import gradients, op_arguments, random_scene
+from scenes import gradients, op_arguments, op_results, random_scene
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
-RESULTS = [result.name for result in torch.ops.diff_smoe_rasterization.rasterize.default._schema.returns]
 NUM_IMAGES = 5  # results of the op that are the caller's: color, radii, gate_sum, depth, inverse_depth
 
 pytestmark = [
@@ -79,6 +78,12 @@ def test_opcheck_of_rasterize_on_no_gaussians(mode):
     opcheck_rasterize(scene)
 
 
+@with_gate
+def test_opcheck_of_radii(mode):
+    scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
+    torch.library.opcheck(torch.ops.diff_smoe_rasterization.radii.default, op_arguments(scene, "radii"))
+
+
 def test_opcheck_of_mark_visible():
     scene = random_scene("alpha", 20, dtype=torch.float32)
     torch.library.opcheck(torch.ops.diff_smoe_rasterization.mark_visible.default,
@@ -88,9 +93,10 @@ def test_opcheck_of_mark_visible():
 @SHAPES
 def test_opcheck_of_contributions(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
-    saved = dict(zip(RESULTS, torch.ops.diff_smoe_rasterization.rasterize.default(*op_arguments(scene))))
+    images, saved = op_results(scene)
     op, weights = torch.ops.diff_smoe_rasterization.contributions.default, random_normal((18, 20), 1, torch.float32)
-    arguments = op_arguments(scene, "contributions", **saved, pixel_weights=weights)
+    arguments = op_arguments(scene, "contributions", radii=images["radii"], saved=list(saved.values()),
+                             pixel_weights=weights)
     # Sums by atomics differ in their last digits, which the last part of opcheck does not allow.
     parts = {} if weights.device.type == "cpu" else {
         "test_utils": ("test_schema", "test_autograd_registration", "test_faketensor")}

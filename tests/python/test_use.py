@@ -7,7 +7,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import gradients, random_scene
+from scenes import gradients, op_arguments, random_scene
 from torch.autograd import forward_ad
 
 from diff_smoe_rasterization import fused_ssim, rasterize
@@ -145,6 +145,8 @@ def test_forward_mode_is_refused():
         refused(activate, scene.inputs["opacities"].view(-1, 1), dual, scene.inputs["rotations"])
         refused(fused_ssim, forward_ad.make_dual(image, image), image)
         refused(l1_ssim_loss, forward_ad.make_dual(image, image), image)
+        refused(torch.ops.diff_smoe_rasterization.rasterize, *op_arguments(scene.with_inputs(scales=dual)))
+        refused(torch.ops.diff_smoe_rasterization.radii, *op_arguments(scene.with_inputs(scales=dual), "radii"))
     if hasattr(torch, "func"):
         for function in [render] + [torch.compile(render, backend="eager")] * hasattr(torch.library, "opcheck"):
             refused(torch.func.jvp, function, (scales,), (scales,))

@@ -27,10 +27,14 @@ template <class S> void sum_records(const S* records, int64_t count, int size, d
 
 }  // namespace
 
-template <class S>
-void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
-              const SavedForward<S>& saved, const ImageOutputs<S>& images, const ImageGradients<S>& image_gradients,
-              const GaussianGradients<S>& gradients, StageTimes* times) {
+template <class S> void backward(const Frame<S>& frame, const Gradients<S>& wanted, StageTimes* times) {
+  const GaussianInputs<S>& inputs = frame.inputs;
+  const Camera<S>& camera = frame.camera;
+  const RasterConfig<S>& config = frame.config;
+  const SavedForward<S>& saved = frame.saved;
+  const ImageOutputs<S>& images = frame.images;
+  const ImageGradients<S>& image_gradients = wanted.images;
+  const GaussianGradients<S>& gradients = wanted.inputs;
   const int record = kNumGateMoments + config.num_features();
   const int64_t num_instances = saved.instance_offsets[inputs.num_gaussians];
   const std::unique_ptr<S[]> dL_dinstances(new S[num_instances * record]);
@@ -77,9 +81,7 @@ void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const Ra
   for (const auto& share : camera_shares) gradients.camera->add(share);
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                         \
-  template void backward(const GaussianInputs<S>&, const Camera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
-                         const ImageOutputs<S>&, const ImageGradients<S>&, const GaussianGradients<S>&, StageTimes*);
+#define DSMOE_INSTANTIATE(S) template void backward(const Frame<S>&, const Gradients<S>&, StageTimes*);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

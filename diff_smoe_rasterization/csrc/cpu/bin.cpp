@@ -36,9 +36,12 @@ std::vector<KeyedIndex<DepthBits<S>>> depth_order(int64_t num_gaussians, const R
 
 }  // namespace
 
-template <class S>
-void bin(int64_t num_gaussians, const Camera<S>& camera, const RasterConfig<S>& config, const SavedForward<S>& saved,
-         const int32_t* radii, StageTimes* times) {
+template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
+  const int64_t num_gaussians = frame.inputs.num_gaussians;
+  const Camera<S>& camera = frame.camera;
+  const RasterConfig<S>& config = frame.config;
+  const SavedForward<S>& saved = frame.saved;
+  const int32_t* radii = frame.images.radii;
   std::vector<KeyedIndex<DepthBits<S>>> order;
   {
     const Stopwatch stopwatch(times, &StageTimes::sort);
@@ -95,9 +98,7 @@ void bin(int64_t num_gaussians, const Camera<S>& camera, const RasterConfig<S>& 
   });
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                   \
-  template void bin(int64_t, const Camera<S>&, const RasterConfig<S>&, const SavedForward<S>&, const int32_t*, \
-                    StageTimes*);
+#define DSMOE_INSTANTIATE(S) template void bin(const Frame<S>&, StageTimes*);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

@@ -7,9 +7,11 @@
 namespace dsmoe {
 namespace cpu {
 
-template <class S>
-void blend(const Camera<S>& camera, const RasterConfig<S>& config, const SavedForward<S>& saved,
-           const ImageOutputs<S>& images, StageTimes* times) {
+template <class S> void blend(const Frame<S>& frame, StageTimes* times) {
+  const Camera<S>& camera = frame.camera;
+  const RasterConfig<S>& config = frame.config;
+  const SavedForward<S>& saved = frame.saved;
+  const ImageOutputs<S>& images = frame.images;
   const Stopwatch stopwatch(times, &StageTimes::blend);
   const auto& kernels = tile_kernels<S>();
   const int64_t pairs =
@@ -18,9 +20,7 @@ void blend(const Camera<S>& camera, const RasterConfig<S>& config, const SavedFo
   if (times != nullptr) times->forward_pairs += pairs;
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                    \
-  template void blend(const Camera<S>&, const RasterConfig<S>&, const SavedForward<S>&, const ImageOutputs<S>&, \
-                      StageTimes*);
+#define DSMOE_INSTANTIATE(S) template void blend(const Frame<S>&, StageTimes*);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

@@ -16,9 +16,13 @@ constexpr int64_t kChunk = 4096;  // Gaussians: a few additions each
 
 }  // namespace
 
-template <class S>
-void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
-                   const SavedForward<S>& saved, const S* pixel_weights, const ContributionSums<S>& sums) {
+template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map) {
+  const int64_t num_gaussians = frame.inputs.num_gaussians;
+  const int width = frame.camera.width, height = frame.camera.height;
+  const RasterConfig<S>& config = frame.config;
+  const SavedForward<S>& saved = frame.saved;
+  const S* pixel_weights = map.pixel_weights;
+  const ContributionSums<S>& sums = map.sums;
   const std::unique_ptr<Contribution<S>[]> instances(new Contribution<S>[saved.instance_offsets[num_gaussians]]);
   const auto& kernels = tile_kernels<S>();
   const TileContributions<S> out = {pixel_weights, instances.get()};
@@ -38,9 +42,7 @@ void contributions(int64_t num_gaussians, int width, int height, const RasterCon
   });
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                               \
-  template void contributions(int64_t, int, int, const RasterConfig<S>&, const SavedForward<S>&, const S*, \
-                              const ContributionSums<S>&);
+#define DSMOE_INSTANTIATE(S) template void contributions(const Frame<S>&, const ContributionMap<S>&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

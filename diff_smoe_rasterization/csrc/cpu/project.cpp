@@ -17,9 +17,12 @@ constexpr int64_t kChunk = 1024;  // Gaussians: enough to hide the hand-out, few
 
 }  // namespace
 
-template <class S>
-int64_t project(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
-                const SavedForward<S>& saved, const ImageOutputs<S>& images, StageTimes* times) {
+template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
+  const GaussianInputs<S>& inputs = frame.inputs;
+  const Camera<S>& camera = frame.camera;
+  const RasterConfig<S>& config = frame.config;
+  const SavedForward<S>& saved = frame.saved;
+  const ImageOutputs<S>& images = frame.images;
   const Stopwatch stopwatch(times, &StageTimes::project);
   const int num_features = config.num_features();
   int64_t* counts = saved.instance_offsets + 1;
@@ -51,9 +54,9 @@ int64_t project(const GaussianInputs<S>& inputs, const Camera<S>& camera, const 
   return num_instances;
 }
 
-template <class S> void mark_visible(int64_t num_gaussians, const S* means3D, const Camera<S>& camera, bool* visible) {
-  for (int64_t i = 0; i < num_gaussians; ++i) {
-    visible[i] = transform_point(camera.view, load3(means3D + 3 * i)).z > camera.near;
+template <class S> void mark_visible(const Frame<S>& frame, bool* visible) {
+  for (int64_t i = 0; i < frame.inputs.num_gaussians; ++i) {
+    visible[i] = transform_point(frame.camera.view, load3(frame.inputs.means3D + 3 * i)).z > frame.camera.near;
   }
 }
 
@@ -64,10 +67,9 @@ template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int
   return -1;
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                           \
-  template int64_t project(const GaussianInputs<S>&, const Camera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
-                           const ImageOutputs<S>&, StageTimes*);                                                       \
-  template void mark_visible(int64_t, const S*, const Camera<S>&, bool*);                                              \
+#define DSMOE_INSTANTIATE(S)                              \
+  template int64_t project(const Frame<S>&, StageTimes*); \
+  template void mark_visible(const Frame<S>&, bool*);     \
   template int64_t first_non_finite(const GaussianInputs<S>&, int);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

@@ -211,26 +211,22 @@ template <class Launch> void dispatch_keys(int64_t tiles, Launch launch) {
   tiles < std::numeric_limits<uint16_t>::max() ? launch(uint16_t()) : launch(uint32_t());
 }
 
-template <class Key, class S>
-ListArguments<S, Key> list_arguments(int64_t num_gaussians, const DeviceCamera<S>& camera,
-                                     const RasterConfig<S>& config, const SavedForward<S>& saved,
-                                     const int32_t* radii) {
+template <class Key, class S> ListArguments<S, Key> list_arguments(const Frame<S>& frame) {
   ListArguments<S, Key> list = {};
-  list.num_gaussians = num_gaussians;
-  list.mode = config.mode;
-  list.width = camera.width, list.height = camera.height;
-  list.columns = TileGrid(camera.width, camera.height).columns;
-  list.saved = saved;
-  list.radii = radii;
+  list.num_gaussians = frame.inputs.num_gaussians;
+  list.mode = frame.config.mode;
+  list.width = frame.camera.width, list.height = frame.camera.height;
+  list.columns = TileGrid(list.width, list.height).columns;
+  list.saved = frame.saved;
+  list.radii = frame.images.radii;
   return list;
 }
 
-template <class Key, class S>
-void bin_by(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-            const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream) {
-  const int64_t tiles = num_tiles(camera.width, camera.height), capacity = saved.capacity;
+template <class Key, class S> void bin_by(const Frame<S>& frame, Scratch& scratch, cudaStream_t stream) {
+  const SavedForward<S>& saved = frame.saved;
+  const int64_t tiles = num_tiles(frame.camera.width, frame.camera.height), capacity = saved.capacity;
   const bool slots = saved.instance_width == 2;
-  auto list = list_arguments<Key>(num_gaussians, camera, config, saved, radii);
+  auto list = list_arguments<Key>(frame);
   list.keys = allocate<Key>(scratch, capacity);
   list.values = allocate<int32_t>(scratch, capacity);
   list.slot_owners = slots ? allocate<int32_t>(scratch, capacity) : nullptr;
@@ -276,40 +272,32 @@ bool needs_depth_order(BlendMode mode) {
   return needed;
 }
 
-template <class S>
-void sort_by_depth(int64_t num_gaussians, const DepthKeys<S>& keys, int32_t* order, Scratch& scratch,
-                   cudaStream_t stream) {
+template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work) {
+  const int64_t num_gaussians = frame.inputs.num_gaussians;
   if (num_gaussians == 0) return;
-  auto* sorted_keys = allocate<DepthBits<S>>(scratch, num_gaussians);
-  with_temporary(scratch, "sorting by depth", [&](void* memory, size_t& bytes) {
-    return cub::DeviceRadixSort::SortPairs(memory, bytes, keys.depths, sorted_keys, keys.gaussians, order,
-                                           num_gaussians, 0, 8 * int(sizeof(S)), stream);
+  auto* sorted_keys = allocate<DepthBits<S>>(*work.scratch, num_gaussians);
+  with_temporary(*work.scratch, "sorting by depth", [&](void* memory, size_t& bytes) {
+    return cub::DeviceRadixSort::SortPairs(memory, bytes, keys.depths, sorted_keys, keys.gaussians, frame.saved.order,
+                                           num_gaussians, 0, 8 * int(sizeof(S)), work.stream);
   });
 }
 
-template <class S>
-void count_instances(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                     const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream) {
-  auto counted = saved;
-  counted.slot_ranges = nullptr;
-  dispatch_keys(num_tiles(camera.width, camera.height), [&](auto key) {
-    list_instances(list_arguments<decltype(key)>(num_gaussians, camera, config, counted, radii), scratch, stream);
-  });
+template <class S> void count_instances(const Frame<S>& frame, const Work& work) {
+  Frame<S> counted = frame;
+  counted.saved.slot_ranges = nullptr;
+  dispatch_keys(num_tiles(frame.camera.width, frame.camera.height),
+                [&](auto key) { list_instances(list_arguments<decltype(key)>(counted), *work.scratch, work.stream); });
 }
 
-template <class S>
-void bin(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-         const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream) {
-  dispatch_keys(num_tiles(camera.width, camera.height),
-                [&](auto key) { bin_by<decltype(key)>(num_gaussians, camera, config, saved, radii, scratch, stream); });
+template <class S> void bin(const Frame<S>& frame, const Work& work) {
+  dispatch_keys(num_tiles(frame.camera.width, frame.camera.height),
+                [&](auto key) { bin_by<decltype(key)>(frame, *work.scratch, work.stream); });
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                         \
-  template void sort_by_depth(int64_t, const DepthKeys<S>&, int32_t*, Scratch&, cudaStream_t);                       \
-  template void count_instances(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&,     \
-                                const int32_t*, Scratch&, cudaStream_t);                                             \
-  template void bin(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&, const int32_t*, \
-                    Scratch&, cudaStream_t);
+#define DSMOE_INSTANTIATE(S)                                                      \
+  template void sort_by_depth(const Frame<S>&, const DepthKeys<S>&, const Work&); \
+  template void count_instances(const Frame<S>&, const Work&);                    \
+  template void bin(const Frame<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

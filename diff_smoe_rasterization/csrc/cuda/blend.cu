@@ -142,11 +142,11 @@ __global__ void __launch_bounds__(kWalkBlock) blend_kernel(const __grid_constant
 
 }  // namespace
 
-template <class S>
-void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-           const SavedForward<S>& saved, const ImageOutputs<S>& images, unsigned long long* pairs,
-           cudaStream_t stream) {
-  const auto arguments = blend_arguments(num_gaussians, camera, config, saved, images, pairs);
+template <class S> void blend(const Frame<S>& frame, const Work& work) {
+  const DeviceCamera<S>& camera = frame.camera;
+  const RasterConfig<S>& config = frame.config;
+  const cudaStream_t stream = work.stream;
+  const auto arguments = blend_arguments(frame, work);
   const unsigned tiles = static_cast<unsigned>(num_tiles(camera.width, camera.height));
   // Double is for checking: it has only the general kernel.
   dispatch_blend(config.mode, sizeof(S) == 4 ? config.num_features() : kAnyFeatures, [&](auto mode, auto features) {
@@ -156,9 +156,7 @@ void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterCon
   });
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                           \
-  template void blend(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
-                      const ImageOutputs<S>&, unsigned long long*, cudaStream_t);
+#define DSMOE_INSTANTIATE(S) template void blend(const Frame<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

@@ -377,43 +377,42 @@ void backward_outgrown(const BackwardWork<S, RecordSink<S>>& work, Scratch& scra
 
 }  // namespace
 
-template <class S>
-void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                    const SavedForward<S>& saved, const ImageOutputs<S>& images,
-                    const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
-                    Scratch& scratch, unsigned long long* pairs, cudaStream_t stream) {
+template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work) {
+  const DeviceCamera<S>& camera = frame.camera;
+  const RasterConfig<S>& config = frame.config;
+  const SavedForward<S>& saved = frame.saved;
+  S* dL_dbackground = pass.gradients.inputs.background;
+  Scratch& scratch = *work.scratch;
+  const cudaStream_t stream = work.stream;
   const int64_t tiles = num_tiles(camera.width, camera.height), warps = tiles * kWarpsPerTile;
-  BackwardWork<S, RecordSink<S>> work = {};
-  static_cast<BlendArguments<S>&>(work) = blend_arguments(num_gaussians, camera, config, saved, images, pairs);
-  work.dL_dimages = image_gradients;
-  work.num_features = config.num_features();
-  work.tiles = static_cast<int>(tiles);
-  work.sink.records = dL_dgaussians;
-  work.sink.slots = slots;
-  work.sink.length = kNumGateMoments + work.num_features;
+  BackwardWork<S, RecordSink<S>> arguments = {};
+  static_cast<BlendArguments<S>&>(arguments) = blend_arguments(frame, work);
+  arguments.dL_dimages = pass.gradients.images;
+  arguments.num_features = config.num_features();
+  arguments.tiles = static_cast<int>(tiles);
+  arguments.sink.records = pass.dL_dgaussians;
+  arguments.sink.slots = pass.slots;
+  arguments.sink.length = kNumGateMoments + arguments.num_features;
   if (dL_dbackground != nullptr) {
-    work.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+    arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
   }
   bool known = false;                          // the number of features, when compiling
   if constexpr (sizeof(S) == sizeof(float)) {  // double is for checking: it has only the general kernel
-    known = work.num_features == kSegmentFeatures;
+    known = arguments.num_features == kSegmentFeatures;
     const int64_t segment_blocks = saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0;
-    if (known) launch_backward<S, kSegmentFeatures>(work, tiles + segment_blocks, stream);
+    if (known) launch_backward<S, kSegmentFeatures>(arguments, tiles + segment_blocks, stream);
   }
   if (!known) {
-    work.scaled = allocate_scaled(work, scratch);
-    launch_backward<S, kAnyFeatures>(work, tiles, stream);
+    arguments.scaled = allocate_scaled(arguments, scratch);
+    launch_backward<S, kAnyFeatures>(arguments, tiles, stream);
   }
-  if (slots != nullptr && num_gaussians > 0) backward_outgrown(work, scratch, stream);
+  if (pass.slots != nullptr && frame.inputs.num_gaussians > 0) backward_outgrown(arguments, scratch, stream);
   if (dL_dbackground != nullptr) {
-    sum_columns(work.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
+    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
   }
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                    \
-  template void blend_backward(int64_t, const DeviceCamera<S>&, const RasterConfig<S>&, const SavedForward<S>&, \
-                               const ImageOutputs<S>&, const ImageGradients<S>&, S*, S*, S*, Scratch&,          \
-                               unsigned long long*, cudaStream_t);
+#define DSMOE_INSTANTIATE(S) template void blend_backward(const Frame<S>&, const BackwardPass<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

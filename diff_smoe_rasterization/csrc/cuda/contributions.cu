@@ -95,30 +95,27 @@ __global__ void __launch_bounds__(kWalkBlock)
 
 }  // namespace
 
-template <class S>
-void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
-                   const SavedForward<S>& saved, const ImageOutputs<S>& images, const S* pixel_weights,
-                   const ContributionSums<S>& sums, cudaStream_t stream) {
+template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work) {
+  const int64_t num_gaussians = frame.inputs.num_gaussians;
+  const RasterConfig<S>& config = frame.config;
+  const ContributionSums<S>& sums = map.sums;
+  const cudaStream_t stream = work.stream;
   const auto clear = [&](auto* numbers) {
     if (num_gaussians == 0) return;
     check(cudaMemsetAsync(numbers, 0, num_gaussians * sizeof(*numbers), stream), "clearing the contributions");
   };
   clear(sums.pixel_weights), clear(sums.pixels), clear(sums.blend_weights), clear(sums.distances);
-  DeviceCamera<S> camera;
-  camera.width = width, camera.height = height;
-  ContributionArguments<S> arguments{blend_arguments(num_gaussians, camera, config, saved, images, nullptr)};
-  arguments.pixel_weights = pixel_weights;
+  ContributionArguments<S> arguments{blend_arguments(frame, work)};
+  arguments.pixel_weights = map.pixel_weights;
   arguments.sums = sums;
-  const unsigned tiles = static_cast<unsigned>(num_tiles(width, height));
+  const unsigned tiles = static_cast<unsigned>(num_tiles(frame.camera.width, frame.camera.height));
   dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
     contributions_kernel<S, decltype(mode)::value><<<tiles, kWalkBlock, 0, stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("contributions");
   });
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                     \
-  template void contributions(int64_t, int, int, const RasterConfig<S>&, const SavedForward<S>&, \
-                              const ImageOutputs<S>&, const S*, const ContributionSums<S>&, cudaStream_t);
+#define DSMOE_INSTANTIATE(S) template void contributions(const Frame<S>&, const ContributionMap<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

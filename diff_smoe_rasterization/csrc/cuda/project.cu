@@ -81,16 +81,15 @@ __global__ void mark_visible_kernel(int64_t num_gaussians, const S* means3D, con
 
 }  // namespace
 
-template <class S>
-void project(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-             const SavedForward<S>& saved, const ImageOutputs<S>& images, const DepthKeys<S>& keys,
-             cudaStream_t stream) {
+template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work) {
+  const GaussianInputs<S>& inputs = frame.inputs;
+  const RasterConfig<S>& config = frame.config;
   if (inputs.num_gaussians == 0) return;
   dispatch_sh_rows(inputs, true, [&](auto type, size_t shared) {
     using Rows = typename decltype(type)::type;
     const auto launch = [&](auto kernel) {
-      kernel<<<blocks_for(inputs.num_gaussians, kRowsBlock), kRowsBlock, shared, stream>>>(inputs, camera, config,
-                                                                                           saved, images.radii, keys);
+      kernel<<<blocks_for(inputs.num_gaussians, kRowsBlock), kRowsBlock, shared, work.stream>>>(
+          inputs, frame.camera, config, frame.saved, frame.images.radii, keys);
       DSMOE_CHECK_LAUNCH("project");
     };
     if constexpr (Rows::kStaged) {
@@ -100,17 +99,17 @@ void project(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, con
   });
 }
 
-template <class S>
-void mark_visible(int64_t num_gaussians, const S* means3D, const S* view, S near, bool* visible, cudaStream_t stream) {
-  if (num_gaussians == 0) return;
-  mark_visible_kernel<<<blocks_for(num_gaussians, 256), 256, 0, stream>>>(num_gaussians, means3D, view, near, visible);
+template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work) {
+  const int64_t count = frame.inputs.num_gaussians;
+  if (count == 0) return;
+  mark_visible_kernel<<<blocks_for(count, 256), 256, 0, work.stream>>>(count, frame.inputs.means3D, frame.camera.view,
+                                                                       frame.camera.near, visible);
   DSMOE_CHECK_LAUNCH("mark_visible");
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                                \
-  template void project(const GaussianInputs<S>&, const DeviceCamera<S>&, const RasterConfig<S>&,           \
-                        const SavedForward<S>&, const ImageOutputs<S>&, const DepthKeys<S>&, cudaStream_t); \
-  template void mark_visible(int64_t, const S*, const S*, S, bool*, cudaStream_t);
+#define DSMOE_INSTANTIATE(S)                                                \
+  template void project(const Frame<S>&, const DepthKeys<S>&, const Work&); \
+  template void mark_visible(const Frame<S>&, bool*, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

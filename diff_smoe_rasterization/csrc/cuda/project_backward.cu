@@ -235,12 +235,22 @@ __global__ void __launch_bounds__(kRowsBlock)
 
 }  // namespace
 
-template <class S>
-void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                      const SavedForward<S>& saved, const int32_t* radii, const S* dL_dgaussians, const S* slots,
-                      const GaussianGradients<S>& gradients, Scratch& scratch, cudaStream_t stream) {
-  ProjectBackwardArguments<S> arguments = {inputs,        camera, config,    saved,   radii,
-                                           dL_dgaussians, slots,  gradients, nullptr, nullptr};
+template <class S> void project_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work) {
+  const GaussianInputs<S>& inputs = frame.inputs;
+  const RasterConfig<S>& config = frame.config;
+  const GaussianGradients<S>& gradients = pass.gradients.inputs;
+  const S* dL_dgaussians = pass.dL_dgaussians;
+  Scratch& scratch = *work.scratch;
+  const cudaStream_t stream = work.stream;
+  ProjectBackwardArguments<S> arguments = {};
+  arguments.inputs = inputs;
+  arguments.camera = frame.camera;
+  arguments.config = config;
+  arguments.saved = frame.saved;
+  arguments.radii = frame.images.radii;
+  arguments.dL_dgaussians = dL_dgaussians;
+  arguments.slots = pass.slots;
+  arguments.gradients = gradients;
   const bool with_camera = gradients.camera != nullptr;
   const int64_t blocks = blocks_for(inputs.num_gaussians, kRowsBlock), warps = blocks * (kRowsBlock / kWarp);
   if (with_camera) arguments.camera_rows = allocate<S>(scratch, warps * kCameraGradientSize);
@@ -270,14 +280,11 @@ void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& ca
     });
   }
   if (with_camera) {
-    sum_columns(arguments.camera_rows, warps, kCameraGradientSize, gradients.camera->view, stream);
+    sum_columns(arguments.camera_rows, warps, kCameraGradientSize, reinterpret_cast<S*>(gradients.camera), stream);
   }
 }
 
-#define DSMOE_INSTANTIATE(S)                                                                               \
-  template void project_backward(const GaussianInputs<S>&, const DeviceCamera<S>&, const RasterConfig<S>&, \
-                                 const SavedForward<S>&, const int32_t*, const S*, const S*,               \
-                                 const GaussianGradients<S>&, Scratch&, cudaStream_t);
+#define DSMOE_INSTANTIATE(S) template void project_backward(const Frame<S>&, const BackwardPass<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

@@ -31,19 +31,16 @@ template <class S> struct BlendArguments {
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
-template <class S>
-BlendArguments<S> blend_arguments(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                                  const SavedForward<S>& saved, const ImageOutputs<S>& images,
-                                  unsigned long long* pairs) {
+template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, const Work& work) {
   BlendArguments<S> arguments = {};
-  arguments.num_gaussians = num_gaussians;
-  arguments.width = camera.width;
-  arguments.height = camera.height;
-  arguments.tile_columns = TileGrid(camera.width, camera.height).columns;
-  arguments.config = config;
-  arguments.saved = saved;
-  arguments.images = images;
-  arguments.pairs = pairs;
+  arguments.num_gaussians = frame.inputs.num_gaussians;
+  arguments.width = frame.camera.width;
+  arguments.height = frame.camera.height;
+  arguments.tile_columns = TileGrid(frame.camera.width, frame.camera.height).columns;
+  arguments.config = frame.config;
+  arguments.saved = frame.saved;
+  arguments.images = frame.images;
+  arguments.pairs = work.pairs;
   return arguments;
 }
 

@@ -16,29 +16,16 @@
 #include "optim/adam.h"
 #include "optim/gaussians.h"
 #include "optim/image_loss.h"
+#include "torch/check_tensor.h"
 
 namespace dsmoe {
 namespace binding {
 
 using OptionalTensor = c10::optional<at::Tensor>;  // std::optional in newer torch
 
-inline void check_same(const char* function, const std::string& name, const at::Tensor& tensor,
-                       const std::string& other_name, const at::Tensor& other) {
-  TORCH_CHECK_VALUE(tensor.sizes() == other.sizes(), function, ": ", name, " has shape ", tensor.sizes(),
-                    "; it must be ", other.sizes(), ", as ", other_name, " is");
-  TORCH_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
-                   "; it must be on ", other.device(), ", as ", other_name, " is");
-}
-
-inline void check_real(const char* function, const std::string& name, const at::Tensor& tensor) {
-  const at::ScalarType type = tensor.scalar_type();
-  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, function, ": ", name, " is ", c10::toString(type),
-                   "; it must be Float or Double");
-}
-
-inline void check_type(const char* function, const std::string& name, const at::Tensor& tensor, at::ScalarType type) {
-  TORCH_CHECK_TYPE(tensor.scalar_type() == type, function, ": ", name, " is ", c10::toString(tensor.scalar_type()),
-                   "; it must be ", c10::toString(type));
+// Autograd must notice where a tensor was changed in place after it was saved.
+inline void note_change(at::TensorList tensors) {
+  for (const at::Tensor& tensor : tensors) tensor.unsafeGetTensorImpl()->bump_version();
 }
 
 template <class Backend>
@@ -59,26 +46,24 @@ void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
   if (visible.has_value()) {
     flags = visible->contiguous();
     check_type("adam", "visible", flags, at::kBool);
-    TORCH_CHECK_VALUE(flags.dim() == 1, "adam: visible has shape ", flags.sizes(), "; it must be [N]");
-    TORCH_CHECK_TYPE(flags.device() == first.device(), "adam: visible is on ", flags.device(), "; it must be on ",
-                     first.device(), ", as parameters[0] is");
+    check_shape("adam", "visible", flags, {"N"});
+    check_device("adam", "visible", flags, "parameters[0]", first);
   }
 
   std::vector<at::Tensor> dense_gradients;
   for (size_t i = 0; i < count; ++i) {
     const auto name = [i](const char* list) { return std::string(list) + "[" + std::to_string(i) + "]"; };
-    const auto check_state = [&](const char* list, const at::Tensor& tensor) {
-      check_same("adam", name(list), tensor, name("parameters"), parameters[i]);
-      check_type("adam", name(list), tensor, first.scalar_type());
-      TORCH_CHECK_VALUE(tensor.is_contiguous(), "adam: ", name(list), " is not contiguous; it must be");
+    const auto check_like_parameter = [&](const char* list, const at::Tensor& tensor) {
+      check_same_shape("adam", name(list).c_str(), tensor, name("parameters").c_str(), parameters[i]);
+      check_like("adam", name(list).c_str(), tensor, "parameters[0]", first);
     };
-    check_state("parameters", parameters[i]);
-    TORCH_CHECK_TYPE(parameters[i].device() == first.device(), "adam: ", name("parameters"), " is on ",
-                     parameters[i].device(), "; it must be on ", first.device(), ", as parameters[0] is");
-    check_state("moments", moments[i]);
-    check_state("squares", squares[i]);
-    check_same("adam", name("gradients"), gradients[i], name("parameters"), parameters[i]);
-    check_type("adam", name("gradients"), gradients[i], first.scalar_type());
+    check_like_parameter("parameters", parameters[i]);
+    check_like_parameter("gradients", gradients[i]);
+    check_like_parameter("moments", moments[i]);
+    check_like_parameter("squares", squares[i]);
+    check_contiguous("adam", name("parameters").c_str(), parameters[i]);
+    check_contiguous("adam", name("moments").c_str(), moments[i]);
+    check_contiguous("adam", name("squares").c_str(), squares[i]);
     TORCH_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)),
                       "adam: ", name("parameters"), " has shape ", parameters[i].sizes(), "; visible has ",
                       flags.defined() ? flags.size(0) : 0, " rows, and so must every parameter");
@@ -103,10 +88,7 @@ void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
     }
     Backend::adam(tensors, constants, flags.defined() ? flags.data_ptr<bool>() : nullptr);
   });
-  // So that autograd notices where a tensor was changed after it was saved.
-  for (at::TensorList list : {parameters, moments, squares}) {
-    for (const at::Tensor& tensor : list) tensor.unsafeGetTensorImpl()->bump_version();
-  }
+  for (at::TensorList list : {parameters, moments, squares}) note_change(list);
 }
 
 // The loss and, if it is wanted, its gradient by the image; an empty tensor otherwise.
@@ -115,7 +97,10 @@ std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at:
                                               double ssim_weight, double offset, int64_t margin, bool with_gradient) {
   const char* function = "image_loss";
   check_real(function, "image", image);
-  check_same(function, "target", target, "image", image);
+  refuse_tangent(function, image);
+  refuse_tangent(function, target);
+  check_same_shape(function, "target", target, "image", image);
+  check_device(function, "target", target, "image", image);
   TORCH_CHECK_VALUE(image.dim() >= 2 && image.numel() > 0, function, ": image has shape ", image.sizes(),
                     "; it must be [..., H, W] with at least one pixel");
   const int64_t height = image.size(-2), width = image.size(-1);
@@ -125,8 +110,8 @@ std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at:
                     image.sizes(), "; with a margin of ", margin, " its sides must be at least ", 2 * margin + 1);
   const bool bytes = target.scalar_type() == at::kByte;
   TORCH_CHECK_TYPE(bytes || target.scalar_type() == image.scalar_type(), function, ": target is ",
-                   c10::toString(target.scalar_type()), "; it must be ", c10::toString(image.scalar_type()),
-                   ", as image is, or Byte");
+                   dtype_name(target.scalar_type()), "; it must be ", dtype_name(image.scalar_type()),
+                   ", as image is, or uint8");
   const c10::DeviceGuard guard(image.device());
   const at::Tensor x = image.contiguous(), y = target.contiguous();
   const int64_t planes = x.numel() / (height * width);
@@ -153,28 +138,16 @@ std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at:
   return {loss, gradient};
 }
 
-inline void check_shape(const char* function, const char* name, const at::Tensor& tensor, at::IntArrayRef shape) {
-  TORCH_CHECK_VALUE(tensor.sizes() == shape, function, ": ", name, " has shape ", tensor.sizes(), "; it must be ",
-                    shape);
-}
-
-inline void check_like(const char* function, const char* name, const at::Tensor& tensor, const char* other_name,
-                       const at::Tensor& other) {
-  check_type(function, name, tensor, other.scalar_type());
-  TORCH_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
-                   "; it must be on ", other.device(), ", as ", other_name, " is");
-}
-
 // Opacities [N, 1], scales [N, 3] and rotations [N, 4] of the Gaussians.
 using GaussianTensors = std::tuple<at::Tensor, at::Tensor, at::Tensor>;
 
 inline GaussianTensors checked(const char* function, const at::Tensor& opacities, const at::Tensor& scales,
                                const at::Tensor& rotations) {
   check_real(function, "opacities", opacities);
+  for (const at::Tensor* tensor : {&opacities, &scales, &rotations}) refuse_tangent(function, *tensor);
   check_like(function, "scales", scales, "opacities", opacities);
   check_like(function, "rotations", rotations, "opacities", opacities);
-  TORCH_CHECK_VALUE(opacities.dim() == 2 && opacities.size(1) == 1, function, ": opacities has shape ",
-                    opacities.sizes(), "; it must be [N, 1]");
+  check_shape(function, "opacities", opacities, {"N", 1});
   check_shape(function, "scales", scales, {opacities.size(0), 3});
   check_shape(function, "rotations", rotations, {opacities.size(0), 4});
   return {opacities.contiguous(), scales.contiguous(), rotations.contiguous()};
@@ -211,12 +184,13 @@ GaussianTensors activate_backward(at::TensorList raw, at::TensorList values, con
   TORCH_CHECK_VALUE(raw.size() == 3 && values.size() == 3, function, ": raw and values must have 3 tensors each");
   const GaussianTensors raw_tensors = checked(function, raw[0], raw[1], raw[2]);
   const GaussianTensors value_tensors = checked(function, values[0], values[1], values[2]);
-  check_same(function, "values", values[0], "raw", raw[0]);
+  check_same_shape(function, "values", values[0], "raw", raw[0]);
   check_like(function, "values", values[0], "raw", raw[0]);
   const c10::DeviceGuard guard(raw[0].device());
   const auto dense = [&](const char* name, const OptionalTensor& gradient, const at::Tensor& value) {
     if (!gradient.has_value()) return at::Tensor();
-    check_shape(function, name, *gradient, value.sizes());
+    refuse_tangent(function, *gradient);
+    check_same_shape(function, name, *gradient, "its value", value);
     check_like(function, name, *gradient, "raw", raw[0]);
     return gradient->contiguous();
   };
@@ -237,16 +211,15 @@ void add_view(const at::Tensor& dL_dmeans2D, const at::Tensor& radii, const at::
               const at::Tensor& view_count) {
   const char* function = "add_view";
   check_real(function, "dL_dmeans2D", dL_dmeans2D);
-  TORCH_CHECK_VALUE(radii.dim() == 1, function, ": radii has shape ", radii.sizes(), "; it must be [N]");
+  check_shape(function, "radii", radii, {"N"});
   check_type(function, "radii", radii, at::kInt);
   check_shape(function, "dL_dmeans2D", dL_dmeans2D, {radii.size(0), 3});
-  TORCH_CHECK_TYPE(radii.device() == dL_dmeans2D.device(), function, ": radii is on ", radii.device(),
-                   "; it must be on ", dL_dmeans2D.device(), ", as dL_dmeans2D is");
+  check_device(function, "radii", radii, "dL_dmeans2D", dL_dmeans2D);
   for (const at::Tensor* statistic : {&gradient_sum, &view_count}) {
     const char* name = statistic == &gradient_sum ? "gradient_sum" : "view_count";
     check_shape(function, name, *statistic, {radii.size(0)});
     check_like(function, name, *statistic, "dL_dmeans2D", dL_dmeans2D);
-    TORCH_CHECK_VALUE(statistic->is_contiguous(), function, ": ", name, " is not contiguous; it must be");
+    check_contiguous(function, name, *statistic);
   }
   const c10::DeviceGuard guard(radii.device());
   const at::Tensor gradients = dL_dmeans2D.contiguous(), dense_radii = radii.contiguous();
@@ -255,6 +228,7 @@ void add_view(const at::Tensor& dL_dmeans2D, const at::Tensor& radii, const at::
                                          gradient_sum.data_ptr<scalar_t>(), view_count.data_ptr<scalar_t>(),
                                          radii.size(0));
   });
+  note_change({gradient_sum, view_count});
 }
 
 }  // namespace binding

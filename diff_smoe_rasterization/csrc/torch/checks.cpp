@@ -5,85 +5,14 @@
 #include <sstream>
 #include <vector>
 
-#include "dsmoe/rasterize_cuda.h"
 #include "dsmoe/sh.h"
 
 namespace dsmoe {
 namespace binding {
 namespace {
 
-std::string dtype_name(at::ScalarType type) {
-  switch (type) {
-    case at::kHalf:
-      return "float16";
-    case at::kBFloat16:
-      return "bfloat16";
-    case at::kFloat:
-      return "float32";
-    case at::kDouble:
-      return "float64";
-    case at::kInt:
-      return "int32";
-    case at::kLong:
-      return "int64";
-    default:
-      return c10::toString(type);
-  }
-}
-
-// One size of an expected shape: a number, or a letter (or -1) for any.
-struct Size {
-  Size(int64_t size) : size(size), letter(size < 0 ? "any" : nullptr) {}
-  Size(const char* letter) : size(-1), letter(letter) {}
-  int64_t size;
-  const char* letter;
-};
-using Shape = std::vector<Size>;
-
-std::string to_string(const Shape& shape) {
-  std::ostringstream out;
-  for (size_t i = 0; i < shape.size(); ++i) {
-    out << (i == 0 ? "[" : ", ");
-    if (shape[i].letter != nullptr) {
-      out << shape[i].letter;
-    } else {
-      out << shape[i].size;
-    }
-  }
-  out << "]";
-  return out.str();
-}
-
-bool matches(const at::Tensor& tensor, const Shape& shape) {
-  if (tensor.dim() != static_cast<int64_t>(shape.size())) return false;
-  for (size_t i = 0; i < shape.size(); ++i) {
-    if (shape[i].letter == nullptr && tensor.size(i) != shape[i].size) return false;
-  }
-  return true;
-}
-
-void check_shape(const char* function, const char* name, const at::Tensor& tensor, const Shape& shape) {
-  TORCH_CHECK_VALUE(matches(tensor, shape), function, ": ", name, " has shape ", tensor.sizes(), "; it must be ",
-                    to_string(shape));
-}
-
 void check_shape(Input input, const Inputs& inputs, const Shape& shape) {
   if (inputs[input].defined()) check_shape("rasterize", kInputNames[input], inputs[input], shape);
-}
-
-void check_real(const char* function, const char* name, const at::Tensor& tensor) {
-  const at::ScalarType type = tensor.scalar_type();
-  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, function, ": ", name, " is ", dtype_name(type),
-                   "; it must be float32 or float64: cast it, for instance with ", name, ".float()");
-}
-
-void check_like(const char* function, const char* name, const at::Tensor& tensor, const char* other_name,
-                const at::Tensor& other) {
-  TORCH_CHECK_TYPE(tensor.scalar_type() == other.scalar_type(), function, ": ", name, " is ",
-                   dtype_name(tensor.scalar_type()), "; it must be ", dtype_name(other.scalar_type()), ", as ",
-                   other_name, " is");
-  TORCH_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
-                   "; it must be on ", other.device(), ", as ", other_name, " is");
 }
 
 void check_either(bool first, bool second, const char* names) {
@@ -124,6 +53,8 @@ void check_shapes(const Inputs& inputs) {
   check_shape(kDc, inputs, {count, 1, 3});
   check_shape(kShs, inputs, {count, "K", 3});
   check_shape(kColorsPrecomp, inputs, {count, "C"});
+  TORCH_CHECK_VALUE(num_channels(inputs) > 0, "rasterize: colors_precomp has shape ", inputs[kColorsPrecomp].sizes(),
+                    "; a colour has one channel or more");
   check_shape(kScales, inputs, {count, 3});
   check_shape(kRotations, inputs, {count, 4});
   check_shape(kCov3DPrecomp, inputs, {count, 6});
@@ -152,33 +83,23 @@ void check_blend_mode(const char* function, int64_t blend_mode) {
                     "; it must be 0 to ", BlendModes::kSize - 1);
 }
 
-// What a rendering saved: unchanged, and of that rendering.
-void check_saved(const char* function, Output output, const Outputs& outputs, const OutputSpec& spec,
-                 const at::Device& device) {
-  const at::Tensor& tensor = outputs[output];
-  check_shape(function, kOutputNames[output], tensor, {spec.shape.begin(), spec.shape.end()});
-  TORCH_CHECK_TYPE(tensor.scalar_type() == spec.type && tensor.is_contiguous() && tensor.device() == device, function,
-                   ": ", kOutputNames[output], " must be as rasterize returned it: dense ", dtype_name(spec.type),
-                   " on ", device);
-}
-
-void check_options(const Options& options) {
+void check_options(const char* function, const Options& options) {
   const int64_t height = options.image_height, width = options.image_width;
-  TORCH_CHECK_VALUE(height > 0 && width > 0, "rasterize: image_height x image_width is ", height, " x ", width,
+  TORCH_CHECK_VALUE(height > 0 && width > 0, function, ": image_height x image_width is ", height, " x ", width,
                     "; both must be positive");
-  TORCH_CHECK_VALUE(height <= INT_MAX / width, "rasterize: image_height x image_width is ", height, " x ", width,
+  TORCH_CHECK_VALUE(height <= INT_MAX / width, function, ": image_height x image_width is ", height, " x ", width,
                     "; an image may have ", INT_MAX, " pixels");
-  const auto check_positive = [](const char* name, double value) {
-    TORCH_CHECK_VALUE(std::isfinite(value) && value > 0, "rasterize: ", name, " is ", value,
+  const auto check_positive = [&](const char* name, double value) {
+    TORCH_CHECK_VALUE(std::isfinite(value) && value > 0, function, ": ", name, " is ", value,
                       "; it must be positive and finite");
   };
   check_positive("tanfovx", options.tanfovx);
   check_positive("tanfovy", options.tanfovy);
-  check_not_negative("rasterize", "scale_modifier", options.scale_modifier);
-  check_not_negative("rasterize", "near", options.near);
-  check_not_negative("rasterize", "alpha_min", options.alpha_min);
-  check_not_negative("rasterize", "background_gate", options.fixed_background_gate);
-  check_blend_mode("rasterize", options.blend_mode);
+  check_not_negative(function, "scale_modifier", options.scale_modifier);
+  check_not_negative(function, "near", options.near);
+  check_not_negative(function, "alpha_min", options.alpha_min);
+  check_not_negative(function, "background_gate", options.fixed_background_gate);
+  check_blend_mode(function, options.blend_mode);
 }
 
 }  // namespace
@@ -186,34 +107,30 @@ void check_options(const Options& options) {
 void check_arguments(const Inputs& inputs, const Options& options) {
   check_real("rasterize", "means3D", inputs[kMeans3D]);
   for (int i = 0; i < kNumInputs; ++i) {
-    if (inputs[i].defined()) check_like("rasterize", kInputNames[i], inputs[i], "means3D", inputs[kMeans3D]);
+    if (!inputs[i].defined()) continue;
+    check_like("rasterize", kInputNames[i], inputs[i], "means3D", inputs[kMeans3D]);
+    refuse_tangent("rasterize", inputs[i]);
   }
-  check_options(options);
+  check_options("rasterize", options);
   check_present(inputs);
   check_shapes(inputs);
   check_sh_degree(inputs, options.sh_degree);
 }
 
-void check_backward_arguments(const Inputs& inputs, const Options& options, const Outputs& outputs,
-                              const ImageGradientTensors& image_gradients, const InputMask& wanted) {
+void check_backward_arguments(const Inputs& inputs, const Options& options, const Images& images,
+                              const Images& image_gradients, const InputMask& wanted) {
   const char* function = "rasterize_backward";
   check_arguments(inputs, options);
-  const auto specs = output_specs(inputs, options);
-  for (int i = 0; i < kNumOutputs; ++i) {
-    check_saved(function, static_cast<Output>(i), outputs, specs[i], inputs[kMeans3D].device());
-  }
-  if (outputs[kSegments].numel() > 0) {
-    const int64_t capacity = outputs[kInstances].size(0);
-    check_shape(function, kOutputNames[kSegments], outputs[kSegments],
-                {cuda::num_segment_rows(capacity), cuda::kSegmentRow});
-    check_shape(function, kOutputNames[kSegmentQueue], outputs[kSegmentQueue], {cuda::num_queue_entries(capacity), 2});
-  }
-  for (int i = 0; i < kNumImageGradients; ++i) {
+  const at::Tensor& like = inputs[kMeans3D];
+  for (int i = 0; i < kNumImages; ++i) {
+    const auto shape = image_shape(static_cast<Image>(i), inputs, options);
+    check_result(function, kImageNames[i], images[i], shape, i == kRadii ? at::kInt : like.scalar_type(),
+                 like.device());
     if (!image_gradients[i].defined()) continue;
-    const Output image = kImageOfGradient[i];
-    check_like(function, kImageGradientNames[i], image_gradients[i], "means3D", inputs[kMeans3D]);
-    check_shape(function, kImageGradientNames[i], image_gradients[i],
-                {specs[image].shape.begin(), specs[image].shape.end()});
+    refuse_tangent(function, image_gradients[i]);
+    const std::string name = std::string("dL_d") + kImageNames[i];
+    check_like(function, name.c_str(), image_gradients[i], "means3D", like);
+    check_shape(function, name.c_str(), image_gradients[i], {shape.begin(), shape.end()});
   }
   for (int i = 0; i < kNumInputs; ++i) {
     TORCH_CHECK_VALUE(!wanted[i] || inputs[i].defined(), function, ": the gradient of ", kInputNames[i],
@@ -221,33 +138,24 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
   }
 }
 
-void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs& outputs,
-                                  const at::Tensor& background_gate, const Options& blend) {
+void check_contribution_arguments(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
+                                  const at::Tensor& background_gate, const Options& options) {
   const char* function = "contributions";
-  const at::Tensor &projected = outputs[kProjected], &image = outputs[kLastContributor];
-  check_real(function, kOutputNames[kProjected], projected);
-  check_shape(function, kOutputNames[kProjected], projected, {"N", kProjectedGaussianSize});
-  check_shape(function, kOutputNames[kLastContributor], image, {"H", "W"});
-  TORCH_CHECK_VALUE(image.numel() > 0, function, ": last_contributor has shape ", image.sizes(),
-                    "; an image has pixels");
-  // All that the specifications of these outputs depend on.
-  Inputs inputs;
-  inputs[kMeans3D] = projected;
-  Options options = {};
-  options.image_height = image.size(0), options.image_width = image.size(1);
-  const at::Tensor& instances = outputs[kInstances];
-  options.deterministic = projected.is_cuda() && instances.dim() == 2 && instances.size(1) == 2;
-  const auto specs = output_specs(inputs, options);
-  for (Output i : {kRadii, kProjected, kInstanceOffsets, kTileOffsets, kInstances, kLastContributor, kOrder}) {
-    check_saved(function, i, outputs, specs[i], projected.device());
-  }
-  check_like(function, "pixel_weights", pixel_weights, "means3D", projected);
-  check_shape(function, "pixel_weights", pixel_weights, {image.size(0), image.size(1)});
-  if (background_gate.defined()) check_like(function, "background_gate", background_gate, "projected", projected);
+  check_options(function, options);
+  check_result(function, "radii", radii, {radii.numel()}, at::kInt, radii.device());
+  TORCH_CHECK_VALUE(!saved.empty(), function, ": saved has length 0; it must be what rasterize returned");
+  check_real(function, "saved[0]", saved[0]);
+  check_like(function, "pixel_weights", pixel_weights, "means3D", saved[0]);
+  check_shape(function, "pixel_weights", pixel_weights, {options.image_height, options.image_width});
+  if (background_gate.defined()) check_like(function, "background_gate", background_gate, "means3D", saved[0]);
   check_background_gate(function, background_gate);
-  check_not_negative(function, "alpha_min", blend.alpha_min);
-  check_not_negative(function, "background_gate", blend.fixed_background_gate);
-  check_blend_mode(function, blend.blend_mode);
+}
+
+void check_result(const char* function, const char* name, const at::Tensor& tensor, const std::vector<int64_t>& shape,
+                  at::ScalarType type, at::Device device) {
+  check_shape(function, name, tensor, {shape.begin(), shape.end()});
+  TORCH_CHECK_TYPE(tensor.scalar_type() == type && tensor.is_contiguous() && tensor.device() == device, function, ": ",
+                   name, " must be as rasterize returned it: dense ", dtype_name(type), " on ", device);
 }
 
 void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix) {
@@ -257,12 +165,18 @@ void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix) 
   check_shape("markVisible", "viewmatrix", viewmatrix, {4, 4});
 }
 
-void refuse_non_finite(const Inputs& inputs, int64_t index) {
-  if (index < 0) return;
+void refuse_non_finite(const Inputs& inputs) {
+  at::Tensor finite = at::ones({num_gaussians(inputs)}, inputs[kMeans3D].options().dtype(at::kBool));
+  const auto is_read = [&](int i) { return i != kMeans2D && inputs[i].defined() && inputs[i].numel() > 0; };
   for (int i = kMeans3D; i <= kCov3DPrecomp; ++i) {
-    if (i == kMeans2D || !inputs[i].defined()) continue;
-    TORCH_CHECK_VALUE(at::isfinite(inputs[i][index]).all().item<bool>(), "rasterize: ", kInputNames[i], "[", index,
-                      "] is not finite (strict=True)");
+    if (is_read(i)) finite = finite.logical_and(at::isfinite(inputs[i]).reshape({finite.size(0), -1}).all(1));
+  }
+  const at::Tensor indices = at::logical_not(finite).nonzero();
+  if (indices.numel() == 0) return;
+  const int64_t index = indices[0][0].item<int64_t>();
+  for (int i = kMeans3D; i <= kCov3DPrecomp; ++i) {
+    TORCH_CHECK_VALUE(!is_read(i) || at::isfinite(inputs[i][index]).all().item<bool>(), "rasterize: ", kInputNames[i],
+                      "[", index, "] is not finite (strict=True)");
   }
 }
 

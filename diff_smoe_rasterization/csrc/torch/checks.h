@@ -2,8 +2,12 @@
 // and values, TypeError for types and devices. This is the only place that checks; Python adds none of these.
 #pragma once
 
+#include <cstring>
 #include <string>
+#include <type_traits>
+#include <vector>
 
+#include "check_tensor.h"
 #include "tensors.h"
 
 namespace dsmoe {
@@ -13,17 +17,47 @@ namespace binding {
 void check_arguments(const Inputs& inputs, const Options& options);
 
 // The backward op's own arguments; for a caller that is not our autograd formula.
-void check_backward_arguments(const Inputs& inputs, const Options& options, const Outputs& outputs,
-                              const ImageGradientTensors& image_gradients, const InputMask& wanted);
+void check_backward_arguments(const Inputs& inputs, const Options& options, const Images& images,
+                              const Images& image_gradients, const InputMask& wanted);
 
-// The op contributions: of the outputs those that it reads.
-void check_contribution_arguments(const at::Tensor& pixel_weights, const Outputs& outputs,
-                                  const at::Tensor& background_gate, const Options& blend);
+void check_contribution_arguments(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
+                                  const at::Tensor& background_gate, const Options& options);
+
+// A tensor that some rendering made: unchanged, and of such a rendering. shape: -1 is any size.
+void check_result(const char* function, const char* name, const at::Tensor& tensor, const std::vector<int64_t>& shape,
+                  at::ScalarType type, at::Device device);
+
+// Checks the tensors that a rendering saved, and points to them. sizes: what is -1 in them is not checked.
+template <class SavedForward, class Sizes>
+void unpack_saved(const char* function, const Saved& tensors, SavedForward& saved, const Sizes& sizes,
+                  at::Device device) {
+  size_t count = 0;
+  for_each_array(saved, sizes, [&](const char*, auto*&, int64_t) { ++count; });
+  TORCH_CHECK_VALUE(tensors.size() == count, function, ": saved has length ", tensors.size(), "; it must be ", count);
+  size_t next = 0;
+  for_each_array(saved, sizes, [&](const char* name, auto*& pointer, int64_t rows) {
+    const SavedArray array = saved_array(name, pointer, rows);
+    const at::Tensor& tensor = tensors[next++];
+    check_result(function, name, tensor, saved_shape(array), scalar_type(array.type), device);
+    pointer = static_cast<std::remove_reference_t<decltype(pointer)>>(tensor.data_ptr());
+  });
+}
+
+// The numbers that the saved array of that name has, 0 where there is no such tensor.
+template <class SavedForward> int64_t saved_length(const Saved& tensors, SavedForward saved, const char* wanted) {
+  size_t next = 0;
+  int64_t length = 0;
+  for_each_array(saved, {}, [&](const char* name, auto*&, int64_t) {
+    const size_t index = next++;
+    if (std::strcmp(name, wanted) == 0 && index < tensors.size()) length = tensors[index].numel();
+  });
+  return length;
+}
 
 void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix);
 
-// Under `strict`: raises for Gaussian `index`, which has an attribute that is not finite; -1 is none.
-void refuse_non_finite(const Inputs& inputs, int64_t index);
+// Under `strict`: raises for the first Gaussian that has an attribute that is not finite. Waits for the device.
+void refuse_non_finite(const Inputs& inputs);
 
 // Under `prefiltered`: raises for a Gaussian that is not visible [N], unless its position is not finite.
 void refuse_culled(const Inputs& inputs, const at::Tensor& visible);

@@ -8,6 +8,7 @@
 #include "dsmoe/rasterize_cuda.h"
 #include "io/python_bindings.h"
 #include "profiling.h"
+#include "tensors.h"
 
 namespace py = pybind11;
 
@@ -22,6 +23,41 @@ py::dict constants() {
                   "compensation_floor"_a = dsmoe::kCompensationFloor, "low_pass"_a = dsmoe::kLowPass,
                   "frustum_margin"_a = dsmoe::kFrustumMargin, "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon,
                   "tile_size"_a = dsmoe::kTileSize, "segment_length"_a = dsmoe::cuda::kSegmentLength);
+}
+
+// The lists of fields.h: names in the order of the ops' arguments and results; the options with their types.
+template <size_t kCount> py::tuple names(const char* const (&list)[kCount]) {
+  py::tuple out(kCount);
+  for (size_t i = 0; i < kCount; ++i) out[i] = py::str(list[i]);
+  return out;
+}
+
+py::dict options() {
+  py::dict types;
+#define DSMOE_TYPE(type, schema, name) types[#name] = schema;
+  DSMOE_OPTIONS(DSMOE_TYPE)
+#undef DSMOE_TYPE
+  return types;
+}
+
+// What a backend saves: of each tensor its name, its type ("real": that of the inputs) and how many numbers a row has.
+template <class Saved, class Sizes> py::list saved_arrays() {
+  py::list arrays;
+  Saved saved;
+  for_each_array(saved, Sizes(), [&](const char* name, auto*& pointer, int64_t rows) {
+    const dsmoe::SavedArray array = dsmoe::saved_array(name, pointer, rows);
+    const char* type = array.type == dsmoe::NumberType::kInt32   ? "int32"
+                       : array.type == dsmoe::NumberType::kInt64 ? "int64"
+                                                                 : "real";
+    arrays.append(py::make_tuple(name, type, array.columns));
+  });
+  return arrays;
+}
+
+py::dict saved() {
+  using namespace py::literals;
+  return py::dict("cpu"_a = saved_arrays<dsmoe::SavedForward<float>, dsmoe::SavedSizes>(),
+                  "cuda"_a = saved_arrays<dsmoe::cuda::SavedForward<float>, dsmoe::cuda::SavedSizes>());
 }
 
 // The core's list, for Python's own: names in the order of their numbers, each with its facts.
@@ -62,6 +98,10 @@ py::dict stage_times() {
 PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
   m.attr("constants") = constants();
   m.attr("blend_modes") = blend_modes();
+  m.attr("inputs") = names(dsmoe::binding::kInputNames);
+  m.attr("images") = names(dsmoe::binding::kImageNames);
+  m.attr("options") = options();
+  m.attr("saved") = saved();
   m.def("build_info", &build_info);
   m.def("set_profiling", &dsmoe::binding::set_profiling);
   m.def("stage_times", &stage_times);

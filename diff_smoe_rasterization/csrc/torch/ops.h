@@ -1,8 +1,14 @@
-// The signatures of the ops, once for all backends: schema.cpp says them to torch; a backend registers
-// `rasterize<&forward>` and its like under its dispatch key.
+// The ops, once for all backends: from torch's stack of arguments to C++ values, checks, and the results back. Their
+// functions are boxed, so that no list of arguments is written here: fields.h has the only one. A Backend renders:
+// ops_cpu.cpp and ops_cuda.cpp.
 #pragma once
 
+#include <ATen/Dispatch.h>
+#include <ATen/core/stack.h>
+#include <torch/library.h>
+
 #include <algorithm>
+#include <stdexcept>
 #include <string>
 #include <tuple>
 #include <vector>
@@ -13,97 +19,205 @@
 namespace dsmoe {
 namespace binding {
 
-// What the forward pass alone is told: what it refuses, and whether a backward pass may follow.
-struct ForwardOptions {
-  bool strict, prefiltered, for_backward;
+// Reads the arguments of an op in their order.
+class Arguments {
+ public:
+  Arguments(const c10::OperatorHandle& op, torch::jit::Stack& stack)
+      : stack_(stack), begin_(stack.size() - op.schema().arguments().size()), next_(begin_) {}
+
+  void read(at::Tensor& value) {  // undefined where it is None
+    const c10::IValue& argument = next();
+    value = argument.isNone() ? at::Tensor() : argument.toTensor();
+  }
+  void read(int64_t& value) { value = next().toInt(); }
+  void read(double& value) { value = next().toDouble(); }
+  void read(bool& value) { value = next().toBool(); }
+  void read(std::vector<at::Tensor>& value) { value = next().toTensorVector(); }
+  void read(std::vector<bool>& value) {
+    for (const bool flag : next().toBoolList()) value.push_back(flag);
+  }
+  void read(Inputs& value) {
+    for (at::Tensor& tensor : value) read(tensor);
+  }
+  void read(Options& value) {
+#define DSMOE_READ(type, schema, name) read(value.name);
+    DSMOE_OPTIONS(DSMOE_READ)
+#undef DSMOE_READ
+  }
+
+  template <class T> T read() {
+    T value = {};
+    read(value);
+    return value;
+  }
+
+  // Takes the arguments from the stack, which makes place for the results.
+  template <class... Results> void give_back(Results&&... results) {
+    stack_.resize(begin_);
+    torch::jit::push(stack_, std::forward<Results>(results)...);
+  }
+
+ private:
+  const c10::IValue& next() { return stack_[next_++]; }
+
+  torch::jit::Stack& stack_;
+  size_t begin_, next_;
 };
 
-using ForwardFunction = Outputs (*)(const Inputs&, const Options&, ForwardOptions);
-using BackwardFunction = void (*)(const Inputs&, const Options&, const Outputs&, const ImageGradientTensors&,
-                                  const Inputs& gradients);
-
-template <ForwardFunction kForward>
-auto rasterize(const at::Tensor& means3D, const OptionalTensor& means2D, const at::Tensor& opacities,
-               const OptionalTensor& dc, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
-               const OptionalTensor& scales, const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp,
-               const at::Tensor& bg, const at::Tensor& viewmatrix, const at::Tensor& projmatrix,
-               const at::Tensor& campos, const OptionalTensor& background_gate, int64_t image_height,
-               int64_t image_width, double tanfovx, double tanfovy, double scale_modifier, double near,
-               double alpha_min, double fixed_background_gate, int64_t sh_degree, int64_t blend_mode, bool antialiasing,
-               bool depth, bool inverse_depth, bool deterministic, bool debug, bool clamp_color, bool strict,
-               bool prefiltered, bool for_backward) {
-  const auto given = [](const OptionalTensor& tensor) { return tensor.has_value() ? *tensor : at::Tensor(); };
-  // clang-format off
-  const Inputs inputs = {
-      means3D, given(means2D), opacities, given(dc), given(shs), given(colors_precomp), given(scales),
-      given(rotations), given(cov3D_precomp), bg, viewmatrix, projmatrix, campos,
-      given(background_gate)};
-  // clang-format on
-  const Options options = {image_height,  image_width,           tanfovx,   tanfovy,    scale_modifier, near,
-                           alpha_min,     fixed_background_gate, sh_degree, blend_mode, antialiasing,   depth,
-                           inverse_depth, deterministic,         debug,     clamp_color};
-  check_arguments(inputs, options);
-  if (debug) {
-    for (int i = kBackground; i <= kBackgroundGate; ++i)
-      refuse_nan(std::string("rasterize: ") + kInputNames[i], inputs[i]);
+// What does not fit is a RuntimeError in Python; the core's own exception would be an OverflowError.
+template <class Function> void dispatch(const at::Tensor& like, Function function) {
+  try {
+    AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "diff_smoe_rasterization", [&] { function(scalar_t()); });
+  } catch (const std::overflow_error& error) {
+    TORCH_CHECK(false, error.what());
   }
-  const Outputs outputs = kForward(contiguous(inputs), options, {strict, prefiltered, for_backward});
-  if (debug) {
-    for (Output image : kImageOfGradient) refuse_nan(std::string("rasterize: ") + kOutputNames[image], outputs[image]);
-  }
-  return std::tuple_cat(outputs);
 }
 
-template <BackwardFunction kBackward>
-std::vector<at::Tensor> rasterize_backward(const OptionalTensor& dL_dcolor, const OptionalTensor& dL_dgate_sum,
-                                           const OptionalTensor& dL_ddepth, const OptionalTensor& dL_dinverse_depth,
-                                           at::TensorList present_inputs, InputMask present, at::TensorList output_list,
-                                           int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
-                                           double scale_modifier, double near, double alpha_min,
-                                           double fixed_background_gate, int64_t sh_degree, int64_t blend_mode,
-                                           bool antialiasing, bool depth, bool inverse_depth, bool deterministic,
-                                           bool debug, bool clamp_color, InputMask wanted) {
-  const auto dense = [](const OptionalTensor& tensor) {
-    return tensor.has_value() ? tensor->contiguous() : at::Tensor();
-  };
-  const ImageGradientTensors image_gradients = {dense(dL_dcolor), dense(dL_dgate_sum), dense(dL_ddepth),
-                                                dense(dL_dinverse_depth)};
-  const auto check_length = [](const char* name, size_t length, size_t expected) {
-    TORCH_CHECK_VALUE(length == expected, "rasterize_backward: ", name, " has length ", length, "; it must be ",
-                      expected);
-  };
-  check_length("inputs", present_inputs.size(), std::count(present.begin(), present.end(), true));
-  check_length("outputs", output_list.size(), kNumOutputs);
+// What `rasterize` and `radii` ask of the values of their arguments. Returns them dense.
+template <class Backend> Inputs checked(const Inputs& inputs, const Options& options) {
+  if (options.debug) {
+    for (int i = kBackground; i <= kBackgroundGate; ++i) {
+      refuse_nan(std::string("rasterize: ") + kInputNames[i], inputs[i]);
+    }
+  }
+  const Inputs dense = contiguous(inputs);
+  if (options.strict) refuse_non_finite(dense);
+  if (options.prefiltered) {
+    refuse_culled(dense, Backend::visible(dense[kMeans3D], dense[kViewMatrix], options.near));
+  }
+  return dense;
+}
+
+template <class Backend> void rasterize(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  Arguments arguments(op, *stack);
+  const auto given = arguments.read<Inputs>();
+  const auto options = arguments.read<Options>();
+  check_arguments(given, options);
+  const typename Backend::Guard guard(given[kMeans3D].device());
+  const Inputs inputs = checked<Backend>(given, options);
+  const Images images = allocate_images(inputs, options);
+  TensorMemory memory(inputs[kMeans3D]);
+  dispatch(inputs[kMeans3D],
+           [&](auto zero) { Backend::template forward<decltype(zero)>(inputs, options, images, memory); });
+  if (options.debug) {
+    for (Image image : kDifferentiable) refuse_nan(std::string("rasterize: ") + kImageNames[image], images[image]);
+  }
+  arguments.give_back(images[kColor], images[kRadii], images[kGateSum], images[kDepth], images[kInverseDepth],
+                      memory.take_saved());
+}
+
+template <class Backend> void radii(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  Arguments arguments(op, *stack);
+  const auto given = arguments.read<Inputs>();
+  const auto options = arguments.read<Options>();
+  check_arguments(given, options);
+  const typename Backend::Guard guard(given[kMeans3D].device());
+  const Inputs inputs = checked<Backend>(given, options);
+  Images images;
+  images[kRadii] = at::empty({num_gaussians(inputs)}, inputs[kMeans3D].options().dtype(at::kInt));
+  TensorMemory memory(inputs[kMeans3D]);
+  dispatch(inputs[kMeans3D],
+           [&](auto zero) { Backend::template radii<decltype(zero)>(inputs, options, images, memory); });
+  arguments.give_back(images[kRadii]);
+}
+
+inline void check_length(const char* name, size_t length, size_t expected) {
+  TORCH_CHECK_VALUE(length == expected, "rasterize_backward: ", name, " has length ", length, "; it must be ",
+                    expected);
+}
+
+// The inputs in their places; `list` holds those that are present.
+inline Inputs spread(const std::vector<at::Tensor>& list, const std::vector<bool>& present) {
+  check_length("present", present.size(), kNumInputs);
+  check_length("inputs", list.size(), std::count(present.begin(), present.end(), true));
   for (Input i : {kMeans3D, kOpacities, kBackground, kViewMatrix, kProjMatrix, kCampos}) {
     TORCH_CHECK_VALUE(present[i], "rasterize_backward: ", kInputNames[i], " is absent; it must be given");
   }
   Inputs inputs;
-  auto next = present_inputs.begin();
+  auto next = list.begin();
   for (int i = 0; i < kNumInputs; ++i) {
     if (present[i]) inputs[i] = *next++;
   }
-  Outputs outputs;
-  std::copy(output_list.begin(), output_list.end(), outputs.begin());
-  const Options options = {image_height,  image_width,           tanfovx,   tanfovy,    scale_modifier, near,
-                           alpha_min,     fixed_background_gate, sh_degree, blend_mode, antialiasing,   depth,
-                           inverse_depth, deterministic,         debug,     clamp_color};
-  check_backward_arguments(inputs, options, outputs, image_gradients, wanted);
-  if (debug) {
-    for (int i = 0; i < kNumImageGradients; ++i) {
-      refuse_nan(std::string("rasterize_backward: ") + kImageGradientNames[i], image_gradients[i]);
+  return inputs;
+}
+
+template <class Backend> void rasterize_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  Arguments arguments(op, *stack);
+  Images image_gradients, images;
+  for (Image image : kDifferentiable) {
+    arguments.read(image_gradients[image]);
+    if (image_gradients[image].defined()) image_gradients[image] = image_gradients[image].contiguous();
+  }
+  const auto input_list = arguments.read<std::vector<at::Tensor>>();
+  const auto present = arguments.read<std::vector<bool>>();
+  const auto image_list = arguments.read<std::vector<at::Tensor>>();
+  const auto saved = arguments.read<Saved>();
+  const auto options = arguments.read<Options>();
+  const auto wanted_list = arguments.read<std::vector<bool>>();
+  const Inputs given = spread(input_list, present);
+  check_length("images", image_list.size(), kNumImages);
+  check_length("wanted", wanted_list.size(), kNumInputs);
+  InputMask wanted;
+  std::copy(image_list.begin(), image_list.end(), images.begin());
+  std::copy(wanted_list.begin(), wanted_list.end(), wanted.begin());
+
+  check_backward_arguments(given, options, images, image_gradients, wanted);
+  const typename Backend::Guard guard(given[kMeans3D].device());
+  if (options.debug) {
+    for (Image image : kDifferentiable) {
+      refuse_nan(std::string("rasterize_backward: dL_d") + kImageNames[image], image_gradients[image]);
     }
   }
-  inputs = contiguous(inputs);
-  const Inputs gradients = allocate_gradients(inputs, wanted);
-  kBackward(inputs, options, outputs, image_gradients, gradients);
-
-  std::vector<at::Tensor> result;
+  const Inputs inputs = contiguous(given), gradients = allocate_gradients(inputs, wanted);
+  dispatch(inputs[kMeans3D], [&](auto zero) {
+    Backend::template backward<decltype(zero)>(inputs, options, images, saved, image_gradients, gradients);
+  });
+  std::vector<at::Tensor> results;
   for (int i = 0; i < kNumInputs; ++i) {
     if (!wanted[i]) continue;
-    if (debug) refuse_nan(std::string("rasterize_backward: the gradient of ") + kInputNames[i], gradients[i]);
-    result.push_back(gradients[i]);
+    if (options.debug) refuse_nan(std::string("rasterize_backward: the gradient of ") + kInputNames[i], gradients[i]);
+    results.push_back(gradients[i]);
   }
-  return result;
+  arguments.give_back(std::move(results));
+}
+
+template <class Backend> void contributions(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  Arguments arguments(op, *stack);
+  const auto pixel_weights = arguments.read<at::Tensor>();
+  const auto radii = arguments.read<at::Tensor>();
+  const auto saved = arguments.read<Saved>();
+  const auto background_gate = arguments.read<at::Tensor>();
+  const auto options = arguments.read<Options>();
+  check_contribution_arguments(pixel_weights, radii, saved, background_gate, options);
+  const typename Backend::Guard guard(radii.device());
+  const auto real = [&] { return at::empty({radii.numel()}, pixel_weights.options()); };
+  const at::Tensor weights = real(), pixels = at::empty_like(radii), blend_weights = real(), distances = real();
+  const at::Tensor map = pixel_weights.contiguous();
+  dispatch(map, [&](auto zero) {
+    using S = decltype(zero);
+    ContributionSums<S> sums;
+    sums.pixel_weights = mutable_data<S>(weights);
+    sums.pixels = mutable_data<int32_t>(pixels);
+    sums.blend_weights = mutable_data<S>(blend_weights);
+    sums.distances = mutable_data<S>(distances);
+    Backend::template contributions<S>(map, radii, saved, blend_config<S>(background_gate, options), options, sums);
+  });
+  arguments.give_back(weights, pixels, blend_weights, distances);
+}
+
+template <class Backend>
+at::Tensor mark_visible(const at::Tensor& positions, const at::Tensor& viewmatrix, double near) {
+  const typename Backend::Guard guard(positions.device());
+  check_positions(positions, viewmatrix);
+  return Backend::visible(positions.contiguous(), viewmatrix.contiguous(), near);
+}
+
+template <class Backend> void register_ops(torch::Library& m) {
+  m.impl("rasterize", torch::CppFunction::makeFromBoxedFunction<&rasterize<Backend>>());
+  m.impl("rasterize_backward", torch::CppFunction::makeFromBoxedFunction<&rasterize_backward<Backend>>());
+  m.impl("radii", torch::CppFunction::makeFromBoxedFunction<&radii<Backend>>());
+  m.impl("contributions", torch::CppFunction::makeFromBoxedFunction<&contributions<Backend>>());
+  m.impl("mark_visible", &mark_visible<Backend>);
 }
 
 }  // namespace binding

@@ -1,46 +1,47 @@
-// What torch knows of the ops. `alpha` and every other image but the colour is optional; what is made for the backward
-// pass are ordinary typed tensors among the results, so that torch accounts for their memory. Without `for_backward`,
-// what only makes that pass faster is left out. The background's gate is `background_gate`, else the fixed number.
+// What torch knows of the ops. Their arguments are listed in fields.h.
 #include <torch/library.h>
 
 #include <string>
 
+#include "fields.h"
+
 namespace {
 
-const std::string kOptions =
-    "SymInt image_height, SymInt image_width, float tanfovx, float tanfovy, float scale_modifier, float near, "
-    "float alpha_min, float fixed_background_gate, int sh_degree, int blend_mode, bool antialiasing, bool depth, bool "
-    "inverse_depth, bool deterministic, bool debug, bool clamp_color";
+#define DSMOE_ARGUMENT(first, schema, name) schema " " #name ", "
+const std::string kInputs = DSMOE_INPUTS(DSMOE_ARGUMENT);
+const std::string kOptions = DSMOE_OPTIONS(DSMOE_ARGUMENT);
+#undef DSMOE_ARGUMENT
 
+std::string without_comma(const std::string& list) { return list.substr(0, list.size() - 2); }
+
+// Besides the images, a backend returns what its backward pass reads again, as ordinary typed tensors, so that torch
+// accounts for their memory. Which they are is the backend's own affair; the first is [N, 8], `projected` of params.h.
+#define DSMOE_RESULT(enumerator, name) "Tensor " #name ", "
 const std::string kRasterize =
-    "rasterize(Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? dc, Tensor? shs, Tensor? colors_precomp, "
-    "Tensor? scales, Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, "
-    "Tensor campos, Tensor? background_gate, " +
-    kOptions +
-    ", bool strict, bool prefiltered, bool for_backward=True) -> "
-    "(Tensor color, Tensor radii, Tensor gate_sum, Tensor depth, Tensor inverse_depth, Tensor projected, "
-    "Tensor features, Tensor instance_offsets, Tensor tile_offsets, Tensor instances, Tensor final_transmittance, "
-    "Tensor last_contributor, Tensor order, Tensor segments, Tensor segment_queue)";
+    "rasterize(" + kInputs + without_comma(kOptions) + ") -> (" DSMOE_IMAGES(DSMOE_RESULT) "Tensor[] saved)";
+#undef DSMOE_RESULT
 
-// inputs: the present ones of the 14 tensors of rasterize; outputs: all its results. Returned are the gradients of the
+// images, saved: all results of rasterize; inputs: the present ones of its tensors. Returned are the gradients of the
 // wanted inputs, in their order. The lists hold no None, or torch would not see that they require a gradient.
 const std::string kRasterizeBackward =
     "rasterize_backward(Tensor? dL_dcolor, Tensor? dL_dgate_sum, Tensor? dL_ddepth, Tensor? dL_dinverse_depth, "
-    "Tensor[] inputs, bool[14] present, Tensor[] outputs, " +
-    kOptions + ", bool[14] wanted) -> Tensor[]";
+    "Tensor[] inputs, bool[] present, Tensor[] images, Tensor[] saved, " +
+    kOptions + "bool[] wanted) -> Tensor[]";
 
-// From a map and what one rasterize saved: sums over the pixels of each Gaussian.
+// The radii [N] that rasterize would return for the same arguments.
+const std::string kRadii = "radii(" + kInputs + without_comma(kOptions) + ") -> Tensor";
+
+// From a map [H, W] and what one rasterize saved: sums over the pixels of each Gaussian.
 const std::string kContributions =
-    "contributions(Tensor pixel_weights, Tensor radii, Tensor projected, Tensor instance_offsets, "
-    "Tensor tile_offsets, Tensor instances, Tensor last_contributor, Tensor order, Tensor? background_gate, float "
-    "alpha_min, float fixed_background_gate, int blend_mode) -> (Tensor pixel_weights, Tensor pixels, Tensor "
-    "blend_weights, Tensor distances)";
+    "contributions(Tensor pixel_weights, Tensor radii, Tensor[] saved, Tensor? background_gate, " +
+    without_comma(kOptions) + ") -> (Tensor pixel_weights, Tensor pixels, Tensor blend_weights, Tensor distances)";
 
 }  // namespace
 
 TORCH_LIBRARY(diff_smoe_rasterization, m) {
   m.def(kRasterize.c_str());
   m.def(kRasterizeBackward.c_str());
+  m.def(kRadii.c_str());
   m.def(kContributions.c_str());
   m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near) -> Tensor");
 }

@@ -1,5 +1,4 @@
-// The arguments of the ops as C++ values, and torch tensors as the core's structs of pointers. What every backend of
-// the binding shares; a backend adds the calls into its part of the core (forward_cpu.cpp, backward_cpu.cpp).
+// The arguments of the ops as C++ values, and torch tensors as the core's structs of pointers.
 #pragma once
 
 #include <ATen/ATen.h>
@@ -7,95 +6,45 @@
 
 #include <algorithm>
 #include <array>
+#include <utility>
 #include <vector>
 
 #include "dsmoe/rasterize.h"
+#include "fields.h"
 
 namespace dsmoe {
 namespace binding {
 
-using OptionalTensor = c10::optional<at::Tensor>;  // std::optional in newer torch
+#define DSMOE_ENUMERATOR(enumerator, ...) enumerator,
+#define DSMOE_NAME_OF_INPUT(enumerator, schema, name) #name,
+#define DSMOE_NAME_OF_IMAGE(enumerator, name) #name,
 
-// The tensors that a rendering depends on, in the order of the ops' arguments. N Gaussians, C channels.
-enum Input : int {
-  kMeans3D,         // [N, 3]
-  kMeans2D,         // [N, 3] or absent; its value is not read, it receives a gradient
-  kOpacities,       // [N] or [N, 1]
-  kDc,              // [N, 1, 3] or absent
-  kShs,             // [N, K, 3] or absent
-  kColorsPrecomp,   // [N, C] or absent
-  kScales,          // [N, 3] or absent
-  kRotations,       // [N, 4] or absent
-  kCov3DPrecomp,    // [N, 6] or absent
-  kBackground,      // [C]
-  kViewMatrix,      // [4, 4]
-  kProjMatrix,      // [4, 4]
-  kCampos,          // [3]
-  kBackgroundGate,  // one element, or absent
-  kNumInputs
-};
-constexpr const char* kInputNames[kNumInputs] = {
-    "means3D",   "means2D",       "opacities", "dc",         "shs",        "colors_precomp", "scales",
-    "rotations", "cov3D_precomp", "bg",        "viewmatrix", "projmatrix", "campos",         "background_gate"};
+// The tensors that a rendering depends on, in the order of the ops' arguments.
+enum Input : int { DSMOE_INPUTS(DSMOE_ENUMERATOR) kNumInputs };
+constexpr const char* kInputNames[] = {DSMOE_INPUTS(DSMOE_NAME_OF_INPUT)};
 
-// The tensors that a rendering makes, in the order of the op's results: images first, then what backward needs again.
-enum Output : int {
-  kColor,               // [C, H, W]
-  kRadii,               // [N] int32
-  kGateSum,             // [1, H, W] the denominator; the alpha image
-  kDepth,               // [1, H, W], or [0] where it was not asked for
-  kInverseDepth,        // [1, H, W], or [0]
-  kProjected,           // [N, 8] ProjectedGaussian
-  kFeatures,            // CPU: [N, F]; CUDA: [N, feature_stride(F)]
-  kInstanceOffsets,     // int64; CPU: [N + 1]; CUDA: [N, 2] slot ranges where deterministic, else [0]
-  kTileOffsets,         // int64; CPU: [tiles + 1]; CUDA: [tiles + 2], the last one counts all instances
-  kInstances,           // int32; CPU: [I, 2] TileInstance; CUDA: [capacity, 1 or 2]
-  kFinalTransmittance,  // [H, W]
-  kLastContributor,     // [H, W] int32
-  kOrder,               // CUDA: [N] int32 Gaussians by depth, culled ones as ~index; CPU: [0]
-  kSegments,            // CUDA: [rows, kSegmentRow] where the backward pass walks segments, else [0]
-  kSegmentQueue,        // CUDA: [entries, 2] int32 where there are segments, else [0]
-  kNumOutputs
-};
-constexpr const char* kOutputNames[kNumOutputs] = {"color",
-                                                   "radii",
-                                                   "gate_sum",
-                                                   "depth",
-                                                   "inverse_depth",
-                                                   "projected",
-                                                   "features",
-                                                   "instance_offsets",
-                                                   "tile_offsets",
-                                                   "instances",
-                                                   "final_transmittance",
-                                                   "last_contributor",
-                                                   "order",
-                                                   "segments",
-                                                   "segment_queue"};
+// The tensors that a rendering makes for its caller, in the order of the op's results.
+enum Image : int { DSMOE_IMAGES(DSMOE_ENUMERATOR) kNumImages };
+constexpr const char* kImageNames[] = {DSMOE_IMAGES(DSMOE_NAME_OF_IMAGE)};
+
+#undef DSMOE_ENUMERATOR
+#undef DSMOE_NAME_OF_INPUT
+#undef DSMOE_NAME_OF_IMAGE
 
 // The images that loss gradients arrive at, in the order of the backward op's arguments.
-enum ImageGradient : int {
-  kColorGradient,
-  kGateSumGradient,
-  kDepthGradient,
-  kInverseDepthGradient,
-  kNumImageGradients
-};
-constexpr Output kImageOfGradient[kNumImageGradients] = {kColor, kGateSum, kDepth, kInverseDepth};
-constexpr const char* kImageGradientNames[kNumImageGradients] = {"dL_dcolor", "dL_dgate_sum", "dL_ddepth",
-                                                                 "dL_dinverse_depth"};
+constexpr std::array<Image, kNumImages - 1> kDifferentiable = {kColor, kGateSum, kDepth, kInverseDepth};
 
+using OptionalTensor = c10::optional<at::Tensor>;   // std::optional in newer torch
 using Inputs = std::array<at::Tensor, kNumInputs>;  // an absent input is an undefined tensor
-using Outputs = std::array<at::Tensor, kNumOutputs>;
-using ImageGradientTensors = std::array<at::Tensor, kNumImageGradients>;
+using Images = std::array<at::Tensor, kNumImages>;  // also their gradients, undefined where there is none
+using Saved = std::vector<at::Tensor>;              // the arrays of SavedForward, in the order of for_each_array
 using InputMask = std::array<bool, kNumInputs>;
 
-// The plain numbers of GaussianRasterizationSettings.
+// The other arguments: numbers and flags.
 struct Options {
-  int64_t image_height, image_width;
-  double tanfovx, tanfovy, scale_modifier, near, alpha_min, fixed_background_gate;
-  int64_t sh_degree, blend_mode;
-  bool antialiasing, depth, inverse_depth, deterministic, debug, clamp_color;
+#define DSMOE_MEMBER(type, schema, name) type name = {};
+  DSMOE_OPTIONS(DSMOE_MEMBER)
+#undef DSMOE_MEMBER
 };
 
 inline int64_t num_gaussians(const Inputs& inputs) { return inputs[kMeans3D].size(0); }
@@ -107,18 +56,44 @@ inline int64_t num_channels(const Inputs& inputs) {
 // Dense copies of the tensors that are not dense already.
 Inputs contiguous(Inputs inputs);
 
-// What a backend keeps for its backward pass is its own affair: the images have one shape, the rest differs.
-struct OutputSpec {
-  std::vector<int64_t> shape;  // -1: any
-  at::ScalarType type;
-};
-std::array<OutputSpec, kNumOutputs> output_specs(const Inputs& inputs, const Options& options);
+// The shape of an image; of the radii too.
+std::vector<int64_t> image_shape(Image image, const Inputs& inputs, const Options& options);
 
-// All outputs but the instances, whose number is not known yet; nothing is filled.
-Outputs allocate_outputs(const Inputs& inputs, const Options& options);
+// All images, nothing filled.
+Images allocate_images(const Inputs& inputs, const Options& options);
 
 // A gradient for each input that wants one, nothing filled; the others stay undefined.
 Inputs allocate_gradients(const Inputs& inputs, const InputMask& wanted);
+
+at::ScalarType scalar_type(NumberType type);
+
+// What one of the saved arrays looks like as a tensor: [rows] numbers, or [rows, columns].
+std::vector<int64_t> saved_shape(const SavedArray& array);
+
+// Torch's allocator, behind the core's interface.
+class TensorMemory final : public Allocator {
+ public:
+  explicit TensorMemory(const at::Tensor& like) : options_(like.options()) {}
+
+  void* allocate(size_t bytes) override {
+    scratch_.push_back(at::empty({static_cast<int64_t>(bytes)}, options_.dtype(at::kByte)));
+    return scratch_.back().data_ptr();
+  }
+
+  void* keep(int index, const SavedArray& array) override {
+    if (saved_.size() <= static_cast<size_t>(index)) saved_.resize(index + 1);
+    saved_[index] = at::empty(saved_shape(array), options_.dtype(scalar_type(array.type)));
+    return saved_[index].data_ptr();
+  }
+
+  void release() override { scratch_.clear(); }
+
+  Saved take_saved() { return std::move(saved_); }
+
+ private:
+  at::TensorOptions options_;
+  Saved saved_, scratch_;
+};
 
 template <class S> const S* data(const at::Tensor& tensor) { return tensor.defined() ? tensor.data_ptr<S>() : nullptr; }
 
@@ -142,31 +117,18 @@ template <class S> GaussianInputs<S> gaussian_inputs(const Inputs& inputs, const
   return out;
 }
 
-// Reads the camera's tensors, which must lie in host memory.
-template <class S> Camera<S> camera(const Inputs& inputs, const Options& options) {
-  Camera<S> out;
-  out.width = static_cast<int>(options.image_width);
-  out.height = static_cast<int>(options.image_height);
-  out.tan_fov_x = static_cast<S>(options.tanfovx);
-  out.tan_fov_y = static_cast<S>(options.tanfovy);
-  std::copy_n(data<S>(inputs[kViewMatrix]), 16, out.view);
-  std::copy_n(data<S>(inputs[kProjMatrix]), 16, out.projection);
-  std::copy_n(data<S>(inputs[kCampos]), 3, out.position);
-  out.near = static_cast<float>(options.near);  // thresholds are float32 values in every scalar type
-  return out;
-}
-
-// What decides which pairs count and how they are blended; background_gate may be undefined.
-template <class S> void set_blend(RasterConfig<S>& out, const at::Tensor& background_gate, const Options& options) {
+// What decides which pairs count and how they are blended.
+template <class S> RasterConfig<S> blend_config(const at::Tensor& background_gate, const Options& options) {
+  RasterConfig<S> out;
   out.mode = static_cast<BlendMode>(options.blend_mode);
   out.background_gate = static_cast<S>(options.fixed_background_gate);
   out.background_gate_at = data<S>(background_gate);
-  out.alpha_min = static_cast<float>(options.alpha_min);
+  out.alpha_min = static_cast<float>(options.alpha_min);  // thresholds are float32 values in every scalar type
+  return out;
 }
 
 template <class S> RasterConfig<S> raster_config(const Inputs& inputs, const Options& options) {
-  RasterConfig<S> out;
-  set_blend(out, inputs[kBackgroundGate], options);
+  RasterConfig<S> out = blend_config<S>(inputs[kBackgroundGate], options);
   out.num_channels = static_cast<int>(num_channels(inputs));
   out.background = data<S>(inputs[kBackground]);
   out.scale_modifier = static_cast<S>(options.scale_modifier);
@@ -177,36 +139,31 @@ template <class S> RasterConfig<S> raster_config(const Inputs& inputs, const Opt
   return out;
 }
 
-template <class S> SavedForward<S> saved_forward(const Outputs& outputs) {
-  static_assert(sizeof(ProjectedGaussian<S>) == kProjectedGaussianSize * sizeof(S), "a row of `projected`");
-  static_assert(sizeof(TileInstance) == 2 * sizeof(int32_t), "a row of `instances`");
-  SavedForward<S> out;
-  out.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(outputs[kProjected]));
-  out.features = mutable_data<S>(outputs[kFeatures]);
-  out.instance_offsets = mutable_data<int64_t>(outputs[kInstanceOffsets]);
-  out.tile_offsets = mutable_data<int64_t>(outputs[kTileOffsets]);
-  out.instances = reinterpret_cast<TileInstance*>(mutable_data<int32_t>(outputs[kInstances]));
-  out.final_transmittance = mutable_data<S>(outputs[kFinalTransmittance]);
-  out.gate_sum = mutable_data<S>(outputs[kGateSum]);
-  out.last_contributor = mutable_data<int32_t>(outputs[kLastContributor]);
-  return out;
+// Of a camera of either backend, all but its tensors.
+template <class Camera> void set_image(Camera& camera, const Options& options) {
+  camera.width = static_cast<int>(options.image_width);
+  camera.height = static_cast<int>(options.image_height);
+  camera.tan_fov_x = static_cast<decltype(camera.tan_fov_x)>(options.tanfovx);
+  camera.tan_fov_y = static_cast<decltype(camera.tan_fov_y)>(options.tanfovy);
+  camera.near = static_cast<float>(options.near);
 }
 
-template <class S> ImageOutputs<S> image_outputs(const Outputs& outputs) {
+template <class S> ImageOutputs<S> image_outputs(const Images& images) {
   ImageOutputs<S> out;
-  out.color = mutable_data<S>(outputs[kColor]);
-  out.depth = mutable_data<S>(outputs[kDepth]);
-  out.inverse_depth = mutable_data<S>(outputs[kInverseDepth]);
-  out.radii = mutable_data<int32_t>(outputs[kRadii]);
+  out.color = mutable_data<S>(images[kColor]);
+  out.depth = mutable_data<S>(images[kDepth]);
+  out.inverse_depth = mutable_data<S>(images[kInverseDepth]);
+  out.radii = mutable_data<int32_t>(images[kRadii]);
+  out.gate_sum = mutable_data<S>(images[kGateSum]);
   return out;
 }
 
-template <class S> ImageGradients<S> image_gradients(const ImageGradientTensors& tensors) {
+template <class S> ImageGradients<S> image_gradients(const Images& gradients) {
   ImageGradients<S> out;
-  out.color = data<S>(tensors[kColorGradient]);
-  out.gate_sum = data<S>(tensors[kGateSumGradient]);
-  out.depth = data<S>(tensors[kDepthGradient]);
-  out.inverse_depth = data<S>(tensors[kInverseDepthGradient]);
+  out.color = data<S>(gradients[kColor]);
+  out.gate_sum = data<S>(gradients[kGateSum]);
+  out.depth = data<S>(gradients[kDepth]);
+  out.inverse_depth = data<S>(gradients[kInverseDepth]);
   return out;
 }
 
@@ -223,6 +180,13 @@ template <class S> GaussianGradients<S> gaussian_gradients(const Inputs& gradien
   out.dc = mutable_data<S>(gradients[kDc]);
   out.shs = mutable_data<S>(gradients[kShs]);
   return out;
+}
+
+// Everything of a rendering but its camera's tensors and what it saved.
+template <class S, class Frame> void fill_frame(Frame& frame, const Inputs& inputs, const Options& options) {
+  frame.inputs = gaussian_inputs<S>(inputs, options);
+  frame.config = raster_config<S>(inputs, options);
+  set_image(frame.camera, options);
 }
 
 // A gradient that the core returns in one piece, and the inputs whose gradients are its parts, in their order.
@@ -252,11 +216,18 @@ struct JointGradient {
   }
 };
 
-inline JointGradient camera_joint(const Inputs& gradients, const at::Tensor& like) {
-  return {{{kViewMatrix, 16}, {kProjMatrix, 16}, {kCampos, 3}}, gradients, like};
-}
-inline JointGradient background_joint(const Inputs& inputs, const Inputs& gradients) {
-  return {{{kBackground, num_channels(inputs)}, {kBackgroundGate, 1}}, gradients, inputs[kMeans3D]};
+// Fills gradients.inputs, calls `backward`, and stores the gradients that it returned in one piece.
+template <class S, class Gradients, class Backward>
+void with_input_gradients(const Inputs& inputs, const Inputs& gradients, Gradients& out, Backward backward) {
+  const at::Tensor& like = inputs[kMeans3D];
+  const JointGradient camera({{kViewMatrix, 16}, {kProjMatrix, 16}, {kCampos, 3}}, gradients, like);
+  const JointGradient background({{kBackground, num_channels(inputs)}, {kBackgroundGate, 1}}, gradients, like);
+  out.inputs = gaussian_gradients<S>(gradients);
+  out.inputs.camera = reinterpret_cast<CameraGradient<S>*>(mutable_data<S>(camera.whole));
+  out.inputs.background = mutable_data<S>(background.whole);
+  backward();
+  camera.store(gradients);
+  background.store(gradients);
 }
 
 }  // namespace binding

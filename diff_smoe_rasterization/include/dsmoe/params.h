@@ -8,6 +8,12 @@
 
 namespace dsmoe {
 
+// How many tiles an image of these pixels has.
+inline int64_t num_tiles(int width, int height) {
+  const TileGrid grid(width, height);
+  return static_cast<int64_t>(grid.columns) * grid.rows;
+}
+
 template <class S> struct GaussianInputs {
   int64_t num_gaussians = 0;
   const S* means3D = nullptr;         // [N, 3] world
@@ -52,7 +58,7 @@ struct TileInstance {
   uint32_t slot;  // where its gradient goes: the Gaussian's instances lie side by side
 };
 
-// What the forward pass leaves for the backward pass; rows of culled Gaussians are zero.
+// What the CPU's forward pass leaves for the backward pass; rows of culled Gaussians are zero.
 template <class S> struct SavedForward {
   ProjectedGaussian<S>* projected = nullptr;  // [N]
   S* features = nullptr;                      // [N, F]
@@ -60,8 +66,36 @@ template <class S> struct SavedForward {
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
   TileInstance* instances = nullptr;          // [I]
   S* final_transmittance = nullptr;           // [H, W] T_{N+1}
-  S* gate_sum = nullptr;                      // [H, W] the denominator
+  S* gate_sum = nullptr;                      // [H, W] the denominator: the caller's image
   int32_t* last_contributor = nullptr;        // [H, W] how many entries of the tile's list the numerator has seen
+};
+
+// What the lengths of those arrays follow from.
+struct SavedSizes {
+  int64_t num_gaussians = 0;   // N
+  int64_t num_features = 0;    // F; -1: not known
+  int64_t tiles = 0;           // of the image
+  int64_t pixels = 0;          // H W
+  int64_t num_instances = -1;  // I; -1: not known yet
+};
+
+// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. Whoever
+// allocates, checks or passes on these arrays goes by this list and its order.
+template <class S, class Visit> void for_each_array(SavedForward<S>& saved, const SavedSizes& sizes, Visit visit) {
+  visit("projected", saved.projected, sizes.num_gaussians);
+  visit("features", saved.features, sizes.num_features < 0 ? -1 : sizes.num_gaussians * sizes.num_features);
+  visit("instance_offsets", saved.instance_offsets, sizes.num_gaussians + 1);
+  visit("tile_offsets", saved.tile_offsets, sizes.tiles + 1);
+  visit("final_transmittance", saved.final_transmittance, sizes.pixels);
+  visit("last_contributor", saved.last_contributor, sizes.pixels);
+  visit("instances", saved.instances, sizes.num_instances);
+}
+
+// Seconds of each stage, and the work the blend did, of the calls that were given this struct.
+struct StageTimes {
+  double project = 0, sort = 0, bin = 0, blend = 0;
+  double blend_backward = 0, project_backward = 0;
+  int64_t forward_pairs = 0, backward_pairs = 0;  // (Gaussian, pixel) pairs whose exponent was evaluated
 };
 
 template <class S> struct ImageOutputs {
@@ -69,6 +103,7 @@ template <class S> struct ImageOutputs {
   S* depth = nullptr;          // [H, W], or null
   S* inverse_depth = nullptr;  // [H, W], or null
   int32_t* radii = nullptr;    // [N] pixels
+  S* gate_sum = nullptr;       // [H, W] the alpha image
 };
 
 // Sums over the pixels that blended a Gaussian, as contribution.h says; written whole.
@@ -77,6 +112,12 @@ template <class S> struct ContributionSums {
   int32_t* pixels = nullptr;   // [N]
   S* blend_weights = nullptr;  // [N]
   S* distances = nullptr;      // [N] pixels
+};
+
+// From a map of the image to sums over the pixels of each Gaussian.
+template <class S> struct ContributionMap {
+  const S* pixel_weights = nullptr;  // [H, W]
+  ContributionSums<S> sums;
 };
 
 // Any of these may be null: that output was not used.

@@ -1,66 +1,95 @@
-// The rasterizer's public C++ interface, CPU backend: no torch, no allocation of results, float and double.
+// The rasterizer's public C++ interface, CPU backend: no torch, float and double.
 //
-//   SavedForward and ImageOutputs point to memory of the caller's, sized as params.h says, except `instances`, whose
-//   size the first stage returns:
+//     cpu::Frame<float> frame;                    // fill inputs, camera, config and images
+//     cpu::Heap heap;                             // or an Allocator of your own
+//     cpu::forward(frame, heap);                  // the images, and what the backward pass needs
+//     cpu::backward(frame, gradients);            // from gradients by the images to gradients by the inputs
 //
-//     int64_t count = cpu::project(inputs, camera, config, saved, images);   // projected, features, offsets, radii
-//     saved.instances = ... [count];
-//     cpu::bin(inputs.num_gaussians, camera, config, saved, images.radii);   // tile lists, front to back
-//     cpu::blend(camera, config, saved, images);                             // the images
-//     cpu::backward(inputs, camera, config, saved, images, image_gradients, gradients);
-//     cpu::contributions(inputs.num_gaussians, width, height, config, saved, pixel_weights, sums);  // of each Gaussian
+// The stages that these two run, in their order, are declared below and can be called one by one. Then the caller
+// allocates what `saved` points to.
 //
 // Results do not depend on config.num_threads, bit for bit.
 #pragma once
 
 #include <cstdint>
+#include <memory>
+#include <vector>
 
+#include "dsmoe/allocator.h"
 #include "dsmoe/params.h"
-#include "dsmoe/tiles.h"
 
 namespace dsmoe {
-
-inline int64_t num_tiles(int width, int height) {
-  const TileGrid grid(width, height);
-  return static_cast<int64_t>(grid.columns) * grid.rows;
-}
-
 namespace cpu {
 
-// Seconds of each stage, and the work the blend did, of the calls that were given this struct.
-struct StageTimes {
-  double project = 0, sort = 0, bin = 0, blend = 0;
-  double blend_backward = 0, project_backward = 0;
-  int64_t forward_pairs = 0, backward_pairs = 0;  // (Gaussian, pixel) pairs whose exponent was evaluated
+using dsmoe::StageTimes;
+
+// One rendering, from its inputs to what it leaves for the backward pass.
+template <class S> struct Frame {
+  GaussianInputs<S> inputs;
+  Camera<S> camera;
+  RasterConfig<S> config;
+  ImageOutputs<S> images;  // where the results go
+  SavedForward<S> saved;   // filled by `forward`
 };
 
+// What a backward pass is given and what it writes.
+template <class S> struct Gradients {
+  ImageGradients<S> images;
+  GaussianGradients<S> inputs;
+};
+
+// Renders frame.inputs to frame.images and fills frame.saved. times: is added to, or null.
 // Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
-template <class S>
-int64_t project(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
-                const SavedForward<S>& saved, const ImageOutputs<S>& images, StageTimes* times = nullptr);
+template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* times = nullptr);
 
-template <class S>
-void bin(int64_t num_gaussians, const Camera<S>& camera, const RasterConfig<S>& config, const SavedForward<S>& saved,
-         const int32_t* radii, StageTimes* times = nullptr);
+// Writes gradients.inputs. `frame` is as `forward` left it.
+template <class S> void backward(const Frame<S>& frame, const Gradients<S>& gradients, StageTimes* times = nullptr);
 
-template <class S>
-void blend(const Camera<S>& camera, const RasterConfig<S>& config, const SavedForward<S>& saved,
-           const ImageOutputs<S>& images, StageTimes* times = nullptr);
+// Fills frame.images.radii as `forward` does, and nothing else.
+template <class S> void radii(const Frame<S>& frame, Scratch& scratch);
 
-template <class S>
-void backward(const GaussianInputs<S>& inputs, const Camera<S>& camera, const RasterConfig<S>& config,
-              const SavedForward<S>& saved, const ImageOutputs<S>& images, const ImageGradients<S>& image_gradients,
-              const GaussianGradients<S>& gradients, StageTimes* times = nullptr);
+// The sizes of what `forward` keeps; how many instances there are is not known yet.
+template <class S> SavedSizes saved_sizes(const Frame<S>& frame) {
+  SavedSizes sizes;
+  sizes.num_gaussians = frame.inputs.num_gaussians;
+  sizes.num_features = frame.config.num_features();
+  sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
+  sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
+  return sizes;
+}
 
-// Walks the tile lists once more, and sums what the pixels of each Gaussian say. pixel_weights: [H, W]. Of config it
-// reads the mode, alpha_min, the background's gate and num_threads; of saved neither features nor images but
-// last_contributor.
-template <class S>
-void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
-                   const SavedForward<S>& saved, const S* pixel_weights, const ContributionSums<S>& sums);
+// Keeps everything until it is destroyed.
+class Heap final : public Allocator {
+ public:
+  void* allocate(size_t bytes) override {
+    blocks_.emplace_back(new char[bytes]);
+    return blocks_.back().get();
+  }
+  void* keep(int, const SavedArray& array) override { return allocate(array.bytes()); }
+  void release() override {}
 
-// Marks the Gaussians in front of the near plane. visible: [N].
-template <class S> void mark_visible(int64_t num_gaussians, const S* means3D, const Camera<S>& camera, bool* visible);
+ private:
+  std::vector<std::unique_ptr<char[]>> blocks_;
+};
+
+// Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are.
+// Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
+template <class S> int64_t project(const Frame<S>& frame, StageTimes* times = nullptr);
+
+// Fills saved.tile_offsets and saved.instances: the tile lists, front to back.
+template <class S> void bin(const Frame<S>& frame, StageTimes* times = nullptr);
+
+// Fills frame.images but the radii, and what saved has for each pixel.
+template <class S> void blend(const Frame<S>& frame, StageTimes* times = nullptr);
+
+// Walks the tile lists once more, and sums what the pixels of each Gaussian say. Of the frame it reads the number of
+// Gaussians, the image's size, of config the mode, alpha_min, the background's gate and num_threads, and of saved
+// neither features nor images but last_contributor.
+template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map);
+
+// Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
+// visible: [N].
+template <class S> void mark_visible(const Frame<S>& frame, bool* visible);
 
 // The first Gaussian with an attribute that is NaN or infinite, or -1.
 template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int num_channels);

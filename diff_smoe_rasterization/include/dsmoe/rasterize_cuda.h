@@ -1,13 +1,12 @@
 // The rasterizer's public C++ interface, CUDA backend: no torch, float and double, every call asynchronous on the
 // caller's stream. All pointers are device pointers, to memory of the caller's.
 //
-//     cuda::project(inputs, camera, config, saved, images, keys, stream);                     // footprints, colours
-//     cuda::sort_by_depth(inputs.num_gaussians, keys, saved.order, scratch, stream);
-//     saved.instances = ... [capacity, saved.instance_width]; saved.capacity = capacity;
-//     cuda::bin(inputs.num_gaussians, camera, config, saved, images.radii, scratch, stream);  // tile lists
-//     cuda::blend(inputs.num_gaussians, camera, config, saved, images, pairs, stream);        // the images
-//     cuda::blend_backward(...); cuda::project_backward(...);                                 // the gradients
-//     cuda::contributions(...);                                                               // scores of Gaussians
+//     cuda::Frame<float> frame;                   // fill inputs, camera, config and images
+//     cuda::StreamMemory memory(stream);          // or an Allocator of your own
+//     cuda::forward(frame, {stream}, memory);     // the images, and what the backward pass needs
+//     cuda::backward(frame, gradients, {stream}, memory);
+//
+// The stages that these two run, in their order, are declared below and can be called one by one.
 //
 // A capacity that turns out too small costs time, not correctness: where the instances do not fit, the blend reads the
 // depth order itself instead of the tile lists. So the host never has to wait, and a captured graph stays right when
@@ -19,7 +18,9 @@
 #include <cstddef>
 #include <cstdint>
 #include <type_traits>
+#include <vector>
 
+#include "dsmoe/allocator.h"
 #include "dsmoe/params.h"
 
 using cudaStream_t = struct CUstream_st*;  // as CUDA's own headers have it, which callers without CUDA lack
@@ -60,18 +61,109 @@ template <class S> struct SavedForward {
   int64_t* slot_ranges = nullptr;    // [N, 2] each Gaussian's slots, begin and end; null without slots
   S* segments = nullptr;             // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
   int32_t* segment_queue = nullptr;  // [num_queue_entries(capacity), 2] which segments some pixel has reached, or null
-  S* final_transmittance = nullptr;
-  S* gate_sum = nullptr;
+  S* final_transmittance = nullptr;  // [H, W] T_{N+1}
+  S* gate_sum = nullptr;             // [H, W] the denominator: the caller's image
   int32_t* last_contributor = nullptr;  // [H, W] how many entries of the list the numerator has seen
 };
 
-// Memory for the duration of one call, or null where there is none left; the caller frees it in the stream's order.
-class Scratch {
- public:
-  virtual void* allocate(size_t bytes) = 0;
+// What the lengths of those arrays follow from.
+struct SavedSizes {
+  int64_t num_gaussians = 0;  // N
+  int64_t num_features = 0;   // F; -1: not known
+  int64_t tiles = 0;          // of the image
+  int64_t pixels = 0;         // H W
+  int64_t capacity = -1;      // of `instances`; -1: not known yet
+  bool slots = false;         // gradients are bitwise reproducible
+  bool segments = false;      // the backward pass walks long lists in segments
+};
 
- protected:
-  ~Scratch() = default;
+// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. Whoever
+// allocates, checks or passes on these arrays goes by this list and its order. tile_offsets has num_instances behind
+// it.
+template <class S, class Visit> void for_each_array(SavedForward<S>& saved, const SavedSizes& sizes, Visit visit) {
+  const bool known = sizes.capacity >= 0;
+  const int64_t stride = sizes.num_features < 0 ? -1 : feature_stride(static_cast<int>(sizes.num_features));
+  visit("projected", saved.projected, sizes.num_gaussians);
+  visit("features", saved.features, stride < 0 ? -1 : sizes.num_gaussians * stride);
+  visit("order", saved.order, sizes.num_gaussians);
+  visit("tile_offsets", saved.tile_offsets, sizes.tiles + 2);
+  visit("slot_ranges", saved.slot_ranges, sizes.slots ? 2 * sizes.num_gaussians : 0);
+  visit("final_transmittance", saved.final_transmittance, sizes.pixels);
+  visit("last_contributor", saved.last_contributor, sizes.pixels);
+  visit("instances", saved.instances, known ? sizes.capacity * (sizes.slots ? 2 : 1) : -1);
+  visit("segments", saved.segments, !sizes.segments ? 0 : known ? num_segment_rows(sizes.capacity) * kSegmentRow : -1);
+  visit("segment_queue", saved.segment_queue, !sizes.segments ? 0 : known ? 2 * num_queue_entries(sizes.capacity) : -1);
+}
+
+// Sets what is no array of its own, once the arrays are there.
+template <class S> void complete(SavedForward<S>& saved, const SavedSizes& sizes) {
+  saved.num_instances = saved.tile_offsets + sizes.tiles + 1;
+  saved.capacity = sizes.capacity;
+  saved.instance_width = sizes.slots ? 2 : 1;
+}
+
+// One rendering, from its inputs to what it leaves for the backward pass.
+template <class S> struct Frame {
+  GaussianInputs<S> inputs;
+  DeviceCamera<S> camera;
+  RasterConfig<S> config;
+  ImageOutputs<S> images;  // where the results go
+  SavedForward<S> saved;   // filled by `forward`
+};
+
+// What a backward pass is given and what it writes.
+template <class S> struct Gradients {
+  ImageGradients<S> images;
+  GaussianGradients<S> inputs;
+};
+
+// How a pass runs.
+struct Run {
+  cudaStream_t stream = nullptr;
+  bool deterministic = false;   // gradients are equal bit for bit from run to run; slower
+  bool for_backward = true;     // false: what only makes a backward pass faster is left out
+  StageTimes* times = nullptr;  // is added to, or null; the pass then waits for its kernels
+};
+
+// Renders frame.inputs to frame.images and fills frame.saved. The first call of a size, mode and order of N waits for
+// the number of instances, and so does every call with `deterministic`; no other waits.
+// Throws std::overflow_error where `deterministic` has more instances than fit 32-bit slots.
+template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory);
+
+// Writes gradients.inputs. `frame` is as `forward` left it, and run.deterministic as it was there.
+template <class S>
+void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory);
+
+// Fills frame.images.radii as `forward` does, and nothing else.
+template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory);
+
+// The sizes of what `forward` keeps; the capacity is not known yet.
+template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run) {
+  SavedSizes sizes;
+  sizes.num_gaussians = frame.inputs.num_gaussians;
+  sizes.num_features = frame.config.num_features();
+  sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
+  sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
+  sizes.slots = run.deterministic;
+  sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kSegmentFeatures;
+  return sizes;
+}
+
+// Memory of the current device, from the pool of the stream. What is kept lasts as long as the object.
+class StreamMemory final : public Allocator {
+ public:
+  explicit StreamMemory(cudaStream_t stream) : stream_(stream) {}
+  StreamMemory(const StreamMemory&) = delete;
+  StreamMemory& operator=(const StreamMemory&) = delete;
+  ~StreamMemory();
+
+  void* allocate(size_t bytes) override;
+  void* keep(int index, const SavedArray& array) override;
+  void release() override;
+
+ private:
+  cudaStream_t stream_;
+  std::vector<void*> scratch_, kept_;
 };
 
 // The bits of a positive float, read as an integer, are in the order of the float.
@@ -87,59 +179,54 @@ template <class S> struct DepthKeys {
 // culled ones keep their places.
 bool needs_depth_order(BlendMode mode);
 
-// Fills saved.projected, saved.features, images.radii and keys.
-template <class S>
-void project(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-             const SavedForward<S>& saved, const ImageOutputs<S>& images, const DepthKeys<S>& keys,
-             cudaStream_t stream);
+// How a stage runs.
+struct Work {
+  cudaStream_t stream = nullptr;
+  Scratch* scratch = nullptr;           // for memory between its kernels
+  unsigned long long* pairs = nullptr;  // in device memory; (Gaussian, pixel) pairs evaluated are added to it; or null
+};
 
-// Fills order [N].
-template <class S>
-void sort_by_depth(int64_t num_gaussians, const DepthKeys<S>& keys, int32_t* order, Scratch& scratch,
-                   cudaStream_t stream);
+// Fills frame.saved.projected, frame.saved.features, frame.images.radii and keys.
+template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
 
-// Fills saved.num_instances alone, for a caller that wants exactly as much memory as is needed.
-template <class S>
-void count_instances(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                     const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream);
+// Fills frame.saved.order.
+template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
 
-// Fills saved.num_instances, instances, tile_offsets and slot_ranges, and empties segment_queue.
-template <class S>
-void bin(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-         const SavedForward<S>& saved, const int32_t* radii, Scratch& scratch, cudaStream_t stream);
+// Fills only frame.saved.num_instances, for a caller that wants exactly as much memory as is needed.
+template <class S> void count_instances(const Frame<S>& frame, const Work& work);
 
-// pairs: where not null, the number of (Gaussian, pixel) pairs that were evaluated is added to it.
-template <class S>
-void blend(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-           const SavedForward<S>& saved, const ImageOutputs<S>& images, unsigned long long* pairs, cudaStream_t stream);
+// Fills saved.num_instances, instances, tile_offsets and slot_ranges of the frame, and empties segment_queue.
+template <class S> void bin(const Frame<S>& frame, const Work& work);
 
-// From image gradients to one record per Gaussian: the sums over its pixels, [N, kNumGateMoments + F], which must be
-// zero before. slots: [capacity, kSlotsPerInstance, kNumGateMoments + F], also zero, which take the place of the
-// records where the instances fit; or null. dL_dbackground: [C + 1], or null. pairs: as above.
-template <class S>
-void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                    const SavedForward<S>& saved, const ImageOutputs<S>& images,
-                    const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
-                    Scratch& scratch, unsigned long long* pairs, cudaStream_t stream);
+// Fills frame.images but the radii, and what saved has for each pixel.
+template <class S> void blend(const Frame<S>& frame, const Work& work);
+
 constexpr int kSlotsPerInstance = 4;  // one for each quarter of a tile
 
-// From the records to the gradients of every input.
-template <class S>
-void project_backward(const GaussianInputs<S>& inputs, const DeviceCamera<S>& camera, const RasterConfig<S>& config,
-                      const SavedForward<S>& saved, const int32_t* radii, const S* dL_dgaussians, const S* slots,
-                      const GaussianGradients<S>& gradients, Scratch& scratch, cudaStream_t stream);
+// What goes through both stages of a backward pass.
+template <class S> struct BackwardPass {
+  Gradients<S> gradients;      // given by the images, wanted by the inputs
+  S* dL_dgaussians = nullptr;  // [N, kNumGateMoments + F] a Gaussian's record: the sums over its pixels; zero before
+  // [capacity, kSlotsPerInstance, kNumGateMoments + F], zero before, in place of the records where the instances fit;
+  // or null.
+  S* slots = nullptr;
+};
+
+// From image gradients to the records, and to the gradient by the background.
+template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
+
+// From the records to the gradients of every other input.
+template <class S> void project_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
-// may differ in their last digits from call to call. pixel_weights: [H, W]. Of config it reads the mode, alpha_min and
-// the background's gate; of saved neither features nor images but last_contributor; of images the radii.
-template <class S>
-void contributions(int64_t num_gaussians, int width, int height, const RasterConfig<S>& config,
-                   const SavedForward<S>& saved, const ImageOutputs<S>& images, const S* pixel_weights,
-                   const ContributionSums<S>& sums, cudaStream_t stream);
+// may differ in their last digits from call to call. Of the frame it reads the number of Gaussians, the image's size,
+// of config the mode, alpha_min and the background's gate, of images the radii, and of saved neither features nor
+// images but last_contributor.
+template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work);
 
-// Marks the Gaussians in front of the near plane. visible: [N].
-template <class S>
-void mark_visible(int64_t num_gaussians, const S* means3D, const S* view, S near, bool* visible, cudaStream_t stream);
+// Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
+// visible: [N].
+template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work);
 
 }  // namespace cuda
 }  // namespace dsmoe

@@ -6,7 +6,16 @@ import torch
 from against_cpu import FLOAT32, FLOAT64, Tolerance, compare
 from comparison import assert_all_close, assert_close, reference_gradients
 from real_data import folder
-from scenes import Scene, camera_settings, gradients, op_arguments, random_scene, with_gate, with_gates
+from scenes import (
+    Scene,
+    camera_settings,
+    gradients,
+    op_arguments,
+    op_results,
+    random_scene,
+    with_gate,
+    with_gates,
+)
 
 from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.extension import _C
@@ -187,7 +196,7 @@ LONG_LISTS = {
 def test_lists_of_several_segments(mode, name, gpu):
     """Of float and three features, so that a warp of the backward pass has a part of a list; some tiles are partial."""
     scene = LONG_LISTS[name](mode)
-    offsets = torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene.to(torch.float32).to(gpu)))[8]
+    offsets = op_results(scene.to(torch.float32).to(gpu))[1]["tile_offsets"]
     assert (offsets[1:-1] - offsets[:-2]).max() > 2 * _C.constants["segment_length"]
     # Sums of a thousand terms and more, in another order. Of 1480 pixels with a thousand pairs of alpha near 1/255
     # each, a few have one that lies within rounding, 1e-6 of itself, of that threshold.
@@ -202,21 +211,21 @@ def test_renderings_without_gradients_keep_no_segments(mode, gpu):
     """They have no use for them. Images are the same bit for bit, and a backward pass would be right nevertheless."""
     scene = LONG_LISTS["faint"](mode).to(torch.float32).to(gpu)
     colour_alone = {"depth": False, "inverse_depth": False}
-    op = torch.ops.diff_smoe_rasterization.rasterize
-    kept, lean = (op(*op_arguments(scene, **colour_alone, for_backward=wanted)) for wanted in (True, False))
-    assert lean[-2].numel() == lean[-1].numel() == 0 < kept[-2].numel()
+    kept, lean = (op_results(scene, **colour_alone, for_backward=wanted) for wanted in (True, False))
+    for name in ("segments", "segment_queue"):
+        assert lean[1][name].numel() == 0 < kept[1][name].numel()
     with torch.no_grad():
         rendering = rasterize(settings=scene.settings, **scene.inputs)
-    for image in (lean[0], rendering.color):
-        assert torch.equal(image, kept[0])
+    for image in (lean[0]["color"], rendering.color):
+        assert torch.equal(image, kept[0]["color"])
 
-    names = [argument.name for argument in op.default._schema.arguments[:14]]  # the tensors
-    inputs = {name: value for name, value in zip(names, op_arguments(scene)) if value is not None}
-    present = [name in inputs for name in names]
-    gradient = torch.randn(kept[0].shape, generator=torch.Generator().manual_seed(1)).to(gpu)
+    inputs = {name: value for name, value in zip(_C.inputs, op_arguments(scene)) if value is not None}
+    present = [name in inputs for name in _C.inputs]
+    gradient = torch.randn(kept[0]["color"].shape, generator=torch.Generator().manual_seed(1)).to(gpu)
     first, second = (torch.ops.diff_smoe_rasterization.rasterize_backward(
         *op_arguments(scene, "rasterize_backward", **colour_alone, dL_dcolor=gradient, inputs=list(inputs.values()),
-                      present=present, wanted=present, outputs=list(outputs))) for outputs in (kept, lean))
+                      present=present, wanted=present, images=list(images.values()), saved=list(saved.values())))
+        for images, saved in (kept, lean))
     # The same sums of a thousand float32 terms and more, added in another order.
     assert_all_close(dict(zip(inputs, first)), dict(zip(inputs, second)), 1e-4)
 

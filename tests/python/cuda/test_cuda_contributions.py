@@ -5,7 +5,7 @@ import pytest
 import torch
 from comparison import assert_close
 from devices import random_normal
-from scenes import gate_of, op_arguments, random_scene, with_gate, with_gates
+from scenes import gate_of, op_results, random_scene, with_gate, with_gates
 from test_cuda_against_cpu import SCENES, selected
 from test_cuda_graphs import SLEEP, WARM_UP, list_size, own_width, scene_of
 
@@ -117,9 +117,8 @@ def test_lists_that_are_outgrown(mode, gpu):
 def test_a_deterministic_rendering_has_its_sums(mode, gpu):
     """Slots lie beside the instances of its lists."""
     scene = random_scene(mode, 3000, 160, 107, scale=0.03)
-    results = torch.ops.diff_smoe_rasterization.rasterize(
-        *op_arguments(scene.to(torch.float32).to(gpu).with_settings(deterministic=True)))
-    assert results[9].shape[1] == 2
+    saved = op_results(scene.to(torch.float32).to(gpu).with_settings(deterministic=True))[1]
+    assert saved["slot_ranges"].numel() == 2 * 3000
     pixel_weights = map_for(scene.settings)
     expected = scores(scene, gpu, torch.float32, pixel_weights)[3]
     actual = scores(scene, gpu, torch.float32, pixel_weights, deterministic=True)[3]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import BACKGROUND_GATES, Scene, op_arguments, random_scene, with_gate, with_gates
+from scenes import BACKGROUND_GATES, Scene, op_results, random_scene, with_gate, with_gates
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -108,10 +108,9 @@ def own_width(mode, width):
 
 def list_size(scene, gpu):
     """Returns for how many tile instances a call has room, and how many there are."""
-    results = torch.ops.diff_smoe_rasterization.rasterize(*op_arguments(scene.to(torch.float32).to(gpu)))
-    offsets, instances = results[8], results[9]
+    saved = op_results(scene.to(torch.float32).to(gpu))[1]
     torch.cuda.synchronize()
-    return len(instances), int(offsets[-1])
+    return len(saved["instances"]), int(saved["tile_offsets"][-1])
 
 
 @with_gates

@@ -81,16 +81,26 @@ def test_statistics_count_views_and_screen_space_gradients(device, dtype):
     torch.testing.assert_close(gradient_sum.double(), expected_sum, rtol=tolerance, atol=tolerance)
 
 
+def test_statistics_that_were_saved_for_a_backward_pass_are_not_changed_unseen(device):
+    factor = torch.ones(4, requires_grad=True)
+    for place in range(2):
+        statistics = [torch.ones(4), torch.ones(4)]
+        product = (factor * statistics[place]).sum()
+        add_view(torch.ones(4, 3), torch.ones(4, dtype=torch.int32), *statistics)
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            product.backward()
+
+
 def test_what_does_not_fit_is_refused(device):
     opacities, scales, rotations = raw_parameters(4, torch.float32)
     for arguments, error, text in (
             ((opacities[:, 0], scales, rotations), ValueError, r"opacities has shape \[4\]; it must be \[N, 1\]"),
             ((opacities, scales[:3], rotations), ValueError, r"scales has shape \[3, 3\]; it must be \[4, 3\]"),
-            ((opacities, scales, rotations.double()), TypeError, "rotations is Double; it must be Float"),
-            ((opacities.half(), scales, rotations), TypeError, "opacities is Half")):
+            ((opacities, scales, rotations.double()), TypeError, "rotations is float64; it must be float32"),
+            ((opacities.half(), scales, rotations), TypeError, "opacities is float16")):
         with pytest.raises(error, match="activate: " + text):
             activate(*arguments)
-    with pytest.raises(TypeError, match="add_view: radii is Long; it must be Int"):
+    with pytest.raises(TypeError, match="add_view: radii is int64; it must be int32"):
         add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int64), torch.zeros(4), torch.zeros(4))
     with pytest.raises(ValueError, match=r"add_view: view_count has shape \[5\]; it must be \[4\]"):
         add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int32), torch.zeros(4), torch.zeros(5))

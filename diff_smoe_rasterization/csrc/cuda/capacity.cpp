@@ -1,11 +1,9 @@
 #include "capacity.h"
 
-#include <algorithm>
-
-#include "../cuda/check.h"
+#include "check.h"
 
 namespace dsmoe {
-namespace binding {
+namespace cuda {
 namespace {
 
 constexpr size_t kMostKeys = 1024;  // more sizes than that are not remembered
@@ -22,7 +20,7 @@ int64_t with_margin(int64_t count, int64_t calls) {
 
 bool is_capturing(cudaStream_t stream) {
   cudaStreamCaptureStatus status;
-  cuda::check(cudaStreamIsCapturing(stream, &status), "asking for the stream's state");
+  check(cudaStreamIsCapturing(stream, &status), "asking for the stream's state");
   return status != cudaStreamCaptureStatusNone;
 }
 
@@ -39,8 +37,9 @@ int64_t InstanceCapacities::likely(const Key& key) {
   if (found == counts_.end()) return -1;
   Count& count = found->second;
   const int64_t latest = *static_cast<volatile int64_t*>(count.latest);  // the device writes it
-  count.greatest = std::max(count.greatest, latest);
-  return count.greatest < 0 ? -1 : with_margin(count.greatest, count.calls++);
+  count.recent.add(latest);
+  const int64_t greatest = count.recent.greatest();
+  return greatest < 0 ? -1 : with_margin(greatest, count.calls++);
 }
 
 void InstanceCapacities::learn(const Key& key, const int64_t* num_instances, cudaStream_t stream) {
@@ -49,13 +48,13 @@ void InstanceCapacities::learn(const Key& key, const int64_t* num_instances, cud
   if (found == counts_.end()) {
     if (counts_.size() >= kMostKeys || is_capturing(stream)) return;  // no memory can be pinned during a capture
     Count count;
-    cuda::check(cudaHostAlloc(reinterpret_cast<void**>(&count.latest), sizeof(int64_t), cudaHostAllocPortable),
-                "allocating pinned memory");
+    check(cudaHostAlloc(reinterpret_cast<void**>(&count.latest), sizeof(int64_t), cudaHostAllocPortable),
+          "allocating pinned memory");
     *count.latest = -1;
     found = counts_.emplace(key, count).first;
   }
-  cuda::check(cudaMemcpyAsync(found->second.latest, num_instances, sizeof(int64_t), cudaMemcpyDeviceToHost, stream),
-              "counting instances");
+  check(cudaMemcpyAsync(found->second.latest, num_instances, sizeof(int64_t), cudaMemcpyDeviceToHost, stream),
+        "counting instances");
 }
 
 InstanceCapacities& InstanceCapacities::shared() {
@@ -63,5 +62,5 @@ InstanceCapacities& InstanceCapacities::shared() {
   return *capacities;
 }
 
-}  // namespace binding
+}  // namespace cuda
 }  // namespace dsmoe

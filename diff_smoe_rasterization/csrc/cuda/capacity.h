@@ -1,7 +1,8 @@
 // How much memory the tile instances of a rendering get, before the GPU has counted them. The counts of earlier
 // renderings of the same size, mode and order of N are a good guess; a bad one costs time, never correctness
 // (rasterize_cuda.h). The background's gate is no part of the key: of a tensor the host does not know it.
-// This table of sizes is all that outlives a call.
+// What needed much more than the others is forgotten after a thousand renderings: the key sort and the memory follow
+// the capacity. This table of sizes is all that outlives a call.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -12,8 +13,10 @@
 #include <mutex>
 #include <tuple>
 
+#include "recent_greatest.h"
+
 namespace dsmoe {
-namespace binding {
+namespace cuda {
 
 class InstanceCapacities {
  public:
@@ -33,7 +36,7 @@ class InstanceCapacities {
   // captured graph may write it at any time.
   struct Count {
     int64_t* latest = nullptr;
-    int64_t greatest = -1;
+    RecentGreatest recent;
     int64_t calls = 0;
   };
 
@@ -43,5 +46,5 @@ class InstanceCapacities {
 
 bool is_capturing(cudaStream_t stream);
 
-}  // namespace binding
+}  // namespace cuda
 }  // namespace dsmoe

@@ -6,15 +6,15 @@
 #include <utility>
 #include <vector>
 
-#include "../cuda/check.h"
-#include "profiling.h"
+#include "check.h"
+#include "dsmoe/params.h"
 
 namespace dsmoe {
-namespace binding {
+namespace cuda {
 
 class EventClock {
  public:
-  EventClock(cpu::StageTimes* times, cudaStream_t stream) : times_(times), stream_(stream) { record(nullptr); }
+  EventClock(StageTimes* times, cudaStream_t stream) : times_(times), stream_(stream) { record(nullptr); }
   EventClock(const EventClock&) = delete;
   EventClock& operator=(const EventClock&) = delete;
   ~EventClock() {
@@ -22,15 +22,15 @@ class EventClock {
   }
 
   // Ends the stage `field`, which began where the last one ended.
-  void end(double cpu::StageTimes::*field) { record(field); }
+  void end(double StageTimes::*field) { record(field); }
 
   // Waits, and adds up the stages.
   void finish() {
     if (times_ == nullptr) return;
-    cuda::check(cudaEventSynchronize(marks_.back().event), "timing stages");
+    check(cudaEventSynchronize(marks_.back().event), "timing stages");
     for (size_t i = 1; i < marks_.size(); ++i) {
       float milliseconds = 0;
-      cuda::check(cudaEventElapsedTime(&milliseconds, marks_[i - 1].event, marks_[i].event), "timing stages");
+      check(cudaEventElapsedTime(&milliseconds, marks_[i - 1].event, marks_[i].event), "timing stages");
       times_->*marks_[i].field += milliseconds * 1e-3;
     }
   }
@@ -38,21 +38,21 @@ class EventClock {
  private:
   struct Mark {
     cudaEvent_t event;
-    double cpu::StageTimes::*field;
+    double StageTimes::*field;
   };
 
-  void record(double cpu::StageTimes::*field) {
+  void record(double StageTimes::*field) {
     if (times_ == nullptr) return;
     cudaEvent_t event;
-    cuda::check(cudaEventCreate(&event), "timing stages");
+    check(cudaEventCreate(&event), "timing stages");
     marks_.push_back({event, field});
-    cuda::check(cudaEventRecord(event, stream_), "timing stages");
+    check(cudaEventRecord(event, stream_), "timing stages");
   }
 
-  cpu::StageTimes* times_;
+  StageTimes* times_;
   cudaStream_t stream_;
   std::vector<Mark> marks_;
 };
 
-}  // namespace binding
+}  // namespace cuda
 }  // namespace dsmoe

@@ -1,0 +1,152 @@
+// The order of the stages, and the memory between them. A capacity that turns out too small costs time, not
+// correctness (rasterize_cuda.h), so only the first call of a kind waits for the number of instances.
+#include <limits>
+#include <stdexcept>
+#include <string>
+
+#include "capacity.h"
+#include "check.h"
+#include "dsmoe/rasterize_cuda.h"
+#include "event_clock.h"
+
+namespace dsmoe {
+namespace cuda {
+namespace {
+
+template <class T> T* allocate(Scratch& scratch, int64_t count) {
+  void* memory = scratch.allocate(static_cast<size_t>(count) * sizeof(T));
+  if (memory == nullptr && count > 0) check(cudaErrorMemoryAllocation, "allocating scratch memory");
+  return static_cast<T*>(memory);
+}
+
+template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream_t stream) {
+  T* memory = allocate<T>(scratch, count);
+  if (count > 0) check(cudaMemsetAsync(memory, 0, count * sizeof(T), stream), "clearing scratch memory");
+  return memory;
+}
+
+// Memory for what the depth sort sorts. Without a depth order, project writes the order itself.
+template <class S> DepthKeys<S> depth_keys(const Frame<S>& frame, Scratch& scratch) {
+  const int64_t count = frame.inputs.num_gaussians;
+  if (!needs_depth_order(frame.config.mode)) return {nullptr, frame.saved.order};
+  DepthKeys<S> keys;
+  keys.depths = allocate<DepthBits<S>>(scratch, count);
+  keys.gaussians = allocate<int32_t>(scratch, count);
+  return keys;
+}
+
+// Waits for a number of the device.
+template <class T> T read(const T* number, const char* what, cudaStream_t stream) {
+  T value = 0;
+  check(cudaMemcpyAsync(&value, number, sizeof(value), cudaMemcpyDeviceToHost, stream), what);
+  check(cudaStreamSynchronize(stream), what);
+  return value;
+}
+
+// Adds the pairs that were counted. Waits for them.
+void add_pairs(const Work& work, int64_t* sum) {
+  if (sum != nullptr) *sum += static_cast<int64_t>(read(work.pairs, "counting pairs", work.stream));
+}
+
+template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
+  int device = 0;
+  check(cudaGetDevice(&device), "asking for the device");
+  return InstanceCapacities::key(device, frame.camera.width, frame.camera.height, static_cast<int>(frame.config.mode),
+                                 frame.inputs.num_gaussians);
+}
+
+// For how many instances there will be room.
+template <class S>
+int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
+  const int64_t likely = InstanceCapacities::shared().likely(key);
+  if (is_capturing(run.stream)) return likely < 0 ? 8 * frame.inputs.num_gaussians + 1024 : likely;
+  if (likely >= 0 && !run.deterministic) return likely;
+  count_instances(frame, work);
+  return read(frame.saved.num_instances, "projecting Gaussians", run.stream);
+}
+
+}  // namespace
+
+template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory) {
+  auto& saved = frame.saved;
+  Work work = {run.stream, &memory};
+  EventClock clock(run.times, run.stream);
+
+  SavedSizes sizes = saved_sizes(frame, run);
+  saved = {};
+  saved.gate_sum = frame.images.gate_sum;
+  allocate_saved(saved, sizes, memory);
+  complete(saved, sizes);
+  const DepthKeys<S> keys = depth_keys(frame, memory);
+  project(frame, keys, work);
+  clock.end(&StageTimes::project);
+  if (keys.depths != nullptr) sort_by_depth(frame, keys, work);
+  clock.end(&StageTimes::sort);
+  memory.release();
+
+  const auto key = capacity_key(frame);
+  sizes.capacity = choose_capacity(frame, key, run, work);
+  memory.release();
+  if (run.deterministic && sizes.capacity > std::numeric_limits<uint32_t>::max()) {
+    throw std::overflow_error("rasterize: " + std::to_string(sizes.capacity) +
+                              " tile instances; with deterministic=True the most is " +
+                              std::to_string(std::numeric_limits<uint32_t>::max()));
+  }
+  allocate_saved(saved, sizes, memory);
+  complete(saved, sizes);
+  bin(frame, work);
+  memory.release();
+  InstanceCapacities::shared().learn(key, saved.num_instances, run.stream);
+  clock.end(&StageTimes::bin);
+
+  if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);
+  blend(frame, work);
+  clock.end(&StageTimes::blend);
+  clock.finish();
+  add_pairs(work, run.times != nullptr ? &run.times->forward_pairs : nullptr);
+  memory.release();
+}
+
+template <class S>
+void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory) {
+  const int64_t count = frame.inputs.num_gaussians;
+  const int64_t record = kNumGateMoments + frame.config.num_features();
+  Work work = {run.stream, &memory};
+  if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);
+  EventClock clock(run.times, run.stream);
+  BackwardPass<S> pass;
+  pass.gradients = gradients;
+  pass.dL_dgaussians = allocate_zeros<S>(memory, count * record, run.stream);
+  if (run.deterministic) {
+    pass.slots = allocate_zeros<S>(memory, frame.saved.capacity * kSlotsPerInstance * record, run.stream);
+  }
+  blend_backward(frame, pass, work);
+  clock.end(&StageTimes::blend_backward);
+  project_backward(frame, pass, work);
+  clock.end(&StageTimes::project_backward);
+  clock.finish();
+  add_pairs(work, run.times != nullptr ? &run.times->backward_pairs : nullptr);
+  memory.release();
+}
+
+template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory) {
+  const int64_t count = frame.inputs.num_gaussians;
+  Frame<S> projected = frame;
+  projected.saved.projected = allocate<ProjectedGaussian<S>>(memory, count);
+  projected.saved.features = allocate<S>(memory, count * feature_stride(frame.config.num_features()));
+  DepthKeys<S> keys;
+  keys.gaussians = allocate<int32_t>(memory, count);
+  project(projected, keys, {run.stream, &memory});
+  memory.release();
+}
+
+#define DSMOE_INSTANTIATE(S)                                                            \
+  template void forward(Frame<S>&, const Run&, Allocator&);                             \
+  template void backward(const Frame<S>&, const Gradients<S>&, const Run&, Allocator&); \
+  template void radii(const Frame<S>&, const Run&, Allocator&);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cuda
+}  // namespace dsmoe
