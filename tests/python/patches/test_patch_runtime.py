@@ -100,12 +100,6 @@ def test_a_wrong_mode_is_refused_by_name(monkeypatch):
         runtime.blend_of(run("Smoe"))
 
 
-def test_a_variable_that_does_not_count_is_named(monkeypatch):
-    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe")
-    with pytest.warns(UserWarning, match="DSMOE_BLEND_MODE is smoe, but the blend mode is alpha"):
-        assert runtime.blend_of(run("alpha")) == ALPHA
-
-
 @pytest.mark.parametrize("arguments, white", [(["--random_background"], False), ([], True)])
 def test_a_background_that_changes_its_meaning_is_named(monkeypatch, arguments, white):
     monkeypatch.setattr(sys, "argv", ["train.py"] + arguments)

@@ -108,6 +108,7 @@ def test_another_ssim_stays_and_that_is_said_once(other, capsys):
     assert capsys.readouterr().err.count("is not SSIM as it is fused here") == 1
 
 
+@pytest.mark.slow
 def test_a_small_fit_goes_the_same_way():
     """3DGS's loss, its epsilon, parameters that are replaced on the way as densification does."""
     def fitted(similarity, adam):
@@ -184,13 +185,6 @@ def test_unique_rows_are_those_of_torch(dtype, shape):
         same_unique(torch.randint(low, high, shape, generator=generator, dtype=dtype))
     extremes = torch.tensor([ends.min, ends.min + 1, 0, 1, ends.max - 1, ends.max], dtype=dtype)
     same_unique(extremes[torch.randint(0, 6, shape, generator=generator)])
-
-
-def test_unique_rows_of_columns_whose_distinct_values_multiply_to_more_than_int64_takes():
-    rows = torch.randint(-2**63, 2**63 - 1, (3000, 6), generator=torch.Generator().manual_seed(0))
-    rows = torch.cat([rows, rows[:1000]])
-    assert math.prod(len(column.unique()) for column in rows.unbind(1)) > 2**63
-    same_unique(rows)
 
 
 @pytest.mark.parametrize("rows", [torch.tensor([[2.5, 1.0], [0.0, -0.0], [2.5, 1.0]]), torch.tensor([0.5, 0.5, -3]),

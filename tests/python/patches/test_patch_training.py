@@ -1,6 +1,6 @@
 """Small trainers train, patched and unmodified under `dsmoe run`, to the same bits; the mode goes where it must.
 
-Two of them at every push, all under `-m slow`.
+Two of them train at every push, the others under `-m slow`.
 """
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst"
 from diff_smoe_rasterization import BLEND_MODES, patches  # noqa: E402
 from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED  # noqa: E402
 
-EVERY_PUSH = ("3dgs-2023", "hac")
-every_trainer = pytest.mark.parametrize("name", [
-    name if name in EVERY_PUSH else pytest.param(name, marks=pytest.mark.slow) for name in TRAINERS])
+
+def each_of(trainers, *at_every_push):
+    """A parameter `name`; trainers that are not named are left out of a push."""
+    return pytest.mark.parametrize("name", [
+        name if name in at_every_push else pytest.param(name, marks=pytest.mark.slow) for name in trainers])
+
 
 
 def model(output):
@@ -86,7 +89,7 @@ def trained(tmp_path_factory, scene, python):
     return Trained(tmp_path_factory.mktemp("runs"), scene, python)
 
 
-@every_trainer
+@each_of(TRAINERS, "3dgs-2023", "hac")
 def test_patched_and_run_train_to_the_same_bits(name, trained):
     checkout = trained.checkout(name, "plain")
     before = contents(checkout)
@@ -99,8 +102,7 @@ def test_patched_and_run_train_to_the_same_bits(name, trained):
         assert f"blend_mode='{mode}'" in saved and f"background_gate={gate}" in saved
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name == "3dgs-2023" else pytest.mark.slow)
-                                  for name in TRAINERS if not name.startswith("hac")])
+@each_of(("3dgs-2023", "3dgs-2024", "taming", "c3dgs"), "3dgs-2023")
 def test_render_uses_the_saved_mode_or_the_flag_or_alpha(name, trained):
     output = trained(name, "patched", "smoe").output
     saved, alpha = trained.rendered(name, output), trained.rendered(name, output, "--blend_mode", "alpha")
@@ -119,7 +121,7 @@ def test_render_uses_the_saved_gate_or_the_flag_or_0(trained):
     assert eq_7 == without and all(saved[picture] != eq_7[picture] for picture in saved)
 
 
-@every_trainer
+@each_of(TRAINERS, "3dgs-2023")
 def test_a_wrong_mode_is_refused_before_anything_is_loaded(name, trained, tmp_path):
     if name == "c3dgs":
         words = ["compress.py", "-m", trained("3dgs-2023", "patched", "smoe").output, "--output_vq"]
