@@ -81,7 +81,7 @@ def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = No
     name = trainer or (record.manifest["trainer"] if record else None)
     chosen = by_name(name) if name else known
     if read(GR) is None or chosen is None:
-        reason = why_unknown if read(GR) else _no_renderer(root)
+        reason = _no_renderer(root) if read(GR) is None else why_unknown
         return Plan(root, Verdict("unknown", None, [reason]), options, record)
     files = {name: read(name) for name in scripts.python_files(root)}
     if "modernise" in options:

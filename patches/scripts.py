@@ -40,8 +40,8 @@ def other_files(root: Path) -> Dict[str, bytes]:
                       and not any(os.path.exists(os.path.join(above, name, sign)) for sign in OF_NO_CHECKOUT)]
         folder = Path(above).relative_to(root)
         for name in names if folder.as_posix() not in (".", *FOLDERS) else ():
-            if name.endswith(".py") and (root / folder / name).is_file():
-                found[(folder / name).as_posix()] = (root / folder / name).read_bytes()
+            if name.endswith(".py") and os.access(os.path.join(above, name), os.R_OK):  # no link to nothing
+                found[(folder / name).as_posix()] = Path(above, name).read_bytes()
     return found
 
 
