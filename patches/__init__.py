@@ -3,13 +3,13 @@
     from diff_smoe_rasterization import patches
     patches.apply("gaussian-splatting")        # what `dsmoe patch apply gaussian-splatting` does
 
-engine.py plans and carries out; trainers/ has a short file of rules for each trainer; codemods.py is how a rule
-changes a file; shims/ is what `dsmoe run` puts in front of an unmodified checkout. runtime.py is what a patched trainer
-imports.
+trainers.py is the table of trainers; codemods.py is how a rule changes a file; engine.py plans and carries out;
+record.py keeps the originals. shims/ is what `dsmoe run` puts in front of an unmodified checkout, runtime.py what a
+patched trainer imports.
 """
 from .engine import apply, check, diff, inspect, plan, revert
 from .errors import PatchError
-from .facts import names
+from .trainers import names
 
 TRAINERS = names()
 

@@ -1,19 +1,19 @@
 """What `dsmoe patch apply|check|diff|revert` prints."""
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
-from typing import List, Tuple
+from argparse import Namespace
+from typing import Any, Dict, Iterable, List
 
 from . import engine
 from .errors import PatchError
 
 
-def apply(arguments: argparse.Namespace) -> int:
+def apply(arguments: Namespace) -> int:
     """Patches, or with --dry-run shows what a patch would change."""
     if arguments.dry_run:
-        planned = engine.plan(arguments.path, arguments.modernise, arguments.trainer, arguments.fuse)
+        planned = engine.plan(arguments.path, **_options(arguments))
         todo = engine.pending(planned)
         for name, data in todo.items():
             sys.stdout.write(engine.diff_of(name, (planned.root / name).read_bytes(), data))
@@ -21,12 +21,11 @@ def apply(arguments: argparse.Namespace) -> int:
             _print_notes(planned)
             return 0
     else:
-        planned = engine.apply(arguments.path, arguments.modernise, arguments.trainer, arguments.fuse)
+        planned = engine.apply(arguments.path, **_options(arguments))
     verdict = planned.verdict
     if planned.written:
         print(f"{arguments.path}: patched ({verdict.trainer})")
-        for change in planned.changes:
-            print(f"  {change.name}: {', '.join(change.rules)}")
+        _print_lines(f"{change.name}: {', '.join(change.rules)}" for change in planned.changes)
         print("It knows --blend_mode and --background_gate now, and saves them in cfg_args; `dsmoe patch revert` takes "
               "the patch back.")
     else:
@@ -37,12 +36,11 @@ def apply(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def check(arguments: argparse.Namespace) -> int:
+def check(arguments: Namespace) -> int:
     """Says in one word how the checkout is, and why."""
-    planned = engine.inspect(arguments.path, arguments.modernise, arguments.trainer, arguments.fuse)
+    planned = engine.inspect(arguments.path, **_options(arguments))
     verdict = planned.verdict
-    trainer = f" ({verdict.trainer})" if verdict.trainer else ""
-    print(f"{arguments.path}: {verdict}{trainer}")
+    print(f"{arguments.path}: {verdict}" + (f" ({verdict.trainer})" if verdict.trainer else ""))
     if verdict in ("patchable", "patched"):
         _print_lines((*verdict.reasons, *_remarks(planned, arguments)))
         return 0
@@ -50,28 +48,9 @@ def check(arguments: argparse.Namespace) -> int:
     return 1
 
 
-def _remarks(planned: engine.Plan, arguments: argparse.Namespace) -> List[str]:
-    """The notes on a checkout, and what to type where rules that an option asks for are still not applied."""
-    pending = [] if planned.written else [rule.option for rule in planned.requested if rule.pending]
-    return [*planned.notes] + ([_how_to_apply(tuple(dict.fromkeys(pending)), planned, arguments)] if pending else [])
-
-
-def _how_to_apply(options: Tuple[str, ...], planned: engine.Plan, arguments: argparse.Namespace) -> str:
-    """Says what to type for rules of these options that are not applied, or why they cannot be."""
-    try:
-        is_written = bool(engine.pending(planned))
-    except PatchError as error:
-        return f"{', '.join(options)}: cannot be applied as it is: {error}"
-    trainer = ["--trainer", arguments.trainer] if arguments.trainer else []
-    command = " ".join(map(shlex.quote, ["dsmoe", "patch", "apply", *engine.words_of(options).split(), *trainer,
-                                         str(arguments.path)]))
-    before = "" if is_written else "undo your edit of patched files, then "
-    return f"{', '.join(options)}: to apply what is not, {before}type: {command}"
-
-
-def diff(arguments: argparse.Namespace) -> int:
+def diff(arguments: Namespace) -> int:
     """Shows what the patch changes, against the files as they were before any patch."""
-    planned = engine.plan(arguments.path, arguments.modernise, arguments.trainer, arguments.fuse)
+    planned = engine.plan(arguments.path, **_options(arguments))
     for change in planned.changes:
         sys.stdout.write(engine.diff_of(change.name, change.before, change.after))
     if planned.verdict == "patched" and planned.record is None:
@@ -81,7 +60,7 @@ def diff(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def revert(arguments: argparse.Namespace) -> int:
+def revert(arguments: Namespace) -> int:
     """Puts every file back."""
     names = engine.revert(arguments.path)
     print(f"{arguments.path}: as it was before the patch ({len(names)} files)"
@@ -89,7 +68,26 @@ def revert(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _print_lines(lines) -> None:
+def _options(arguments: Namespace) -> Dict[str, Any]:
+    return {name: getattr(arguments, name) for name in ("modernise", "trainer", "fuse")}
+
+
+def _remarks(planned: engine.Plan, arguments: Namespace) -> List[str]:
+    """The notes on a checkout, and what to type where rules that an option asks for are still not applied."""
+    options = dict.fromkeys(rule.option for rule in planned.requested if rule.pending and not planned.written)
+    if not options:
+        return list(planned.notes)
+    try:
+        before = "" if engine.pending(planned) else "undo your edit of patched files, then "
+        words = ["--" + option for option in options] + (["--trainer", arguments.trainer] if arguments.trainer else [])
+        command = " ".join(map(shlex.quote, ["dsmoe", "patch", "apply", *words, str(arguments.path)]))
+        advice = f"to apply what is not, {before}type: {command}"
+    except PatchError as error:
+        advice = f"cannot be applied as it is: {error}"
+    return [*planned.notes, f"{', '.join(options)}: {advice}"]
+
+
+def _print_lines(lines: Iterable[str]) -> None:
     for line in lines:
         print("  " + line)
 

@@ -10,17 +10,15 @@ import difflib
 import io
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Dict, List, NamedTuple, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, Tuple, Union
 
 from diff_smoe_rasterization._version import __version__
 
-from . import facts, source
+from . import facts, scripts, source
 from .errors import PatchError
 from .merge import without_patch
-from .record import FOLDER, Record, check_writable, remove_rest, replace_file
-from .rules import GR, Trainer
-from .scope import build_files, notes_on_scripts, other_files, python_files
-from .trainers import TRAINERS
+from .record import FOLDER, Record, check_writable, put_back, remove_rest, replace_file
+from .trainers import GR, TRAINERS, Trainer, names
 
 if TYPE_CHECKING:
     from .patch import Change, Requested  # which need LibCST
@@ -47,43 +45,79 @@ class Plan(NamedTuple):
 
     root: Path
     verdict: Verdict
-    changes: Tuple[Change, ...]
-    remarks: Tuple[str, ...]  # which scripts no rule reaches, which files are left as they are
     options: Tuple[str, ...]  # of the patch, "modernise" and "fuse"; also those that it was made with
     record: Optional[Record]
+    changes: Tuple[Change, ...] = ()
+    remarks: Tuple[str, ...] = ()  # which scripts no rule reaches, which files are left as they are
     requested: Tuple[Requested, ...] = ()  # every rule that the options ask for
     written: bool = False  # whether `apply` wrote files by this plan
 
     @property
     def notes(self) -> Tuple[str, ...]:
         """The remarks, and of each rule that an option asks for where it is applied, or that it is skipped."""
-        notes = []
+        notes = list(self.remarks)
         for option in self.options:
             rules = [rule for rule in self.requested if rule.option == option]
             notes += [rule.note(self.written) for rule in rules if rule.files]
             skipped = [rule.rule for rule in rules if not rule.files]
             notes += [f"{option}: skipped, nothing matches: {', '.join(skipped)}"] if skipped else []
-        return (*self.remarks, *notes)
+        return tuple(notes)
 
 
-def plan(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
-    """Plans the patch of a checkout, also of one that is patched. Raises PatchError where it is refused."""
-    planned = inspect(path, modernise, trainer, fuse)
-    if planned.verdict in ("patchable", "patched"):
-        return planned
-    if planned.verdict == "half-patched" and planned.record and planned.record.can_be_finished():
+def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
+    """Plans the patch of a checkout in whatever state it is."""
+    have_libcst()
+    from .patch import Patch
+
+    root = _root(path)
+    record = Record.in_force(root)
+    before = options_of(record)
+    options = tuple(name for name, wanted in (("modernise", modernise), ("fuse", fuse)) if wanted or name in before)
+
+    def read(name: str) -> Optional[bytes]:
+        return record.original(name) if record and name in record.files else read_file(root / name)
+
+    known, why_unknown = facts.recognise(facts.of_checkout(read))
+    name = trainer or (record.manifest["trainer"] if record else None)
+    chosen = by_name(name) if name else known
+    if read(GR) is None or chosen is None:
+        reason = _no_renderer(root) if read(GR) is None else why_unknown
+        return Plan(root, Verdict("unknown", None, [reason]), options, record)
+    files = {name: read(name) for name in scripts.python_files(root)}
+    if "modernise" in options:
+        files.update((name, read(name)) for name in scripts.build_files(root))
+    patch = Patch(files, chosen)
+    requested = patch.request(options, lambda name: read_file(root / name))
+    changes = patch.changes()
+    state, reasons = patch.state()
+    if record and not patch.problems:
+        state, reasons = _state_by_record(root, record, changes, chosen)
+    elif state == "patchable" and (root / FOLDER / "manifest.json").exists():
+        reasons = [f"no file is patched any more: `apply` replaces the {FOLDER} that is there, `revert` removes it"]
+    if trainer and known and known.flavour != chosen.flavour:
+        patch.notes.insert(0, f"--trainer {trainer}: by what it imports and calls this is {known.name}, whose "
+                              f"rasterizer has another API ({known.flavour}, not {chosen.flavour})")
+    remarks = (*patch.notes, *scripts.notes(root, files, chosen))
+    return Plan(root, Verdict(state, chosen.name, reasons), options, record, changes, remarks, requested)
+
+
+def plan(path: PathLike, **options: Any) -> Plan:
+    """Plans a patch, with the options of `inspect`. Raises PatchError where it is refused."""
+    planned = inspect(path, **options)
+    can_be_finished = planned.verdict == "half-patched" and planned.record and planned.record.can_be_finished()
+    if planned.verdict in ("patchable", "patched") or can_be_finished:
         return planned
     raise PatchError(refusal(planned.verdict))
 
 
-def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Verdict:
-    """Says how a checkout is: unknown, patchable, patched, half-patched or drifted, with `.trainer` and `.reasons`."""
-    return inspect(path, modernise, trainer, fuse).verdict
+def check(path: PathLike, **options: Any) -> Verdict:
+    """Says how a checkout is: one of STATES, with `.trainer` and `.reasons`. Options as of `inspect`."""
+    return inspect(path, **options).verdict
 
 
-def diff(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> str:
+def diff(path: PathLike, **options: Any) -> str:
     """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
-    changes = plan(path, modernise, trainer, fuse).changes
+    changes = plan(path, **options).changes
     return "".join(diff_of(change.name, change.before, change.after) for change in changes)
 
 
@@ -91,38 +125,33 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     """Patches a checkout; writes nothing where it is patched already.
 
     Returns the plan; its `verdict` is how the checkout was before, `written` whether anything was changed.
-    Raises PatchError where it is refused, and then every file is as it was.
+    Raises PatchError where it is refused, and then every file is as it was; where the disk fails, as before any patch.
     """
-    planned = plan(path, modernise, trainer, fuse)
+    planned = plan(path, modernise=modernise, trainer=trainer, fuse=fuse)
     root, record, todo = planned.root, planned.record, pending(planned)
     if not todo:
         if record and not record.manifest["complete"]:
-            record.completed()
+            record.note_complete(True)
         return planned
-    before, after = ({name: made[state] for name, made in _outcome(planned).items()} for state in (0, 1))
-    for name in todo:
-        check_writable(root, name)
-    if record is None and (root / FOLDER / "manifest.json").exists():  # of a patch of which nothing is left
-        Record.load(root).remove()
-    notes = {"version": __version__, "trainer": planned.verdict.trainer, "options": planned.options,
-             "rules": {change.name: change.rules for change in planned.changes}}
+    before = {change.name: change.before for change in planned.changes}
+    after = {change.name: change.after for change in planned.changes}
+    check_writable(root, todo)
+    failing = FOLDER
     try:
-        begun = Record.write(root, before, after, notes)
+        if record:
+            record.take_back()  # so that each file is the original, or patched by this plan
+        elif (root / FOLDER / "manifest.json").exists():  # of a patch of which nothing is left
+            Record.load(root).remove()
+        begun = Record.begin(root, before, after, {
+            "version": __version__, "trainer": planned.verdict.trainer, "options": planned.options,
+            "rules": {change.name: change.rules for change in planned.changes}})
+        for failing, data in after.items():
+            replace_file(root, root / failing, data)
+        begun.note_complete(True)
     except OSError as error:
+        put_back(root, before)
         remove_rest(root)
-        raise PatchError(f"{FOLDER}: the originals cannot be kept, so nothing was changed: {error}") from None
-    undo = {name: (root / name).read_bytes() for name in todo}
-    try:
-        for name, data in todo.items():
-            replace_file(root, root / name, data)
-        begun.completed()
-    except OSError as error:
-        for done, data in undo.items():
-            if (root / done).read_bytes() != data:
-                replace_file(root, root / done, data)
-        if record is None:
-            begun.remove()
-        raise PatchError(f"{name}: cannot be written, so all was put back: {error}") from None
+        raise PatchError(f"{failing}: cannot be written, so all was put back: {error}") from None
     return planned._replace(written=True)
 
 
@@ -141,16 +170,9 @@ def pending(planned: Plan) -> Dict[str, bytes]:
     if edited:
         raise PatchError(f"{edited[0]}: was changed since it was patched: undo your edit, then apply it with "
                          f"{words_of(planned.options)}")
-    return {name: after for name, (_, after) in _outcome(planned).items()
-            if (planned.root / name).read_bytes() != after}
-
-
-def _outcome(planned: Plan) -> Dict[str, Tuple[bytes, bytes]]:
-    """Returns what each file was before any patch, and what it becomes."""
-    made = {change.name: (change.before, change.after) for change in planned.changes}
-    for name in set(planned.record.files if planned.record else ()) - set(made):  # of an earlier version's rules
-        made[name] = (planned.record.original(name),) * 2
-    return made
+    wanted = {name: record.original(name) for name in record.files} if record else {}
+    wanted.update((change.name, change.after) for change in planned.changes)
+    return {name: data for name, data in wanted.items() if (planned.root / name).read_bytes() != data}
 
 
 class Reverted(Tuple[str, ...]):
@@ -173,21 +195,20 @@ def revert(path: PathLike) -> Reverted:
         raise PatchError(f"{root}: there is no {FOLDER}, so nothing can be put back: it was not patched, or by hand")
     states = record.states() if Record.in_force(root) else {}
     back = {name: record.original(name) for name, state in states.items() if state in ("patched", "changed")}
-    edited = {name: record.patched(name) for name in back if states[name] == "changed"}
+    edited = [name for name in back if states[name] == "changed"]
     for name, state in states.items():
-        if state == "gone" or name in edited and edited[name] is None:
+        if state == "gone" or name in edited and record.patched(name) is None:
             raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. Undo your edit; or copy what lies in "
                              f"{FOLDER}/originals over the checkout, by which your edit is lost, and delete {FOLDER}")
-    for name, patched in edited.items():
-        back[name] = without_patch(name, back[name], patched, (root / name).read_bytes())
-    for name in back:
-        check_writable(root, name)
-    for name, data in back.items():
-        replace_file(root, root / name, data)
+    for name in edited:
+        back[name] = without_patch(name, back[name], record.patched(name), (root / name).read_bytes())
+    check_writable(root, back)
+    record.note_complete(False)  # an interruption leaves what `apply` can finish too
+    put_back(root, back)
     record.remove()
-    names = Reverted(back)
-    names.edited = tuple(edited)
-    return names
+    reverted = Reverted(back)
+    reverted.edited = tuple(edited)
+    return reverted
 
 
 _SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
@@ -195,57 +216,21 @@ _SINCE = {"changed": "was changed since it was patched", "gone": "was removed si
           "original": "is the original, though the record says that it was patched; `revert` puts back the others too"}
 
 
-def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
-    """Plans the patch of a checkout in whatever state it is."""
-    source.have_libcst()
-    from .patch import Patch
-
-    root = _root(path)
-    record = Record.in_force(root)
-    before = options_of(record)
-    options = tuple(name for name, wanted in (("modernise", modernise), ("fuse", fuse)) if wanted or name in before)
-
-    def read(name: str) -> Optional[bytes]:
-        if record and name in record.files:
-            return record.original(name)
-        return _read(root / name)
-
-    if read(GR) is None:
-        return Plan(root, Verdict("unknown", None, [_no_renderer(root)]), (), (), options, record)
-    chosen, reason = _trainer(read, trainer or (record.manifest["trainer"] if record else None))
-    if chosen is None:
-        return Plan(root, Verdict("unknown", None, [reason]), (), (), options, record)
-    files = {name: read(name) for name in python_files(root)}
-    if "modernise" in options:
-        files.update((name, read(name)) for name in build_files(root))
-    patch = Patch(files, chosen)
-    requested = patch.request(options, lambda name: _read(root / name))
-    state, reasons = patch.state()
-    if record and not patch.problems:
-        state, reasons = _state_by_record(root, record, chosen)
-    elif state == "patchable" and (root / FOLDER / "manifest.json").exists():
-        reasons = [f"no file is patched any more: `apply` replaces the {FOLDER} that is there, `revert` removes it"]
-    looks_like = _trainer(read, None)[0] if trainer else None
-    if looks_like and looks_like.flavour != chosen.flavour:
-        patch.notes.insert(0, f"--trainer {trainer}: by what it imports and calls this is {looks_like.name}, whose "
-                              f"rasterizer has another API ({looks_like.flavour}, not {chosen.flavour})")
-    remarks = (*patch.notes, *notes_on_scripts(files, other_files(root), chosen))
-    return Plan(root, Verdict(state, chosen.name, reasons), patch.changes(), remarks, options, record, requested)
-
-
-def _state_by_record(root: Path, record: Record, trainer: Trainer) -> Tuple[str, List[str]]:
+def _state_by_record(root: Path, record: Record, changes: Tuple[Change, ...],
+                     trainer: Trainer) -> Tuple[str, List[str]]:
     """How a checkout is that has a record: `patched`, or what the record and the files disagree in."""
     from .patch import Patch
 
     states = record.states()
-    by = [", with ".join(filter(None, [f"by version {record.manifest['version']}", words_of(options_of(record))]))]
     if set(states.values()) <= {"patched", "changed"}:
-        files = {name: _read(root / name) for name in python_files(root)}
-        if Patch(files, trainer).state()[0] == "patched":
-            return "patched", by + [f"{name}: was edited since; every rule for the blend mode is still applied"
-                                    for name, state in states.items() if state == "changed"]
+        by = ", with ".join(filter(None, [f"by version {record.manifest['version']}", words_of(options_of(record))]))
+        is_current = all(read_file(root / change.name) == change.after for change in changes)
+        files = {} if is_current else {name: read_file(root / name) for name in scripts.python_files(root)}
+        if is_current or Patch(files, trainer).state()[0] == "patched":
+            return "patched", [by] + [f"{name}: was edited since; every rule for the blend mode is still applied"
+                                      for name, state in states.items() if state == "changed"]
         if "changed" not in states.values():
-            return "patched", by + [f"its rules were others: to bring it up to date, type: dsmoe patch apply {root}"]
+            return "patched", [by, f"its rules were others: to bring it up to date, type: dsmoe patch apply {root}"]
     if record.can_be_finished():
         return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
     return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
@@ -264,20 +249,11 @@ def words_of(options: Tuple[str, ...]) -> str:
     return " ".join("--" + option for option in options)
 
 
-def _trainer(read, name: Optional[str]) -> Tuple[Optional[Trainer], str]:
-    if name is None:
-        return facts.recognise(facts.of_checkout(read))
+def by_name(name: str) -> Trainer:
     for trainer in TRAINERS:
         if trainer.name == name:
-            return trainer, ""
-    raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(facts.names())}")
-
-
-def _no_renderer(root: Path) -> str:
-    """Says that a folder is no checkout, and which one beside it is."""
-    above = root.resolve()
-    near = [folder for folder in (*above.parents, *sorted(above.glob("*/"))) if os.path.isfile(str(folder / GR))]
-    return f"there is no {GR} in {root}; wanted is the checkout's folder" + (f", such as {near[0]}" if near else "")
+            return trainer
+    raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(names())}")
 
 
 def _root(path: PathLike) -> Path:
@@ -287,11 +263,15 @@ def _root(path: PathLike) -> Path:
     return root
 
 
-def _read(path: Path) -> Optional[bytes]:
-    try:
-        return path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        return None
+def _no_renderer(root: Path) -> str:
+    """Says that a folder is no checkout, and which one beside it is."""
+    above = root.resolve()
+    near = [folder for folder in (*above.parents, *sorted(above.glob("*/"))) if os.path.isfile(str(folder / GR))]
+    return f"there is no {GR} in {root}; wanted is the checkout's folder" + (f", such as {near[0]}" if near else "")
+
+
+def read_file(path: Path) -> Optional[bytes]:
+    return path.read_bytes() if path.is_file() else None
 
 
 def refusal(verdict: Verdict) -> str:
@@ -305,3 +285,12 @@ def diff_of(name: str, before: bytes, after: bytes) -> str:
     old, new = (io.StringIO(source.decode(name, data)[0], newline="\n").readlines() for data in (before, after))
     lines = difflib.unified_diff(old, new, "a/" + name, "b/" + name)
     return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in lines)
+
+
+def have_libcst() -> None:
+    """Raises ImportError, which says what to type, where LibCST is missing."""
+    try:
+        import libcst  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"patching reads and writes Python with LibCST, which cannot be imported ({error}): "
+                          "pip install libcst; `dsmoe run` needs no patch") from None

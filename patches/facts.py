@@ -2,17 +2,17 @@
 from __future__ import annotations
 
 import ast
-from typing import Callable, Optional, Set, Tuple
+from typing import Callable, Iterator, Optional, Set, Tuple
 
-from .rules import GR, INTEGRATIONS, RASTERIZER, Trainer
 from .source import called_name, python_tree
-from .trainers import TRAINERS
+from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINERS, Trainer, names
 
 PATCHED = "imports from " + INTEGRATIONS
 LOOKED_AT = (GR, "scene/gaussian_model.py", "train.py", "render.py")
-BASE_SETTINGS = {"image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix",
-                 "projmatrix", "sh_degree", "campos", "prefiltered", "debug"}
-FURTHER_SETTINGS = {"antialiasing", "pixel_weights", "clamp_color", "blend_mode", "background_gate"}
+KNOWN_SETTINGS = {
+    "image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
+    "sh_degree", "campos", "prefiltered", "debug", "antialiasing", "pixel_weights", "clamp_color", "blend_mode",
+    "background_gate"}
 
 
 def of_checkout(read: Callable[[str], Optional[bytes]]) -> Set[str]:
@@ -22,52 +22,40 @@ def of_checkout(read: Callable[[str], Optional[bytes]]) -> Set[str]:
     """
     facts: Set[str] = set()
     for name in LOOKED_AT:
-        data = read(name)
-        if data is not None:
-            tree = python_tree(data)  # where it is not Python, a rule that needs the file will say so
-            rasterizers = {"rasterizer", *_assigned_rasterizers(tree)}
-            for node in ast.walk(tree):
-                facts |= _of_node(node) | _of_results(node, rasterizers)
+        nodes = list(ast.walk(python_tree(read(name) or b"")))  # where it is not Python, a rule will say so
+        rasterizers = {"rasterizer"} | {target.id for node in nodes if isinstance(node, ast.Assign)
+                                        and _makes_rasterizer(node.value)
+                                        for target in node.targets if isinstance(target, ast.Name)}
+        for node in nodes:
+            facts.update(_of_node(node, rasterizers))
     return facts
 
 
-def _of_node(node: ast.AST) -> Set[str]:
+def _of_node(node: ast.AST, rasterizers: Set[str]) -> Iterator[str]:
     if isinstance(node, ast.ImportFrom) and node.module:
-        if node.module == RASTERIZER or node.module.startswith(INTEGRATIONS + "."):
-            imported = {f"imports {alias.name}" for alias in node.names}
-            return imported if node.module == RASTERIZER else imported | {PATCHED}
-        return {"imports " + node.module.rpartition(".")[2]}
-    if isinstance(node, ast.Import):
-        return {"imports " + alias.name.rpartition(".")[2] for alias in node.names}
-    if isinstance(node, ast.Call):
-        called = called_name(node)
-        if called == "GaussianRasterizationSettings":
-            return {f"sets {keyword.arg}" for keyword in node.keywords if keyword.arg}  # not **pipe.blend
-        if called == "visible_filter":
-            return {"calls visible_filter"}
-    return {"reads invdepthmap"} if isinstance(node, ast.Attribute) and node.attr == "invdepthmap" else set()
+        is_ours = node.module.startswith(INTEGRATIONS + ".")
+        if is_ours:
+            yield PATCHED
+        if is_ours or node.module == RASTERIZER:
+            yield from (f"imports {alias.name}" for alias in node.names)
+        else:
+            yield "imports " + node.module.rpartition(".")[2]
+    elif isinstance(node, ast.Import):
+        yield from ("imports " + alias.name.rpartition(".")[2] for alias in node.names)
+    elif isinstance(node, ast.Call) and called_name(node) == "GaussianRasterizationSettings":
+        yield from (f"sets {keyword.arg}" for keyword in node.keywords if keyword.arg)  # not **pipe.blend
+    elif isinstance(node, ast.Call) and called_name(node) == "visible_filter":
+        yield "calls visible_filter"
+    elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
+        yield "reads invdepthmap"
+    elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and isinstance(node.targets[0], ast.Tuple):
+        called, results = node.value.func, node.targets[0].elts
+        if ((_makes_rasterizer(called) or getattr(called, "id", "") in rasterizers)
+                and not any(isinstance(one, ast.Starred) for one in results)):
+            yield f"unpacks {len(results)} results"
 
 
-def _assigned_rasterizers(tree: ast.AST) -> Set[str]:
-    """Returns the names to which a GaussianRasterizer is assigned."""
-    return {target.id for node in ast.walk(tree)
-            if isinstance(node, ast.Assign) and _is_rasterizer(node.value)
-            for target in node.targets if isinstance(target, ast.Name)}
-
-
-def _of_results(node: ast.AST, rasterizers: Set[str]) -> Set[str]:
-    """Says into how many variables the results of a rasterizer are unpacked: a, b = rasterizer(...)."""
-    if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Call):
-        return set()
-    called, target = node.value.func, node.targets[0]
-    if not (_is_rasterizer(called) or isinstance(called, ast.Name) and called.id in rasterizers):
-        return set()
-    if not isinstance(target, ast.Tuple) or any(isinstance(one, ast.Starred) for one in target.elts):
-        return set()
-    return {f"unpacks {len(target.elts)} results"}
-
-
-def _is_rasterizer(node: ast.AST) -> bool:
+def _makes_rasterizer(node: ast.AST) -> bool:
     return isinstance(node, ast.Call) and getattr(node.func, "id", "") == "GaussianRasterizer"
 
 
@@ -75,8 +63,7 @@ def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
     """Returns the trainer and "", or None and why it is none that is known."""
     if "imports GaussianRasterizationSettings" not in facts:
         return None, f"{GR} imports GaussianRasterizationSettings neither from {RASTERIZER} nor from {INTEGRATIONS}"
-    foreign = sorted(fact[5:] for fact in facts if fact.startswith("sets ")
-                     and fact[5:] not in BASE_SETTINGS | FURTHER_SETTINGS)
+    foreign = sorted({fact[5:] for fact in facts if fact.startswith("sets ")} - KNOWN_SETTINGS)
     if foreign:
         return None, (f"its GaussianRasterizationSettings have {', '.join(foreign)}, which no trainer has that is "
                       f"known here ({', '.join(names())})")
@@ -87,8 +74,3 @@ def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
         return None, (f"its rasterizer returns {min(results)} results; that of {nearest.name}, which it resembles, "
                       f"returns {nearest.results}")
     return nearest, ""
-
-
-def names() -> Tuple[str, ...]:
-    """The names of the trainers."""
-    return tuple(sorted(trainer.name for trainer in TRAINERS))

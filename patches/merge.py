@@ -46,5 +46,5 @@ def _meet(one: Hunk, other: Hunk) -> bool:
 def _conflict(name: str, where: str, patched: List[bytes], edited: List[bytes]) -> str:
     texts = ([line.decode("utf-8", "replace").rstrip("\r\n") for line in lines] for lines in (patched, edited))
     lines = list(difflib.unified_diff(*texts, lineterm="", n=0))[2:]
-    return (f"{name}: {where}: you have edited what the patch wrote; nothing was touched. Undo that edit (- the patch's, "
-            "+ yours), then revert:\n" + "\n".join("  " + line for line in lines))
+    return (f"{name}: {where}: you have edited what the patch wrote; nothing was touched. Undo that edit "
+            "(- the patch's, + yours), then revert:\n" + "\n".join("  " + line for line in lines))

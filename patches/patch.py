@@ -3,10 +3,14 @@ from __future__ import annotations
 
 from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Tuple
 
-from . import codemods, fuse, modernise, optional, source
+from . import source
+from .codemods import CODEMODS, Found
 from .errors import PatchError
+from .optional import OPTIONS
 from .record import FOLDER
-from .rules import RASTERIZER, ImportRasterizer, Trainer
+from .trainers import RASTERIZER, Rule, Trainer
+
+Read = Callable[[str], Optional[bytes]]  # the bytes of a file of the checkout, None where there is none
 
 
 class Change(NamedTuple):
@@ -16,9 +20,6 @@ class Change(NamedTuple):
     before: bytes
     after: bytes
     rules: Tuple[str, ...]
-
-
-OPTIONS = {"modernise": modernise.RULES, "fuse": fuse.RULES}
 
 
 class Requested(NamedTuple):
@@ -42,81 +43,71 @@ class Patch:
     """What the rules of a trainer make of its files; those files that none of them changes are not in it."""
 
     def __init__(self, files: Dict[str, bytes], trainer: Trainer) -> None:
-        self.files, self.trees, self.writers = files, {}, {}
+        self.files = files
+        self.parsed: Dict[str, Tuple] = {}  # of each file that was, its tree and what makes bytes of it
         self.rules: Dict[str, List[str]] = {}  # of each file, those that changed it
         self.problems: List[str] = []  # why it cannot be patched
-        self.pending: List[str] = []
+        self.pending: List[str] = []  # rules that are not applied, as "FILE: rule NAME"
         self.done: List[str] = []
         self.notes: List[str] = []
         for rule in trainer.rules:
-            if rule.file not in files:
-                self.problems.append(f"{rule.file}: rule {rule.name}: there is no such file; expected is {rule.right}")
-                continue
-            try:
-                outcome = self._run(codemods.run, rule, rule.file)
-            except PatchError as error:
-                self.problems.append(str(error))
-                continue
-            found = outcome.pending + outcome.done
-            line = f"{rule.file}: rule {rule.name}"
-            if not getattr(rule, "least", rule.expected) <= found <= rule.expected or outcome.misfits:
-                misfits = f", and {outcome.misfits} that look alike" if outcome.misfits else ""
-                self.problems.append(f"{line}: {found} matches instead of {rule.expected}{misfits}; right would be "
-                                     f"{rule.right}")
-            if outcome.pending:
-                self.pending.append(line)
-            if outcome.done:
-                self.done.append(line)
+            self._require(rule)
         # A script of the user's that imports the rasterizer must not get another one than the trainer's own files.
-        known = {rule.file for rule in trainer.rules if isinstance(rule, ImportRasterizer)}
+        known = {rule.file for rule in trainer.rules if rule.name == "import-rasterizer"}
         for name in sorted(set(files) - known):
             if RASTERIZER.encode() in files[name] and not name.startswith("submodules/"):
-                self._tried(codemods.run, ImportRasterizer(name, trainer.flavour), name)
+                rule = Rule("import-rasterizer", name, trainer.flavour)
+                self._try(name, rule.name, CODEMODS[rule.name], rule=rule)
                 if f"from {RASTERIZER}._C ".encode() in files[name]:
                     self.notes.append(f"{name}: the import from {RASTERIZER}._C stays; where it fails, the file has to "
                                       "do without what it names")
 
-    def request(self, options: Iterable[str], read_now: Callable[[str], Optional[bytes]]) -> Tuple[Requested, ...]:
-        """Applies the rules of these of OPTIONS; returns what becomes of each.
-
-        read_now: the bytes of a file as it is now, patched or not; None where it is gone.
-        """
-        found = {(option, rule): {name: self._tried(optional.run, rule, name) for name in sorted(self.files)
-                                  if rule.looks_at(self.files[name])}
-                 for option in options for rule in OPTIONS[option]}
-        states = {change.name: (read_now(change.name), change.after) for change in self.changes()}
-        requested = []
-        for (option, rule), outcomes in found.items():
-            names = tuple(name for name, outcome in outcomes.items() if outcome and (outcome.pending or outcome.done))
-            pending = tuple(name for name in names if outcomes[name].pending
-                            and self._is_pending(rule, name, *states[name]))
-            requested.append(Requested(option, rule.name, rule.reason, names, pending))
-        return tuple(requested)
-
-    def _is_pending(self, rule: optional.Rule, name: str, now: Optional[bytes], after: bytes) -> bool:
-        """Whether a rule that changes a file is still to be applied to what the file is now.
-
-        after: what the file is once every rule is applied.
-        """
-        if now is None or now == self.files[name]:
-            return True
-        if now == after:
-            return False
+    def _require(self, rule: Rule) -> None:
+        line = f"{rule.file}: rule {rule.name}"
+        if rule.file not in self.files:
+            self.problems.append(f"{line}: there is no such file; expected is {rule.right}")
+            return
         try:
-            return rule.looks_at(now) and optional.run(rule, source.parse(name, now)[0]).pending > 0
-        except PatchError:  # an edit that cannot be read
-            return True
-
-    def _tried(self, run, rule, name: str) -> Optional[codemods.Outcome]:
-        """Applies a rule that may match or not; a file that cannot be read is left as it is."""
-        try:
-            return self._run(run, rule, name)
+            found = self._run(rule.file, rule.name, CODEMODS[rule.name], rule=rule)
         except PatchError as error:
-            note = f"left as it is: {error}"
-            self.notes += [note] if note not in self.notes else []
-            return None
+            self.problems.append(str(error))
+            return
+        matches = found.pending + found.done
+        if not rule.least <= matches <= rule.expected or found.misfits:
+            misfits = f", and {found.misfits} that look alike" if found.misfits else ""
+            self.problems.append(f"{line}: {matches} matches instead of {rule.expected}{misfits}; right would be "
+                                 f"{rule.right}")
+        self.pending += [line] if found.pending else []
+        self.done += [line] if found.done else []
+
+    def request(self, options: Iterable[str], read_now: Read) -> Tuple[Requested, ...]:
+        """Applies the rules of these options; returns what becomes of each. read_now: files patched or not."""
+        matching = []
+        for option in options:
+            for rule in OPTIONS[option]:
+                found = {name: self._try(name, rule.name, rule.codemod) for name in sorted(self.files)
+                         if rule.looks_at(self.files[name])}
+                matching.append((option, rule, {name: counts for name, counts in found.items()
+                                                if counts and (counts.pending or counts.done)}))
+        after = {change.name: change.after for change in self.changes()}
+
+        def is_pending(rule, name: str) -> bool:
+            now = read_now(name)
+            if now in (None, self.files[name], after[name]):
+                return now != after[name]
+            try:  # a file that is patched with other options, or was edited
+                counts = Found()
+                rule.codemod(source.parse(name, now)[0], counts)
+                return counts.pending > 0
+            except PatchError:
+                return True
+
+        return tuple(Requested(option, rule.name, rule.reason, tuple(found), tuple(
+            name for name, counts in found.items() if counts.pending and is_pending(rule, name)))
+            for option, rule, found in matching)
 
     def state(self) -> Tuple[str, List[str]]:
+        """One of engine.STATES, and the reasons."""
         if self.problems:
             return "drifted", self.problems
         if self.done and self.pending:
@@ -129,15 +120,24 @@ class Patch:
     def changes(self) -> Tuple[Change, ...]:
         changes = []
         for name, rules in self.rules.items():
-            after = self.writers[name](self.trees[name])
-            changes.append(Change(name, self.files[name], after, tuple(dict.fromkeys(rules))))
+            tree, write = self.parsed[name]
+            changes.append(Change(name, self.files[name], write(tree), tuple(dict.fromkeys(rules))))
         return tuple(changes)
 
-    def _run(self, run, rule, name: str):
-        if name not in self.trees:
-            self.trees[name], self.writers[name] = source.parse(name, self.files[name])
-        outcome = run(rule, self.trees[name])
-        self.trees[name] = outcome.tree
-        if outcome.pending:
-            self.rules.setdefault(name, []).append(rule.name)
-        return outcome
+    def _try(self, name: str, label: str, codemod: Callable, **words: Rule) -> Optional[Found]:
+        """Applies a rule that may match or not; a file that cannot be read is left as it is."""
+        try:
+            return self._run(name, label, codemod, **words)
+        except PatchError as error:
+            note = f"left as it is: {error}"
+            self.notes += [note] if note not in self.notes else []
+            return None
+
+    def _run(self, name: str, label: str, codemod: Callable, **words: Rule) -> Found:
+        if name not in self.parsed:
+            self.parsed[name] = source.parse(name, self.files[name])
+        (tree, write), found = self.parsed[name], Found()
+        self.parsed[name] = codemod(tree, found, **words), write
+        if found.pending:
+            self.rules.setdefault(name, []).append(label)
+        return found

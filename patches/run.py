@@ -13,15 +13,15 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Dict, Iterator, List, NoReturn, Optional, Sequence, Tuple
+from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
 
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
 
 from . import facts
+from .engine import read_file
 from .errors import PatchError
 from .record import Record
-from .rules import RASTERIZER
-from .trainers import TRAINERS
+from .trainers import RASTERIZER, TRAINERS, names
 
 SHIMS = Path(__file__).resolve().parent / "shims"
 STAND_INS = {"simple_knn": "simple_knn._C", "fused_ssim": "fused_ssim", "torch_scatter": "torch_scatter",
@@ -72,14 +72,13 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         del environment[BACKGROUND_GATE_VARIABLE]
     if "PYTHONPYCACHEPREFIX" not in environment:
         environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
-    answer, lines = _ask_python(words, environment)
-    absent = [name for name, module in STAND_INS.items() if module not in answer["usable"]]
+    usable, lines = _ask_python(words, environment)
+    absent = [name for name, module in STAND_INS.items() if module not in usable]
     folders = [str(SHIMS / name) for name in [flavour, *absent]]
-    environment["PYTHONPATH"] = os.pathsep.join(folders + [path for path in [environment.get("PYTHONPATH")] if path])
-    lines.insert(0, f"{found}: {RASTERIZER} will be {flavour} of this package, blend mode {blend_mode}"
-                    + (f", background gate {gate}" if gate is not None else "")
-                    + "; each process that imports it says so")
-    return environment, lines
+    environment["PYTHONPATH"] = os.pathsep.join(folders + list(filter(None, [environment.get("PYTHONPATH")])))
+    said_gate = f", background gate {gate}" if gate is not None else ""
+    return environment, [f"{found}: {RASTERIZER} will be {flavour} of this package, blend mode {blend_mode}{said_gate};"
+                         " each process that imports it says so", *lines]
 
 
 def flavours() -> Tuple[str, ...]:
@@ -91,23 +90,22 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str]:
     """Returns the flavour, and for which trainer it was chosen."""
     by_name = {**{name: name for name in flavours()}, **{known.name: known.flavour for known in TRAINERS}}
     if trainer is not None and trainer not in by_name:
-        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(facts.names())}, or for "
+        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(names())}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(flavours())}")
     reasons = []
     folders = _folders(words)
     for folder in folders:
-        found = facts.of_checkout(lambda name: (folder / name).read_bytes() if (folder / name).is_file() else None)
+        found = facts.of_checkout(lambda name: read_file(folder / name))
         if facts.PATCHED in found or Record.in_force(folder):
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
         for path in (folder / RASTERIZER, folder / f"{RASTERIZER}.py"):
             if folder == folders[0] and path.exists():  # where Python looks first
                 raise PatchError(f"{path} would be imported before this package's; move it away")
-        if trainer is None:
-            known, reason = facts.recognise(found)
-            if known:
-                return known.flavour, f"{known.name} in {folder}"
-            reasons.append(f"{folder}: {reason}")
+        known, reason = facts.recognise(found)
+        if known and trainer is None:
+            return known.flavour, f"{known.name} in {folder}"
+        reasons.append(f"{folder}: {reason}")
     if trainer is not None:
         return by_name[trainer], trainer
     raise PatchError("no trainer that is known was found; name it with --trainer, or the rasterizer whose API it calls "
@@ -121,34 +119,16 @@ def _folders(words: Sequence[str]) -> List[Path]:
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
-def _python_options(words: Sequence[str]) -> Iterator[str]:
-    """Yields the letters of Python's own options, which come before the script: -uE, -W ignore -E, -Xdev."""
-    rest = iter(words)
-    for word in rest:
-        if not word.startswith("-") or word in ("-", "--"):
-            return
-        if word == "--check-hash-based-pycs":
-            next(rest, None)
-        for place, letter in enumerate(word[1:] if not word.startswith("--") else "", start=2):
-            if letter in "cm":  # what follows is the program's
-                return
-            yield letter
-            if letter in "WX":  # with a value, which is the rest of the word or the next one
-                if place == len(word):
-                    next(rest, None)
-                break
+def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[List[str], List[str]]:
+    """Returns which of STAND_INS the command's Python has itself, and a warning where it may not have this package.
 
-
-def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[Dict, List[str]]:
-    """Asks the command's Python what it can import. Raises PatchError where that is not this package."""
+    Raises PatchError where it has not.
+    """
     is_python = re.fullmatch(r"python[0-9.]*t?", os.path.basename(words[0])) is not None
-    for option in _python_options(words[1:]) if is_python else ():
-        if option in "IE":
-            raise PatchError(f"{words[0]} -{option}: does not look at PYTHONPATH, where the rasterizer is found")
     python = words[0] if is_python else next((name for name in ("python", "python3")
                                               if shutil.which(name, path=environment.get("PATH"))), None)
     if python is None:
-        return {"usable": list(STAND_INS.values())}, []
+        return list(STAND_INS.values()), []
     asked = subprocess.run([python, "-c", PROBE, "diff_smoe_rasterization", *STAND_INS.values()], env=environment,
                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, universal_newlines=True)
     try:
@@ -157,9 +137,9 @@ def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[Dict
         said = asked.stderr.strip() or "it printed nothing"
         raise PatchError(f"{python} cannot be asked what it can import: {said}") from None
     if answer["ours"]:
-        return answer, []
+        return answer["usable"], []
     message = (f"{python} (Python {answer['version']}) cannot import diff_smoe_rasterization; install it there: "
                f"{python} -m pip install PATH_OF_THIS_PROJECT")
     if is_python:
         raise PatchError(message)
-    return answer, [message + f", unless {words[0]} starts another Python"]
+    return answer["usable"], [message + f", unless {words[0]} starts another Python"]

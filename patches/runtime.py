@@ -153,13 +153,13 @@ def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-# Of the largest value. A variance E[x^2] - E[x]^2 of the first pair below is 4e-3 of E[x^2], so that what float32 rounds
-# off, some 1e-7, becomes some 1e-5 to 1e-4 of it; another window, border or constant makes several per cent.
+# Of the largest value. A variance E[x^2] - E[x]^2 of the first pair below is 4e-3 of E[x^2]: what float32 rounds off,
+# some 1e-7, becomes some 1e-5 to 1e-4 of it; another window, border or constant makes several per cent.
 SSIM_ROUNDING = 1e-3
 
 
 def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a trainer's ssim(img1, img2, window_size=11, size_average=True), computed by `fused_ssim` where it can be.
+    """Returns a trainer's ssim(img1, img2, window_size=11, size_average=True), by `fused_ssim` where that can be.
 
     img1, img2: [3, H, W] or [B, 3, H, W]. When images of a shape come first, both are computed of pairs of that shape:
     where they differ in value or gradient the trainer's own stays, and a line on stderr says so. It is also called for
@@ -234,7 +234,7 @@ def difference_of_ssim(ssim: Callable[..., Any], device: Any, shape: Any) -> str
                     differs, largest = float((ours - theirs).abs().max()), float(ours.abs().max())
                     if not differs <= SSIM_ROUNDING * largest:  # NaN is no such number
                         return f"they differ by {differs:.1e} where the largest value is {largest:.1e}"
-            except Exception as error:  # whatever another function has against the pair: it is not this package's to end
+            except Exception as error:  # whatever another function has against the pair: the training goes on
                 return f"it raises {error!r}"
     return ""
 

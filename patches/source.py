@@ -45,36 +45,23 @@ def parse(name: str, data: bytes):
 def _where(data: bytes) -> str:
     """Returns what Python itself says of a file that LibCST cannot parse."""
     try:
-        _parsed(data)
+        ast.parse(data)
     except (SyntaxError, ValueError) as error:  # a ValueError of a null byte, as some Pythons have it
         line = getattr(error, "lineno", None)
         return f"line {line}: {error.msg}" if line else str(error)
     return ""
 
 
-def python_tree(data: bytes) -> ast.AST:
+def python_tree(data: bytes) -> ast.Module:
     """Returns the syntax tree of a file as Python's own parser has it; of one that cannot be parsed an empty one."""
-    try:
-        return _parsed(data)
-    except (SyntaxError, ValueError):
-        return ast.Module(body=[], type_ignores=[])
-
-
-def _parsed(data: bytes) -> ast.AST:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # such as of invalid escapes in a string
-        return ast.parse(data)
+        try:
+            return ast.parse(data)
+        except (SyntaxError, ValueError):
+            return ast.Module(body=[], type_ignores=[])
 
 
 def called_name(call: ast.Call) -> str:
     """Returns the last part of the name that is called: c of a.b.c(...)."""
     return getattr(call.func, "attr", getattr(call.func, "id", ""))
-
-
-def have_libcst() -> None:
-    """Raises ImportError, which says what to type, where LibCST is missing."""
-    try:
-        import libcst  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f"patching reads and writes Python with LibCST, which cannot be imported ({error}): "
-                          "pip install libcst; `dsmoe run` needs no patch") from None

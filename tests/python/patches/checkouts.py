@@ -1,7 +1,6 @@
 """Copies of the small trainers, and what tests ask about a folder."""
 from __future__ import annotations
 
-import ast
 import json
 import os
 import shutil
@@ -13,31 +12,70 @@ import diff_smoe_rasterization
 HERE = Path(__file__).resolve().parent
 PACKAGES = HERE / "packages"  # what the trainers import beside the rasterizer
 RECORD = ".dsmoe_patch"
+SPARSE_ADAM = """
+try:
+    from diff_gaussian_rasterization import SparseGaussianAdam
+    HAS_SPARSE_ADAM = True
+except ImportError:
+    HAS_SPARSE_ADAM = False
+"""
 
-# A trainer is these folders of trainers/, one laid over the other.
-LAYERS = {"3dgs-2023": ("common", "3dgs-2023"), "3dgs-2024": ("common", "3dgs-2023", "3dgs-2024"),
-          "taming": ("common", "3dgs-2023", "taming"), "c3dgs": ("common", "c3dgs"), "hac": ("common", "hac"),
-          "hac-plus": ("common", "hac", "hac-plus")}
-# HAC++ grew out of HAC: these lines of HAC's files are others in it.
-EDITS = {"hac-plus": {
-    "train.py": {
-        "import torch\n": "import lpips\nimport torch\n",
-        "run_codec = True\n": "lpips_fn = lpips.LPIPS(net=\"vgg\").to(\"cpu\")\nrun_codec = True\n",
-        """PSNR {psnr(image, view.original_image).item():.9g}")\n    world.gaussians.train()""":
-            """PSNR {psnr(image, view.original_image).item():.9g}")
-        logger.info(f"step {step}: LPIPS {lpips_fn(image, view.original_image).item():.9g}")
-    world.gaussians.train()"""},
-    "gaussian_renderer/__init__.py": {
-        "(pc.get_opacity_mlp(inputs) * pc.get_mask[visible_mask][..., 0])": "pc.get_opacity_mlp(inputs)",
-        "    return xyz, color, neural_opacity[mask], sizes, rot, neural_opacity, mask":
-            """    kept = pc.get_mask[visible_mask].view(-1, 1)[mask]
-    return xyz, color, neural_opacity[mask] * kept, sizes * kept, rot, neural_opacity, mask"""},
-    "arguments/__init__.py": {
-        "        self.lambda_dssim = 0.25\n":
-            """        self.mlp_hyp_lr_init, self.mlp_hyp_lr_final, self.mlp_hyp_lr_delay_mult = 0.005, 0.001, 0.01
-        self.mask_lr_final, self.lambda_dssim = 0.001, 0.25\n"""}}}
+# A trainer is the small 3DGS of 2023 with other files laid over it, without some, and with other lines in some.
+LAYERS = {"3dgs-2023": (), "3dgs-2024": ("3dgs-2024",), "taming": ("taming",), "c3dgs": ("c3dgs",), "hac": ("hac",),
+          "hac-plus": ("hac", "hac-plus")}
+REMOVED = {"c3dgs": ("train.py", "full_eval.py"), "hac": ("render.py", "full_eval.py"),
+           "hac-plus": ("render.py", "full_eval.py")}
+SPARSE = {"        return Adam(groups, lr=0.0, eps=1e-15)":
+          """        if self.kind == "sparse_adam":
+            return SparseGaussianAdam(groups, lr=0.0, eps=1e-15)
+        return Adam(groups, lr=0.0, eps=1e-15)""",
+          "import Adam, build_covariance\n": "import Adam, build_covariance\n" + SPARSE_ADAM}
+SPARSE_STEP = {"model.optimizer.step()": """visible = result["radii"] > 0
+            model.optimizer.step(*([visible, len(visible)] if opt.optimizer_type == "sparse_adam" else []))"""}
+EDITS = {
+    "3dgs-2024": {
+        "scene/gaussian_model.py": SPARSE,
+        "utils/loss_utils.py": {"avg_pool2d\n\n": """avg_pool2d
+
+try:
+    from diff_gaussian_rasterization._C import fusedssim, fusedssim_backward
+except ImportError:
+    fusedssim = fusedssim_backward = None
+
+"""},
+        "render.py": {"safe_state, save_image\n": "safe_state, save_image\n" + SPARSE_ADAM,
+                      "skip_test: bool)": "skip_test: bool,\n                separate_sh: bool)",
+                      "background_of(dataset))[": "background_of(dataset), separate_sh=separate_sh)[",
+                      "args.skip_test)": "args.skip_test,\n                HAS_SPARSE_ADAM)"},
+        "train.py": {**SPARSE_STEP, "import l1_loss, ssim\n": "import l1_loss, ssim\n" + SPARSE_ADAM,
+                     "else fixed)\n": "else fixed,\n                        separate_sh=HAS_SPARSE_ADAM)\n",
+                     "        loss.backward()":
+                     """        depth_loss = (result["depth"] - view.invdepthmap).abs().mean()
+        (loss + 0.1 * depth_loss).backward()"""}},
+    "taming": {
+        "scene/gaussian_model.py": SPARSE,
+        "train.py": {**SPARSE_STEP, "import l1_loss, ssim\n": """import l1_loss
+from utils.taming_utils import compute_gaussian_score, compute_photometric_loss
+""",
+                     "torch.lerp(l1_loss(image, target), 1 - ssim(image, target), opt.lambda_dssim)":
+                     "compute_photometric_loss(view, image) + 0 * l1_loss(image, target)",
+                     "            if step % opt":
+                     """            views_of_all = world.getTrainCameras()
+            scores = compute_gaussian_score(views_of_all, model, pipe, fixed)
+            print(f"step {step}: loss by Gaussian {scores.sum().item():.9g}")
+            if step % opt"""}},
+    "c3dgs": {"scene/gaussian_model.py": {
+        "import Adam, build_covariance\n": "import Adam, build_covariance\n\nfrom scene.compressed import Compressed\n",
+        "class GaussianModel:": "class GaussianModel(Compressed):",
+        "        np.savez(path, **{":
+            "        np.savez(path, indices=torch.stack(self.indices).cpu().numpy(), **{",
+        "for name in self.FIELDS})\n": """for name in self.FIELDS})
+            self.indices = torch.tensor(saved["indices"], device=data_device).unbind() if "indices" in saved else None
+"""}},
+    "hac-plus": {"train.py": {"import torch\n": "import lpips\nimport torch\n",
+                              "\ndef training(": "\nlpips_fn = lpips.LPIPS(net='vgg').to('cpu')\n\n\ndef training("}},
+}
 TRAINERS = tuple(LAYERS)
-WITH_RENDER = ("3dgs-2023", "3dgs-2024", "taming", "c3dgs")
 
 # Where the patch puts the mode into the pipeline: the functions behind the command lines.
 ENTRIES = {"3dgs-2023": {"train.py": ["training"], "render.py": ["render_sets"]},
@@ -49,16 +87,19 @@ ENTRIES["hac-plus"] = ENTRIES["hac"]
 
 def make_checkout(name, folder):
     """Copies trainer `name` to `folder`; returns it."""
-    for layer in LAYERS[name]:
+    folder = Path(folder)
+    for layer in ("common", *LAYERS[name]):
         shutil.copytree(HERE / "trainers" / layer, folder, dirs_exist_ok=True,
                         ignore=shutil.ignore_patterns("__pycache__"))
+    for file in REMOVED.get(name, ()):
+        (folder / file).unlink()
     for file, lines in EDITS.get(name, {}).items():
-        text = (Path(folder) / file).read_text()
+        text = (folder / file).read_text()
         for before, after in lines.items():
             assert text.count(before) == 1, (file, before)
             text = text.replace(before, after)
-        (Path(folder) / file).write_text(text)
-    return Path(folder)
+        (folder / file).write_text(text)
+    return folder
 
 
 def make_scene(folder, seed=1):
@@ -68,45 +109,18 @@ def make_scene(folder, seed=1):
 
 
 def contents(folder, record=True):
-    """{path: (mode, bytes)} of every file and {path: mode} of every folder below, without the record if so asked."""
+    """{path: (mode, bytes or what a link points to)} of all below, without the record if so asked."""
     found = {}
     for path in sorted(Path(folder).rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if not record and (name + "/").startswith(RECORD + "/"):
-            continue
-        mode = stat.S_IMODE(path.lstat().st_mode)
-        found[name] = (mode, path.read_bytes()) if path.is_file() else mode
+        if record or not (name + "/").startswith(RECORD + "/"):
+            data = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
+            found[name] = stat.S_IMODE(path.lstat().st_mode), data
     return found
 
 
 def changed_files(before, after):
     return {name for name in set(before) | set(after) if before.get(name) != after.get(name)}
-
-
-class _WithoutImports(ast.NodeTransformer):
-    def visit_Import(self, node):
-        return ast.Pass()
-
-    visit_ImportFrom = visit_Import
-
-
-def definitions(path):
-    """{qualified name: syntax tree} of each function, and "" for the rest of the file; imports are left out."""
-    found = {}
-
-    def collect(body, prefix):
-        rest = []
-        for node in body:
-            if isinstance(node, ast.FunctionDef):
-                found[prefix + node.name] = node
-            elif isinstance(node, ast.ClassDef):
-                collect(node.body, prefix + node.name + ".")
-            elif not isinstance(node, ast.Pass):
-                rest.append(node)
-        found[prefix] = ast.Module(body=rest, type_ignores=[])
-
-    collect(_WithoutImports().visit(ast.parse(path.read_bytes())).body, "")
-    return found
 
 
 def environment(**more):

@@ -2,59 +2,46 @@ import os
 from argparse import ArgumentParser, Namespace
 
 import torch
+from tqdm import tqdm
 
 from arguments import CompressionParams, ModelParams, OptimizationParams, PipelineParams, get_combined_args
-from compression.vq import Codebook, compress
-from finetune import finetune
 from gaussian_renderer import GaussianModel, render
 from scene import Scene
-from utils.general_utils import safe_state
-from utils.image_utils import psnr
-from utils.loops import background_of, write_cfg_args
+from utils.general_utils import background_of, build_covariance, endlessly, psnr, safe_state
+from utils.loss_utils import l1_loss
 
 
-def sensitivity(gaussians, views, pipe):
-    """How much the pictures change with every colour [N, K * 3] and with every covariance [N, 6]."""
-    shapes = gaussians.get_normalized_covariance().detach().requires_grad_(True)
-    factors = gaussians.get_scaling_factor.detach()
-    inputs = (gaussians._features_dc, gaussians._features_rest, shapes)
-    sums = [torch.zeros_like(tensor) for tensor in inputs]
-    for view in views:
-        black = torch.zeros(3, device=shapes.device)
-        cov3d = shapes * factors ** 2
-        image = render(view, gaussians, pipe, black, clamp_color=False, cov3d=cov3d)["render"]
-        for total, gradient in zip(sums, torch.autograd.grad(image.sum(), inputs)):
-            total += gradient.abs() / image[0].numel()
-    return torch.cat(sums[:2], dim=1).flatten(1), sums[2]
-
-
-def psnr_of(gaussians, views, pipe, fixed):
-    with torch.no_grad():
-        return [psnr(render(view, gaussians, pipe, fixed)["render"], view.original_image).item() for view in views]
+def sensitivity(model, views, pipe):
+    """[N]: how much the pictures change with every covariance."""
+    cov3d = build_covariance(model.get_scaling, model.get_rotation).detach().requires_grad_(True)
+    black = torch.zeros(3, device=cov3d.device)
+    images = [render(view, model, pipe, black, clamp_color=False, cov3d=cov3d)["render"].sum() for view in views]
+    return torch.autograd.grad(sum(images), cov3d)[0].abs().amax(1)
 
 
 def run_vq(model_params: ModelParams, rates: OptimizationParams, pipeline_params: PipelineParams,
            books: CompressionParams):
-    fixed = background_of(model_params)
-    model = GaussianModel(model_params.sh_degree, quantization=not rates.not_quantization_aware)
+    model = GaussianModel(model_params.sh_degree)
     world = Scene(model_params, model, load_iteration=books.load_iteration, shuffle=True)
+    model.compress(sensitivity(model, world.getTrainCameras(), pipeline_params))
+    model.training_setup(rates)
 
-    of_colors, of_shapes = sensitivity(model, world.getTrainCameras(), pipeline_params)
+    fixed, views = background_of(model_params), endlessly(world.getTrainCameras())
+    os.makedirs(books.output_vq, exist_ok=True)
+    with open(os.path.join(books.output_vq, "cfg_args"), "w") as file:
+        file.write(repr(Namespace(**{**vars(model_params), "model_path": books.output_vq})))
+    for step in tqdm(range(books.finetune_iterations)):
+        view = next(views)
+        loss = l1_loss(render(view, model, pipeline_params, fixed)["render"], view.original_image)
+        loss.backward()
+        print(f"step {step}: loss {loss.item():.9g}")
+        model.optimizer.step()
+        model.optimizer.zero_grad()
+    world.model_path = books.output_vq
+    world.save(world.loaded_iter + books.finetune_iterations)
     with torch.no_grad():
-        compress(model, of_colors.amax(-1), of_shapes.amax(-1),
-                 Codebook(books.color_codebook_size, books.color_importance_include, books.color_cluster_iterations),
-                 Codebook(books.gaussian_codebook_size, books.gaussian_importance_include,
-                          books.gaussian_cluster_iterations),
-                 books.prune_threshold)
-    print(f"{len(model.get_xyz)} Gaussians, {len(model._features_dc)} colours, {len(model._scaling)} shapes")
-
-    write_cfg_args(books.output_vq, Namespace(**{**vars(model_params), "model_path": books.output_vq}))
-    finetune(world, books.finetune_iterations, rates, pipeline_params, fixed)
-    last = world.loaded_iter + books.finetune_iterations
-    folder = os.path.join(books.output_vq, "point_cloud", f"iteration_{last}")
-    os.makedirs(folder, exist_ok=True)
-    model.save_npz(os.path.join(folder, "point_cloud.npz"))
-    print("PSNR", *(f"{value:.9g}" for value in psnr_of(model, world.getTestCameras(), pipeline_params, fixed)))
+        for view in world.getTestCameras():
+            print(f"PSNR {psnr(render(view, model, pipeline_params, fixed)['render'], view.original_image).item():.9g}")
 
 
 if __name__ == "__main__":
@@ -62,6 +49,5 @@ if __name__ == "__main__":
     model_flags, pipe_flags = ModelParams(flags, sentinel=True), PipelineParams(flags)
     step_flags, book_flags = OptimizationParams(flags), CompressionParams(flags)
     args = get_combined_args(flags)
-
     safe_state(True)
     run_vq(model_flags.extract(args), step_flags.extract(args), pipe_flags.extract(args), book_flags.extract(args))

@@ -1,12 +1,12 @@
 import math
 
+import torch
 from diff_gaussian_rasterization import (
     GaussianRasterizationSettings, GaussianRasterizer,
     GaussianRasterizerIndexed,
 )
 
 from scene.gaussian_model import GaussianModel
-from utils.screen import points_on_screen, shape_arguments
 
 
 def render(
@@ -14,7 +14,7 @@ def render(
     override_color=None, cov3d=None, clamp_color=True,
 ):
     """One picture of `pc`, from its codebooks where it has them, or with other covariances."""
-    points = points_on_screen(pc.get_xyz)
+    points = torch.zeros_like(pc.get_xyz, requires_grad=torch.is_grad_enabled())
     settings = GaussianRasterizationSettings(
         image_height=int(view.image_height), image_width=int(view.image_width),
         tanfovx=math.tan(view.FoVx / 2), tanfovy=math.tan(view.FoVy / 2),
@@ -24,20 +24,17 @@ def render(
         clamp_color=clamp_color, prefiltered=False,
         debug=pipe.debug,
     )
-    if pc.has_codebooks:
+    if pc.indices is not None:
+        colors, shapes = pc.indices
         image, radii = GaussianRasterizerIndexed(raster_settings=settings)(
-            means3D=pc.get_xyz, means2D=points, shs=pc._get_features_raw, sh_indices=pc._feature_indices,
-            g_indices=pc._gaussian_indices, colors_precomp=None, opacities=pc.get_opacity,
-            scales=pc.get_scaling_normalized, scale_factors=pc.get_scaling_factor,
-            rotations=pc._rotation_post_activation, cov3D_precomp=None,
+            means3D=pc.get_xyz, means2D=points, shs=pc.get_features, sh_indices=colors, g_indices=shapes,
+            colors_precomp=None, opacities=pc.get_opacity, scales=pc.get_scaling,
+            scale_factors=torch.ones_like(pc.get_opacity), rotations=pc.get_rotation, cov3D_precomp=None,
         )
     else:
-        shape = {"scales": None, "rotations": None, "cov3D_precomp": cov3d}
-        if cov3d is None:
-            shape = shape_arguments(pc, pipe, scaling_modifier)
+        shape = pc.shape(pipe) if cov3d is None else {"cov3D_precomp": cov3d}
         image, radii = GaussianRasterizer(raster_settings=settings)(
             means3D=pc.get_xyz, means2D=points, shs=pc.get_features if override_color is None else None,
-            colors_precomp=override_color, opacities=pc.get_opacity, scales=shape["scales"],
-            rotations=shape["rotations"], cov3D_precomp=shape["cov3D_precomp"],
+            colors_precomp=override_color, opacities=pc.get_opacity, **shape,
         )
     return {"render": image, "viewspace_points": points, "visibility_filter": radii > 0, "radii": radii}

@@ -1,32 +1,23 @@
 import os
-import random
 from glob import glob
 
 from arguments import ModelParams
-from scene.cameras import Camera
-from scene.dataset_readers import read_made_up_scene
+from scene.dataset_readers import Camera, read_made_up_scene
 from scene.gaussian_model import GaussianModel
 
 
 class Scene:
-    def __init__(self, args: ModelParams, gaussians: GaussianModel, load_iteration=None, shuffle=True, ply_path=None,
-                 override_quantization=False):
+    def __init__(self, args: ModelParams, gaussians: GaussianModel, load_iteration=None, shuffle=True):
         self.model_path, self.gaussians, self.loaded_iter = args.model_path, gaussians, load_iteration
-        info = read_made_up_scene(args.source_path)
-        if shuffle:
-            random.shuffle(info.shown)
-        self.cameras_extent = info.radius
-        self.train_cameras, self.test_cameras = (
-            [Camera(view.R, view.T, view.FovX, view.FovY, view.image, view.image_name, args.data_device)
-             for view in views] for views in (info.shown, info.hidden))
-
+        made = read_made_up_scene(args.source_path)
+        self.train_cameras, self.test_cameras = ([Camera(view, args.data_device) for view in views]
+                                                 for views in (made.shown, made.hidden))
         if load_iteration is None:
-            gaussians.create_from_pcd(info.point_cloud, self.cameras_extent, args.data_device)
+            gaussians.create_from_pcd(made.points, made.colors, args.data_device)
             return
         if load_iteration < 0:
             self.loaded_iter = max(int(folder.rpartition("_")[2]) for folder in glob(self._folder("*")))
-        saved, = glob(os.path.join(self._folder(self.loaded_iter), "point_cloud.*"))
-        gaussians.load(saved, args.data_device)
+        gaussians.load(os.path.join(self._folder(self.loaded_iter), "point_cloud.npz"), args.data_device)
 
     def _folder(self, iteration):
         return os.path.join(self.model_path, "point_cloud", f"iteration_{iteration}")

@@ -3,28 +3,26 @@ import os
 from typing import NamedTuple
 
 import numpy as np
-
-from utils.graphics_utils import Cloud
+import torch
 
 WIDTH, HEIGHT = 32, 24
 FOV_X = 0.9
 FOV_Y = 2 * np.arctan(np.tan(FOV_X / 2) * HEIGHT / WIDTH)
+NEAR, FAR = 0.01, 100.0
 
 
 class View(NamedTuple):
     R: np.ndarray
     T: np.ndarray
-    FovX: float
-    FovY: float
     image: np.ndarray  # [3, H, W]
     image_name: str
 
 
 class MadeUpScene(NamedTuple):
-    radius: float
     hidden: list  # views that are left for tests
     shown: list  # views to train with
-    point_cloud: Cloud
+    points: np.ndarray  # [N, 3]
+    colors: np.ndarray  # [N, 3]
 
 
 def make_picture(random):
@@ -41,12 +39,29 @@ def read_made_up_scene(path):
     with open(os.path.join(path, "made_up.json")) as file:
         wanted = json.load(file)
     random = np.random.RandomState(wanted["seed"])
-    cameras = []
+    views = []
     for index in range(wanted["views"]):
         angle = 2 * np.pi * index / wanted["views"]
         R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        cameras.append(View(R.astype(np.float32), np.array([0, 0, 2], dtype=np.float32), FOV_X, FOV_Y,
-                            make_picture(random), f"view{index}"))
-    cloud = Cloud(random.uniform(-1, 1, (wanted["points"], 3)).astype(np.float32),
-                  random.uniform(0, 1, (wanted["points"], 3)).astype(np.float32))
-    return MadeUpScene(3.3, cameras[:1], cameras[1:], cloud)
+        views.append(View(R.astype(np.float32), np.array([0, 0, 2], dtype=np.float32), make_picture(random),
+                          f"view{index}"))
+    points, colors = (random.uniform(low, 1, (wanted["points"], 3)).astype(np.float32) for low in (-1, 0))
+    return MadeUpScene(views[:1], views[1:], points, colors)
+
+
+class Camera:
+    """One view of the made-up scene: its matrices, transposed as the rasterizer wants them, and its picture."""
+
+    def __init__(self, view: View, data_device):
+        self.FoVx, self.FoVy, self.image_name = FOV_X, FOV_Y, view.image_name
+        self.original_image = torch.tensor(view.image).to(data_device)
+        _, self.image_height, self.image_width = view.image.shape
+        to_view, projection = torch.eye(4), torch.zeros(4, 4)
+        to_view[:3, :3], to_view[:3, 3] = torch.tensor(view.R.T.copy()), torch.tensor(view.T)
+        projection[0, 0], projection[1, 1] = 1 / np.tan(FOV_X / 2), 1 / np.tan(FOV_Y / 2)
+        depth = FAR / (FAR - NEAR)
+        projection[2, 2], projection[2, 3], projection[3, 2] = depth, -depth * NEAR, 1
+        self.world_view_transform = to_view.T.contiguous().to(data_device)
+        self.full_proj_transform = self.world_view_transform @ projection.T.to(data_device)
+        self.camera_center = torch.tensor(-view.R @ view.T).to(data_device)
+        self.invdepthmap = torch.full((1, self.image_height, self.image_width), 1 / 3.0, device=data_device)

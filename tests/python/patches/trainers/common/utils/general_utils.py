@@ -1,7 +1,9 @@
+import os
 import random
 
 import numpy as np
 import torch
+from PIL import Image
 
 
 def safe_state(silent):
@@ -10,35 +12,58 @@ def safe_state(silent):
         seed(0)
 
 
-def inverse_sigmoid(y):
-    return torch.log(y) - torch.log1p(-y)
+def endlessly(cameras):
+    """The cameras in a random order, over and over."""
+    while True:
+        for index in torch.randperm(len(cameras)).tolist():
+            yield cameras[index]
 
 
-def get_expon_lr_func(lr_init, lr_final, max_steps=1):
-    """A rate that falls from lr_init to lr_final by the same factor in every step."""
-    def rate(step):
-        share = min(max(step / max_steps, 0.0), 1.0)
-        return lr_init ** (1.0 - share) * lr_final ** share
-
-    return rate
+def background_of(params):
+    return torch.full((3,), float(params.white_background), device=params.data_device)
 
 
-def build_rotation(quaternions):
-    """[N, 4] (w, x, y, z) to [N, 3, 3]."""
+def psnr(img1, img2):
+    return -10 * ((img1 - img2) ** 2).mean().log10()
+
+
+def save_image(image, path):
+    """Writes a [3, H, W] image as 8-bit PNG."""
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    pixels = image.detach().cpu().clamp(0, 1).mul(255).round().permute(1, 2, 0)
+    Image.fromarray(pixels.numpy().astype(np.uint8)).save(path)
+
+
+def build_covariance(scales, quaternions):
+    """[N, 6] of the ellipsoids with these axes: xx, xy, xz, yy, yz, zz."""
     w, x, y, z = torch.nn.functional.normalize(quaternions).unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
             2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
             2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return torch.stack(rows, -1).view(-1, 3, 3)
-
-
-def strip_symmetric(matrices):
-    """[N, 3, 3] symmetric to [N, 6]: xx, xy, xz, yy, yz, zz."""
+    axes = torch.stack(rows, -1).view(-1, 3, 3) * scales[:, None, :]
     row, column = torch.triu_indices(3, 3)
-    return matrices[:, row, column]
+    return (axes @ axes.transpose(1, 2))[:, row, column]
 
 
-def build_covariance(scales, quaternions):
-    """[N, 6] of the ellipsoids with these axes."""
-    axes = build_rotation(quaternions) * scales[:, None, :]
-    return strip_symmetric(axes @ axes.transpose(1, 2))
+class Adam:
+    """Adam as in torch.optim, whose first use imports all of torch._dynamo: seconds, in every process of a test."""
+
+    def __init__(self, params, lr, eps):
+        self.param_groups, self.state, self.eps = [{"lr": lr, **group} for group in params], {}, eps
+
+    @torch.no_grad()
+    def step(self):
+        for group in self.param_groups:
+            for tensor in group["params"]:
+                if tensor.grad is None:
+                    continue
+                count, mean, square = self.state.get(tensor, (0, torch.zeros_like(tensor), torch.zeros_like(tensor)))
+                self.state[tensor] = count, mean, square = (
+                    count + 1, mean.lerp(tensor.grad, 0.1), square.lerp(tensor.grad ** 2, 0.001))
+                deviation = (square / (1 - 0.999 ** count)).sqrt() + self.eps
+                tensor -= group["lr"] * mean / (1 - 0.9 ** count) / deviation
+
+    def zero_grad(self):
+        for group in self.param_groups:
+            for tensor in group["params"]:
+                tensor.grad = None

@@ -1,0 +1,176 @@
+"""Where a patched trainer's blend mode and background gate come from."""
+from __future__ import annotations
+
+import sys
+import warnings
+from collections import namedtuple
+from types import SimpleNamespace
+
+import pytest
+
+from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings
+from diff_smoe_rasterization.patches import runtime
+from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED
+
+
+ALPHA = {"blend_mode": "alpha", "background_gate": None}
+
+
+@pytest.fixture(autouse=True)
+def no_earlier_warning(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    runtime._warn.cache_clear()
+    runtime._say.cache_clear()
+
+
+def run(mode, gate="", **more):
+    """What a trainer extracts of the command line; without `gate` the option is not typed."""
+    return SimpleNamespace(blend_mode=mode, background_gate=gate, **more)
+
+
+def test_the_default_is_alpha_or_the_variable(monkeypatch):
+    assert runtime.default_blend() == ("alpha", "")
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe_tn")
+    assert runtime.default_blend() == ("smoe_tn", "")
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "smo")
+    with pytest.raises(ValueError, match="DSMOE_BLEND_MODE is 'smo'.*alpha, smoe, smoe_tn, smoe_std"):
+        runtime.default_blend()
+
+
+@pytest.mark.parametrize("mode", BLEND_MODES)
+@pytest.mark.parametrize("variable", [None, "0.25"])
+def test_the_blend_of_a_run(mode, variable, monkeypatch):
+    """In `smoe` the gate is the recommended one or the variable's; no other mode has one, whatever that says."""
+    if variable:
+        monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
+    gate = float(variable or RECOMMENDED) if mode == "smoe" else None
+    for dataset in (run(mode, white_background=False), run(mode, 0.25 if variable else RECOMMENDED)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert runtime.blend_of(dataset) == {"blend_mode": mode, "background_gate": gate}
+        assert (dataset.blend_mode, dataset.background_gate) == (mode, gate)  # what is saved of it
+
+
+def test_a_gate_that_is_typed_wins(monkeypatch):
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.25")
+    with pytest.warns(UserWarning, match="DSMOE_BACKGROUND_GATE is 0.25, but the background gate is 0.0: --background"):
+        assert runtime.blend_of(run("smoe", "0"))["background_gate"] == 0
+
+
+@pytest.mark.parametrize("mode, gate, variable, message", [
+    ("smoe", "-1", "", "background_gate is '-1'; it must be a number, 0 or more"), ("smoe", "x", "", "'x'; it must be"),
+    ("smoe", "", "y", "DSMOE_BACKGROUND_GATE is 'y'"), ("smoe", "0.1", "y", "DSMOE_BACKGROUND_GATE is 'y'"),
+    ("alpha", "0.1", "", "blend_mode is 'alpha'; only 'smoe' knows it"), ("smoe_std", "0", "", "'smoe_std'; only")])
+def test_a_wrong_gate_is_refused_by_name(mode, gate, variable, message, monkeypatch):
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
+    with pytest.raises(ValueError, match=message):
+        runtime.blend_of(run(mode, gate))
+
+
+def test_a_model_in_smoe_of_before_there_were_gates_has_eq_7_and_says_so(tmp_path):
+    (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe')")
+    old = SimpleNamespace(blend_mode="smoe", model_path=str(tmp_path))
+    with pytest.warns(UserWarning, match="records no background gate, so it is 0, Eq. 7"):
+        assert runtime.blend_of(old) == {"blend_mode": "smoe", "background_gate": 0}
+    with pytest.warns(UserWarning, match="is of a run with background gate 0.0, but this one has .*_gate 0.0$"):
+        runtime.blend_of(run("smoe", "0.25", model_path=str(tmp_path)))
+
+
+@pytest.mark.parametrize("name", ["default_blend_mode", "blend_mode_of"])
+def test_a_trainer_that_an_earlier_version_has_patched_says_what_to_type(name):
+    with pytest.raises(ImportError, match="earlier version.*type: dsmoe patch apply"):
+        exec(f"from diff_smoe_rasterization.patches.runtime import {name}")
+
+
+@pytest.mark.parametrize("dataset", [SimpleNamespace(), SimpleNamespace(blend_mode=None, background_gate=None)])
+def test_an_old_model_is_alpha_and_says_so_once(dataset):
+    with pytest.warns(UserWarning, match="records no blend mode"):
+        assert runtime.blend_of(dataset) == ALPHA
+    assert dataset.blend_mode == "alpha"  # what is saved of it says so
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert runtime.blend_of(SimpleNamespace(blend_mode="alpha")) == ALPHA
+        assert runtime.blend_of(type(dataset)()) == ALPHA
+
+
+def test_a_wrong_mode_is_refused_by_name(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["train.py", "--blend_mode=Smoe"])
+    message = "'Smoe', as --blend_mode says; it must be one of alpha, smoe, smoe_tn, smoe_std"
+    with pytest.raises(ValueError, match=message):
+        runtime.blend_of(run("Smoe"))
+
+
+@pytest.mark.parametrize("arguments, white", [(["--random_background"], False), ([], True)])
+def test_a_background_that_changes_its_meaning_is_named(monkeypatch, arguments, white):
+    monkeypatch.setattr(sys, "argv", ["train.py"] + arguments)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for harmless in (run("alpha", white_background=white), run("smoe", "0.1", white_background=white)):
+            runtime.blend_of(harmless)
+    for mode, gate, words in (("smoe", "0", "smoe and background gate 0"), ("smoe_tn", "", "smoe_tn")):
+        with pytest.warns(UserWarning, match=f"_background with blend mode {words}: the background shows only where"):
+            runtime.blend_of(run(mode, gate, white_background=white))
+
+
+def model(folder, text):
+    """A model's folder, whose cfg_args has this text."""
+    (folder / "cfg_args").write_text(text)
+    return run("alpha", model_path=str(folder))
+
+
+def test_one_line_says_which_mode_it_is_and_whence(monkeypatch, tmp_path, capsys):
+    def said(dataset, *words):
+        monkeypatch.setattr(sys, "argv", ["train.py", *words])
+        runtime._say.cache_clear()
+        runtime.blend_of(dataset)
+        runtime.blend_of(dataset)
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        return printed.err.split("diff_smoe_rasterization: ")[1:]
+
+    alpha, smoe = run("alpha"), run("smoe")
+    assert said(alpha) == ["blend mode alpha, the default\n"]
+    for words in (["--blend_mode", "smoe"], ["--blend_mode=smoe"], ["--blend", "smoe"]):
+        assert said(smoe, *words) == ["blend mode smoe, as --blend_mode says; "
+                                      f"background gate {RECOMMENDED}, the default\n"]
+    for words in (["--background_gate", "2"], ["--back=2"]):
+        assert said(run("smoe", "2"), *words) == ["blend mode smoe, the default; "
+                                                  "background gate 2.0, as --background_gate says\n"]
+    saved = model(tmp_path, "Namespace(data_device='cuda', blend_mode='alpha', eval=False)")
+    assert said(saved) == [f"blend mode alpha, as in {tmp_path}/cfg_args\n"]
+    saved = model(tmp_path, "Namespace(blend_mode='smoe', background_gate=0.5)")
+    saved.blend_mode, saved.background_gate = "smoe", 0.5
+    assert said(saved) == ["blend mode smoe, as in {0}; background gate 0.5, as in {0}\n".format(tmp_path / "cfg_args")]
+    for name, value in (("BLEND_MODE", "smoe"), ("BACKGROUND_GATE", str(RECOMMENDED))):
+        monkeypatch.setenv("DSMOE_" + name, value)
+    assert said(smoe) == ["blend mode smoe, as in DSMOE_BLEND_MODE; "
+                          f"background gate {RECOMMENDED}, as in DSMOE_BACKGROUND_GATE\n"]
+
+
+def test_training_again_in_another_mode_is_named(monkeypatch, tmp_path):
+    """A rendering without the flag has the mode of cfg_args; a training, resumed or not, has the default."""
+    with pytest.warns(UserWarning, match="a run with blend mode smoe, .* has alpha, the default.*--blend_mode smoe"):
+        runtime.blend_of(model(tmp_path, "Namespace(sh_degree=3, blend_mode='smoe')"))
+    for text in ("Namespace(blend_mode='alpha')", "Namespace(sh_degree=3)", "", "no Python",
+                 "Namespace(blend_mode=f())", "__import__('os').mkdir('x')"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert runtime.blend_of(model(tmp_path, text)) == ALPHA
+    monkeypatch.chdir(tmp_path)  # of no model yet: the current folder's is another
+    (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe')")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        runtime.blend_of(run("alpha", model_path=""))
+
+
+def test_a_renderer_with_another_rasterizer_is_refused(monkeypatch, tmp_path):
+    """As after `git checkout gaussian_renderer`: the mode would be recorded, and ignored."""
+    theirs = SimpleNamespace(GaussianRasterizationSettings=namedtuple("Settings", "image_height debug"),
+                             __file__=str(tmp_path / "gaussian_renderer/__init__.py"))
+    monkeypatch.setitem(sys.modules, "gaussian_renderer", theirs)
+    with pytest.raises(RuntimeError, match=f"another rasterizer.*dsmoe patch check {tmp_path}$"):
+        runtime.blend_of(run("smoe"))
+    ours = SimpleNamespace(GaussianRasterizationSettings=GaussianRasterizationSettings)
+    for renderer in (ours, SimpleNamespace()):
+        monkeypatch.setitem(sys.modules, "gaussian_renderer", renderer)
+        assert runtime.blend_of(run("smoe"))["blend_mode"] == "smoe"

@@ -1,0 +1,230 @@
+"""What --modernise and --fuse bring in computes what the trainer computed; what is absent is missed when it is used."""
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import urllib.error
+
+import pytest
+import torch
+from torch.nn.functional import conv2d
+
+import diff_smoe_rasterization
+from diff_smoe_rasterization import FusedAdam
+from diff_smoe_rasterization.patches import runtime
+
+
+def window(size, sigma=1.5):
+    offsets = torch.arange(size, dtype=torch.float32) - size // 2
+    line = torch.exp(-offsets ** 2 / (2 * sigma ** 2))
+    return torch.outer(line, line) / line.sum() ** 2
+
+
+def ssim(img1, img2, window_size=11, size_average=True):
+    """Wang et al. 2004: Gaussian windows, which reach into zeros outside the image."""
+    weights = window(window_size).to(img1).expand(img1.shape[-3], 1, -1, -1)
+
+    def mean(image):
+        return conv2d(image, weights, padding=window_size // 2, groups=img1.shape[-3])
+
+    mean1, mean2 = mean(img1), mean(img2)
+    variance1, variance2 = mean(img1 ** 2) - mean1 ** 2, mean(img2 ** 2) - mean2 ** 2
+    covariance = mean(img1 * img2) - mean1 * mean2
+    values = ((2 * mean1 * mean2 + 0.01 ** 2) * (2 * covariance + 0.03 ** 2)
+              / ((mean1 ** 2 + mean2 ** 2 + 0.01 ** 2) * (variance1 + variance2 + 0.03 ** 2)))
+    return values.mean() if size_average else values.mean((-3, -2, -1))
+
+
+@pytest.fixture
+def fused_calls(monkeypatch):
+    """The shapes that `fused_ssim` is called with; the first two are of a comparison."""
+    calls, original = [], diff_smoe_rasterization.fused_ssim
+
+    def counted(img1, img2):
+        calls.append(tuple(img1.shape))
+        return original(img1, img2)
+
+    monkeypatch.setattr(diff_smoe_rasterization, "fused_ssim", counted)
+    return calls
+
+
+@pytest.mark.parametrize("shape", [(3, 40, 52), (1, 24, 31), (2, 3, 40, 52)])
+def test_ssim_is_fused_where_it_is_the_same(shape, fused_calls, capsys):
+    call = runtime.fused_where_equal(ssim)
+    torch.manual_seed(0)
+    image, target = torch.rand(shape, requires_grad=True), torch.rand(shape)
+    for arguments in ((), (11,), (11, True)):
+        value = call(image, target, *arguments)
+        gradient, = torch.autograd.grad(value, image)
+        expected = ssim(image, target)
+        # Rounding, as at runtime.SSIM_ROUNDING; variances of this pair are a quarter of E[x^2].
+        assert float(value.detach()) == pytest.approx(float(expected.detach()), abs=1e-5)
+        torch.testing.assert_close(gradient, torch.autograd.grad(expected, image)[0], rtol=0,
+                                   atol=1e-4 * float(gradient.abs().max()))
+    assert fused_calls == [shape] * 5  # two of them to compare, once
+    assert capsys.readouterr().err == "" and call.__name__ == "ssim"
+
+
+def test_what_the_kernel_does_not_have_is_computed_as_before(fused_calls):
+    call = runtime.fused_where_equal(ssim)
+    torch.manual_seed(0)
+    one, other = torch.rand(2, 1, 3, 20, 30)
+    assert torch.equal(call(one, other, 7), ssim(one, other, 7))
+    assert torch.equal(call(one, other, size_average=False), ssim(one, other, size_average=False))
+    assert torch.equal(call(one.double(), other.double()), ssim(one.double(), other.double()))
+    assert torch.equal(call(one, other[..., :1]), ssim(one, other[..., :1]))
+    assert torch.equal(call(img1=one, img2=other), ssim(one, other))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert call(one, other) == ssim(one, other)
+    assert torch.equal(call(one, other.requires_grad_()), ssim(one, other)) and not fused_calls
+    with torch.inference_mode():
+        assert float(call(one, other)) == pytest.approx(float(ssim(one, other)), abs=1e-5)
+    assert len(fused_calls) == 3
+
+
+@pytest.mark.parametrize("other", [
+    lambda img1, img2: ssim(img1, img2, 9), lambda img1, img2: ssim(img1, img2) + 0.01,
+    lambda img1, img2: ssim(img1[..., 5:-5, 5:-5], img2[..., 5:-5, 5:-5]),
+    lambda img1, img2: ssim(0.95 * img1, 0.95 * img2),  # as other constants
+    lambda img1, img2: ssim(img1, img2).clamp(min=0),
+    lambda img1, img2: ssim(img1, img2, size_average=False),
+    lambda img1, img2: ssim(img1.unflatten(-1, (4, -1)).flatten(-2), img2),  # takes no such width
+    lambda img1, img2: ssim(img1.detach(), img2) + 0 * img1.mean(), lambda img1, img2: ssim(img1, img2) * math.nan,
+    lambda img1, img2: ssim(img1, img2) + 0 * (img1 - img1.detach()).sqrt().sum()])  # its gradient alone is NaN
+def test_another_ssim_stays_and_that_is_said_once(other, capsys):
+    runtime._say.cache_clear()
+    call = runtime.fused_where_equal(other)
+    torch.manual_seed(0)
+    one, two = torch.rand(2, 2, 3, 20, 30)
+    for _ in range(2):
+        try:
+            expected = other(one, two)
+        except RuntimeError as error:
+            with pytest.raises(RuntimeError, match=re.escape(str(error).splitlines()[0])):
+                call(one, two)
+        else:
+            torch.testing.assert_close(call(one, two), expected, rtol=0, atol=0, equal_nan=True)
+    assert capsys.readouterr().err.count("is not SSIM as it is fused here") == 1
+
+
+@pytest.mark.slow
+def test_a_small_fit_goes_the_same_way():
+    """3DGS's loss, its epsilon, parameters that are replaced on the way as densification does."""
+    def fitted(similarity, adam):
+        torch.manual_seed(0)
+        target, start = torch.rand(3, 24, 24), torch.rand(3, 24, 24)
+        image = torch.nn.Parameter(start)
+        optimizer, losses = adam([{"params": [image], "lr": 0.01}], lr=0.0, eps=1e-15), []
+        for step in range(40):
+            loss = 0.8 * (image - target).abs().mean() + 0.2 * (1 - similarity(image, target))
+            loss.backward()
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+            losses.append(loss.item())
+            if step == 20:
+                state = optimizer.state.pop(image)
+                image = optimizer.param_groups[0]["params"][0] = torch.nn.Parameter(image.detach().clone())
+                optimizer.state[image] = {name: value.clone() if torch.is_tensor(value) else value
+                                          for name, value in state.items()}
+        return losses
+
+    before, after = fitted(ssim, torch.optim.Adam), fitted(runtime.fused_where_equal(ssim), FusedAdam)
+    # Adam divides by the gradient's size, so a pixel whose gradient is about 0 may step otherwise: 0.01 of 1728.
+    assert before[-1] < 0.5 * before[0]
+    assert after == pytest.approx(before, rel=1e-3)
+
+
+def test_a_module_that_is_absent_is_missed_when_it_is_used():
+    assert runtime.optional_import("math").pi > 3
+    absent = runtime.optional_import("there_is_no_such_module")
+    with pytest.raises(ImportError, match="there_is_no_such_module"):
+        absent.login()
+
+
+def test_what_is_deferred_is_made_once():
+    made = []
+    call = runtime.deferred(lambda: made.append(1) or (lambda value: 2 * value))
+    assert made == [] and call(3) == 6 and call(4) == 8 and made == [1]
+
+
+@pytest.mark.parametrize("shape, at_once", [((7, 3, 3), 3), ((2, 4, 3, 3), 3), ((7, 3, 3), 7), ((3, 3), 1),
+                                            ((0, 3, 3), 3)])
+def test_eigenvectors_in_parts_are_those_of_all_at_once(monkeypatch, shape, at_once):
+    monkeypatch.setattr(runtime, "EIGH_AT_ONCE", at_once)
+    matrices = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    found, expected = runtime.eigh_in_parts(matrices, UPLO="U"), torch.linalg.eigh(matrices, UPLO="U")
+    assert torch.equal(found.eigenvalues, expected.eigenvalues)
+    assert torch.equal(found.eigenvectors, expected.eigenvectors)
+    gradient, expected_gradient = (torch.autograd.grad((result[0] ** 2).sum(), matrices)[0]
+                                   for result in (found, expected))
+    torch.testing.assert_close(gradient, expected_gradient)
+
+
+def same_unique(rows, **keywords):
+    """Asserts that unique_rows returns what torch.unique(dim=0) does."""
+    for inverse, counts in itertools.product((False, True), repeat=2):
+        found, expected = (unique(rows, return_inverse=inverse, return_counts=counts, dim=0, **keywords)
+                           for unique in (runtime.unique_rows, torch.unique))
+        assert isinstance(found, tuple) == isinstance(expected, tuple) == (inverse or counts)
+        pairs = list(zip(found, expected)) if isinstance(found, tuple) else [(found, expected)]
+        assert len(pairs) == 1 + inverse + counts
+        for one, other in pairs:
+            assert one.dtype == other.dtype and torch.equal(one, other)
+
+
+INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+
+
+@pytest.mark.parametrize("dtype", INTEGERS)
+@pytest.mark.parametrize("shape", [(1, 3), (2000, 3), (500, 1), (500, 4), (300,), (200, 2, 2), (0, 3), (0,)])
+def test_unique_rows_are_those_of_torch(dtype, shape):
+    generator = torch.Generator().manual_seed(0)
+    ends = torch.iinfo(dtype)
+    for low, high in ((0, 1), (0, 3), (max(-90, ends.min), 90)):  # all rows equal, many, few
+        same_unique(torch.randint(low, high, shape, generator=generator, dtype=dtype))
+    extremes = torch.tensor([ends.min, ends.min + 1, 0, 1, ends.max - 1, ends.max], dtype=dtype)
+    same_unique(extremes[torch.randint(0, 6, shape, generator=generator)])
+
+
+@pytest.mark.parametrize("rows", [torch.tensor([[2.5, 1.0], [0.0, -0.0], [2.5, 1.0]]), torch.tensor([0.5, 0.5, -3]),
+                                  torch.tensor([[True, False], [False, True], [True, False]]),
+                                  torch.arange(12).reshape(3, 4).t() % 2])
+def test_unique_rows_of_other_tensors(rows):
+    same_unique(rows)
+    same_unique(rows, sorted=False)
+
+
+def test_rows_of_integers_are_not_given_to_the_unique_that_may_fail(monkeypatch):
+    unique, given = torch.unique, []
+    monkeypatch.setattr(torch, "unique", lambda input, *words, dim=None, **keywords: (
+        given.append((input.dim(), dim)), unique(input, *words, dim=dim, **keywords))[1])
+    runtime.unique_rows(torch.tensor([[3, 1], [2, 1]]), dim=0)
+    assert given == [(1, None)] * 4
+
+
+def test_a_metric_is_nan_where_its_weights_cannot_be_had():
+    calls = []
+
+    @runtime.nan_without_network
+    def metric(value):
+        calls.append(value)
+        if value > 1:
+            raise urllib.error.URLError("no route to host")
+        return torch.tensor(value)
+
+    assert metric(1.0) == 1.0
+    with pytest.warns(UserWarning, match="no route to host"):
+        assert torch.isnan(metric(2.0))
+    assert torch.isnan(metric(1.0)) and calls == [1.0, 2.0]
+
+    absent = runtime.optional_import("there_is_no_such_module")
+    with pytest.warns(UserWarning, match="there_is_no_such_module"):
+        assert torch.isnan(runtime.nan_without_network(runtime.deferred(lambda: absent.LPIPS()))(1.0))
+
+    @runtime.nan_without_network
+    def wrong(value):
+        raise ValueError("a bug is no missing network")
+
+    with pytest.raises(ValueError):
+        wrong(1.0)

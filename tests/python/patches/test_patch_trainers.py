@@ -1,0 +1,122 @@
+"""The patch on each small trainer: recognised as what it is, and nothing but the statements changes."""
+from __future__ import annotations
+
+import ast
+import os
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
+
+from checkouts import ENTRIES, TRAINERS, changed_files, contents, make_checkout  # noqa: E402
+from tiny import GR, RENDER, RENDERER, TRAIN, make, refused  # noqa: E402
+
+from diff_smoe_rasterization import patches  # noqa: E402
+from diff_smoe_rasterization.patches import facts  # noqa: E402
+
+STATEMENTS = ("from diff_smoe_rasterization.", "**pipe.blend,", "**pipe.blend, debug=pipe.debug,",
+              "self.blend_mode, self.background_gate = default_blend()", "pipe.blend = blend_of(dataset)",
+              "pipeline.blend = blend_of(dataset)", "pipeline_params.blend = blend_of(model_params)")
+
+
+def only_statements_change(diff):
+    """Asserts that a diff takes imports of the rasterizer away and adds what a patch adds."""
+    lines = [line for line in diff.splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")]
+    removed, added = ([line[1:].strip() for line in lines if line[0] == sign] for sign in "-+")
+    assert removed and all(line.startswith(("from diff_gaussian_rasterization import", "prefiltered=False, debug="))
+                           for line in removed), removed
+    assert all(line.startswith(STATEMENTS) or "**pipe.blend," in line for line in added), added
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_each_trainer_is_recognised_patched_and_put_back(name, tmp_path):
+    checkout = make_checkout(name, tmp_path / "some folder")
+    before = contents(checkout)
+    assert patches.check(checkout) == "patchable" and patches.check(checkout).trainer == name
+    only_statements_change(patches.diff(checkout))
+    planned = patches.apply(checkout, modernise=True)
+    changed = changed_files(before, contents(checkout, record=False))
+    assert {*ENTRIES[name], GR, "arguments/__init__.py"} <= changed == {change.name for change in planned.changes}
+    for file in changed:
+        compile((checkout / file).read_bytes(), file, "exec")
+    texts = {file: (checkout / file).read_text() for file in changed}
+    assert not any("from diff_gaussian_rasterization import" in text for text in texts.values())
+    assert texts[GR].count("**pipe.blend,") == texts[GR].count("GaussianRasterizationSettings(")
+    for file, functions in ENTRIES[name].items():
+        assert texts[file].count(".blend = blend_of(") == len(functions)
+    assert patches.check(checkout) == "patched"
+    patches.revert(checkout)
+    assert contents(checkout) == before
+
+
+@pytest.mark.parametrize("name", patches.TRAINERS)
+def test_in_public_checkouts_only_the_statements_change(name):
+    """Densification, optimizers, losses: no line of them is touched, but by --fuse."""
+    folder = Path(os.environ.get("DSMOE_TRAINERS", "."), name)
+    if "DSMOE_TRAINERS" not in os.environ or not folder.is_dir():
+        pytest.skip(f"DSMOE_TRAINERS names no folder with a public checkout {name}")
+    before = contents(folder)
+    only_statements_change(patches.diff(folder))
+    found = {rule.rule: rule.files for rule in patches.inspect(folder, fuse=True).requested}
+    assert found == {"fused-loss": ("utils/loss_utils.py",), "fused-adam": ("scene/gaussian_model.py",)}
+    assert contents(folder) == before
+
+
+def test_recognised_by_structure_alone():
+    base = {"imports GaussianRasterizationSettings", "sets bg", "sets debug"}
+    for name, signs in (("3dgs-2023", set()), ("3dgs-2024", {"sets antialiasing", "imports SparseGaussianAdam"}),
+                        ("taming", {"sets pixel_weights", "imports SparseGaussianAdam"}),
+                        ("c3dgs", {"sets clamp_color", "imports GaussianRasterizerIndexed"}),
+                        ("hac", {"calls visible_filter", "imports encodings"}),
+                        ("hac-plus", {"calls visible_filter", "imports gpcc_utils"}),
+                        ("scaffold-gs", {"calls visible_filter", "imports lpips"})):
+        assert facts.recognise(base | signs)[0].name == name
+    assert facts.recognise({"sets bg"})[0] is None
+
+
+ONE_LINE = "    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)\n"
+BY_NAME = "    draw = GaussianRasterizer(raster_settings=settings)\n    {} = draw(means3D=pc.get_xyz)\n"
+DEPTH_LOSS = TRAIN + "\n\ndef depth_loss(view, depth):\n    return abs(depth - view.invdepthmap).mean()\n"
+ANTIALIASED = RENDERER.replace("prefiltered=False,", "antialiasing=pipe.antialiasing, prefiltered=False,")
+
+
+@pytest.mark.parametrize("renderer, results, train, trainer", [
+    (RENDERER, "color, radii", TRAIN, "3dgs-2023"), (RENDERER, "color, *rest", TRAIN, "3dgs-2023"),
+    (RENDERER, "everything", TRAIN, "3dgs-2023"),
+    (RENDERER, "color, radii, depth", DEPTH_LOSS, "3dgs-2024"),  # of August
+    (ANTIALIASED, "color, radii, depth", TRAIN, "3dgs-2024"),  # of September
+    (RENDERER, "color, radii, depth", TRAIN, None), (RENDERER, "color,", TRAIN, None),
+    (RENDERER.replace("bg=bg_color", "kernel_size=0.1"), "color, radii", TRAIN, None)])
+def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, results, train, trainer):
+    count = len(getattr(ast.parse(results).body[0].value, "elts", "12"))
+    renderer = renderer.replace(ONE_LINE, BY_NAME.format(results))
+    make(tmp_path, {GR: renderer, "train.py": train, "scene/gaussian_model.py": ""})
+    if trainer:
+        assert patches.apply(tmp_path).verdict.trainer == trainer and patches.check(tmp_path) == "patched"
+        return
+    refused(tmp_path, "unknown", "kernel_size" if "kernel_size" in renderer else f"its rasterizer returns {count} ")
+
+
+def test_scaffold_gs_renders_in_two_files(tmp_path):
+    """HAC's rasterizer without HAC's encodings, and with a render.py."""
+    visible = """
+
+def prefilter_voxel(camera, pc, pipe):
+    settings = GaussianRasterizationSettings(bg=None, debug=pipe.debug)
+    return GaussianRasterizer(raster_settings=settings).visible_filter(pc.get_xyz)
+"""
+    rendering = "\n\ndef render_sets(dataset, iteration, pipeline):\n    return render(None, None, pipeline, None)\n"
+    make(tmp_path, {GR: RENDERER + visible, "train.py": TRAIN + rendering, "render.py": RENDER})
+    planned = patches.apply(tmp_path)
+    assert planned.verdict.trainer == "scaffold-gs" and planned.notes == ()
+    assert (tmp_path / GR).read_text().count("**pipe.blend,") == 2
+    for name, count in (("train.py", 2), ("render.py", 1)):
+        assert (tmp_path / name).read_text().count(".blend = blend_of(dataset)") == count
+
+
+def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
+    make(tmp_path, {GR: ANTIALIASED})
+    (note,) = patches.apply(tmp_path, trainer="3dgs-2023").notes
+    assert "--trainer 3dgs-2023" in note and "3dgs-2024" in note and "another API" in note
+    assert patches.plan(tmp_path).notes == ()  # it was said when it was chosen
