@@ -15,7 +15,6 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    config.addinivalue_line("markers", "sanitize: small; run under compute-sanitizer")
     if config.getoption("--device") == "cuda" and without_cuda_because():
         raise pytest.UsageError(f"--device cuda: {without_cuda_because()}")
 

@@ -10,7 +10,7 @@ from flips import explain
 
 from diff_smoe_rasterization import rasterize
 
-sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "..", "benchmarks"))
+sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "..", "benchmarks", "timing"))
 import models  # noqa: E402
 
 CUT = {"alpha": 0.0, "smoe": 1 / 255}
