@@ -232,7 +232,10 @@ def _words_of(parser: argparse.ArgumentParser, path: str = "") -> Iterator[Tuple
 
 
 def _bench_run(arguments: argparse.Namespace) -> int:
-    from .benchmarks.engine import rows_table, run_suite
+    from .benchmarks.suite import require
+
+    require("yaml", "pydantic")
+    from .benchmarks.suite.engine import rows_table, run_suite
 
     rows = run_suite(arguments.suite, results=arguments.output, jobs=arguments.jobs, slurm=arguments.slurm,
                      retry_failed=arguments.retry_failed, dry_run=arguments.dry_run, only=arguments.only,
@@ -246,7 +249,10 @@ def _bench_run(arguments: argparse.Namespace) -> int:
 
 
 def _bench_report(arguments: argparse.Namespace) -> None:
-    from .benchmarks.report import report
+    from .benchmarks.suite import require
+
+    require("pydantic", "jinja2", "matplotlib")
+    from .benchmarks.suite.report import report
 
     print(report(arguments.results, arguments.output))
 
@@ -314,7 +320,7 @@ def _eval(arguments: argparse.Namespace) -> None:
 def _with_lpips(net: str, device: str) -> Measure:
     """The trainer's metrics and LPIPS of images without a mask. Raises TrainerError where its weights are not there."""
     from .benchmarks.errors import BenchError
-    from .benchmarks.lpips import check_weights, lpips_network
+    from .benchmarks.suite.lpips import check_weights, lpips_network
     from .trainer.metrics import image_metrics, quantised
 
     kind = {"vgg": "lpips_vgg_std", "alex": "lpips_alex"}[net]

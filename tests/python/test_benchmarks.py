@@ -11,7 +11,7 @@ from devices import without_cuda_because
 
 from diff_smoe_rasterization.settings import BLEND_MODES
 
-sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks"))
+sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks", "timing"))
 import cpu_rasterizer  # noqa: E402
 import gpu_floor  # noqa: E402
 import gpu_rasterizer  # noqa: E402

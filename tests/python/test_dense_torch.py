@@ -11,7 +11,7 @@ from scenes import assert_not_empty, gradients, random_scene
 from diff_smoe_rasterization.reference import rasterize as reference_rasterize
 from diff_smoe_rasterization.settings import BLEND_MODES
 
-sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks"))
+sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "benchmarks", "timing"))
 import dense_torch  # noqa: E402
 
 # Same formulas in float64, other order of sums: 1e-16 a term, grown by sums of about 1e2 terms and by 1/(1 - alpha) of

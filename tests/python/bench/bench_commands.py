@@ -9,7 +9,6 @@ from pathlib import Path
 
 import diff_smoe_rasterization
 
-
 ABOVE = str(Path(diff_smoe_rasterization.__file__).resolve().parents[1])  # of the package under test, installed or not
 
 

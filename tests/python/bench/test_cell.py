@@ -3,20 +3,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import subprocess
-import sys
 import time
 
 import pytest
-from bench_commands import environment
-from PIL import Image
+from diff_smoe_rasterization.benchmarks.suite import cell as cells
+from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 
-from diff_smoe_rasterization.benchmarks import cell as cells
-from diff_smoe_rasterization.benchmarks.suite import expand
 from diff_smoe_rasterization.trainer.rendering import Renderer
-
-pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
 
 
 @pytest.fixture
@@ -25,14 +18,6 @@ def cell_file(content, tmp_path):
     path = tmp_path / "cell.json"
     path.write_text(json.dumps(cell))
     return cell, path
-
-
-def test_one_cell_is_one_command(cell_file, tmp_path):
-    cell, path = cell_file
-    done = subprocess.run([sys.executable, "-m", "diff_smoe_rasterization.benchmarks.cell", str(path),
-                           str(tmp_path / "out")], env=environment(), cwd=str(tmp_path), stdout=subprocess.PIPE)
-    assert done.returncode == 0 and cell["id"].encode() in done.stdout
-    assert json.loads((tmp_path / "out" / "row.json").read_text())["ok"]
 
 
 def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatch):
@@ -46,35 +31,6 @@ def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatc
     row = cells.supervise(str(path), str(tmp_path / "out"))
     assert not row["ok"] and row["cell"] == cell["id"]
     assert "signal 9" in row["reason"] and "memory" in row["reason"] and row["reason"].endswith(": the last words")
-
-
-def test_a_rendering_that_equals_the_truth_is_a_row(content, tiny_scene, tmp_path, capsys):
-    """A black scene, black from the start: its PSNR is infinite, for which json has no number."""
-    black = tmp_path / "black"
-    subprocess.run(["cp", "-r", tiny_scene, str(black)], check=True)
-    for path in (black / "images").iterdir():
-        Image.new("RGB", Image.open(path).size).save(path)
-    points = black / "sparse" / "0" / "points3D.txt"
-    rows = [line.split() for line in points.read_text().splitlines() if not line.startswith("#")]
-    points.write_text("".join(" ".join([*row[:4], "0", "0", "0", *row[7:]]) + "\n" for row in rows))
-    cell = expand({**content, "scenes": [{"name": "black", "path": str(black)}]}, "").cells[0]
-    (tmp_path / "cell.json").write_text(json.dumps(cell))
-    assert cells.main([str(tmp_path / "cell.json"), str(tmp_path / "out")]) == 0
-    assert "Gaussians, PSNR - dB" in capsys.readouterr().out
-    row = json.loads((tmp_path / "out" / "row.json").read_text())
-    assert row["ok"] and row["psnr"] is None and row["ssim"] == pytest.approx(1)
-
-
-def test_what_cannot_be_printed_costs_no_row(tmp_path):
-    """Snakemake removes the row of a command that fails: one whose reader has gone, or that lacks a character."""
-    program = "from diff_smoe_rasterization.benchmarks.cell import tell; tell('\u2013')"
-    reader, writer = os.pipe()
-    os.close(reader)
-    for encoding, output in (("utf-8", writer), ("ascii", subprocess.DEVNULL)):
-        done = subprocess.run([sys.executable, "-c", program], stdout=output, stderr=subprocess.PIPE,
-                              env=environment(PYTHONIOENCODING=encoding))
-        assert (done.returncode, done.stderr) == (0, b"")
-    os.close(writer)
 
 
 def test_two_cells_never_have_one_gpu(tmp_path):
@@ -167,11 +123,3 @@ def test_the_process_of_a_cell_is_told_its_gpu_and_how_many_have_it(cell_file, t
                        "--locks", str(tmp_path / "locks")]) == 0
     said = (tmp_path / "out" / "log.txt").read_text().split()
     assert said[0] == "7" and said[-3:] == ["--inside", "--per-device", "2"]
-
-
-@pytest.mark.parametrize("number", ["0", "-1"])
-def test_a_gpu_is_given_to_one_cell_at_least(number, cell_file, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        cells.main([str(cell_file[1]), str(tmp_path / "out"), "--gpus", "7", "--per-device", number])
-    assert f"--per-device: is {number}; it must be at least 1" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -10,19 +10,17 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from bench_commands import command, environment, rows_of, wait_for
-
-from diff_smoe_rasterization.benchmarks import engine, preparation, selection
-from diff_smoe_rasterization.benchmarks.cell import failed_row
 from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.methods.names import blend_of
-from diff_smoe_rasterization.benchmarks.suite import expand
+from diff_smoe_rasterization.benchmarks.suite import engine, selection
+from diff_smoe_rasterization.benchmarks.suite.cell import failed_row
+from diff_smoe_rasterization.benchmarks.suite.expansion import expand
+from diff_smoe_rasterization.benchmarks.suite.names import blend_of
+
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.errors import TrainerError
 
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
-pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
 snakemake = pytest.importorskip("snakemake", reason="the engine is Snakemake: pip install snakemake")
 
 
@@ -75,25 +73,6 @@ def test_a_row_says_what_was_measured_and_how(finished):
     assert row["machine"]["cells_at_once"] == 2  # --jobs 2, two cells
 
 
-def test_a_failed_cell_is_a_row_with_its_reason(finished):
-    row, = [row for row in rows_of(finished[2]).values() if not row["ok"]]
-    assert row["scene"] == "absent" and "nothing: neither a folder `sparse`" in row["reason"]
-    assert row["psnr"] is None and row["num_gaussians"] is None and row["lpips"]["value"] is None
-
-
-def test_both_kinds_of_rows_have_the_same_fields(finished):
-    one, other = rows_of(finished[2]).values()
-    assert set(one) == set(other)
-
-
-def test_images_that_were_asked_for_are_there_and_the_model_is_not(finished):
-    row, = [row for row in rows_of(finished[2]).values() if row["ok"]]
-    folder = finished[2] / "cells" / row["cell"]
-    gt, render = (sorted(path.name for path in (folder / "images" / kind).iterdir()) for kind in ("gt", "render"))
-    assert gt == render == ["view_000.png"]
-    assert not (folder / "run").exists()
-
-
 def test_what_is_done_is_not_done_again(finished, capsys):
     _, suite, results = finished
     before = {path: path.read_text() for path in results.glob("cells/*/log.txt")}
@@ -108,6 +87,7 @@ def test_what_is_done_is_not_done_again(finished, capsys):
         assert [line.split()[0] for line in lines] == states and summary == counts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [[], ["--retry-failed"]])
 def test_a_failed_cell_is_tried_again_where_its_path_has_changed(words, copied, finished, tmp_path):
     """The reason is gone, and only the cell that failed is run."""
@@ -144,7 +124,7 @@ def test_rows_of_an_earlier_run_elsewhere_are_not_run_again(finished, tmp_path, 
 
 def test_where_all_is_done_nothing_is_needed(finished, tmp_path, monkeypatch):
     """Neither Snakemake nor, for a suite for GPUs, a GPU; the suite's file lists all cells, chosen or not."""
-    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None if "snakemake" in name else object())
     monkeypatch.setattr(engine, "visible_gpus", list)
     content = {**finished[0], "protocol": {**finished[0]["protocol"], "device": "cuda"}}
     wanted = expand(content, "").cells
@@ -177,36 +157,6 @@ def test_a_damaged_row_is_named_before_anything_is_run(damaged, copied, finished
     assert "1 to do" in capsys.readouterr().out
 
 
-def test_what_else_may_be_wrong_with_a_folder(copied, finished, tmp_path, capsys):
-    _, suite, _ = finished
-    (tmp_path / "file").touch()
-    for more in ([], ["--dry-run"]):
-        assert main(["bench", "run", suite, "-o", str(tmp_path / "file"), *more]) == 1
-        assert f"{tmp_path / 'file'}: is a file; it must be a folder" in capsys.readouterr().err
-    (copied / "suite.json").write_text("{}")
-    assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 0
-    cell = next(copied.glob("cells/*/cell.json"))
-    for damaged in ("{}", json.dumps({"suite": "two", "protocol": 2, "scene": 3, "method": 4})):
-        cell.write_text(damaged)
-        assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 1
-        assert f"error: {cell}: " in capsys.readouterr().err
-    inside = str(tmp_path / "file" / "results")
-    assert main(["bench", "run", suite, "-o", inside]) == 1
-    assert f"{inside}: nothing can be written there (Not a directory)" in capsys.readouterr().err
-
-
-def test_a_row_that_a_report_would_refuse_is_named(copied, finished, capsys):
-    _, suite, _ = finished
-    path = next(copied.glob("cells/*/row.json"))
-    row = json.loads(path.read_text())
-    for field, value, wanted in (("ok", 3, "of type bool"), ("seed", "q", "a whole number"),
-                                 ("psnr", "20", "a finite number")):
-        path.write_text(json.dumps({**row, field: value}))
-        assert main(["bench", "run", suite, "-o", str(copied), "--dry-run"]) == 1
-        told = capsys.readouterr().err
-        assert f"error: {path}: {field} is {value!r}; it must be {wanted}" in told and "made anew" in told
-
-
 def test_rows_must_be_of_the_suites_cells(finished, tmp_path, capsys):
     content, suite, results = finished
     longer = write_suite({**content, "protocol": {**content["protocol"], "iterations": 13}}, tmp_path)
@@ -224,14 +174,6 @@ def test_rows_must_be_of_the_suites_cells(finished, tmp_path, capsys):
     assert not (tmp_path / "results").exists()
 
 
-def test_a_reader_that_has_enough_is_no_error(content, tmp_path):
-    run = subprocess.Popen(command("bench", "run", write_suite(content, tmp_path), "--dry-run"), env=environment(),
-                           cwd=str(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    run.stdout.close()
-    assert run.wait() == 0 and run.stderr.read() == b""
-    run.stderr.close()
-
-
 def test_options_that_do_not_go_together_are_refused_before_anything_is_written(content, tmp_path, capsys):
     suite, results = write_suite(content, tmp_path), tmp_path / "results"
     for words, told in ((["--jobs", "0"], "--jobs is 0"), (["--per-gpu", "-1"], "--per-gpu is -1"),
@@ -243,29 +185,6 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_written(
             assert main(["bench", "run", suite, "-o", str(results), *words, *more]) == 1
             assert told in capsys.readouterr().err
     assert not results.exists()
-
-
-def test_a_suite_for_gpus_leaves_nothing_where_there_is_none(content, tmp_path, monkeypatch, capsys):
-    content["protocol"].update(device="cuda", principal_point="centre")
-    suite, results = write_suite(content, tmp_path), tmp_path / "results"
-    monkeypatch.setattr(engine, "visible_gpus", list)
-    assert main(["bench", "run", suite, "-o", str(results), "--dry-run"]) == 0
-    assert main(["bench", "run", suite, "-o", str(results)]) == 1
-    told = capsys.readouterr().err
-    assert "no CUDA device" in told and "protocol.device: cpu" in told and not results.exists()
-
-
-@pytest.mark.parametrize("words", [[], ["--dry-run"]])
-def test_results_of_another_protocol_are_not_added_to(words, finished, tmp_path, capsys):
-    content, _, results = finished
-    longer = {**content, "protocol": {**content["protocol"], "iterations": 13}}
-    words = ["bench", "run", write_suite(longer, tmp_path), *words, "--only", "scene=tiny", "-o"]
-    assert main([*words, str(results)]) == 1
-    told = capsys.readouterr().err
-    assert "another protocol" in told and "protocol.iterations is 12 there and 13 here" in told
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "empty" / "suite.json").write_text((results / "suite.json").read_text())
-    assert main([*words, str(tmp_path / "empty")]) == 0  # which has no row
 
 
 def test_scenes_and_methods_that_have_rows_stay_as_they_are(content, tmp_path, monkeypatch, capsys):
@@ -302,18 +221,6 @@ def test_scenes_and_methods_that_have_rows_stay_as_they_are(content, tmp_path, m
                 methods=[method, {"name": "native"}], seeds=[0, 1]).endswith("1 done, 7 to do, 0 failed\n")
 
 
-def test_scenes_that_are_not_there_are_named_before_anything_is_run(content, tmp_path, capsys):
-    content["scenes"].append({"name": "absent", "path": "nowhere"})
-    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
-    line = f"scene absent: {tmp_path / 'nowhere'}: no such folder; name it"
-    assert main([*words, "--dry-run"]) == 0
-    assert capsys.readouterr().out.splitlines()[-2:] == [line, "0 done, 4 to do, 0 failed"]
-    assert main([*words, "--dry-run", "--only", "scene=tiny"]) == 0
-    assert "absent" not in capsys.readouterr().out
-    assert main(words) == 1 and line in capsys.readouterr().err
-    assert not (tmp_path / "results").exists()
-
-
 def test_checkouts_that_are_not_there_are_named_before_anything_is_run(content, tmp_path, capsys):
     (tmp_path / "there").mkdir()
     content["protocol"].update(device="cuda", principal_point="centre")
@@ -335,23 +242,6 @@ def test_checkouts_that_are_not_there_are_named_before_anything_is_run(content, 
     assert not (tmp_path / "results").exists()
 
 
-def test_variables_are_needed_for_cells_that_are_run(content, tmp_path, monkeypatch, capsys):
-    monkeypatch.delenv("NOT_THERE", raising=False)
-    content["protocol"].update(device="cuda", principal_point="centre")
-    content["methods"].append({"name": "3dgs-2023", "path": "${NOT_THERE}/3dgs"})
-    monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
-    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
-    assert main([*words, "--dry-run"]) == 0
-    told = capsys.readouterr().out
-    assert "\nmethods[1].path: $NOT_THERE is not set" in told and told.endswith("0 done, 4 to do, 0 failed\n")
-    assert main(words) == 1
-    told = capsys.readouterr().err
-    assert "methods[1].path: $NOT_THERE is not set" in told and "; set it, or leave it out with --only" in told
-    assert not (tmp_path / "results").exists()
-    native = [cell for cell in expand(content, "").cells if cell["method"]["name"] == "native"]
-    assert preparation.what_is_missing(native) == []
-
-
 @pytest.fixture
 def running(content, tmp_path):
     """A run in the middle of its only cell: the suite, the results, the process, the cell's folder."""
@@ -369,20 +259,8 @@ def running(content, tmp_path):
     run.stderr.close()
 
 
-def test_a_killed_run_continues_where_it_was(running):
-    """Killed without warning in the middle of a cell, all of it: it goes on from its checkpoint."""
-    suite, results, run, folder = running
-    os.killpg(run.pid, signal.SIGKILL)
-    run.wait()
-    assert not (folder / "row.json").exists()
-    wait_for(lambda: is_free(results), 60)
-    assert main(["bench", "run", suite, "-o", str(results)]) == 0
-    row, = rows_of(results).values()
-    assert row["ok"] and row["protocol"]["continued"]
-    assert "resumed at iteration" in (folder / "log.txt").read_text()
-
-
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGTERM,
+                                    pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_what_a_run_has_started_ends_with_it_and_keeps_others_away_till_then(number, running, capsys):
     suite, results, run, folder = running
     inner = int(processes_with(f"cells/{folder.name} --inside")[0].parent.name)
@@ -404,6 +282,7 @@ def test_what_a_run_has_started_ends_with_it_and_keeps_others_away_till_then(num
         assert (results / "rows.jsonl").read_text() == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_what_is_queued_is_cancelled_at_leisure(number, tmp_path):
     """Whatever ends the command, and where a terminal tells all that it has started. Snakemake is another program here:
@@ -420,7 +299,7 @@ def test_what_is_queued_is_cancelled_at_leisure(number, tmp_path):
         "signal.signal(signal.SIGINT, cancel)\n"
         f"open({str(told)!r}, 'w').write('running ')\n"
         "time.sleep(60)\n")
-    program = ("import sys\nfrom diff_smoe_rasterization.benchmarks import engine\n"
+    program = ("import sys\nfrom diff_smoe_rasterization.benchmarks.suite import engine\n"
                f"with engine.only_one({str(tmp_path)!r}) as lock:\n"
                f"    engine.run_snakemake([sys.executable, {str(snakemake)!r}], lock, is_queued=True)\n")
     run = subprocess.Popen([sys.executable, "-c", program], env=environment(), cwd=str(tmp_path),
@@ -450,20 +329,6 @@ def processes_with(words):
         except OSError:  # it has ended meanwhile
             pass
     return found
-
-
-def test_a_second_run_on_the_same_results_is_refused(tmp_path):
-    with engine.only_one(str(tmp_path)):
-        with pytest.raises(TrainerError, match=f"another run .*process {os.getpid()} on "):
-            with engine.only_one(str(tmp_path)):
-                pass
-
-
-@pytest.mark.parametrize("variable", ["DSMOE_LPIPS_ALEX", "DSMOE_LPIPS_VGG"])
-def test_a_file_of_weights_is_found_from_the_folder_of_cells(monkeypatch, tmp_path, variable):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(variable, "weights.npz")
-    assert engine.environment()[variable] == str(tmp_path / "weights.npz")
 
 
 def test_cells_are_chosen_by_their_fields(content):
@@ -521,52 +386,3 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
         patch.setattr(engine.importlib.util, "find_spec", lambda name: None if "slurm" in name else object())
         with pytest.raises(BenchError, match="snakemake-executor-plugin-slurm"):
             engine.command(suite, suite.cells, "out", None, [])
-
-
-def test_on_the_cpu_cells_share_its_cores(content, monkeypatch):
-    """As many threads as torch takes, if there are cores for them: 10 cores here, where torch takes 8."""
-    suite = expand({**content, "seeds": [0, 1]}, "")
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(10), raising=False)
-    for jobs, cells_, at_once, threads in ((None, 4, 1, 8), (1, 4, 1, 8), (3, 4, 3, 3), (16, 4, 4, 2), (16, 1, 1, 8)):
-        words = engine.command(suite, suite.cells[:cells_], "out", jobs, None)
-        assert f"per_device={at_once}" in words and f"threads={threads}" in words
-        assert words[words.index("--cores") + 1] == str(at_once * threads)
-    assert engine.threads_of_each(11) == 1
-
-
-ECHO = """#!/bin/sh
-case "$*" in *snakemake*) exec "{python}" "$@" ;; esac
-echo '{{"cell": "'"${{4#cells/}}"'", "suite": "tiny", "ok": false, "label": "native", "method": "native",' \\
-     '"variant": "native", "schedule": "3dgs", "scene": "tiny", "blend_mode": "alpha", "densify_grad_threshold": 1,' \\
-     '"iterations": 1, "seed": 0, "machine": {{}}, "reason": "'"$OMP_NUM_THREADS threads $*"'"}}' >"$4/row.json"
-"""
-
-
-def test_cells_are_told_the_gpus(content, tmp_path, monkeypatch):
-    """One GPU, called 0, which Snakemake would take for a number; each cell fails, with its command as the reason."""
-    content["protocol"].update(device="cuda", principal_point="centre")
-    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results")]
-    python = tmp_path / "python"
-    python.write_text(ECHO.format(python=sys.executable))
-    python.chmod(0o755)
-    monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
-    monkeypatch.setattr(engine.sys, "executable", str(python))
-    monkeypatch.setattr(engine, "threads_of_each", lambda at_once: 6 // at_once)
-
-    def reasons():
-        lines = (tmp_path / "results" / "rows.jsonl").read_text().splitlines()
-        reasons = [json.loads(line)["reason"].partition(" --hold .dsmoe.lock") for line in lines]
-        return {reason[0].partition(" -m")[0] + reason[2] for reason in reasons}
-
-    two = {"3 threads --gpus 0 --locks .locks --per-device 2"}
-    assert main([*words, "--per-gpu", "2"]) == 1 and reasons() == two
-    assert main(words) == 1 and reasons() == two  # what is done is not done again
-    one = {"6 threads --gpus 0 --locks .locks --per-device 1"}
-    assert main([*words, "--retry-failed"]) == 1 and reasons() == one
-
-
-def test_without_snakemake_the_message_says_what_to_install(finished, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
-    assert main(["bench", "run", finished[1], "-o", str(tmp_path / "results")]) == 1
-    assert "pip install '.[bench]' in the source folder" in capsys.readouterr().err

@@ -4,20 +4,18 @@ from __future__ import annotations
 import json
 import os
 
-import numpy as np
 import pytest
 import torch
-
-from diff_smoe_rasterization.benchmarks import mechanism
 from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.mechanism_probe import Probe, median, quantiles
+from diff_smoe_rasterization.benchmarks.mechanism import record as mechanism
+from diff_smoe_rasterization.benchmarks.mechanism.probe import Probe
+
 from diff_smoe_rasterization.trainer.checkpoint import CHECKPOINT_NAME, load_checkpoint
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.loop import Trainer, train
 from diff_smoe_rasterization.trainer.modelfile import model_path
 from diff_smoe_rasterization.trainer.scene import load_scene
-from diff_smoe_rasterization.trainer.strategy import Step
 
 RESETS = [60, 120, 180]
 DENSIFICATIONS = list(range(40, 200, 20))
@@ -46,13 +44,6 @@ def runs(tiny_scene, tmp_path_factory):
 @pytest.fixture(params=["alpha", "smoe"])
 def watched_run(request, runs):
     return runs[request.param]
-
-
-@pytest.fixture(scope="module")
-def steady(tiny_scene, tmp_path_factory):
-    """The record of a short run without resets."""
-    config = config_of(tiny_scene, tmp_path_factory.mktemp("steady") / "out", "smoe", schedule="steady", iterations=101)
-    return mechanism.run(config, progress=False)
 
 
 def same(one, other):
@@ -119,22 +110,6 @@ def test_opacities_after_a_reset(runs):
             assert (drop > 1 and pull > 0.9) if mode == "alpha" else (abs(drop) < 1 and abs(pull) < 0.1)
 
 
-def test_fullness_falls_with_opacities(watched_run):
-    _, record = watched_run
-    for reset in record["resets"]:
-        assert 0 < reset["after"]["fullness"] < reset["before"]["fullness"] < 1
-
-
-def test_the_pruned_have_a_share_of_the_picture(runs):
-    shares = []
-    for _, record in runs.values():
-        for step in record["densifications"]:
-            for name in ("faint", "large"):
-                shares.append(step["pruned_colors"][name])
-                assert (shares[-1] == 0) if step[name] == 0 else (0 <= shares[-1] <= 1)
-    assert max(shares) > 0
-
-
 def test_the_summary_adds_up(watched_run):
     _, record = watched_run
     steps, found = record["densifications"], record["summary"]
@@ -150,30 +125,6 @@ def test_the_summary_adds_up(watched_run):
     assert first["iteration"] == 80 and first["color"] == after["pruned_colors"]
     assert last is None  # densification ends with the last reset
     assert found["settled_opacity"] is None  # the run ends before
-
-
-def test_the_record_is_what_was_written(watched_run):
-    config, record = watched_run
-    assert mechanism.read_record(config.output) == json.loads(json.dumps(record))
-    assert record["config"]["scene"] == os.path.basename(config.scene) and record["config"]["output"] is None
-    assert record["probe_seconds"] > 0 and record["train_seconds"] > 0
-
-
-def test_a_run_without_resets(steady):
-    assert steady["resets"] == [] and [state["iteration"] for state in steady["states"]] == [100]
-    assert steady["summary"]["net_pull"]["after_resets"] is None and steady["summary"]["settled_opacity"] is None
-    assert steady["summary"]["pruned"]["large"] == 0
-
-
-def test_what_never_happened_leaves_a_panel_empty(steady):
-    pytest.importorskip("matplotlib", reason="figures need matplotlib")
-    from diff_smoe_rasterization.benchmarks import mechanism_plots
-
-    nothing = {**steady, "densifications": []}
-    for draw in (mechanism_plots.opacity, mechanism_plots.pruning, mechanism_plots.densification):
-        for record in (steady, nothing):
-            draw(mechanism_plots.named([record])).canvas.draw()
-    mechanism_plots.plt.close("all")
 
 
 @pytest.fixture
@@ -199,61 +150,12 @@ def test_a_share_is_what_a_gaussian_alone_lights_up(probe_of, mode):
     assert all(tensor.grad is None for tensor in probe.model.raw.values())
 
 
-def test_near_edges_are_those_that_the_camera_projects_there(probe_of):
-    probe = probe_of("alpha")
-    generator = torch.Generator().manual_seed(0)
-    chosen = torch.rand(probe.model.num_gaussians, generator=generator) < 0.3
-    means = probe.model.raw["means3D"].detach().double().numpy()
-    near, seen = [], []
-    for camera, mask in probe.train:
-        x, y, z = camera.rotation @ means.T + camera.translation[:, None]
-        column, row = (np.floor(value).astype(int) for value in (camera.fx * x / z + camera.cx,
-                                                                 camera.fy * y / z + camera.cy))
-        inside = (z > 0.2) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        near.append(inside & mask.numpy()[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)])
-        seen.append(inside)
-    near, seen = np.stack(near), np.stack(seen)
-    found = probe.edges(chosen)
-    # A centre within rounding of a pixel's border may fall on either side: one of the seen.
-    assert found["all"] == pytest.approx(near.sum() / seen.sum(), abs=1.5 / seen.sum())
-    only = seen[:, chosen.numpy()].sum()
-    assert found["chosen"] == pytest.approx(near[:, chosen.numpy()].sum() / only, abs=1.5 / only)
-    assert 0 < found["area"] < 1 and found["chosen"] != found["all"]
-    assert probe.edges(torch.zeros_like(chosen))["chosen"] is None
-
-
-def test_quantiles_are_values():
-    values = torch.arange(101.0).flip(0)
-    assert quantiles(values) == [1, 10, 25, 50, 75, 90, 99]
-    assert median(torch.tensor([3.0, 1.0, 2.0])) == 2
-    assert quantiles(values[:0]) is None and median(values[:0]) is None
-
-
-def test_the_net_pull_is_over_the_steps_since_the_last_state(tiny_scene, tmp_path):
-    config = config_of(tiny_scene, tmp_path / "out", "alpha")
-    trainer = Trainer(config, load_scene(config, progress=False))
-    recorder = mechanism.Recorder(trainer)
-    logits = trainer.model.raw["opacities"]
-    for iteration, value in ((99, -1.0), (100, 0.5), (200, 2.0)):
-        logits.grad = torch.full_like(logits, value)
-        recorder.before_change(Step(iteration, None, None, None, None))
-    assert [state["net_pull"] for state in recorder.states] == pytest.approx([(1 - 0.5) / (1 + 0.5), -1])
-
-
 def test_a_folder_with_a_run_is_not_overwritten(watched_run, tmp_path):
     with pytest.raises(TrainerError, match="already holds"):
         mechanism.run(watched_run[0], progress=False)
     (tmp_path / "results.json").touch()
     with pytest.raises(TrainerError, match="holds results.json but no config.json"):
         mechanism.run(watched_run[0].changed(output=str(tmp_path)), progress=False)
-
-
-@pytest.mark.parametrize("below", ["", "out"])
-def test_a_scene_is_not_written_into(tiny_scene, below, capsys):
-    before = sorted(os.listdir(tiny_scene))
-    assert mechanism.main(["run", tiny_scene, os.path.join(tiny_scene, below), "--quiet"]) == 1
-    assert "lies in the scene's folder" in capsys.readouterr().err
-    assert sorted(os.listdir(tiny_scene)) == before
 
 
 @pytest.mark.parametrize("text, told", [
@@ -282,7 +184,7 @@ def test_the_command_trains_and_explains_its_errors(tiny_scene, tmp_path, capsys
 
 def test_three_figures_show_the_series_of_all_runs(runs, tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="figures need matplotlib")
-    from diff_smoe_rasterization.benchmarks import mechanism_plots
+    from diff_smoe_rasterization.benchmarks.mechanism import plots as mechanism_plots
 
     folders, records = [config.output for config, _ in runs.values()], [record for _, record in runs.values()]
     assert mechanism.main(["plot", str(tmp_path), "-o", str(tmp_path)]) == 1
@@ -303,12 +205,3 @@ def test_three_figures_show_the_series_of_all_runs(runs, tmp_path, capsys):
     # The last reset first; each from the state before it, where there is one, to the next reset.
     assert [line.get_xdata()[[0, 1, -1]].tolist() for line in after.lines[:3]] == [[0, 1, 110], [0, 1, 60], [1, 10, 60]]
     mechanism_plots.plt.close("all")
-
-
-def test_runs_are_named_by_what_tells_them_apart(runs):
-    pytest.importorskip("matplotlib", reason="figures need matplotlib")
-    from diff_smoe_rasterization.benchmarks import mechanism_plots
-
-    record = runs["alpha"][1]
-    other = {**record, "config": {**record["config"], "densify_grad_threshold": 0.005}}
-    assert [run.label for run in mechanism_plots.named([record, other])] == ["alpha 0.002", "alpha 0.005"]

@@ -7,9 +7,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from diff_smoe_rasterization.benchmarks.suite import preparation
 from PIL import Image
-
-from diff_smoe_rasterization.benchmarks import preparation
 
 ROOM = {"views": 2, "width": 16, "height": 12, "points": 20, "supersampling": 1}
 
@@ -29,24 +28,6 @@ def test_a_made_up_scene_is_made_anew_where_its_parameters_have_changed(tmp_path
     assert made(tmp_path, width=20) == (folder, (20, 12)) and not (folder / "left").exists()
     made(tmp_path, width=20, views=1)
     assert [path.name for path in (folder / "images").iterdir()] == ["view_000.png"]  # none of the earlier scene's
-
-
-def test_a_made_up_scene_that_is_not_complete_is_made_anew(tmp_path, monkeypatch):
-    folder, _ = made(tmp_path)
-    complete = sorted(folder.rglob("*"))
-    shutil.rmtree(folder)
-
-    def write_a_part(folder, **parameters):
-        (Path(folder) / "sparse" / "0").mkdir(parents=True)
-        (Path(folder) / "sparse" / "0" / "cameras.txt").touch()
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(preparation, "write_synthetic_scene", write_a_part)
-        with pytest.raises(KeyboardInterrupt):
-            made(tmp_path)
-    made(tmp_path)
-    assert sorted(folder.rglob("*")) == complete and (folder / "sparse" / "0" / "cameras.txt").read_text()
 
 
 @pytest.fixture
@@ -93,37 +74,6 @@ def test_the_copy_of_a_checkout_follows_it(checkout, tmp_path):
     assert not (copy / "left").exists() and preparation.patches.check(copy) == "patched"
     two = commit()
     assert prepared(folder, tmp_path / "results") == {**method, "commit": two}
-
-
-def test_the_copy_of_another_checkout_is_another_copy(checkout, tmp_path):
-    """And a checkout without git, whose commit the suite says, is copied anew too."""
-    folder, _ = checkout
-    other = tmp_path / "other"
-    shutil.copytree(folder, other, ignore=shutil.ignore_patterns(".git"))
-    (other / "only_here.py").write_text("a = 1\n")
-    copy = Path(prepared(folder, tmp_path / "results")["path"])
-    assert not (copy / "only_here.py").exists()
-    method = prepared(other, tmp_path / "results", commit="v2")
-    assert method["path"] == str(copy) and method["commit"] == "v2"
-    assert (copy / "only_here.py").read_text() == "a = 1\n"
-    (other / "only_here.py").write_text("a = 2\n")  # of the same size
-    prepared(other, tmp_path / "results", commit="v3")
-    assert (copy / "only_here.py").read_text() == "a = 2\n"
-
-
-def test_a_copy_that_was_interrupted_is_made_anew(checkout, tmp_path, monkeypatch):
-    folder, _ = checkout
-
-    def copy_a_part(path, copy, **options):
-        (Path(copy)).mkdir(parents=True)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(preparation.shutil, "copytree", copy_a_part)
-        with pytest.raises(KeyboardInterrupt):
-            prepared(folder, tmp_path / "results")
-    copy = prepared(folder, tmp_path / "results")["path"]
-    assert preparation.patches.check(copy) == "patched"
 
 
 def test_a_copys_commits_are_those_of_what_was_copied(checkout, tmp_path):

@@ -7,9 +7,9 @@ import json
 import math
 
 import pytest
+from diff_smoe_rasterization.benchmarks.suite import rows
+from diff_smoe_rasterization.benchmarks.suite.report import ReportError, groups, layouts, survey, tables
 from report_rows import PROTOCOL, failed, row, write_rows
-
-from diff_smoe_rasterization.benchmarks.report import ReportError, layouts, rows, survey, tables
 
 
 def table_of(entries, name, suite="table1"):
@@ -36,27 +36,6 @@ def test_a_cell_is_the_mean_over_seeds_with_its_spread():
     assert line["LPIPS Alex"] == "0.250 ± 0.000"
     assert "GPU peak [MiB]" not in line  # no row has it
     assert shown(table_of(entries[:1], "cells"), scene="bonsai")["PSNR [dB]"] == "23.00"  # one seed has no spread
-
-
-def test_a_scene_counts_once_however_many_seeds_it_has():
-    entries = [row("truck", seed=0, psnr=20.0), row("truck", seed=1, psnr=22.0), row("train", seed=0, psnr=31.0)]
-    line = shown(table_of(entries, "table1"), end="sparse")
-    assert line["Tanks and Temples PSNR [dB]"] == "25.50"  # (20 + 31) / 2: train has no seed 1
-    assert line["Tanks and Temples seeds"] == "1 of 2"
-    entries.append(row("train", seed=1, psnr=33.0))
-    line = shown(table_of(entries, "table1"), end="sparse")
-    assert line["Tanks and Temples PSNR [dB]"] == "26.50 ± 1.41"  # 25.5 and 27.5
-    assert line["Tanks and Temples seeds"] == "2"
-
-
-def test_an_average_leaves_no_scene_out():
-    entries = [row("truck"), row("train"), row("truck", "smoe"), row("truck", method="3dgs-2023"),
-               failed(scene="train", method="3dgs-2023")]
-    table = table_of(entries, "table1")
-    name = "Tanks and Temples PSNR [dB]"
-    assert shown(table, method="native, alpha")[name] == "20.00"
-    assert shown(table, method="native, smoe")[name] == "not run: train"
-    assert shown(table, method="3dgs-2023, alpha")[name] == "failed: train"
 
 
 def test_an_average_is_of_the_seeds_that_every_scene_has_in_both_modes():
@@ -105,28 +84,6 @@ def test_a_scene_is_of_the_data_set_that_its_row_names(tmp_path):
         "other/room.csv", "TanksAndTemples/my_truck.csv"}
 
 
-def test_the_papers_sizes_fit_its_numbers_of_gaussians():
-    """59 floats a Gaussian (58 in 2DGS, 30 in DBS); 4 %: both figures are printed rounded."""
-    paper = layouts.read_paper()["table1"]
-    names = paper["columns"]
-    for end in ("sparse", "dense"):
-        for method, floats in (("3DGS", 59), ("3DSMoES", 59), ("2DGS", 58), ("DBS", 30)):
-            for figures in paper[end][method].values():
-                count, size = (float(figures[names.index(name)]) for name in ("num_gaussians_m", "size_own_mb"))
-                assert size == pytest.approx(count * floats * 4, rel=0.04)
-
-
-def test_every_printed_row_is_complete():
-    paper = layouts.read_paper()
-    for end in paper["ends"]:
-        for averages in paper["table1"][end].values():
-            assert {len(figures) for figures in averages.values()} == {len(paper["table1"]["columns"])}
-            assert list(averages) == list(paper["datasets"])
-        assert {len(figures) for figures in paper["table2"][end].values()} == {len(paper["table2"]["columns"])}
-    for names in paper["names"].values():
-        assert all(name in {**paper["table1"]["sparse"], **paper["table2"]["sparse"]} for name in names.values())
-
-
 def test_other_trainers_stand_in_table_2():
     entries = [row("truck", method="taming", variant="patched", fps=100.0),
                row("truck", "smoe", method="taming", variant="patched", psnr=21.0)]
@@ -136,16 +93,6 @@ def test_other_trainers_stand_in_table_2():
     printed = next(line for line in table.rows if line.labels == ("sparse", "3DSMoES-Taming"))
     assert printed.source == tables.PAPER and [cell.printed for cell in printed.cells][-3:-1] == ["280", "194"]
     assert table_of([row()], "table2") is None
-
-
-def test_the_ablation_stands_in_table_3():
-    entries = [row(blend_mode=mode, psnr=psnr)
-               for mode, psnr in (("alpha", 20.0), ("smoe", 23.0), ("smoe_tn", 22.0), ("smoe_std", 21.0))]
-    table = table_of(entries, "table3")
-    assert [(line.labels[2], line.cells[0].value) for line in table.rows if line.source == tables.OURS] == [
-        ("smoe: full", 23.0), ("smoe_tn: without T_d", 22.0), ("smoe_std: without T_n,d", 21.0)]
-    assert [line.cells[0].printed for line in table.rows if line.source == tables.PAPER] == ["23.81", "22.71", "22.33"]
-    assert table_of(entries[:2], "table3") is None
 
 
 def test_deltas_are_of_the_seeds_that_both_modes_have():
@@ -181,32 +128,7 @@ def test_each_gate_of_smoe_is_a_blend_of_its_own():
         assert any(line.source == tables.PAPER for line in table.rows) == (name == "deltas")
     shared_out = table_of([*entries, row(seed=1)], "table1")  # averages of all gates are of the seeds they share
     assert shown(shared_out, method="native, smoe")["Mip-NeRF 360 (ours: bonsai) PSNR [dB]"] == "21.00"
-    assert survey.submethod(rows.grouped(entries, layouts.end_of)[2]) == "-native-smoe-0.05-t0.005"
-
-
-def test_deltas_hold_all_else_equal():
-    entries = [row(), row(blend_mode="smoe", threshold=0.001), row(blend_mode="smoe", schedule="steady"),
-               row("fox", blend_mode="smoe"), row(blend_mode="smoe", label="native, capped")]
-    assert table_of(entries, "deltas") is None
-
-
-def test_deltas_beside_what_the_paper_prints():
-    table = table_of([row(), row(blend_mode="smoe")], "deltas")
-    printed = {line.labels: line.cells for line in table.rows if line.source == tables.PAPER}
-    cells = printed["Mip-NeRF 360", "3DGS", "0.005 (sparse)", ""]
-    names = [column.name for column in table.columns]
-    assert cells[names.index("Δ PSNR [dB]")].value == pytest.approx(24.43 - 23.32)
-    assert cells[names.index("#Gaussians ratio")].value == pytest.approx(0.064 / 0.088)
-
-
-@pytest.mark.parametrize("alpha, smoe, number, train", [(0, 50.0, "–", "0.50"), (40000, 0.0, "0.50", "0.00")])
-def test_nothing_is_divided_by_0(alpha, smoe, number, train):
-    entries = [row(num_gaussians=alpha), row(blend_mode="smoe", num_gaussians=20000, train_seconds=smoe),
-               row("fox", train_seconds=0.0), row("fox", blend_mode="smoe", num_gaussians=10000)]
-    line = shown(table_of(entries, "deltas"), scene="bonsai")
-    assert (line["#Gaussians ratio"], line["train ratio"]) == (number, train)
-    line = shown(table_of(entries, "deltas"), scene="fox")
-    assert (line["#Gaussians ratio"], line["train ratio"]) == ("0.25", "–")
+    assert survey.submethod(groups.grouped(entries, layouts.end_of)[2]) == "-native-smoe-0.05-t0.005"
 
 
 def test_renderings_that_equal_the_ground_truth_have_an_infinite_psnr(tmp_path):
@@ -219,15 +141,6 @@ def test_renderings_that_equal_the_ground_truth_have_an_infinite_psnr(tmp_path):
     assert shown(table_of(entries, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "+1.00"  # of seed 1
     nothing = row("fox", psnr=None, ssim=None, psnr_edge=None)  # without test views
     assert "PSNR [dB]" not in shown(table_of([nothing], "cells"), scene="fox")
-
-
-def test_pairs_of_different_commits_are_named():
-    entries = [row(seed=seed, blend_mode=mode, commit={"project": commit, "trainer": None})
-               for seed, commits in ((0, "aa"), (1, "ab")) for mode, commit in zip(("alpha", "smoe"), commits)]
-    notes = table_of(entries, "deltas").notes
-    assert notes[-1] == ("alpha and smoe are of different commits in 1 pair: bonsai, native, 0.005, seed 1: "
-                         "project a and b.")
-    assert not any("commits" in note for note in table_of(entries[:2], "deltas").notes)
 
 
 def elsewhere(**changes):
@@ -275,21 +188,6 @@ def test_times_of_cells_that_shared_their_gpu_are_left_out():
     assert layouts.SHARED_NOTE in delta.notes and "shared" in tables.to_latex(delta)
 
 
-def test_an_average_over_scenes_has_no_time_where_one_of_them_shared_its_gpu():
-    entries = [row("truck", method="taming", variant="patched"), shared(scene="train", method="taming",
-                                                                        variant="patched", psnr=22.0)]
-    line = shown(table_of(entries, "table2"), method="taming, alpha")
-    assert (line["PSNR [dB]"], line["train [s]"], line["FPS"]) == ("21.00", "shared", "shared")
-
-
-def test_cells_that_were_alone_are_not_marked():
-    entries = [shared(1), row("fox"), row("lego", machine={"device": "CPU X", "cells_at_once": 1})]
-    table = table_of(entries, "cells")
-    assert shown(table, scene="bonsai")["FPS"] == "3" and layouts.SHARED_NOTE not in table.notes
-    table = table_of([*entries, row("train", machine={"device": "CPU X", "cells_at_once": 2})], "cells")
-    assert shown(table, scene="train")["train [s]"] == "shared" and layouts.SHARED_NOTE in table.notes
-
-
 def test_a_failed_cell_is_a_row_with_its_reason():
     entries = [row(), failed("out of memory | 12 GiB", blend_mode="smoe"), row("fox", seed=0),
                failed("killed", scene="fox", seed=1)]
@@ -299,50 +197,6 @@ def test_a_failed_cell_is_a_row_with_its_reason():
     assert shown(table_of(entries, "cells"), method="native, smoe")["PSNR [dB]"] == "failed"
     assert shown(table_of(entries, "cells"), scene="fox", seeds="1 of 2")["PSNR [dB]"] == "20.00"
     assert shown(table_of(entries, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "smoe failed"
-
-
-def test_lpips_of_different_kinds_have_columns_of_their_own():
-    kinds = [{"value": 0.3, "kind": "lpips_alex", "reason": None},
-             {"value": 0.4, "kind": "lpips_vgg_inria", "reason": None},
-             {"value": None, "kind": "lpips_vgg_std", "reason": "no weights at hand"}]
-    table = table_of([row(lpips=kinds[0], lpips_all=kinds)], "cells")
-    line = shown(table, scene="bonsai")
-    assert (line["LPIPS Alex"], line["LPIPS VGG as 3DGS"]) == ("0.300", "0.400")
-    assert "LPIPS VGG" not in line
-    assert any("lpips_vgg_std: no weights at hand" in note for note in table.notes)
-
-
-def test_a_suite_that_asks_for_no_lpips_lacks_none():
-    none = {"value": None, "kind": None, "reason": "the suite asks for none"}
-    assert not any("Not measured" in note for note in table_of([row(lpips=none, lpips_all=[])], "cells").notes)
-
-
-@pytest.mark.parametrize("label, text", [("3dgs-2023-fused", "3dgs-2023-fused, smoe"), ("mine", "mine-fused, smoe")])
-def test_a_fused_checkout_says_so_once(label, text):
-    entries = [row(blend_mode="smoe", method="3dgs-2023", label=label, variant="fused"),
-               row(blend_mode="smoe", method="3dgs-2023", variant="patched", psnr=21.0)]
-    assert shown(table_of(entries, "cells"), method=text)["PSNR [dB]"] == "20.00"
-    assert shown(table_of(entries, "table1"), method=text)["Mip-NeRF 360 (ours: bonsai) PSNR [dB]"] == "20.00"
-    assert shown(table_of(entries, "cells"), method="3dgs-2023, smoe")["PSNR [dB]"] == "21.00"
-
-
-def test_short_runs_and_unpatched_checkouts_say_so():
-    entries = [row(iterations=7000), row(method="3dgs-2023", variant="unpatched"),
-               row("fox", method="3dgs-2023", label="3dgs-2023-unpatched", variant="unpatched")]
-    table = table_of(entries, "cells")
-    assert {line.labels[1] for line in table.rows} == {"native, alpha, 7,000 iterations",
-                                                       "3dgs-2023-unpatched, alpha"}
-
-
-def test_csv_is_unrounded_and_complete():
-    psnr = 24.123456789
-    table = table_of([row(psnr=psnr), row(seed=1, psnr=psnr), row("fox, the \"red\" one")], "cells")
-    lines = list(csv.DictReader(io.StringIO(tables.to_csv(table))))
-    assert len(lines) == 2 and {line["source"] for line in lines} == {"ours"}
-    bonsai = next(line for line in lines if line["scene"] == "bonsai")
-    assert float(bonsai["PSNR [dB]"]) == psnr and float(bonsai["PSNR [dB] sd"]) == 0
-    fox = next(line for line in lines if line["scene"] == "fox, the \"red\" one")
-    assert fox["PSNR [dB] sd"] == "" and fox["#Gaussians"] == "40000"
 
 
 @pytest.mark.parametrize("name", ["table1", "table3", "deltas", "cells", "failures"])
@@ -374,17 +228,6 @@ def test_survey_rows(tmp_path):
                      "-native-smoe-steady-t0.0002,20.0,0.75,,2000000,40000", ""]  # Alex's LPIPS may not stand there
 
 
-def test_a_cells_own_row_wins_over_the_list(tmp_path):
-    entry = row(psnr=20.0)
-    results = write_rows(tmp_path, [row(psnr=10.0), {**entry, "psnr": 15.0}, row("fox")])
-    assert [found["psnr"] for found in rows.read_rows(results)] == [15.0, 20.0]  # the last line of a cell
-    folder = tmp_path / "cells" / entry["cell"]
-    folder.mkdir(parents=True)
-    (folder / "row.json").write_text(json.dumps(entry), encoding="utf-8")
-    assert [found["psnr"] for found in rows.read_rows(results)] == [20.0, 20.0]
-    assert len(rows.read_rows(str(tmp_path / "rows.jsonl"))) == 2
-
-
 @pytest.mark.parametrize("name, value", [("background", "white"), ("image_size", [96, 64]), ("split", "none"),
                                          ("downscaler", "box"), ("psnr", "floats"), ("sh_degree", 2),
                                          ("train_views", 7), ("test_views", 7), ("scale_recipe", True),
@@ -405,12 +248,6 @@ def test_rules_that_one_row_does_not_state_are_not_compared(tmp_path):
     entries.append(row(seed=3, protocol={**PROTOCOL, "recipe": {"feature_lr": 0.01}}))
     with pytest.raises(ReportError, match="recipe.feature_lr is 0.0025 in .* and 0.01 in "):
         rows.read_rows(write_rows(tmp_path, entries))
-
-
-def test_scenes_and_suites_may_differ_in_protocol(tmp_path):
-    white = {**PROTOCOL, "background": "white"}
-    entries = [row(), row("lego", protocol=white), row(suite="smoke", protocol=white), failed(seed=1, protocol={})]
-    assert len(rows.read_rows(write_rows(tmp_path, entries))) == 4
 
 
 @pytest.mark.parametrize("text, reason", [("{", "line 1: not valid json"), ("[]", "line 1: expected one object"),

@@ -5,7 +5,7 @@ import pytest
 from report_rows import failed, row
 
 pytest.importorskip("matplotlib", reason="figures need matplotlib")
-from diff_smoe_rasterization.benchmarks.report import curves, layouts, rows  # noqa: E402
+from diff_smoe_rasterization.benchmarks.suite.report import curves, groups, layouts  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -15,7 +15,7 @@ def closed_figures():
 
 
 def groups_of(entries):
-    return rows.grouped(entries, layouts.end_of)
+    return groups.grouped(entries, layouts.end_of)
 
 
 def test_a_curve_goes_through_the_means_from_few_gaussians_to_many():
@@ -30,36 +30,6 @@ def test_a_curve_goes_through_the_means_from_few_gaussians_to_many():
     assert alpha == [[200, 21], [900, 30]] and smoe == [[50, 25]]
     whisker = axes[0].containers[0].lines[2][0].get_segments()[0]
     assert whisker[1, 1] - whisker[0, 1] == pytest.approx(2 * 2 ** 0.5)  # seeds 20 and 22: sd is the root of 2
-
-
-def test_amounts_that_are_nearly_equal_have_a_plain_axis():
-    """A logarithm has no ticks between them, and equal ones no width."""
-    entries = [row(threshold=threshold, num_gaussians=105145, size_bytes={"own": size, "common": size * size})
-               for threshold, size in ((0.005, 2_000_000), (0.0002, 2_900_000))]
-    number, own, common = curves.rate_distortion(groups_of(entries)).axes[:3]
-    assert [axis.get_xscale() for axis in (number, own, common)] == ["linear", "linear", "log"]
-    for axis, least, most in ((number, 105145, 105145), (own, 2.0, 2.9)):
-        low, high = axis.get_xlim()
-        assert low < 0.75 * least and high > 1.25 * most
-
-
-def test_two_points_are_no_curve():
-    entries = [row(threshold=threshold, num_gaussians=number) for threshold, number in ((0.005, 10), (0.0002, 90))]
-    entries += [row(blend_mode="smoe", threshold=threshold) for threshold in (0.005, 0.001, 0.0002)]
-    drawn = curves.rate_distortion(groups_of(entries))
-    for lines in ([container.lines[0] for container in drawn.axes[0].containers], drawn.legends[0].get_lines()):
-        assert [line.get_linestyle() for line in lines] == ["None", "-"]
-
-
-def test_marks_in_one_place_are_all_seen():
-    """The smaller in front of the larger, and what is hollow in front of what is not."""
-    entries = [row(blend_mode=mode, schedule=schedule) for schedule in ("3dgs", "steady") for mode in ("alpha", "smoe")]
-    drawn = curves.rate_distortion(groups_of(entries + [row(label="other"), row(label="other", blend_mode="smoe")]))
-    marks = sorted((container.lines[0] for container in drawn.axes[0].containers), key=lambda line: line.get_zorder())
-    for behind, before in zip(marks, marks[1:]):
-        hollow = before.get_markerfacecolor() == "none" and behind.get_markerfacecolor() != "none"
-        assert before.get_markersize() < behind.get_markersize() or hollow
-    assert len(marks) == 6
 
 
 def test_bars_are_the_means():
@@ -85,13 +55,6 @@ def test_bars_are_of_cells_that_had_their_gpu_alone():
     assert len(curve.containers) == 2  # quality is as it is
 
 
-def test_bars_are_of_one_machine():
-    entries = [row(), row(blend_mode="smoe", machine={"device": "Card Y"})]
-    assert curves.bars(groups_of(entries)) is None
-    one_shared = [*entries[:1], row(blend_mode="smoe", machine={"device": "Card Y", "cells_per_gpu": 2})]
-    assert len(curves.bars(groups_of(one_shared)).axes[0].patches) == 1
-
-
 def test_what_has_no_place_on_an_axis_is_left_out():
     entries = [row(psnr=float("inf")), row(threshold=0.002, num_gaussians=0), row(threshold=0.001, num_gaussians=7)]
     psnr = curves.rate_distortion(groups_of(entries)).axes[0]
@@ -111,15 +74,6 @@ def test_the_legend_lies_inside_and_above_the_panels(draw, methods):
     box = drawn.legends[0].get_window_extent()
     assert box.x0 >= 0 and box.x1 <= drawn.bbox.x1 and box.y1 <= drawn.bbox.y1
     assert box.y0 >= max(axis.get_window_extent().y1 for axis in drawn.axes)
-
-
-def test_blends_differ_by_more_than_colour():
-    modes = [row(blend_mode=mode) for mode in curves.MARKS]
-    gates = [row(blend_mode="smoe", background_gate=gate) for gate in (0.05, 0.3, "learned")]
-    for entries, parts in ((modes, (0, 1, 2)), (modes[:2] + gates, (0, 2))):  # gates: by mark and hatch
-        styles = curves._styles(groups_of(entries))
-        assert all(len({marks[part] for _, marks in styles.values()}) == len(entries) for part in parts)
-        assert len({color for color, _ in styles.values()}) == len(entries)
 
 
 def test_what_was_not_measured_is_not_drawn(tmp_path):

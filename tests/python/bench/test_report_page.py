@@ -15,7 +15,8 @@ from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images,
 
 pytest.importorskip("matplotlib", reason="a report needs matplotlib")
 pytest.importorskip("jinja2", reason="a report needs jinja2")
-from diff_smoe_rasterization.benchmarks.report import ReportError, report, sliders, survey  # noqa: E402
+from diff_smoe_rasterization.benchmarks.suite.report import ReportError, report, sliders, survey  # noqa: E402
+
 from diff_smoe_rasterization.trainer.errors import TrainerError  # noqa: E402
 
 
@@ -66,16 +67,6 @@ def test_the_page_loads_nothing_but_its_own_files(written):
     assert all((written / name).is_file() for name in layers)
 
 
-def test_a_second_report_leaves_nothing_of_the_first(written, tmp_path):
-    output = tmp_path / "report"
-    shutil.copytree(written, output)
-    (output / "mine.txt").write_text("kept")
-    report(write_rows(tmp_path / "results", [row("fox")]), str(output))
-    names = {path.relative_to(output).as_posix() for path in output.rglob("*") if path.is_file()}
-    assert {"mine.txt", "index.html", "report.md", "survey/table1/other/fox.csv"} < names
-    assert not [name for name in names if "bonsai" in name or "failures" in name or name.startswith("images/")]
-
-
 def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypatch):
     output = tmp_path / "report"
     shutil.copytree(written, output)
@@ -115,15 +106,6 @@ def test_cells_without_a_row_are_named(tmp_path):
         "2 cells on 1 scene, 2 seeds; none failed.")
 
 
-def test_files_of_others_are_left_alone(tmp_path):
-    (tmp_path / "report" / "images").mkdir(parents=True)
-    (tmp_path / "report" / "images" / "mine.png").write_bytes(b"")
-    (tmp_path / "report" / "index.html").write_text("my own page")
-    with pytest.raises(ReportError, match="index.html is no report"):
-        report(write_rows(tmp_path / "results", [row()]), str(tmp_path / "report"))
-    assert (tmp_path / "report" / "images" / "mine.png").is_file()
-
-
 def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path):
     results = write_rows(tmp_path / "results", [row()])
     (tmp_path / "file").touch()
@@ -139,18 +121,6 @@ def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path):
     assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["mine.txt"]
 
 
-def test_a_page_without_images_says_why(written, tmp_path):
-    def page(results):
-        report(results, str(tmp_path / "report"))
-        return (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
-
-    results = write_rows(tmp_path / "results", [row()])
-    assert "No images: rows of another folder." in page(results)
-    (tmp_path / "results" / "cells" / row()["cell"]).mkdir(parents=True)
-    assert "No images: the suite asked for none." in page(results)
-    assert "No images" not in (written / "index.html").read_text(encoding="utf-8")
-
-
 def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path):
     said = {**PROTOCOL, "arguments": ["--port", "0"]}
     entries = [row(protocol=said), row(blend_mode="smoe", schedule="steady", protocol=said,
@@ -162,47 +132,6 @@ def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path):
     assert rules["cells that shared their GPU or CPU"] == "1 of 2, up to 3 at once" and "arguments" not in rules
 
 
-def test_text_of_rows_is_text(written):
-    assert "&lt;out of memory&gt; &amp; more" in (written / "index.html").read_text(encoding="utf-8")
-
-
-def test_renderings_are_copied_byte_for_byte(tmp_path):
-    entry = row(blend_mode="smoe", background_gate=0.05)
-    write_images(tmp_path / "results", entry, ALPHA, names=("a b",))
-    found = sliders.collect(str(tmp_path / "results"), "s u", [entry], str(tmp_path))
-    view, = found[0]["settings"][0]["views"]
-    truth, gated, error = view["layers"]
-    source = tmp_path / "results" / "cells" / entry["cell"] / "images"
-    assert (tmp_path / gated["path"]).read_bytes() == (source / "render" / "a b.png").read_bytes()
-    assert (tmp_path / truth["path"]).read_bytes() == (source / "gt" / "a b.png").read_bytes()
-    assert " " not in truth["path"] + gated["path"] + error["path"]
-    # One of three channels is off by 80 of 255: 10 log10(3 (255 / 80)^2)
-    assert gated["note"] == error["note"] == "14.84 dB"
-
-
-def test_errors_take_the_whole_scale():
-    def color(difference):
-        image = np.full((1, 1, 3), 100, np.uint8)
-        image[..., 0] += difference
-        return sliders.error_image(np.full((1, 1, 3), 100, np.uint8), image)[0, 0].astype(int)
-
-    # The colour map grows brighter all along; 0.25 of 255, averaged over three channels, is its end.
-    brightness = [color(difference).sum() for difference in (0, 40, 80, 120, 155)]
-    assert brightness == sorted(set(brightness))
-    full = sliders.error_image(np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 64, np.uint8))
-    beyond = sliders.error_image(np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 255, np.uint8))
-    assert (full == beyond).all() and full.sum() > brightness[-1]
-
-
-def test_images_under_one_slider_are_of_one_seed(tmp_path):
-    entries = [row(seed=0), row(seed=1), row(blend_mode="smoe", seed=1), row(blend_mode="smoe", seed=2)]
-    for entry, color in zip(entries, (TRUTH, ALPHA, SMOE, TRUTH)):
-        write_images(tmp_path / "results", entry, color, names=("one",))
-    found = sliders.collect(str(tmp_path / "results"), "s", entries, str(tmp_path))
-    _, alpha, smoe, *_ = found[0]["settings"][0]["views"][0]["layers"]
-    assert [Image.open(tmp_path / layer["path"]).getpixel((0, 0)) for layer in (alpha, smoe)] == [ALPHA, SMOE]
-
-
 @pytest.mark.parametrize("changes", [{"truth": (99, 100, 100)}, {"size": (32, 48)}])
 def test_images_of_different_truths_are_refused(tmp_path, changes):
     entries = [row(), row(blend_mode="smoe")]
@@ -210,12 +139,6 @@ def test_images_of_different_truths_are_refused(tmp_path, changes):
     write_images(tmp_path, entries[1], SMOE, **changes)
     with pytest.raises(ReportError, match="cannot be compared"):
         sliders.collect(str(tmp_path), "table1", entries, str(tmp_path / "report"))
-
-
-def test_a_report_without_any_success_is_a_report(tmp_path):
-    path = report(write_rows(tmp_path / "results", [failed("killed")]), str(tmp_path / "report"))
-    with open(path, encoding="utf-8") as file:
-        assert "killed" in file.read()
 
 
 @pytest.fixture(scope="module")
@@ -255,44 +178,9 @@ def colors_of(page):
     return tuple(line[len(line) // 10]), tuple(line[len(line) * 9 // 10])
 
 
-def test_every_image_is_there(page):
-    sizes = page.evaluate("[...document.images].map(image => image.complete ? image.naturalWidth : -1)")
-    assert len(sizes) == 4 and min(sizes) > 0
-
-
 def test_the_slider_shows_alpha_to_the_left_and_smoe_to_the_right(page):
     assert colors_of(page) == (ALPHA, SMOE)
     assert page.locator(".tag.left").inner_text().startswith("alpha · 14.84 dB")
-
-
-def test_the_slider_moves_by_mouse(page):
-    box = page.locator(".stage").bounding_box()
-    middle = box["y"] + box["height"] / 2
-    page.mouse.move(box["x"] + box["width"] / 2, middle)
-    page.mouse.down()
-    page.mouse.move(box["x"] + 0.02 * box["width"], middle)
-    page.mouse.up()
-    assert colors_of(page) == (SMOE, SMOE)
-
-
-def test_everything_is_reached_and_moved_by_keyboard(page):
-    page.keyboard.press("Tab")
-    assert page.evaluate("document.activeElement.textContent") == "Skip to the results"
-    reached = []
-    for _ in range(30):
-        page.keyboard.press("Tab")
-        reached.append(page.evaluate("document.activeElement.dataset.role || document.activeElement.type || ''"))
-        if reached[-1] == "range":
-            break
-    assert [name for name in reached if name][-6:] == ["setting", "view", "left", "right", "zoom", "range"]
-    assert page.locator(".stage").evaluate("element => getComputedStyle(element).outlineStyle") == "solid"
-    slider = page.locator(".stage input")
-    page.keyboard.press("ArrowRight")
-    assert slider.input_value() == "51" and slider.get_attribute("aria-valuetext") == "51 %"
-    page.keyboard.press("End")
-    assert colors_of(page) == (ALPHA, ALPHA)
-    page.keyboard.press("Home")
-    assert colors_of(page) == (SMOE, SMOE)
 
 
 def test_layers_views_and_settings_are_chosen(page):
@@ -310,51 +198,3 @@ def test_layers_views_and_settings_are_chosen(page):
         "ground truth", "alpha", "error of alpha"]
     assert page.get_by_label("Left", exact=True).input_value() == "ground truth"
     assert colors_of(page)[0] == TRUTH
-
-
-def test_a_fitted_image_is_seen_whole(page):
-    page.get_by_label("Zoom", exact=True).select_option("3")
-    page.get_by_label("Zoom", exact=True).select_option("fit")
-    assert page.locator(".stage").bounding_box()["width"] > 800
-    page.set_viewport_size({"width": 1000, "height": 300})
-    box = page.locator(".stage").bounding_box()
-    assert box["height"] == pytest.approx(0.8 * 300, abs=1) and box["width"] == pytest.approx(1.5 * 240, abs=1)
-
-
-def test_zoom_shows_pixels(page):
-    assert page.locator(".stage").bounding_box()["width"] > 48
-    page.get_by_label("Zoom", exact=True).select_option("1")
-    assert page.locator(".stage").bounding_box()["width"] == 48
-    page.get_by_label("Zoom", exact=True).select_option("3")
-    assert page.locator(".stage").bounding_box()["height"] == 96
-
-
-CONTRASTS = """() => {
-  const numbers = text => text.match(/[\\d.]+/g).map(Number);
-  const luminance = color => { const [r, g, b] = color.slice(0, 3).map(value => value / 255).map(
-    value => value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
-    return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
-  const behind = element => { for (; element; element = element.parentElement) {
-    const color = numbers(getComputedStyle(element).backgroundColor);
-    if (color.length === 3) return color; } };
-  return [...document.querySelectorAll("h1, h2, h3, p, a, td, th, li, dt, dd, label, select, figcaption")].map(
-    element => { const [high, low] = [numbers(getComputedStyle(element).color), behind(element)].map(luminance)
-      .sort((one, other) => other - one); return [(high + 0.05) / (low + 0.05), element.outerHTML.slice(0, 80)]; });
-}"""
-
-
-@pytest.mark.parametrize("page, dark", [("light", False), ("dark", True)], indirect=["page"])
-def test_text_stands_out(page, dark):
-    ratios = page.evaluate(CONTRASTS)
-    assert len(ratios) > 100 and min(ratios)[0] >= 4.5, min(ratios)  # WCAG 2's least for text, level AA
-    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    assert (max(map(int, re.findall(r"\d+", background))) < 64) == dark
-    sources = page.evaluate("[...document.querySelectorAll('picture img')].map(image => image.currentSrc)")
-    assert len(set(sources)) == 2
-    light = page.evaluate("[...document.querySelectorAll('picture img')].map(image => image.src)")
-    assert (sources == light) != dark
-
-
-def test_a_narrow_page_does_not_scroll_sideways(page):
-    page.set_viewport_size({"width": 360, "height": 700})
-    assert page.evaluate("document.documentElement.scrollWidth") <= 360

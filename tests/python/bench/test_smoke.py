@@ -8,9 +8,9 @@ import subprocess
 import pytest
 from bench_commands import command, environment, rows_of
 
-for library in ("yaml", "jsonschema", "snakemake", "matplotlib", "jinja2"):
+for library in ("yaml", "snakemake", "matplotlib", "jinja2"):
     pytest.importorskip(library, reason="`dsmoe bench` needs it: pip install '.[bench]', with Python 3.11 or later")
-from diff_smoe_rasterization.benchmarks.suite import find_suite, load_suite  # noqa: E402
+from diff_smoe_rasterization.benchmarks.suite.expansion import find_suite, load_suite  # noqa: E402
 
 
 @pytest.fixture(scope="module")

@@ -6,17 +6,12 @@ import os
 from pathlib import Path
 
 import pytest
-
 from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.methods import run
-from diff_smoe_rasterization.benchmarks.methods.checkout import SHAPES
-from diff_smoe_rasterization.benchmarks.methods.names import CHECKOUTS, LACKS
-from diff_smoe_rasterization.benchmarks.protocol import RECIPE, config_of, protocol_of
-from diff_smoe_rasterization.benchmarks.selection import earlier_rows
-from diff_smoe_rasterization.benchmarks.suite import SHIPPED, THRESHOLDS, expand, find_suite, load_suite
-from diff_smoe_rasterization.trainer.config import TrainConfig
+from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite
+from diff_smoe_rasterization.benchmarks.suite.protocol import config_of
+from diff_smoe_rasterization.benchmarks.suite.schema import THRESHOLDS
+from diff_smoe_rasterization.benchmarks.suite.selection import earlier_rows
 
-pytest.importorskip("jsonschema", reason="suites are checked by jsonschema: pip install jsonschema")
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 
 SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "captures", "captures_ablation",
@@ -50,33 +45,6 @@ def test_gates_are_of_smoe_alone(content):
     names = [cell["id"] for cell in cells]
     assert [cell["id"] for cell in expand(content, "").cells] == [names[4], names[2]]
     assert names[1].startswith("native_tiny_smoe-learned_3dgs_") and names[3].startswith("native_tiny_smoe-0.05_3dgs_")
-
-
-def test_a_cell_has_all_options_of_its_training(content):
-    cell = expand(content, "").cells[1]
-    config = config_of(cell, "out")
-    assert (config.blend_mode, config.iterations, config.densify_grad_threshold) == ("smoe", 12, 0.005)
-    assert config.background_gate == 0  # whatever the trainer's default
-    assert (config.densification_interval, config.eval_every, config.principal_point) == (4, 6, "scene")
-
-
-def test_a_scaled_recipe_is_that_of_the_trainer(content):
-    content["protocol"].update(scale_recipe=True, options={}, iterations=300)
-    config = config_of(expand(content, "").cells[0])
-    shortened = TrainConfig(iterations=300, blend_mode="alpha").shortened()
-    assert config.densify_until_iter == shortened.densify_until_iter == 150
-    assert config.opacity_reset_interval == shortened.opacity_reset_interval
-
-
-def test_the_row_of_a_native_cell_has_its_whole_recipe(content, tmp_path):
-    content["protocol"].update(scale_recipe=True, options={"lambda_dssim": 0.3})
-    cell = expand(content, "").cells[0]
-    config = config_of(cell)
-    recipe = protocol_of({"downscaler": "that of a trainer"}, config, [])["recipe"]
-    assert recipe["lambda_dssim"] == 0.3 and recipe["rotation_lr"] == 0.001
-    assert recipe["densify_until_iter"] == TrainConfig(iterations=12, blend_mode="alpha").shortened().densify_until_iter
-    assert set(recipe) == set(RECIPE)
-    assert run(cell, str(tmp_path)).notes["scale_recipe"] is True
 
 
 def test_an_axis_of_a_method_wins_over_the_scenes_over_the_suites(content, tiny_scene):
@@ -115,11 +83,11 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tiny_scene, tmp_path
     ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
     ({"densify_grad_thresholds": ["5e-3"]}, ["densify_grad_thresholds[0]", "write 0.005"]),
     ({"seeds": []}, ["seeds"]),
-    ({"seeds": 0}, ["seeds", "a list, such as [0]"]),
+    ({"seeds": 0}, ["seeds", "a valid list, such as [0]"]),
     ({"name": "../x"}, ["name"]),
     ({"name": "x\n"}, ["name", "x\\n"]),
-    ({"name": 65 * "x"}, ["name", "too long"]),
-    ({"densify_grad_thresholds": [1e300]}, ["densify_grad_thresholds[0]", "maximum of 1000000"]),
+    ({"name": 65 * "x"}, ["name", "at most 64"]),
+    ({"densify_grad_thresholds": [1e300]}, ["densify_grad_thresholds[0]", "less than or equal to 1000000"]),
     ({"seeds": [1.0]}, ["seeds[0]", "1.0", "integer"]),
     ({"scenes": [{"name": "a"}]}, ["scenes[0]", "path", "synthetic"]),
     ({"scenes": [{"name": "a", "path": "p", "resolution": 0}]}, ["scenes[0].resolution"]),
@@ -151,13 +119,6 @@ def test_a_file_that_is_no_suite_is_named(tmp_path, text):
         load_suite(str(path))
 
 
-def test_a_file_that_is_no_text_is_named(tmp_path):
-    path = tmp_path / "suite.yaml"
-    path.write_bytes(b"\x89PNG\r\n\xff")
-    with pytest.raises(BenchError, match="suite.yaml: not valid YAML"):
-        load_suite(str(path))
-
-
 @pytest.mark.parametrize("text, words", [
     ("protocol: {iterations: 7}\nname: a\nprotocol: {}\n", "'protocol' is there twice.*line 3"),
     ("protocol: {options: {opacity_lr: 1, opacity_lr: 2}}\n", "'opacity_lr' is there twice.*line 1")])
@@ -166,14 +127,6 @@ def test_a_field_that_is_there_twice_is_refused(tmp_path, text, words):
     path.write_text(text)
     with pytest.raises(BenchError, match=words):
         load_suite(str(path))
-
-
-def test_a_field_may_stand_for_a_merged_one(content, tmp_path):
-    """The merged mapping is read after the one it goes into: what is the same in both is there once."""
-    path = tmp_path / "suite.yaml"
-    scenes = "scenes: [{<<: &a {<<: &b {path: p, images: x}, images: y, name: c}}, {<<: *a, name: d}]\n"
-    path.write_text("name: merged\nmethods: [{name: native}]\n" + scenes)
-    assert [(scene["name"], scene["images"]) for scene in load_suite(str(path)).scenes] == [("c", "y"), ("d", "y")]
 
 
 def test_a_variable_that_is_not_set_is_named(content, monkeypatch):
@@ -211,16 +164,6 @@ def test_a_checkout_whose_loader_moves_the_principal_point_is_not_compared_with_
 def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
     with pytest.raises(BenchError, match=r"methods\[0\].arguments: " + words[0].partition("=")[0]):
         expand(on_cuda(content, methods=[{"name": "taming", "path": "p", "arguments": words}]), "")
-
-
-def test_flags_that_are_a_methods_own_are_its_own(content):
-    """argparse takes a whole flag as itself: --mode of Taming is not short for --model_path, as it is elsewhere."""
-    words = ["--densification_interval=500", "--mode", "final_count", "--budget", 9]
-    taming = {"name": "taming", "path": "p", "arguments": words}
-    assert expand(on_cuda(content, methods=[taming]), "").methods[0]["arguments"][-1] == "9"
-    for word in words[:2]:
-        with pytest.raises(BenchError, match=r"methods\[0\].arguments: " + word.partition("=")[0]):
-            expand(on_cuda(content, methods=[{"name": "3dgs-2023", "path": "p", "arguments": [word, 3]}]), "")
 
 
 def test_two_downscalers_are_refused(content):
@@ -269,11 +212,6 @@ def test_an_unpatched_checkout_has_its_own_blending_alone(content):
         expand(on_cuda(content, methods=[{"name": "2dgs", "path": "p", "variant": "patched"}]), "")
 
 
-def test_a_method_without_a_threshold_needs_its_size(content):
-    with pytest.raises(BenchError, match=r"methods\[0\].arguments: dbs needs --cap_max"):
-        expand(on_cuda(content, methods=[{"name": "dbs", "path": "p"}]), "")
-
-
 @pytest.mark.parametrize("name, arguments", [("dbs", ["--cap_max", 3000]), ("taming", [])])
 def test_a_method_without_a_threshold_is_trained_once(name, arguments, content):
     method = {"name": name, "path": "p", "arguments": arguments, "blend_modes": ["alpha"]}
@@ -296,17 +234,6 @@ def test_a_budget_is_that_of_the_arguments(name, arguments, right, content):
     else:
         with pytest.raises(BenchError, match=r"methods\[0\].budget: is 999"):
             expand(suite, "")
-
-
-def test_a_method_with_a_schedule_of_its_own_has_none_of_ours(content):
-    methods = [{"name": "hac", "path": "p"}]
-    assert {cell["schedule"] for cell in expand(on_cuda(content, methods=methods), "").cells} == {None}
-    with pytest.raises(BenchError, match=r"methods\[0\].schedules"):
-        expand(on_cuda(content, methods=[dict(methods[0], schedules=["steady"])]), "")
-
-
-def test_every_checkout_that_a_suite_may_name_can_be_run():
-    assert set(SHAPES) == set(CHECKOUTS) == set(LACKS)
 
 
 @pytest.mark.parametrize("name", SHIPPED_NAMES)
@@ -335,14 +262,9 @@ def test_rows_from_before_there_were_gates_are_of_todays_cells(monkeypatch):
     monkeypatch.setenv("DSMOE_DATA", "/somewhere")
     monkeypatch.setenv("DSMOE_TRAINERS", "/somewhere")
     rows = str(Path(__file__).resolve().parents[3] / "benchmarks" / "results" / "captures_h200.jsonl")
+    if not os.path.isfile(rows):
+        pytest.skip("the rows are in the repository, not in its source distribution")
     for name, lacking in (("captures", set()), ("gate", {0.03, 0.3, "learned"})):
         cells = [cell for cell in load_suite(find_suite(name)).cells if cell["seed"] == 0]
         found = earlier_rows(rows, cells)
         assert {cell["background_gate"] for cell in cells if cell["id"] not in found} == lacking
-
-
-def test_every_shipped_suite_is_listed_here():
-    found = {os.path.splitext(file)[0] for file in os.listdir(SHIPPED) if file.endswith(".yaml")}
-    assert found == set(SHIPPED_NAMES)
-    with pytest.raises(BenchError, match="smoke"):
-        find_suite("nothing")

@@ -3,8 +3,8 @@
     python peer_worker.py inria|dr_aa|gsplat MODEL.npz VIEWS
 
 test_cuda_peers.py runs it, as a process of its own because peers share one module name. The model is one that
-benchmarks/models.py reads; how a peer is called is in benchmarks/gpu_renderers.py. The last line of the output is JSON,
-a row for each view.
+benchmarks/timing/models.py reads; how a peer is called is in gpu_renderers.py there. The last line of the output is
+JSON, a row for each view.
 """
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import sys
 import torch
 
 HERE = os.path.dirname(os.path.abspath(__file__))
-sys.path[:0] = [HERE, os.path.join(HERE, "..", "..", "..", "benchmarks")]
+sys.path[:0] = [HERE, os.path.join(HERE, "..", "..", "..", "benchmarks", "timing")]
 import gpu_renderers  # noqa: E402
 import models  # noqa: E402
 from flips import explain  # noqa: E402

@@ -1,7 +1,7 @@
 """Against public rasterizers, where they are: $DSMOE_PEERS holds a folder each (inria, dr_aa, gsplat) with its package.
 
-$DSMOE_BIG_MODEL is the model: an .npz that benchmarks/models.py reads (benchmarks/gpu_rasterizer.py --save-npz writes
-one of a trained .ply and its scene). Without it a made-up one is used.
+$DSMOE_BIG_MODEL is the model: an .npz that benchmarks/timing/models.py reads (gpu_rasterizer.py --save-npz writes one of
+a trained .ply and its scene). Without it a made-up one is used.
 
 Known differences, each with its test or the reason why there is none:
 - Inria's backward is not the derivative of its forward where the projection's Jacobian is clamped, beyond 1.3 tan(fov /
@@ -39,7 +39,7 @@ def model(gpu, tmp_path):
     if path:
         assert os.path.isfile(path), f"DSMOE_BIG_MODEL: there is no file {path}"
         return path
-    sys.path.insert(0, os.path.join(os.path.dirname(WORKER), "..", "..", "..", "benchmarks"))
+    sys.path.insert(0, os.path.join(os.path.dirname(WORKER), "..", "..", "..", "benchmarks", "timing"))
     import models
     path = str(tmp_path / "synthetic.npz")
     models.to_npz(models.synthetic(300_000), path)

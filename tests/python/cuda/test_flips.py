@@ -11,7 +11,7 @@ from flips import explain
 
 from diff_smoe_rasterization import rasterize
 
-sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "..", "benchmarks"))
+sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "..", "benchmarks", "timing"))
 import models  # noqa: E402
 
 MODES = pytest.mark.parametrize("mode", ["alpha", pytest.param("smoe", marks=pytest.mark.slow)])

@@ -209,7 +209,7 @@ def test_eval_measures_lpips_where_asked(trained, tmp_path, capsys, monkeypatch)
     assert "nowhere.npz: no such file" in fails(capsys, "eval", run, "--lpips", "vgg")
     monkeypatch.delenv("DSMOE_LPIPS_VGG")
     asked = []
-    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.lpips.lpips_network",
+    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.lpips.lpips_network",
                         lambda kind, device: asked.append((kind, device)) or (lambda image, target: 0.25))
     assert main(["eval", run, "--lpips", "vgg"]) == 0
     assert "LPIPS (vgg, v0.1, 8-bit images in [-1, 1]): 0.2500\n" in capsys.readouterr().out

@@ -1,0 +1,238 @@
+"""One cell: one training and its measurement, from a file of plain values to a row.
+
+    python -I -m diff_smoe_rasterization.benchmarks.suite.cell CELL.json OUT [--gpus 0,1 --per-device 2 --locks FOLDER]
+
+OUT/row.json is written in any case but one: where this command itself is killed, so that whoever started it starts it
+again. The work is done in a process of its own, whose end, a crash or a lack of memory included, becomes a row with the
+reason. OUT/log.txt is what it printed.
+"""
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from typing import IO, Any, Dict, List, Optional, Tuple
+
+from ...trainer.errors import TrainerError
+from ...trainer.files import write_json_atomically
+from ...trainer.output_folder import locked
+from .processes import die_with_parent, last_line
+from .rows import ROW_NAME
+
+LOG_NAME = "log.txt"
+SHARING = {"cuda": "cells_per_gpu", "cpu": "cells_at_once"}  # what a row's machine calls it, by device
+SHARING_NAME = "cells_at_once.json"  # beside a checkpoint: its seconds were counted while so many shared the device
+AXES = ("blend_mode", "background_gate", "schedule", "densify_grad_threshold", "seed", "headline")
+FIGURES = ("psnr", "psnr_float", "ssim", "psnr_edge", "num_gaussians", "train_seconds", "fps", "peak_gpu_mib")
+
+
+def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
+    """What a row says of its cell, whether it was measured or failed."""
+    method, scene = cell["method"], cell["scene"]
+    return {"cell": cell["id"], "suite": cell["suite"], "method": method["name"], "label": method["label"],
+            "variant": method["variant"], "scene": scene["name"], "dataset": scene["dataset"],
+            **{axis: cell[axis] for axis in AXES}, "iterations": cell["protocol"]["iterations"],
+            "end": method.get("end"), "budget": method.get("budget")}
+
+
+def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float]) -> Dict[str, Any]:
+    """The row of a cell that gave no figures."""
+    return {**identity(cell), "ok": False, "reason": reason, **dict.fromkeys(FIGURES),
+            "lpips": {"value": None, "kind": next(iter(cell["protocol"]["lpips"]), None), "reason": "the cell failed"},
+            "lpips_all": [], "size_bytes": {"own": None, "common": None}, "wall_seconds": wall_seconds,
+            "protocol": {}, "commit": {"project": None, "trainer": None}, "machine": {}, "history": [], "per_view": []}
+
+
+def measured_row(cell: Dict[str, Any], output: str, started: float,
+                 per_device: Optional[int] = None) -> Dict[str, Any]:
+    """Trains and measures. per_device: as `supervise` has it. Raises what goes wrong."""
+    from ...trainer.results import result_row
+    from . import methods, protocol
+    from .measure import headline_lpips
+
+    earlier = note_sharing(output, per_device)
+    outcome = methods.run(cell, output)
+    if outcome.notes.get("continued"):  # train_seconds goes on from what the earlier attempt counted
+        per_device = max(filter(None, (per_device, earlier)), default=None)
+    config, evaluation = protocol.config_of(cell, output), outcome.evaluation
+    sharing = {} if per_device is None else {SHARING[config.device]: per_device}
+    trained = result_row(config, outcome.scene, outcome.num_gaussians, outcome.train_seconds, evaluation)
+    write_images(output, outcome)
+    return {**identity(cell), "ok": True, "reason": None,
+            **{name: evaluation.metrics.get(name) for name in ("psnr", "psnr_float", "ssim", "psnr_edge")},
+            "lpips": headline_lpips(outcome.lpips), "lpips_all": outcome.lpips, "num_gaussians": outcome.num_gaussians,
+            "size_bytes": {"own": outcome.own_bytes, "common": protocol.common_bytes(
+                outcome.num_gaussians, outcome.common_bytes_per_primitive)},
+            "train_seconds": outcome.train_seconds, "wall_seconds": time.time() - started, "fps": evaluation.fps,
+            "peak_gpu_mib": outcome.peak_gpu_mib,
+            "protocol": {**protocol.protocol_of(trained["protocol"], config, outcome.lpips), **outcome.notes},
+            "commit": {"project": protocol.project_commit(), "trainer": outcome.commit},
+            "machine": {**protocol.machine_of(config.device), **sharing}, "history": outcome.history,
+            "per_view": evaluation.per_view}
+
+
+def note_sharing(output: str, per_device: Optional[int]) -> Optional[int]:
+    """Writes beside the checkpoint how many cells may have this one's device; returns the most of earlier attempts."""
+    path, earlier = os.path.join(output, "run", SHARING_NAME), None
+    if os.path.isfile(path):
+        with open(path, encoding="utf-8") as file:
+            earlier = json.load(file)
+    if (per_device or 0) > (earlier or 0):
+        write_json_atomically(path, per_device)
+    return earlier
+
+
+def write_images(output: str, outcome: Any) -> None:
+    """OUT/images/{gt,render}/NAME.png of the views whose renderings were kept."""
+    from ...trainer.inspection import to_image
+    from ...trainer.pictures import file_names
+
+    views = {view.camera.name: view for view in outcome.scene.test}
+    files = dict(zip(views, file_names(list(views))))
+    for name, rendering in outcome.renders.items():
+        for kind, image in (("gt", views[name].image_float()), ("render", rendering)):
+            folder = os.path.join(output, "images", kind)
+            os.makedirs(folder, exist_ok=True)
+            to_image(image).save(os.path.join(folder, files[name] + ".png"))
+
+
+def work(cell: Dict[str, Any], output: str, started: float, per_device: Optional[int] = None) -> None:
+    """The inner process: writes the row, and removes what is no longer needed. Raises nothing but what kills it."""
+    path = os.path.join(output, ROW_NAME)
+    try:
+        row = measured_row(cell, output, started, per_device)
+    except Exception as error:  # whatever it is, it is the row's reason; KeyboardInterrupt and SystemExit are not
+        if not isinstance(error, TrainerError):
+            traceback.print_exc()
+        text = str(error) if isinstance(error, TrainerError) else f"{type(error).__name__}: {error}"
+        write_json_atomically(path, failed_row(cell, text, time.time() - started))
+        return
+    write_json_atomically(path, row)
+    if not cell["keep_models"]:
+        shutil.rmtree(os.path.join(output, "run"), ignore_errors=True)
+
+
+def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device: Optional[int] = None,
+              held: Optional[IO[str]] = None) -> Dict[str, Any]:
+    """Runs `work` in a process of its own, which ends with this one, and returns the row that is in OUT then.
+
+    gpu: the one that the process is given; None: as the machine has it. per_device: how many cells may have that GPU,
+    or on the CPU this machine, at once; None where nobody counts. held: a lock that the process has too.
+    """
+    with open(cell_path, encoding="utf-8") as file:
+        cell = json.load(file)
+    os.makedirs(output, exist_ok=True)
+    row_path, log_path = os.path.join(output, ROW_NAME), os.path.join(output, LOG_NAME)
+    if os.path.isfile(row_path):
+        os.remove(row_path)
+    environment = dict(os.environ, PYTHONUNBUFFERED="1", **({} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu}))
+    command = [sys.executable, *["-I"] * sys.flags.isolated, "-m", __spec__.name, cell_path, output, "--inside"]
+    command += ["--per-device", str(per_device)] if per_device is not None else []
+    started = time.time()
+    with open(log_path, "ab") as log:
+        status = subprocess.call(command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+                                 env=environment, preexec_fn=die_with_parent, pass_fds=[held.fileno()] if held else [])
+    if not os.path.isfile(row_path):
+        write_json_atomically(row_path, failed_row(cell, how_it_ended(status, log_path), time.time() - started))
+    with open(row_path, encoding="utf-8") as file:
+        return json.load(file)
+
+
+def how_it_ended(status: int, log_path: str) -> str:
+    """The reason for a row where a process left none."""
+    words = last_line(log_path)
+    how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+    memory = "; the system may have been out of memory" if status == -signal.SIGKILL else ""
+    return f"the process {how}{memory}" + (f"; its last line: {words}" if words else "")
+
+
+def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Tuple[str, IO[str]]:
+    """Waits for a GPU that fewer than per_gpu cells of these locks have: one that none has, where there is one.
+
+    Returns its name, and the lock, which is to be kept open. Snakemake counts GPUs, and does not say which is free.
+    """
+    import fcntl
+
+    os.makedirs(folder, exist_ok=True)
+    while True:
+        for slot, gpu in itertools.product(range(per_gpu), gpus):
+            lock = open(os.path.join(folder, f"gpu_{gpu}_{slot}.lock"), "w")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return gpu, lock
+            except OSError:
+                lock.close()
+        time.sleep(poll_seconds)
+
+
+def at_least_one(text: str) -> int:
+    """The number that a word of the command is. Raises ArgumentTypeError."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"is {number}; it must be at least 1")
+    return number
+
+
+def shown(value: Optional[float], form: str) -> str:
+    """A figure as text; "-" where there is none, or an infinite one, for which json has no number."""
+    return "-" if value is None else format(value, form)
+
+
+def tell(text: str) -> None:
+    """Prints a line where it can be printed: Snakemake would remove the row of a command that failed at this."""
+    try:
+        print(text, flush=True)
+    except (OSError, ValueError):  # whoever read the output has gone; or its encoding lacks a character
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where the rest goes when the process ends
+
+
+def main(argv: Optional[List[str]] = None) -> int:
+    """Runs the command; 0 where there is a row, whatever it says."""
+    parser = argparse.ArgumentParser(prog="python -I -m diff_smoe_rasterization.benchmarks.suite.cell",
+                                     description="Trains and measures one cell of a suite.")
+    parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
+    parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
+    parser.add_argument("--gpus", metavar="N,N", default="", help="take one of these GPUs")
+    parser.add_argument("--per-device", metavar="K", type=at_least_one,
+                        help="cells that may have one GPU, or on the CPU this machine, at once; the row says it "
+                             "(default: 1 with --gpus, else nothing is said)")
+    parser.add_argument("--locks", metavar="FOLDER", help="where cells tell each other which GPU they have")
+    parser.add_argument("--hold", metavar="FILE",
+                        help="a lock that is held, together with other cells; ends with what started this command")
+    parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args(argv)
+    if arguments.inside:
+        with open(arguments.cell, encoding="utf-8") as file:
+            work(json.load(file), arguments.output, time.time(), arguments.per_device)
+        return 0
+    gpu, lock, held, per_device = None, None, None, arguments.per_device
+    try:
+        if arguments.hold:
+            die_with_parent()
+            held = locked(arguments.hold, shared=True)
+        if arguments.gpus:
+            per_device = per_device or 1
+            gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_device)
+        row = supervise(arguments.cell, arguments.output, gpu, per_device, held)
+    except TrainerError as error:
+        print(f"{arguments.cell}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    finally:
+        for file in filter(None, (lock, held)):
+            file.close()
+    tell(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {shown(row['psnr'], '.2f')} dB" if row["ok"]
+                               else f"failed: {row['reason']}"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

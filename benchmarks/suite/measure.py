@@ -1,0 +1,98 @@
+"""What is measured of a rendering: PSNR, SSIM, PSNR near edges and LPIPS, the same way whatever program rendered.
+
+Every metric is one number of one image; a scene's figure is the mean over its test views (trainer/evaluation.py).
+"""
+from __future__ import annotations
+
+import math
+import os
+from typing import Dict, List, Optional, Sequence
+
+import torch
+import torch.nn.functional as F
+
+from ...trainer.metrics import image_metrics, psnr, quantised
+from ..errors import BenchError
+from .lpips import LPIPS_KINDS, VARIABLES, Distance, lpips_network, net_of
+
+STRONG_GRADIENT = 0.05  # of luminance in [0, 1], per pixel: 13 grey levels from one pixel to the next
+EDGE_REACH = 3  # pixels in x and y
+LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601
+EDGE_RULE = (f"8-bit images, pixels within {EDGE_REACH} px (in x and y) of a pixel of the ground truth whose Rec. 601 "
+             f"luminance has a Sobel gradient of at least {STRONG_GRADIENT} per pixel; mean over test views that have "
+             "such pixels")
+
+
+def edge_mask(target: torch.Tensor) -> torch.Tensor:
+    """[H, W] bool: pixels near the strong gradients of a ground truth [3, H, W] in [0, 1]; see EDGE_RULE."""
+    luminance = (target * target.new_tensor(LUMINANCE)[:, None, None]).sum(dim=0)
+    padded = F.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate")
+    sobel = target.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8  # of a ramp: its slope
+    gradient = F.conv2d(padded, torch.stack([sobel, sobel.T])[:, None])[0]
+    strong = (gradient.norm(dim=0) >= STRONG_GRADIENT).to(target.dtype)
+    return F.max_pool2d(strong[None, None], 2 * EDGE_REACH + 1, stride=1, padding=EDGE_REACH)[0, 0] > 0
+
+
+def edge_psnr(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None) -> Optional[float]:
+    """PSNR in dB of two images [3, H, W] over the pixels of `edge_mask(target)` that the mask [1, H, W], if any, keeps.
+
+    None where there are no such pixels.
+    """
+    edges = edge_mask(target)
+    if mask is not None:
+        edges &= mask[0] > 0
+    kept = None if mask is None else mask[:, edges]
+    return psnr(image[:, edges], target[:, edges], kept) if bool(edges.any()) else None
+
+
+class Measures:
+    """All metrics of one rendering; LPIPS of each kind whose weights are at hand."""
+
+    def __init__(self, device: str, lpips: Sequence[str] = ()) -> None:
+        """lpips: names of LPIPS_KINDS. Raises BenchError for another name."""
+        self.reasons: Dict[str, Optional[str]] = {}  # why a kind of LPIPS is absent; None where it is measured
+        self._networks: Dict[str, Distance] = {}
+        for kind in lpips:
+            if kind not in LPIPS_KINDS:
+                raise BenchError(f"lpips is {kind!r}; it must be one of {', '.join(LPIPS_KINDS)}")
+            try:
+                self._networks[kind] = lpips_network(kind, device)
+                self.reasons[kind] = None
+            except (ImportError, OSError, KeyError, ValueError, RuntimeError) as error:
+                said, *_ = f"{type(error).__name__}: {error}".splitlines()
+                variable = VARIABLES[net_of(kind)]
+                self.reasons[kind] = (f"${variable}: {said}" if os.environ.get(variable) else
+                                      f"no weights at hand: {said} (${variable} may name a file of them)")
+
+    def __call__(self, color: torch.Tensor, target: torch.Tensor,
+                 mask: Optional[torch.Tensor] = None) -> Dict[str, Optional[float]]:
+        """color: a rendering [3, H, W]; target: its ground truth in [0, 1].
+
+        mask: [1, H, W], the view's, if it has one; LPIPS is then that of both images times the mask.
+        """
+        png = quantised(color)
+        metrics: Dict[str, Optional[float]] = {**image_metrics(color, target, mask),
+                                               "psnr_edge": edge_psnr(png, target, mask)}
+        if mask is not None:
+            png, target = png * mask, target * mask
+        for kind, network in self._networks.items():
+            try:
+                metrics[kind] = distance = network(png, target)
+                if not math.isfinite(distance):
+                    raise ValueError(f"it is {distance}")
+            except (RuntimeError, ValueError) as error:  # an image too small for the strides, too large for the memory
+                metrics[kind] = None
+                self.reasons[kind] = f"{type(error).__name__}: {error}".splitlines()[0]
+        return metrics
+
+    def lpips_of(self, metrics: Dict[str, Optional[float]]) -> List[Dict[str, object]]:
+        """Each kind asked for, with its mean, or the reason why some view, and so the scene, has none."""
+        return [{"value": metrics.get(kind) if reason is None else None, "kind": kind, "reason": reason}
+                for kind, reason in self.reasons.items()]
+
+
+def headline_lpips(rows: Sequence[Dict[str, object]]) -> Dict[str, object]:
+    """The first kind that has a value, else the first."""
+    if not rows:
+        return {"value": None, "kind": None, "reason": "the suite asks for none"}
+    return next((row for row in rows if row["value"] is not None), rows[0])

@@ -1,0 +1,53 @@
+"""Ways to train and render a cell: the native trainer, and public trainers' checkouts by the shape of their commands.
+
+A method is a function of a cell and a folder that returns an `Outcome`.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Dict, List, Optional
+
+import torch
+
+from ....trainer.config import TrainConfig
+from ....trainer.evaluation import Evaluation
+from ....trainer.scene import Scene
+from ...errors import BenchError
+from ..names import NATIVE
+from ..protocol import BYTES_PER_GAUSSIAN
+
+
+@dataclass
+class Outcome:
+    """What a method leaves of a cell."""
+
+    scene: Scene
+    evaluation: Evaluation
+    lpips: List[Dict[str, Any]]  # a row {value, kind, reason} for each kind asked for
+    num_gaussians: int
+    own_bytes: Optional[int]  # in the method's own container
+    train_seconds: Optional[float]
+    peak_gpu_mib: Optional[float]
+    common_bytes_per_primitive: Optional[int] = BYTES_PER_GAUSSIAN  # None: it does not fit into the common container
+    commit: Optional[str] = None  # of the checkout
+    history: List[Dict[str, Any]] = field(default_factory=list)
+    renders: Dict[str, torch.Tensor] = field(default_factory=dict)  # [3, H, W] of the test views whose images are kept
+    notes: Dict[str, Any] = field(default_factory=dict)  # of the row's protocol: further or other entries
+
+
+def run(cell: Dict[str, Any], output: str) -> Outcome:
+    """Trains, renders and measures a cell in the folder `output`. Raises TrainerError."""
+    if cell["method"]["name"] == NATIVE:
+        from .native import run_native
+
+        return run_native(cell, output)
+    from .checkout import run_checkout
+
+    return run_checkout(cell, output)
+
+
+def require_test_views(scene: Scene, config: TrainConfig) -> Scene:
+    """The scene. Raises BenchError, before anything is trained, where there would be nothing to measure."""
+    if not scene.test:
+        raise BenchError(f"scene {config.scene} has no test views: nothing could be measured")
+    return scene

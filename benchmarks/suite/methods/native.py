@@ -1,0 +1,57 @@
+"""The native trainer as a method of the harness."""
+from __future__ import annotations
+
+import json
+import os
+from typing import Any, Dict, List
+
+import torch
+
+from ....trainer.checkpoint import CHECKPOINT_NAME
+from ....trainer.evaluation import evaluate
+from ....trainer.inspection import open_renderer
+from ....trainer.loop import HISTORY_NAME, train
+from ....trainer.modelfile import model_path
+from ....trainer.pictures import evenly_spaced
+from ....trainer.process import set_up_process
+from ....trainer.scene import load_scene
+from ..measure import Measures
+from ..protocol import config_of
+from . import Outcome, require_test_views
+
+
+def run_native(cell: Dict[str, Any], output: str) -> Outcome:
+    """Trains in output/run, continuing where an earlier attempt stopped, and measures. Raises TrainerError."""
+    folder = os.path.join(output, "run")
+    config = config_of(cell, folder)
+    set_up_process(config.device)
+    on_gpu = config.device == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats()
+    continued = os.path.isfile(os.path.join(folder, CHECKPOINT_NAME))
+    scene = require_test_views(load_scene(config, progress=False), config).to(config.device)
+    row = train(config, resume=True, progress=False, scene=scene)
+    # The peak of a part of the training would be taken for that of the whole.
+    peak = torch.cuda.max_memory_allocated() / 2**20 if on_gpu and not continued else None
+    measures = Measures(config.device, cell["protocol"]["lpips"])  # after the peak, of which its networks are no part
+    ply = model_path(folder, config.iterations)
+    renderer = open_renderer(config, ply, config.blend_mode, config.device)
+    evaluation = evaluate(renderer, scene.test, config.device, measure=measures)
+    renders = {}
+    with torch.no_grad():
+        for index in evenly_spaced(len(scene.test), cell["images"]):
+            camera = scene.test[index].camera
+            renders[camera.name] = renderer(camera).color.cpu()
+    return Outcome(scene=scene, evaluation=evaluation, lpips=measures.lpips_of(evaluation.metrics),
+                   num_gaussians=row["num_gaussians"], own_bytes=os.path.getsize(ply),
+                   train_seconds=row["train_seconds"], peak_gpu_mib=peak, history=_history(folder), renders=renders,
+                   notes={"continued": continued, "scale_recipe": cell["protocol"]["scale_recipe"],
+                          "background_gate": row["background_gate"]})
+
+
+def _history(folder: str) -> List[Dict[str, Any]]:
+    path = os.path.join(folder, HISTORY_NAME)
+    if not os.path.isfile(path):
+        return []
+    with open(path, encoding="utf-8") as file:
+        return json.load(file)

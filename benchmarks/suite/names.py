@@ -1,0 +1,37 @@
+"""The names of the methods and blends a suite may ask for; what methods are is in the modules beside this one."""
+from __future__ import annotations
+
+from typing import Any, Mapping
+
+NATIVE = "native"
+VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse
+# Of each public trainer, whether it can be patched to this package's rasterizer (patches/).
+CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
+             "2dgs": False, "dbs": False}
+WITHOUT_SCHEDULE = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
+COUNTED_BY = {"taming": "--budget", "dbs": "--cap_max"}  # they are given a number of primitives, and have no threshold
+NEEDS = {"dbs": "--cap_max"}  # an argument without which a method has no size
+# Options of the recipe that a trainer has no flag for, or whose flag does nothing or means something else in it.
+OF_3DGS_ALONE = ("antialiasing", "feature_lr", "percent_dense", "opacity_reset_interval")
+LACKS = {"3dgs-2023": ("antialiasing",), "3dgs-2024": (), "c3dgs": ("antialiasing",), "2dgs": ("antialiasing",),
+         "taming": ("antialiasing", "feature_lr"),  # it has a second rate for the higher SH bands
+         "dbs": OF_3DGS_ALONE,
+         **dict.fromkeys(("hac", "hac-plus"), (*OF_3DGS_ALONE, "sh_degree", "sh_degree_interval", "opacity_lr",
+                                               "rotation_lr", "densify_from_iter", "densify_until_iter",
+                                               "densification_interval"))}
+
+# Options of the native trainer that a suite may set: those of the recipe. The others have a field of their own.
+RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
+          "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
+          "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval")
+
+
+def blend_of(row: Mapping[str, Any]) -> str:
+    """The blend of a row or a cell: its mode, in `smoe` with its gate, such as "smoe 0.05" or "smoe learned".
+
+    "smoe" alone is gate 0, the paper's Eq. 7: that of rows that say none, which are older than the gate.
+    """
+    gate = row.get("background_gate") or 0
+    if row["blend_mode"] != "smoe" or gate == 0:
+        return row["blend_mode"]
+    return f"smoe {gate if isinstance(gate, str) else format(gate, 'g')}"

@@ -1,0 +1,122 @@
+"""The rules that make two rows comparable, as data: each row carries them.
+
+What the trainer already writes down (split, sizes, downscaler, background, metrics) comes from its `result_row`; here
+are the harness's own. A rule that a reader would have to know beforehand is a rule that is missing here.
+"""
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+from typing import Any, Dict, Optional
+
+from ...trainer.config import TrainConfig
+from ...trainer.environment import machine, versions
+from ...trainer.images import image_size, target_size
+from ...trainer.scene import read_layout
+from .measure import EDGE_RULE
+from .names import RECIPE
+
+COMMIT_VARIABLE = "DSMOE_COMMIT"  # says the project's commit where its files are no git checkout
+ROOT = str(Path(__file__).resolve().parents[2])  # of the sources, or of the installed package
+BYTES_PER_GAUSSIAN = 4 * 59  # float32 numbers: position 3, SH colours 48, opacity 1, scale 3, quaternion 4
+
+RULES = {
+    "quantisation": "headline figures on 8-bit images (clamped, rounded); psnr_float on floats clamped to [0, 1]",
+    "psnr": "squared error averaged over pixels and channels of one 8-bit image; mean over test views",
+    "psnr_edge": EDGE_RULE,
+    "lpips": {"lpips_vgg_inria": "VGG, images in [0, 1] as they are, which is what the code of 3DGS feeds",
+              "lpips_vgg_std": "VGG, images taken to [-1, 1], as LPIPS is defined",
+              "lpips_alex": "AlexNet, images taken to [-1, 1]"},
+    "fps": "1 / mean seconds per test view; synchronised before and after; the first views rendered once before; no "
+           "disk, no metrics",
+    "train_seconds": "the training loop, synchronised; without loading, evaluation and checkpoints",
+    "wall_seconds": "the whole cell: loading, training, rendering, measuring; not what an interrupted attempt took",
+    "size": "bytes; own: the method's own files; common: 59 float32 numbers for each Gaussian",
+    "num_gaussians": "Gaussians of the trained model; for HAC and HAC++ its anchors",
+    "peak_gpu_mib": "the most that torch's allocator held while training, ground truth included",
+}
+
+
+def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
+    """The cell as options of the native trainer, whose names are those of 3DGS. Raises ConfigError."""
+    protocol, scene = cell["protocol"], cell["scene"]
+    config = TrainConfig(
+        scene=scene["path"], output=output, blend_mode=cell["blend_mode"], background_gate=cell["background_gate"],
+        iterations=protocol["iterations"],
+        resolution=scene["resolution"], images=scene["images"], principal_point=protocol["principal_point"],
+        white_background=scene["background"] == "white", init_points=scene["init_points"],
+        schedule=cell["schedule"] or "3dgs", seed=cell["seed"], device=protocol["device"],
+        densify_grad_threshold=cell["densify_grad_threshold"], eval_every=protocol["evaluate_every"],
+        checkpoint_every=protocol["checkpoint_every"])
+    if protocol["scale_recipe"]:
+        config = config.shortened()
+    return config.changed(**protocol["options"])
+
+
+def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Dict[str, Any]:
+    """The protocol of a row of the native trainer; a checkout's notes replace what is otherwise there.
+
+    measured: the protocol that the trainer's `result_row` gives.
+    """
+    rules = {**RULES, "lpips": {row["kind"]: RULES["lpips"][row["kind"]] for row in lpips}}
+    return {**measured, **rules, "images": config.images, "downscaler": downscaler(config, measured["downscaler"]),
+            "sh_degree": config.sh_degree, "recipe": {name: getattr(config, name) for name in RECIPE},
+            "eval": "every test view of the split, none left out"}
+
+
+def downscaler(config: TrainConfig, name: str) -> str:
+    """How images came to their size: as the files are, or resized by the loader."""
+    layout = read_layout(config)
+    posed = (list(layout.test) or list(layout.train))[0]
+    supplied = image_size(posed.path)
+    if target_size(*supplied, config.resolution) == supplied:
+        return f"none: files of {config.images} as supplied"
+    return name
+
+
+def common_bytes(num_primitives: int, bytes_per_primitive: Optional[int] = BYTES_PER_GAUSSIAN) -> Optional[int]:
+    """Size in the container that all methods are compared in: float32 numbers of a 3DGS Gaussian of SH degree 3.
+
+    None for primitives that are no such Gaussians.
+    """
+    return None if bytes_per_primitive is None else num_primitives * bytes_per_primitive
+
+
+def machine_of(device: str) -> Dict[str, Any]:
+    """What a cell ran on."""
+    return {"device": machine(device), "versions": versions()}
+
+
+def project_commit() -> Optional[str]:
+    """The commit of this project's files, "+" behind it where they were changed since; None where nothing says it."""
+    return os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT) or _commit_of_the_build()
+
+
+def _commit_of_the_build() -> Optional[str]:
+    try:
+        from ..._build_info import COMMIT
+    except ImportError:
+        return None
+    return COMMIT
+
+
+def commit_of(folder: str) -> Optional[str]:
+    """The commit that a checkout is at, "+" behind it where tracked files were changed.
+
+    None without git, and for a folder inside of another checkout, whose commit says nothing about it.
+    """
+    top = _git(folder, "rev-parse", "--show-toplevel")
+    commit = _git(folder, "rev-parse", "HEAD")
+    if not top or not commit or os.path.realpath(top) != os.path.realpath(folder):
+        return None
+    return commit + ("+" if _git(folder, "status", "--porcelain", "--untracked-files=no") else "")
+
+
+def _git(folder: str, *words: str) -> Optional[str]:
+    try:
+        answer = subprocess.run(["git", "-C", folder, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                                check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return answer.stdout.decode().strip()

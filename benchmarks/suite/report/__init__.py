@@ -1,0 +1,193 @@
+"""What `dsmoe bench report` writes of a folder of results: tables, figures, survey rows and a page.
+
+groups.py averages rows; layouts.py says which tables there are and tables.py writes them; curves.py draws; sliders.py
+collects images; page.html, .css and .js are the page; survey.py writes rows for the compression survey. paper.json holds the paper's
+printed figures.
+"""
+from __future__ import annotations
+
+import base64
+import json
+import os
+import shutil
+import tempfile
+from typing import Any, Dict, List, NamedTuple, Sequence
+
+import jinja2
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
+
+from ....trainer.output_folder import make_folder
+from ..rows import CELLS_FOLDER, SUITE_NAME, ReportError, Row, read_rows
+from . import survey
+from .curves import Picture, draw_all
+from .groups import at_once, grouped, is_alone, safe_name, some
+from .layouts import commits, end_of, read_paper, tables_of
+from .sliders import ERROR_COLORS, ERROR_FULL_SCALE, collect
+from .tables import Table, to_csv, to_latex, to_markdown
+
+__all__ = ["ReportError", "report"]
+
+PAGE_NAME = "index.html"
+GENERATOR = "dsmoe bench report"  # written into the page, so that a later report knows it as its own
+PARTS = ("tables", "figures", "images", "survey", "report.md")  # of a report, beside its page
+MOST_ABSENT = 3  # cells without a row that are named
+NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
+                "continued", "arguments", "background_gate")  # of one cell, or said otherwise
+
+
+class Section(NamedTuple):
+    """What the page shows of one suite."""
+
+    suite: str
+    id: str  # in the page
+    counts: str
+    tables: List[Table]
+    pictures: List[Picture]
+    scenes: List[Dict[str, Any]]
+    no_images: str  # why, where there are no scenes
+    protocols: List[Dict[str, Any]]
+
+
+def report(results: str, output: str) -> str:
+    """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT.
+
+    OUTPUT/index.html, report.md, tables/, figures/, images/, survey/; an earlier report there is replaced once the new
+    one is whole. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged, where
+    rows cannot be compared or where OUTPUT has such files of someone else, TrainerError where nothing can be written
+    there.
+    """
+    rows = read_rows(results)
+    _refuse_files_of_others(output)
+    make_folder(output)
+    with tempfile.TemporaryDirectory(prefix=".report-", dir=output) as made:
+        sections = [_section(results, suite, [row for row in rows if row["suite"] == suite], made)
+                    for suite in sorted({row["suite"] for row in rows})]
+        _write(made, "report.md", _markdown(sections))
+        _write(made, PAGE_NAME, _page(sections, commits(rows)))
+        for name in (PAGE_NAME, *PARTS):  # the page first: it says that the others are a report's
+            _replace(os.path.join(made, name), os.path.join(output, name))
+    return os.path.join(output, PAGE_NAME)
+
+
+def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Section:
+    """Writes what a report has of one suite, but for its part of the page."""
+    paper = read_paper()
+    tables = tables_of(suite, rows, paper)
+    for table in tables:
+        for form, text in (("md", to_markdown(table)), ("csv", to_csv(table)), ("tex", to_latex(table))):
+            _write(output, os.path.join("tables", f"{table.name}.{form}"), text)
+    pictures = draw_all(suite, grouped(rows, end_of), os.path.join(output, "figures"))
+    scenes = collect(results, suite, rows, output)
+    survey.write_survey(rows, paper["datasets"], os.path.join(output, "survey", safe_name(suite)))
+    here = any(os.path.isdir(os.path.join(results, CELLS_FOLDER, row["cell"])) for row in rows)
+    no_images = "No images: the suite asked for none." if here else "No images: rows of another folder."
+    return Section(suite, safe_name(suite), _counts(rows) + _absent(results, suite, rows), tables, pictures, scenes,
+                   no_images, _protocols(rows))
+
+
+def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
+    """The static page: figures inside it and images beside it; it needs no network."""
+    def data_url(path: str) -> str:
+        with open(path, "rb") as file:
+            return "data:image/svg+xml;base64," + base64.b64encode(file.read()).decode("ascii")
+
+    folder = os.path.dirname(os.path.abspath(__file__))
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True, trim_blocks=True,
+                                     lstrip_blocks=True, keep_trailing_newline=True,
+                                     undefined=jinja2.StrictUndefined)
+    environment.filters["data_url"] = data_url
+    scale = ", ".join(to_hex(colormaps[ERROR_COLORS](step / 8)) for step in range(9))
+    return environment.get_template("page.html").render(
+        generator=GENERATOR, sections=sections, commits=measured_with, error_scale=scale,
+        error_full=f"{ERROR_FULL_SCALE:g}")
+
+
+def _refuse_files_of_others(output: str) -> None:
+    page = os.path.join(output, PAGE_NAME)
+    if os.path.isfile(page):
+        with open(page, encoding="utf-8", errors="replace") as file:
+            if f'content="{GENERATOR}"' not in file.read():
+                raise ReportError(f"{page} is no report; name another folder")
+        return
+    for name in PARTS:
+        if os.path.exists(os.path.join(output, name)):
+            raise ReportError(f"{os.path.join(output, name)} is of no report; name another folder")
+
+
+def _replace(new: str, old: str) -> None:
+    """Puts a file or folder in the place of an earlier one; where there is no new one, the place is empty then."""
+    if os.path.isdir(old) and not os.path.islink(old):
+        shutil.rmtree(old)
+    elif os.path.lexists(old):
+        os.remove(old)
+    if os.path.exists(new):
+        os.replace(new, old)
+
+
+def _markdown(sections: Sequence[Section]) -> str:
+    """All tables and figures as one page for code hosts."""
+    parts = ["# Benchmark report\n"]
+    for section in sections:
+        parts.append(f"## {section.suite}\n\n{section.counts}.\n")
+        parts += map(to_markdown, section.tables)
+        parts += [f"![{picture.alt}](figures/{picture.name}.png)\n" for picture in section.pictures]
+    return "\n".join(parts)
+
+
+def _write(folder: str, name: str, text: str) -> None:
+    path = os.path.join(folder, name)
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    with open(path, "w", encoding="utf-8") as file:
+        file.write(text)
+
+
+def _counts(rows: Sequence[Row]) -> str:
+    failed = sum(not row["ok"] for row in rows)
+    numbers = [_number(len({row[of] for row in rows}), of) for of in ("cell", "scene", "seed")]
+    return "{} on {}, {}; {} failed".format(*numbers, failed or "none")
+
+
+def _number(count: int, of: str) -> str:
+    return f"{count} {of}" if count == 1 else f"{count} {of}s"
+
+
+def _absent(results: str, suite: str, rows: Sequence[Row]) -> str:
+    """Which cells of the suite have no row yet, where RESULTS is a folder that lists its cells."""
+    try:
+        with open(os.path.join(results, SUITE_NAME), encoding="utf-8") as file:
+            said = json.load(file)
+        cells = said["cells"] if said["name"] == suite else []
+        absent = sorted(set(cells) - {row["cell"] for row in rows})
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    if not absent:
+        return ""
+    return f"; {len(absent)} of {_number(len(cells), 'cell')} {'has' if len(absent) == 1 else 'have'} no row yet: " \
+           f"{some(absent, MOST_ABSENT)}"
+
+
+def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
+    """Of every scene: what its rows say of their protocol, once."""
+    measured = [row for row in rows if row["ok"]]
+    found = []
+    for scene in sorted({row["scene"] for row in measured}):
+        here, rules = [row for row in measured if row["scene"] == scene], {}
+        for row in here:
+            said = {name: value for name, value in (row.get("protocol") or {}).items() if name not in NOT_PROTOCOL}
+            said.update(iterations=row.get("iterations"), schedules=row.get("schedule") or "the method's own")
+            for name, value in said.items():
+                values = rules.setdefault(name.replace("_", " "), [])
+                if value is not None and _plain(name, value) not in values:
+                    values.append(_plain(name, value))
+        beside = [at_once(row) for row in here if not is_alone(row)]
+        if beside:
+            rules["cells that shared their GPU or CPU"] = [f"{len(beside)} of {len(here)}, up to {max(beside)} at once"]
+        found.append({"scene": scene, "rules": {name: "; ".join(values) for name, values in sorted(rules.items())}})
+    return found
+
+
+def _plain(name: str, value: Any) -> str:
+    if name == "image_size" and isinstance(value, list):
+        return "×".join(map(str, value))
+    return "; ".join(f"{key}: {entry}" for key, entry in value.items()) if isinstance(value, dict) else str(value)

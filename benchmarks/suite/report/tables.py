@@ -1,0 +1,166 @@
+"""A table of labels and figures, and its forms: Markdown, LaTeX, CSV."""
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+from typing import Dict, List, NamedTuple, Optional, Tuple
+
+from .groups import LPIPS, Measured
+
+DASH = "–"
+OURS, PAPER = "ours", "paper"
+# How a figure is headed and with how many digits it is printed.
+FIGURES: Dict[str, Tuple[str, int]] = {
+    "seeds": ("seeds", 0), "psnr": ("PSNR [dB]", 2), "psnr_float": ("PSNR, floats [dB]", 2),
+    "psnr_edge": ("PSNR at edges [dB]", 2), "ssim": ("SSIM", 3), "num_gaussians": ("#Gaussians", 0),
+    "num_gaussians_m": ("#G [M]", 3), "size_own_mb": ("own size [MB]", 1), "size_common_mb": ("common size [MB]", 1),
+    "train_seconds": ("train [s]", 0), "wall_seconds": ("wall [s]", 0), "fps": ("FPS", 0),
+    "peak_gpu_mib": ("GPU peak [MiB]", 0), "learned_gate": ("learned gate", 3),
+}
+LPIPS_NAMES = {"lpips_alex": "LPIPS Alex", "lpips_vgg_std": "LPIPS VGG", "lpips_vgg_inria": "LPIPS VGG as 3DGS",
+               "paper": "LPIPS, paper's"}
+
+
+class Column(NamedTuple):
+    """A column of figures; columns of one group stand under one heading."""
+
+    name: str
+    digits: int
+    group: str = ""
+    signed: bool = False
+
+    @property
+    def full_name(self) -> str:
+        return f"{self.group} {self.name}".strip()
+
+
+class Cell(NamedTuple):
+    """A figure with its spread, or a text in its place; printed: as the paper prints it."""
+
+    value: Optional[float] = None
+    spread: Optional[float] = None
+    text: str = ""
+    printed: str = ""
+
+    def shown(self, column: Column, plus_minus: str = " ± ") -> str:
+        if self.printed:
+            return self.printed
+        if self.value is None:
+            return self.text or DASH
+        value = round(self.value, column.digits) + 0.0  # no "-0.00"
+        spread = "" if self.spread is None else f"{plus_minus}{self.spread:,.{column.digits}f}"
+        return f"{value:{'+' if column.signed and value else ''},.{column.digits}f}{spread}"
+
+    def unrounded(self) -> str:
+        """The number, a whole one without ".0"; the text in its place."""
+        if self.printed or self.value is None:
+            return self.printed or self.text
+        return str(int(self.value)) if float(self.value).is_integer() else repr(self.value)
+
+
+class TableRow(NamedTuple):
+    """Labels, then one cell for each column; source: OURS, or PAPER for figures that are the paper's."""
+
+    labels: Tuple[str, ...]
+    cells: Tuple[Cell, ...]
+    source: str = OURS
+
+
+class Table(NamedTuple):
+    """labels: the headings of the first columns."""
+
+    name: str  # of its files
+    title: str
+    labels: Tuple[str, ...]
+    columns: Tuple[Column, ...]
+    rows: Tuple[TableRow, ...]
+    notes: Tuple[str, ...] = ()
+
+    def headings(self) -> List[Tuple[str, int]]:
+        """The groups of columns, each with its number of columns."""
+        groups = itertools.groupby(self.columns, key=lambda column: column.group)
+        return [(group, len(list(columns))) for group, columns in groups]
+
+    def lines(self, plus_minus: str = " ± ") -> List[List[str]]:
+        """The words of each row: source, labels, figures as they are shown."""
+        return [[row.source, *row.labels, *(cell.shown(column, plus_minus) for cell, column in
+                                            zip(row.cells, self.columns))] for row in self.rows]
+
+
+def column(name: str, group: str = "", difference: bool = False) -> Column:
+    """The column of a figure, or of its differences."""
+    heading, digits = (LPIPS_NAMES.get(name[len(LPIPS):], name), 3) if name.startswith(LPIPS) else FIGURES[name]
+    return Column("Δ " + heading if difference else heading, digits, group, difference)
+
+
+def cell(figure: Measured) -> Cell:
+    """A measured figure as a cell."""
+    return Cell(figure.mean, figure.spread, figure.why)
+
+
+def printed(text: str) -> Cell:
+    """One of the paper's figures, as printed there."""
+    return Cell(float(text), printed="0" + text if text.startswith(".") else text)
+
+
+def without_empty_columns(table: Table) -> Table:
+    """The table without the columns that no row has anything in."""
+    kept = [any(row.cells[index].value is not None or row.cells[index].text for row in table.rows)
+            for index in range(len(table.columns))]
+    return table._replace(columns=tuple(itertools.compress(table.columns, kept)),
+                          rows=tuple(row._replace(cells=tuple(itertools.compress(row.cells, kept)))
+                                     for row in table.rows))
+
+
+def to_markdown(table: Table) -> str:
+    """A heading, a Markdown table, then the notes as a list."""
+    head = ["source", *table.labels, *(column.full_name for column in table.columns)]
+    rule = ["---"] * (1 + len(table.labels)) + ["---:"] * len(table.columns)
+    lines = ["| " + " | ".join(text.replace("|", "\\|").replace("\n", " ") for text in line) + " |"
+             for line in [head, rule, *table.lines()]]
+    return "\n".join([f"### {table.title}", "", *lines, *[""] * bool(table.notes),
+                      *(f"- {note}" for note in table.notes), ""])
+
+
+PLUS_MINUS = r" $\pm$ "
+SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--", "−": "$-$",
+           "×": r"$\times$", "Δ": r"$\Delta$", "≥": r"$\geq$", "\n": " ",
+           **{sign: "\\" + sign for sign in "&%$#_{}"}}
+
+
+def to_latex(table: Table) -> str:
+    """A table for booktabs; the paper's rows are in italics and marked."""
+    lines = [r"\begin{table}", r"\centering", rf"\caption{{{_escaped(table.title)}}}",
+             rf"\begin{{tabular}}{{l{'l' * len(table.labels)}{'r' * len(table.columns)}}}", r"\toprule"]
+    if any(column.group for column in table.columns):
+        spans = [f"\\multicolumn{{{width}}}{{c}}{{{_escaped(group)}}}" for group, width in table.headings()]
+        lines.append(" & ".join([""] * (1 + len(table.labels)) + spans) + r" \\")
+    head = ["source", *table.labels, *(column.name for column in table.columns)]
+    lines += [" & ".join(map(_escaped, head)) + r" \\", r"\midrule"]
+    for row, before, texts in zip(table.rows, (None, *table.rows), table.lines(PLUS_MINUS)):
+        if before and row.labels[0] != before.labels[0]:
+            lines.append(r"\midrule")
+        command = r"\textit{%s}" if row.source == PAPER else "%s"
+        lines.append(" & ".join(command % _escaped(text) for text in texts) + r" \\")
+    lines += [r"\bottomrule", r"\end{tabular}", *(rf"\par\footnotesize {_escaped(note)}" for note in table.notes)]
+    return "\n".join([*lines, r"\end{table}", ""])
+
+
+def _escaped(text: str) -> str:
+    """For LaTeX; a plus-minus in mathematics is left as it is."""
+    return PLUS_MINUS.join("".join(SPECIAL.get(letter, letter) for letter in part) for part in text.split(PLUS_MINUS))
+
+
+def to_csv(table: Table) -> str:
+    """Figures unrounded, ours with a column of their spread wherever a row has one."""
+    spread = [any(row.cells[index].spread is not None for row in table.rows) for index in range(len(table.columns))]
+    names = [[name.full_name, f"{name.full_name} sd"][:1 + wide] for name, wide in zip(table.columns, spread)]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["source", *table.labels, *itertools.chain(*names)])
+    for row in table.rows:
+        figures = [[cell.unrounded(), "" if cell.spread is None else repr(cell.spread)][:1 + wide]
+                   for cell, wide in zip(row.cells, spread)]
+        writer.writerow([row.source, *row.labels, *itertools.chain(*figures)])
+    return text.getvalue()

@@ -1,0 +1,153 @@
+"""Rows, and the folder RESULTS in which they lie: engine.py and cell.py write it, the report reads it.
+
+The Snakefile, which Snakemake reads as a file of its own, repeats the names.
+"""
+from __future__ import annotations
+
+import json
+import math
+import os
+from typing import Any, Dict, Iterable, Iterator, List, Optional, Tuple, Type
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
+from typing_extensions import Annotated
+
+from ...trainer.config import LEARNED
+from ..errors import BenchError
+from .schema import first_mistake, must
+
+ROWS_NAME = "rows.jsonl"  # all rows, one a line
+CELLS_FOLDER = "cells"  # a folder for each cell, by its name
+CELL_NAME = "cell.json"  # in it: what is trained on what
+ROW_NAME = "row.json"  # in it too: what came out
+SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its cells, run or not
+
+Row = Dict[str, Any]
+
+LARGEST = 1e18  # of a number that is a figure
+FINITE = "it must be a finite number"
+Number = Annotated[float, must(lambda value: abs(value) < LARGEST, FINITE)]  # NaN is not smaller either
+Decibels = Annotated[float, must(lambda value: abs(value) < LARGEST or value == math.inf, FINITE)]
+Gate = Annotated[Any, must(lambda value: value in (None, LEARNED) or (
+    type(value) in (int, float) and abs(value) < LARGEST), f"{FINITE} or {LEARNED!r}")]
+# What two rows of one scene must share to be comparable, where both say it.
+RULES = ("split", "train_views", "test_views", "resolution", "image_size", "downscaler", "background",
+         "principal_point", "sh_degree", "recipe", "scale_recipe")
+RULE_PREFIXES = ("psnr", "ssim", "lpips", "edge", "fps", "size", "quantisation")
+
+
+class ReportError(BenchError):
+    """Rows cannot be reported; the text says which and why."""
+
+
+class Part(BaseModel):
+    """What is read of an object; it may have other fields too."""
+
+    model_config = ConfigDict(strict=True)
+
+
+def _may_be(kind: Any, *names: str) -> Dict[str, Any]:
+    return dict.fromkeys(names, (Optional[kind], None))
+
+
+Lpips = create_model("Lpips", __base__=Part, **_may_be(str, "kind"), **_may_be(Number, "value"))
+Size = create_model("Size", __base__=Part, **_may_be(Number, "own", "common"))
+Machine = create_model("Machine", __base__=Part, **_may_be(str, "device"),
+                       **_may_be(int, "cells_per_gpu", "cells_at_once"))
+RowFile = create_model(  # older rows have fewer fields
+    "RowFile", __base__=Part, cell=(str, ...), suite=(str, ...), ok=(bool, ...), method=(str, ...),
+    blend_mode=(str, ...), scene=(str, ...), seed=(int, ...),
+    **_may_be(str, "label", "variant", "schedule", "dataset", "end", "reason"), **_may_be(int, "budget", "iterations"),
+    **_may_be(Gate, "background_gate"), **_may_be(Decibels, "psnr", "psnr_float", "psnr_edge"),
+    **_may_be(Number, "densify_grad_threshold", "ssim", "num_gaussians", "train_seconds", "wall_seconds", "fps",
+              "peak_gpu_mib"),
+    **_may_be(Dict[str, Any], "protocol", "commit"), **_may_be(Size, "size_bytes"), **_may_be(Machine, "machine"),
+    **_may_be(Lpips, "lpips"), **_may_be(List[Optional[Lpips]], "lpips_all"))
+CellRow = create_model(  # of `dsmoe bench run`: it says all that its cell's name says
+    "CellRow", __base__=RowFile, label=(str, ...), variant=(str, ...), schedule=(Optional[str], ...),
+    densify_grad_threshold=(Number, ...), iterations=(int, ...))
+CellFile = create_model("CellFile", __base__=Part, suite=(str, ...),
+                        **dict.fromkeys(("protocol", "scene", "method"), (Dict[str, Any], ...)))
+
+
+def read_object(path: str, model: Type[Any] = dict) -> Optional[Dict[str, Any]]:
+    """The object of a .json file; None where there is no file. Raises BenchError where it is damaged."""
+    if not os.path.isfile(path):
+        return None
+    try:
+        return checked(_text(path), path, model)
+    except BenchError as error:
+        raise BenchError(f"{error}; remove it to have it made anew") from error
+
+
+def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
+    """The object that a text in json is, of which all that is read has its type. Raises ReportError.
+
+    place: where the text stands, in words.
+    """
+    try:
+        found = json.loads(text)
+    except ValueError as error:
+        raise ReportError(f"{place}: not valid json, as `dsmoe bench run` writes it ({error})") from error
+    if not isinstance(found, dict):
+        raise ReportError(f"{place}: expected one object, as `dsmoe bench run` writes it")
+    try:
+        TypeAdapter(model).validate_python(found)
+    except ValidationError as error:
+        lacking = [str(one["loc"][0]) for one in error.errors() if one["type"] == "missing"]
+        if lacking:
+            raise ReportError(f"{place}: the row lacks {', '.join(lacking)}, which those of `dsmoe bench run` "
+                              "have") from error
+        raise ReportError("{}: {} {}".format(place, *first_mistake(error))) from error
+    return found
+
+
+def read_rows(results: str) -> List[Row]:
+    """The rows of a results folder (cells/*/row.json and rows.jsonl) or of one .jsonl file, sorted by cell.
+
+    A cell's own row.json wins over rows.jsonl, and there the last line of a cell. Raises ReportError where there are
+    none, where one is damaged, or where a suite mixes protocols.
+    """
+    listed = results if os.path.isfile(results) else os.path.join(results, ROWS_NAME)
+    lines = _text(listed).split("\n") if os.path.isfile(listed) else []
+    found = [checked(line, f"{listed}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
+    paths = (os.path.join(results, CELLS_FOLDER, name, ROW_NAME) for name in cell_folders(results))
+    found += [checked(_text(path), path) for path in paths if os.path.isfile(path)]
+    if not found:
+        raise ReportError(f"{results}: no rows: neither {CELLS_FOLDER}/*/{ROW_NAME} nor {ROWS_NAME}")
+    rows = {row["cell"]: row for row in found}
+    _refuse_mixed_protocols(rows[name] for name in sorted(rows))
+    return [rows[name] for name in sorted(rows)]
+
+
+def cell_folders(results: str) -> List[str]:
+    """The names in RESULTS/cells."""
+    folder = os.path.join(results, CELLS_FOLDER)
+    return sorted(os.listdir(folder)) if os.path.isdir(folder) else []
+
+
+def _text(path: str) -> str:
+    try:
+        with open(path, encoding="utf-8") as file:
+            return file.read()
+    except UnicodeDecodeError as error:
+        raise ReportError(f"{path}: not text in UTF-8 ({error})") from error
+
+
+def _refuse_mixed_protocols(rows: Iterable[Row]) -> None:
+    first: Dict[Tuple[str, str, str], Tuple[Any, str]] = {}
+    for row in rows:
+        for name, value in _rules(row) if row["ok"] else ():
+            known, cell = first.setdefault((row["suite"], row["scene"], name), (value, row["cell"]))
+            if known != value:
+                raise ReportError(f"suite {row['suite']}, scene {row['scene']}: cells of different protocols stand "
+                                  f"in no common table: {name} is {known!r} in {cell} and {value!r} in {row['cell']}")
+
+
+def _rules(row: Row) -> Iterator[Tuple[str, Any]]:
+    """(name, value) of each rule that the row states; the entries of one that is a dict stand alone."""
+    for name, value in (row.get("protocol") or {}).items():
+        if name in RULES or name.startswith(RULE_PREFIXES):
+            entries = {f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict) else {
+                name: value}
+            yield from ((key, entry) for key, entry in entries.items() if entry is not None)
