@@ -3,6 +3,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <vector>
@@ -100,6 +101,36 @@ TEST(ForEachTileRow, VisitsTheTileOfEveryPixelThatCounts) {
   // In float the exponent of a needle carries the rounding of its short axis: beyond some thousand pixels of length
   // that exceeds the slack.
   expect_every_pixel_that_counts_is_in_a_visited_tile<float>(random_ellipses(1500, 1000, 1000));
+}
+
+// Conics of needles whose float entries have a determinant of 0 or less: which pixels count is known, in double.
+TEST(ForEachTileRow, VisitsTheTileOfEveryPixelWhereTheDeterminantIsLost) {
+  const TileGrid grid(kWidth, kHeight);
+  Random random(9);
+  int needles = 0, rows = 0;
+  for (int i = 0; i < 400; ++i) {
+    const Vec2<double> mean = {kWidth * random.uniform(0, 1), kHeight * random.uniform(0, 1)};
+    const Ellipse e =
+        make_ellipse(random.log_uniform(2e3, 1e5), 0.55, random.uniform(0, 3.2), mean, random.uniform(1, 23.03));
+    const auto conic = narrowed<float>(e.conic);
+    const double xx = conic.xx, xy = conic.xy, yy = conic.yy;
+    if (xx * yy - xy * xy > 0) continue;
+    ++needles;
+    const auto visited = visited_tiles<float>(e, {0, 0, grid.columns, grid.rows}, grid);
+    int first = kHeight, last = -1;
+    for (int y = 0; y < kHeight; ++y) {
+      for (int x = 0; x < kWidth; ++x) {
+        const double dx = x - double(float(mean.x)), dy = y - double(float(mean.y));
+        if (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy > e.reach) continue;
+        first = std::min(first, y / kTileSize), last = std::max(last, y / kTileSize);
+        ASSERT_TRUE(visited[y / kTileSize * grid.columns + x / kTileSize])
+            << "needle " << i << " pixel " << x << ", " << y;
+      }
+    }
+    rows += last > first;
+  }
+  EXPECT_GT(needles, 50);
+  EXPECT_GT(rows, 50) << "needles that reach more than one row of tiles";
 }
 
 TEST(ForEachTileRow, VisitsOnlyTilesThatTheEllipseMeets) {

@@ -50,7 +50,8 @@ template <class S> class EllipseBand {
     reach_ = squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack);
     determinant_ = difference_of_products(conic.xx, conic.yy, conic.xy, conic.xy);
     inverse_xx_ = rough_reciprocal(conic.xx);
-    const S scale = max(S(0), reach_ * rough_reciprocal(determinant_));
+    // The conic of a long needle may round to a determinant of 0 or less. Then its pairs fill a strip without end.
+    const S scale = determinant_ > S(0) ? max(S(0), reach_ * rough_reciprocal(determinant_)) : S(INFINITY);
     v_extent_ = rough_sqrt(scale * conic.xx);
     // v where u is largest: on the line conic.xy u + conic.yy v = 0.
     v_at_u_extent_ = -conic.xy * rough_reciprocal(conic.yy) * rough_sqrt(scale * conic.yy);
