@@ -261,7 +261,7 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
 template <BlendMode kMode, class S, int kFeatures>
 __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
                                                       int segment, BackwardPixels<S, kFeatures>& pixels) {
-  WalkRange range = {0, tile.length};
+  WalkRange range = {0, tile.source.length};
   if (Blend<kMode>::kStopsEarly) {
     int32_t seen = 0;
     for (int k = 0; k < kLanePixels; ++k) seen = seen > pixels.last[k] ? seen : pixels.last[k];

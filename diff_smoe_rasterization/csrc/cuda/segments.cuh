@@ -24,7 +24,7 @@ template <class S> struct alignas(4 * sizeof(S)) SegmentPixel {
 // The lane's pixel k in a segment of its tile, the first segment aside.
 template <class S>
 __device__ SegmentPixel<S>& segment_pixel(const SavedForward<S>& saved, const WarpTile<S>& tile, int segment, int k) {
-  const int64_t row = tile.begin / kSegmentLength + segment;
+  const int64_t row = tile.source.begin / kSegmentLength + segment;
   const int pixel = (tile.quarter * kLanePixels + k) * kWarp + tile.lane;
   return reinterpret_cast<SegmentPixel<S>*>(saved.segments)[row * (kTileSize * kTileSize) + pixel];
 }
@@ -34,7 +34,7 @@ template <class S, int kFeatures>
 constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && kFeatures == kSegmentFeatures;
 
 template <class S> __device__ bool has_segments(const SavedForward<S>& saved, const WarpTile<S>& tile) {
-  return saved.segments != nullptr && tile.listed && tile.length > kSegmentLength;
+  return saved.segments != nullptr && tile.source.listed && tile.source.length > kSegmentLength;
 }
 
 // The segments that some pixel of a warp has reached, in no order. Entry 0 counts those behind it.
