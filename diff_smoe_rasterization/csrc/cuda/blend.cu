@@ -7,7 +7,7 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// Notes the pixels' state where a segment begins, and that the backward pass has something to do there.
+// Notes the state of the pixels where a segment begins, and queues the segment for the backward pass.
 template <class S, int kSums>
 __device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
                               const PixelState<S> (&state)[kLanePixels], const S (&sums)[kLanePixels][kSums]) {
@@ -22,7 +22,7 @@ __device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile
   }
 }
 
-// At the end of the list: from the sums in front of each segment to those behind.
+// Called at the end of the list: turns the sums in front of each segment into the sums from there to the end.
 template <class S, int kSums>
 __device__ void end_segments(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int last,
                              const S (&sums)[kLanePixels][kSums]) {

@@ -40,7 +40,7 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Hands the sums of the first `count` Gaussians of a batch on.
+// Sums a batch by tensor cores, and gives the sums of its first `count` Gaussians to the sink.
 template <class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
                           const TensorBasis& basis, int count) {
@@ -58,7 +58,8 @@ __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const T
   });
 }
 
-// Sums `values` over the warp, and hands the first `wanted` sums on, as numbers `first`, first + 1, ... of a Gaussian.
+// Sums `values` over the warp, and gives the first `wanted` sums to the sink: numbers `first`, first + 1, ... of the
+// Gaussian's record.
 template <class S, int kCount, class Sink>
 __device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values)[kCount], int32_t gaussian,
                            int32_t position, int first, int wanted) {
@@ -68,7 +69,7 @@ __device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values
   sink.to_record(tile, gaussian, position, sink.length, [&](auto add) { add(first + sum.number, values[0]); });
 }
 
-// The six moments of a lane's pixels, one below the other.
+// Sums the six moments over a lane's pixels, which lie one below the other.
 template <class S> __device__ void column_moments(const S (&dL_dpower)[kLanePixels], S dx, S dy, S* moments) {
   S one = S(0), y = S(0), yy = S(0);
 #pragma unroll
@@ -96,7 +97,7 @@ struct TensorShare {
   const TensorBasis& moment_basis;  // the block's
 };
 
-// Back to front: of each Gaussian the moments of dL/dpower and the gradients of its features.
+// Walks back to front, and sums for each Gaussian the moments of dL/dpower and the gradients of its features.
 template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kReadsIndices = true;
@@ -204,8 +205,8 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
   int batch;  // Gaussians that wait in the tensor stage
 };
 
-// The gradients that a warp's pixels start with, before any pair. Also writes the warp's row of the background's
-// gradients, where they are wanted: once, in the first segment of the list.
+// Sets what a warp's pixels start with, before any pair. Where the background's gradients are wanted, it also writes
+// the warp's row of them; the warp of the list's first segment does that.
 template <BlendMode kMode, class S, int kFeatures>
 __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
                                              const WarpSegment& place, BackwardPixels<S, kFeatures>& pixels) {
@@ -255,9 +256,8 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
   }
 }
 
-// The part of the list that a warp walks: up to the last pair that some pixel has taken, and of a list with segments
-// only the warp's own. Empty where nothing is left there. Where another segment follows, the pixels continue in front
-// of it.
+// Returns the part of the list that a warp walks: up to the last pair that some pixel has taken, and in a list with
+// segments only its own one. The part may be empty. Where another segment lies behind, the pixels get its state.
 template <BlendMode kMode, class S, int kFeatures>
 __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
                                                       int segment, BackwardPixels<S, kFeatures>& pixels) {
@@ -349,7 +349,7 @@ template <class S> __global__ void store_outgrown_kernel(const __grid_constant__
   if (at < arguments.size) arguments.records[at] = arguments.sink.sum(at);
 }
 
-// Where the instances outgrew their memory, fills the records by walks over all Gaussians; does nothing elsewhere.
+// Where the instances outgrew their memory, this fills the records by walks over all Gaussians. Else it does nothing.
 template <class S>
 void backward_outgrown(const BackwardWork<S, RecordSink<S>>& work, Scratch& scratch, cudaStream_t stream) {
   BackwardWork<S, OutgrownSink<S>> outgrown = {};

@@ -54,8 +54,7 @@ DSMOE_HD GaussianGradients<S> gradients_of(const GaussianGradients<S>& g, int nu
   return out;
 }
 
-// Whether the instances did not fit their memory: then the tile lists are empty, and the depth order serves as the list
-// of every tile.
+// Whether the instances did not fit their memory. Then no tile list is read; the depth order is the list of every tile.
 template <class S> __device__ bool overflows(const SavedForward<S>& saved) {
   return *saved.num_instances > saved.capacity;
 }
