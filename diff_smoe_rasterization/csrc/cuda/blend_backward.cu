@@ -18,7 +18,7 @@ template <class S> struct BackwardArguments : BlendArguments<S> {
   int tiles;                     // of the image
 };
 
-template <class S, class Sink> struct BackwardWork : BackwardArguments<S> {
+template <class S, class Sink> struct BackwardWithSink : BackwardArguments<S> {
   Sink sink;  // where each warp's sums go
 };
 
@@ -290,7 +290,7 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
 template <class S, BlendMode kMode, int kFeatures, class Sink>
 __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks
                                                                                           : kGeneralBackwardBlocks)
-    blend_backward_kernel(const __grid_constant__ BackwardWork<S, Sink> arguments) {
+    blend_backward_kernel(const __grid_constant__ BackwardWithSink<S, Sink> arguments) {
   using Visitor = BackwardVisitor<S, kMode, kFeatures, Sink>;
   __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
   __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
@@ -328,10 +328,10 @@ template <class S> S* allocate_scaled(const BackwardArguments<S>& arguments, Scr
 }
 
 template <class S, int kFeatures, class Sink>
-void launch_backward(const BackwardWork<S, Sink>& work, int64_t blocks, cudaStream_t stream) {
-  dispatch_blend(work.config.mode, kFeatures, [&](auto mode, auto) {
+void launch_backward(const BackwardWithSink<S, Sink>& arguments, int64_t blocks, cudaStream_t stream) {
+  dispatch_blend(arguments.config.mode, kFeatures, [&](auto mode, auto) {
     blend_backward_kernel<S, decltype(mode)::value, kFeatures>
-        <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(work);
+        <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("blend_backward");
   });
 }
@@ -351,26 +351,30 @@ template <class S> __global__ void store_outgrown_kernel(const __grid_constant__
 
 // Where the instances outgrew their memory, this fills the records by walks over all Gaussians. Else it does nothing.
 template <class S>
-void backward_outgrown(const BackwardWork<S, RecordSink<S>>& work, Scratch& scratch, cudaStream_t stream) {
-  BackwardWork<S, OutgrownSink<S>> outgrown = {};
-  static_cast<BackwardArguments<S>&>(outgrown) = work;
+void backward_outgrown(const BackwardWithSink<S, RecordSink<S>>& arguments, Scratch& scratch, cudaStream_t stream) {
+  BackwardWithSink<S, OutgrownSink<S>> outgrown = {};
+  static_cast<BackwardArguments<S>&>(outgrown) = arguments;
   outgrown.dL_dbackground_rows = nullptr;  // the usual kernel has written them
-  if (outgrown.scaled == nullptr) outgrown.scaled = allocate_scaled(work, scratch);
-  const int64_t size = work.num_gaussians * work.sink.length;
+  if (outgrown.scaled == nullptr) outgrown.scaled = allocate_scaled(arguments, scratch);
+  const int64_t size = arguments.num_gaussians * arguments.sink.length;
   OutgrownSink<S>& sink = outgrown.sink;
   sink.exponents = allocate<int32_t>(scratch, size);
   sink.sums = allocate<unsigned long long>(scratch, size);
-  sink.length = work.sink.length;
+  sink.length = arguments.sink.length;
   sink.term_bits = 62;
-  for (int64_t warps = int64_t(work.tiles) * kWarpsPerTile; warps > 0; warps /= 2) --sink.term_bits;
+  for (int64_t warps = int64_t(arguments.tiles) * kWarpsPerTile; warps > 0; warps /= 2) --sink.term_bits;
   check(cudaMemsetAsync(sink.exponents, 0, size * sizeof(*sink.exponents), stream), "clearing gradients");
   check(cudaMemsetAsync(sink.sums, 0, size * sizeof(*sink.sums), stream), "clearing gradients");
   for (const bool measures : {true, false}) {
     sink.measures = measures;
-    launch_backward<S, kAnyFeatures>(outgrown, work.tiles, stream);
+    launch_backward<S, kAnyFeatures>(outgrown, arguments.tiles, stream);
     outgrown.pairs = nullptr;  // counted once
   }
-  OutgrownRecords<S> stored = {size, work.saved, sink, work.sink.records};
+  OutgrownRecords<S> stored = {};
+  stored.size = size;
+  stored.saved = arguments.saved;
+  stored.sink = sink;
+  stored.records = arguments.sink.records;
   store_outgrown_kernel<<<blocks_for(size, kStoreBlock), kStoreBlock, 0, stream>>>(stored);
   DSMOE_CHECK_LAUNCH("store_outgrown");
 }
@@ -383,30 +387,30 @@ void blend_backward(int64_t num_gaussians, const DeviceCamera<S>& camera, const 
                     const ImageGradients<S>& image_gradients, S* dL_dgaussians, S* slots, S* dL_dbackground,
                     Scratch& scratch, unsigned long long* pairs, cudaStream_t stream) {
   const int64_t tiles = num_tiles(camera.width, camera.height), warps = tiles * kWarpsPerTile;
-  BackwardWork<S, RecordSink<S>> work = {};
-  static_cast<BlendArguments<S>&>(work) = blend_arguments(num_gaussians, camera, config, saved, images, pairs);
-  work.dL_dimages = image_gradients;
-  work.num_features = config.num_features();
-  work.tiles = static_cast<int>(tiles);
-  work.sink.records = dL_dgaussians;
-  work.sink.slots = slots;
-  work.sink.length = kNumGateMoments + work.num_features;
+  BackwardWithSink<S, RecordSink<S>> arguments = {};
+  static_cast<BlendArguments<S>&>(arguments) = blend_arguments(num_gaussians, camera, config, saved, images, pairs);
+  arguments.dL_dimages = image_gradients;
+  arguments.num_features = config.num_features();
+  arguments.tiles = static_cast<int>(tiles);
+  arguments.sink.records = dL_dgaussians;
+  arguments.sink.slots = slots;
+  arguments.sink.length = kNumGateMoments + arguments.num_features;
   if (dL_dbackground != nullptr) {
-    work.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+    arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
   }
   bool known = false;                          // the number of features, when compiling
   if constexpr (sizeof(S) == sizeof(float)) {  // double is for checking: it has only the general kernel
-    known = work.num_features == kSegmentFeatures;
+    known = arguments.num_features == kSegmentFeatures;
     const int64_t segment_blocks = saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0;
-    if (known) launch_backward<S, kSegmentFeatures>(work, tiles + segment_blocks, stream);
+    if (known) launch_backward<S, kSegmentFeatures>(arguments, tiles + segment_blocks, stream);
   }
   if (!known) {
-    work.scaled = allocate_scaled(work, scratch);
-    launch_backward<S, kAnyFeatures>(work, tiles, stream);
+    arguments.scaled = allocate_scaled(arguments, scratch);
+    launch_backward<S, kAnyFeatures>(arguments, tiles, stream);
   }
-  if (slots != nullptr && num_gaussians > 0) backward_outgrown(work, scratch, stream);
+  if (slots != nullptr && num_gaussians > 0) backward_outgrown(arguments, scratch, stream);
   if (dL_dbackground != nullptr) {
-    sum_columns(work.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
+    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
   }
 }
 
