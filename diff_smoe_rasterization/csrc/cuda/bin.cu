@@ -1,5 +1,6 @@
-// Stage 2: the depth order, and the tile lists front to back. One sort of the Gaussians by depth, then a stable sort of
-// their instances by tile, so that the second sort's keys are short (Faster-GS, arXiv:2602.09999, sorts so too).
+// Stage 2: the depth order, and the tile lists front to back. The Gaussians are sorted by depth, then their instances
+// by tile with a stable sort, so that the keys of the second sort are short. (Faster-GS, arXiv:2602.09999, does the
+// same.)
 #include <cub/device/device_radix_sort.cuh>
 #include <limits>
 
@@ -16,7 +17,7 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// Runs a CUB algorithm: it says how much memory it needs, gets it, and works.
+// Runs a CUB algorithm in two calls: the first says how much memory it needs, the second does the work.
 template <class Algorithm> void with_temporary(Scratch& scratch, const char* what, Algorithm algorithm) {
   size_t bytes = 0;
   check(algorithm(nullptr, bytes), what);
@@ -38,7 +39,7 @@ template <class S, class Key> struct ListArguments {
   int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
 };
 
-// The rows of tiles of the Gaussians whose turn it is; `position` is the lane's in the depth order.
+// The rows of tiles that the warp's Gaussians meet. position: of the lane's Gaussian in the depth order.
 template <class S, class Key>
 __device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t position,
                                    typename WarpTileRows<S>::Shared* shared, int lane) {
@@ -56,7 +57,7 @@ __device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t po
   return {gaussian, tiles, list.columns, shared, lane};
 }
 
-// Lists a row a lane from `slot` on, but not beyond `end`. Lanes that write together write side by side.
+// Lists the tiles of one row a lane, from `slot` on and not beyond `end`. Neighbouring lanes write neighbouring places.
 template <class S, class Key>
 __device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row, int64_t& slot, int64_t end, int lane) {
   const WarpLine instances(row.width, lane);
@@ -94,7 +95,8 @@ __global__ void __launch_bounds__(kListBlock)
   const auto rows =
       rows_at(list, (int64_t(block) * kListWarps + warp) * list.gaussians_per_warp + lane, tiles + warp * kWarp, lane);
 
-  // Twice over the rows: to count their tiles, then to list them. One loop does both, so that both find the same rows.
+  // The loop runs twice over the rows: it counts their tiles, then lists them. It is one loop, so that both times it
+  // finds the same rows.
   int64_t slot = 0, end = 0;
 #pragma unroll 1
   for (bool listing = false;; listing = true) {
@@ -143,8 +145,9 @@ template <class Key> struct OffsetArguments {
   int32_t* segment_queue;  // its counter is set to 0; or null
 };
 
-// The first instance of each tile, and an empty queue of segments for the blend. A warp looks for one instance: it cuts
-// what is left of the sorted keys into 32 parts, and goes on in the first part that ends at the tile or behind.
+// Finds the first instance of each tile, and empties the queue of segments for the blend. A warp searches for one tile:
+// it cuts the remaining sorted keys into 32 parts, and continues in the first part whose last key is not below the
+// tile.
 template <class Key> __global__ void tile_offsets_kernel(const __grid_constant__ OffsetArguments<Key> arguments) {
   if (arguments.segment_queue != nullptr && blockIdx.x == 0 && threadIdx.x == 0) arguments.segment_queue[0] = 0;
   const int64_t tile = (int64_t(blockIdx.x) * kListBlock + threadIdx.x) / kWarp;
@@ -169,7 +172,7 @@ struct SlotArguments {
   int32_t* instances;            // [capacity, 2] written: Gaussian, slot
 };
 
-// Nothing is written where the instances do not fit: then no list is read.
+// Where the instances do not fit, nothing is written, because nobody reads the lists then.
 __global__ void pair_with_slots_kernel(const __grid_constant__ SlotArguments arguments) {
   const int64_t i = int64_t(blockIdx.x) * kListBlock + threadIdx.x, count = *arguments.num_instances;
   if (i >= count || count > arguments.capacity) return;
@@ -197,7 +200,7 @@ template <class Key, class S> void list_instances(ListArguments<S, Key> list, Sc
     check(cudaMemsetAsync(list.saved.num_instances, 0, sizeof(int64_t), stream), "counting instances");
     return;
   }
-  // The states of the look-back, and its counter behind them.
+  // The states of the look-back; its counter lies behind them.
   auto* states = allocate<unsigned long long>(scratch, int64_t(blocks) + 1);
   check(cudaMemsetAsync(states, 0, (size_t(blocks) + 1) * sizeof(*states), stream), "listing instances");
   list.look_back = {states, reinterpret_cast<unsigned*>(states + blocks)};

@@ -7,7 +7,7 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// Notes the pixels' state where a segment begins, and that the backward pass has something to do there.
+// Notes the state of the pixels where a segment begins, and queues the segment for the backward pass.
 template <class S, int kSums>
 __device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
                               const PixelState<S> (&state)[kLanePixels], const S (&sums)[kLanePixels][kSums]) {
@@ -22,7 +22,7 @@ __device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile
   }
 }
 
-// At the end of the list: from the sums in front of each segment to those behind.
+// Called at the end of the list: turns the sums in front of each segment into the sums from there to the end.
 template <class S, int kSums>
 __device__ void end_segments(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int last,
                              const S (&sums)[kLanePixels][kSums]) {
@@ -52,9 +52,9 @@ template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
 
   __device__ __forceinline__ void begin_chunk(int32_t position) {
     if constexpr (kSegments) {
-      if (segments && position == (segment + 1) * kSegmentLength) {
-        begin_segment(arguments, tile, ++segment, pixels.state, pixels.sums);
-      }
+      if (position != next_segment) return;
+      begin_segment(arguments, tile, position / kSegmentLength, pixels.state, pixels.sums);
+      next_segment += kSegmentLength;
     }
   }
 
@@ -82,8 +82,7 @@ template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
   const WarpTile<S>& tile;
   BlendedPixels<S, kSums>& pixels;
   AlphaCut<S> cut;
-  bool segments;  // the list is long enough to be noted in segments
-  int segment;    // the one that the walk is in
+  int32_t next_segment;  // where the next segment begins, or -1 where the list is not noted in segments
 };
 
 // Blends kSums features from `first_feature` on, and writes them.
@@ -100,9 +99,11 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   }
   using Visitor = BlendVisitor<S, kMode, kSums>;
   const bool segments = Visitor::kSegments && has_segments(arguments.saved, tile);
-  Visitor visitor = {arguments, tile, blended, config.alpha_cut(), segments, 0};
-  const unsigned met = walk_tile(stage, {0, tile.length, first_feature}, visitor);
-  if constexpr (Visitor::kSegments) end_segments(arguments, tile, visitor.segment, blended.sums);
+  Visitor visitor = {arguments, tile, blended, config.alpha_cut(), segments ? kSegmentLength : -1};
+  const unsigned met = walk_tile(stage, {0, tile.source.length, first_feature}, visitor);
+  if constexpr (Visitor::kSegments) {
+    end_segments(arguments, tile, visitor.next_segment / kSegmentLength - 1, blended.sums);
+  }
 
   const int64_t pixels = int64_t(arguments.width) * arguments.height;
   for (int k = 0; k < kLanePixels; ++k) {

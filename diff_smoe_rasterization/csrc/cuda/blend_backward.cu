@@ -18,7 +18,7 @@ template <class S> struct BackwardArguments : BlendArguments<S> {
   int tiles;                     // of the image
 };
 
-template <class S, class Sink> struct BackwardWork : BackwardArguments<S> {
+template <class S, class Sink> struct BackwardWithSink : BackwardArguments<S> {
   Sink sink;  // where each warp's sums go
 };
 
@@ -40,7 +40,7 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Hands the sums of the first `count` Gaussians of a batch on.
+// Sums a batch by tensor cores, and gives the sums of its first `count` Gaussians to the sink.
 template <class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
                           const TensorBasis& basis, int count) {
@@ -58,7 +58,8 @@ __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const T
   });
 }
 
-// Sums `values` over the warp, and hands the first `wanted` sums on, as numbers `first`, first + 1, ... of a Gaussian.
+// Sums `values` over the warp, and gives the first `wanted` sums to the sink: numbers `first`, first + 1, ... of the
+// Gaussian's record.
 template <class S, int kCount, class Sink>
 __device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values)[kCount], int32_t gaussian,
                            int32_t position, int first, int wanted) {
@@ -68,7 +69,7 @@ __device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values
   sink.to_record(tile, gaussian, position, sink.length, [&](auto add) { add(first + sum.number, values[0]); });
 }
 
-// The six moments of a lane's pixels, one below the other.
+// Sums the six moments over a lane's pixels, which lie one below the other.
 template <class S> __device__ void column_moments(const S (&dL_dpower)[kLanePixels], S dx, S dy, S* moments) {
   S one = S(0), y = S(0), yy = S(0);
 #pragma unroll
@@ -96,7 +97,7 @@ struct TensorShare {
   const TensorBasis& moment_basis;  // the block's
 };
 
-// Back to front: of each Gaussian the moments of dL/dpower and the gradients of its features.
+// Walks back to front, and sums for each Gaussian the moments of dL/dpower and the gradients of its features.
 template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kReadsIndices = true;
@@ -204,8 +205,8 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
   int batch;  // Gaussians that wait in the tensor stage
 };
 
-// The gradients that a warp's pixels start with, before any pair. Also writes the warp's row of the background's
-// gradients, where they are wanted: once, in the first segment of the list.
+// Sets what a warp's pixels start with, before any pair. Where the background's gradients are wanted, it also writes
+// the warp's row of them; the warp of the list's first segment does that.
 template <BlendMode kMode, class S, int kFeatures>
 __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
                                              const WarpSegment& place, BackwardPixels<S, kFeatures>& pixels) {
@@ -255,13 +256,12 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
   }
 }
 
-// The part of the list that a warp walks: up to the last pair that some pixel has taken, and of a list with segments
-// only the warp's own. Empty where nothing is left there. Where another segment follows, the pixels continue in front
-// of it.
+// Returns the part of the list that a warp walks: up to the last pair that some pixel has taken, and in a list with
+// segments only its own one. The part may be empty. Where another segment lies behind, the pixels get its state.
 template <BlendMode kMode, class S, int kFeatures>
 __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>& arguments, const WarpTile<S>& tile,
                                                       int segment, BackwardPixels<S, kFeatures>& pixels) {
-  WalkRange range = {0, tile.length};
+  WalkRange range = {0, tile.source.length};
   if (Blend<kMode>::kStopsEarly) {
     int32_t seen = 0;
     for (int k = 0; k < kLanePixels; ++k) seen = seen > pixels.last[k] ? seen : pixels.last[k];
@@ -290,7 +290,7 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
 template <class S, BlendMode kMode, int kFeatures, class Sink>
 __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks
                                                                                           : kGeneralBackwardBlocks)
-    blend_backward_kernel(const __grid_constant__ BackwardWork<S, Sink> arguments) {
+    blend_backward_kernel(const __grid_constant__ BackwardWithSink<S, Sink> arguments) {
   using Visitor = BackwardVisitor<S, kMode, kFeatures, Sink>;
   __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
   __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
@@ -328,10 +328,10 @@ template <class S> S* allocate_scaled(const BackwardArguments<S>& arguments, Scr
 }
 
 template <class S, int kFeatures, class Sink>
-void launch_backward(const BackwardWork<S, Sink>& work, int64_t blocks, cudaStream_t stream) {
-  dispatch_blend(work.config.mode, kFeatures, [&](auto mode, auto) {
+void launch_backward(const BackwardWithSink<S, Sink>& arguments, int64_t blocks, cudaStream_t stream) {
+  dispatch_blend(arguments.config.mode, kFeatures, [&](auto mode, auto) {
     blend_backward_kernel<S, decltype(mode)::value, kFeatures>
-        <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(work);
+        <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("blend_backward");
   });
 }
@@ -349,28 +349,32 @@ template <class S> __global__ void store_outgrown_kernel(const __grid_constant__
   if (at < arguments.size) arguments.records[at] = arguments.sink.sum(at);
 }
 
-// Where the instances outgrew their memory, fills the records by walks over all Gaussians; does nothing elsewhere.
+// Where the instances outgrew their memory, this fills the records by walks over all Gaussians. Else it does nothing.
 template <class S>
-void backward_outgrown(const BackwardWork<S, RecordSink<S>>& work, Scratch& scratch, cudaStream_t stream) {
-  BackwardWork<S, OutgrownSink<S>> outgrown = {};
-  static_cast<BackwardArguments<S>&>(outgrown) = work;
+void backward_outgrown(const BackwardWithSink<S, RecordSink<S>>& arguments, Scratch& scratch, cudaStream_t stream) {
+  BackwardWithSink<S, OutgrownSink<S>> outgrown = {};
+  static_cast<BackwardArguments<S>&>(outgrown) = arguments;
   outgrown.dL_dbackground_rows = nullptr;  // the usual kernel has written them
-  if (outgrown.scaled == nullptr) outgrown.scaled = allocate_scaled(work, scratch);
-  const int64_t size = work.num_gaussians * work.sink.length;
+  if (outgrown.scaled == nullptr) outgrown.scaled = allocate_scaled(arguments, scratch);
+  const int64_t size = arguments.num_gaussians * arguments.sink.length;
   OutgrownSink<S>& sink = outgrown.sink;
   sink.exponents = allocate<int32_t>(scratch, size);
   sink.sums = allocate<unsigned long long>(scratch, size);
-  sink.length = work.sink.length;
+  sink.length = arguments.sink.length;
   sink.term_bits = 62;
-  for (int64_t warps = int64_t(work.tiles) * kWarpsPerTile; warps > 0; warps /= 2) --sink.term_bits;
+  for (int64_t warps = int64_t(arguments.tiles) * kWarpsPerTile; warps > 0; warps /= 2) --sink.term_bits;
   check(cudaMemsetAsync(sink.exponents, 0, size * sizeof(*sink.exponents), stream), "clearing gradients");
   check(cudaMemsetAsync(sink.sums, 0, size * sizeof(*sink.sums), stream), "clearing gradients");
   for (const bool measures : {true, false}) {
     sink.measures = measures;
-    launch_backward<S, kAnyFeatures>(outgrown, work.tiles, stream);
+    launch_backward<S, kAnyFeatures>(outgrown, arguments.tiles, stream);
     outgrown.pairs = nullptr;  // counted once
   }
-  OutgrownRecords<S> stored = {size, work.saved, sink, work.sink.records};
+  OutgrownRecords<S> stored = {};
+  stored.size = size;
+  stored.saved = arguments.saved;
+  stored.sink = sink;
+  stored.records = arguments.sink.records;
   store_outgrown_kernel<<<blocks_for(size, kStoreBlock), kStoreBlock, 0, stream>>>(stored);
   DSMOE_CHECK_LAUNCH("store_outgrown");
 }
@@ -385,7 +389,7 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
   Scratch& scratch = *work.scratch;
   const cudaStream_t stream = work.stream;
   const int64_t tiles = num_tiles(camera.width, camera.height), warps = tiles * kWarpsPerTile;
-  BackwardWork<S, RecordSink<S>> arguments = {};
+  BackwardWithSink<S, RecordSink<S>> arguments = {};
   static_cast<BlendArguments<S>&>(arguments) = blend_arguments(frame, work);
   arguments.dL_dimages = pass.gradients.images;
   arguments.num_features = config.num_features();

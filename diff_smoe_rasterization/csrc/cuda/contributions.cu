@@ -1,5 +1,5 @@
-// What is summed over the pixels of each Gaussian: the blend's walk once more, without features. A warp sums its
-// pixels, then adds the four numbers to the Gaussian's own by atomics.
+// Sums over the pixels of each Gaussian. The kernel repeats the blend's walk, without features. A warp sums over its
+// pixels, then adds the four numbers to those of the Gaussian by atomics.
 #include "../dispatch.h"
 #include "dsmoe/contribution.h"
 #include "dsmoe/rasterize.h"
@@ -31,7 +31,7 @@ template <class S> struct ScoredPixels {
   int32_t last[kLanePixels];  // entries of the list that the numerator has seen
 };
 
-// Front to back, as the blend goes; up to the last pair that the blend took.
+// Walks front to back, as the blend does, up to the last pair that the blend took.
 template <class S, BlendMode kMode> struct ContributionVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
   static constexpr bool kReadsFeatures = false, kReadsIndices = true;

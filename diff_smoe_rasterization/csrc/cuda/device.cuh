@@ -31,8 +31,7 @@ template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Came
   }
 }
 
-// Whether the instances did not fit their memory: then the tile lists are empty, and the depth order serves as the list
-// of every tile.
+// Whether the instances did not fit their memory. Then no tile list is read; the depth order is the list of every tile.
 template <class S> __device__ bool overflows(const SavedForward<S>& saved) {
   return *saved.num_instances > saved.capacity;
 }

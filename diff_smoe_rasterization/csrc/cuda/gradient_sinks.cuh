@@ -19,7 +19,7 @@ template <class S> struct RecordSink {
   static constexpr bool kOnlyOutgrown = false;
 
   // Whether the warps of this tile have terms for this sink.
-  __device__ bool takes(const WarpTile<S>& tile) const { return slots == nullptr || tile.listed; }
+  __device__ bool takes(const WarpTile<S>& tile) const { return slots == nullptr || tile.source.listed; }
 
   // Calls put(add), where add(number, term) adds to the record of a Gaussian, which lies at `position` of the list.
   // numbers: those of a record, a constant where the caller has one.
@@ -27,7 +27,7 @@ template <class S> struct RecordSink {
   __device__ __forceinline__ void to_record(const WarpTile<S>& tile, int32_t gaussian, int32_t position, int numbers,
                                             Put put) const {
     if (slots != nullptr) {
-      const uint32_t slot = static_cast<uint32_t>(tile.list[2 * int64_t(position) + 1]);
+      const uint32_t slot = tile.source.slot(position);
       S* record = slots + (int64_t(slot) * kSlotsPerInstance + tile.quarter) * numbers;
       put([record](int number, S term) { record[number] = term; });
     } else {

@@ -8,7 +8,7 @@
 namespace dsmoe {
 namespace cuda {
 
-// Zero before the launch.
+// All zero before the launch.
 struct LookBack {
   unsigned long long* states;  // [blocks] what each block has published, its kind in the two upper bits
   unsigned* next_block;  // [1] blocks number themselves in the order in which they start: none waits for a later one
@@ -16,10 +16,10 @@ struct LookBack {
 
 constexpr unsigned long long kOwnSum = 1ull << 62, kRunningSum = 2ull << 62, kSumMask = kOwnSum - 1;
 
-// For thread 0.
+// Called by thread 0 of the block.
 inline __device__ unsigned take_block_number(const LookBack& look_back) { return atomicAdd(look_back.next_block, 1u); }
 
-// For the first warp: the sum over all blocks before this one.
+// Called by the first warp of the block. Returns the sum over all blocks before this one.
 inline __device__ unsigned long long sum_before(const LookBack& look_back, unsigned block, unsigned long long own) {
   volatile unsigned long long* states = look_back.states;
   const int lane = threadIdx.x % kWarp;
@@ -28,7 +28,7 @@ inline __device__ unsigned long long sum_before(const LookBack& look_back, unsig
     if (lane == 0) states[block] = kOwnSum | own;
     for (int64_t first = int64_t(block) - 1;; first -= kWarp) {
       const int64_t predecessor = first - lane;
-      unsigned long long state = kRunningSum;  // before the first block: 0
+      unsigned long long state = kRunningSum;  // the sum before the first block is 0
       if (predecessor >= 0) {
         do state = states[predecessor];
         while (state == 0);

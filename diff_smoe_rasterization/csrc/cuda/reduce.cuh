@@ -7,9 +7,9 @@
 namespace dsmoe {
 namespace cuda {
 
-// Sums kCount numbers over the lanes of a warp in fewer steps than one number at a time needs: lanes that trade partial
-// sums keep one half of the numbers each. Afterwards values[0] is the sum of number `number`, in the lanes where
-// `holds` is set (each number once).
+// Sums kCount numbers over the lanes of a warp. In each step two lanes exchange partial sums, and each keeps half of
+// the numbers; so it takes fewer steps than kCount sums one by one. Afterwards values[0] is the sum of number `number`
+// in the lanes where `holds` is set; each number has one such lane.
 template <int kCount> class TransposedSum {
  public:
   __device__ explicit TransposedSum(int lane) : lane_(lane) {
@@ -73,12 +73,12 @@ inline __device__ int32_t max_over_lanes(int32_t value) {
 
 template <class S> struct ColumnSums {
   const S* rows;  // [count, columns]
-  int64_t count;
-  int columns;
-  S* sums;  // [columns]
+  int64_t count;  // rows
+  int columns;    // numbers a row
+  S* sums;        // [columns] written
 };
 
-// sums[c] = sum_r rows[r, c], in double; one block a column.
+// sums[c] = sum_r rows[r, c], in double. A block sums one column.
 template <class S> __global__ void sum_columns_kernel(const __grid_constant__ ColumnSums<S> matrix) {
   __shared__ double shared[kColumnBlock];
   double sum = 0;

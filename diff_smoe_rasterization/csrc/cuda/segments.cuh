@@ -15,29 +15,29 @@ namespace cuda {
 static_assert(kSegmentLength % kWarp == 0, "a segment is a number of whole chunks");
 static_assert(kSegmentRow == kTileSize * kTileSize * (1 + kSegmentFeatures), "a row has a place for each pixel");
 
-// One pixel where a segment begins.
+// The state of one pixel where a segment begins.
 template <class S> struct alignas(4 * sizeof(S)) SegmentPixel {
   S transmittance;           // in front of the segment
   S sums[kSegmentFeatures];  // sum w c from there to the end of the list; in front of there until the end is known
 };
 
-// The lane's pixel k in a segment of its tile, the first segment aside.
+// The state of the lane's pixel k in segment 1, 2, ... of its tile.
 template <class S>
 __device__ SegmentPixel<S>& segment_pixel(const SavedForward<S>& saved, const WarpTile<S>& tile, int segment, int k) {
-  const int64_t row = tile.begin / kSegmentLength + segment;
+  const int64_t row = tile.source.begin / kSegmentLength + segment;
   const int pixel = (tile.quarter * kLanePixels + k) * kWarp + tile.lane;
   return reinterpret_cast<SegmentPixel<S>*>(saved.segments)[row * (kTileSize * kTileSize) + pixel];
 }
 
-// Which kernels know of segments, whatever the memory that they are given.
+// Which kernels can walk segments.
 template <class S, int kFeatures>
 constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && kFeatures == kSegmentFeatures;
 
 template <class S> __device__ bool has_segments(const SavedForward<S>& saved, const WarpTile<S>& tile) {
-  return saved.segments != nullptr && tile.listed && tile.length > kSegmentLength;
+  return saved.segments != nullptr && tile.source.listed && tile.source.length > kSegmentLength;
 }
 
-// The segments that some pixel of a warp has reached, in no order. Entry 0 counts those behind it.
+// The segments that some pixel of a warp has reached, in any order. Entry 0 holds their number.
 struct SegmentQueue {
   int2* entries;  // (tile and quarter, segment)
 
@@ -60,8 +60,8 @@ template <class S> __device__ bool is_idle_block(const SavedForward<S>& saved, i
   return block >= tiles && (block - tiles) * kWarpsPerTile >= segment_queue(saved).entries[0].x;
 }
 
-// The first blocks have a tile each, in its first segment; the warps of those behind have an entry of the queue each.
-// tile is -1 where nothing is left.
+// The first `tiles` blocks take the first segment of one tile each. Each warp of the later blocks takes one entry of
+// the queue, or tile -1 where none is left.
 template <class S> __device__ WarpSegment segment_of_warp(const SavedForward<S>& saved, int tiles) {
   const int block = blockIdx.x, warp = threadIdx.x / kWarp;
   if (block < tiles) return {block, warp, 0};

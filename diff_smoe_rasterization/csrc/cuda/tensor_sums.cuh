@@ -31,7 +31,7 @@ constexpr int kTensorRecord = kNumGateMoments + kTensorFeatures;
 constexpr float kWarpTileCentre = (kWarpTile - 1) / 2.0f;
 static_assert(kWarpTile == 8 && kLanePixels == 2, "the places of pixels in the operands");
 
-// The right-hand operands, as the lanes hold them: two numbers for each step.
+// A right-hand operand, as the lanes hold it: two numbers a lane for each step.
 struct TensorBasis {
   float2 of[kTensorSteps][kWarp];
 };
@@ -63,7 +63,7 @@ struct TensorLane {
   __device__ explicit TensorLane(int lane) : row(lane / 4), column(lane % 4) {}
 };
 
-// The moments' right-hand operand; all warps of the block share it. No barrier.
+// Fills the right-hand operand of the moments, which all warps of the block share. The caller needs a barrier behind.
 inline __device__ void fill_moment_basis(TensorBasis& basis) {
   for (int i = threadIdx.x; i < kTensorSteps * kWarp; i += blockDim.x) {
     const int step = i / kWarp;
@@ -78,7 +78,7 @@ inline __device__ void fill_moment_basis(TensorBasis& basis) {
   }
 }
 
-// The features' right-hand operand, from each lane's g' of its two pixels.
+// Fills the right-hand operand of the features from each lane's g' of its two pixels.
 inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&scaled)[kLanePixels][kTensorFeatures],
                                            int lane) {
   for (int k = 0; k < kLanePixels; ++k) {
@@ -108,7 +108,7 @@ struct TensorSums {
 
 inline __device__ TensorSums sum_pixels(const TensorStage& stage, const TensorBasis& basis, int lane) {
   const TensorLane at(lane);
-  // Sums that do not wait for each other: of the numbers' upper parts, and of their lower ones.
+  // The upper and the lower parts of the numbers have sums of their own, which need not wait for each other.
   float moments[2][4] = {}, features[2][4] = {};
 #pragma unroll
   for (int m = 0; m < kTensorSteps / 2; ++m) {

@@ -22,7 +22,7 @@ __device__ TileRect footprint_bounds(BlendMode mode, int width, int height, Vec2
 
 template <class T> __device__ T from_lane(T value, int lane) { return __shfl_sync(kAllLanes, value, lane); }
 
-// Items of all lanes in one line, lane by lane: where each lane's items begin, and how many there are.
+// The items of all lanes, numbered lane by lane: this says where each lane's items begin, and how many there are.
 class WarpLine {
  public:
   __device__ WarpLine(unsigned items, int lane) {
@@ -36,7 +36,8 @@ class WarpLine {
     total = __shfl_sync(kAllLanes, sum, kWarp - 1);
   }
 
-  // The lane that has item k: the last one that begins at k or before. Any lane where k is beyond the items.
+  // Returns the lane that has item k: the last one that begins at k or before. k may be beyond the items; then the
+  // result is some lane.
   __device__ int owner(unsigned k) const {
     int lane = 0;
 #pragma unroll
@@ -49,23 +50,23 @@ class WarpLine {
   unsigned begin, total;
 };
 
-// Tiles side by side that one Gaussian meets.
+// Neighbouring tiles of one row that one Gaussian meets.
 struct alignas(16) TileRow {
   uint32_t tile;  // the first
   int32_t width;  // how many
   int32_t gaussian;
-  int32_t ends;  // of the Gaussian's rows: kFirstRow, kLastRow, both or none
+  int32_t ends;  // whether it is the first or the last of the Gaussian's rows: kFirstRow, kLastRow, both or 0
 };
 constexpr int32_t kFirstRow = 1, kLastRow = 2;
 
 template <class S> class WarpTileRows {
  public:
-  // A lane's tiles in shared memory, for all lanes to read; so far apart that lanes meet no bank twice.
+  // A lane's tiles in shared memory, for all lanes to read. The padding spreads the lanes over the banks.
   struct alignas(16) Shared {
     unsigned char tiles[sizeof(FootprintTiles<S>) + 16];
   };
 
-  // gaussian and its tiles: the lane's own. shared: [32] the warp's.
+  // gaussian, tiles: of the lane. shared: [32] of the warp.
   __device__ WarpTileRows(int32_t gaussian, const FootprintTiles<S>& tiles, int columns, Shared* shared, int lane)
       : gaussian_(gaussian), columns_(columns), shared_(shared), line_(max(0, tiles.end() - tiles.begin()), lane) {
     memcpy(shared[lane].tiles, &tiles, sizeof(tiles));
@@ -74,7 +75,7 @@ template <class S> class WarpTileRows {
 
   __device__ unsigned total() const { return line_.total; }
 
-  // Row k of all; all lanes take part.
+  // Returns row k of all rows. All lanes must call it together.
   __device__ TileRow at(unsigned k) const {
     const int owner = line_.owner(k);
     const unsigned row = k - from_lane(line_.begin, owner);

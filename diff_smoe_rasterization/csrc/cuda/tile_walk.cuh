@@ -44,8 +44,38 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   return arguments;
 }
 
-// The pixels of a warp, and the source of its entries: the tile's list, or, where the instances outgrew their memory,
-// the depth order of all Gaussians.
+// Where a tile's walk gets its entries: from the list of the tile, or, where the instances outgrew their memory, from
+// the depth order of all Gaussians. Both lead front to back.
+template <class S> class EntrySource {
+ public:
+  EntrySource() = default;
+  __device__ EntrySource(const BlendArguments<S>& arguments, int tile) {
+    const SavedForward<S>& saved = arguments.saved;
+    listed = !overflows(saved);
+    begin = listed ? saved.tile_offsets[tile] : 0;
+    length = static_cast<int32_t>(listed ? saved.tile_offsets[tile + 1] - begin : arguments.num_gaussians);
+    entries_ = listed ? saved.instances + begin * saved.instance_width : saved.order;
+    stride_ = listed ? saved.instance_width : 1;
+  }
+
+  // The Gaussian of an entry. Below 0 for a culled one, which only the depth order has.
+  __device__ int32_t gaussian(int32_t position) const { return entries_[int64_t(position) * stride_]; }
+
+  // Where the gradient of a listed entry goes, if it has slots.
+  __device__ uint32_t slot(int32_t position) const {
+    return static_cast<uint32_t>(entries_[2 * int64_t(position) + 1]);
+  }
+
+  bool listed;     // the entries are the tile's list; else the depth order, which knows nothing of tiles
+  int64_t begin;   // the list's first instance
+  int32_t length;  // entries
+
+ private:
+  const int32_t* entries_;  // [length, stride]
+  int stride_;              // numbers an entry
+};
+
+// The pixels of a warp, and the entries that may meet them.
 template <class S> class WarpTile {
  public:
   __device__ explicit WarpTile(const BlendArguments<S>& arguments)
@@ -60,12 +90,7 @@ template <class S> class WarpTile {
     x = x0 + lane % kWarpTile, y = y0 + lane / kWarpTile;
     empty = x0 >= arguments.width || y0 >= arguments.height;
     rect = {S(x0), S(y0), S(min(x0 + kWarpTile, arguments.width) - 1), S(min(y0 + kWarpTile, arguments.height) - 1)};
-    const SavedForward<S>& saved = arguments.saved;
-    listed = !overflows(saved);
-    begin = listed ? saved.tile_offsets[tile] : 0;
-    length = static_cast<int32_t>(listed ? saved.tile_offsets[tile + 1] - begin : arguments.num_gaussians);
-    list = listed ? saved.instances + begin * saved.instance_width : saved.order;
-    stride = listed ? saved.instance_width : 1;
+    source = EntrySource<S>(arguments, tile);
   }
 
   __device__ bool inside(const BlendArguments<S>& arguments, int k) const {
@@ -77,15 +102,11 @@ template <class S> class WarpTile {
 
   int quarter;  // of the tile, row by row
   int lane;
-  int tile_x, tile_y;   // of the tile, in tiles
-  int x, y;             // of the lane's first pixel
-  bool empty;           // no pixel of the warp lies in the image
-  PixelRect<S> rect;    // the warp's pixels in the image
-  bool listed;          // the entries are the tile's list; else the depth order
-  int64_t begin;        // the list's first instance
-  const int32_t* list;  // [length, stride] Gaussians, front to back
-  int stride;           // numbers an entry
-  int32_t length;       // entries
+  int tile_x, tile_y;  // of the tile, in tiles
+  int x, y;            // of the lane's first pixel
+  bool empty;          // no pixel of the warp lies in the image
+  PixelRect<S> rect;   // the warp's pixels in the image
+  EntrySource<S> source;
 };
 
 // A Gaussian that meets the warp's pixels.
@@ -123,8 +144,8 @@ __device__ auto load_entry(const Visitor& visitor, int32_t position, const WalkR
   ListEntry<S, Visitor::kReadsFeatures> entry;
   entry.valid = Visitor::kBackToFront ? position >= range.begin : position < range.end;
   if (!entry.valid) return entry;
-  entry.gaussian = tile.list[int64_t(position) * tile.stride];
-  entry.valid = entry.gaussian >= 0;  // the depth order has culled Gaussians too, below 0
+  entry.gaussian = tile.source.gaussian(position);
+  entry.valid = entry.gaussian >= 0;
   if (!entry.valid) return entry;
   entry.staged.gaussian = saved.projected[entry.gaussian];
   if constexpr (Visitor::kReadsFeatures) {
@@ -134,7 +155,7 @@ __device__ auto load_entry(const Visitor& visitor, int32_t position, const WalkR
     };
     *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
   }
-  if (!tile.listed) {  // the entries of the depth order know nothing of tiles
+  if (!tile.source.listed) {
     const TileRect bounds = footprint_bounds(arguments.config.mode, arguments.width, arguments.height,
                                              entry.staged.gaussian.mean, arguments.images.radii, entry.gaussian);
     entry.valid =
