@@ -19,7 +19,7 @@ from scenes import op_arguments, op_results, random_scene, with_gate
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.extension import _C
-from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
+from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings
 
 WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
 DIFFERENTIABLE = ("color", "gate_sum", "depth", "inverse_depth")  # images of the op
@@ -102,6 +102,14 @@ def test_build_info_tells_what_runs():
     assert info["version"] == diff_smoe_rasterization.__version__
     assert info["num_threads"] == torch.get_num_threads()
     assert info["simd_level"] in ("avx512", "avx2", "baseline")
+
+
+def test_the_settings_and_the_op_have_the_same_fields():
+    """A setting is a line of csrc/torch/fields.h and a field of this name; these options are no settings."""
+    options = set(_C.options) - {"fixed_background_gate", "depth", "inverse_depth", "for_backward"}
+    fields = set(GaussianRasterizationSettings._fields)
+    assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "background_gate"}  # tensors
+    assert fields - options <= set(_C.inputs) and options <= fields
 
 
 def test_the_blend_modes_have_the_numbers_of_the_core():
