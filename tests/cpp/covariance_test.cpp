@@ -77,31 +77,37 @@ TEST(QuaternionToRotation, BackwardIsTheDerivativeOffTheUnitSphere) {
   }
 }
 
-TEST(Covariance3D, IsTheProductOfTheMatrices) {
-  Random random(3);
-  const Vector r = random.uniforms(9), s = random.uniforms(3, 0.1, 2);
-  double expected[3][3] = {};
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) {
-      for (int k = 0; k < 3; ++k) expected[i][j] += r[3 * i + k] * s[k] * s[k] * r[3 * j + k];
+// x: axes, scale, rotation.
+ImageFactor<double> factor_of(const Vector& x) { return image_factor(mat23(&x[0]), vec3(&x[6]), mat3(&x[9])); }
+
+TEST(ImageFactor, IsHalfOfTheProductOfTheMatrices) {
+  const Vector x = Random(3).uniforms(18);
+  double half[2][3] = {}, expected[2][2] = {};
+  for (int a = 0; a < 2; ++a) {
+    for (int k = 0; k < 3; ++k) {
+      for (int i = 0; i < 3; ++i) half[a][k] += x[3 * a + i] * x[9 + 3 * i + k] * x[6 + k];
     }
   }
-  const auto cov = covariance_3d(vec3(s.data()), mat3(r.data()));
+  for (int a = 0; a < 2; ++a) {
+    for (int b = 0; b < 2; ++b) {
+      for (int k = 0; k < 3; ++k) expected[a][b] += half[a][k] * half[b][k];
+    }
+  }
+  const auto cov = covariance_2d(factor_of(x));
   EXPECT_NEAR(cov.xx, expected[0][0], kRounding);
   EXPECT_NEAR(cov.xy, expected[0][1], kRounding);
-  EXPECT_NEAR(cov.xz, expected[0][2], kRounding);
   EXPECT_NEAR(cov.yy, expected[1][1], kRounding);
-  EXPECT_NEAR(cov.yz, expected[1][2], kRounding);
-  EXPECT_NEAR(cov.zz, expected[2][2], kRounding);
+  const auto conic = conic_of(factor_of(x)), by_covariance = make_conic(cov);
+  EXPECT_NEAR(conic.unfiltered, by_covariance.unfiltered, kRounding);
+  EXPECT_NEAR(conic.determinant, by_covariance.determinant, kRounding);
 }
 
-// x: scale, then the nine entries of the rotation.
-TEST(Covariance3D, BackwardIsTheDerivative) {
+TEST(ImageFactor, BackwardIsTheDerivative) {
   Random random(4);
-  const Vector x = random.uniforms(12), w = random.uniforms(6);
-  auto loss = [&](const Vector& v) { return weighted_sum(w, flat(covariance_3d(vec3(&v[0]), mat3(&v[3])))); };
-  const auto g = covariance_3d_backward(vec3(&x[0]), mat3(&x[3]), sym3(w.data()));
-  Vector actual;
+  const Vector x = random.uniforms(18), w = random.uniforms(3);
+  auto loss = [&](const Vector& v) { return weighted_sum(w, flat(covariance_2d(factor_of(v)))); };
+  const auto g = image_factor_backward(mat23(&x[0]), vec3(&x[6]), mat3(&x[9]), factor_of(x), sym2(w.data()));
+  Vector actual = flat(g.axes);
   append(actual, g.scale);
   for (const double entry : flat(g.rotation)) actual.push_back(entry);
   expect_gradient(actual, loss, x);
@@ -232,10 +238,7 @@ TEST(Conic, KeepsANeedlesDeterminantInFloat) {
   EXPECT_NEAR(conic.determinant / expected, 1, 2e-7L);  // 1.5 ulp
 }
 
-double compensation(const Vector& v) {
-  const auto cov = sym2(v.data());
-  return opacity_compensation(cov, make_conic(cov));
-}
+double compensation(const Vector& v) { return opacity_compensation(make_conic(sym2(v.data()))); }
 
 TEST(OpacityCompensation, IsTheRootOfTheDeterminants) {
   EXPECT_NEAR(compensation({5, 2, 3}), std::sqrt((5.0 * 3 - 4) / (5.3 * 3.3 - 4)), kRounding);

@@ -238,6 +238,29 @@ TEST(ProjectGaussian, IsCulledWhereTheImagePlaneOverflows) {
   }
 }
 
+// Needles of 10^4 px, 10^5 times as long as wide: as a product of rounded covariances, the conic would be wrong from
+// the first digit on.
+TEST(ProjectGaussian, KeepsTheDigitsOfANeedleInFloat) {
+  Random random(3);
+  for (int i = 0; i < 200; ++i) {
+    Scene<double> wide = single_gaussian();
+    wide.config.mode = BlendMode::kSmoe;
+    wide.scales = {float(random.uniform(500, 1000)), 0.007f, 0.009f};
+    for (double& component : wide.rotations) component = float(random.uniform(-0.5, 0.5));
+    const Scene<float> scene = convert<float>(wide);
+    float features[5];
+    const auto narrow = project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, features);
+    const auto& actual = narrow.gaussian.conic;
+    const auto expected = project(convert<double>(scene)).gaussian.conic;
+    ASSERT_GT(narrow.radius, 0);
+    // The camera's turn, the rotation and the product with the scales round some twenty times.
+    const double tolerance = 20 * 6e-8 * (expected.xx + expected.yy);
+    EXPECT_NEAR(actual.xx, expected.xx, tolerance);
+    EXPECT_NEAR(actual.xy, expected.xy, tolerance);
+    EXPECT_NEAR(actual.yy, expected.yy, tolerance);
+  }
+}
+
 // Slides along the camera's x axis, over both sides of the image.
 TEST(ProjectGaussian, RadiusIsPositiveExactlyWhereTheFootprintMeetsTheImage) {
   for (const auto mode : {BlendMode::kAlpha, BlendMode::kSmoe}) {
@@ -252,7 +275,7 @@ TEST(ProjectGaussian, RadiusIsPositiveExactlyWhereTheFootprintMeetsTheImage) {
       }
       const Gaussian<double> gaussian = load_gaussian(scene.inputs(), 0);
       const auto view = transform_point(camera.view, gaussian.mean);
-      const auto conic = make_conic(covariances(gaussian, camera, view, 1.0).image);
+      const auto conic = covariances(gaussian, camera, view, 1.0).conic;
       const auto pixel = project_to_pixel(camera, gaussian.mean);
       bool expected = false;
       if (mode == BlendMode::kAlpha) {  // x range of Inria's rectangle against 3 columns of tiles; y is on the image

@@ -24,37 +24,6 @@ template <class S> DSMOE_HD Vec4<S> quaternion_to_rotation_backward(Vec4<S> q, c
       S(2) * (r * (g.r1.x - g.r0.y) + x * (g.r0.z + g.r2.x) + y * (g.r1.z + g.r2.y) - S(2) * z * (g.r0.x + g.r1.y))};
 }
 
-// Sigma = R S S^T R^T (3DGS Eq. 6); scale already holds the scale modifier.
-template <class S> DSMOE_HD Sym3<S> covariance_3d(Vec3<S> scale, const Mat3<S>& rotation) {
-  const Vec3<S> variance = {scale.x * scale.x, scale.y * scale.y, scale.z * scale.z};
-  auto entry = [&](Vec3<S> a, Vec3<S> b) {
-    return variance.x * a.x * b.x + variance.y * a.y * b.y + variance.z * a.z * b.z;
-  };
-  const auto& [a, b, c] = rotation;
-  return {entry(a, a), entry(a, b), entry(a, c), entry(b, b), entry(b, c), entry(c, c)};
-}
-
-template <class S> struct Covariance3dGradient {
-  Vec3<S> scale;
-  Mat3<S> rotation;
-};
-
-// dL_dcov holds the derivative by each of the six stored numbers: an off-diagonal one stands for two matrix entries.
-template <class S>
-DSMOE_HD Covariance3dGradient<S> covariance_3d_backward(Vec3<S> scale, const Mat3<S>& rotation,
-                                                        const Sym3<S>& dL_dcov) {
-  const S half = S(0.5);
-  const Sym3<S> g = {dL_dcov.xx, half * dL_dcov.xy, half * dL_dcov.xz, dL_dcov.yy, half * dL_dcov.yz, dL_dcov.zz};
-  // Column k of R contributes scale_k^2 r_k r_k^T; g r_k serves both derivatives.
-  const Vec3<S> rx = {rotation.r0.x, rotation.r1.x, rotation.r2.x};
-  const Vec3<S> ry = {rotation.r0.y, rotation.r1.y, rotation.r2.y};
-  const Vec3<S> rz = {rotation.r0.z, rotation.r1.z, rotation.r2.z};
-  const Vec3<S> gx = g * rx, gy = g * ry, gz = g * rz;
-  const S vx = S(2) * scale.x * scale.x, vy = S(2) * scale.y * scale.y, vz = S(2) * scale.z * scale.z;
-  return {{S(2) * scale.x * dot(rx, gx), S(2) * scale.y * dot(ry, gy), S(2) * scale.z * dot(rz, gz)},
-          {{vx * gx.x, vy * gy.x, vz * gz.x}, {vx * gx.y, vy * gy.y, vz * gz.y}, {vx * gx.z, vy * gy.z, vz * gz.z}}};
-}
-
 // The local affine approximation of the perspective projection (EWA splatting): J W, 2x3. The slopes x/z and y/z are
 // clamped a little outside the frustum, where the approximation would explode.
 template <class S> struct ProjectionJacobian {
@@ -101,7 +70,7 @@ template <class S> DSMOE_HD Mat23<S> image_axes(const Mat23<S>& jacobian, const 
   return {transposed_times(rotation, jacobian.r0), transposed_times(rotation, jacobian.r1)};
 }
 
-// Sigma2D = M Sigma M^T, before the low-pass filter.
+// Of a given covariance: Sigma2D = M Sigma M^T, before the low-pass filter.
 template <class S> DSMOE_HD Sym2<S> covariance_2d(const Mat23<S>& axes, const Sym3<S>& cov) {
   const Vec3<S> u = cov * axes.r0, v = cov * axes.r1;
   return {dot(axes.r0, u), dot(axes.r0, v), dot(axes.r1, v)};
@@ -124,21 +93,66 @@ DSMOE_HD Covariance2dGradient<S> covariance_2d_backward(const Mat23<S>& axes, co
           {S(2) * g.xx * u + g.xy * v, g.xy * u + S(2) * g.yy * v}};
 }
 
+// Of scale and rotation, Sigma = R S S^T R^T (3DGS Eq. 6): Sigma2D = L L^T with L = M R S. The determinant is the sum
+// of the squared minors of L: no term cancels, however long and thin the Gaussian is. scale holds the scale modifier.
+template <class S> struct ImageFactor {
+  Mat23<S> turned;  // M R
+  Mat23<S> half;    // L
+};
+
+template <class S> DSMOE_HD ImageFactor<S> image_factor(const Mat23<S>& axes, Vec3<S> scale, const Mat3<S>& rotation) {
+  const Vec3<S> a = transposed_times(rotation, axes.r0), b = transposed_times(rotation, axes.r1);
+  return {{a, b}, {scale * a, scale * b}};
+}
+
+template <class S> DSMOE_HD Sym2<S> covariance_2d(const ImageFactor<S>& factor) {
+  const Vec3<S> a = factor.half.r0, b = factor.half.r1;
+  return {dot(a, a), dot(a, b), dot(b, b)};
+}
+
+template <class S> struct ImageFactorGradient {
+  Vec3<S> scale;
+  Mat3<S> rotation;
+  Mat23<S> axes;
+};
+
+template <class S>
+DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3<S> scale, const Mat3<S>& rotation,
+                                                      const ImageFactor<S>& factor, const Sym2<S>& g) {
+  const Vec3<S> dL_da = S(2) * g.xx * factor.half.r0 + g.xy * factor.half.r1;
+  const Vec3<S> dL_db = g.xy * factor.half.r0 + S(2) * g.yy * factor.half.r1;
+  const Vec3<S> a = scale * dL_da, b = scale * dL_db;  // by M R
+  const auto row = [&](S x, S y) { return x * a + y * b; };
+  return {factor.turned.r0 * dL_da + factor.turned.r1 * dL_db,
+          {row(axes.r0.x, axes.r1.x), row(axes.r0.y, axes.r1.y), row(axes.r0.z, axes.r1.z)},
+          {rotation * a, rotation * b}};
+}
+
 // The conic, the inverse of Sigma2D + low-pass, with what the radius and antialiasing need.
 template <class S> struct Conic {
   Sym2<S> inverse;   // per px^2
   Sym2<S> filtered;  // Sigma2D + low-pass, px^2
   S determinant;     // of filtered; not above 0: no footprint
+  S unfiltered;      // the determinant of Sigma2D
 };
 
-template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& cov2d) {
-  Conic<S> out;
-  out.filtered = {cov2d.xx + S(kLowPass), cov2d.xy, cov2d.yy + S(kLowPass)};
-  const auto& c = out.filtered;
-  out.determinant = difference_of_products(c.xx, c.yy, c.xy, c.xy);
-  const S scale = S(1) / out.determinant;
-  out.inverse = {c.yy * scale, -c.xy * scale, c.xx * scale};
-  return out;
+// A Gaussian whose covariance on the image plane is cov2d. The determinants: before the low-pass filter, and after.
+template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& cov2d, S unfiltered, S determinant) {
+  const Sym2<S> c = {cov2d.xx + S(kLowPass), cov2d.xy, cov2d.yy + S(kLowPass)};
+  const S scale = S(1) / determinant;
+  return {{c.yy * scale, -c.xy * scale, c.xx * scale}, c, determinant, unfiltered};
+}
+
+template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& c) {
+  return make_conic(c, difference_of_products(c.xx, c.yy, c.xy, c.xy),
+                    difference_of_products(c.xx + S(kLowPass), c.yy + S(kLowPass), c.xy, c.xy));
+}
+
+template <class S> DSMOE_HD Conic<S> conic_of(const ImageFactor<S>& factor) {
+  const Vec3<S> minors = cross(factor.half.r0, factor.half.r1);
+  const Sym2<S> c = covariance_2d(factor);
+  const S unfiltered = dot(minors, minors);
+  return make_conic(c, unfiltered, unfiltered + S(kLowPass) * (c.xx + c.yy + S(kLowPass)));
 }
 
 // Whether the filtered covariance is positive definite; a caller's own cov3D_precomp may be anything.
@@ -155,15 +169,13 @@ template <class S> DSMOE_HD Sym2<S> make_conic_backward(const Conic<S>& conic, c
 }
 
 // Antialiasing: the factor on the opacity that keeps a Gaussian's total weight when the low-pass filter widens it.
-template <class S> DSMOE_HD S opacity_compensation(const Sym2<S>& cov2d, const Conic<S>& conic) {
-  const S before = difference_of_products(cov2d.xx, cov2d.yy, cov2d.xy, cov2d.xy);
-  return sqrt(max(S(kCompensationFloor), before / conic.determinant));
+template <class S> DSMOE_HD S opacity_compensation(const Conic<S>& conic) {
+  return sqrt(max(S(kCompensationFloor), conic.unfiltered / conic.determinant));
 }
 
 template <class S>
 DSMOE_HD Sym2<S> opacity_compensation_backward(const Sym2<S>& cov2d, const Conic<S>& conic, S dL_dfactor) {
-  const S before = difference_of_products(cov2d.xx, cov2d.yy, cov2d.xy, cov2d.xy);
-  const S ratio = before / conic.determinant;
+  const S ratio = conic.unfiltered / conic.determinant;
   if (!(ratio > S(kCompensationFloor))) return {S(0), S(0), S(0)};
   const S dL_dratio = dL_dfactor * S(0.5) / sqrt(ratio);
   const S dL_dbefore = dL_dratio / conic.determinant, dL_dafter = -dL_dratio * ratio / conic.determinant;

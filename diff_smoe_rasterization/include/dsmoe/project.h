@@ -63,14 +63,15 @@ template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, const Camera<S>
   return {0, 0, grid.columns, grid.rows};
 }
 
-// A Gaussian's covariance in the world and on the image plane, and what the backward pass needs of their making.
+// A Gaussian's covariance on the image plane, and what the backward pass needs of its making.
 template <class S> struct Covariances {
   Vec3<S> scale;     // modified; where the covariance is not given
   Mat3<S> rotation;  // likewise
   ProjectionJacobian<S> jacobian;
   Mat23<S> axes;
-  Sym3<S> world;
-  Sym2<S> image;  // px^2, before the low-pass filter
+  ImageFactor<S> factor;  // likewise
+  Sym2<S> image;          // px^2, before the low-pass filter
+  Conic<S> conic;
 };
 
 template <class S>
@@ -80,13 +81,15 @@ DSMOE_HD Covariances<S> covariances(const Gaussian<S>& gaussian, const Camera<S>
   out.jacobian = projection_jacobian(camera, view);
   out.axes = image_axes(out.jacobian.jacobian, view_rotation(camera.view));
   if (gaussian.has_covariance) {
-    out.world = gaussian.covariance;
+    out.image = covariance_2d(out.axes, gaussian.covariance);
+    out.conic = make_conic(out.image);
   } else {
     out.scale = scale_modifier * gaussian.scale;
     out.rotation = quaternion_to_rotation(gaussian.rotation);
-    out.world = covariance_3d(out.scale, out.rotation);
+    out.factor = image_factor(out.axes, out.scale, out.rotation);
+    out.image = covariance_2d(out.factor);
+    out.conic = conic_of(out.factor);
   }
-  out.image = covariance_2d(out.axes, out.world);
   return out;
 }
 
@@ -96,8 +99,8 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
   out.radius = 0;
   const Vec3<S> view = transform_point(camera.view, gaussian.mean);
   if (!(view.z > camera.near) || !is_finite(gaussian.opacity)) return out;
-  const Sym2<S> cov2d = covariances(gaussian, camera, view, rules.scale_modifier).image;
-  const Conic<S> conic = make_conic(cov2d);
+  const auto made = covariances(gaussian, camera, view, rules.scale_modifier);
+  const Conic<S>& conic = made.conic;
   const Vec2<S> pixel = project_to_pixel(camera, gaussian.mean);
   const S radius = screen_radius(conic);
   // NaN and infinity in any other attribute reach the determinant or the pixel.
@@ -110,7 +113,7 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
                         : meets_image(conic.inverse, pixel, widest_reach, camera.width, camera.height);
   if (!seen) return out;
   S opacity = gaussian.opacity;
-  if (rules.antialiasing) opacity *= opacity_compensation(cov2d, conic);
+  if (rules.antialiasing) opacity *= opacity_compensation(conic);
   const S reach = squared_reach(cut, opacity, rules.cut.of(opacity));
   out.gaussian = {pixel, conic.inverse, opacity, reach, view.z};
   out.radius = static_cast<int32_t>(min(radius, S(1 << 30)));
@@ -130,7 +133,7 @@ template <class S> struct GaussianGradient {
   S opacity;
   Vec3<S> scale;  // where the covariance is not given
   Vec4<S> rotation;
-  Sym3<S> covariance;  // by the covariance, given or not
+  Sym3<S> covariance;  // where it is given
   CameraShare<S> camera;
 };
 
@@ -140,25 +143,27 @@ DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const
   GaussianGradient<S> out = {};
   const Vec3<S> view = transform_point(camera.view, gaussian.mean);
   const auto made = covariances(gaussian, camera, view, rules.scale_modifier);
-  const Conic<S> conic = make_conic(made.image);
+  const Conic<S>& conic = made.conic;
 
   Sym2<S> dL_dcov2d = make_conic_backward(conic, g.gate.conic);
   out.opacity = g.gate.opacity;
   if (rules.antialiasing) {
     const Sym2<S> extra = opacity_compensation_backward(made.image, conic, g.gate.opacity * gaussian.opacity);
     dL_dcov2d = {dL_dcov2d.xx + extra.xx, dL_dcov2d.xy + extra.xy, dL_dcov2d.yy + extra.yy};
-    out.opacity *= opacity_compensation(made.image, conic);
+    out.opacity *= opacity_compensation(conic);
   }
-  const auto by_image = covariance_2d_backward(made.axes, made.world, dL_dcov2d);
-  out.covariance = by_image.cov;
-  if (!gaussian.has_covariance) {
-    const auto by_world = covariance_3d_backward(made.scale, made.rotation, by_image.cov);
-    out.scale = rules.scale_modifier * by_world.scale;
-    out.rotation = quaternion_to_rotation_backward(gaussian.rotation, by_world.rotation);
+  Mat23<S> dL_daxes;
+  if (gaussian.has_covariance) {
+    const auto by = covariance_2d_backward(made.axes, gaussian.covariance, dL_dcov2d);
+    out.covariance = by.cov, dL_daxes = by.axes;
+  } else {
+    const auto by = image_factor_backward(made.axes, made.scale, made.rotation, made.factor, dL_dcov2d);
+    out.scale = rules.scale_modifier * by.scale, dL_daxes = by.axes;
+    out.rotation = quaternion_to_rotation_backward(gaussian.rotation, by.rotation);
   }
 
   const Mat3<S> view_axes = view_rotation(camera.view);
-  const Mat23<S> dL_dJ = {view_axes * by_image.axes.r0, view_axes * by_image.axes.r1};
+  const Mat23<S> dL_dJ = {view_axes * dL_daxes.r0, view_axes * dL_daxes.r1};
   Vec3<S> dL_dview = projection_jacobian_backward(made.jacobian, dL_dJ);
   if (rules.depth) dL_dview.z += g.depth;
   if (rules.inverse_depth) dL_dview.z -= g.inverse_depth / (view.z * view.z);
@@ -167,8 +172,8 @@ DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const
   out.mean2D = {g.gate.mean.x * S(0.5) * S(camera.width), g.gate.mean.y * S(0.5) * S(camera.height)};
 
   const auto& j = made.jacobian.jacobian;
-  const Mat3<S> dL_drotation = {j.r0.x * by_image.axes.r0, j.r1.y * by_image.axes.r1,
-                                j.r0.z * by_image.axes.r0 + j.r1.z * by_image.axes.r1};
+  const Mat3<S> dL_drotation = {j.r0.x * dL_daxes.r0, j.r1.y * dL_daxes.r1,
+                                j.r0.z * dL_daxes.r0 + j.r1.z * dL_daxes.r1};
   out.camera = {gaussian.mean, dL_dview, dL_drotation, by_pixel.clip, S(-1) * g.color};
   return out;
 }

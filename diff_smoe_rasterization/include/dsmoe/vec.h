@@ -25,6 +25,11 @@ template <class S> struct Mat23 { Vec3<S> r0, r1; };
 template <class S> DSMOE_HD Vec3<S> operator+(Vec3<S> a, Vec3<S> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 template <class S> DSMOE_HD Vec3<S> operator-(Vec3<S> a, Vec3<S> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 template <class S> DSMOE_HD Vec3<S> operator*(S s, Vec3<S> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class S> DSMOE_HD Vec3<S> operator*(Vec3<S> a, Vec3<S> b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+template <class S> DSMOE_HD Vec3<S> cross(Vec3<S> a, Vec3<S> b) {
+  return {difference_of_products(a.y, b.z, a.z, b.y), difference_of_products(a.z, b.x, a.x, b.z),
+          difference_of_products(a.x, b.y, a.y, b.x)};
+}
 template <class S> DSMOE_HD S dot(Vec3<S> a, Vec3<S> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
 template <class S> DSMOE_HD Vec3<S> operator*(const Sym3<S>& m, Vec3<S> v) {
