@@ -1,7 +1,8 @@
 """Builds the torch extension. Metadata: pyproject.toml; files and compiler flags: sources.txt.
 
 Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA), TORCH_CUDA_ARCH_LIST, MAX_JOBS;
-DSMOE_CUDA_ARCH=all compiles for every card where none is seen; DSMOE_CORE_LIBRARY is a libdsmoe.a that CMake has built.
+DSMOE_CUDA_ARCH=all compiles for every card where none is seen; DSMOE_CORE_FOLDER=DIR links the libraries that CMake has
+built in DIR (libdsmoe_core.a, libdsmoe_io.a, libdsmoe_cuda.a) in place of compiling their sources once more.
 """
 import os
 import re
@@ -113,13 +114,16 @@ def architecture_flags(nvcc, torch):
     return [f"-gencode=arch=compute_{number},code={kind}" for number, kind in kinds]
 
 
-def compiled_core(torch):
-    """Returns [path] of the library that holds the groups core and io already; [] where they are compiled here.
+def compiled_libraries(torch):
+    """Returns the libraries that CMake has built, by the group of sources.txt that each holds, in the order of linking.
 
-    Torch releases of the older C++ ABI cannot link it.
+    Empty where all is compiled here. Torch releases of the older C++ ABI cannot link them.
     """
-    path = os.environ.get("DSMOE_CORE_LIBRARY")
-    return [path] if path and torch.compiled_with_cxx11_abi() else []
+    folder = os.environ.get("DSMOE_CORE_FOLDER")
+    if not folder or not torch.compiled_with_cxx11_abi():
+        return {}
+    paths = {group: Path(folder) / f"libdsmoe_{group}.a" for group in ("cuda", "core", "io")}
+    return {group: str(path) for group, path in paths.items() if path.is_file()}
 
 
 def extension():
@@ -127,8 +131,8 @@ def extension():
     torch, cpp_extension = import_build_tools()
     sources = read_sources()
     without_cuda = reasons_against_cuda(sources["cuda"], torch, cpp_extension.CUDA_HOME)
-    core = compiled_core(torch)
-    groups = ([] if core else ["core", "io"]) + ["torch"] + ([] if without_cuda else ["cuda", "torch_cuda"])
+    groups = ["core", "io", "torch"] + ([] if without_cuda else ["cuda", "torch_cuda"])
+    libraries = {group: path for group, path in compiled_libraries(torch).items() if group in groups}
     flags = sources["flags"] + ["-g0", "-fvisibility=hidden", "-pthread"]
     if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
         flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
@@ -139,12 +143,12 @@ def extension():
     make = cpp_extension.CppExtension if without_cuda else cpp_extension.CUDAExtension
     module = make(
         f"{PACKAGE}._C",
-        [f"{PACKAGE}/{path}" for group in groups for path in sources[group]],
+        [f"{PACKAGE}/{path}" for group in groups if group not in libraries for path in sources[group]],
         include_dirs=folders,
         define_macros=[] if without_cuda else [("DSMOE_WITH_CUDA", None)],
         extra_compile_args={"cxx": flags, "nvcc": nvcc_flags},
-        extra_objects=core,
-        extra_link_args=["-pthread"],
+        extra_objects=list(libraries.values()),
+        extra_link_args=["-pthread"] + (["-Wl,--exclude-libs,ALL"] if libraries else []),
     )
     built_against = {
         "TORCH_VERSION": torch.__version__,
