@@ -125,6 +125,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; returns its exit status: 0, 1 on an error that its text explains, 130 or 143 if interrupted."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads sleep, where they would spin
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
     if unknown:  # argparse would show the usage of `dsmoe` alone
