@@ -78,7 +78,7 @@ def test_opcheck_of_rasterize_on_no_gaussians(mode):
     opcheck_rasterize(scene)
 
 
-@with_gate
+@SHAPES
 def test_opcheck_of_radii(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
     torch.library.opcheck(torch.ops.diff_smoe_rasterization.radii.default, op_arguments(scene, "radii"))
