@@ -150,8 +150,8 @@ def num_instances(renderer: Ours, settings) -> int:
     from diff_smoe_rasterization import extension, rasterize_with_splats
     with torch.no_grad():
         _, splats = rasterize_with_splats(settings=settings, **renderer.parameters)
-    tile = extension._C.constants["tile_size"]
-    return int(splats._tile_offsets[-(-settings.image_width // tile) * -(-settings.image_height // tile)])
+    names = [name for name, *_ in extension._C.saved["cuda"]]
+    return int(splats._saved[names.index("tile_offsets")][-1])
 
 
 def stages(measurement: Measurement) -> Dict[str, Any]:

@@ -113,6 +113,25 @@ TEST(ImageFactor, BackwardIsTheDerivative) {
   expect_gradient(actual, loss, x);
 }
 
+// Adam makes a whole step of any gradient, of rounding too: a sphere must not be turned before it has another shape.
+TEST(ImageFactor, DoesNotTurnASphereInFloat) {
+  Random random(5);
+  const Vec4<float> unturned = {1, 0, 0, 0};
+  const Mat3<float> rotation = quaternion_to_rotation(unturned);
+  for (int i = 0; i < 100; ++i) {
+    const Vector x = random.uniforms(10);
+    const std::vector<float> f(x.begin(), x.end());
+    const Mat23<float> axes = {{f[0], f[1], f[2]}, {f[3], f[4], f[5]}};
+    const Vec3<float> scale = {f[6], f[6], f[6]};
+    const auto factor = image_factor(axes, scale, rotation);
+    const auto g = image_factor_backward(axes, scale, rotation, factor, Sym2<float>{f[7], f[8], f[9]});
+    const auto q = quaternion_to_rotation_backward(unturned, g.rotation);
+    EXPECT_EQ(q.y, 0.0f);
+    EXPECT_EQ(q.z, 0.0f);
+    EXPECT_EQ(q.w, 0.0f);
+  }
+}
+
 Camera<double> wide_camera() {
   Camera<double> camera;
   camera.width = 64;

@@ -81,16 +81,21 @@ template <class S> struct Covariance2dGradient {
   Mat23<S> axes;
 };
 
+// The derivative by each of the six stored numbers of Sigma: an off-diagonal one stands for two matrix entries.
+template <class S> DSMOE_HD Sym3<S> dL_dcovariance(const Mat23<S>& axes, const Sym2<S>& g) {
+  const Vec3<S> a = axes.r0, b = axes.r1;
+  return {g.xx * a.x * a.x + g.xy * a.x * b.x + g.yy * b.x * b.x,
+          S(2) * g.xx * a.x * a.y + g.xy * (a.x * b.y + a.y * b.x) + S(2) * g.yy * b.x * b.y,
+          S(2) * g.xx * a.x * a.z + g.xy * (a.x * b.z + a.z * b.x) + S(2) * g.yy * b.x * b.z,
+          g.xx * a.y * a.y + g.xy * a.y * b.y + g.yy * b.y * b.y,
+          S(2) * g.xx * a.y * a.z + g.xy * (a.y * b.z + a.z * b.y) + S(2) * g.yy * b.y * b.z,
+          g.xx * a.z * a.z + g.xy * a.z * b.z + g.yy * b.z * b.z};
+}
+
 template <class S>
 DSMOE_HD Covariance2dGradient<S> covariance_2d_backward(const Mat23<S>& axes, const Sym3<S>& cov, const Sym2<S>& g) {
-  const Vec3<S> a = axes.r0, b = axes.r1, u = cov * a, v = cov * b;
-  return {{g.xx * a.x * a.x + g.xy * a.x * b.x + g.yy * b.x * b.x,
-           S(2) * g.xx * a.x * a.y + g.xy * (a.x * b.y + a.y * b.x) + S(2) * g.yy * b.x * b.y,
-           S(2) * g.xx * a.x * a.z + g.xy * (a.x * b.z + a.z * b.x) + S(2) * g.yy * b.x * b.z,
-           g.xx * a.y * a.y + g.xy * a.y * b.y + g.yy * b.y * b.y,
-           S(2) * g.xx * a.y * a.z + g.xy * (a.y * b.z + a.z * b.y) + S(2) * g.yy * b.y * b.z,
-           g.xx * a.z * a.z + g.xy * a.z * b.z + g.yy * b.z * b.z},
-          {S(2) * g.xx * u + g.xy * v, g.xy * u + S(2) * g.yy * v}};
+  const Vec3<S> u = cov * axes.r0, v = cov * axes.r1;
+  return {dL_dcovariance(axes, g), {S(2) * g.xx * u + g.xy * v, g.xy * u + S(2) * g.yy * v}};
 }
 
 // Of scale and rotation, Sigma = R S S^T R^T (3DGS Eq. 6): Sigma2D = L L^T with L = M R S. The determinant is the sum
@@ -116,16 +121,23 @@ template <class S> struct ImageFactorGradient {
   Mat23<S> axes;
 };
 
+// By R through Sigma, of which column k of R contributes scale_k^2 r_k r_k^T: the derivative by Sigma is symmetric to
+// the last bit, so that a round Gaussian's unturned quaternion gets a gradient of exactly 0, and not rounding.
 template <class S>
 DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3<S> scale, const Mat3<S>& rotation,
                                                       const ImageFactor<S>& factor, const Sym2<S>& g) {
   const Vec3<S> dL_da = S(2) * g.xx * factor.half.r0 + g.xy * factor.half.r1;
   const Vec3<S> dL_db = g.xy * factor.half.r0 + S(2) * g.yy * factor.half.r1;
-  const Vec3<S> a = scale * dL_da, b = scale * dL_db;  // by M R
-  const auto row = [&](S x, S y) { return x * a + y * b; };
+  const Sym3<S> dL_dcov = dL_dcovariance(axes, g);
+  const S half = S(0.5);
+  const Sym3<S> by = {dL_dcov.xx, half * dL_dcov.xy, half * dL_dcov.xz, dL_dcov.yy, half * dL_dcov.yz, dL_dcov.zz};
+  const Vec3<S> variance = S(2) * (scale * scale);
+  const Vec3<S> x = variance.x * (by * Vec3<S>{rotation.r0.x, rotation.r1.x, rotation.r2.x});
+  const Vec3<S> y = variance.y * (by * Vec3<S>{rotation.r0.y, rotation.r1.y, rotation.r2.y});
+  const Vec3<S> z = variance.z * (by * Vec3<S>{rotation.r0.z, rotation.r1.z, rotation.r2.z});
   return {factor.turned.r0 * dL_da + factor.turned.r1 * dL_db,
-          {row(axes.r0.x, axes.r1.x), row(axes.r0.y, axes.r1.y), row(axes.r0.z, axes.r1.z)},
-          {rotation * a, rotation * b}};
+          {{x.x, y.x, z.x}, {x.y, y.y, z.y}, {x.z, y.z, z.z}},
+          {rotation * (scale * dL_da), rotation * (scale * dL_db)}};
 }
 
 // The conic, the inverse of Sigma2D + low-pass, with what the radius and antialiasing need.

@@ -33,7 +33,7 @@ def test_room_for_one_large_view_is_given_up_again(gpu):
 
 def test_the_filter_of_anchors_teaches_nothing(gpu):
     """It has no tile instances. Were they counted, the first rendering of the same size would have no room for its own."""
-    scene = random_scene("smoe", 20_000, 333, 157, scale=0.02, dtype=torch.float32, degree=0).to(gpu)
+    scene = random_scene("smoe", 20_000, 333, 157, scale=0.1, dtype=torch.float32, degree=0).to(gpu)
     shape = {name: scene.inputs[name] for name in ("means3D", "scales", "rotations")}
     radii = GaussianRasterizer(scene.settings).visible_filter(**shape)
     torch.cuda.synchronize()
