@@ -172,7 +172,8 @@ def backward_arguments(mode, **others):
              for seed, name in enumerate(DIFFERENTIABLE)}
     given.update(inputs=[tensor for tensor in tensors if tensor is not None], images=list(images.values()),
                  saved=list(saved.values()), present=present, wanted=present)
-    names = [argument.name for argument in torch.ops.diff_smoe_rasterization.rasterize_backward.default._schema.arguments]
+    schema = torch.ops.diff_smoe_rasterization.rasterize_backward.default._schema
+    names = [argument.name for argument in schema.arguments]
     return dict(zip(names, op_arguments(scene, "rasterize_backward", **given, **others)))
 
 

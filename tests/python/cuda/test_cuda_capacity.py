@@ -1,7 +1,6 @@
 """For how many tile instances a rendering makes room, and what it learns that from."""
 from __future__ import annotations
 
-import pytest
 import torch
 from scenes import op_results, random_scene
 
@@ -32,7 +31,7 @@ def test_room_for_one_large_view_is_given_up_again(gpu):
 
 
 def test_the_filter_of_anchors_teaches_nothing(gpu):
-    """It has no tile instances. Were they counted, the first rendering of the same size would have no room for its own."""
+    """It has no tile instances. Were they counted, the first rendering of that size would have no room for its own."""
     scene = random_scene("smoe", 20_000, 333, 157, scale=0.1, dtype=torch.float32, degree=0).to(gpu)
     shape = {name: scene.inputs[name] for name in ("means3D", "scales", "rotations")}
     radii = GaussianRasterizer(scene.settings).visible_filter(**shape)

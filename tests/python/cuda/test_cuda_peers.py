@@ -1,7 +1,7 @@
 """Against public rasterizers, where they are: $DSMOE_PEERS holds a folder each (inria, dr_aa, gsplat) with its package.
 
-$DSMOE_BIG_MODEL is the model: an .npz that benchmarks/timing/models.py reads (gpu_rasterizer.py --save-npz writes one of
-a trained .ply and its scene). Without it a made-up one is used.
+$DSMOE_BIG_MODEL is the model: an .npz that benchmarks/timing/models.py reads (gpu_rasterizer.py --save-npz writes one
+of a trained .ply and its scene). Without it a made-up one is used.
 
 Known differences, each with its test or the reason why there is none:
 - Inria's backward is not the derivative of its forward where the projection's Jacobian is clamped, beyond 1.3 tan(fov /
