@@ -26,7 +26,6 @@ OPTIONS = {name: _PYTHON_TYPES[kind] for name, kind in _C.options.items()}
 _NUM_INPUTS, _NUM_IMAGES = len(INPUTS), len(IMAGES)
 _RADII, _DEPTH = IMAGES.index("radii"), IMAGES.index("depth")
 _BLEND_MODE = list(OPTIONS).index("blend_mode")
-_FOR_BACKWARD = list(OPTIONS).index("for_backward")
 _ALPHA = 0  # BLEND_MODES.index("alpha")
 
 

@@ -111,6 +111,7 @@ def _arguments(settings, outputs, **tensors):
 
 
 # All but for_backward, which `rasterize_op` decides.
+assert list(OPTIONS)[-1] == "for_backward"
 _GIVEN_OPTIONS = tuple(OPTIONS.items())[:-1]
 
 

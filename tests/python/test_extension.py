@@ -149,7 +149,9 @@ def test_images_may_be_edited_in_place(mode, outputs):
         sum((image ** 2).sum() for image in images).backward()
         return {name: tensor.grad for name, tensor in leaf.leaves().items()}
 
-    assert_same_gradients(gradients(lambda image: image.mul_(0.5)), gradients(lambda image: image * 0.5))
+    for factor in (0.5, 0.0, -1.0):
+        assert_same_gradients(gradients(lambda image: image.mul_(factor)),  # noqa: B023
+                              gradients(lambda image: image * factor))  # noqa: B023
 
 
 @on_every_device

@@ -19,7 +19,9 @@ template <class S> void radii(const Frame<S>& frame, Scratch& scratch) {
   const int64_t count = frame.inputs.num_gaussians;
   Frame<S> projected = frame;
   const auto allocate = [&](auto*& pointer, int64_t size) {
-    pointer = static_cast<std::remove_reference_t<decltype(pointer)>>(scratch.allocate(size * sizeof(*pointer)));
+    void* memory = scratch.allocate(size * sizeof(*pointer));
+    if (memory == nullptr && size > 0) throw std::bad_alloc();
+    pointer = static_cast<std::remove_reference_t<decltype(pointer)>>(memory);
   };
   allocate(projected.saved.projected, count);
   allocate(projected.saved.features, count * frame.config.num_features());

@@ -7,7 +7,7 @@
 #include "../dispatch.h"
 #include "device.cuh"
 #include "dsmoe/blend.h"
-#include "dsmoe/rasterize.h"
+#include "dsmoe/params.h"
 #include "look_back.cuh"
 #include "reduce.cuh"
 #include "tile_rows.cuh"

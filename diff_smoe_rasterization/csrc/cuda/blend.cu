@@ -1,6 +1,6 @@
 // Stage 3: the images.
 #include "../dispatch.h"
-#include "dsmoe/rasterize.h"
+#include "dsmoe/params.h"
 #include "segments.cuh"
 
 namespace dsmoe {

@@ -1,6 +1,6 @@
 // From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures.
 #include "../dispatch.h"
-#include "dsmoe/rasterize.h"
+#include "dsmoe/params.h"
 #include "gradient_sinks.cuh"
 #include "reduce.cuh"
 #include "segments.cuh"
@@ -410,7 +410,8 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
     arguments.scaled = allocate_scaled(arguments, scratch);
     launch_backward<S, kAnyFeatures>(arguments, tiles, stream);
   }
-  if (pass.slots != nullptr && frame.inputs.num_gaussians > 0) backward_outgrown(arguments, scratch, stream);
+  if (pass.slots != nullptr && !pass.fits && frame.inputs.num_gaussians > 0)
+    backward_outgrown(arguments, scratch, stream);
   if (dL_dbackground != nullptr) {
     sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
   }

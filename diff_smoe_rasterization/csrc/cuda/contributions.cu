@@ -2,7 +2,7 @@
 // pixels, then adds the four numbers to those of the Gaussian by atomics.
 #include "../dispatch.h"
 #include "dsmoe/contribution.h"
-#include "dsmoe/rasterize.h"
+#include "dsmoe/params.h"
 #include "reduce.cuh"
 #include "tile_walk.cuh"
 

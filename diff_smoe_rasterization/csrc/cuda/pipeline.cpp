@@ -117,7 +117,8 @@ void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& r
   BackwardPass<S> pass;
   pass.gradients = gradients;
   pass.dL_dgaussians = allocate_zeros<S>(memory, count * record, run.stream);
-  if (run.deterministic) {
+  if (frame.saved.instance_width == 2) {    // as the forward pass has decided
+    pass.fits = !is_capturing(run.stream);  // the count of a captured graph's next contents is not known
     pass.slots = allocate_zeros<S>(memory, frame.saved.capacity * kSlotsPerInstance * record, run.stream);
   }
   blend_backward(frame, pass, work);

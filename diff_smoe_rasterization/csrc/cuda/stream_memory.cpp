@@ -1,5 +1,6 @@
 #include <cuda_runtime_api.h>
 
+#include "check.h"
 #include "dsmoe/rasterize_cuda.h"
 
 namespace dsmoe {
@@ -8,9 +9,13 @@ namespace {
 
 void* from_pool(size_t bytes, cudaStream_t stream) {
   void* memory = nullptr;
-  if (cudaMallocAsync(&memory, bytes, stream) == cudaSuccess) return memory;
-  cudaGetLastError();  // forgets it: who asked says what was wanted
-  return nullptr;
+  const cudaError_t status = cudaMallocAsync(&memory, bytes, stream);
+  if (status == cudaErrorMemoryAllocation) {
+    cudaGetLastError();  // forgets it: the caller says what was wanted
+    return nullptr;
+  }
+  check(status, "allocating memory");
+  return memory;
 }
 
 void free_all(std::vector<void*>& blocks, cudaStream_t stream) {

@@ -21,6 +21,7 @@
   X(kBackgroundGate, "Tensor?", background_gate) /* one element; absent: a fixed number */
 
 // The others: X(type in C++, type in the schema, name). They mean what the field of that name means in settings.py.
+// for_backward stays the last one: callers in Python append it.
 #define DSMOE_OPTIONS(X)                                                   \
   X(int64_t, "SymInt", image_height)                                       \
   X(int64_t, "SymInt", image_width)                                        \

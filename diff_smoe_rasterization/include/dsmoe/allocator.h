@@ -11,8 +11,8 @@
 
 namespace dsmoe {
 
-// Memory for the duration of one call, or null where there is none left. It is free again when the call returns, on a
-// GPU in the order of the stream.
+// Memory for the duration of one call, at a multiple of 256 bytes, or null where there is none left. It is free again
+// when the call returns, on a GPU in the order of the stream.
 class Scratch {
  public:
   virtual void* allocate(size_t bytes) = 0;
@@ -38,8 +38,8 @@ struct SavedArray {
 
 class Allocator : public Scratch {
  public:
-  // Memory for array number `index` of those that `for_each_array` names, or null where there is none left. It must
-  // last until the backward pass has run, or until the caller knows that none will.
+  // Memory for array number `index` of those that `for_each_array` names, at a multiple of 256 bytes, or null where
+  // there is none left. It must last until the backward pass has run, or until the caller knows that none will.
   virtual void* keep(int index, const SavedArray& array) = 0;
 
   // Later work on the same stream may take what `allocate` has given so far.

@@ -79,8 +79,8 @@ struct SavedSizes {
   int64_t num_instances = -1;  // I; -1: not known yet
 };
 
-// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. Whoever
-// allocates, checks or passes on these arrays goes by this list and its order.
+// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. All
+// code that allocates, checks or passes on these arrays uses this list and its order.
 template <class S, class Visit> void for_each_array(SavedForward<S>& saved, const SavedSizes& sizes, Visit visit) {
   visit("projected", saved.projected, sizes.num_gaussians);
   visit("features", saved.features, sizes.num_features < 0 ? -1 : sizes.num_gaussians * sizes.num_features);

@@ -1,6 +1,8 @@
 // A pixel behind its last pair: from its sums to its features, and where its backward pass begins.
 #pragma once
 
+#include <cmath>
+
 #include "dsmoe/blend.h"
 
 namespace dsmoe {
@@ -29,7 +31,9 @@ DSMOE_HD FeatureEnd<Real> feature_end(FeatureRule rule, const PixelEnd<Real>& en
   const bool averaged = rule == FeatureRule::kAveraged, divides = averaged || Blend<kMode>::kDivides;
   const S gate = averaged ? S(0) : Blend<kMode>::background_gate(end.background_gate);
   const Real weight = Real(gate) * end.transmittance;
-  return {weight, divides ? end.gate_sum + weight : Real(S(1)), end.gate_sum >= Real(S(kGateSumCut)), divides};
+  // Where nothing is divided the gate sum is not read: it is an image of the caller's, who may have changed it.
+  const S least = divides ? S(kGateSumCut) : S(-INFINITY);
+  return {weight, divides ? end.gate_sum + weight : Real(S(1)), end.gate_sum >= Real(least), divides};
 }
 
 template <BlendMode kMode, class Real>

@@ -77,8 +77,8 @@ struct SavedSizes {
   bool segments = false;      // the backward pass walks long lists in segments
 };
 
-// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. Whoever
-// allocates, checks or passes on these arrays goes by this list and its order. tile_offsets has num_instances behind
+// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. All code
+// that allocates, checks or passes on these arrays uses this list and its order. tile_offsets has num_instances behind
 // it.
 template <class S, class Visit> void for_each_array(SavedForward<S>& saved, const SavedSizes& sizes, Visit visit) {
   const bool known = sizes.capacity >= 0;
@@ -120,17 +120,17 @@ template <class S> struct Gradients {
 // How a pass runs.
 struct Run {
   cudaStream_t stream = nullptr;
-  bool deterministic = false;   // gradients are equal bit for bit from run to run; slower
+  bool deterministic = false;   // forward: gradients will be equal bit for bit from run to run; slower
   bool for_backward = true;     // false: what only makes a backward pass faster is left out
   StageTimes* times = nullptr;  // is added to, or null; the pass then waits for its kernels
 };
 
 // Renders frame.inputs to frame.images and fills frame.saved. The first call of a size, mode and order of N waits for
-// the number of instances, and so does every call with `deterministic`; no other waits.
+// the number of instances. So does every call with `deterministic` outside a capture, and every call with `times`.
 // Throws std::overflow_error where `deterministic` has more instances than fit 32-bit slots.
 template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory);
 
-// Writes gradients.inputs. `frame` is as `forward` left it, and run.deterministic as it was there.
+// Writes gradients.inputs. `frame` is as `forward` left it.
 template <class S>
 void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory);
 
@@ -149,7 +149,8 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run)
   return sizes;
 }
 
-// Memory of the current device, from the pool of the stream. What is kept lasts as long as the object.
+// Memory of the current device, from the pool of the stream, which must outlive the object. What is kept lasts as long
+// as the object.
 class StreamMemory final : public Allocator {
  public:
   explicit StreamMemory(cudaStream_t stream) : stream_(stream) {}
@@ -210,6 +211,7 @@ template <class S> struct BackwardPass {
   // [capacity, kSlotsPerInstance, kNumGateMoments + F], zero before, in place of the records where the instances fit;
   // or null.
   S* slots = nullptr;
+  bool fits = false;  // with slots: the instances are known to fit their memory, so the way for others is left out
 };
 
 // From image gradients to the records, and to the gradient by the background.
