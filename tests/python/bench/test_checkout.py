@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 import small_dbs
 from bench_commands import ABOVE, wait_for
+from PIL import Image
+
+from diff_smoe_rasterization import io
 from diff_smoe_rasterization.benchmarks.suite import preparation
 from diff_smoe_rasterization.benchmarks.suite.cell import work
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.methods import checkout as shapes
-from PIL import Image
-
-from diff_smoe_rasterization import io
 
 pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 

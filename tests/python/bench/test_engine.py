@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 from bench_commands import command, environment, rows_of, wait_for
+
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import engine, selection
 from diff_smoe_rasterization.benchmarks.suite.cell import failed_row
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.names import blend_of
-
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.errors import TrainerError
 

@@ -6,10 +6,10 @@ import os
 
 import pytest
 import torch
+
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.mechanism import record as mechanism
 from diff_smoe_rasterization.benchmarks.mechanism.probe import Probe
-
 from diff_smoe_rasterization.trainer.checkpoint import CHECKPOINT_NAME, load_checkpoint
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import TrainerError

@@ -16,7 +16,6 @@ from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images,
 pytest.importorskip("matplotlib", reason="a report needs matplotlib")
 pytest.importorskip("jinja2", reason="a report needs jinja2")
 from diff_smoe_rasterization.benchmarks.suite.report import ReportError, report, sliders, survey  # noqa: E402
-
 from diff_smoe_rasterization.trainer.errors import TrainerError  # noqa: E402
 
 
