@@ -200,6 +200,17 @@ def test_a_failed_cell_is_a_row_with_its_reason():
     assert shown(table_of(entries, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "smoe failed"
 
 
+def test_csv_is_unrounded_and_complete():
+    psnr = 24.123456789
+    table = table_of([row(psnr=psnr), row(seed=1, psnr=psnr), row("fox, the \"red\" one")], "cells")
+    lines = list(csv.DictReader(io.StringIO(tables.to_csv(table))))
+    assert len(lines) == 2 and {line["source"] for line in lines} == {"ours"}
+    bonsai = next(line for line in lines if line["scene"] == "bonsai")
+    assert float(bonsai["PSNR [dB]"]) == psnr and float(bonsai["PSNR [dB] sd"]) == 0
+    fox = next(line for line in lines if line["scene"] == "fox, the \"red\" one")
+    assert fox["PSNR [dB] sd"] == "" and fox["#Gaussians"] == "40000"
+
+
 @pytest.mark.parametrize("name", ["table1", "table3", "deltas", "cells", "failures"])
 def test_every_line_of_latex_and_markdown_has_all_columns(name):
     entries = [row(blend_mode=mode, seed=seed) for mode in ("alpha", "smoe", "smoe_tn") for seed in (0, 1)]

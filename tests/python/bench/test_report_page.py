@@ -131,6 +131,20 @@ def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path):
     assert rules["cells that shared their GPU or CPU"] == "1 of 2, up to 3 at once" and "arguments" not in rules
 
 
+def test_renderings_are_copied_byte_for_byte(tmp_path):
+    entry = row(blend_mode="smoe", background_gate=0.05)
+    write_images(tmp_path / "results", entry, ALPHA, names=("a b",))
+    found = sliders.collect(str(tmp_path / "results"), "s u", [entry], str(tmp_path))
+    view, = found[0]["settings"][0]["views"]
+    truth, gated, error = view["layers"]
+    source = tmp_path / "results" / "cells" / entry["cell"] / "images"
+    for layer, kind in ((truth, "gt"), (gated, "render")):
+        assert (tmp_path / layer["path"]).read_bytes() == (source / kind / "a b.png").read_bytes()
+    assert " " not in truth["path"] + gated["path"] + error["path"]
+    # One of three channels is off by 80 of 255: 10 log10(3 (255 / 80)^2)
+    assert gated["note"] == error["note"] == "14.84 dB"
+
+
 @pytest.mark.parametrize("changes", [{"truth": (99, 100, 100)}, {"size": (32, 48)}])
 def test_images_of_different_truths_are_refused(tmp_path, changes):
     entries = [row(), row(blend_mode="smoe")]
