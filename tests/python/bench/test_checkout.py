@@ -77,11 +77,11 @@ def write_views(folder, views):
 
 
 class SmallTrainers:
-    """Cells of small trainers, and their rows, each trained once."""
+    """Cells of small trainers, each patched once."""
 
     def __init__(self, scene, folder):
         self.scene, self.folder = scene, folder
-        self.rows = {}
+        self.prepared = {}
 
     def checkout(self, name):
         path = self.folder / f"checkout-{name}"
@@ -100,15 +100,10 @@ class SmallTrainers:
                    "seeds": [seed], "densify_grad_thresholds": [0.0001], "images": 1}
         cell, = expand(content, "").cells
         cell["protocol"] = {**cell["protocol"], "device": "cpu"}
-        return dict(cell, method=preparation.prepared_method(cell["method"], str(self.folder / "results")))
-
-    def run(self, *words, **options):
-        """(row, output folder) of a cell with these arguments of `cell`."""
-        key = json.dumps([words, options], default=str, sort_keys=True)
-        if key not in self.rows:
-            output = self.folder / f"out {len(self.rows)}"
-            self.rows[key] = row_of(self.cell(*words, **options), output), output
-        return self.rows[key]
+        key = json.dumps(cell["method"], sort_keys=True)
+        if key not in self.prepared:
+            self.prepared[key] = preparation.prepared_method(cell["method"], str(self.folder / "results"))
+        return dict(cell, method=self.prepared[key])
 
 
 def row_of(cell, output):
@@ -129,8 +124,9 @@ def small(scene, tmp_path_factory):
 
 @pytest.mark.parametrize("name", ["3dgs-2023", pytest.param("c3dgs", marks=pytest.mark.slow),
                                   pytest.param("hac", marks=pytest.mark.slow)])
-def test_a_patched_checkout_gives_a_row(name, small):
-    row, output = small.run(name)
+def test_a_patched_checkout_gives_a_row(name, small, tmp_path):
+    output = tmp_path / "out"
+    row = row_of(small.cell(name), output)
     assert row["ok"], row["reason"]
     assert (row["method"], row["variant"], row["blend_mode"]) == (name, "patched", "smoe")
     assert row["schedule"] == (None if name == "hac" else "3dgs")
@@ -252,9 +248,12 @@ def test_a_checkout_that_was_trained_on_other_images_is_refused(small, scene, tm
 
 
 def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
-    row = row_of(small.cell("3dgs-2023", arguments=["--no_such_flag"]), tmp_path / "out")
-    assert not row["ok"] and "train.py of 3dgs-2023 ended with status 2" in row["reason"]
-    assert "--no_such_flag" in row["reason"]
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho told >&2\necho 'train.py: error: no such flag' >&2\nexit 2\n")
+    python.chmod(0o755)
+    row = row_of(small.cell("3dgs-2023", python=str(python)), tmp_path / "out")
+    assert not row["ok"]
+    assert "train.py of 3dgs-2023 ended with status 2: train.py: error: no such flag (" in row["reason"]
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """From a suite to rows: what is done is not done again, what fails is a row, what is killed continues."""
 from __future__ import annotations
 
+import csv
 import json
 import os
 import shutil
@@ -72,6 +73,25 @@ def test_a_row_says_what_was_measured_and_how(finished):
     assert row["lpips"]["value"] is None and row["lpips"]["reason"]
     assert row["train_seconds"] < row["wall_seconds"]
     assert row["machine"]["cells_at_once"] == 2  # --jobs 2, two cells
+
+
+def test_the_report_of_a_run_holds_what_its_rows_say(finished, tmp_path):
+    pytest.importorskip("matplotlib", reason="a report needs matplotlib")
+    assert main(["bench", "report", str(finished[2]), "-o", str(tmp_path)]) == 0
+    rows = {row["ok"]: row for row in rows_of(finished[2]).values()}
+    found = {}
+    for name in ("cells", "failures"):
+        with open(tmp_path / "tables" / f"two_{name}.csv", encoding="utf-8", newline="") as file:
+            found[name] = list(csv.DictReader(file))
+    measured = next(line for line in found["cells"] if line["scene"] == "tiny")
+    assert float(measured["PSNR [dB]"]) == rows[True]["psnr"]
+    assert int(measured["#Gaussians"]) == rows[True]["num_gaussians"]
+    failed, = found["failures"]
+    assert (failed["cell"], failed["reason"]) == (rows[False]["cell"], rows[False]["reason"])
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    for part in ('id="two_cells"', 'data-scene="tiny"', "data:image/svg+xml", "2 cells on 2 scenes, 1 seed; 1 failed"):
+        assert part in page, part
+    assert len(list((tmp_path / "images").rglob("*.png"))) == 3  # the truth, a rendering, its error
 
 
 def test_what_is_done_is_not_done_again(finished, capsys):

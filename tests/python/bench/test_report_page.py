@@ -34,6 +34,12 @@ def written(tmp_path_factory):
     return output
 
 
+@pytest.fixture
+def no_figures(monkeypatch):
+    """They take two seconds a report."""
+    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.report.draw_all", lambda *_: [])
+
+
 class References(HTMLParser):
     """What a page loads."""
 
@@ -66,7 +72,7 @@ def test_the_page_loads_nothing_but_its_own_files(written):
     assert all((written / name).is_file() for name in layers)
 
 
-def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypatch):
+def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypatch, no_figures):
     output = tmp_path / "report"
     shutil.copytree(written, output)
 
@@ -74,7 +80,7 @@ def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypat
         return {path.relative_to(output).as_posix(): path.read_bytes() for path in output.rglob("*") if path.is_file()}
 
     before = files()
-    monkeypatch.setattr(survey, "write_survey", lambda *_: 1 / 0)  # after tables, figures and images
+    monkeypatch.setattr(survey, "write_survey", lambda *_: 1 / 0)  # after tables and images
     with pytest.raises(ZeroDivisionError):
         report(write_rows(tmp_path / "results", [row("fox")]), str(output))
     assert files() == before
@@ -86,7 +92,7 @@ def test_a_folder_of_others_is_left_alone(tmp_path):
         report(write_rows(tmp_path / "results", [row()]), str(tmp_path / "report"))
 
 
-def test_cells_without_a_row_are_named(tmp_path):
+def test_cells_without_a_row_are_named(tmp_path, no_figures):
     def counts(rows, **suite):
         folder = tmp_path / "results"
         write_rows(folder, rows)
@@ -105,7 +111,7 @@ def test_cells_without_a_row_are_named(tmp_path):
         "2 cells on 1 scene, 2 seeds; none failed.")
 
 
-def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path):
+def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path, no_figures):
     results = write_rows(tmp_path / "results", [row()])
     (tmp_path / "file").touch()
     with pytest.raises(TrainerError, match="file: nothing can be written there .* choose another folder with -o"):
@@ -120,7 +126,7 @@ def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path):
     assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["mine.txt"]
 
 
-def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path):
+def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path, no_figures):
     said = {**PROTOCOL, "arguments": ["--port", "0"]}
     entries = [row(protocol=said), row(blend_mode="smoe", schedule="steady", protocol=said,
                                        machine={"cells_per_gpu": 3}), failed(seed=1, iterations=7)]
