@@ -4,6 +4,7 @@ The look and the files are those of the report's figures.
 """
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
@@ -60,7 +61,8 @@ def opacity(runs: Sequence[Run]):
             for age, near in enumerate(reversed(_after_resets(run.record))):
                 _line(after, run, near, value, alpha=0.55 ** age)
         for level in (0.1, 0.9):
-            _line(axes[0, 0], run, states, lambda state: _quantile(state, "opacities", level), alpha=0.5, width=0.7)
+            _line(axes[0, 0], run, states, lambda state, level=level: _quantile(state, "opacities", level),
+                  alpha=0.5, width=0.7)
         _mark_resets(axes[:, 0], run)
     _logarithmic(axes[0])
     for axis in axes[1]:
@@ -78,8 +80,9 @@ def pruning(runs: Sequence[Run]):
         _line(axes[0, 1], run, steps, lambda step: step["after_prune"]["psnr"] - step["before_prune"]["psnr"])
         for column, name in enumerate(("faint", "large")):
             pruned = [step for step in steps if step[name]]
-            _points(axes[1, column], run, pruned, lambda step: step[name])
-            _points(axes[2, column], run, pruned, lambda step: max(step["pruned_colors"][name] or 0, LEAST_SHARE))
+            _points(axes[1, column], run, pruned, itemgetter(name))
+            _points(axes[2, column], run, pruned,
+                    lambda step, name=name: max(step["pruned_colors"][name] or 0, LEAST_SHARE))
         _mark_resets(axes.flat, run)
     _logarithmic(axes[1:].flat)
     return drawn
@@ -93,12 +96,12 @@ def densification(runs: Sequence[Run]):
         steps = run.record["densifications"]
         _points(axes[0, 0], run, steps, lambda step: step["cloned"] + step["split"] or None)
         for level, alpha in ((0.5, 0.4), (0.9, 0.7), (0.99, 1.0)):
-            _line(axes[0, 1], run, steps, lambda step: _quantile(step, "gradients", level), alpha=alpha)
+            _line(axes[0, 1], run, steps, lambda step, level=level: _quantile(step, "gradients", level), alpha=alpha)
         axes[0, 1].axhline(run.record["config"]["densify_grad_threshold"], color=plt.rcParams["text.color"],
                            linewidth=0.8)
         for axis, name in ((axes[1, 0], "edges"), (axes[1, 1], "size")):
-            _points(axis, run, steps, lambda step: step[name]["chosen"])
-            _line(axis, run, steps, lambda step: step[name]["all"])
+            _points(axis, run, steps, lambda step, name=name: step[name]["chosen"])
+            _line(axis, run, steps, lambda step, name=name: step[name]["all"])
         _line(axes[1, 0], run, steps, lambda step: step["edges"]["area"], alpha=0.35)
         _mark_resets(axes.flat, run)
     _logarithmic((axes[0, 0], axes[0, 1], axes[1, 1]))

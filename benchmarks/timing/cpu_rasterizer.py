@@ -20,12 +20,12 @@ import time
 from statistics import fmean, median
 from typing import Dict, NamedTuple
 
-import torch
-
 import dense_torch
 import floor
 import memory
 import models
+import torch
+
 from diff_smoe_rasterization import BLEND_MODES, build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.trainer.environment import processor_name
 

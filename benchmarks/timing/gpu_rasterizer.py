@@ -17,11 +17,11 @@ import sys
 import tempfile
 from typing import Any, Dict, List
 
-import torch
-
 import models
-from diff_smoe_rasterization import build_info
+import torch
 from gpu_renderers import RENDERERS, renderer_named
+
+from diff_smoe_rasterization import build_info
 
 
 def machine() -> Dict[str, Any]:

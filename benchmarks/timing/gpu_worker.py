@@ -10,10 +10,9 @@ import traceback
 from statistics import fmean, median
 from typing import Any, Callable, Dict, List
 
-import torch
-
 import gpu_floor
 import models
+import torch
 from gpu_renderers import Ours, Renderer, renderer_named
 
 DEVICE = "cuda"

@@ -13,10 +13,10 @@ from typing import Dict, NamedTuple
 
 import numpy as np
 import torch
+from models import Model
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.trainer.cameras import Camera
-from models import Model
 
 UNITS = ("Gaussian", "pixel", "tile instance")
 LIMITS = dict(zip(UNITS, (200, 64, 72)))  # bytes of float32 renderings with three channels

@@ -42,10 +42,10 @@ class Model(NamedTuple):
         background, (mode, gate) = torch.zeros(3, device=self.inputs["means3D"].device), mode_and_gate(blend)
         return self.cameras[view].settings(background, self.sh_degree, mode)._replace(background_gate=gate)
 
-    def to(self, device: str) -> "Model":
+    def to(self, device: str) -> Model:
         return self._replace(inputs={name: tensor.to(device) for name, tensor in self.inputs.items()})
 
-    def seen(self, num_views: int, width: Optional[int] = None, height: Optional[int] = None) -> "Model":
+    def seen(self, num_views: int, width: Optional[int] = None, height: Optional[int] = None) -> Model:
         """The model with at most so many of its views, evenly chosen, at another size where one is given."""
         count = min(num_views, len(self.cameras))
         chosen = [self.cameras[index * len(self.cameras) // count] for index in range(count)]

@@ -64,8 +64,8 @@ class ThreeDGS:
     def train_arguments(self) -> List[str]:
         """What the protocol and the axes are in the trainer's words."""
         config = self.config
-        words = ["-s", self.scene, "-m", self.model, "--eval", "--iterations", config.iterations,
-                 "--test_iterations", -1, "--save_iterations", config.iterations,
+        words = ["-s", self.scene, "-m", self.model, *self.test_arguments(), "--iterations", config.iterations,
+                 "--save_iterations", config.iterations,
                  "--port", 0]  # 0: a free one, since cells run side by side
         if self.method["name"] not in COUNTED_BY:
             words += ["--densify_grad_threshold", config.densify_grad_threshold]
@@ -80,6 +80,10 @@ class ThreeDGS:
             words += ["--blend_mode", config.blend_mode]
             words += ["--background_gate", config.background_gate] if config.blend_mode == "smoe" else []
         return [str(word) for word in words] + self.own_arguments()
+
+    def test_arguments(self) -> List[Any]:
+        """Views are held out; none is looked at while it trains."""
+        return ["--eval", "--test_iterations", -1]
 
     def recipe_arguments(self) -> List[str]:
         """What the suite says of the recipe, default of ours or not; what it does not say is the trainer's own."""
@@ -217,11 +221,8 @@ class HAC(InOneProcess):
     stubs = ()  # it reads its pictures again with torchvision, at the end
     of_gaussians = False  # anchors, from which networks make Gaussians
 
-    def train_arguments(self) -> List[str]:
-        words = super().train_arguments()
-        test = words.index("--test_iterations")  # the model is encoded where it is tested last
-        words[test + 1] = str(self.config.iterations)
-        return words
+    def test_arguments(self) -> List[Any]:
+        return ["--eval", "--test_iterations", self.config.iterations]  # the model is encoded where it is tested last
 
     def own_bytes(self) -> int:
         return size_of(os.path.join(self.model, "bitstreams"))
@@ -239,12 +240,11 @@ class DBS(InOneProcess):
     observed = ("--hold-out", "--model-renders", "beta_model")
     of_gaussians = False  # Beta primitives, with lobes of its own beside SH
 
+    def test_arguments(self) -> List[Any]:
+        return []  # the observer holds views out
+
     def train_arguments(self) -> List[str]:
-        words = super().train_arguments()
-        for word, values in (("--eval", 0), ("--test_iterations", 1)):
-            at = words.index(word)
-            del words[at:at + 1 + values]
-        return words + ["--disable_viewer", "--no-compress"]
+        return [*super().train_arguments(), "--disable_viewer", "--no-compress"]
 
 
 SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDGS, "taming": Taming, "2dgs": TwoDGS,

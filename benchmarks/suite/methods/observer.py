@@ -73,10 +73,11 @@ def shift_seeds(seed):
     import numpy
     import torch
 
+    def shifted(original):
+        return lambda value, *rest: original(int(value) + seed, *rest)
+
     for module, name in ((random, "seed"), (numpy.random, "seed"), (torch, "manual_seed")):
-        def shifted(value, *rest, original=getattr(module, name)):
-            return original(int(value) + seed, *rest)
-        setattr(module, name, shifted)
+        setattr(module, name, shifted(getattr(module, name)))
 
 
 def watch_loop(iterations, views):
@@ -128,7 +129,7 @@ def keep(folder, number, view, image, seconds):
     import numpy
 
     os.makedirs(folder, exist_ok=True)
-    files = [os.path.join(folder, "%s_%d.npy" % (kind, number)) for kind in ("render", "truth")]
+    files = [os.path.join(folder, f"{kind}_{number}.npy") for kind in ("render", "truth")]
     for path, kept in zip(files, (image, view.original_image[:3])):
         numpy.save(path, kept.detach().float().cpu().numpy())
     return {"name": view.image_name, "milliseconds": 1000 * seconds, "file": files[0], "truth": files[1]}

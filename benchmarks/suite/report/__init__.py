@@ -1,8 +1,8 @@
 """What `dsmoe bench report` writes of a folder of results: tables, figures, survey rows and a page.
 
 groups.py averages rows; layouts.py says which tables there are and tables.py writes them; curves.py draws; sliders.py
-collects images; page.html, .css and .js are the page; survey.py writes rows for the compression survey. paper.json holds the paper's
-printed figures.
+collects images; page.html, .css and .js are the page; survey.py writes rows for the compression survey. paper.json
+holds the paper's printed figures.
 """
 from __future__ import annotations
 

@@ -33,12 +33,12 @@ class Setting(NamedTuple):
     end: Optional[str]
 
     @property
-    def series(self) -> "Setting":
+    def series(self) -> Setting:
         """The setting without what is varied along a curve."""
         return self._replace(threshold=None, budget=None if self.budget is None else -1, end=None)
 
     @property
-    def pair(self) -> "Setting":
+    def pair(self) -> Setting:
         """The setting without the blend: what alpha and smoe are compared in."""
         return self._replace(blend="")
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from diff_smoe_rasterization.benchmarks.suite.names import blend_of
 from PIL import Image
+
+from diff_smoe_rasterization.benchmarks.suite.names import blend_of
 
 PROTOCOL = {"split": "sorted by name, every 8th is a test image", "resolution": -1, "image_size": [48, 32],
             "downscaler": "pillow bicubic", "background": "black", "principal_point": "scene",

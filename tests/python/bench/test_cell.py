@@ -6,9 +6,9 @@ import math
 import time
 
 import pytest
+
 from diff_smoe_rasterization.benchmarks.suite import cell as cells
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
-
 from diff_smoe_rasterization.trainer.rendering import Renderer
 
 

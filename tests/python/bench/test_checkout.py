@@ -7,22 +7,27 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import random
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import small_dbs
+import torch
 from bench_commands import ABOVE, wait_for
+from PIL import Image
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import preparation
 from diff_smoe_rasterization.benchmarks.suite.cell import work
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.methods import checkout as shapes
-from PIL import Image
-
-from diff_smoe_rasterization import io
+from diff_smoe_rasterization.benchmarks.suite.methods import observer
 
 pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
@@ -72,11 +77,11 @@ def write_views(folder, views):
 
 
 class SmallTrainers:
-    """Cells of small trainers, and their rows, each trained once."""
+    """Cells of small trainers, each patched once."""
 
     def __init__(self, scene, folder):
         self.scene, self.folder = scene, folder
-        self.rows = {}
+        self.prepared = {}
 
     def checkout(self, name):
         path = self.folder / f"checkout-{name}"
@@ -95,15 +100,10 @@ class SmallTrainers:
                    "seeds": [seed], "densify_grad_thresholds": [0.0001], "images": 1}
         cell, = expand(content, "").cells
         cell["protocol"] = {**cell["protocol"], "device": "cpu"}
-        return dict(cell, method=preparation.prepared_method(cell["method"], str(self.folder / "results")))
-
-    def run(self, *words, **options):
-        """(row, output folder) of a cell with these arguments of `cell`."""
-        key = json.dumps([words, options], default=str, sort_keys=True)
-        if key not in self.rows:
-            output = self.folder / f"out {len(self.rows)}"
-            self.rows[key] = row_of(self.cell(*words, **options), output), output
-        return self.rows[key]
+        key = json.dumps(cell["method"], sort_keys=True)
+        if key not in self.prepared:
+            self.prepared[key] = preparation.prepared_method(cell["method"], str(self.folder / "results"))
+        return dict(cell, method=self.prepared[key])
 
 
 def row_of(cell, output):
@@ -124,8 +124,9 @@ def small(scene, tmp_path_factory):
 
 @pytest.mark.parametrize("name", ["3dgs-2023", pytest.param("c3dgs", marks=pytest.mark.slow),
                                   pytest.param("hac", marks=pytest.mark.slow)])
-def test_a_patched_checkout_gives_a_row(name, small):
-    row, output = small.run(name)
+def test_a_patched_checkout_gives_a_row(name, small, tmp_path):
+    output = tmp_path / "out"
+    row = row_of(small.cell(name), output)
     assert row["ok"], row["reason"]
     assert (row["method"], row["variant"], row["blend_mode"]) == (name, "patched", "smoe")
     assert row["schedule"] == (None if name == "hac" else "3dgs")
@@ -165,6 +166,54 @@ def test_a_trainer_that_would_choose_on_the_test_views_is_kept_from_it(small, tm
     assert row["psnr_float"] == pytest.approx(-10 * np.log10(((truth - level) ** 2).mean()), abs=1e-4)
 
 
+@pytest.mark.parametrize("other, blend", [
+    ({"seed": 1}, ["--blend_mode", "smoe", "--background_gate", "0.0"]),
+    ({"seed": 2, "background_gates": [0.3]}, ["--blend_mode", "smoe", "--background_gate", "0.3"]),
+    ({"seed": 3, "blend_mode": "alpha"}, ["--blend_mode", "alpha"])])
+def test_blend_and_seed_reach_the_trainer_and_no_variable_does(other, blend, small, tmp_path, monkeypatch):
+    variables = {"DSMOE_BLEND_MODE": "smoe_tn", "DSMOE_BACKGROUND_GATE": "0.7"}
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    started = []
+
+    def call(line, env, **_):
+        started.append((line, env))
+        Path(line[2]).write_text("{}")
+        return 0
+
+    monkeypatch.setattr(shapes.subprocess, "call", call)
+    cell = small.cell("3dgs-2023", **other)
+    shapes.ThreeDGS(cell, shapes.config_of(cell), str(tmp_path)).train()
+    (line, environment), = started
+    ours, trainers = line[:line.index("--")], line[line.index("--"):]
+    assert ours[ours.index("--seed") + 1] == str(other["seed"]) and trainers[-len(blend):] == blend
+    assert trainers[1] == str(Path(cell["method"]["path"], "train.py")) and not set(variables) & set(environment)
+
+
+def test_seeds_are_shifted_by_the_cells(monkeypatch):
+    for module, name in ((random, "seed"), (np.random, "seed"), (torch, "manual_seed")):
+        monkeypatch.setattr(module, name, getattr(module, name))  # is put back
+    observer.shift_seeds(5)
+    for seed in (random.seed, np.random.seed, torch.manual_seed):
+        seed(0)
+    assert (random.random(), np.random.rand(), torch.rand(1).item()) == (
+        random.Random(5).random(), np.random.RandomState(5).rand(),
+        torch.rand(1, generator=torch.Generator().manual_seed(5)).item())
+
+
+@pytest.mark.parametrize("names, wrong", [(["a/view0.JPG", "view8"], None), (["view0"], "view8"),
+                                          (["view0", "view9"], "view8, view9"), (["view0", "view8", "view1"], "view1")])
+def test_a_checkout_must_have_the_same_split(names, wrong):
+    """Without folder and extension, which trainers keep or drop."""
+    test = [SimpleNamespace(camera=SimpleNamespace(name=name)) for name in ("view0.png", "view8.png")]
+    seen = [{"name": name} for name in names]
+    if wrong is None:
+        assert shapes.matched(SimpleNamespace(test=test), seen, "taming") == list(zip(test, seen))
+    else:
+        with pytest.raises(BenchError, match=f"taming rendered {len(names)} test views, .*{wrong}.*another split"):
+            shapes.matched(SimpleNamespace(test=test), seen, "taming")
+
+
 def test_steady_means_neither_reset_nor_size_prune(small):
     cell = small.cell("3dgs-2023", schedules=["steady"])
     words = shapes.ThreeDGS(cell, shapes.config_of(cell), "out").train_arguments()
@@ -199,9 +248,12 @@ def test_a_checkout_that_was_trained_on_other_images_is_refused(small, scene, tm
 
 
 def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
-    row = row_of(small.cell("3dgs-2023", arguments=["--no_such_flag"]), tmp_path / "out")
-    assert not row["ok"] and "train.py of 3dgs-2023 ended with status 2" in row["reason"]
-    assert "--no_such_flag" in row["reason"]
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho told >&2\necho 'train.py: error: no such flag' >&2\nexit 2\n")
+    python.chmod(0o755)
+    row = row_of(small.cell("3dgs-2023", python=str(python)), tmp_path / "out")
+    assert not row["ok"]
+    assert "train.py of 3dgs-2023 ended with status 2: train.py: error: no such flag (" in row["reason"]
 
 
 @pytest.mark.slow
@@ -264,8 +316,6 @@ def test_what_a_trainer_writes_beside_its_scene_stays_its_own(tmp_path):
 
 def test_modules_that_are_imported_and_not_used_may_be_absent():
     """2DGS imports what extracts meshes."""
-    from diff_smoe_rasterization.benchmarks.suite.methods import observer
-
     observer.stub("a_module_that_nobody_has")
     try:
         import a_module_that_nobody_has.other as other

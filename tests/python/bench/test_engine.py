@@ -1,6 +1,7 @@
 """From a suite to rows: what is done is not done again, what fails is a row, what is killed continues."""
 from __future__ import annotations
 
+import csv
 import json
 import os
 import shutil
@@ -10,13 +11,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from bench_commands import command, environment, rows_of, wait_for
+
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import engine, selection
 from diff_smoe_rasterization.benchmarks.suite.cell import failed_row
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.names import blend_of
-
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.errors import TrainerError
 
@@ -71,6 +73,25 @@ def test_a_row_says_what_was_measured_and_how(finished):
     assert row["lpips"]["value"] is None and row["lpips"]["reason"]
     assert row["train_seconds"] < row["wall_seconds"]
     assert row["machine"]["cells_at_once"] == 2  # --jobs 2, two cells
+
+
+def test_the_report_of_a_run_holds_what_its_rows_say(finished, tmp_path):
+    pytest.importorskip("matplotlib", reason="a report needs matplotlib")
+    assert main(["bench", "report", str(finished[2]), "-o", str(tmp_path)]) == 0
+    rows = {row["ok"]: row for row in rows_of(finished[2]).values()}
+    found = {}
+    for name in ("cells", "failures"):
+        with open(tmp_path / "tables" / f"two_{name}.csv", encoding="utf-8", newline="") as file:
+            found[name] = list(csv.DictReader(file))
+    measured = next(line for line in found["cells"] if line["scene"] == "tiny")
+    assert float(measured["PSNR [dB]"]) == rows[True]["psnr"]
+    assert int(measured["#Gaussians"]) == rows[True]["num_gaussians"]
+    failed, = found["failures"]
+    assert (failed["cell"], failed["reason"]) == (rows[False]["cell"], rows[False]["reason"])
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    for part in ('id="two_cells"', 'data-scene="tiny"', "data:image/svg+xml", "2 cells on 2 scenes, 1 seed; 1 failed"):
+        assert part in page, part
+    assert len(list((tmp_path / "images").rglob("*.png"))) == 3  # the truth, a rendering, its error
 
 
 def test_what_is_done_is_not_done_again(finished, capsys):
@@ -187,6 +208,17 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_written(
     assert not results.exists()
 
 
+def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, capsys):
+    content, _, results = finished
+    longer = {**content, "protocol": {**content["protocol"], "iterations": 13}}
+    words = ["bench", "run", write_suite(longer, tmp_path), "--only", "scene=tiny", "-o", str(results)]
+    before = sorted(results.rglob("*"))
+    for more in ([], ["--dry-run"]):
+        assert main([*words, *more]) == 1
+        assert "protocol.iterations is 12 there and 13 here" in capsys.readouterr().err
+    assert sorted(results.rglob("*")) == before
+
+
 def test_scenes_and_methods_that_have_rows_stay_as_they_are(content, tmp_path, monkeypatch, capsys):
     """Where they lie may change; what is new may be added; the axes may be extended."""
     for folder in ("taming", "moved"):
@@ -257,6 +289,20 @@ def running(content, tmp_path):
     folder, = results.glob("cells/*")
     yield suite, results, run, folder
     run.stderr.close()
+
+
+@pytest.mark.slow
+def test_a_killed_run_continues_where_it_was(running):
+    """Killed without warning in the middle of a cell, all of it: it goes on from its checkpoint."""
+    suite, results, run, folder = running
+    os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    assert not (folder / "row.json").exists()
+    wait_for(lambda: is_free(results), 60)
+    assert main(["bench", "run", suite, "-o", str(results)]) == 0
+    row, = rows_of(results).values()
+    assert row["ok"] and row["protocol"]["continued"]
+    assert "resumed at iteration" in (folder / "log.txt").read_text()
 
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGTERM,
@@ -386,3 +432,41 @@ def test_gpus_and_queues_are_snakemakes_business(content, monkeypatch):
         patch.setattr(engine.importlib.util, "find_spec", lambda name: None if "slurm" in name else object())
         with pytest.raises(BenchError, match="snakemake-executor-plugin-slurm"):
             engine.command(suite, suite.cells, "out", None, [])
+
+
+def test_on_the_cpu_cells_share_its_cores(content, monkeypatch):
+    """As many threads as torch takes, if there are cores for them: 10 cores here, where torch takes 8."""
+    suite = expand({**content, "seeds": [0, 1]}, "")
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(10), raising=False)
+    for jobs, count, at_once, threads in ((None, 4, 1, 8), (1, 4, 1, 8), (3, 4, 3, 3), (16, 4, 4, 2), (16, 1, 1, 8)):
+        words = engine.command(suite, suite.cells[:count], "out", jobs, None)
+        assert f"per_device={at_once}" in words and f"threads={threads}" in words
+        assert words[words.index("--cores") + 1] == str(at_once * threads)
+    assert engine.threads_of_each(11) == 1
+
+
+CELL_PYTHON = """#!/bin/sh
+case "$*" in *snakemake*) exec "{python}" "$@" ;; esac
+cp "../${{4#cells/}}.json" "$4/row.json"
+echo "$OMP_NUM_THREADS threads: $*" >>told
+"""
+
+
+def test_cells_are_told_the_gpus_and_their_threads(content, tmp_path, monkeypatch):
+    """One GPU, called 0, which Snakemake would take for a number; another program stands for the cells' Python."""
+    content["protocol"].update(device="cuda", principal_point="centre")
+    for cell in expand(content, "").cells:
+        (tmp_path / f"{cell['id']}.json").write_text(done_row(cell))
+    python = tmp_path / "python"
+    python.write_text(CELL_PYTHON.format(python=sys.executable))
+    python.chmod(0o755)
+    monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
+    monkeypatch.setattr(engine.sys, "executable", str(python))
+    monkeypatch.setattr(engine, "threads_of_each", lambda at_once: 6 // at_once)
+    words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results"), "--per-gpu", "2"]
+    assert main(words) == 0
+    told = (tmp_path / "results" / "told").read_text().splitlines()
+    assert len(told) == 2
+    for line in told:
+        assert line.startswith("3 threads: ") and line.endswith(" --gpus 0 --locks .locks --per-device 2")

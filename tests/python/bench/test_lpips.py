@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import real_data
 import torch
+from test_measure import step_image
+
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import lpips, measure
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures
-from test_measure import step_image
 
 
 def test_weights_that_are_named_and_not_there_are_refused_where_they_are_wanted(monkeypatch, tmp_path):

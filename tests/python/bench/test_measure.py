@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+
 from diff_smoe_rasterization.benchmarks.suite import measure
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures, edge_mask, edge_psnr
-
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.evaluation import evaluate, summary
 from diff_smoe_rasterization.trainer.metrics import image_metrics

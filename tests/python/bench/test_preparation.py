@@ -7,8 +7,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from diff_smoe_rasterization.benchmarks.suite import preparation
 from PIL import Image
+
+from diff_smoe_rasterization.benchmarks.suite import preparation
 
 ROOM = {"views": 2, "width": 16, "height": 12, "points": 20, "supersampling": 1}
 

@@ -7,9 +7,10 @@ import json
 import math
 
 import pytest
+from report_rows import PROTOCOL, failed, row, write_rows
+
 from diff_smoe_rasterization.benchmarks.suite import rows
 from diff_smoe_rasterization.benchmarks.suite.report import ReportError, groups, layouts, survey, tables
-from report_rows import PROTOCOL, failed, row, write_rows
 
 
 def table_of(entries, name, suite="table1"):
@@ -114,7 +115,7 @@ def test_each_gate_of_smoe_is_a_blend_of_its_own():
     entries = [row(background_gate=1.0), row(psnr=21.0, **smoe), row(psnr=23.0, seed=1, background_gate=0.0, **smoe),
                row(psnr=24.5, background_gate=0.05, **smoe), row(blend_mode="smoe_tn", background_gate=0.0),
                row(psnr=24.0, background_gate="learned", protocol={"background_gate": 0.25}, **smoe)]
-    lines = [line for line in table_of(entries, "cells").rows]
+    lines = table_of(entries, "cells").rows
     assert [line.labels[1].partition(", ")[2] for line in lines] == ["alpha", "smoe", "smoe 0.05", "smoe learned",
                                                                      "smoe_tn"]
     assert shown(table_of(entries, "cells"), method="native, smoe", seeds="2")["PSNR [dB]"] == "22.00 ± 1.41"
@@ -197,6 +198,17 @@ def test_a_failed_cell_is_a_row_with_its_reason():
     assert shown(table_of(entries, "cells"), method="native, smoe")["PSNR [dB]"] == "failed"
     assert shown(table_of(entries, "cells"), scene="fox", seeds="1 of 2")["PSNR [dB]"] == "20.00"
     assert shown(table_of(entries, "deltas"), scene="bonsai")["Δ PSNR [dB]"] == "smoe failed"
+
+
+def test_csv_is_unrounded_and_complete():
+    psnr = 24.123456789
+    table = table_of([row(psnr=psnr), row(seed=1, psnr=psnr), row("fox, the \"red\" one")], "cells")
+    lines = list(csv.DictReader(io.StringIO(tables.to_csv(table))))
+    assert len(lines) == 2 and {line["source"] for line in lines} == {"ours"}
+    bonsai = next(line for line in lines if line["scene"] == "bonsai")
+    assert float(bonsai["PSNR [dB]"]) == psnr and float(bonsai["PSNR [dB] sd"]) == 0
+    fox = next(line for line in lines if line["scene"] == "fox, the \"red\" one")
+    assert fox["PSNR [dB] sd"] == "" and fox["#Gaussians"] == "40000"
 
 
 @pytest.mark.parametrize("name", ["table1", "table3", "deltas", "cells", "failures"])

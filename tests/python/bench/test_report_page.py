@@ -16,7 +16,6 @@ from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images,
 pytest.importorskip("matplotlib", reason="a report needs matplotlib")
 pytest.importorskip("jinja2", reason="a report needs jinja2")
 from diff_smoe_rasterization.benchmarks.suite.report import ReportError, report, sliders, survey  # noqa: E402
-
 from diff_smoe_rasterization.trainer.errors import TrainerError  # noqa: E402
 
 
@@ -33,6 +32,12 @@ def written(tmp_path_factory):
     output = tmp_path_factory.mktemp("report")
     assert report(str(folder), str(output)) == os.path.join(str(output), "index.html")
     return output
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """They take two seconds a report."""
+    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.report.draw_all", lambda *_: [])
 
 
 class References(HTMLParser):
@@ -67,7 +72,7 @@ def test_the_page_loads_nothing_but_its_own_files(written):
     assert all((written / name).is_file() for name in layers)
 
 
-def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypatch):
+def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypatch, no_figures):
     output = tmp_path / "report"
     shutil.copytree(written, output)
 
@@ -75,7 +80,7 @@ def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypat
         return {path.relative_to(output).as_posix(): path.read_bytes() for path in output.rglob("*") if path.is_file()}
 
     before = files()
-    monkeypatch.setattr(survey, "write_survey", lambda *_: 1 / 0)  # after tables, figures and images
+    monkeypatch.setattr(survey, "write_survey", lambda *_: 1 / 0)  # after tables and images
     with pytest.raises(ZeroDivisionError):
         report(write_rows(tmp_path / "results", [row("fox")]), str(output))
     assert files() == before
@@ -87,7 +92,7 @@ def test_a_folder_of_others_is_left_alone(tmp_path):
         report(write_rows(tmp_path / "results", [row()]), str(tmp_path / "report"))
 
 
-def test_cells_without_a_row_are_named(tmp_path):
+def test_cells_without_a_row_are_named(tmp_path, no_figures):
     def counts(rows, **suite):
         folder = tmp_path / "results"
         write_rows(folder, rows)
@@ -106,7 +111,7 @@ def test_cells_without_a_row_are_named(tmp_path):
         "2 cells on 1 scene, 2 seeds; none failed.")
 
 
-def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path):
+def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path, no_figures):
     results = write_rows(tmp_path / "results", [row()])
     (tmp_path / "file").touch()
     with pytest.raises(TrainerError, match="file: nothing can be written there .* choose another folder with -o"):
@@ -121,7 +126,7 @@ def test_a_report_is_written_into_folders_alone_and_over_links(tmp_path):
     assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["mine.txt"]
 
 
-def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path):
+def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path, no_figures):
     said = {**PROTOCOL, "arguments": ["--port", "0"]}
     entries = [row(protocol=said), row(blend_mode="smoe", schedule="steady", protocol=said,
                                        machine={"cells_per_gpu": 3}), failed(seed=1, iterations=7)]
@@ -130,6 +135,20 @@ def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path):
     rules = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
     assert rules["iterations"] == "30000" and rules["schedules"] == "3dgs; steady"
     assert rules["cells that shared their GPU or CPU"] == "1 of 2, up to 3 at once" and "arguments" not in rules
+
+
+def test_renderings_are_copied_byte_for_byte(tmp_path):
+    entry = row(blend_mode="smoe", background_gate=0.05)
+    write_images(tmp_path / "results", entry, ALPHA, names=("a b",))
+    found = sliders.collect(str(tmp_path / "results"), "s u", [entry], str(tmp_path))
+    view, = found[0]["settings"][0]["views"]
+    truth, gated, error = view["layers"]
+    source = tmp_path / "results" / "cells" / entry["cell"] / "images"
+    for layer, kind in ((truth, "gt"), (gated, "render")):
+        assert (tmp_path / layer["path"]).read_bytes() == (source / kind / "a b.png").read_bytes()
+    assert " " not in truth["path"] + gated["path"] + error["path"]
+    # One of three channels is off by 80 of 255: 10 log10(3 (255 / 80)^2)
+    assert gated["note"] == error["note"] == "14.84 dB"
 
 
 @pytest.mark.parametrize("changes", [{"truth": (99, 100, 100)}, {"size": (32, 48)}])

@@ -12,6 +12,8 @@ for library in ("yaml", "snakemake", "matplotlib", "jinja2"):
     pytest.importorskip(library, reason="`dsmoe bench` needs it: pip install '.[bench]', with Python 3.11 or later")
 from diff_smoe_rasterization.benchmarks.suite.expansion import find_suite, load_suite  # noqa: E402
 
+pytestmark = pytest.mark.slow  # a minute; test_engine.py goes from a smaller suite to its report
+
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):

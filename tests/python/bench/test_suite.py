@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite
 from diff_smoe_rasterization.benchmarks.suite.protocol import config_of
