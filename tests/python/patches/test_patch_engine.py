@@ -1,6 +1,7 @@
 """The engine of the patches: what is planned, written, kept and put back, and when not."""
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
@@ -128,17 +129,17 @@ def killed_at(step, action):
 
 @pytest.mark.parametrize("begin, action, interruptions", [
     (lambda path: None, patches.apply, 15), (patches.apply, patches.revert, 5),
-    (patches.apply, lambda path: patches.apply(path, modernise=True), 20)])
+    pytest.param(patches.apply, lambda path: patches.apply(path, modernise=True), 20, marks=pytest.mark.slow)])
 def test_a_kill_leaves_what_can_be_finished_or_put_back(tmp_path, begin, action, interruptions):
     before = contents(make(tmp_path / "fresh"))
     whole = {True: None, False: None}
     for modernise in whole:
         patches.apply(shutil.copytree(tmp_path / "fresh", tmp_path / f"whole {modernise}"), modernise=modernise)
         whole[modernise] = contents(tmp_path / f"whole {modernise}", record=False)
+    begin(shutil.copytree(tmp_path / "fresh", tmp_path / "begun"))
     for step in range(interruptions + 1):
-        torn = shutil.copytree(tmp_path / "fresh", tmp_path / f"torn {step}")
-        begin(torn)
-        assert killed_at(step, lambda: action(torn)) == (step < interruptions), step
+        torn = shutil.copytree(tmp_path / "begun", tmp_path / f"torn {step}")
+        assert killed_at(step, functools.partial(action, torn)) == (step < interruptions), step
         for file in changed_files(before, contents(torn, record=False)):
             assert (torn / file).read_bytes() in [files[file][1] for files in whole.values()], "neither old nor new"
         if step == interruptions:

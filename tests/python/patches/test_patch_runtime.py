@@ -12,7 +12,6 @@ from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings
 from diff_smoe_rasterization.patches import runtime
 from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED
 
-
 ALPHA = {"blend_mode": "alpha", "background_gate": None}
 
 
