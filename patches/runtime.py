@@ -18,13 +18,6 @@ from diff_smoe_rasterization.settings import (
 )
 
 
-def __getattr__(name: str) -> Any:
-    if name in ("default_blend_mode", "blend_mode_of"):
-        raise ImportError(f"{name}: this trainer was patched by an earlier version, which knew no background gate; "
-                          "type: dsmoe patch apply PATH (the checkout's folder)")
-    raise AttributeError(name)
-
-
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode: $DSMOE_BLEND_MODE, else "alpha"; and of --background_gate: "".
 
@@ -77,8 +70,8 @@ def _gate_of(dataset: Any, mode: str) -> Optional[float]:
     """Returns the background's gate of a run, None in other modes than `smoe`: "" is the default, a string typed."""
     given = getattr(dataset, "background_gate", None)
     if mode == "smoe" and given is None:
-        _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, in "
-              "another mode, or by a patch that knew none); --background_gate says otherwise")
+        _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, "
+              "or in another mode); --background_gate says otherwise")
         given = 0.0
     if mode != "smoe" and not isinstance(given, str):  # of a model in `smoe`
         given = None

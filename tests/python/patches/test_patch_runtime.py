@@ -75,12 +75,6 @@ def test_a_model_in_smoe_of_before_there_were_gates_has_eq_7_and_says_so(tmp_pat
         runtime.blend_of(run("smoe", "0.25", model_path=str(tmp_path)))
 
 
-@pytest.mark.parametrize("name", ["default_blend_mode", "blend_mode_of"])
-def test_a_trainer_that_an_earlier_version_has_patched_says_what_to_type(name):
-    with pytest.raises(ImportError, match="earlier version.*type: dsmoe patch apply"):
-        exec(f"from diff_smoe_rasterization.patches.runtime import {name}")
-
-
 @pytest.mark.parametrize("dataset", [SimpleNamespace(), SimpleNamespace(blend_mode=None, background_gate=None)])
 def test_an_old_model_is_alpha_and_says_so_once(dataset):
     with pytest.warns(UserWarning, match="records no blend mode"):
