@@ -37,9 +37,12 @@ def named(*names: str) -> m.MatchIfTrue:
 
 
 class _EachNode(cst.CSTTransformer):
-    def __init__(self, matcher: m.BaseMatcherNode, change: Callable) -> None:
+    def __init__(self, matcher: m.BaseMatcherNode, change: Callable, into=cst.CSTNode) -> None:
         super().__init__()
-        self.kind, self.matcher, self.change = type(matcher).__name__, matcher, change
+        self.kind, self.matcher, self.change, self.into = type(matcher).__name__, matcher, change, into
+
+    def on_visit(self, node: cst.CSTNode) -> bool:
+        return isinstance(node, self.into)
 
     def on_leave(self, original_node: cst.CSTNode, updated_node: cst.CSTNode) -> cst.CSTNode:
         if type(original_node).__name__ == self.kind and m.matches(original_node, self.matcher):
@@ -53,9 +56,9 @@ def each_node(tree: cst.Module, matcher: m.BaseMatcherNode, change: Callable) ->
 
 
 def each_line(block, matcher: m.BaseMatcherNode, change: Callable):
-    """Returns a module or block with the list change(line) for each of its own lines that matches."""
-    return block.with_changes(body=[new for line in block.body
-                                    for new in (change(line) if m.matches(line, matcher) else [line])])
+    """Returns a module or block with the list change(line) for each of its lines that matches, also under an `if`."""
+    return block.visit(_EachNode(matcher, lambda _, line: cst.FlattenSentinel(change(line)),
+                                 into=(cst.Module, cst.IndentedBlock, cst.If, cst.Else)))
 
 
 def statement(text: str) -> cst.SimpleStatementLine:

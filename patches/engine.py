@@ -238,10 +238,7 @@ def _state_by_record(root: Path, record: Record, changes: Tuple[Change, ...],
 
 def options_of(record: Optional[Record]) -> Tuple[str, ...]:
     """The options that a patch was made with."""
-    if record is None:
-        return ()
-    earlier = ["modernise"] if record.manifest.get("modernise") else []  # as records were written that had no "options"
-    return tuple(record.manifest.get("options", earlier))
+    return tuple(record.manifest["options"]) if record else ()
 
 
 def words_of(options: Tuple[str, ...]) -> str:

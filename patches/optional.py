@@ -10,8 +10,8 @@ from typing import Callable, List, NamedTuple, Tuple
 import libcst as cst
 import libcst.matchers as m
 
-from .codemods import (Found, call_of_ours, decorated, each_line, each_node, keywords_of, named, renamed_import,
-                       statement)
+from . import codemods
+from .codemods import Found, call_of_ours, decorated, each_line, each_node, keywords_of, named, renamed_import
 from .trainers import INTEGRATIONS, PACKAGE, RUNTIME
 
 
@@ -68,8 +68,8 @@ def lpips_when_used(tree: cst.Module, found: Found) -> cst.Module:
 
 def after_import(line: cst.SimpleStatementLine, names: str, new: str) -> List[cst.SimpleStatementLine]:
     """Returns an import from runtime.py and a new line for one; the comments above it stay above both."""
-    return [statement(f"from {RUNTIME} import {names}").with_changes(leading_lines=line.leading_lines),
-            line.with_changes(leading_lines=[], body=statement(new).body)]
+    return [codemods.statement(f"from {RUNTIME} import {names}").with_changes(leading_lines=line.leading_lines),
+            line.with_changes(leading_lines=[], body=codemods.statement(new).body)]
 
 
 def without_standard(tree: cst.Module, found: Found) -> cst.Module:

@@ -88,7 +88,7 @@ class Record:
         return (self.folder / "originals" / name).read_bytes()
 
     def patched(self, name: str) -> Optional[bytes]:
-        """The file as it became; None where an earlier version wrote the record, or where the copy is another."""
+        """The file as it became; None where the copy is of a patch that was interrupted."""
         path = self.folder / "patched" / name
         data = path.read_bytes() if path.is_file() else b""
         return data if sha256(data) == self.files[name]["after"][-1] else None

@@ -95,7 +95,7 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str]:
     reasons = []
     folders = _folders(words)
     for folder in folders:
-        found = facts.of_checkout(lambda name: read_file(folder / name))
+        found = facts.of_checkout(lambda name, folder=folder: read_file(folder / name))
         if facts.PATCHED in found or Record.in_force(folder):
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")

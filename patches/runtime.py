@@ -11,14 +11,11 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Optional, Tuple
 
 from diff_smoe_rasterization.settings import (
-    BLEND_MODES, resolve_background_gate, resolve_blend_mode, training_background_gate)
-
-
-def __getattr__(name: str) -> Any:
-    if name in ("default_blend_mode", "blend_mode_of"):
-        raise ImportError(f"{name}: this trainer was patched by an earlier version, which knew no background gate; "
-                          "type: dsmoe patch apply PATH (the checkout's folder)")
-    raise AttributeError(name)
+    BLEND_MODES,
+    resolve_background_gate,
+    resolve_blend_mode,
+    training_background_gate,
+)
 
 
 def default_blend() -> Tuple[str, str]:
@@ -73,8 +70,8 @@ def _gate_of(dataset: Any, mode: str) -> Optional[float]:
     """Returns the background's gate of a run, None in other modes than `smoe`: "" is the default, a string typed."""
     given = getattr(dataset, "background_gate", None)
     if mode == "smoe" and given is None:
-        _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, in "
-              "another mode, or by a patch that knew none); --background_gate says otherwise")
+        _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, "
+              "or in another mode); --background_gate says otherwise")
         given = 0.0
     if mode != "smoe" and not isinstance(given, str):  # of a model in `smoe`
         given = None
@@ -215,9 +212,10 @@ def difference_of_ssim(ssim: Callable[..., Any], device: Any, shape: Any) -> str
     One pair has little contrast, so that SSIM's constants count. The other leaves [0, 1], and its SSIM is negative.
     """
     import torch
+
     from diff_smoe_rasterization import fused_ssim
 
-    def value_and_gradient(similarity: Callable[..., Any]) -> Any:
+    def value_and_gradient(similarity: Callable[..., Any], one: Any, other: Any) -> Any:
         img1 = one.clone().requires_grad_()
         value = similarity(img1, other)
         return (value.detach(), *torch.autograd.grad(value, img1))
@@ -225,10 +223,10 @@ def difference_of_ssim(ssim: Callable[..., Any], device: Any, shape: Any) -> str
     generator = torch.Generator().manual_seed(0)
     with torch.inference_mode(False), torch.enable_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         noise = [torch.rand(tuple(shape), generator=generator).to(device) for _ in range(2)]
-        for one, other in ((0.4 + 0.1 * noise[0], 0.5 + 0.1 * noise[1]),
-                           (1.4 * (1 - noise[0]) - 0.2 + 0.05 * noise[1], noise[0])):
+        for pair in ((0.4 + 0.1 * noise[0], 0.5 + 0.1 * noise[1]),
+                     (1.4 * (1 - noise[0]) - 0.2 + 0.05 * noise[1], noise[0])):
             try:
-                for ours, theirs in zip(value_and_gradient(fused_ssim), value_and_gradient(ssim)):
+                for ours, theirs in zip(value_and_gradient(fused_ssim, *pair), value_and_gradient(ssim, *pair)):
                     if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
                         return f"it gives {theirs.dtype} {list(theirs.shape)}, not {ours.dtype} {list(ours.shape)}"
                     differs, largest = float((ours - theirs).abs().max()), float(ours.abs().max())

@@ -10,6 +10,7 @@ from pathlib import Path
 import diff_smoe_rasterization
 
 HERE = Path(__file__).resolve().parent
+PACKAGE_PARENT = Path(diff_smoe_rasterization.__file__).resolve().parent.parent  # where it is installed, or the tree
 PACKAGES = HERE / "packages"  # what the trainers import beside the rasterizer
 RECORD = ".dsmoe_patch"
 SPARSE_ADAM = """
@@ -127,5 +128,4 @@ def environment(**more):
     """Of a process of a trainer: this package, what else trainers import, one thread."""
     kept = {name: value for name, value in os.environ.items()
             if name not in ("PYTHONDONTWRITEBYTECODE", "DSMOE_BLEND_MODE", "DSMOE_BACKGROUND_GATE")}
-    above = Path(diff_smoe_rasterization.__file__).resolve().parent.parent  # where it is installed, or the source tree
-    return {**kept, "PYTHONPATH": os.pathsep.join([str(PACKAGES), str(above)]), "OMP_NUM_THREADS": "1", **more}
+    return {**kept, "PYTHONPATH": os.pathsep.join([str(PACKAGES), str(PACKAGE_PARENT)]), "OMP_NUM_THREADS": "1", **more}

@@ -32,6 +32,9 @@ BEFORE_AND_AFTER = [
      "f = nan_without_network(deferred(lambda: lpips.LPIPS(net='vgg').to('cuda')))\n"),
     ("lpips-when-used", "f = lpips.LPIPS()\n", f"from {RUNTIME} import deferred, nan_without_network\n"
      "f = nan_without_network(deferred(lambda: lpips.LPIPS()))\n"),
+    ("lpips-when-used", "if __name__ == '__main__':\n    f = lpips.LPIPS().to(device)\n",  # metrics.py of Scaffold-GS
+     f"if __name__ == '__main__':\n    from {RUNTIME} import deferred, nan_without_network\n"
+     "    f = nan_without_network(deferred(lambda: lpips.LPIPS().to(device)))\n"),
     ("lpips-when-used", "def f():\n    g = lpips.LPIPS(net='vgg')\n", None),
     ("lpips-offline", "import torch\n\ndef lpips(x, y):\n    return x\n",
      f"import torch\nfrom {RUNTIME} import nan_without_network\n\n"

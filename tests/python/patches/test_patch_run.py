@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from checkouts import contents, environment
+from checkouts import PACKAGE_PARENT, contents, environment
 from tiny import GR, RENDERER, make
 
 from diff_smoe_rasterization import patches
@@ -32,7 +32,7 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path, python):
                                       "sys.exit(subprocess.call([sys.executable, 'show.py'] + sys.argv[1:]))\n"})
     before = contents(tmp_path)
     result = python("-m", "diff_smoe_rasterization", *RUN, "--background-gate", "0.25", "--", sys.executable,
-                    checkout / "parent.py", *WORDS, cwd=tmp_path)
+                    checkout / "parent.py", *WORDS, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert result.status == 7, result.err
     assert result.out.splitlines() == [f"diff_smoe_rasterization.rasterizer smoe {WORDS}"]
     announced, *said = result.err.splitlines()

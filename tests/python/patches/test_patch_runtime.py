@@ -12,7 +12,6 @@ from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings
 from diff_smoe_rasterization.patches import runtime
 from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED
 
-
 ALPHA = {"blend_mode": "alpha", "background_gate": None}
 
 
@@ -74,12 +73,6 @@ def test_a_model_in_smoe_of_before_there_were_gates_has_eq_7_and_says_so(tmp_pat
         assert runtime.blend_of(old) == {"blend_mode": "smoe", "background_gate": 0}
     with pytest.warns(UserWarning, match="is of a run with background gate 0.0, but this one has .*_gate 0.0$"):
         runtime.blend_of(run("smoe", "0.25", model_path=str(tmp_path)))
-
-
-@pytest.mark.parametrize("name", ["default_blend_mode", "blend_mode_of"])
-def test_a_trainer_that_an_earlier_version_has_patched_says_what_to_type(name):
-    with pytest.raises(ImportError, match="earlier version.*type: dsmoe patch apply"):
-        exec(f"from diff_smoe_rasterization.patches.runtime import {name}")
 
 
 @pytest.mark.parametrize("dataset", [SimpleNamespace(), SimpleNamespace(blend_mode=None, background_gate=None)])

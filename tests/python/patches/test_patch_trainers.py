@@ -33,9 +33,9 @@ def only_statements_change(diff):
 def test_each_trainer_is_recognised_patched_and_put_back(name, tmp_path):
     checkout = make_checkout(name, tmp_path / "some folder")
     before = contents(checkout)
-    assert patches.check(checkout) == "patchable" and patches.check(checkout).trainer == name
     only_statements_change(patches.diff(checkout))
     planned = patches.apply(checkout, modernise=True)
+    assert planned.verdict == "patchable" and planned.verdict.trainer == name
     changed = changed_files(before, contents(checkout, record=False))
     assert {*ENTRIES[name], GR, "arguments/__init__.py"} <= changed == {change.name for change in planned.changes}
     for file in changed:

@@ -8,12 +8,11 @@ from tqdm import tqdm
 from arguments import ModelParams, OptimizationParams, PipelineParams, training_flags
 from gaussian_renderer import prefilter_voxel, render
 from scene import GaussianModel, Scene
-from utils.general_utils import background_of, endlessly, psnr, safe_state, save_image
+from utils.general_utils import background_of, endlessly, safe_state, save_image
 from utils.loss_utils import l1_loss, ssim
 
 
-def training(args_param, dataset, opt, pipe, dataset_name, testing_iterations, saving_iterations,
-             checkpoint_iterations, checkpoint, debug_from, wandb=None, logger=None, ply_path=None):
+def training(args_param, dataset, opt, pipe, saving_iterations, logger=None):
     with open(os.path.join(dataset.model_path, "cfg_args"), "w") as file:
         file.write(repr(Namespace(**vars(dataset))))
     model = GaussianModel(dataset)
@@ -29,23 +28,13 @@ def training(args_param, dataset, opt, pipe, dataset_name, testing_iterations, s
         loss.backward()
         logger.info(f"step {step}: loss {loss.item():.9g}")
         with torch.no_grad():
-            training_report(None, dataset_name, step, testing_iterations, world, render, (pipe, fixed), wandb, logger)
             if step in saving_iterations:
                 world.save(step)
             model.optimizer.step()
             model.optimizer.zero_grad()
 
 
-def training_report(tb_writer, dataset_name, step, testing_iterations, world: Scene, renderFunc, renderArgs,
-                    wandb=None, logger=None):
-    for view in world.getTestCameras() if step in testing_iterations else ():
-        visible = prefilter_voxel(view, world.gaussians, *renderArgs)
-        image = renderFunc(view, world.gaussians, *renderArgs, visible_mask=visible)["render"].clamp(0, 1)
-        logger.info(f"step {step}: PSNR {psnr(image, view.original_image).item():.9g}")
-
-
-def render_sets(args_param, dataset: ModelParams, iteration: int, pipeline: PipelineParams, skip_train=True,
-                skip_test=False, wandb=None, tb_writer=None, dataset_name=None, logger=None):
+def render_sets(args_param, dataset: ModelParams, iteration: int, pipeline: PipelineParams, logger=None):
     with torch.no_grad():
         model = GaussianModel(dataset)
         world = Scene(dataset, model, load_iteration=iteration, shuffle=False)
@@ -67,7 +56,6 @@ if __name__ == "__main__":
     logger.addHandler(logging.FileHandler(os.path.join(args.model_path, "outputs.log")))
     logger.setLevel("INFO")
     safe_state(args.quiet)
-    training(args, model_flags.extract(args), step_flags.extract(args), pipe_flags.extract(args), "chairs",
-             args.test_iterations, args.save_iterations + [args.iterations], args.checkpoint_iterations,
-             args.start_checkpoint, args.debug_from, None, logger)
+    training(args, model_flags.extract(args), step_flags.extract(args), pipe_flags.extract(args),
+             args.save_iterations + [args.iterations], logger)
     render_sets(args, model_flags.extract(args), -1, pipe_flags.extract(args), logger=logger)
