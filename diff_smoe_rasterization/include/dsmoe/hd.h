@@ -86,6 +86,22 @@ DSMOE_HD float max(float a, float b) { return ::fmaxf(a, b); }
 template <class S> DSMOE_HD S clamp(S x, S low, S high) { return min(max(x, low), high); }
 template <class S> DSMOE_HD S select(bool mask, S a, S b) { return mask ? a : b; }
 
+// a b, rounded: in kernels no part of a fused multiply-add, so that equal products cancel exactly.
+DSMOE_HD float product(float a, float b) {
+#if defined(__CUDA_ARCH__)
+  return __fmul_rn(a, b);
+#else
+  return a * b;
+#endif
+}
+DSMOE_HD double product(double a, double b) {
+#if defined(__CUDA_ARCH__)
+  return __dmul_rn(a, b);
+#else
+  return a * b;
+#endif
+}
+
 // a b - c d with one rounding error of the result instead of the products' (Kahan): determinants of long, thin
 // Gaussians cancel almost completely.
 template <class S> DSMOE_HD S difference_of_products(S a, S b, S c, S d) {
