@@ -131,15 +131,15 @@ DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3
   const Sym3<S> dL_dcov = dL_dcovariance(axes, g);
   const S half = S(0.5);
   const Sym3<S> by = {dL_dcov.xx, half * dL_dcov.xy, half * dL_dcov.xz, dL_dcov.yy, half * dL_dcov.yz, dL_dcov.zz};
-  const Vec3<S> variance = S(2) * (scale * scale);
-  const auto column = [&](S twice_variance, Vec3<S> r) {
+  const auto column = [&](S axis, Vec3<S> r) {
+    const S twice_variance = product(S(2) * axis, axis);
     const Vec3<S> turned = by * r;
     return Vec3<S>{product(twice_variance, turned.x), product(twice_variance, turned.y),
                    product(twice_variance, turned.z)};
   };
-  const Vec3<S> x = column(variance.x, {rotation.r0.x, rotation.r1.x, rotation.r2.x});
-  const Vec3<S> y = column(variance.y, {rotation.r0.y, rotation.r1.y, rotation.r2.y});
-  const Vec3<S> z = column(variance.z, {rotation.r0.z, rotation.r1.z, rotation.r2.z});
+  const Vec3<S> x = column(scale.x, {rotation.r0.x, rotation.r1.x, rotation.r2.x});
+  const Vec3<S> y = column(scale.y, {rotation.r0.y, rotation.r1.y, rotation.r2.y});
+  const Vec3<S> z = column(scale.z, {rotation.r0.z, rotation.r1.z, rotation.r2.z});
   return {factor.turned.r0 * dL_da + factor.turned.r1 * dL_db,
           {{x.x, y.x, z.x}, {x.y, y.y, z.y}, {x.z, y.z, z.z}},
           {rotation * (scale * dL_da), rotation * (scale * dL_db)}};
