@@ -61,7 +61,7 @@ constexpr NumberType type_of(int64_t) { return NumberType::kInt64; }
 
 template <class T> SavedArray saved_array(const char* name, const T*, int64_t rows) {
   using Number = typename ElementOf<T>::Number;
-  return {name, type_of(Number()), rows, static_cast<int>(sizeof(T) / sizeof(Number))};
+  return {name, type_of(Number()), rows, static_cast<int>(sizeof(T) / sizeof(Number))};  // NOLINT: T may be a struct
 }
 
 // Asks for each of the saved arrays that has no memory yet and whose length is known. Throws std::bad_alloc.
