@@ -9,14 +9,14 @@ from typing import Any, Dict, List
 
 import numpy as np
 
-from .. import io
+from ... import io
+from ..config import TrainConfig
+from ..errors import SceneError
+from ..model import SH_C0
+from ..system.files import is_file
 from .cameras import Camera
-from .config import TrainConfig
-from .errors import SceneError
-from .files import is_file
 from .images import image_size
 from .layout import Layout, PosedImage
-from .model import SH_C0
 from .pointcloud import PointCloud
 
 RANDOM_POINTS = 100_000  # as 3DGS

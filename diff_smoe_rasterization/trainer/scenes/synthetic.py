@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from .. import io
+from ... import io
 from .cameras import Camera
 
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (u [R], v [R]) -> colours [R, 3]

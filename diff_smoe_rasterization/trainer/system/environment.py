@@ -8,7 +8,7 @@ from typing import Any, Dict
 import numpy as np
 import torch
 
-from .._version import __version__
+from ..._version import __version__
 
 
 def processor_name() -> str:
@@ -38,7 +38,7 @@ def versions() -> Dict[str, str]:
 
 def extension_info() -> Dict[str, Any]:
     """`build_info()` of the compiled extension. Raises ImportError where it is not built."""
-    from .. import build_info
+    from ... import build_info
 
     return dict(build_info())
 

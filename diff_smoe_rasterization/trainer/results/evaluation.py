@@ -7,12 +7,12 @@ from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence
 
 import torch
 
-from .errors import TrainerError
-from .images import View
+from ..errors import TrainerError
+from ..scenes.images import View
+from ..system.progress import progress_bar
+from ..system.stopwatch import synchronised_time
 from .metrics import image_metrics
-from .progress import progress_bar
 from .rendering import Renderer
-from .stopwatch import synchronised_time
 
 WARM_UP_VIEWS = 2  # rendered untimed before the first timed one
 Measure = Callable[..., Mapping[str, Optional[float]]]

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from PIL import Image
 
+from ..config import TrainConfig
+from ..errors import SceneError
+from ..system.progress import progress_bar
 from .cameras import Camera
-from .config import TrainConfig
-from .errors import SceneError
 from .layout import PosedImage
-from .progress import progress_bar
 
 MAX_WIDTH = 1600  # of images at resolution -1
 MAX_PIXELS = 2**27  # of an image to train on, beyond which --resolution is taken for a mistake

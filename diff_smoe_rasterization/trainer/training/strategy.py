@@ -10,11 +10,11 @@ from typing import Any, Callable, Dict, Sequence
 
 import torch
 
-from ..gaussians import add_view
-from ..settings import Rendering
-from .cameras import Camera
-from .config import TrainConfig
-from .model import PARAMETERS, GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
+from ...gaussians import add_view
+from ...settings import Rendering
+from ..config import TrainConfig
+from ..model import PARAMETERS, GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
+from ..scenes.cameras import Camera
 
 MIN_OPACITY = 0.005  # fainter Gaussians are pruned
 RESET_OPACITY = 0.01  # an opacity reset leaves no Gaussian above this

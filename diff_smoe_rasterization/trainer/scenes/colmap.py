@@ -6,11 +6,11 @@ import os
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import io
+from ... import io
+from ..config import TrainConfig
+from ..errors import SceneError
+from ..system.files import is_folder
 from .cameras import Camera
-from .config import TrainConfig
-from .errors import SceneError
-from .files import is_folder
 from .layout import HOLD_OUT, Layout, PosedImage, hold_out
 from .pointcloud import PointCloud
 

@@ -6,9 +6,9 @@ import os
 from dataclasses import dataclass
 from typing import List, Optional, Sequence, Tuple
 
+from ..errors import SceneError
+from ..system.files import is_file, is_folder
 from .cameras import Camera
-from .errors import SceneError
-from .files import is_file, is_folder
 from .pointcloud import PointCloud
 
 MASKS = "masks"  # folder of a scene, beside its images

@@ -6,11 +6,11 @@ from typing import NamedTuple, Optional, Tuple
 
 import torch
 
-from .. import io
-from ..settings import BLEND_MODES, resolve_background_gate
-from .errors import TrainerError
-from .files import is_file
-from .model import GaussianModel
+from ... import io
+from ...settings import BLEND_MODES, resolve_background_gate
+from ..errors import TrainerError
+from ..model import GaussianModel
+from ..system.files import is_file
 
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
 

@@ -5,16 +5,16 @@ from typing import Any, Callable, Dict, Optional, Tuple
 
 import torch
 
-from ..settings import BackgroundGate, GaussianRasterizationSettings, Rendering
-from .cameras import Camera
-from .model import GaussianModel
+from ...settings import BackgroundGate, GaussianRasterizationSettings, Rendering
+from ..model import GaussianModel
+from ..scenes.cameras import Camera
 
 Rasterize = Callable[..., Rendering]
 
 
 def package_rasterizer() -> Rasterize:
     """The compiled `rasterize`; imported late, so that scenes and configs work without the extension."""
-    from .. import rasterize
+    from ... import rasterize
 
     return rasterize
 

@@ -8,7 +8,7 @@ import os
 import stat
 from typing import Any, BinaryIO, Callable, Optional
 
-from .errors import TrainerError
+from ..errors import TrainerError
 
 
 def is_file(path: str) -> bool:

@@ -8,8 +8,8 @@ from typing import Optional
 import numpy as np
 import torch
 
-from ..camera import settings_from_camera
-from ..settings import GaussianRasterizationSettings
+from ...camera import settings_from_camera
+from ...settings import GaussianRasterizationSettings
 
 
 @dataclass(frozen=True)

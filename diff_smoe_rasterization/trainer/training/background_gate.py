@@ -6,7 +6,7 @@ from typing import Any, Dict
 
 import torch
 
-from ..optimizers import FusedAdam
+from ...optimizers import FusedAdam
 
 LEARNING_RATE = 0.01
 START = 1.0

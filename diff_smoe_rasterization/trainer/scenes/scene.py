@@ -13,15 +13,15 @@ from typing import Any, Dict, List, Optional, Sequence
 
 import numpy as np
 
+from ..config import TrainConfig
+from ..errors import SceneError
+from ..system.files import is_file, is_folder
 from .cameras import Camera, scene_extent
-from .config import TrainConfig
-from .errors import SceneError
-from .files import is_file, is_folder
+from .colmap import read_colmap_layout
 from .images import View, fitted_camera, image_size, load_views
 from .layout import Layout, check_files, with_masks
+from .nerf import read_nerf_layout
 from .pointcloud import PointCloud
-from .scene_colmap import read_colmap_layout
-from .scene_nerf import read_nerf_layout
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import Any, Dict, Iterator
 
 import torch
 
-from .errors import TrainerError, out_of_memory
-from .files import write_atomically
+from ..errors import TrainerError, out_of_memory
+from ..system.files import write_atomically
 
 CHECKPOINT_NAME = "checkpoint.pt"
 TENSOR = "__tensor__"  # marks where a tensor was

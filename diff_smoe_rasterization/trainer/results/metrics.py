@@ -7,7 +7,7 @@ from typing import Dict, Optional
 import torch
 import torch.nn.functional as F
 
-from ..losses import fused_ssim
+from ...losses import fused_ssim
 
 
 def quantised(image: torch.Tensor) -> torch.Tensor:

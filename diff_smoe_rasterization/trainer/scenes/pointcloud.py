@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import SceneError
+from ..errors import SceneError
 
 MIN_POINTS = 4  # each scale is the distance to three neighbours
 

@@ -7,7 +7,7 @@ from typing import List, Sequence, Tuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from .errors import printable
+from ..errors import printable
 
 MARGIN = 6  # pixels between pictures
 LABEL_HEIGHT = 18

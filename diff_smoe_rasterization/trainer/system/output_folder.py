@@ -11,7 +11,7 @@ import platform
 from contextlib import contextmanager
 from typing import IO, Collection, Iterator, List, NamedTuple, Optional
 
-from .errors import TrainerError
+from ..errors import TrainerError
 from .files import is_file, write_json_atomically
 
 try:

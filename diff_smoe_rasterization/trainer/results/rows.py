@@ -5,13 +5,13 @@ import json
 import os
 from typing import Any, Dict, List, Optional, Union
 
-from .config import LEARNED, TrainConfig
-from .environment import machine, versions
-from .errors import TrainerError
+from ..config import LEARNED, TrainConfig
+from ..errors import TrainerError
+from ..scenes.images import DOWNSCALER
+from ..scenes.scene import Scene
+from ..system.environment import machine, versions
+from ..system.files import is_file, write_json_atomically
 from .evaluation import Evaluation
-from .files import is_file, write_json_atomically
-from .images import DOWNSCALER
-from .scene import Scene
 
 RESULTS_NAME = "results.json"
 

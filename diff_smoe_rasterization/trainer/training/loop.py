@@ -9,28 +9,28 @@ from typing import Any, Callable, Dict, List, Optional, Tuple
 
 import torch
 
-from ..losses import l1_ssim_loss_and_gradient
+from ...losses import l1_ssim_loss_and_gradient
+from ..config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
+from ..errors import TrainerError
+from ..model import GaussianModel, GaussianOptimizer
+from ..results.evaluation import Evaluation, evaluate
+from ..results.metrics import psnr
+from ..results.modelfile import FOLDER, model_path, save_model
+from ..results.pictures import loss_plot
+from ..results.rendering import Rasterize, Renderer, background_color
+from ..results.rows import RESULTS_NAME, result_row, write_results
+from ..scenes.images import as_float
+from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
+from ..system.environment import extension_info
+from ..system.files import is_file, write_atomically, write_json_atomically
+from ..system.interrupt import DelayedInterrupt
+from ..system.output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
+from ..system.progress import progress_bar
+from ..system.stopwatch import Stopwatch
 from .background_gate import LearnedGate
 from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
-from .config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
-from .environment import extension_info
-from .errors import TrainerError
-from .evaluation import Evaluation, evaluate
-from .files import is_file, write_atomically, write_json_atomically
-from .images import as_float
-from .interrupt import DelayedInterrupt
-from .metrics import psnr
-from .model import GaussianModel, GaussianOptimizer
-from .modelfile import FOLDER, model_path, save_model
 from .order import ViewOrder
-from .output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
-from .pictures import loss_plot
-from .progress import progress_bar
 from .randomness import random_state, restore_random_state, seed_everything
-from .rendering import Rasterize, Renderer, background_color
-from .results import RESULTS_NAME, result_row, write_results
-from .scene import Scene, load_scene, read_layout, scene_fingerprint
-from .stopwatch import Stopwatch
 from .strategy import STRATEGIES, Step, StrategyContext
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
