@@ -1,9 +1,9 @@
 // The three nearest neighbours of every point: exact, by leaving out boxes that are too far.
 #include <cmath>
 
-#include "cuda/device.cuh"
+#include "device.cuh"
 #include "dsmoe/hd.h"
-#include "optim/neighbors.h"
+#include "dsmoe/neighbors.h"
 
 namespace dsmoe {
 namespace cuda {

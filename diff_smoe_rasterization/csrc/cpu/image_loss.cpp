@@ -1,11 +1,12 @@
 // L1 and SSIM on the CPU. Threads take bands of rows of one plane; windows run along each row, and then down the last
 // eleven rows, which wait in a ring.
+#include "dsmoe/image_loss.h"
+
 #include <algorithm>
 #include <vector>
 
-#include "cpu/parallel.h"
-#include "optim/image_loss.h"
-#include "optim/multiversion.h"
+#include "multiversion.h"
+#include "parallel.h"
 
 namespace dsmoe {
 namespace cpu {

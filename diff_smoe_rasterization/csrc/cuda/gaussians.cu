@@ -1,6 +1,6 @@
 // A thread per Gaussian.
-#include "cuda/check.h"
-#include "optim/gaussians.h"
+#include "check.h"
+#include "dsmoe/gaussians.h"
 
 namespace dsmoe {
 namespace cuda {

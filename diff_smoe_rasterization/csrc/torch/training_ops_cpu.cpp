@@ -3,7 +3,7 @@
 #include <torch/library.h>
 
 #include "cpu/parallel.h"
-#include "optim/ops.h"
+#include "training_ops.h"
 
 namespace dsmoe {
 namespace binding {

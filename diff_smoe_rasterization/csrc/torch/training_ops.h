@@ -1,6 +1,6 @@
-// The ops as torch calls them, once for all backends: ops_schema.cpp says their signatures, a backend registers
-// `adam<Backend>` and its like under its dispatch key. A Backend has the functions that ops_cpu.cpp and ops_cuda.cpp
-// define.
+// The trainers' ops as torch calls them, once for all backends: training_schema.cpp says their signatures, a backend
+// registers `adam<Backend>` and its like under its dispatch key. A Backend has the functions that training_ops_cpu.cpp
+// and training_ops_cuda.cpp define.
 #pragma once
 
 #include <ATen/ATen.h>
@@ -13,10 +13,10 @@
 #include <tuple>
 #include <vector>
 
-#include "optim/adam.h"
-#include "optim/gaussians.h"
-#include "optim/image_loss.h"
-#include "torch/check_tensor.h"
+#include "check_tensor.h"
+#include "dsmoe/adam_tensors.h"
+#include "dsmoe/gaussians.h"
+#include "dsmoe/image_loss.h"
 
 namespace dsmoe {
 namespace binding {

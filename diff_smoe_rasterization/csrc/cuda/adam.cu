@@ -1,8 +1,8 @@
 // Adam over several tensors in one launch: a block takes a piece of one of them.
 #include <algorithm>
 
-#include "cuda/check.h"
-#include "optim/adam.h"
+#include "check.h"
+#include "dsmoe/adam_tensors.h"
 
 namespace dsmoe {
 namespace cuda {

@@ -1,7 +1,7 @@
 // L1 and SSIM: one kernel for the values and SSIM's derivatives by the local moments, one for the gradient, one that
 // adds up. A block computes one tile of one plane; windows run along rows, then along columns, in shared memory.
-#include "cuda/check.h"
-#include "optim/image_loss.h"
+#include "check.h"
+#include "dsmoe/image_loss.h"
 
 namespace dsmoe {
 namespace cuda {

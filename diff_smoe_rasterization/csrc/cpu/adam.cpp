@@ -1,9 +1,9 @@
 // Adam on the CPU: threads take runs of rows.
 #include <algorithm>
 
-#include "cpu/parallel.h"
-#include "optim/adam.h"
-#include "optim/multiversion.h"
+#include "dsmoe/adam_tensors.h"
+#include "multiversion.h"
+#include "parallel.h"
 
 namespace dsmoe {
 namespace cpu {

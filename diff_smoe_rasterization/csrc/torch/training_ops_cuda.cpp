@@ -2,8 +2,8 @@
 #include <ATen/cuda/CUDAContext.h>
 #include <torch/library.h>
 
-#include "optim/neighbors.h"
-#include "optim/ops.h"
+#include "dsmoe/neighbors.h"
+#include "training_ops.h"
 
 namespace dsmoe {
 namespace binding {
