@@ -18,11 +18,11 @@ from .trainer.config import (
     holds_run,
 )
 from .trainer.errors import TrainerError, in_one_line, printable
-from .trainer.files import is_folder
-from .trainer.interrupt import exit_status
+from .trainer.system.files import is_folder
+from .trainer.system.interrupt import exit_status
 
 if TYPE_CHECKING:
-    from .trainer.evaluation import Measure
+    from .trainer.results.evaluation import Measure
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -144,7 +144,7 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        from .trainer.checkpoint import CHECKPOINT_NAME
+        from .trainer.training.checkpoint import CHECKPOINT_NAME
 
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = "; continue it with --resume" if continues else ""
@@ -272,9 +272,9 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    from .trainer.loop import train
-    from .trainer.process import set_up_process
-    from .trainer.results import blend_name, results_table, viewer_warning
+    from .trainer.results.rows import blend_name, results_table, viewer_warning
+    from .trainer.system.process import set_up_process
+    from .trainer.training.loop import train
 
     config = _train_config(arguments)
     set_up_process(config.device)
@@ -307,8 +307,8 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
 
 def _eval(arguments: argparse.Namespace) -> None:
     from .trainer.inspection import evaluate_run
-    from .trainer.metrics import image_metrics
-    from .trainer.results import results_table
+    from .trainer.results.metrics import image_metrics
+    from .trainer.results.rows import results_table
 
     measure = _with_lpips(arguments.lpips, arguments.device) if arguments.lpips else image_metrics
     row = evaluate_run(arguments.output, arguments.device, arguments.split, arguments.scene, measure=measure)
@@ -322,7 +322,7 @@ def _with_lpips(net: str, device: str) -> Measure:
     """The trainer's metrics and LPIPS of images without a mask. Raises TrainerError where its weights are not there."""
     from .benchmarks.errors import BenchError
     from .benchmarks.suite.lpips import check_weights, lpips_network
-    from .trainer.metrics import image_metrics, quantised
+    from .trainer.results.metrics import image_metrics, quantised
 
     kind = {"vgg": "lpips_vgg_std", "alex": "lpips_alex"}[net]
     try:
@@ -358,6 +358,6 @@ def _render(arguments: argparse.Namespace) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    from .trainer.environment import describe
+    from .trainer.system.environment import describe
 
     print(describe())

@@ -9,10 +9,10 @@ from typing import Dict, List, Optional, Sequence
 import torch
 
 from ...rasterizer import rasterize_with_splats
-from ...trainer.metrics import psnr, quantised
-from ...trainer.pictures import evenly_spaced
-from ...trainer.rendering import Renderer
-from ...trainer.scene import Scene
+from ...trainer.results.metrics import psnr, quantised
+from ...trainer.results.pictures import evenly_spaced
+from ...trainer.results.rendering import Renderer
+from ...trainer.scenes.scene import Scene
 from ..suite.measure import edge_mask
 
 VIEWS = 4  # evenly spaced test views, and as many training views

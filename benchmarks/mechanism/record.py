@@ -31,12 +31,12 @@ import torch
 
 from ...trainer.config import TrainConfig, add_arguments, config_from_arguments, holds_run
 from ...trainer.errors import TrainerError
-from ...trainer.files import write_text_atomically
-from ...trainer.loop import Run, Trainer, check_device, earlier_models
-from ...trainer.process import set_up_process
-from ...trainer.scene import Scene, load_scene
-from ...trainer.stopwatch import Stopwatch
-from ...trainer.strategy import MAX_SCALE, MIN_OPACITY, Step, ThreeDGSStrategy
+from ...trainer.scenes.scene import Scene, load_scene
+from ...trainer.system.files import write_text_atomically
+from ...trainer.system.process import set_up_process
+from ...trainer.system.stopwatch import Stopwatch
+from ...trainer.training.loop import Run, Trainer, check_device, earlier_models
+from ...trainer.training.strategy import MAX_SCALE, MIN_OPACITY, Step, ThreeDGSStrategy
 from ..errors import BenchError
 from ..suite.methods import require_test_views
 from ..suite.protocol import machine_of, project_commit

@@ -21,8 +21,8 @@ import traceback
 from typing import IO, Any, Dict, List, Optional, Tuple
 
 from ...trainer.errors import TrainerError
-from ...trainer.files import write_json_atomically
-from ...trainer.output_folder import locked
+from ...trainer.system.files import write_json_atomically
+from ...trainer.system.output_folder import locked
 from .processes import die_with_parent, last_line
 from .rows import ROW_NAME
 
@@ -53,7 +53,7 @@ def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float])
 def measured_row(cell: Dict[str, Any], output: str, started: float,
                  per_device: Optional[int] = None) -> Dict[str, Any]:
     """Trains and measures. per_device: as `supervise` has it. Raises what goes wrong."""
-    from ...trainer.results import result_row
+    from ...trainer.results.rows import result_row
     from . import methods, protocol
     from .measure import headline_lpips
 
@@ -92,7 +92,7 @@ def note_sharing(output: str, per_device: Optional[int]) -> Optional[int]:
 def write_images(output: str, outcome: Any) -> None:
     """OUT/images/{gt,render}/NAME.png of the views whose renderings were kept."""
     from ...trainer.inspection import to_image
-    from ...trainer.pictures import file_names
+    from ...trainer.results.pictures import file_names
 
     views = {view.camera.name: view for view in outcome.scene.test}
     files = dict(zip(views, file_names(list(views))))

@@ -15,8 +15,8 @@ from functools import partial
 from types import MappingProxyType
 from typing import IO, Any, Dict, List, Mapping, Optional, Sequence
 
-from ...trainer.files import write_json_atomically, write_text_atomically
-from ...trainer.output_folder import make_folder, only_one
+from ...trainer.system.files import write_json_atomically, write_text_atomically
+from ...trainer.system.output_folder import make_folder, only_one
 from ..errors import BenchError
 from . import require
 from .cell import SHARING, identity, shown

@@ -1,6 +1,7 @@
 """What is measured of a rendering: PSNR, SSIM, PSNR near edges and LPIPS, the same way whatever program rendered.
 
-Every metric is one number of one image; a scene's figure is the mean over its test views (trainer/evaluation.py).
+Every metric is one number of one image; a scene's figure is the mean over its test views (results/evaluation.py of the
+trainer).
 """
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from typing import Dict, List, Optional, Sequence
 import torch
 import torch.nn.functional as F
 
-from ...trainer.metrics import image_metrics, psnr, quantised
+from ...trainer.results.metrics import image_metrics, psnr, quantised
 from ..errors import BenchError
 from .lpips import LPIPS_KINDS, VARIABLES, Distance, lpips_network, net_of
 

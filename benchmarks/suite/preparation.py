@@ -7,8 +7,8 @@ import shutil
 from typing import Any, Dict, List
 
 from ... import patches
-from ...trainer.files import write_json_atomically
-from ...trainer.synthetic import write_synthetic_scene
+from ...trainer.scenes.synthetic import write_synthetic_scene
+from ...trainer.system.files import write_json_atomically
 from ..errors import BenchError
 from .expansion import NOT_IN_THE_IDENTITY
 from .names import CHECKOUTS, NATIVE

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, Dict, Optional
 
 from ...trainer.config import TrainConfig
-from ...trainer.environment import machine, versions
-from ...trainer.images import image_size, target_size
-from ...trainer.scene import read_layout
+from ...trainer.scenes.images import image_size, target_size
+from ...trainer.scenes.scene import read_layout
+from ...trainer.system.environment import machine, versions
 from .measure import EDGE_RULE
 from .names import RECIPE
 

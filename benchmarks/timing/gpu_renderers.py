@@ -13,7 +13,7 @@ import torch
 from models import Model, mode_and_gate
 
 from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
-from diff_smoe_rasterization.trainer.cameras import Camera
+from diff_smoe_rasterization.trainer.scenes.cameras import Camera
 
 NEAR = 0.2
 FAR = 1e4  # for the peers that take a far plane; beyond every Gaussian

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings, resolve_background_gate, resolve_blend_mode
-from diff_smoe_rasterization.trainer.cameras import Camera
 from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.modelfile import load_model
-from diff_smoe_rasterization.trainer.scene import load_cameras
+from diff_smoe_rasterization.trainer.results.modelfile import load_model
+from diff_smoe_rasterization.trainer.scenes.cameras import Camera
+from diff_smoe_rasterization.trainer.scenes.scene import load_cameras
 
 
 def mode_and_gate(blend: str) -> Tuple[str, Optional[float]]:

@@ -10,7 +10,7 @@ from typing import Any, Dict, List, Optional, Sequence, Union
 
 from ..settings import BACKGROUND_GATE_VARIABLE, BLEND_MODES, resolve_background_gate, resolve_blend_mode
 from .errors import ConfigError
-from .files import is_file, is_folder, write_text_atomically
+from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
 SCHEDULES = ("3dgs", "steady")

@@ -10,17 +10,17 @@ from PIL import Image
 
 from .config import LEARNED, TrainConfig
 from .errors import TrainerError
-from .evaluation import Measure, evaluate
-from .files import write_json_atomically
-from .loop import PER_VIEW_NAME, check_device
-from .metrics import image_metrics, quantised
-from .modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
-from .output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
-from .pictures import file_names
-from .progress import progress_bar
-from .rendering import Rasterize, Renderer, background_color
-from .results import read_results, result_row, write_results
-from .scene import load_cameras, load_scene
+from .results.evaluation import Measure, evaluate
+from .results.metrics import image_metrics, quantised
+from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
+from .results.pictures import file_names
+from .results.rendering import Rasterize, Renderer, background_color
+from .results.rows import read_results, result_row, write_results
+from .scenes.scene import load_cameras, load_scene
+from .system.files import write_json_atomically
+from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
+from .system.progress import progress_bar
+from .training.loop import PER_VIEW_NAME, check_device
 
 RENDER = "dsmoe render"  # in its folders' records
 

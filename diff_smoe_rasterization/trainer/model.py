@@ -10,7 +10,7 @@ from ..gaussians import activate
 from ..neighbors import distCUDA2
 from ..optimizers import FusedAdam
 from .config import TrainConfig
-from .pointcloud import PointCloud
+from .scenes.pointcloud import PointCloud
 
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi))
 INITIAL_OPACITY = 0.1

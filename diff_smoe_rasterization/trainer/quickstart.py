@@ -15,18 +15,18 @@ import torch
 
 from .config import TrainConfig, add_arguments
 from .errors import TrainerError, in_one_line
-from .images import View, image_size
 from .inspection import open_renderer, to_image
-from .interrupt import exit_status
-from .loop import check_device, train
-from .metrics import psnr, quantised
-from .modelfile import model_path
-from .output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
-from .pictures import comparison, evenly_spaced, file_names
-from .process import set_up_process
-from .results import RESULTS_NAME, results_table, viewer_warning, write_results
-from .scene import Scene, load_scene, read_layout
-from .synthetic import write_synthetic_scene
+from .results.metrics import psnr, quantised
+from .results.modelfile import model_path
+from .results.pictures import comparison, evenly_spaced, file_names
+from .results.rows import RESULTS_NAME, results_table, viewer_warning, write_results
+from .scenes.images import View, image_size
+from .scenes.scene import Scene, load_scene, read_layout
+from .scenes.synthetic import write_synthetic_scene
+from .system.interrupt import exit_status
+from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
+from .system.process import set_up_process
+from .training.loop import check_device, train
 
 MODES = ("alpha", "smoe")
 PICTURES = 3  # test views that are shown

@@ -10,8 +10,8 @@ from typing import Any, Dict, List, Optional
 import torch
 
 from ....trainer.config import TrainConfig
-from ....trainer.evaluation import Evaluation
-from ....trainer.scene import Scene
+from ....trainer.results.evaluation import Evaluation
+from ....trainer.scenes.scene import Scene
 from ...errors import BenchError
 from ..names import NATIVE
 from ..protocol import BYTES_PER_GAUSSIAN

@@ -18,10 +18,10 @@ import torch
 
 from ....settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE
 from ....trainer.config import TrainConfig
-from ....trainer.evaluation import Evaluation, summary
-from ....trainer.images import View
-from ....trainer.pictures import evenly_spaced
-from ....trainer.scene import Scene, load_scene
+from ....trainer.results.evaluation import Evaluation, summary
+from ....trainer.results.pictures import evenly_spaced
+from ....trainer.scenes.images import View
+from ....trainer.scenes.scene import Scene, load_scene
 from ...errors import BenchError
 from ..measure import Measures
 from ..names import COUNTED_BY, RECIPE

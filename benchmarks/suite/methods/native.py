@@ -7,14 +7,14 @@ from typing import Any, Dict, List
 
 import torch
 
-from ....trainer.checkpoint import CHECKPOINT_NAME
-from ....trainer.evaluation import evaluate
 from ....trainer.inspection import open_renderer
-from ....trainer.loop import HISTORY_NAME, train
-from ....trainer.modelfile import model_path
-from ....trainer.pictures import evenly_spaced
-from ....trainer.process import set_up_process
-from ....trainer.scene import load_scene
+from ....trainer.results.evaluation import evaluate
+from ....trainer.results.modelfile import model_path
+from ....trainer.results.pictures import evenly_spaced
+from ....trainer.scenes.scene import load_scene
+from ....trainer.system.process import set_up_process
+from ....trainer.training.checkpoint import CHECKPOINT_NAME
+from ....trainer.training.loop import HISTORY_NAME, train
 from ..measure import Measures
 from ..protocol import config_of
 from . import Outcome, require_test_views

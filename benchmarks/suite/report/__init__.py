@@ -17,7 +17,7 @@ import jinja2
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from ....trainer.output_folder import make_folder
+from ....trainer.system.output_folder import make_folder
 from ..rows import CELLS_FOLDER, SUITE_NAME, ReportError, Row, read_rows
 from . import survey
 from .curves import Picture, draw_all

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from ....trainer.metrics import psnr
+from ....trainer.results.metrics import psnr
 from ..rows import CELLS_FOLDER, ReportError, Row
 from .groups import Group, grouped, safe_name
 from .layouts import end_of

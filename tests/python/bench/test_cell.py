@@ -9,7 +9,7 @@ import pytest
 
 from diff_smoe_rasterization.benchmarks.suite import cell as cells
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
-from diff_smoe_rasterization.trainer.rendering import Renderer
+from diff_smoe_rasterization.trainer.results.rendering import Renderer
 
 
 @pytest.fixture

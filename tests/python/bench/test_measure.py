@@ -11,8 +11,8 @@ import torch
 from diff_smoe_rasterization.benchmarks.suite import measure
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures, edge_mask, edge_psnr
 from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.evaluation import evaluate, summary
-from diff_smoe_rasterization.trainer.metrics import image_metrics
+from diff_smoe_rasterization.trainer.results.evaluation import evaluate, summary
+from diff_smoe_rasterization.trainer.results.metrics import image_metrics
 
 
 def step_image(height=24, width=32, column=16, low=0.2, high=0.8):

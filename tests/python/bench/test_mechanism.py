@@ -10,12 +10,12 @@ import torch
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.mechanism import record as mechanism
 from diff_smoe_rasterization.benchmarks.mechanism.probe import Probe
-from diff_smoe_rasterization.trainer.checkpoint import CHECKPOINT_NAME, load_checkpoint
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.loop import Trainer, train
-from diff_smoe_rasterization.trainer.modelfile import model_path
-from diff_smoe_rasterization.trainer.scene import load_scene
+from diff_smoe_rasterization.trainer.results.modelfile import model_path
+from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.training.checkpoint import CHECKPOINT_NAME, load_checkpoint
+from diff_smoe_rasterization.trainer.training.loop import Trainer, train
 
 RESETS = [60, 120, 180]
 DENSIFICATIONS = list(range(40, 200, 20))

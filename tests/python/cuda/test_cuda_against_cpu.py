@@ -22,7 +22,7 @@ from diff_smoe_rasterization.extension import _C
 from diff_smoe_rasterization.settings import OUTPUTS
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.model import GaussianModel
-from diff_smoe_rasterization.trainer.scene import load_cameras, read_layout
+from diff_smoe_rasterization.trainer.scenes.scene import load_cameras, read_layout
 
 
 def crowd(mode, **options):

@@ -19,8 +19,8 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer import inspection
-from diff_smoe_rasterization.trainer.loop import Trainer
-from diff_smoe_rasterization.trainer.results import viewer_warning
+from diff_smoe_rasterization.trainer.results.rows import viewer_warning
+from diff_smoe_rasterization.trainer.training.loop import Trainer
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
          "--densification-interval", "4", "--quiet"]
@@ -465,9 +465,9 @@ def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
     arguments = ["train", scene, "-o", str(tmp_path / "out"), *SHORT]
     for function, words in ((cuda, "the GPU is out of memory, 20.00 GiB"), (array, "out of memory, 1.00 PiB"),
                             (cpu, f"the machine is out of memory, {2**50} bytes more were asked for")):
-        monkeypatch.setattr("diff_smoe_rasterization.trainer.loop.load_scene", function)
+        monkeypatch.setattr("diff_smoe_rasterization.trainer.training.loop.load_scene", function)
         assert words in fails(capsys, *arguments)
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.loop.load_scene", defect)
+    monkeypatch.setattr("diff_smoe_rasterization.trainer.training.loop.load_scene", defect)
     with pytest.raises(RuntimeError, match="another one"):
         main(arguments)
 
@@ -529,7 +529,7 @@ def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monke
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.loop.load_scene", interrupted)
+    monkeypatch.setattr("diff_smoe_rasterization.trainer.training.loop.load_scene", interrupted)
     assert main(["train", scene, "-o", str(tmp_path / "out"), *SHORT]) == 130
     assert capsys.readouterr().err.endswith("interrupted\n")
 

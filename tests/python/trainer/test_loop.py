@@ -9,12 +9,12 @@ import torch
 
 from diff_smoe_rasterization.losses import l1_ssim_loss
 from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient as l1_ssim
-from diff_smoe_rasterization.trainer import loop
 from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.loop import Run, Trainer, train
-from diff_smoe_rasterization.trainer.rendering import package_rasterizer
-from diff_smoe_rasterization.trainer.scene import load_scene
-from diff_smoe_rasterization.trainer.strategy import STRATEGIES, Strategy
+from diff_smoe_rasterization.trainer.results.rendering import package_rasterizer
+from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.training import loop
+from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
+from diff_smoe_rasterization.trainer.training.strategy import STRATEGIES, Strategy
 
 
 @pytest.fixture
@@ -225,7 +225,7 @@ def test_evaluation_leaves_training_alone(tiny_config, scene):
 def test_training_seconds_are_those_of_the_steps(tiny_config, scene, monkeypatch):
     """Evaluation and checkpoints take no part of them."""
     clock = [0.0]
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.stopwatch.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("diff_smoe_rasterization.trainer.system.stopwatch.time.perf_counter", lambda: clock[0])
     step, save = Trainer.step, Run.save_checkpoint
 
     def timed(function, seconds):

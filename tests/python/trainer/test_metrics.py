@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from diff_smoe_rasterization.losses import fused_ssim
-from diff_smoe_rasterization.trainer.metrics import image_metrics, masked_ssim, psnr, quantised
+from diff_smoe_rasterization.trainer.results.metrics import image_metrics, masked_ssim, psnr, quantised
 
 
 def test_psnr_by_hand():

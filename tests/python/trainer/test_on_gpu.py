@@ -10,9 +10,9 @@ import pytest
 import torch
 from devices import without_cuda_because
 
-from diff_smoe_rasterization.trainer.loop import Run, Trainer, train
 from diff_smoe_rasterization.trainer.model import PARAMETERS
-from diff_smoe_rasterization.trainer.scene import load_scene
+from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
 
 pytestmark = pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
 

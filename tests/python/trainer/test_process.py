@@ -5,7 +5,7 @@ import io
 
 import torch
 
-from diff_smoe_rasterization.trainer import process, progress
+from diff_smoe_rasterization.trainer.system import process, progress
 
 
 def test_a_training_on_a_gpu_has_one_thread_of_the_host_and_one_on_the_cpu_has_all(monkeypatch):

@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.trainer import files, quickstart
-from diff_smoe_rasterization.trainer.pictures import busiest_window, comparison, evenly_spaced
+from diff_smoe_rasterization.trainer import quickstart
+from diff_smoe_rasterization.trainer.results.pictures import busiest_window, comparison, evenly_spaced
+from diff_smoe_rasterization.trainer.system import files
 
 
 @pytest.fixture(scope="module")

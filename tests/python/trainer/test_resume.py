@@ -11,13 +11,14 @@ import pytest
 import torch
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.trainer import checkpoint, files
-from diff_smoe_rasterization.trainer.checkpoint import load_checkpoint, save_checkpoint
 from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.loop import Trainer, train
-from diff_smoe_rasterization.trainer.modelfile import model_path
-from diff_smoe_rasterization.trainer.order import ViewOrder
-from diff_smoe_rasterization.trainer.scene import load_scene
+from diff_smoe_rasterization.trainer.results.modelfile import model_path
+from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.system import files
+from diff_smoe_rasterization.trainer.training import checkpoint
+from diff_smoe_rasterization.trainer.training.checkpoint import load_checkpoint, save_checkpoint
+from diff_smoe_rasterization.trainer.training.loop import Trainer, train
+from diff_smoe_rasterization.trainer.training.order import ViewOrder
 
 
 class Killed(Exception):

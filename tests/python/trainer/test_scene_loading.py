@@ -12,14 +12,14 @@ import torch
 from PIL import Image
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.trainer.cameras import Camera
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import SceneError
-from diff_smoe_rasterization.trainer.images import target_size
-from diff_smoe_rasterization.trainer.layout import PosedImage, hold_out
-from diff_smoe_rasterization.trainer.pictures import file_names
-from diff_smoe_rasterization.trainer.pointcloud import PointCloud
-from diff_smoe_rasterization.trainer.scene import load_cameras, load_scene
+from diff_smoe_rasterization.trainer.results.pictures import file_names
+from diff_smoe_rasterization.trainer.scenes.cameras import Camera
+from diff_smoe_rasterization.trainer.scenes.images import target_size
+from diff_smoe_rasterization.trainer.scenes.layout import PosedImage, hold_out
+from diff_smoe_rasterization.trainer.scenes.pointcloud import PointCloud
+from diff_smoe_rasterization.trainer.scenes.scene import load_cameras, load_scene
 
 
 def load(folder, **options):

@@ -1,0 +1,205 @@
+// L1 and SSIM: one kernel for the values and SSIM's derivatives by the local moments, one for the gradient, one that
+// adds up. A block computes one tile of one plane; windows run along rows, then along columns, in shared memory.
+#include "check.h"
+#include "dsmoe/image_loss.h"
+
+namespace dsmoe {
+namespace cuda {
+namespace {
+
+constexpr int kBlock = 256;
+constexpr int kSumBlock = 512;
+
+// The pixels of a tile, as many as shared memory has room for.
+template <class S> struct Tile {
+  static constexpr int kWidth = sizeof(S) == 4 ? 32 : 16, kHeight = 16;
+  static constexpr int kPaddedWidth = kWidth + 2 * kSsimRadius, kPaddedHeight = kHeight + 2 * kSsimRadius;
+};
+
+template <class S> int64_t num_blocks(int64_t planes, int height, int width) {
+  const int64_t across = (width + Tile<S>::kWidth - 1) / Tile<S>::kWidth;
+  const int64_t down = (height + Tile<S>::kHeight - 1) / Tile<S>::kHeight;
+  return planes * across * down;
+}
+
+// Where this block's tile lies.
+struct Place {
+  int64_t plane;  // index of the plane's first pixel
+  int row, column;
+};
+
+template <class S> __device__ Place place_of_block(const ImageLoss<S>& loss) {
+  const int across = (loss.width + Tile<S>::kWidth - 1) / Tile<S>::kWidth;
+  const int down = (loss.height + Tile<S>::kHeight - 1) / Tile<S>::kHeight;
+  const int tile = blockIdx.x % (across * down);
+  return {static_cast<int64_t>(blockIdx.x / (across * down)) * loss.height * loss.width,
+          tile / across * Tile<S>::kHeight, tile % across * Tile<S>::kWidth};
+}
+
+// Calls visit(i, row, column, index) for the pixels of the tile and the window's reach around it; index is -1 outside
+// the image.
+template <class S, class Visit> __device__ void for_each_padded(const ImageLoss<S>& loss, Place place, Visit visit) {
+  using T = Tile<S>;
+  for (int i = threadIdx.x; i < T::kPaddedWidth * T::kPaddedHeight; i += kBlock) {
+    const int row = place.row + i / T::kPaddedWidth - kSsimRadius;
+    const int column = place.column + i % T::kPaddedWidth - kSsimRadius;
+    const bool inside = 0 <= row && row < loss.height && 0 <= column && column < loss.width;
+    visit(i / T::kPaddedWidth, i % T::kPaddedWidth,
+          inside ? place.plane + static_cast<int64_t>(row) * loss.width + column : int64_t(-1));
+  }
+}
+
+// The block's sum, in thread 0.
+__device__ double block_sum(double value) {
+  __shared__ double of_warps[32];
+  for (int offset = 16; offset > 0; offset /= 2) value += __shfl_down_sync(0xffffffffu, value, offset);
+  if (threadIdx.x % 32 == 0) of_warps[threadIdx.x / 32] = value;
+  __syncthreads();
+  if (threadIdx.x < 32) {
+    value = threadIdx.x < blockDim.x / 32 ? of_warps[threadIdx.x] : 0;
+    for (int offset = 16; offset > 0; offset /= 2) value += __shfl_down_sync(0xffffffffu, value, offset);
+  }
+  return value;
+}
+
+template <class S>
+__global__ void __launch_bounds__(kBlock)
+    value_kernel(const __grid_constant__ ImageLoss<S> loss, const __grid_constant__ SsimWindow<S> window, S l1_scale,
+                 S ssim_scale) {
+  using T = Tile<S>;
+  __shared__ S image[T::kPaddedHeight][T::kPaddedWidth], target[T::kPaddedHeight][T::kPaddedWidth];
+  __shared__ S rows[kNumSsimMoments][T::kPaddedHeight][T::kWidth];
+  const Place place = place_of_block(loss);
+  for_each_padded(loss, place, [&](int row, int column, int64_t index) {
+    image[row][column] = index < 0 ? S(0) : loss.image[index];
+    target[row][column] = index < 0 ? S(0) : target_value(loss, index);
+  });
+  __syncthreads();
+
+  for (int i = threadIdx.x; i < T::kPaddedHeight * T::kWidth; i += kBlock) {
+    const int row = i / T::kWidth, column = i % T::kWidth;
+    S sums[kNumSsimMoments] = {};
+#pragma unroll
+    for (int k = 0; k < kSsimTaps; ++k) {
+      const S x = image[row][column + k], y = target[row][column + k];
+      const S weighted_x = window.taps[k] * x, weighted_y = window.taps[k] * y;
+      sums[0] += weighted_x;
+      sums[1] += weighted_y;
+      sums[2] += weighted_x * x;
+      sums[3] += weighted_y * y;
+      sums[4] += weighted_x * y;
+    }
+#pragma unroll
+    for (int m = 0; m < kNumSsimMoments; ++m) rows[m][row][column] = sums[m];
+  }
+  __syncthreads();
+
+  const int64_t map_size = loss.planes * loss.height * loss.width;
+  double sum = 0;
+  for (int i = threadIdx.x; i < T::kHeight * T::kWidth; i += kBlock) {
+    const int row = i / T::kWidth, column = i % T::kWidth;
+    if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
+    S means[kNumSsimMoments] = {};
+#pragma unroll
+    for (int k = 0; k < kSsimTaps; ++k) {
+#pragma unroll
+      for (int m = 0; m < kNumSsimMoments; ++m) means[m] += window.taps[k] * rows[m][row + k][column];
+    }
+    const bool counts = in_margins(loss, place.row + row, place.column + column);
+    const Ssim<S> pixel = ssim(SsimMoments<S>{means[0], means[1], means[2], means[3], means[4]});
+    const S difference =
+        image[row + kSsimRadius][column + kSsimRadius] - target[row + kSsimRadius][column + kSsimRadius];
+    sum += l1_scale * abs(difference) + (counts ? ssim_scale * pixel.value : S(0));
+    if (loss.derivatives != nullptr) {
+      const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
+      loss.derivatives[index] = counts ? pixel.d_mean : S(0);
+      loss.derivatives[map_size + index] = counts ? pixel.d_square : S(0);
+      loss.derivatives[2 * map_size + index] = counts ? pixel.d_product : S(0);
+    }
+  }
+  sum = block_sum(sum);
+  if (threadIdx.x == 0) loss.sums[blockIdx.x] = sum;
+}
+
+template <class S>
+__global__ void __launch_bounds__(kBlock)
+    gradient_kernel(const __grid_constant__ ImageLoss<S> loss, const __grid_constant__ SsimWindow<S> window, S l1_scale,
+                    S ssim_scale) {
+  using T = Tile<S>;
+  __shared__ S maps[kNumSsimDerivatives][T::kPaddedHeight][T::kPaddedWidth];
+  __shared__ S rows[kNumSsimDerivatives][T::kPaddedHeight][T::kWidth];
+  const Place place = place_of_block(loss);
+  const int64_t map_size = loss.planes * loss.height * loss.width;
+  for_each_padded(loss, place, [&](int row, int column, int64_t index) {
+#pragma unroll
+    for (int m = 0; m < kNumSsimDerivatives; ++m) {
+      maps[m][row][column] = index < 0 ? S(0) : loss.derivatives[m * map_size + index];
+    }
+  });
+  __syncthreads();
+
+  for (int i = threadIdx.x; i < T::kPaddedHeight * T::kWidth; i += kBlock) {
+    const int row = i / T::kWidth, column = i % T::kWidth;
+#pragma unroll
+    for (int m = 0; m < kNumSsimDerivatives; ++m) {
+      S sum = 0;
+#pragma unroll
+      for (int k = 0; k < kSsimTaps; ++k) sum += window.taps[k] * maps[m][row][column + k];
+      rows[m][row][column] = sum;
+    }
+  }
+  __syncthreads();
+
+  for (int i = threadIdx.x; i < T::kHeight * T::kWidth; i += kBlock) {
+    const int row = i / T::kWidth, column = i % T::kWidth;
+    if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
+    S means[kNumSsimDerivatives] = {};
+#pragma unroll
+    for (int k = 0; k < kSsimTaps; ++k) {
+#pragma unroll
+      for (int m = 0; m < kNumSsimDerivatives; ++m) means[m] += window.taps[k] * rows[m][row + k][column];
+    }
+    const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
+    const S x = loss.image[index], y = target_value(loss, index);
+    loss.gradient[index] = l1_scale * sign(x - y) + ssim_scale * ssim_gradient(x, y, means[0], means[1], means[2]);
+  }
+}
+
+// Adds the blocks' sums in a fixed order.
+template <class S>
+__global__ void __launch_bounds__(kSumBlock) sum_kernel(const double* sums, int64_t count, double offset, S* loss) {
+  double sum = 0;
+  for (int64_t i = threadIdx.x; i < count; i += kSumBlock) sum += sums[i];
+  sum = block_sum(sum);
+  if (threadIdx.x == 0) *loss = static_cast<S>(offset + sum);
+}
+
+}  // namespace
+
+template <class S> int64_t num_image_loss_sums(int64_t planes, int height, int width) {
+  return num_blocks<S>(planes, height, width);
+}
+
+template <class S> void image_loss(const ImageLoss<S>& loss, void* stream) {
+  const auto cuda_stream = static_cast<cudaStream_t>(stream);
+  const int64_t blocks = num_blocks<S>(loss.planes, loss.height, loss.width);
+  const SsimWindow<S> window = ssim_window<S>();
+  const S l1_scale = static_cast<S>(loss.l1_scale()), ssim_scale = static_cast<S>(loss.ssim_scale());
+  const unsigned grid = static_cast<unsigned>(blocks);
+  value_kernel<S><<<grid, kBlock, 0, cuda_stream>>>(loss, window, l1_scale, ssim_scale);
+  DSMOE_CHECK_LAUNCH("the loss");
+  if (loss.gradient != nullptr) {
+    gradient_kernel<S><<<grid, kBlock, 0, cuda_stream>>>(loss, window, l1_scale, ssim_scale);
+    DSMOE_CHECK_LAUNCH("the gradient of the loss");
+  }
+  sum_kernel<S><<<1, kSumBlock, 0, cuda_stream>>>(loss.sums, blocks, loss.offset, loss.loss);
+  DSMOE_CHECK_LAUNCH("the sum of the loss");
+}
+
+template int64_t num_image_loss_sums<float>(int64_t, int, int);
+template int64_t num_image_loss_sums<double>(int64_t, int, int);
+template void image_loss<float>(const ImageLoss<float>&, void*);
+template void image_loss<double>(const ImageLoss<double>&, void*);
+
+}  // namespace cuda
+}  // namespace dsmoe

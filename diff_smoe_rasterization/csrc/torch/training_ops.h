@@ -1,0 +1,235 @@
+// The trainers' ops as torch calls them, once for all backends: training_schema.cpp says their signatures, a backend
+// registers `adam<Backend>` and its like under its dispatch key. A Backend has the functions that training_ops_cpu.cpp
+// and training_ops_cuda.cpp define.
+#pragma once
+
+#include <ATen/ATen.h>
+#include <ATen/Dispatch.h>
+#include <c10/core/DeviceGuard.h>
+#include <c10/util/Optional.h>
+
+#include <climits>
+#include <string>
+#include <tuple>
+#include <vector>
+
+#include "check_tensor.h"
+#include "dsmoe/adam_tensors.h"
+#include "dsmoe/gaussians.h"
+#include "dsmoe/image_loss.h"
+
+namespace dsmoe {
+namespace binding {
+
+using OptionalTensor = c10::optional<at::Tensor>;  // std::optional in newer torch
+
+// Autograd must notice where a tensor was changed in place after it was saved.
+inline void note_change(at::TensorList tensors) {
+  for (const at::Tensor& tensor : tensors) tensor.unsafeGetTensorImpl()->bump_version();
+}
+
+template <class Backend>
+void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList moments, at::TensorList squares,
+          at::ArrayRef<double> rates, at::ArrayRef<double> root_scales, double beta1, double beta2, double epsilon,
+          const OptionalTensor& visible) {
+  const size_t count = parameters.size();
+  for (size_t length : {gradients.size(), moments.size(), squares.size(), rates.size(), root_scales.size()}) {
+    TORCH_CHECK_VALUE(length == count, "adam: lists of ", count, " and of ", length,
+                      " items are given; all must have the length of parameters");
+  }
+  if (count == 0) return;
+  const at::Tensor& first = parameters[0];
+  check_real("adam", "parameters[0]", first);
+  const c10::DeviceGuard guard(first.device());
+
+  at::Tensor flags;
+  if (visible.has_value()) {
+    flags = visible->contiguous();
+    check_type("adam", "visible", flags, at::kBool);
+    check_shape("adam", "visible", flags, {"N"});
+    check_device("adam", "visible", flags, "parameters[0]", first);
+  }
+
+  std::vector<at::Tensor> dense_gradients;
+  for (size_t i = 0; i < count; ++i) {
+    const auto name = [i](const char* list) { return std::string(list) + "[" + std::to_string(i) + "]"; };
+    const auto check_like_parameter = [&](const char* list, const at::Tensor& tensor) {
+      check_same_shape("adam", name(list).c_str(), tensor, name("parameters").c_str(), parameters[i]);
+      check_like("adam", name(list).c_str(), tensor, "parameters[0]", first);
+    };
+    check_like_parameter("parameters", parameters[i]);
+    check_like_parameter("gradients", gradients[i]);
+    check_like_parameter("moments", moments[i]);
+    check_like_parameter("squares", squares[i]);
+    check_contiguous("adam", name("parameters").c_str(), parameters[i]);
+    check_contiguous("adam", name("moments").c_str(), moments[i]);
+    check_contiguous("adam", name("squares").c_str(), squares[i]);
+    TORCH_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)),
+                      "adam: ", name("parameters"), " has shape ", parameters[i].sizes(), "; visible has ",
+                      flags.defined() ? flags.size(0) : 0, " rows, and so must every parameter");
+    dense_gradients.push_back(gradients[i].contiguous());
+  }
+
+  AT_DISPATCH_FLOATING_TYPES(first.scalar_type(), "adam", [&] {
+    const AdamConstants<scalar_t> constants = {static_cast<scalar_t>(beta1), static_cast<scalar_t>(beta2),
+                                               static_cast<scalar_t>(1 - beta1), static_cast<scalar_t>(1 - beta2),
+                                               static_cast<scalar_t>(epsilon)};
+    std::vector<AdamTensor<scalar_t>> tensors;
+    for (size_t i = 0; i < count; ++i) {
+      const int64_t size = parameters[i].numel();
+      const int64_t rows = flags.defined() ? flags.size(0) : size;
+      tensors.push_back({parameters[i].data_ptr<scalar_t>(),
+                         dense_gradients[i].data_ptr<scalar_t>(),
+                         moments[i].data_ptr<scalar_t>(),
+                         squares[i].data_ptr<scalar_t>(),
+                         size,
+                         rows > 0 && size > 0 ? size / rows : 1,
+                         {static_cast<scalar_t>(rates[i]), static_cast<scalar_t>(root_scales[i])}});
+    }
+    Backend::adam(tensors, constants, flags.defined() ? flags.data_ptr<bool>() : nullptr);
+  });
+  for (at::TensorList list : {parameters, moments, squares}) note_change(list);
+}
+
+// The loss and, if it is wanted, its gradient by the image; an empty tensor otherwise.
+template <class Backend>
+std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at::Tensor& target, double l1_weight,
+                                              double ssim_weight, double offset, int64_t margin, bool with_gradient) {
+  const char* function = "image_loss";
+  check_real(function, "image", image);
+  refuse_tangent(function, image);
+  refuse_tangent(function, target);
+  check_same_shape(function, "target", target, "image", image);
+  check_device(function, "target", target, "image", image);
+  TORCH_CHECK_VALUE(image.dim() >= 2 && image.numel() > 0, function, ": image has shape ", image.sizes(),
+                    "; it must be [..., H, W] with at least one pixel");
+  const int64_t height = image.size(-2), width = image.size(-1);
+  TORCH_CHECK_VALUE(height <= INT_MAX && width <= INT_MAX, function, ": image has shape ", image.sizes(),
+                    "; its sides may have ", INT_MAX, " pixels");
+  TORCH_CHECK_VALUE(margin >= 0 && height > 2 * margin && width > 2 * margin, function, ": image has shape ",
+                    image.sizes(), "; with a margin of ", margin, " its sides must be at least ", 2 * margin + 1);
+  const bool bytes = target.scalar_type() == at::kByte;
+  TORCH_CHECK_TYPE(bytes || target.scalar_type() == image.scalar_type(), function, ": target is ",
+                   dtype_name(target.scalar_type()), "; it must be ", dtype_name(image.scalar_type()),
+                   ", as image is, or uint8");
+  const c10::DeviceGuard guard(image.device());
+  const at::Tensor x = image.contiguous(), y = target.contiguous();
+  const int64_t planes = x.numel() / (height * width);
+  const at::Tensor loss = at::empty({}, x.options());
+  const at::Tensor gradient = at::empty(with_gradient ? x.sizes() : at::IntArrayRef({0}), x.options());
+  const at::Tensor derivatives = at::empty({with_gradient ? 3 * x.numel() : 0}, x.options());
+  AT_DISPATCH_FLOATING_TYPES(x.scalar_type(), "image_loss", [&] {
+    ImageLoss<scalar_t> arguments = {};
+    arguments.image = x.data_ptr<scalar_t>();
+    arguments.target = bytes ? nullptr : y.data_ptr<scalar_t>();
+    arguments.target_bytes = bytes ? y.data_ptr<uint8_t>() : nullptr;
+    arguments.planes = planes;
+    arguments.height = static_cast<int>(height), arguments.width = static_cast<int>(width);
+    arguments.margin = static_cast<int>(margin);
+    arguments.l1_weight = l1_weight, arguments.ssim_weight = ssim_weight, arguments.offset = offset;
+    const at::Tensor sums =
+        at::empty({Backend::template num_image_loss_sums<scalar_t>(arguments)}, x.options().dtype(at::kDouble));
+    arguments.sums = sums.data_ptr<double>();
+    arguments.loss = loss.data_ptr<scalar_t>();
+    arguments.gradient = with_gradient ? gradient.data_ptr<scalar_t>() : nullptr;
+    arguments.derivatives = with_gradient ? derivatives.data_ptr<scalar_t>() : nullptr;
+    Backend::image_loss(arguments);
+  });
+  return {loss, gradient};
+}
+
+// Opacities [N, 1], scales [N, 3] and rotations [N, 4] of the Gaussians.
+using GaussianTensors = std::tuple<at::Tensor, at::Tensor, at::Tensor>;
+
+inline GaussianTensors checked(const char* function, const at::Tensor& opacities, const at::Tensor& scales,
+                               const at::Tensor& rotations) {
+  check_real(function, "opacities", opacities);
+  for (const at::Tensor* tensor : {&opacities, &scales, &rotations}) refuse_tangent(function, *tensor);
+  check_like(function, "scales", scales, "opacities", opacities);
+  check_like(function, "rotations", rotations, "opacities", opacities);
+  check_shape(function, "opacities", opacities, {"N", 1});
+  check_shape(function, "scales", scales, {opacities.size(0), 3});
+  check_shape(function, "rotations", rotations, {opacities.size(0), 4});
+  return {opacities.contiguous(), scales.contiguous(), rotations.contiguous()};
+}
+
+inline GaussianTensors empty_like(const GaussianTensors& tensors) {
+  return {at::empty_like(std::get<0>(tensors)), at::empty_like(std::get<1>(tensors)),
+          at::empty_like(std::get<2>(tensors))};
+}
+
+template <class S> GaussianParameters<S> pointers(const GaussianTensors& tensors) {
+  const auto pointer = [](const at::Tensor& tensor) -> S* {
+    return tensor.defined() ? tensor.data_ptr<std::remove_const_t<S>>() : nullptr;
+  };
+  return {pointer(std::get<0>(tensors)), pointer(std::get<1>(tensors)), pointer(std::get<2>(tensors))};
+}
+
+template <class Backend>
+GaussianTensors activate(const at::Tensor& opacities, const at::Tensor& scales, const at::Tensor& rotations) {
+  const GaussianTensors raw = checked("activate", opacities, scales, rotations);
+  const c10::DeviceGuard guard(opacities.device());
+  const GaussianTensors values = empty_like(raw);
+  AT_DISPATCH_FLOATING_TYPES(opacities.scalar_type(), "activate", [&] {
+    Backend::template activate<scalar_t>(pointers<const scalar_t>(raw), pointers<scalar_t>(values), opacities.size(0));
+  });
+  return values;
+}
+
+// raw: the arguments of `activate`, values: its results, dL_d...: the gradients by these, where there are any.
+template <class Backend>
+GaussianTensors activate_backward(at::TensorList raw, at::TensorList values, const OptionalTensor& dL_dopacities,
+                                  const OptionalTensor& dL_dscales, const OptionalTensor& dL_drotations) {
+  const char* function = "activate_backward";
+  TORCH_CHECK_VALUE(raw.size() == 3 && values.size() == 3, function, ": raw and values must have 3 tensors each");
+  const GaussianTensors raw_tensors = checked(function, raw[0], raw[1], raw[2]);
+  const GaussianTensors value_tensors = checked(function, values[0], values[1], values[2]);
+  check_same_shape(function, "values", values[0], "raw", raw[0]);
+  check_like(function, "values", values[0], "raw", raw[0]);
+  const c10::DeviceGuard guard(raw[0].device());
+  const auto dense = [&](const char* name, const OptionalTensor& gradient, const at::Tensor& value) {
+    if (!gradient.has_value()) return at::Tensor();
+    refuse_tangent(function, *gradient);
+    check_same_shape(function, name, *gradient, "its value", value);
+    check_like(function, name, *gradient, "raw", raw[0]);
+    return gradient->contiguous();
+  };
+  const GaussianTensors gradients = {dense("dL_dopacities", dL_dopacities, values[0]),
+                                     dense("dL_dscales", dL_dscales, values[1]),
+                                     dense("dL_drotations", dL_drotations, values[2])};
+  const GaussianTensors results = empty_like(raw_tensors);
+  AT_DISPATCH_FLOATING_TYPES(raw[0].scalar_type(), "activate_backward", [&] {
+    Backend::template activate_backward<scalar_t>(
+        pointers<const scalar_t>(raw_tensors), pointers<const scalar_t>(value_tensors),
+        pointers<const scalar_t>(gradients), pointers<scalar_t>(results), raw[0].size(0));
+  });
+  return results;
+}
+
+template <class Backend>
+void add_view(const at::Tensor& dL_dmeans2D, const at::Tensor& radii, const at::Tensor& gradient_sum,
+              const at::Tensor& view_count) {
+  const char* function = "add_view";
+  check_real(function, "dL_dmeans2D", dL_dmeans2D);
+  check_shape(function, "radii", radii, {"N"});
+  check_type(function, "radii", radii, at::kInt);
+  check_shape(function, "dL_dmeans2D", dL_dmeans2D, {radii.size(0), 3});
+  check_device(function, "radii", radii, "dL_dmeans2D", dL_dmeans2D);
+  for (const at::Tensor* statistic : {&gradient_sum, &view_count}) {
+    const char* name = statistic == &gradient_sum ? "gradient_sum" : "view_count";
+    check_shape(function, name, *statistic, {radii.size(0)});
+    check_like(function, name, *statistic, "dL_dmeans2D", dL_dmeans2D);
+    check_contiguous(function, name, *statistic);
+  }
+  const c10::DeviceGuard guard(radii.device());
+  const at::Tensor gradients = dL_dmeans2D.contiguous(), dense_radii = radii.contiguous();
+  AT_DISPATCH_FLOATING_TYPES(gradients.scalar_type(), "add_view", [&] {
+    Backend::template add_view<scalar_t>(gradients.data_ptr<scalar_t>(), dense_radii.data_ptr<int32_t>(),
+                                         gradient_sum.data_ptr<scalar_t>(), view_count.data_ptr<scalar_t>(),
+                                         radii.size(0));
+  });
+  note_change({gradient_sum, view_count});
+}
+
+}  // namespace binding
+}  // namespace dsmoe

@@ -1,0 +1,1 @@
+"""What comes of a run: renderings, their metrics, and the files that hold models, rows and pictures."""

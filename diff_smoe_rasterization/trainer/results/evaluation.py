@@ -1,0 +1,67 @@
+"""Quality and speed of a model over a set of views."""
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence
+
+import torch
+
+from ..errors import TrainerError
+from ..scenes.images import View
+from ..system.progress import progress_bar
+from ..system.stopwatch import synchronised_time
+from .metrics import image_metrics
+from .rendering import Renderer
+
+WARM_UP_VIEWS = 2  # rendered untimed before the first timed one
+Measure = Callable[..., Mapping[str, Optional[float]]]
+METRICS = ("psnr", "ssim", "psnr_float")  # what image_metrics gives
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Means over views, each view counting once."""
+
+    metrics: Dict[str, Optional[float]]  # psnr, ssim, psnr_float and what else was measured; None where there are none
+    fps: Optional[float]  # 1 / mean seconds per view, images rendered and nothing else
+    per_view: List[Dict[str, object]]  # name, metrics and milliseconds of each view
+
+
+def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: bool = False,
+             measure: Measure = image_metrics) -> Evaluation:
+    """Renders every view; times rendering alone, synchronised, without loading, metrics or disk.
+
+    measure: from a rendering and its ground truth, [3, H, W], and of a view that has one its mask [1, H, W], to metrics
+    by name. Raises what `summary` raises.
+    """
+    per_view: List[Dict[str, object]] = []
+    with torch.no_grad():
+        for view in views[:WARM_UP_VIEWS]:
+            renderer(view.camera)
+        for view in progress_bar(views, desc="evaluation", unit="view", disable=not progress, leave=False):
+            started = synchronised_time(device)
+            color = renderer(view.camera).color
+            elapsed = synchronised_time(device) - started
+            pair = (color, view.image_float())
+            per_view.append({"name": view.camera.name, "milliseconds": elapsed * 1000,
+                             **(measure(*pair) if view.mask is None else measure(*pair, view.mask_float()))})
+    return summary(per_view)
+
+
+def summary(per_view: List[Dict[str, Any]]) -> Evaluation:
+    """Means of what was measured of each view. A metric that is None for some views is the mean over the others.
+
+    Raises TrainerError for a rendering that has NaN or infinite pixels: its figures would be none.
+    """
+    for row in per_view:
+        if math.isnan(row["psnr"]):
+            raise TrainerError(f"the rendering of {row['name']} has NaN or infinite pixels")
+    names = list(METRICS) + [name for name in (per_view[0] if per_view else ())
+                             if name not in (*METRICS, "name", "milliseconds")]
+    metrics: Dict[str, Optional[float]] = {}
+    for name in names:
+        values = [float(row[name]) for row in per_view if row[name] is not None]
+        metrics[name] = sum(values) / len(values) if values else None
+    seconds = sum(row["milliseconds"] for row in per_view) / 1000
+    return Evaluation(metrics, len(per_view) / seconds if per_view else None, per_view)

@@ -1,0 +1,82 @@
+"""Side-by-side pictures: ground truth and renderings, labelled, with one magnified window."""
+from __future__ import annotations
+
+import os
+from typing import List, Sequence, Tuple
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from ..errors import printable
+
+MARGIN = 6  # pixels between pictures
+LABEL_HEIGHT = 18
+WINDOW_SHARE = 4  # a window is this part of the picture's width and height, and magnified as much
+MIN_WIDTH = 400  # of each picture; smaller ones are enlarged by a whole factor
+FRAME = (255, 60, 0)
+
+
+def file_names(camera_names: Sequence[str]) -> List[str]:
+    """A file name without extension for each camera: folders joined by "_", equal ones numbered, printable."""
+    names: List[str] = []
+    for camera_name in camera_names:
+        stem = printable(os.path.splitext(camera_name)[0]).replace("/", "_").replace(os.sep, "_")
+        name, number = stem, 1
+        while name in names:
+            number += 1
+            name = f"{stem}_{number}"
+        names.append(name)
+    return names
+
+
+def comparison(truth: Image.Image, renderings: Sequence[Tuple[str, Image.Image]]) -> Image.Image:
+    """One row of whole pictures, and under it the same window of each, magnified. All images have one size."""
+    window = busiest_window(truth)
+    columns = [("ground truth", truth), *renderings]
+    factor = max(1, -(-MIN_WIDTH // truth.width))
+    width, height = truth.width * factor, truth.height * factor
+    sheet = Image.new("RGB", (len(columns) * (width + MARGIN) + MARGIN,
+                              LABEL_HEIGHT + 2 * (height + MARGIN)), (255, 255, 255))
+    draw = ImageDraw.Draw(sheet)
+    for index, (label, image) in enumerate(columns):
+        left = MARGIN + index * (width + MARGIN)
+        draw.text((left, 3), label, fill=(0, 0, 0), font=ImageFont.load_default())
+        whole = image.resize((width, height), Image.NEAREST)
+        ImageDraw.Draw(whole).rectangle([value * factor for value in window], outline=FRAME)
+        sheet.paste(whole, (left, LABEL_HEIGHT))
+        part = image.crop(window).resize((width, height), Image.NEAREST)
+        sheet.paste(part, (left, LABEL_HEIGHT + height + MARGIN))
+    return sheet
+
+
+def loss_plot(losses: Sequence[Tuple[int, float]]) -> Image.Image:
+    """The loss, upward, over the iterations: pairs of both, in order."""
+    width, height, edge = 640, 320, 40
+    picture = Image.new("RGB", (width, height), (255, 255, 255))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default()
+    last, top = losses[-1][0], max(loss for _, loss in losses) or 1.0
+    for share in (0.0, 0.5, 1.0):
+        y, x = height - edge - share * (height - 2 * edge), edge + share * (width - 2 * edge)
+        draw.line([(edge, y), (width - edge, y)], fill=(220, 220, 220))
+        draw.text((4, y - 6), f"{share * top:.3f}", fill=(0, 0, 0), font=font)
+        draw.text((x - 12, height - edge + 6), f"{share * last:.0f}", fill=(0, 0, 0), font=font)
+    draw.line([(edge + iteration / last * (width - 2 * edge), height - edge - loss / top * (height - 2 * edge))
+               for iteration, loss in losses], fill=(0, 114, 178))
+    draw.text((width // 2 - 60, 12), "loss over iterations", fill=(0, 0, 0), font=font)
+    return picture
+
+
+def busiest_window(image: Image.Image) -> Tuple[int, int, int, int]:
+    """(left, top, right, bottom) of the window with the most edges in the ground truth, whatever the renderings."""
+    gray = np.asarray(image.convert("L"), np.float64)
+    edges = np.abs(np.diff(gray, axis=0, prepend=gray[:1])) + np.abs(np.diff(gray, axis=1, prepend=gray[:, :1]))
+    height, width = max(1, gray.shape[0] // WINDOW_SHARE), max(1, gray.shape[1] // WINDOW_SHARE)
+    sums = np.pad(edges, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    inside = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    top, left = np.unravel_index(int(inside.argmax()), inside.shape)
+    return int(left), int(top), int(left) + width, int(top) + height
+
+
+def evenly_spaced(count: int, wanted: int) -> List[int]:
+    """Up to `wanted` indices below `count`, spread evenly."""
+    return sorted({round(index) for index in np.linspace(0, count - 1, min(count, wanted))}) if count else []

@@ -1,0 +1,69 @@
+"""One image of a GaussianModel through the package's public rasterizer."""
+from __future__ import annotations
+
+from typing import Any, Callable, Dict, Optional, Tuple
+
+import torch
+
+from ...settings import BackgroundGate, GaussianRasterizationSettings, Rendering
+from ..model import GaussianModel
+from ..scenes.cameras import Camera
+
+Rasterize = Callable[..., Rendering]
+
+
+def package_rasterizer() -> Rasterize:
+    """The compiled `rasterize`; imported late, so that scenes and configs work without the extension."""
+    from ... import rasterize
+
+    return rasterize
+
+
+class Renderer:
+    """Renders a model with one blend mode and background; the only place where the trainer calls `rasterize`."""
+
+    def __init__(self, model: GaussianModel, blend_mode: str, background: torch.Tensor,
+                 antialiasing: bool = False, rasterize: Optional[Rasterize] = None, *,
+                 background_gate: BackgroundGate) -> None:
+        """background: [3] on the model's device. rasterize: by default the package's.
+
+        background_gate: of `smoe`; the other modes have their own. A tensor has no gradient, and may change.
+        """
+        self.model = model
+        self.blend_mode = blend_mode
+        self.background = background
+        self.background_gate = background_gate
+        self.antialiasing = antialiasing
+        self.rasterize = rasterize or package_rasterizer()
+        self._settings: Dict[int, Tuple[Camera, GaussianRasterizationSettings]] = {}
+
+    def __call__(self, camera: Camera, background: Optional[torch.Tensor] = None,
+                 background_gate: Optional[torch.Tensor] = None, **arguments: Any) -> Rendering:
+        """background, background_gate: for this image, in place of the renderer's.
+
+        arguments: further ones of `rasterize`, means2D or outputs, or colors_precomp in place of the SH colours.
+        """
+        model = self.model
+        settings = self._settings_of(camera)
+        if background is not None:
+            settings = settings._replace(bg=background)
+        if self.blend_mode == "smoe":
+            settings = settings._replace(
+                background_gate=self.background_gate if background_gate is None else background_gate)
+        if "colors_precomp" not in arguments:
+            arguments.update(model.color_arguments())
+        opacities, scales, rotations = model.activated()
+        return self.rasterize(model.raw["means3D"], opacities, settings, scales=scales,
+                              rotations=rotations, **arguments)
+
+    def _settings_of(self, camera: Camera) -> GaussianRasterizationSettings:
+        """The camera's settings; its matrices stay on the device, where sending them anew would hold up the step."""
+        if id(camera) not in self._settings:  # kept with its camera, so that no other one gets this id
+            self._settings[id(camera)] = (camera, camera.settings(self.background, 0, self.blend_mode,
+                                                                  self.antialiasing))
+        return self._settings[id(camera)][1]._replace(sh_degree=self.model.active_sh_degree)
+
+
+def background_color(white: bool, device: str) -> torch.Tensor:
+    """[3] white or black."""
+    return torch.full((3,), 1.0 if white else 0.0, device=device)

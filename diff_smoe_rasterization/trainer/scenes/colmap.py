@@ -1,0 +1,55 @@
+"""COLMAP scenes: a sparse model (binary or text) and a folder of images."""
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ... import io
+from ..config import TrainConfig
+from ..errors import SceneError
+from ..system.files import is_folder
+from .cameras import Camera
+from .layout import HOLD_OUT, Layout, PosedImage, hold_out
+from .pointcloud import PointCloud
+
+
+def read_colmap_layout(folder: str, config: TrainConfig) -> Layout:
+    """Reads folder/sparse/0 (or folder/sparse); images are in folder/images. Raises SceneError."""
+    try:
+        model = io.read_colmap(folder)
+    except (OSError, ValueError) as error:
+        raise SceneError(str(error)) from error
+    for camera in model.cameras.values():
+        _refuse_distortion(model.folder, camera)
+    image_folder = os.path.join(folder, config.images)
+    if not is_folder(image_folder):
+        raise SceneError(f"{image_folder}: no such folder of images (--images names another)")
+    images = [
+        PosedImage(_camera(image, model.cameras[image.camera_id]), os.path.join(image_folder, image.name))
+        for image in model.images
+    ]
+    train, test = hold_out(images)
+    positions = np.asarray(model.points.positions, np.float64)
+    colors = model.points.colors
+    if colors is None:
+        colors = np.full(positions.shape, 128, np.uint8)
+    points = PointCloud(positions, colors / 255.0).checked(model.folder)
+    return Layout("colmap", train, test, points, f"sorted by name, every {HOLD_OUT}th is a test image")
+
+
+def _refuse_distortion(folder: str, camera: io.ColmapCamera) -> None:
+    if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        raise SceneError(
+            f"{folder}: camera {camera.id} has the model {camera.model}; only PINHOLE and SIMPLE_PINHOLE images "
+            "(without lens distortion) can be trained on. Undistort them first, with COLMAP: "
+            "colmap image_undistorter --image_path IMAGES --input_path SPARSE --output_path SCENE --output_type COLMAP")
+
+
+def _camera(image: io.ColmapImage, intrinsics: io.ColmapCamera) -> Camera:
+    # SIMPLE_PINHOLE is f, cx, cy; PINHOLE fx, fy, cx, cy.
+    fx, fy, cx, cy = (float(value) for value in (intrinsics.params[0], *intrinsics.params[-3:]))
+    w, x, y, z = image.qvec
+    return Camera(image.name, Rotation.from_quat([x, y, z, w]).as_matrix(), np.asarray(image.tvec, np.float64),
+                  fx, fy, cx, cy, int(intrinsics.width), int(intrinsics.height))

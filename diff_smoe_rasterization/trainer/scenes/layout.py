@@ -1,0 +1,73 @@
+"""What a scene folder says before any image is read, and the train/test split."""
+from __future__ import annotations
+
+import dataclasses
+import os
+from dataclasses import dataclass
+from typing import List, Optional, Sequence, Tuple
+
+from ..errors import SceneError
+from ..system.files import is_file, is_folder
+from .cameras import Camera
+from .pointcloud import PointCloud
+
+MASKS = "masks"  # folder of a scene, beside its images
+HOLD_OUT = 8  # every 8th image of a COLMAP scene, by sorted name, is a test image
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """A camera and the file of its image, not yet read; the camera's size may differ from the file's."""
+
+    camera: Camera
+    path: str
+    mask: Optional[str] = None  # the file that says which pixels count
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a scene folder says, images unread."""
+
+    kind: str  # "colmap" or "nerf-synthetic"
+    train: Sequence[PosedImage]
+    test: Sequence[PosedImage]
+    points: PointCloud
+    split: str  # how test images are chosen, for the protocol
+
+
+def hold_out(images: Sequence[PosedImage]) -> Tuple[List[PosedImage], List[PosedImage]]:
+    """Training and test images: sorted by name, every 8th from the first on is a test image."""
+    ordered = sorted(images, key=lambda image: image.camera.name)
+    train = [image for index, image in enumerate(ordered) if index % HOLD_OUT != 0]
+    return train, ordered[::HOLD_OUT]
+
+
+def check_files(paths: Sequence[str]) -> None:
+    """Raises SceneError naming the first missing image and how many are missing."""
+    missing = [path for path in paths if not is_file(path)]
+    if missing:
+        raise SceneError(f"{missing[0]}: no such image ({len(missing)} of {len(paths)} images are missing)")
+
+
+def with_masks(folder: str, layout: Layout) -> Layout:
+    """The layout with each image's mask, where the scene has a folder of masks.
+
+    A mask is named as its image, with .png behind the name or in place of its extension, in the same subfolder.
+    Raises SceneError where an image has none.
+    """
+    masks = os.path.join(folder, MASKS)
+    if not is_folder(masks):
+        if os.path.lexists(masks):
+            raise SceneError(f"{masks} is no folder; masks must lie in one, one image each")
+        return layout
+
+    def with_mask(image: PosedImage) -> PosedImage:
+        names = [image.camera.name + ".png", os.path.splitext(image.camera.name)[0] + ".png"]
+        for name in names:
+            if is_file(os.path.join(masks, name)):
+                return dataclasses.replace(image, mask=os.path.join(masks, name))
+        raise SceneError(f"{masks}: the image {image.camera.name} has no mask there; it must be {names[0]} or "
+                         f"{names[1]} (without masks, every pixel counts: rename the folder)")
+
+    return dataclasses.replace(layout, train=[with_mask(image) for image in layout.train],
+                               test=[with_mask(image) for image in layout.test])

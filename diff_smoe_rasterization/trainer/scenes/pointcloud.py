@@ -1,0 +1,34 @@
+"""Coloured points that Gaussians start from."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import SceneError
+
+MIN_POINTS = 4  # each scale is the distance to three neighbours
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """N coloured points."""
+
+    positions: np.ndarray  # [N, 3] float64, world
+    colors: np.ndarray  # [N, 3] float64 in [0, 1]
+
+    def subset(self, count: int, seed: int) -> PointCloud:
+        """A random choice of `count` points, in their original order; all of them where there are no more."""
+        if count == 0 or count >= len(self.positions):
+            return self
+        chosen = np.sort(np.random.RandomState(seed).choice(len(self.positions), count, replace=False))
+        return PointCloud(self.positions[chosen], self.colors[chosen])
+
+    def checked(self, source: str) -> PointCloud:
+        """Returns self; raises SceneError naming `source` where there are too few points or not all are finite."""
+        if len(self.positions) < MIN_POINTS:
+            raise SceneError(f"{source}: {len(self.positions)} points; training needs at least {MIN_POINTS} to start")
+        finite = np.isfinite(self.positions).all(axis=1)
+        if not finite.all():
+            raise SceneError(f"{source}: point {int(np.argmin(finite))} has a coordinate that is NaN or infinite")
+        return self

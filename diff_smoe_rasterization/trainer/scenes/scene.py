@@ -1,0 +1,104 @@
+"""Loads a scene folder: cameras, images, the train/test split and the points to start from.
+
+Two kinds are known: COLMAP (a sparse model beside a folder of images) and NeRF-synthetic (transforms_*.json).
+Everything that can be wrong with a folder is a SceneError here, before training starts.
+"""
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from dataclasses import dataclass
+from typing import Any, Dict, List, Optional, Sequence
+
+import numpy as np
+
+from ..config import TrainConfig
+from ..errors import SceneError
+from ..system.files import is_file, is_folder
+from .cameras import Camera, scene_extent
+from .colmap import read_colmap_layout
+from .images import View, fitted_camera, image_size, load_views
+from .layout import Layout, check_files, with_masks
+from .nerf import read_nerf_layout
+from .pointcloud import PointCloud
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A loaded scene."""
+
+    kind: str
+    train: Sequence[View]
+    test: Sequence[View]
+    points: PointCloud
+    extent: float  # world units
+    split: str
+
+    def to(self, device: str) -> Scene:
+        """The same scene with its images on `device`."""
+
+        return dataclasses.replace(self, train=[view.to(device) for view in self.train],
+                                   test=[view.to(device) for view in self.test])
+
+
+def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None) -> Scene:
+    """Reads the folder config.scene with the config's resolution, background, principal point and initial points.
+
+    layout: what `read_layout` gave, where it is at hand. Raises SceneError naming the file and the reason.
+    """
+    layout = layout or read_layout(config)
+    images = load_views(list(layout.train) + list(layout.test), config, progress)
+    train, test = images[:len(layout.train)], images[len(layout.train):]
+    points = layout.points.subset(config.init_points, config.seed)
+    extent = scene_extent(np.stack([view.camera.center for view in train]))
+    return Scene(layout.kind, train, test, points, extent, layout.split)
+
+
+def read_layout(config: TrainConfig) -> Layout:
+    """Reads everything of a scene folder but its images, whose presence it checks."""
+    folder = config.scene
+    if not is_folder(folder):
+        raise SceneError(f"scene {folder}: no such folder")
+    if is_file(os.path.join(folder, "transforms_train.json")):
+        layout = read_nerf_layout(folder, config)
+    elif is_folder(os.path.join(folder, "sparse")):
+        layout = read_colmap_layout(folder, config)
+    else:
+        raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor transforms_train.json "
+                         "(NeRF-synthetic) is in it")
+    if not layout.train:
+        raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
+    check_files([image.path for image in list(layout.train) + list(layout.test)])
+    return with_masks(folder, layout)
+
+
+def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
+    """Plain values that differ between scenes and stay when a folder is moved: what a resumed run must find again."""
+
+    def names_and_sizes(views: Sequence[View]) -> str:
+        lines = sorted(f"{view.camera.name} {view.camera.width}x{view.camera.height}" for view in views)
+        return _checksum("\n".join(lines).encode("utf-8"))
+
+    return {
+        "number of training views": len(scene.train),
+        "number of test views": len(scene.test),
+        "number of masks": sum(view.mask is not None for view in [*scene.train, *scene.test]),
+        "number of points": len(scene.points.positions),
+        # Six digits, since another numpy may sum in another order.
+        "extent": f"{scene.extent:.6g}",
+        "checksum of the training views' names and sizes": names_and_sizes(scene.train),
+        "checksum of the test views' names and sizes": names_and_sizes(scene.test),
+        "checksum of the points": _checksum(scene.points.positions.tobytes() + scene.points.colors.tobytes()),
+    }
+
+
+def _checksum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def load_cameras(config: TrainConfig, split: str) -> List[Camera]:
+    """The cameras of "train", "test" or "all" images at the config's resolution; images are not decoded."""
+    layout = read_layout(config)
+    posed = {"train": layout.train, "test": layout.test, "all": list(layout.train) + list(layout.test)}[split]
+    return [fitted_camera(image, image_size(image.path), config) for image in posed]

@@ -1,0 +1,133 @@
+"""A command's output folder: new, empty or its own; one run at a time is at work there; what it wrote is recorded.
+
+OUT/.dsmoe.lock is locked while a run is at work and free after it, however it ended. OUT/.dsmoe.json says which command
+wrote which files: no others are replaced or removed.
+"""
+from __future__ import annotations
+
+import json
+import os
+import platform
+from contextlib import contextmanager
+from typing import IO, Collection, Iterator, List, NamedTuple, Optional
+
+from ..errors import TrainerError
+from .files import is_file, write_json_atomically
+
+try:
+    import fcntl
+except ImportError:  # Windows: nobody is kept away
+    fcntl = None  # type: ignore[assignment]
+
+LOCK_NAME = ".dsmoe.lock"
+RECORD_NAME = ".dsmoe.json"
+
+
+class Record(NamedTuple):
+    """What a command says of the files that it wrote into a folder."""
+
+    of: str  # what they show, such as a scene's folder
+    files: List[str]  # their paths in the folder
+
+
+def make_folder(path: str) -> None:
+    """Makes a folder where it is not there. Raises TrainerError where nothing can be written in it."""
+    reason = ""
+    try:
+        os.makedirs(path, exist_ok=True)
+    except OSError as error:
+        reason = f" ({error.strerror})"
+    if reason or not os.access(path, os.W_OK | os.X_OK):
+        raise TrainerError(f"{path}: nothing can be written there{reason}; choose another folder with -o")
+
+
+def locked(path: str, shared: bool = False) -> IO[str]:
+    """The file, open and locked: alone, or together with others who share it. Raises TrainerError where it is taken.
+
+    A file system that knows no locks keeps nobody away.
+    """
+    file = open(os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666), "r+", encoding="utf-8")
+    try:
+        if fcntl:
+            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        with file:
+            holder = file.read().strip()
+        raise TrainerError(f"{os.path.dirname(path) or '.'}: another run is at work there"
+                           f"{f' ({holder})' if holder else ''}; wait for its end, or choose another folder") from error
+    except OSError:
+        pass
+    if not shared:
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {platform.node()}\n")
+        file.flush()
+    return file
+
+
+@contextmanager
+def only_one(folder: str) -> Iterator[IO[str]]:
+    """Keeps a second run away from the folder; yields the lock. Raises TrainerError, naming process and host."""
+    with locked(os.path.join(folder, LOCK_NAME)) as file:
+        yield file
+
+
+def read_record(folder: str, command: str) -> Optional[Record]:
+    """What the command recorded in the folder; None where there is no record.
+
+    Raises TrainerError where it is another command's, or damaged.
+    """
+    path = os.path.join(folder, RECORD_NAME)
+    if not is_file(path):
+        return None
+    try:
+        with open(path, encoding="utf-8") as file:
+            found = json.load(file)
+        writer, record = found["command"], Record(found["of"], found["files"])
+        if not all(os.path.normpath(os.path.join(os.sep, name)) == os.sep + name for name in record.files):
+            raise ValueError("it names files elsewhere")
+    except (ValueError, KeyError, TypeError) as error:
+        raise TrainerError(f"{path}: not a record of what was written ({error}); choose another folder") from error
+    if writer != command:
+        raise TrainerError(f"{folder} holds what {writer} wrote; choose another folder with -o")
+    return record
+
+
+def own_record(folder: str, command: str) -> Record:
+    """What the command recorded in the folder; an empty record where there is no folder, or nothing in it.
+
+    Raises TrainerError where something is in it and the command has not recorded it as its own.
+    """
+    record = read_record(folder, command)
+    there = sorted({*os.listdir(folder)} - {LOCK_NAME}) if os.path.isdir(folder) else []
+    if record is None and there:
+        raise TrainerError(f"{folder} is not empty ({there[0]}), and nothing says that {command} wrote it; "
+                           "choose a new or empty folder with -o")
+    return record or Record("", [])
+
+
+def write_record(folder: str, command: str, record: Record, earlier: Collection[str]) -> None:
+    """Records what is about to be written, and removes what of `earlier` is not.
+
+    earlier: files that the command has written before. Raises TrainerError where another file is in the way.
+    """
+    for name in record.files:
+        if name not in earlier and os.path.lexists(os.path.join(folder, name)):
+            raise TrainerError(f"{os.path.join(folder, name)} is there, and nothing says that {command} wrote it; "
+                               "move it, or choose another folder with -o")
+    remove_files(folder, {*earlier} - {*record.files})
+    write_json_atomically(os.path.join(folder, RECORD_NAME), {"command": command, **record._asdict()})
+
+
+def remove_files(folder: str, names: Collection[str]) -> None:
+    """Removes files of the folder that are there, and folders in it that are empty then; links to folders stay."""
+    for name in names:
+        path = os.path.join(folder, name)
+        if os.path.lexists(path) and not os.path.isdir(path):
+            os.remove(path)
+        parent = os.path.dirname(name)
+        while parent:
+            try:
+                os.rmdir(os.path.join(folder, parent))
+            except OSError:  # not empty, a link, or not there
+                break
+            parent = os.path.dirname(parent)

@@ -1,0 +1,343 @@
+"""The training loop: one step, a run of them with progress, and the whole of `dsmoe train`."""
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import re
+from typing import Any, Callable, Dict, List, Optional, Tuple
+
+import torch
+
+from ...losses import l1_ssim_loss_and_gradient
+from ..config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
+from ..errors import TrainerError
+from ..model import GaussianModel, GaussianOptimizer
+from ..results.evaluation import Evaluation, evaluate
+from ..results.metrics import psnr
+from ..results.modelfile import FOLDER, model_path, save_model
+from ..results.pictures import loss_plot
+from ..results.rendering import Rasterize, Renderer, background_color
+from ..results.rows import RESULTS_NAME, result_row, write_results
+from ..scenes.images import as_float
+from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
+from ..system.environment import extension_info
+from ..system.files import is_file, write_atomically, write_json_atomically
+from ..system.interrupt import DelayedInterrupt
+from ..system.output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
+from ..system.progress import progress_bar
+from ..system.stopwatch import Stopwatch
+from .background_gate import LearnedGate
+from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
+from .order import ViewOrder
+from .randomness import random_state, restore_random_state, seed_everything
+from .strategy import STRATEGIES, Step, StrategyContext
+
+HISTORY_NAME = "history.json"  # the evaluations during a run
+LOSS_NAME = "loss.png"
+PER_VIEW_NAME = "per_view.json"
+PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME)  # beside config.json and the models
+TRAIN = "dsmoe train"  # in its folders' records
+PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
+
+
+def check_device(device: str) -> None:
+    """Raises TrainerError where this machine or this build cannot train on the device."""
+    if device == "cpu":
+        return
+    if not torch.cuda.is_available():
+        raise TrainerError("--device cuda: torch finds no CUDA device on this machine; use --device cpu")
+    info = extension_info()
+    if not info.get("cuda_built"):
+        reason = info.get("without_cuda_because") or "it was built without CUDA"
+        raise TrainerError(f"--device cuda: this diff_smoe_rasterization has no CUDA backend ({reason}); "
+                           "use --device cpu")
+
+
+class Trainer:
+    """A training run over a loaded scene; `step` is one iteration of 3DGS."""
+
+    def __init__(self, config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None) -> None:
+        """rasterize: a function with the signature of the package's `rasterize`, which is the default."""
+        seed_everything(config.seed)
+        self.config = config
+        self.scene = scene.to(config.device)
+        self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
+        self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
+        background = background_color(config.white_background, config.device)
+        learned = config.background_gate == LEARNED
+        self.gate = LearnedGate(config.background_gate_bound, config.device) if learned else None
+        self.renderer = Renderer(
+            self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
+            background_gate=self.gate.value if self.gate else float(config.background_gate))
+        self.strategy = STRATEGIES[config.schedule](StrategyContext(
+            config, self.model, self.optimizer, scene.extent, [view.camera for view in scene.train], self.renderer))
+        self.order = ViewOrder(len(scene.train), config.seed)
+        self.watch = Stopwatch(config.device)
+        self.iteration = 0
+
+    def step(self, before_change: Optional[Callable[[], None]] = None) -> Step:
+        """One iteration, in the order of 3DGS: densification comes between the gradients and the optimizer's step.
+
+        before_change: called once the gradients are known and nothing has changed yet, which is where 3DGS evaluates
+        and saves. So the last iteration changes nothing: what it saves neither an opacity reset nor a densification
+        may have touched.
+        """
+        config, model = self.config, self.model
+        if model.num_gaussians == 0:
+            raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
+                               "try another --densify-grad-threshold or --schedule steady")
+        self.iteration += 1
+        self.optimizer.set_position_rate(self.iteration)
+        if self.iteration % config.sh_degree_interval == 0:
+            model.raise_sh_degree()
+        view = self.scene.train[self.order.next()]
+        means2D = torch.zeros_like(model.raw["means3D"], requires_grad=True)
+        color = torch.rand(3, device=config.device) if config.random_background else None
+        rendering = self.renderer(view.camera, background=color, means2D=means2D,
+                                  background_gate=self.gate() if self.gate else None)
+        image = rendering.color.detach()
+        target = view.image if view.opacity is None else view.image_over(color, self.renderer.background)
+        if view.mask is None:
+            loss, gradient = l1_ssim_loss_and_gradient(image, target, config.lambda_dssim)
+        else:
+            mask = view.mask_float()
+            loss, gradient = l1_ssim_loss_and_gradient(image * mask, as_float(target) * mask, config.lambda_dssim)
+            gradient = gradient * mask
+        step = Step(self.iteration, view.camera, rendering, means2D, loss)
+        self.strategy.before_backward(step)
+        rendering.color.backward(gradient)
+        if before_change:
+            before_change()
+        if self.iteration < config.iterations:
+            with torch.no_grad():
+                self.strategy.after_backward(step)
+                self.optimizer.step()
+                if self.gate:
+                    self.gate.step()
+                self.strategy.after_step(step)
+        self._report = (image, target, view)
+        return step
+
+    def training_psnr(self) -> float:
+        """PSNR of the last step's rendering against its training image."""
+        image, target, view = self._report
+        return psnr(image.clamp(0, 1), as_float(target), view.mask_float())
+
+    @property
+    def background_gate(self) -> float:
+        """The gate as it is now; where it is learned, the host waits for the device."""
+        return float(self.renderer.background_gate)
+
+    def evaluate(self, progress: bool = False) -> Evaluation:
+        """Renders the test views."""
+        return evaluate(self.renderer, self.scene.test, self.config.device, progress)
+
+    def state_dict(self) -> Dict[str, Any]:
+        """Everything the rest of the run depends on, as tensors and plain values."""
+        return {
+            "config": dataclasses.asdict(self.config),
+            "scene": scene_fingerprint(self.scene),
+            "iteration": self.iteration,
+            "train_seconds": self.watch.seconds,
+            "raw": {name: tensor.detach() for name, tensor in self.model.raw.items()},
+            "active_sh_degree": self.model.active_sh_degree,
+            "optimizer": self.optimizer.state_dict(),
+            "strategy": self.strategy.state_dict(),
+            "gate": self.gate.state_dict() if self.gate else None,
+            "order": self.order.state_dict(),
+            "random": random_state(),
+        }
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        """Takes what `state_dict` gave. Raises TrainerError where it was another run's."""
+        differences = TrainConfig.of_record(state["config"]).differences(self.config)
+        if differences:
+            raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
+        for name, here in scene_fingerprint(self.scene).items():
+            there = state["scene"].get(name, 0)  # an earlier version knew no masks
+            if here != there:
+                raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
+                                   f"and {here} in {self.config.scene}")
+        self.iteration = state["iteration"]
+        self.watch.seconds = state["train_seconds"]
+        self.optimizer.replace_all(state["raw"])
+        self.model.active_sh_degree = state["active_sh_degree"]
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.strategy.load_state_dict(state["strategy"])
+        if self.gate:
+            self.gate.load_state_dict(state["gate"])
+        self.order.load_state_dict(state["order"])
+        restore_random_state(state["random"])
+
+
+class Run:
+    """A Trainer with an output folder: progress, evaluations on the way, checkpoints."""
+
+    def __init__(self, trainer: Trainer, progress: bool = True) -> None:
+        self.trainer = trainer
+        self.progress = progress
+        self.history: List[Dict[str, Any]] = []
+        self.losses: List[Tuple[int, float]] = []  # iteration and loss, as often as the loss is looked at
+
+    def resume(self) -> bool:
+        """Continues from the folder's checkpoint; False where there is none yet."""
+        path = self._path(CHECKPOINT_NAME)
+        if not is_file(path):
+            return False
+        with damage_named(path):
+            state = load_checkpoint(path, self.trainer.config.device)
+            self.trainer.load_state_dict(state)
+            self.history = list(state["history"])
+            self.losses = [(int(iteration), float(loss)) for iteration, loss in state.get("losses", [])]
+        before, config = state["config"]["iterations"], self.trainer.config
+        if before < config.iterations:
+            print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
+                  f"{config.densify_until_iter}, falling learning rate of positions until "
+                  f"{config.position_lr_max_steps}")
+        return True
+
+    def train(self) -> Dict[str, Any]:
+        """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
+        trainer, config = self.trainer, self.trainer.config
+        with progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
+                          disable=not self.progress, dynamic_ncols=True) as bar, DelayedInterrupt() as interrupt:
+            trainer.watch.start()
+            ends = trainer.iteration >= config.iterations
+            while not ends:
+                evaluates = (trainer.iteration + 1 < config.iterations
+                             and _is_due(trainer.iteration + 1, config.eval_every))
+                step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
+                bar.update()
+                last = trainer.iteration == config.iterations
+                if last or _is_due(trainer.iteration, PROGRESS_EVERY[config.device]):
+                    self.losses.append((trainer.iteration, _check_loss(step)))
+                    self._show(bar, self.losses[-1][1])
+                ends = trainer.iteration >= config.iterations or interrupt.asked is not None
+                if ends or _is_due(trainer.iteration, config.checkpoint_every):
+                    trainer.watch.stop()
+                    _check_loss(step)
+                    self.save_checkpoint()
+                    trainer.watch.start()
+            trainer.watch.stop()
+        if interrupt.asked is not None:
+            raise interrupt.asked
+        gate = trainer.background_gate
+        save_model(model_path(config.output, trainer.iteration), trainer.model, str(config.blend_mode), gate)
+        evaluation = trainer.evaluate(self.progress)
+        row = result_row(config, trainer.scene, trainer.model.num_gaussians, trainer.watch.seconds, evaluation, gate)
+        write_results(config.output, [row])
+        write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
+        if self.losses:
+            write_atomically(self._path(LOSS_NAME), lambda file: loss_plot(self.losses).save(file, "PNG"))
+        return row
+
+    def save_checkpoint(self) -> None:
+        """Writes the state of trainer, history and losses."""
+        save_checkpoint(self._path(CHECKPOINT_NAME), {**self.trainer.state_dict(), "history": self.history,
+                                                      "losses": self.losses})
+
+    def _show(self, bar: Any, loss: float) -> None:
+        if self.progress:
+            trainer = self.trainer
+            gate = {"gate": f"{trainer.background_gate:.4f}"} if trainer.gate else {}
+            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{trainer.training_psnr():.2f}", **gate,
+                            gaussians=trainer.model.num_gaussians, refresh=False)
+
+    def _evaluate(self, bar: Any) -> None:
+        trainer = self.trainer
+        trainer.watch.stop()
+        evaluation = trainer.evaluate()
+        self.history.append({"iteration": trainer.iteration, **evaluation.metrics,
+                             "num_gaussians": trainer.model.num_gaussians, "train_seconds": trainer.watch.seconds})
+        write_json_atomically(self._path(HISTORY_NAME), self.history)
+        if self.progress and evaluation.metrics["psnr"] is not None:
+            bar.write(f"iteration {trainer.iteration}: test PSNR {evaluation.metrics['psnr']:.2f} dB, "
+                      f"SSIM {evaluation.metrics['ssim']:.4f}, {trainer.model.num_gaussians} Gaussians")
+        trainer.watch.start()
+
+    def _path(self, name: str) -> str:
+        return os.path.join(self.trainer.config.output, name)
+
+
+def _check_loss(step: Step) -> float:
+    """The step's loss. Raises TrainerError where it is not finite: nothing that follows would be worth keeping."""
+    loss = float(step.loss.detach())
+    if not math.isfinite(loss):
+        raise TrainerError(f"iteration {step.iteration}: the loss is {loss}; lower the learning rates")
+    return loss
+
+
+def _is_due(iteration: int, interval: int) -> bool:
+    return interval > 0 and iteration % interval == 0
+
+
+def _model_name(iterations: int) -> str:
+    """Where in its folder a run of so many iterations keeps its model."""
+    return model_path("", iterations).replace(os.sep, "/")
+
+
+def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = False) -> List[str]:
+    """The models that earlier runs have written into config.output, their paths in it.
+
+    Raises TrainerError where something is there that this run must not go on with, or replace.
+    """
+    output = config.output
+    record = read_record(output, TRAIN)
+    models = os.path.join(output, FOLDER)
+    if not holds_run(output):
+        there = [name for name in (*PRODUCTS, FOLDER) if os.path.lexists(os.path.join(output, name))]
+        if there:
+            raise TrainerError(f"{output} holds {', '.join(there)} but no {CONFIG_NAME}: no run of {TRAIN} "
+                               "is known to have written them; choose another folder")
+    elif not resume and not overwrite:
+        raise TrainerError(f"{output} already holds a training run; continue it with --resume, "
+                           "replace it with --overwrite, or choose another folder")
+    elif resume or not record:  # a record is enough to be replaced
+        earlier = TrainConfig.load(output)
+        differences = earlier.differences(config) if resume else []
+        if differences:
+            raise TrainerError(f"{output} holds a run with other options: " + "; ".join(differences))
+        record = record or Record(earlier.scene, [_model_name(earlier.iterations)])
+    if os.path.lexists(models) and not os.path.isdir(models):
+        raise TrainerError(f"{models} is no folder; a run writes its model there")
+    # A record may be a stranger's, and point_cloud a link: nothing but models is removed by it.
+    model = _model_name(0).replace("0", r"\d+").replace(".", r"\.")
+    return [name for name in record.files if re.fullmatch(model, name)] if record else []
+
+
+def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
+          scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None) -> Dict[str, Any]:
+    """Trains a scene into config.output; returns the row of results.json.
+
+    resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
+    of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
+    is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
+    run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
+    hand. Raises TrainerError before training starts where anything does not fit, as where another run is at work in
+    the folder.
+    """
+    if resume and overwrite:
+        raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
+    config.validate()
+    check_device(config.device)
+    earlier_models(config, resume, overwrite)
+    layout = None if scene else read_layout(config)
+    make_folder(config.output)  # a folder that cannot be made is told before images are read
+    with only_one(config.output):
+        models = earlier_models(config, resume, overwrite)  # again: another run may have been at work there
+        scene = scene or load_scene(config, progress, layout)
+        if config.random_background and config.background_gate == 0:
+            print("warning: --random-background with a background gate of 0: the background is seen only where no "
+                  "Gaussian is, so little is learned of transparency")
+        run = Run(Trainer(config, scene, rasterize), progress)
+        if resume:
+            resumed = run.resume()
+            print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
+        model = _model_name(config.iterations)
+        record = Record(os.path.abspath(config.scene), sorted({*(models if resume else ()), model}))
+        write_record(config.output, TRAIN, record, models)
+        if overwrite:
+            remove_files(config.output, [*PRODUCTS, model])
+        config.save(config.output)
+        return run.train()

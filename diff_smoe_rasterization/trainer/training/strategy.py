@@ -1,0 +1,170 @@
+"""Where Gaussians are added and removed: one small interface, and the recipe of 3DGS behind it.
+
+A new strategy is one class with the hooks below and one line in STRATEGIES. What it may need of the run, extra
+renderings of training views included, is in StrategyContext.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Callable, Dict, Sequence
+
+import torch
+
+from ...gaussians import add_view
+from ...settings import Rendering
+from ..config import TrainConfig
+from ..model import PARAMETERS, GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
+from ..scenes.cameras import Camera
+
+MIN_OPACITY = 0.005  # fainter Gaussians are pruned
+RESET_OPACITY = 0.01  # an opacity reset leaves no Gaussian above this
+MAX_SCALE = 0.1  # of the scene extent; larger Gaussians are pruned after the first reset
+CHILDREN = 2  # a split makes so many
+SPLIT_SHRINK = 0.8 * CHILDREN  # a child's scale is its parent's divided by this
+
+
+@dataclass
+class StrategyContext:
+    """What a strategy works on, for the whole run."""
+
+    config: TrainConfig
+    model: GaussianModel
+    optimizer: GaussianOptimizer
+    extent: float  # scene extent, world units
+    cameras: Sequence[Camera]  # the training views
+    render: Callable[..., Rendering]  # render(camera, **rasterize arguments), for passes of the strategy's own
+
+
+@dataclass
+class Step:
+    """One training step, as far as it has come when a hook is called."""
+
+    iteration: int  # counts from 1
+    camera: Camera
+    rendering: Rendering
+    means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H)
+    loss: torch.Tensor
+
+
+class Strategy:
+    """Does nothing: a fixed set of Gaussians. The base of every strategy.
+
+    Hooks run in this order in each step; rows may be added or removed in the last two (through the optimizer), which
+    the last iteration of a run leaves out.
+    """
+
+    def __init__(self, context: StrategyContext) -> None:
+        self.context = context
+
+    def before_backward(self, step: Step) -> None:
+        """The loss is known, its gradients are not."""
+
+    def after_backward(self, step: Step) -> None:
+        """Gradients are known, the optimizer has not stepped. A parameter replaced here is not stepped."""
+
+    def after_step(self, step: Step) -> None:
+        """The optimizer has stepped."""
+
+    def state_dict(self) -> Dict[str, Any]:
+        """Tensors and plain values that a checkpoint must hold."""
+        return {}
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        """Takes what `state_dict` gave."""
+
+
+class ThreeDGSStrategy(Strategy):
+    """Adaptive density control of 3D Gaussian Splatting (Kerbl et al. 2023, section 5.2), as its release runs it.
+
+    Its 20-pixel screen-size prune is absent here because it never fires there: the radii it looks at are zeroed by
+    the densification just before. What prunes is opacity and, after the first opacity reset, world scale.
+    """
+
+    resets_opacity = True
+    prunes_large = True
+
+    def __init__(self, context: StrategyContext) -> None:
+        super().__init__(context)
+        self._forget_statistics()
+
+    def after_backward(self, step: Step) -> None:
+        config = self.context.config
+        if step.iteration >= config.densify_until_iter:
+            return
+        self._observe(step)
+        if step.iteration > config.densify_from_iter and step.iteration % config.densification_interval == 0:
+            self.densify(self._mean_gradients())
+            self.prune(large_too=self.prunes_large and step.iteration > config.opacity_reset_interval)
+            self._forget_statistics()
+        # On white, 3DGS resets once more where densification starts.
+        starts_on_white = config.white_background and step.iteration == config.densify_from_iter
+        if self.resets_opacity and (step.iteration % config.opacity_reset_interval == 0 or starts_on_white):
+            self.reset_opacities()
+
+    def densify(self, gradients: torch.Tensor) -> None:
+        """Clones small and splits large Gaussians whose mean gradient [N] reaches the threshold."""
+        config, model = self.context.config, self.context.model
+        wanted = gradients >= config.densify_grad_threshold
+        large = model.scales.detach().max(dim=1).values > config.percent_dense * self.context.extent
+        parents = wanted & large
+        clones = self._rows(wanted & ~large)
+        children = self._children(self._rows(parents))
+        kept = torch.cat([~parents, parents.new_ones(len(clones["means3D"]) + len(children["means3D"]))])
+        self.context.optimizer.append({name: torch.cat([clones[name], children[name]]) for name in PARAMETERS})
+        self.context.optimizer.keep(kept)
+
+    def _rows(self, mask: torch.Tensor) -> Dict[str, torch.Tensor]:
+        """The raw parameters of the Gaussians where mask [N] (bool) is True."""
+        rows = mask.nonzero().squeeze(1)
+        return {name: self.context.model.raw[name].detach().index_select(0, rows) for name in PARAMETERS}
+
+    def _children(self, parents: Dict[str, torch.Tensor]) -> Dict[str, torch.Tensor]:
+        """Smaller Gaussians at places drawn from each parent's own distribution. parents: raw parameters."""
+        raw = {name: rows.repeat(CHILDREN, *[1] * (rows.dim() - 1)) for name, rows in parents.items()}
+        offsets = torch.normal(torch.zeros_like(raw["scales"]), raw["scales"].exp())
+        turned = torch.bmm(quaternion_to_matrix(raw["rotations"]), offsets.unsqueeze(2)).squeeze(2)
+        raw["means3D"] = raw["means3D"] + turned
+        raw["scales"] = torch.log(raw["scales"].exp() / SPLIT_SHRINK)
+        return raw
+
+    def prune(self, large_too: bool) -> None:
+        """Removes faint Gaussians and, if asked, those larger than a tenth of the scene."""
+        model = self.context.model
+        doomed = model.opacities.detach().squeeze(1) < MIN_OPACITY
+        if large_too:
+            doomed |= model.scales.detach().max(dim=1).values > MAX_SCALE * self.context.extent
+        self.context.optimizer.keep(~doomed)
+
+    def reset_opacities(self) -> None:
+        """Lowers every opacity to at most RESET_OPACITY."""
+        opacities = self.context.model.opacities.detach()
+        self.context.optimizer.set_opacity_logits(inverse_sigmoid(opacities.clamp(max=RESET_OPACITY)))
+
+    def _observe(self, step: Step) -> None:
+        add_view(step.means2D.grad, step.rendering.radii, self.gradient_sum, self.view_count)
+
+    def _mean_gradients(self) -> torch.Tensor:
+        """[N] over the views that saw each Gaussian since the last densification; 0 where none did."""
+        return self.gradient_sum / self.view_count.clamp(min=1)
+
+    def _forget_statistics(self) -> None:
+        means = self.context.model.raw["means3D"]
+        self.gradient_sum = means.new_zeros(len(means))
+        self.view_count = means.new_zeros(len(means))
+
+    def state_dict(self) -> Dict[str, Any]:
+        return {"gradient_sum": self.gradient_sum, "view_count": self.view_count}
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        self.gradient_sum, self.view_count = state["gradient_sum"], state["view_count"]
+
+
+class SteadyStrategy(ThreeDGSStrategy):
+    """The same density control without what destroys Gaussians wholesale: no opacity reset, no size prune."""
+
+    resets_opacity = False
+    prunes_large = False
+
+
+STRATEGIES = {"3dgs": ThreeDGSStrategy, "steady": SteadyStrategy}
+"""Strategies by the name that --schedule takes."""
