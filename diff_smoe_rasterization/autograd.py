@@ -26,7 +26,7 @@ OPTIONS = {name: _PYTHON_TYPES[kind] for name, kind in _C.options.items()}
 _NUM_INPUTS, _NUM_IMAGES = len(INPUTS), len(IMAGES)
 _RADII, _DEPTH = IMAGES.index("radii"), IMAGES.index("depth")
 _BLEND_MODE = list(OPTIONS).index("blend_mode")
-_ALPHA = 0  # BLEND_MODES.index("alpha")
+_DIVIDES = {mode["number"]: mode["divides"] for mode in _C.blend_modes.values()}
 
 
 # Eager calls skip the Python wrapper that register_autograd puts around an op: the formula is already in hand.
@@ -93,8 +93,9 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx, options, *inputs):
         with _below_autograd():
             *images, saved = _OPS.rasterize.default(*inputs, *options)
-        # In `alpha` mode the backward pass reads the images for an expected depth alone; else the caller may edit them.
-        read = options[_BLEND_MODE] != _ALPHA or images[_DEPTH].numel() > 0
+        # The backward pass reads the images where a pixel is divided by its gate sum. An expected depth always is. The
+        # caller may edit the images, so they are copied; where they are not read, they are not.
+        read = _DIVIDES[options[_BLEND_MODE]] or images[_DEPTH].numel() > 0
         ctx.images = [image.clone() if read and image.numel() > 0 else image.detach()
                       for i, image in enumerate(images) if i != _RADII]
         given = _remember(ctx, inputs, options, images[_RADII])

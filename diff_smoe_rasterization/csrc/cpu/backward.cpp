@@ -70,9 +70,11 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& want
       sum_records(dL_dinstances.get() + first * record, count, record, wide.data(), sum.data());
       const ProjectedGaussian<S>& gaussian = saved.projected[i];
       const GateMoments<S> moments = {sum[0], sum[1], sum[2], sum[3], sum[4], sum[5]};
-      const auto to_camera = project_gaussian_backward(
-          inputs, camera, config, i, saved.features + i * config.num_features(),
-          moments_backward(gaussian.conic, gaussian.opacity, moments), sum.data() + kNumGateMoments, gradients);
+      PixelSums<S> sums;
+      sums.gate = moments_backward(gaussian.conic, gaussian.opacity, moments);
+      sums.features.values = saved.features + i * config.num_features();
+      sums.features.dL_dvalues = sum.data() + kNumGateMoments;
+      const auto to_camera = project_gaussian_backward({inputs, camera, config, i}, sums, gradients);
       if (share != nullptr) share->add(to_camera);
     }
   });

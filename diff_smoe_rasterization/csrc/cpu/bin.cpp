@@ -8,6 +8,7 @@
 
 #include "../dispatch.h"
 #include "dsmoe/blend.h"
+#include "dsmoe/depth_bits.h"
 #include "dsmoe/project.h"
 #include "dsmoe/rasterize.h"
 #include "parallel.h"
@@ -64,7 +65,7 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
     for_each_gaussian(run, [&](int32_t i) {
       uint32_t* next = &tile_of_slot[saved.instance_offsets[i]];
       const ProjectedGaussian<S>& gaussian = saved.projected[i];
-      const TileRect bounds = tile_bounds(config.mode, camera, gaussian.mean, S(radii[i]));
+      const TileRect bounds = tile_bounds(config.mode, grid, gaussian.mean, S(radii[i]));
       for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds, [&](int x0, int x1, int y) {
         for (int x = x0; x < x1; ++x) {
           const uint32_t tile = static_cast<uint32_t>(y) * grid.columns + x;

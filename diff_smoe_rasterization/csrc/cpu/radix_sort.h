@@ -3,8 +3,6 @@
 #pragma once
 
 #include <cstdint>
-#include <cstring>
-#include <type_traits>
 #include <vector>
 
 namespace dsmoe {
@@ -14,15 +12,6 @@ template <class Key> struct KeyedIndex {
   Key key;
   int32_t index;
 };
-
-// The bits of a positive float, read as an integer, are in the order of the float.
-template <class S> using DepthBits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
-
-template <class S> DepthBits<S> depth_bits(S depth) {
-  DepthBits<S> bits;
-  std::memcpy(&bits, &depth, sizeof(bits));
-  return bits;
-}
 
 template <class Key> void radix_sort(std::vector<KeyedIndex<Key>>& items) {
   constexpr int kDigitBits = 11;

@@ -8,16 +8,11 @@
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "event_clock.h"
+#include "scratch.h"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
-
-template <class T> T* allocate(Scratch& scratch, int64_t count) {
-  void* memory = scratch.allocate(static_cast<size_t>(count) * sizeof(T));
-  if (memory == nullptr && count > 0) check(cudaErrorMemoryAllocation, "allocating scratch memory");
-  return static_cast<T*>(memory);
-}
 
 template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream_t stream) {
   T* memory = allocate<T>(scratch, count);

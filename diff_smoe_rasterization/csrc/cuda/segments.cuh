@@ -13,12 +13,11 @@ namespace dsmoe {
 namespace cuda {
 
 static_assert(kSegmentLength % kWarp == 0, "a segment is a number of whole chunks");
-static_assert(kSegmentRow == kTileSize * kTileSize * (1 + kSegmentFeatures), "a row has a place for each pixel");
 
 // The state of one pixel where a segment begins.
 template <class S> struct alignas(4 * sizeof(S)) SegmentPixel {
-  S transmittance;           // in front of the segment
-  S sums[kSegmentFeatures];  // sum w c from there to the end of the list; in front of there until the end is known
+  S transmittance;        // in front of the segment
+  S sums[kFastFeatures];  // sum w c from there to the end of the list; in front of there until the end is known
 };
 
 // The state of the lane's pixel k in segment 1, 2, ... of its tile.
@@ -31,7 +30,7 @@ __device__ SegmentPixel<S>& segment_pixel(const SavedForward<S>& saved, const Wa
 
 // Which kernels can walk segments.
 template <class S, int kFeatures>
-constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && kFeatures == kSegmentFeatures;
+constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && kFeatures == kFastFeatures;
 
 template <class S> __device__ bool has_segments(const SavedForward<S>& saved, const WarpTile<S>& tile) {
   return saved.segments != nullptr && tile.source.listed && tile.source.length > kSegmentLength;

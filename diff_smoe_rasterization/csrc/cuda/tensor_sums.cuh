@@ -20,14 +20,13 @@ constexpr bool kHasTensorSums = true;
 constexpr bool kHasTensorSums = false;
 #endif
 
-constexpr int kTensorFeatures = 3;
 // Which kernels sum by tensor cores.
 template <class S, int kFeatures>
-constexpr bool kSumsByTensors = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kTensorFeatures;
+constexpr bool kSumsByTensors = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kFastFeatures;
 constexpr int kTensorSteps = 8;  // of 8 pixels each
 // Numbers between rows: the quads of a warp that read two rows at once meet different banks.
 constexpr int kTensorRow = kWarpTile * kWarpTile + 16;
-constexpr int kTensorRecord = kNumGateMoments + kTensorFeatures;
+constexpr int kTensorRecord = kNumGateMoments + kFastFeatures;
 constexpr float kWarpTileCentre = (kWarpTile - 1) / 2.0f;
 static_assert(kWarpTile == 8 && kLanePixels == 2, "the places of pixels in the operands");
 
@@ -79,17 +78,17 @@ inline __device__ void fill_moment_basis(TensorBasis& basis) {
 }
 
 // Fills the right-hand operand of the features from each lane's g' of its two pixels.
-inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&scaled)[kLanePixels][kTensorFeatures],
+inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&scaled)[kLanePixels][kFastFeatures],
                                            int lane) {
   for (int k = 0; k < kLanePixels; ++k) {
-    for (int f = 0; f < kTensorFeatures; ++f) stage.values[f][2 * lane + k] = scaled[k][f];
+    for (int f = 0; f < kFastFeatures; ++f) stage.values[f][2 * lane + k] = scaled[k][f];
   }
   __syncwarp();
   const TensorLane at(lane);
   const int feature = at.row / 2;
   for (int step = 0; step < kTensorSteps; ++step) {
     const auto number = [&](int k) {
-      if (feature >= kTensorFeatures) return 0.0f;
+      if (feature >= kFastFeatures) return 0.0f;
       const int owner = 8 * (step / 2) + 2 * at.column + step % 2;
       const float value = stage.values[feature][2 * owner + k];
       return at.row % 2 == 0 ? tf32_part(value) : value - tf32_part(value);

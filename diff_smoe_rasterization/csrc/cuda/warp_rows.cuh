@@ -53,6 +53,8 @@ template <int kLength> class WarpRows {
   __device__ WarpRows(float* shared, int length, int exist, int lane)
       : shared_(shared), length_(kLength > 0 ? kLength : length), exist_(exist), lane_(lane) {}
 
+  __device__ int exist() const { return exist_; }
+  __device__ int lane() const { return lane_; }
   __device__ float* memory() const { return shared_; }
   __device__ float* own() const { return shared_ + lane_ * stride(length_); }
 

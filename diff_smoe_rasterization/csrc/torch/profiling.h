@@ -9,7 +9,7 @@ namespace binding {
 void set_profiling(bool enabled);
 
 // Of the latest forward pass, and of the latest backward pass; zeros where there was none.
-cpu::StageTimes stage_times();
+StageTimes stage_times();
 
 enum class Pass { kForward, kBackward };
 
@@ -22,12 +22,12 @@ class StageRecorder {
   StageRecorder& operator=(const StageRecorder&) = delete;
 
   // Null while profiling is off.
-  cpu::StageTimes* times() { return enabled_ ? &times_ : nullptr; }
+  StageTimes* times() { return enabled_ ? &times_ : nullptr; }
 
  private:
   const Pass pass_;
   const bool enabled_;
-  cpu::StageTimes times_;
+  StageTimes times_;
 };
 
 }  // namespace binding

@@ -128,7 +128,7 @@ template <class S> struct ImageGradients {
   const S* inverse_depth = nullptr;  // [H, W]
 };
 
-// Any of these may be null: that gradient is not wanted. The others are written whole.
+// Any of these may be null. Then that gradient is not wanted. The others are written whole.
 template <class S> struct GaussianGradients {
   S* means3D = nullptr;         // [N, 3]
   S* means2D = nullptr;         // [N, 3] dL/dpixel times (W/2, H/2), z = 0: what densification reads
@@ -141,6 +141,22 @@ template <class S> struct GaussianGradients {
   S* shs = nullptr;             // [N, K, 3]
   S* background = nullptr;      // [C + 1] by the colour, then by its gate
   CameraGradient<S>* camera = nullptr;
+};
+
+// One rendering, from its inputs to what it leaves for the backward pass. The backends differ in where the camera lies
+// and in what they save: cpu::Frame and cuda::Frame.
+template <class S, class BackendCamera, class BackendSaved> struct RenderingFrame {
+  GaussianInputs<S> inputs;  // what is rendered
+  BackendCamera camera;      // from where, and the size of the image
+  RasterConfig<S> config;    // how
+  ImageOutputs<S> images;    // where the results go
+  BackendSaved saved;        // filled by `forward`
+};
+
+// What a backward pass is given and what it writes.
+template <class S> struct Gradients {
+  ImageGradients<S> images;     // given, by the images
+  GaussianGradients<S> inputs;  // written, by the inputs
 };
 
 }  // namespace dsmoe

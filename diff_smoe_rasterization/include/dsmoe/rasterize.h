@@ -12,7 +12,6 @@
 #pragma once
 
 #include <cstdint>
-#include <memory>
 #include <vector>
 
 #include "dsmoe/allocator.h"
@@ -21,22 +20,10 @@
 namespace dsmoe {
 namespace cpu {
 
-using dsmoe::StageTimes;
+using dsmoe::Gradients;
 
-// One rendering, from its inputs to what it leaves for the backward pass.
-template <class S> struct Frame {
-  GaussianInputs<S> inputs;
-  Camera<S> camera;
-  RasterConfig<S> config;
-  ImageOutputs<S> images;  // where the results go
-  SavedForward<S> saved;   // filled by `forward`
-};
-
-// What a backward pass is given and what it writes.
-template <class S> struct Gradients {
-  ImageGradients<S> images;
-  GaussianGradients<S> inputs;
-};
+// One rendering. All pointers are to memory of the host.
+template <class S> using Frame = RenderingFrame<S, Camera<S>, SavedForward<S>>;
 
 // Renders frame.inputs to frame.images and fills frame.saved. times: is added to, or null.
 // Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
@@ -58,18 +45,20 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame) {
   return sizes;
 }
 
-// Keeps everything until it is destroyed.
+// Memory of the host. Everything lasts as long as the object.
 class Heap final : public Allocator {
  public:
-  void* allocate(size_t bytes) override {
-    blocks_.emplace_back(new char[bytes]);
-    return blocks_.back().get();
-  }
-  void* keep(int, const SavedArray& array) override { return allocate(array.bytes()); }
-  void release() override {}
+  Heap() = default;
+  Heap(const Heap&) = delete;
+  Heap& operator=(const Heap&) = delete;
+  ~Heap();
+
+  void* allocate(size_t bytes) override;
+  void* keep(int index, const SavedArray& array) override;
+  void release() override;
 
  private:
-  std::vector<std::unique_ptr<char[]>> blocks_;
+  std::vector<void*> blocks_;
 };
 
 // Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are.

@@ -17,10 +17,11 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <type_traits>
 #include <vector>
 
 #include "dsmoe/allocator.h"
+#include "dsmoe/depth_bits.h"
+#include "dsmoe/features.h"
 #include "dsmoe/params.h"
 
 using cudaStream_t = struct CUstream_st*;  // as CUDA's own headers have it, which callers without CUDA lack
@@ -43,8 +44,7 @@ DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features +
 
 // Lists longer than this are walked in segments by the backward pass of float and three features, the rest whole.
 constexpr int kSegmentLength = 512;
-constexpr int kSegmentFeatures = 3;
-constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kSegmentFeatures);  // numbers
+constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kFastFeatures);  // numbers
 DSMOE_HD constexpr int64_t num_segment_rows(int64_t capacity) { return capacity / kSegmentLength + 1; }
 DSMOE_HD constexpr int64_t num_queue_entries(int64_t capacity) { return 1 + 4 * num_segment_rows(capacity); }
 
@@ -102,20 +102,10 @@ template <class S> void complete(SavedForward<S>& saved, const SavedSizes& sizes
   saved.instance_width = sizes.slots ? 2 : 1;
 }
 
-// One rendering, from its inputs to what it leaves for the backward pass.
-template <class S> struct Frame {
-  GaussianInputs<S> inputs;
-  DeviceCamera<S> camera;
-  RasterConfig<S> config;
-  ImageOutputs<S> images;  // where the results go
-  SavedForward<S> saved;   // filled by `forward`
-};
+using dsmoe::Gradients;
 
-// What a backward pass is given and what it writes.
-template <class S> struct Gradients {
-  ImageGradients<S> images;
-  GaussianGradients<S> inputs;
-};
+// One rendering. All pointers are to memory of the device.
+template <class S> using Frame = RenderingFrame<S, DeviceCamera<S>, SavedForward<S>>;
 
 // How a pass runs.
 struct Run {
@@ -145,7 +135,7 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run)
   sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
   sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
   sizes.slots = run.deterministic;
-  sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kSegmentFeatures;
+  sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
   return sizes;
 }
 
@@ -166,9 +156,6 @@ class StreamMemory final : public Allocator {
   cudaStream_t stream_;
   std::vector<void*> scratch_, kept_;
 };
-
-// The bits of a positive float, read as an integer, are in the order of the float.
-template <class S> using DepthBits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
 
 // What the depth sort sorts.
 template <class S> struct DepthKeys {

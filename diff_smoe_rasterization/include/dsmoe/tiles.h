@@ -13,8 +13,10 @@ struct TileRect {
   DSMOE_HD bool empty() const { return x0 >= x1 || y0 >= y1; }
 };
 
+// The tiles of an image.
 struct TileGrid {
   int columns, rows;
+  TileGrid() = default;
   DSMOE_HD TileGrid(int width, int height) : columns((width - 1) / kTileSize + 1), rows((height - 1) / kTileSize + 1) {}
 };
 
