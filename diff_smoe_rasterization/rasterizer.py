@@ -1,11 +1,12 @@
 """The rasterizer as a function, and as the function and the module that 3D Gaussian Splatting trainers call."""
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Optional, Sequence, Tuple
 
 import torch
 
-from .autograd import INPUTS, OPTIONS, rasterize_op
+from .autograd import IMAGES, INPUTS, OPTIONS, rasterize_op
 from .extension import BACKENDS, build_info
 from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 from .splats import Splats
@@ -44,8 +45,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
 
     On CUDA the value of a tensor background_gate is not checked: the host would have to wait for it.
     """
-    inputs, options = _arguments(settings, outputs, means3D=means3D, means2D=means2D, opacities=opacities, dc=dc,
-                                 shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+    inputs, options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
+                                 colors_precomp=colors_precomp, scales=scales, rotations=rotations,
                                  cov3D_precomp=cov3D_precomp)
     return _rendering(rasterize_op(inputs, options)[:-1], outputs)
 
@@ -60,11 +61,11 @@ def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settin
 
     Arguments and errors are those of `rasterize`. Splats hold on to memory of the rendering as long as they live.
     """
-    inputs, options = _arguments(settings, outputs, means3D=means3D, opacities=opacities, means2D=means2D,
-                                 dc=dc, shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+    inputs, options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
+                                 colors_precomp=colors_precomp, scales=scales, rotations=rotations,
                                  cov3D_precomp=cov3D_precomp)
     *images, saved = rasterize_op(inputs, options)
-    return _rendering(images, outputs), Splats(images[1], saved, inputs[-1], options)
+    return _rendering(images, outputs), Splats(images[_RADII], saved, inputs[_BACKGROUND_GATE], options)
 
 
 def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings,
@@ -75,10 +76,9 @@ def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings
     Arguments and errors are those of `rasterize`; there is no gradient.
     """
     # A radius depends neither on the opacity nor on the colour.
-    inputs, options = _arguments(settings._replace(bg=means3D.new_zeros(1)), (), means3D=means3D,
-                                 opacities=means3D.new_zeros(len(means3D)),
-                                 colors_precomp=means3D.new_zeros(len(means3D), 1), scales=scales,
-                                 rotations=rotations, cov3D_precomp=cov3D_precomp)
+    inputs, options = _arguments(settings._replace(bg=means3D.new_zeros(1)), (), means3D,
+                                 means3D.new_zeros(len(means3D)), colors_precomp=means3D.new_zeros(len(means3D), 1),
+                                 scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp)
     with torch.no_grad():
         return torch.ops.diff_smoe_rasterization.radii(*inputs, *options, False)
 
@@ -90,29 +90,44 @@ def _rendering(images, outputs):
                      inverse_depth=inverse_depth if "inverse_depth" in outputs else None)
 
 
-def _arguments(settings, outputs, **tensors):
-    """Returns the tensors and the options of a rendering in the order of the op; all options but the last one."""
-    if not set(outputs) <= set(OUTPUTS):
+def _arguments(settings, outputs, means3D, opacities, **tensors):
+    """Returns the tensors and the options of a rendering in the order of the op; all options but the last one.
+
+    Every eager call comes through here, and costs what this costs: what can be looked up once is looked up below.
+    """
+    if not _OUTPUTS.issuperset(outputs):
         raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     blend_mode, background_gate = resolve_blend(settings)
-    required, optional = _checks("rasterize", "means3D", tensors["means3D"])
-    inputs = {name: required(name, tensors[name]) if name in ("means3D", "opacities") else optional(name, tensor)
-              for name, tensor in tensors.items()}
+    required, optional = _checks("rasterize", "means3D", means3D)
+    inputs = {"means3D": means3D, "opacities": required("opacities", opacities)}
+    for name, tensor in tensors.items():
+        if tensor is not None:
+            inputs[name] = optional(name, tensor)
     fixed_gate = background_gate
     if isinstance(background_gate, torch.Tensor):
         inputs["background_gate"], fixed_gate = required("background_gate", background_gate), 0.0
     inputs["bg"] = required("bg", settings.bg)
     for name, dim in (("viewmatrix", 2), ("projmatrix", 2), ("campos", 1)):
         inputs[name] = _without_batch(required(name, getattr(settings, name)), dim)
+    options = [kind(value) for kind, value in zip(_SETTING_TYPES, _setting_values(settings))]
     computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
                 "depth": "depth" in outputs, "inverse_depth": "inverse_depth" in outputs}
-    return ([inputs.get(name) for name in INPUTS],
-            [kind(computed[name] if name in computed else getattr(settings, name)) for name, kind in _GIVEN_OPTIONS])
+    for name, place in _COMPUTED_OPTIONS.items():
+        options.insert(place, computed[name])
+    return [inputs.get(name) for name in INPUTS], options
 
 
-# All but for_backward, which `rasterize_op` decides.
+_OUTPUTS = frozenset(OUTPUTS)
+_RADII, _BACKGROUND_GATE = IMAGES.index("radii"), INPUTS.index("background_gate")
+
+# The options that are computed, with their places; the others are settings of the same name. `rasterize_op` decides
+# for_backward, which is the last one.
 assert list(OPTIONS)[-1] == "for_backward"
-_GIVEN_OPTIONS = tuple(OPTIONS.items())[:-1]
+_COMPUTED_OPTIONS = {name: place for place, name in enumerate(OPTIONS)
+                     if name in ("fixed_background_gate", "blend_mode", "depth", "inverse_depth")}
+_SETTING_NAMES = [name for name in list(OPTIONS)[:-1] if name not in _COMPUTED_OPTIONS]
+_SETTING_TYPES = [OPTIONS[name] for name in _SETTING_NAMES]
+_setting_values = attrgetter(*_SETTING_NAMES)
 
 
 def _checks(function, first_name, first):
@@ -123,9 +138,8 @@ def _checks(function, first_name, first):
     def required(name, value):
         if not isinstance(value, torch.Tensor):
             raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
-        if value.device != first.device:
-            raise TypeError(f"{function}: {name} is on {value.device}; it must be on {first.device}, as {first_name} "
-                            "is")
+        if value.device != device:
+            raise TypeError(f"{function}: {name} is on {value.device}; it must be on {device}, as {first_name} is")
         return value
 
     def optional(name, value):
@@ -136,10 +150,11 @@ def _checks(function, first_name, first):
             return None
         return required(name, value)
 
+    device = getattr(first, "device", None)
     required(first_name, first)
-    if first.device.type not in BACKENDS:
-        reason = build_info()["without_cuda_because"] if first.device.type == "cuda" else None
-        raise TypeError(f"{function}: {first_name} is on {first.device}; this build renders on "
+    if device.type not in BACKENDS:
+        reason = build_info()["without_cuda_because"] if device.type == "cuda" else None
+        raise TypeError(f"{function}: {first_name} is on {device}; this build renders on "
                         f"{' and '.join(BACKENDS)}" + (f": {reason}" if reason else ""))
     return required, optional
 

@@ -47,7 +47,8 @@ __device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t po
   FootprintTiles<S> tiles;
   if (gaussian >= 0) {
     const ProjectedGaussian<S> projected = list.saved.projected[gaussian];
-    const TileRect bounds = footprint_bounds(list.mode, list.grid, projected.mean, list.radii + gaussian);
+    const TileRect bounds =
+        tile_bounds(list.mode, list.grid, projected.mean, bounding_radius<S>(list.mode, list.radii, gaussian));
     tiles = {projected.conic, projected.mean, projected.squared_reach, bounds};
   }
   if (list.saved.slot_ranges != nullptr && gaussian >= 0 && tiles.end() <= tiles.begin()) {

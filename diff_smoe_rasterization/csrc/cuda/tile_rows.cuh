@@ -11,11 +11,9 @@
 namespace dsmoe {
 namespace cuda {
 
-// The tiles that may hold pairs of a Gaussian. radius: where the Gaussian's radius lies. It is only read where the mode
-// needs it.
-template <class S>
-__device__ TileRect footprint_bounds(BlendMode mode, TileGrid grid, Vec2<S> mean, const int32_t* radius) {
-  return tile_bounds(mode, grid, mean, within_radius(mode) ? S(*radius) : S(0));
+// What tile_bounds wants of a Gaussian: its radius, which is only read where the mode needs it. radii: [N].
+template <class S> __device__ S bounding_radius(BlendMode mode, const int32_t* radii, int32_t gaussian) {
+  return within_radius(mode) ? S(radii[gaussian]) : S(0);
 }
 
 template <class T> __device__ T from_lane(T value, int lane) { return __shfl_sync(kAllLanes, value, lane); }

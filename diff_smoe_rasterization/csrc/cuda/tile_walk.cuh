@@ -156,9 +156,9 @@ __device__ auto load_entry(const Visitor& visitor, int32_t position, const WalkR
     *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
   }
   if (!tile.source.listed) {
-    const TileGrid grid(arguments.width, arguments.height);
-    const TileRect bounds = footprint_bounds(arguments.config.mode, grid, entry.staged.gaussian.mean,
-                                             arguments.images.radii + entry.gaussian);
+    const BlendMode mode = arguments.config.mode;
+    const TileRect bounds = tile_bounds(mode, TileGrid(arguments.width, arguments.height), entry.staged.gaussian.mean,
+                                        bounding_radius<S>(mode, arguments.images.radii, entry.gaussian));
     entry.valid =
         bounds.x0 <= tile.tile_x && tile.tile_x < bounds.x1 && bounds.y0 <= tile.tile_y && tile.tile_y < bounds.y1;
   }
