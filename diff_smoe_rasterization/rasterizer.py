@@ -17,15 +17,15 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
               shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
               scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
               cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> Rendering:
-    """Renders N Gaussians; `settings.blend_mode` says by which equation, see BLEND_MODES.
+    """Renders N Gaussians by the equation that `settings.blend_mode` names (see BLEND_MODES).
 
     Args:
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1.
-        settings: camera and options; its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
+        settings: camera and options. Its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
             differentiable too, each on its own.
-        means2D: [N, 3]; its value is ignored, its gradient is dL/d(pixel) times (width / 2, height / 2), z = 0: what
-            densification reads.
+        means2D: [N, 3], of which only the gradient is of use: dL/d(pixel) times (width / 2, height / 2), z = 0.
+            Densification reads it.
         shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.
         dc: [N, 1, 3], the first coefficient where shs [N, K - 1, 3] holds only the others.
         colors_precomp: [N, C] instead of shs; C is free and settings.bg has as many.
@@ -71,9 +71,10 @@ def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settin
 def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings,
                   scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
                   cov3D_precomp: Optional[torch.Tensor] = None) -> torch.Tensor:
-    """Returns the radii [N] int32 in pixels that `rasterize` would return for Gaussians of finite colours; blends none.
+    """Returns the radii [N] int32, in pixels, that `rasterize` would return for Gaussians of finite colours.
 
-    Arguments and errors are those of `rasterize`; there is no gradient.
+    A radius of 0 means that the Gaussian is not visible. Nothing is blended, so this costs only the projection. It has
+    no gradient. Arguments and errors are those of `rasterize`.
     """
     # A radius depends neither on the opacity nor on the colour.
     inputs, options = _arguments(settings._replace(bg=means3D.new_zeros(1)), (), means3D,

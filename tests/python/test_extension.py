@@ -19,8 +19,7 @@ from scenes import op_arguments, op_results, random_scene, with_gate
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.extension import _C
-from diff_smoe_rasterization.settings import (_OWN_BACKGROUND_GATES, BLEND_MODES, OUTPUTS,
-                                              GaussianRasterizationSettings)
+from diff_smoe_rasterization.settings import _OWN_BACKGROUND_GATES, BLEND_MODES, OUTPUTS, GaussianRasterizationSettings
 
 WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
 DIFFERENTIABLE = ("color", "gate_sum", "depth", "inverse_depth")  # images of the op

@@ -1,5 +1,5 @@
-// Sorts indices by positive floating-point keys: least significant digit first, stable, so that equal depths keep the
-// order of their indices.
+// Sorts indices by integer keys, least significant digit first. The sort is stable, so equal depths keep the order of
+// their indices.
 #pragma once
 
 #include <cstdint>
@@ -32,7 +32,7 @@ template <class Key> void radix_sort(std::vector<KeyedIndex<Key>>& items) {
       offsets[value] = total;
       total += count;
     }
-    if (one_value) continue;  // all share this digit
+    if (one_value) continue;  // this digit is the same in all keys
     for (const auto& item : items) sorted[offsets[(item.key >> (d * kDigitBits)) & kMask]++] = item;
     items.swap(sorted);
   }

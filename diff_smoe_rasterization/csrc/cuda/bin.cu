@@ -1,5 +1,5 @@
-// Stage 2: the depth order, and the tile lists front to back. The Gaussians are sorted by depth, then their instances
-// by tile with a stable sort, so that the keys of the second sort are short. (Faster-GS, arXiv:2602.09999, does the
+// Stage 2: the depth order, and the tile lists front to back. First the Gaussians are sorted by depth. Then a stable
+// sort by tile sorts their instances. So the keys of the second sort are short. (Faster-GS, arXiv:2602.09999, does the
 // same.)
 #include <cub/device/device_radix_sort.cuh>
 #include <limits>
@@ -32,9 +32,9 @@ template <class S, class Key> struct ListArguments {
   SavedForward<S> saved;   // projected and order are read; num_instances and slot_ranges are written
   const int32_t* radii;    // [N] pixels
   LookBack look_back;      // zero before
-  // Null where the instances are only counted:
+  // These are null where the instances are only counted:
   Key* keys;             // [capacity] tile
-  int32_t* values;       // [capacity] what goes along: the Gaussian, or the slot where gradients go by slot
+  int32_t* values;       // [capacity] sorted with the keys: the Gaussian, or its slot where gradients go to slots
   int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
 };
 

@@ -1,5 +1,5 @@
-// L1 and SSIM: one kernel for the values and SSIM's derivatives by the local moments, one for the gradient, one that
-// adds up. A block computes one tile of one plane; windows run along rows, then along columns, in shared memory.
+// L1 and SSIM. One kernel computes the values, and SSIM's derivatives by the local moments; one the gradient; one adds
+// up. A block computes one tile of one plane. Windows run along rows, then along columns, in shared memory.
 #include "dsmoe/image_loss.h"
 #include "tuning.cuh"
 
@@ -33,8 +33,8 @@ template <class S> __device__ Place place_of_block(const ImageLoss<S>& loss) {
           tile / across * Tile<S>::kHeight, tile % across * Tile<S>::kWidth};
 }
 
-// Calls visit(i, row, column, index) for the pixels of the tile and the window's reach around it; index is -1 outside
-// the image.
+// Calls visit(row, column, index) for the pixels of the tile and those around it that its windows reach. row, column:
+// in that padded tile. index: in the image, or -1 outside of it.
 template <class S, class Visit> __device__ void for_each_padded(const ImageLoss<S>& loss, Place place, Visit visit) {
   using T = Tile<S>;
   for (int i = threadIdx.x; i < T::kPaddedWidth * T::kPaddedHeight; i += kLossBlock) {

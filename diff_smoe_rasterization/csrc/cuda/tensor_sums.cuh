@@ -3,9 +3,9 @@
 //   moments     [Gaussians, 6] = dL/dpower [Gaussians, 64 pixels] x [64 pixels, 6]: 1, u, v, u^2, u v, v^2
 //   dL/dfeature [Gaussians, 3] = weights   [Gaussians, 64 pixels] x [64 pixels, 3]: g'
 //
-// with u and v the pixel's place in the warp's 8x8, half-integers that TF32 holds exactly. The factors that it does not
-// hold are split in two, so that the products keep 21 bits. Eight Gaussians go at a time: their dL/dpower are the upper
-// rows of one 16-row operand, their weights the lower ones.
+// with u and v the pixel's place in the warp's 8x8. They are half-integers, which TF32 holds exactly. Factors that TF32
+// does not hold are split in two, so that the products keep 21 bits. Eight Gaussians go at a time: their dL/dpower are
+// the upper rows of one 16-row operand, their weights the lower ones.
 #pragma once
 
 #include "dsmoe/gate.h"

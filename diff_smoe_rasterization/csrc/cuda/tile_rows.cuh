@@ -1,5 +1,6 @@
-// The rows of tiles that the Gaussians of a warp meet, dealt out evenly to its lanes, however many each Gaussian has.
-// The tiles of a row are exact: where the ellipse enters and leaves it (Speedy-Splat's AccuTile, arXiv:2412.00578).
+// The rows of tiles that the Gaussians of a warp meet. The lanes share all rows evenly, however many each Gaussian has.
+// The tiles of a row are exact: they lie between the points where the ellipse enters and leaves the row (Speedy-Splat's
+// AccuTile, arXiv:2412.00578).
 #pragma once
 
 #include <cstring>
@@ -18,7 +19,7 @@ template <class S> __device__ S bounding_radius(BlendMode mode, const int32_t* r
 
 template <class T> __device__ T from_lane(T value, int lane) { return __shfl_sync(kAllLanes, value, lane); }
 
-// The items of all lanes, numbered lane by lane: this says where each lane's items begin, and how many there are.
+// Numbers the items of all lanes, lane by lane: where each lane's items begin, and how many there are.
 class WarpLine {
  public:
   __device__ WarpLine(unsigned items, int lane) {
@@ -32,8 +33,8 @@ class WarpLine {
     total = __shfl_sync(kAllLanes, sum, kWarp - 1);
   }
 
-  // Returns the lane that has item k: the last one that begins at k or before. k may be beyond the items; then the
-  // result is some lane.
+  // Returns the lane that has item k: the last one that begins at k or before. Where k is beyond the items, the result
+  // is some lane.
   __device__ int owner(unsigned k) const {
     int lane = 0;
 #pragma unroll

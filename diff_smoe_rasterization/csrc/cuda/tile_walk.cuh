@@ -1,7 +1,7 @@
 // The tile walk: how a warp goes through the list of a tile. Every pass over pixels is a visitor of it.
 //
 // A warp owns a square of pixels, a quarter of a tile; each lane owns two of them, one below the other, so that they
-// share a Gaussian's terms in x. (Small squares for warps, inside larger tiles for the lists: HiGS, arXiv:2606.00352.)
+// share a Gaussian's terms in x. (HiGS, arXiv:2606.00352, also has small squares for warps inside larger tiles.)
 // The warp takes 32 entries of the list at a time, one a lane:
 //
 //   prefetch  each lane loads its entry of the next chunk, while the current one is visited

@@ -1,4 +1,4 @@
-// Where the time goes: the stage times of the last rendering and its backward pass, while profiling is on.
+// The stage times of the latest rendering and of the latest backward pass. They are taken while profiling is on.
 #pragma once
 
 #include "dsmoe/rasterize.h"

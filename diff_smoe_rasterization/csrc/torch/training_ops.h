@@ -1,6 +1,6 @@
-// The trainers' ops as torch calls them, once for all backends: training_schema.cpp says their signatures, a backend
-// registers `adam<Backend>` and its like under its dispatch key. A Backend has the functions that training_ops_cpu.cpp
-// and training_ops_cuda.cpp define.
+// The trainers' ops as torch calls them, once for all backends. training_schema.cpp has their signatures. A backend
+// registers `adam<Backend>` and the others under its dispatch key. training_ops_cpu.cpp and training_ops_cuda.cpp
+// define the Backends.
 #pragma once
 
 #include <ATen/ATen.h>

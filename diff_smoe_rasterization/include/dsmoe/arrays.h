@@ -1,4 +1,4 @@
-// One Gaussian between the arrays of params.h and the values of project.h and sh.h, for both backends.
+// Loads and stores of one Gaussian: between the arrays of params.h and the values of project.h and sh.h.
 #pragma once
 
 #include "dsmoe/params.h"
@@ -26,30 +26,30 @@ template <class S> DSMOE_HD Gaussian<S> load_gaussian(const GaussianInputs<S>& i
   return out;
 }
 
-// Coefficients of spherical harmonics, read by number: degree 0 apart from the rest, or all in one array.
+// Reads coefficients of spherical harmonics by their number.
 template <class S> struct ShReader {
-  const S* dc;    // [3]
-  const S* rest;  // [K - 1, 3]
+  const S* dc;    // [3] degree 0
+  const S* rest;  // [K - 1, 3] the others
   DSMOE_HD Vec3<S> operator()(int k) const { return k == 0 ? load3(dc) : load3(rest + 3 * (k - 1)); }
 };
 
-// Their gradients, written likewise. Either may be null: that gradient is not wanted.
+// Writes gradients of coefficients by their number. Either array may be null. Then those gradients are not wanted.
 template <class S> struct ShWriter {
-  S* dc;
-  S* rest;
+  S* dc;    // [3]
+  S* rest;  // [K - 1, 3]
   DSMOE_HD void operator()(int k, Vec3<S> value) const {
     if (k == 0 && dc != nullptr) store3(dc, value);
     if (k > 0 && rest != nullptr) store3(rest + 3 * (k - 1), value);
   }
 };
 
-// The colours of one Gaussian: either given, or coefficients of spherical harmonics.
+// The colours of one Gaussian. They are either given, or made of coefficients of spherical harmonics.
 template <class S> struct Colors {
   const S* given;  // [C], or null
   const S* dc;     // [3], or null where shs holds degree 0
   const S* shs;    // [num_sh, 3], or null
-  int num_sh;
-  int sh_degree;
+  int num_sh;      // coefficients in shs
+  int sh_degree;   // active degree
 
   DSMOE_HD ShReader<S> sh() const { return dc != nullptr ? ShReader<S>{dc, shs} : ShReader<S>{shs, shs + 3}; }
 };
@@ -72,7 +72,7 @@ DSMOE_HD ColorGradients<S> color_gradients_of(const GaussianGradients<S>& g, int
   return {at(g.colors_precomp, num_channels), at(g.dc, 3), at(g.shs, 3 * num_sh)};
 }
 
-// Whether every number that colours a Gaussian is finite; one with a number that is not is culled.
+// Whether all numbers that a Gaussian's colour is made of are finite. Else the Gaussian is culled.
 template <class S> DSMOE_HD bool is_finite(const Colors<S>& colors, int num_channels) {
   bool finite = true;
   if (colors.given != nullptr) finite = finite && all_finite(colors.given, num_channels);
@@ -133,7 +133,7 @@ DSMOE_HD Vec3<S> write_color_gradients(const ColorSource<S>& source, const Blend
                            load3(features.dL_dvalues), write);
 }
 
-// What a Gaussian's pixels hand back. dL_dfeatures: [F]. color: what write_color_gradients returned.
+// Puts together what a Gaussian's pixels hand back. dL_dfeatures: [F]. color: what write_color_gradients returned.
 template <class S>
 DSMOE_HD ProjectedGradient<S> projected_gradient(const GateGradient<S>& gate, const S* dL_dfeatures, Vec3<S> color,
                                                  const RasterConfig<S>& config) {
@@ -144,7 +144,7 @@ DSMOE_HD ProjectedGradient<S> projected_gradient(const GateGradient<S>& gate, co
   return out;
 }
 
-// Writes the gradients of Gaussian i, but for those of its colours.
+// Writes the gradients of Gaussian i, except those of its colours.
 template <class S>
 DSMOE_HD void store_gradient(const GaussianGradient<S>& g, const GaussianGradients<S>& out, int64_t i) {
   if (out.means3D != nullptr) store3(out.means3D + 3 * i, g.mean);
@@ -169,7 +169,7 @@ template <class S> DSMOE_HD void store_zeros(const ColorGradients<S>& out, int n
   clear(out.given, num_channels), clear(out.dc, 3), clear(out.shs, 3 * num_sh);
 }
 
-// Writes zeros for every gradient of Gaussian i.
+// Writes zeros to every gradient of Gaussian i.
 template <class S> DSMOE_HD void store_zeros(const GaussianGradients<S>& out, int num_channels, int num_sh, int64_t i) {
   store_gradient(GaussianGradient<S>{}, out, i);
   store_zeros(color_gradients_of(out, num_channels, num_sh, i), num_channels, num_sh);

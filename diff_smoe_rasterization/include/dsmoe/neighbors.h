@@ -1,5 +1,5 @@
-// Distances to the nearest other points, on a GPU. Points are sorted along a space-filling curve first, so that those
-// of a box of consecutive ones lie together and whole boxes can be left out.
+// Distances to the nearest other points, on a GPU. The caller first sorts the points along a space-filling curve. Then
+// kBoxPoints consecutive points lie close together, and the search leaves out whole boxes of them.
 #pragma once
 
 #include <cstdint>

@@ -70,7 +70,7 @@ template <class S> struct SavedForward {
   int32_t* last_contributor = nullptr;        // [H, W] how many entries of the tile's list the numerator has seen
 };
 
-// What the lengths of those arrays follow from.
+// The numbers that decide how long those arrays are.
 struct SavedSizes {
   int64_t num_gaussians = 0;   // N
   int64_t num_features = 0;    // F; -1: not known
@@ -91,7 +91,7 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("instances", saved.instances, sizes.num_instances);
 }
 
-// Seconds of each stage, and the work the blend did, of the calls that were given this struct.
+// Seconds of each stage, and how much work the blend did. Each call that is given this struct adds to it.
 struct StageTimes {
   double project = 0, sort = 0, bin = 0, blend = 0;
   double blend_backward = 0, project_backward = 0;
@@ -120,7 +120,7 @@ template <class S> struct ContributionMap {
   ContributionSums<S> sums;
 };
 
-// Any of these may be null: that output was not used.
+// Any of these may be null. Then that output was not used.
 template <class S> struct ImageGradients {
   const S* color = nullptr;          // [C, H, W]
   const S* gate_sum = nullptr;       // [H, W]; gradient on the alpha image

@@ -1,5 +1,5 @@
-// One Gaussian from world to image plane, and its gradient back: composes camera, covariance, gate and tiles. Values go
-// in and come out; where they lie in memory is the backends' affair (arrays.h).
+// One Gaussian from the world to the image plane, and its gradient back. Values go in and come out. arrays.h loads and
+// stores them.
 #pragma once
 
 #include <cstdint>
@@ -11,7 +11,7 @@
 
 namespace dsmoe {
 
-// What shapes a Gaussian: its covariance is given, or made of scale and rotation.
+// What a Gaussian is made of, except its colours. Its covariance is given, or made of scale and rotation.
 template <class S> struct Gaussian {
   Vec3<S> mean;  // world
   S opacity;     // may exceed 1
@@ -40,7 +40,7 @@ template <class S> struct alignas(16) ProjectedGaussian {
 constexpr int kProjectedGaussianSize = 8;
 
 template <class S> struct Projection {
-  int32_t radius;  // pixels; 0 where the Gaussian is culled, and then the rest means nothing
+  int32_t radius;  // pixels; 0 where the Gaussian is culled: then the rest means nothing
   ProjectedGaussian<S> gaussian;
 };
 

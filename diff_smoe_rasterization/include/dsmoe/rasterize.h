@@ -5,7 +5,7 @@
 //     cpu::forward(frame, heap);                  // the images, and what the backward pass needs
 //     cpu::backward(frame, gradients);            // from gradients by the images to gradients by the inputs
 //
-// The stages that these two run, in their order, are declared below and can be called one by one. Then the caller
+// The stages that these two run are declared below in their order. They can be called one by one. Then the caller
 // allocates what `saved` points to.
 //
 // Results do not depend on config.num_threads, bit for bit.
@@ -26,7 +26,7 @@ using dsmoe::Gradients;
 template <class S> using Frame = RenderingFrame<S, Camera<S>, SavedForward<S>>;
 
 // Renders frame.inputs to frame.images and fills frame.saved. times: is added to, or null.
-// Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
+// Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots, and std::bad_alloc.
 template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* times = nullptr);
 
 // Writes gradients.inputs. `frame` is as `forward` left it.
@@ -35,7 +35,7 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& grad
 // Fills frame.images.radii as `forward` does, and nothing else.
 template <class S> void radii(const Frame<S>& frame, Scratch& scratch);
 
-// The sizes of what `forward` keeps; how many instances there are is not known yet.
+// The sizes of what `forward` keeps. How many instances there are is not known yet.
 template <class S> SavedSizes saved_sizes(const Frame<S>& frame) {
   SavedSizes sizes;
   sizes.num_gaussians = frame.inputs.num_gaussians;

@@ -24,7 +24,7 @@
 #include "dsmoe/features.h"
 #include "dsmoe/params.h"
 
-using cudaStream_t = struct CUstream_st*;  // as CUDA's own headers have it, which callers without CUDA lack
+using cudaStream_t = struct CUstream_st*;  // as in CUDA's own headers, which a caller need not have
 
 namespace dsmoe {
 namespace cuda {
@@ -42,7 +42,8 @@ template <class S> struct DeviceCamera {
 // Numbers between the rows of `features`: rows begin at multiples of four, so that they load as vectors.
 DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features + 3) / 4 * 4; }
 
-// Lists longer than this are walked in segments by the backward pass of float and three features, the rest whole.
+// The backward pass of float and kFastFeatures features walks lists longer than this in segments. All others it walks
+// whole.
 constexpr int kSegmentLength = 512;
 constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kFastFeatures);  // numbers
 DSMOE_HD constexpr int64_t num_segment_rows(int64_t capacity) { return capacity / kSegmentLength + 1; }
@@ -66,7 +67,7 @@ template <class S> struct SavedForward {
   int32_t* last_contributor = nullptr;  // [H, W] how many entries of the list the numerator has seen
 };
 
-// What the lengths of those arrays follow from.
+// The numbers that decide how long those arrays are.
 struct SavedSizes {
   int64_t num_gaussians = 0;  // N
   int64_t num_features = 0;   // F; -1: not known
@@ -95,7 +96,7 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("segment_queue", saved.segment_queue, !sizes.segments ? 0 : known ? 2 * num_queue_entries(sizes.capacity) : -1);
 }
 
-// Sets what is no array of its own, once the arrays are there.
+// Sets the fields that are no arrays of their own. Call it when the arrays have their memory.
 template <class S> void complete(SavedForward<S>& saved, const SavedSizes& sizes) {
   saved.num_instances = saved.tile_offsets + sizes.tiles + 1;
   saved.capacity = sizes.capacity;
@@ -127,7 +128,7 @@ void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& r
 // Fills frame.images.radii as `forward` does, and nothing else.
 template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory);
 
-// The sizes of what `forward` keeps; the capacity is not known yet.
+// The sizes of what `forward` keeps. The capacity is not known yet.
 template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run) {
   SavedSizes sizes;
   sizes.num_gaussians = frame.inputs.num_gaussians;
@@ -163,8 +164,8 @@ template <class S> struct DepthKeys {
   int32_t* gaussians = nullptr;    // [N] 0, 1, 2, ...; ~i for a culled Gaussian i
 };
 
-// Whether the mode needs saved.order by depth. Where not, project gets saved.order itself as keys.gaussians, and
-// culled ones keep their places.
+// Whether the mode needs saved.order to be the depth order. Where it does not, the caller gives `project` saved.order
+// itself as keys.gaussians, and culled Gaussians keep their places.
 bool needs_depth_order(BlendMode mode);
 
 // How a stage runs.
