@@ -1,7 +1,6 @@
 """The rasterizer as a function, and as the function and the module that 3D Gaussian Splatting trainers call."""
 from __future__ import annotations
 
-from operator import attrgetter
 from typing import Optional, Sequence, Tuple
 
 import torch
@@ -110,7 +109,7 @@ def _arguments(settings, outputs, means3D, opacities, **tensors):
     inputs["bg"] = required("bg", settings.bg)
     for name, dim in (("viewmatrix", 2), ("projmatrix", 2), ("campos", 1)):
         inputs[name] = _without_batch(required(name, getattr(settings, name)), dim)
-    options = [kind(value) for kind, value in zip(_SETTING_TYPES, _setting_values(settings))]
+    options = [kind(getattr(settings, name)) for name, kind in _SETTING_OPTIONS]
     computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
                 "depth": "depth" in outputs, "inverse_depth": "inverse_depth" in outputs}
     for name, place in _COMPUTED_OPTIONS.items():
@@ -126,9 +125,7 @@ _RADII, _BACKGROUND_GATE = IMAGES.index("radii"), INPUTS.index("background_gate"
 assert list(OPTIONS)[-1] == "for_backward"
 _COMPUTED_OPTIONS = {name: place for place, name in enumerate(OPTIONS)
                      if name in ("fixed_background_gate", "blend_mode", "depth", "inverse_depth")}
-_SETTING_NAMES = [name for name in list(OPTIONS)[:-1] if name not in _COMPUTED_OPTIONS]
-_SETTING_TYPES = [OPTIONS[name] for name in _SETTING_NAMES]
-_setting_values = attrgetter(*_SETTING_NAMES)
+_SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
 
 
 def _checks(function, first_name, first):
