@@ -14,7 +14,8 @@ from .settings import BLEND_MODES, OUTPUTS, Contributions, GaussianRasterization
 _HOMES = {"build_info": "extension", "set_profiling": "extension", "stage_times": "extension", "fused_ssim": "losses",
           "distCUDA2": "neighbors", "FusedAdam": "optimizers", "SparseGaussianAdam": "optimizers",
           "GaussianRasterizer": "rasterizer", "rasterize": "rasterizer", "rasterize_gaussians": "rasterizer",
-          "rasterize_with_splats": "rasterizer", "settings_from_camera": "camera", "Splats": "splats"}
+          "rasterize_with_splats": "rasterizer", "settings_from_camera": "camera", "Splats": "splats",
+          "visible_radii": "rasterizer"}
 
 if TYPE_CHECKING:
     from .camera import settings_from_camera
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from .losses import fused_ssim
     from .neighbors import distCUDA2
     from .optimizers import FusedAdam, SparseGaussianAdam
-    from .rasterizer import GaussianRasterizer, rasterize, rasterize_gaussians, rasterize_with_splats
+    from .rasterizer import GaussianRasterizer, rasterize, rasterize_gaussians, rasterize_with_splats, visible_radii
     from .splats import Splats
 
 
@@ -54,4 +55,4 @@ if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",
 __all__ = ["BLEND_MODES", "Contributions", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer",
            "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info", "distCUDA2",
            "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
-           "settings_from_camera", "stage_times"]
+           "settings_from_camera", "stage_times", "visible_radii"]

@@ -1,8 +1,8 @@
 """Gradients of the op `rasterize`, and what torch.compile must know of the ops.
 
-One formula, `_keep` and `_backward`, stands behind the op in two ways: registered with torch (2.4 and later), so that
-torch.compile sees through it, and in an autograd.Function, which costs less a call, for all that is not compiled.
-Compiled code takes any number of Gaussians and any image size; another field of view may be compiled anew.
+The op has one formula, `_keep` and `_backward`, which torch meets in two ways. It is registered with torch (2.4 and
+later), so that torch.compile sees through the op. Eager calls take it by an autograd.Function, which costs less a call.
+Compiled code takes any number of Gaussians and any image size. For another field of view it may be compiled anew.
 """
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ OPTIONS = {name: _PYTHON_TYPES[kind] for name, kind in _C.options.items()}
 _NUM_INPUTS, _NUM_IMAGES = len(INPUTS), len(IMAGES)
 _RADII, _DEPTH = IMAGES.index("radii"), IMAGES.index("depth")
 _BLEND_MODE = list(OPTIONS).index("blend_mode")
-_ALPHA = 0  # BLEND_MODES.index("alpha")
+_DIVIDES = {mode["number"]: mode["divides"] for mode in _C.blend_modes.values()}
 
 
-# Eager calls skip the Python wrapper that register_autograd puts around an op: the formula is already in hand.
+# Eager calls skip the Python wrapper that register_autograd puts around an op, because they have the formula already.
 _below_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", None)
 if not hasattr(_below_autograd, "__enter__"):  # torch 1.13 has it, but not as a context manager
     _below_autograd = contextlib.nullcontext
 
 
 def refuse_forward_mode(function, values):
-    """Raises NotImplementedError where a tensor among the values carries a tangent: the ops would drop it."""
-    if forward_ad._current_level < 0:  # nobody takes a forward-mode derivative; unpack_dual would cost time
+    """Raises NotImplementedError where a tensor among the values carries a tangent, which the ops would drop."""
+    if forward_ad._current_level < 0:  # there are no tangents; asking each tensor would cost time
         return
     # Tensors that torch.compile traces do not always show their tangents.
     compiling = _CAN_REGISTER and torch.compiler.is_compiling()
@@ -48,7 +48,7 @@ def refuse_forward_mode(function, values):
 
 
 def _remember(ctx, inputs, options, radii):
-    """Notes what is no tensor, and what needs no gradient. Returns the tensors that were given."""
+    """Notes the arguments that are no tensors, and that radii have no gradient. Returns the tensors that were given."""
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(radii)
     ctx.options = options
@@ -57,7 +57,7 @@ def _remember(ctx, inputs, options, radii):
 
 
 def _keep(ctx, inputs, output):
-    """Keeps what the backward pass needs. The images are the caller's to edit in place, so they are copied."""
+    """Keeps what the backward pass needs. The caller may edit the images in place, so they are copied."""
     *images, saved = output
     given = _remember(ctx, inputs[:_NUM_INPUTS], inputs[_NUM_INPUTS:], images[_RADII])
     ctx.mark_non_differentiable(images[_RADII], *saved)
@@ -87,14 +87,15 @@ def _refuse_second_derivative(ctx, *gradients):
 
 
 class _Rasterize(torch.autograd.Function):
-    """The same formula for eager calls: nothing between Python and the kernels that they do not need."""
+    """The same formula for eager calls, with as little as possible between Python and the kernels."""
 
     @staticmethod
     def forward(ctx, options, *inputs):
         with _below_autograd():
             *images, saved = _OPS.rasterize.default(*inputs, *options)
-        # In `alpha` mode the backward pass reads the images for an expected depth alone; else the caller may edit them.
-        read = options[_BLEND_MODE] != _ALPHA or images[_DEPTH].numel() > 0
+        # The backward pass reads the images where a pixel is divided by its gate sum. An expected depth always is. The
+        # caller may edit the images, so they are copied; where they are not read, they are not.
+        read = _DIVIDES[options[_BLEND_MODE]] or images[_DEPTH].numel() > 0
         ctx.images = [image.clone() if read and image.numel() > 0 else image.detach()
                       for i, image in enumerate(images) if i != _RADII]
         given = _remember(ctx, inputs, options, images[_RADII])
@@ -104,7 +105,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, *gradients):
         kept, count = list(ctx.saved_tensors), sum(ctx.present)
         images = [*ctx.images[:_RADII], kept[count], *ctx.images[_RADII:]]
-        # Under create_graph=True the op itself is called, which refuses to be differentiated when somebody tries.
+        # Under create_graph=True the registered op is called. It refuses where its result is differentiated again.
         with contextlib.nullcontext() if torch.is_grad_enabled() else _below_autograd():
             return (None, *_input_gradients(ctx, list(ctx.needs_input_grad[1:]), gradients, kept[:count], images,
                                             kept[count + 1:], _OPS.rasterize_backward.default))
@@ -128,7 +129,7 @@ def rasterize_op(inputs, options):
 
 
 def _fake_rasterize(*arguments):
-    """The results' shapes and types. How much a backend saves, only its kernels know."""
+    """Returns tensors of the results' shapes and types. Only the kernels know how many rows a backend saves."""
     given = dict(zip((*INPUTS, *OPTIONS), arguments))
     means3D, colors = given["means3D"], given["colors_precomp"]
     count, height, width = means3D.shape[0], given["image_height"], given["image_width"]

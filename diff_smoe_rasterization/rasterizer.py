@@ -5,7 +5,7 @@ from typing import Optional, Sequence, Tuple
 
 import torch
 
-from .autograd import INPUTS, OPTIONS, rasterize_op
+from .autograd import IMAGES, INPUTS, OPTIONS, rasterize_op
 from .extension import BACKENDS, build_info
 from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 from .splats import Splats
@@ -16,15 +16,15 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
               shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
               scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
               cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> Rendering:
-    """Renders N Gaussians; `settings.blend_mode` says by which equation, see BLEND_MODES.
+    """Renders N Gaussians by the equation that `settings.blend_mode` names (see BLEND_MODES).
 
     Args:
         means3D: [N, 3] centres, world.
         opacities: [N, 1] or [N]; may exceed 1.
-        settings: camera and options; its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
+        settings: camera and options. Its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
             differentiable too, each on its own.
-        means2D: [N, 3]; its value is ignored, its gradient is dL/d(pixel) times (width / 2, height / 2), z = 0: what
-            densification reads.
+        means2D: [N, 3], of which only the gradient is of use: dL/d(pixel) times (width / 2, height / 2), z = 0.
+            Densification reads it.
         shs: [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2.
         dc: [N, 1, 3], the first coefficient where shs [N, K - 1, 3] holds only the others.
         colors_precomp: [N, C] instead of shs; C is free and settings.bg has as many.
@@ -44,8 +44,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
 
     On CUDA the value of a tensor background_gate is not checked: the host would have to wait for it.
     """
-    inputs, options = _arguments(settings, outputs, means3D=means3D, means2D=means2D, opacities=opacities, dc=dc,
-                                 shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+    inputs, options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
+                                 colors_precomp=colors_precomp, scales=scales, rotations=rotations,
                                  cov3D_precomp=cov3D_precomp)
     return _rendering(rasterize_op(inputs, options)[:-1], outputs)
 
@@ -60,25 +60,25 @@ def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settin
 
     Arguments and errors are those of `rasterize`. Splats hold on to memory of the rendering as long as they live.
     """
-    inputs, options = _arguments(settings, outputs, means3D=means3D, opacities=opacities, means2D=means2D,
-                                 dc=dc, shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+    inputs, options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
+                                 colors_precomp=colors_precomp, scales=scales, rotations=rotations,
                                  cov3D_precomp=cov3D_precomp)
     *images, saved = rasterize_op(inputs, options)
-    return _rendering(images, outputs), Splats(images[1], saved, inputs[-1], options)
+    return _rendering(images, outputs), Splats(images[_RADII], saved, inputs[_BACKGROUND_GATE], options)
 
 
 def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings,
                   scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
                   cov3D_precomp: Optional[torch.Tensor] = None) -> torch.Tensor:
-    """Returns the radii [N] int32 in pixels that `rasterize` would return for Gaussians of finite colours; blends none.
+    """Returns the radii [N] int32, in pixels, that `rasterize` would return for Gaussians of finite colours.
 
-    Arguments and errors are those of `rasterize`; there is no gradient.
+    A radius of 0 means that the Gaussian is not visible. Nothing is blended, so this costs only the projection. It has
+    no gradient. Arguments and errors are those of `rasterize`.
     """
     # A radius depends neither on the opacity nor on the colour.
-    inputs, options = _arguments(settings._replace(bg=means3D.new_zeros(1)), (), means3D=means3D,
-                                 opacities=means3D.new_zeros(len(means3D)),
-                                 colors_precomp=means3D.new_zeros(len(means3D), 1), scales=scales,
-                                 rotations=rotations, cov3D_precomp=cov3D_precomp)
+    inputs, options = _arguments(settings._replace(bg=means3D.new_zeros(1)), (), means3D,
+                                 means3D.new_zeros(len(means3D)), colors_precomp=means3D.new_zeros(len(means3D), 1),
+                                 scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp)
     with torch.no_grad():
         return torch.ops.diff_smoe_rasterization.radii(*inputs, *options, False)
 
@@ -90,29 +90,42 @@ def _rendering(images, outputs):
                      inverse_depth=inverse_depth if "inverse_depth" in outputs else None)
 
 
-def _arguments(settings, outputs, **tensors):
-    """Returns the tensors and the options of a rendering in the order of the op; all options but the last one."""
-    if not set(outputs) <= set(OUTPUTS):
+def _arguments(settings, outputs, means3D, opacities, **tensors):
+    """Returns the tensors and the options of a rendering in the order of the op; all options but the last one.
+
+    Every eager call comes through here, and costs what this costs: what can be looked up once is looked up below.
+    """
+    if not _OUTPUTS.issuperset(outputs):
         raise ValueError(f"rasterize: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     blend_mode, background_gate = resolve_blend(settings)
-    required, optional = _checks("rasterize", "means3D", tensors["means3D"])
-    inputs = {name: required(name, tensors[name]) if name in ("means3D", "opacities") else optional(name, tensor)
-              for name, tensor in tensors.items()}
+    required, optional = _checks("rasterize", "means3D", means3D)
+    inputs = {"means3D": means3D, "opacities": required("opacities", opacities)}
+    for name, tensor in tensors.items():
+        if tensor is not None:
+            inputs[name] = optional(name, tensor)
     fixed_gate = background_gate
     if isinstance(background_gate, torch.Tensor):
         inputs["background_gate"], fixed_gate = required("background_gate", background_gate), 0.0
     inputs["bg"] = required("bg", settings.bg)
     for name, dim in (("viewmatrix", 2), ("projmatrix", 2), ("campos", 1)):
         inputs[name] = _without_batch(required(name, getattr(settings, name)), dim)
+    options = [kind(getattr(settings, name)) for name, kind in _SETTING_OPTIONS]
     computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
                 "depth": "depth" in outputs, "inverse_depth": "inverse_depth" in outputs}
-    return ([inputs.get(name) for name in INPUTS],
-            [kind(computed[name] if name in computed else getattr(settings, name)) for name, kind in _GIVEN_OPTIONS])
+    for name, place in _COMPUTED_OPTIONS.items():
+        options.insert(place, computed[name])
+    return [inputs.get(name) for name in INPUTS], options
 
 
-# All but for_backward, which `rasterize_op` decides.
+_OUTPUTS = frozenset(OUTPUTS)
+_RADII, _BACKGROUND_GATE = IMAGES.index("radii"), INPUTS.index("background_gate")
+
+# The options that are computed, with their places; the others are settings of the same name. `rasterize_op` decides
+# for_backward, which is the last one.
 assert list(OPTIONS)[-1] == "for_backward"
-_GIVEN_OPTIONS = tuple(OPTIONS.items())[:-1]
+_COMPUTED_OPTIONS = {name: place for place, name in enumerate(OPTIONS)
+                     if name in ("fixed_background_gate", "blend_mode", "depth", "inverse_depth")}
+_SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
 
 
 def _checks(function, first_name, first):
@@ -123,9 +136,8 @@ def _checks(function, first_name, first):
     def required(name, value):
         if not isinstance(value, torch.Tensor):
             raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
-        if value.device != first.device:
-            raise TypeError(f"{function}: {name} is on {value.device}; it must be on {first.device}, as {first_name} "
-                            "is")
+        if value.device != device:
+            raise TypeError(f"{function}: {name} is on {value.device}; it must be on {device}, as {first_name} is")
         return value
 
     def optional(name, value):
@@ -136,10 +148,11 @@ def _checks(function, first_name, first):
             return None
         return required(name, value)
 
+    device = getattr(first, "device", None)
     required(first_name, first)
-    if first.device.type not in BACKENDS:
-        reason = build_info()["without_cuda_because"] if first.device.type == "cuda" else None
-        raise TypeError(f"{function}: {first_name} is on {first.device}; this build renders on "
+    if device.type not in BACKENDS:
+        reason = build_info()["without_cuda_because"] if device.type == "cuda" else None
+        raise TypeError(f"{function}: {first_name} is on {device}; this build renders on "
                         f"{' and '.join(BACKENDS)}" + (f": {reason}" if reason else ""))
     return required, optional
 

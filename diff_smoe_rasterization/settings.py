@@ -27,6 +27,9 @@ smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               wh
 At 0, the default, this is Eq. 7, and the background is seen where no gate is open; at 1 it is alpha blending.
 """
 
+_OWN_BACKGROUND_GATES = {"alpha": 1.0, "smoe": None, "smoe_tn": 0.0, "smoe_std": 0.0}
+"""The background's gate that a blend mode has by itself. None: the caller gives it."""
+
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
 RECOMMENDED_BACKGROUND_GATE = 0.03  # of captures, for trainers that cannot learn it: benchmarks/RESULTS.md
@@ -121,11 +124,10 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor of not one element, and
     for a value in a mode that knows none.
     """
-    if blend_mode != "smoe":
-        of_mode = 1.0 if blend_mode == "alpha" else 0.0
-        if background_gate is None or (blend_mode == "alpha" and not _is_tensor(background_gate)
-                                       and background_gate == 1):
-            return of_mode
+    own = _OWN_BACKGROUND_GATES.get(blend_mode, 0.0)
+    if own is not None:
+        if background_gate is None or (own == 1 and not _is_tensor(background_gate) and background_gate == own):
+            return own
         raise ValueError(f"background_gate is given, but blend_mode is {blend_mode!r}; only 'smoe' knows it")
     source = "background_gate"
     if background_gate is None:
@@ -166,7 +168,8 @@ def training_background_gate(blend_mode: str, background_gate: Optional[float] =
     In `smoe` that is the given value, else the environment variable DSMOE_BACKGROUND_GATE, else the recommended one.
     Raises ValueError as `resolve_background_gate` does.
     """
-    if blend_mode == "smoe" and background_gate is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
+    takes_gate = _OWN_BACKGROUND_GATES.get(blend_mode, 0.0) is None
+    if takes_gate and background_gate is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
         background_gate = RECOMMENDED_BACKGROUND_GATE
     gate = resolve_background_gate(blend_mode, background_gate)
-    return gate if blend_mode == "smoe" else None
+    return gate if takes_gate else None

@@ -40,7 +40,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
   std::vector<S> features(scene.count * num_features);
   BruteForce<S> out;
   for (int64_t i = 0; i < scene.count; ++i) {
-    const auto projection = project_gaussian(inputs, camera, config, i, &features[i * num_features]);
+    const auto projection = project_gaussian<S>({inputs, camera, config, i}, &features[i * num_features]);
     out.radii.push_back(projection.radius);
     projected[i] = projection.gaussian;
   }

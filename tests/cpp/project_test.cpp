@@ -31,9 +31,13 @@ struct Projected : Projection<double> {
   Vector features;
 };
 
+template <class S> Projection<S> project_first(const Scene<S>& scene, S* features) {
+  return project_gaussian<S>({scene.inputs(), scene.camera, scene.raster_config(), 0}, features);
+}
+
 Projected project(const Scene<double>& scene) {
   Vector features(scene.config.num_features());
-  return {project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, features.data()), features};
+  return {project_first(scene, features.data()), features};
 }
 
 Vector flat(const Projected& p) {
@@ -61,9 +65,9 @@ void expect_backward_is_the_derivative(Scene<double> scene) {
   gradient.camera = {};
   std::fill(gradient.by.background.begin(), gradient.by.background.end(), 0);
   std::fill(gradient.by.shs.begin(), gradient.by.shs.end(), 0);  // written for the active degree only
-  gradient.camera.add(project_gaussian_backward(scene.inputs(), scene.camera, scene.raster_config(), 0,
-                                                forward.features.data(), {{w[0], w[1]}, {w[2], w[3], w[4]}, w[5]},
-                                                &w[6], gradient.gradients()));
+  const PixelSums<double> sums = {{{w[0], w[1]}, {w[2], w[3], w[4]}, w[5]}, {forward.features.data(), &w[6]}};
+  gradient.camera.add(project_gaussian_backward<double>({scene.inputs(), scene.camera, scene.raster_config(), 0}, sums,
+                                                        gradient.gradients()));
   // Steps of 1e-4 and pixel coordinates of 20 round at 1e-11.
   expect_near_all(gradient.flat(), expected, kGradientTolerance);
 }
@@ -234,7 +238,7 @@ TEST(ProjectGaussian, IsCulledWhereTheImagePlaneOverflows) {
   float features[5];
   for (const float huge : {1e20f, 1e38f}) {
     scene.scales = {huge, huge, huge};
-    EXPECT_EQ(project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, features).radius, 0);
+    EXPECT_EQ(project_first(scene, features).radius, 0);
   }
 }
 
@@ -249,7 +253,7 @@ TEST(ProjectGaussian, KeepsTheDigitsOfANeedleInFloat) {
     for (double& component : wide.rotations) component = float(random.uniform(-0.5, 0.5));
     const Scene<float> scene = convert<float>(wide);
     float features[5];
-    const auto narrow = project_gaussian(scene.inputs(), scene.camera, scene.raster_config(), 0, features);
+    const auto narrow = project_first(scene, features);
     const auto& actual = narrow.gaussian.conic;
     const auto expected = project(convert<double>(scene)).gaussian.conic;
     ASSERT_GT(narrow.radius, 0);

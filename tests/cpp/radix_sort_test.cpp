@@ -7,6 +7,7 @@
 #include <limits>
 #include <vector>
 
+#include "dsmoe/depth_bits.h"
 #include "finite_difference.h"
 
 namespace dsmoe {

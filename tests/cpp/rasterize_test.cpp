@@ -498,7 +498,7 @@ TEST(FirstNonFinite, NamesTheFirstOrNone) {
 TEST(StageTimes, CountThePairsThatWereEvaluated) {
   Scene<float> scene = convert<float>(make_scene(36, 60, 37, 29));
   Rendering<float> r = project_and_bin(scene);
-  cpu::StageTimes times;
+  StageTimes times;
   cpu::blend(frame_of(scene, r), &times);
   // Whole packs of the rows that a footprint meets: at least the pairs that count before a pixel is full.
   int64_t seen = 0;

@@ -28,37 +28,33 @@ void step_rows(const AdamTensor<S>& tensor, const AdamConstants<S>& constants, i
 }
 
 // Steps the visible rows of [begin, end), neighbours together.
-template <class S>
-void step_visible(const AdamTensor<S>& tensor, const AdamConstants<S>& constants, const bool* visible, int64_t begin,
-                  int64_t end) {
+template <class S> void step_visible(const AdamTensor<S>& tensor, const AdamStep<S>& step, int64_t begin, int64_t end) {
   for (int64_t row = begin; row < end;) {
     const int64_t start = row;
-    while (row < end && visible[row]) ++row;
-    if (row > start) step_rows(tensor, constants, start, row);
-    while (row < end && !visible[row]) ++row;
+    while (row < end && step.visible[row]) ++row;
+    if (row > start) step_rows(tensor, step.constants, start, row);
+    while (row < end && !step.visible[row]) ++row;
   }
 }
 
 }  // namespace
 
-template <class S>
-void adam(const std::vector<AdamTensor<S>>& tensors, const AdamConstants<S>& constants, const bool* visible,
-          int num_threads) {
+template <class S> void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step, int num_threads) {
   for (const AdamTensor<S>& tensor : tensors) {
     if (tensor.size == 0) continue;
     const int64_t chunk_rows = std::max<int64_t>(1, kChunk / tensor.row_size);
     parallel_for(num_threads, tensor.size / tensor.row_size, chunk_rows, [&](int64_t begin, int64_t end) {
-      if (visible == nullptr) {
-        step_rows(tensor, constants, begin, end);
+      if (step.visible == nullptr) {
+        step_rows(tensor, step.constants, begin, end);
       } else {
-        step_visible(tensor, constants, visible, begin, end);
+        step_visible(tensor, step, begin, end);
       }
     });
   }
 }
 
-template void adam<float>(const std::vector<AdamTensor<float>>&, const AdamConstants<float>&, const bool*, int);
-template void adam<double>(const std::vector<AdamTensor<double>>&, const AdamConstants<double>&, const bool*, int);
+template void adam(const std::vector<AdamTensor<float>>&, const AdamStep<float>&, int);
+template void adam(const std::vector<AdamTensor<double>>&, const AdamStep<double>&, int);
 
 }  // namespace cpu
 }  // namespace dsmoe

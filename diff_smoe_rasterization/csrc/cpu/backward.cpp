@@ -1,5 +1,5 @@
-// From image gradients to the gradients of every input: tiles write one record per instance, then each Gaussian sums
-// its own, which lie side by side. No atomics, so the result does not depend on the threads.
+// From image gradients to the gradients of every input. Each tile writes one record per instance. Then each Gaussian
+// sums its own records, which lie side by side. There are no atomics, so the result does not depend on the threads.
 #include <memory>
 #include <vector>
 
@@ -70,9 +70,11 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& want
       sum_records(dL_dinstances.get() + first * record, count, record, wide.data(), sum.data());
       const ProjectedGaussian<S>& gaussian = saved.projected[i];
       const GateMoments<S> moments = {sum[0], sum[1], sum[2], sum[3], sum[4], sum[5]};
-      const auto to_camera = project_gaussian_backward(
-          inputs, camera, config, i, saved.features + i * config.num_features(),
-          moments_backward(gaussian.conic, gaussian.opacity, moments), sum.data() + kNumGateMoments, gradients);
+      PixelSums<S> sums;
+      sums.gate = moments_backward(gaussian.conic, gaussian.opacity, moments);
+      sums.features.values = saved.features + i * config.num_features();
+      sums.features.dL_dvalues = sum.data() + kNumGateMoments;
+      const auto to_camera = project_gaussian_backward({inputs, camera, config, i}, sums, gradients);
       if (share != nullptr) share->add(to_camera);
     }
   });

@@ -1,4 +1,4 @@
-// Stage 2: one depth sort of the visible Gaussians, then their tile instances into per-tile lists, front to back.
+// Stage 2: a depth sort of the visible Gaussians, then a list of instances for each tile, front to back.
 #include <algorithm>
 #include <limits>
 #include <memory>
@@ -8,6 +8,7 @@
 
 #include "../dispatch.h"
 #include "dsmoe/blend.h"
+#include "dsmoe/depth_bits.h"
 #include "dsmoe/project.h"
 #include "dsmoe/rasterize.h"
 #include "parallel.h"
@@ -52,8 +53,8 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
   const int64_t tiles = num_tiles(camera.width, camera.height);
   const int64_t num_visible = static_cast<int64_t>(order.size());
 
-  // A counting sort by tile. Each thread owns a run of the depth order, and its own counters, so that the lists come
-  // out in depth order whatever the number of threads. The tile of each instance, by slot, is found once.
+  // A counting sort by tile. Each thread has a run of the depth order and counters of its own. So the lists are in
+  // depth order, whatever the number of threads. The tile of each instance is found once, and kept by slot.
   const int num_runs = static_cast<int>(std::clamp<int64_t>(num_visible / 256, 1, std::max(1, config.num_threads)));
   const std::unique_ptr<uint32_t[]> tile_of_slot(new uint32_t[saved.instance_offsets[num_gaussians]]);
   std::vector<std::vector<int64_t>> cursors(num_runs, std::vector<int64_t>(tiles));
@@ -64,7 +65,7 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
     for_each_gaussian(run, [&](int32_t i) {
       uint32_t* next = &tile_of_slot[saved.instance_offsets[i]];
       const ProjectedGaussian<S>& gaussian = saved.projected[i];
-      const TileRect bounds = tile_bounds(config.mode, camera, gaussian.mean, S(radii[i]));
+      const TileRect bounds = tile_bounds(config.mode, grid, gaussian.mean, S(radii[i]));
       for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds, [&](int x0, int x1, int y) {
         for (int x = x0; x < x1; ++x) {
           const uint32_t tile = static_cast<uint32_t>(y) * grid.columns + x;
@@ -82,7 +83,7 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
       cursor[tile] = total;
       total += count;
     }
-    // Positions in a list are kept in the scalar type: they must be exact there.
+    // The blend keeps positions in a list as numbers of the scalar type, which must hold them exactly.
     if (total - saved.tile_offsets[tile] >= int64_t(1) << std::numeric_limits<S>::digits) {
       throw std::overflow_error("rasterize: one tile holds " + std::to_string(total - saved.tile_offsets[tile]) +
                                 " Gaussians, more than this scalar type can count");

@@ -1,5 +1,5 @@
-// What is summed over the pixels of each Gaussian: tiles write one record per instance, then each Gaussian sums its
-// own, which lie side by side. No atomics, so the result does not depend on the threads.
+// Sums over the pixels of each Gaussian. Each tile writes one record per instance. Then each Gaussian sums its own
+// records, which lie side by side. There are no atomics, so the result does not depend on the threads.
 #include <memory>
 
 #include "dsmoe/contribution.h"

@@ -1,5 +1,5 @@
-// L1 and SSIM on the CPU. Threads take bands of rows of one plane; windows run along each row, and then down the last
-// eleven rows, which wait in a ring.
+// L1 and SSIM on the CPU. Threads take bands of rows of one plane. Windows run along each row, then down the last
+// eleven rows, which are kept in a ring.
 #include "dsmoe/image_loss.h"
 
 #include <algorithm>
@@ -99,8 +99,8 @@ template <class S> DSMOE_MULTIVERSION void from_bytes(const uint8_t* __restrict 
   for (int i = 0; i < count; ++i) out[i] = S(bytes[i]) / S(255);
 }
 
-// Rows of one plane passed through the window: `push` takes the next row of every map, `means` gives the windowed means
-// around the row that was pushed kSsimRadius rows ago.
+// Moves the window down the rows of one plane. `push` takes the next row of every map. `means` returns the windowed
+// means around the row that was pushed kSsimRadius rows ago.
 template <class S> class RowBlur {
  public:
   RowBlur(int num_maps, int width)
@@ -161,7 +161,7 @@ void blur_band(RowBlur<S>& blur, int begin, int end, int height, Push push, Take
   }
 }
 
-// The target's row: as it is, or from bytes by way of `buffer`.
+// Returns the target's row. Where the target is bytes, `buffer` holds the row.
 template <class S> const S* target_row(const ImageLoss<S>& loss, int64_t index, S* buffer) {
   if (loss.target != nullptr) return loss.target + index;
   from_bytes(loss.target_bytes + index, buffer, loss.width);

@@ -1,5 +1,5 @@
-// Compiles a function once per instruction set; the loader takes the best that the processor has. Results are the same
-// bits in each, because no compiler flag lets products and sums contract.
+// Compiles a function once per instruction set. The loader takes the best one that the processor has. The results are
+// the same bits in each, because no compiler flag lets products and sums become fused.
 #pragma once
 
 #if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)

@@ -20,9 +20,9 @@ namespace {
 struct Job {
   const std::function<void(int)>& worker;
   const int count;
-  int next = 0;     // the first index that no thread has taken
-  int running = 0;  // indices that are taken and have not ended
-  std::exception_ptr failure;
+  int next = 0;                          // the first index that no thread has taken
+  int running = 0;                       // indices that are taken and have not ended
+  std::exception_ptr failure = nullptr;  // the first
 };
 
 class Pool {

@@ -25,11 +25,12 @@ template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
   const ImageOutputs<S>& images = frame.images;
   const Stopwatch stopwatch(times, &StageTimes::project);
   const int num_features = config.num_features();
+  const TileGrid grid(camera.width, camera.height);
   int64_t* counts = saved.instance_offsets + 1;
   parallel_for(config.num_threads, inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       S* features = saved.features + i * num_features;
-      const auto [radius, gaussian] = project_gaussian(inputs, camera, config, i, features);
+      const auto [radius, gaussian] = project_gaussian<S>({inputs, camera, config, i}, features);
       images.radii[i] = radius;
       counts[i] = 0;
       if (radius == 0) {
@@ -38,7 +39,7 @@ template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
         continue;
       }
       saved.projected[i] = gaussian;
-      const TileRect bounds = tile_bounds(config.mode, camera, gaussian.mean, S(radius));
+      const TileRect bounds = tile_bounds(config.mode, grid, gaussian.mean, S(radius));
       for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds,
                         [&](int x0, int x1, int) { counts[i] += x1 - x0; });
     }

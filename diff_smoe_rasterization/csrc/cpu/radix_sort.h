@@ -1,10 +1,8 @@
-// Sorts indices by positive floating-point keys: least significant digit first, stable, so that equal depths keep the
-// order of their indices.
+// Sorts indices by integer keys, least significant digit first. The sort is stable, so equal depths keep the order of
+// their indices.
 #pragma once
 
 #include <cstdint>
-#include <cstring>
-#include <type_traits>
 #include <vector>
 
 namespace dsmoe {
@@ -14,15 +12,6 @@ template <class Key> struct KeyedIndex {
   Key key;
   int32_t index;
 };
-
-// The bits of a positive float, read as an integer, are in the order of the float.
-template <class S> using DepthBits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
-
-template <class S> DepthBits<S> depth_bits(S depth) {
-  DepthBits<S> bits;
-  std::memcpy(&bits, &depth, sizeof(bits));
-  return bits;
-}
 
 template <class Key> void radix_sort(std::vector<KeyedIndex<Key>>& items) {
   constexpr int kDigitBits = 11;
@@ -43,7 +32,7 @@ template <class Key> void radix_sort(std::vector<KeyedIndex<Key>>& items) {
       offsets[value] = total;
       total += count;
     }
-    if (one_value) continue;  // all share this digit
+    if (one_value) continue;  // this digit is the same in all keys
     for (const auto& item : items) sorted[offsets[(item.key >> (d * kDigitBits)) & kMask]++] = item;
     items.swap(sorted);
   }

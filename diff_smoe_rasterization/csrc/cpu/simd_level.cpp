@@ -1,4 +1,4 @@
-// Which instruction set the blend uses: a build for one machine must run on another.
+// Chooses the instruction set of the blend at run time, because a build for one machine must run on another.
 #include <cstdlib>
 #include <stdexcept>
 #include <string>

@@ -1,4 +1,4 @@
-// Adds the seconds of its own life to a stage, where somebody wants to know.
+// Adds the seconds between its construction and its destruction to a stage. Does nothing where nobody wants times.
 #pragma once
 
 #include <chrono>

@@ -1,5 +1,5 @@
-// The blend of one tile, forward and backward, and what it says of each Gaussian: compiled once per instruction set,
-// chosen at run time.
+// The blend of one tile, its backward pass, and the sums that score Gaussians. These are compiled once per instruction
+// set, and chosen at run time.
 #pragma once
 
 #include <cstdint>

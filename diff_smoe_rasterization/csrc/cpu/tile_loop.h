@@ -13,8 +13,8 @@
 namespace dsmoe {
 namespace cpu {
 
-// Calls body(tile, scratch) for every tile of an image; returns the sum of what body returns. num_features: for which
-// scratch memory is wanted.
+// Calls body(tile, scratch) for every tile of an image. Returns the sum of what body returns. num_features: how many
+// features `scratch` has room for.
 template <class S, class Body>
 int64_t for_each_tile(const RasterConfig<S>& config, const SavedForward<S>& saved, int width, int height,
                       int num_features, Body body) {

@@ -1,5 +1,5 @@
-// Stage 2: the depth order, and the tile lists front to back. The Gaussians are sorted by depth, then their instances
-// by tile with a stable sort, so that the keys of the second sort are short. (Faster-GS, arXiv:2602.09999, does the
+// Stage 2: the depth order, and the tile lists front to back. First the Gaussians are sorted by depth. Then a stable
+// sort by tile sorts their instances. So the keys of the second sort are short. (Faster-GS, arXiv:2602.09999, does the
 // same.)
 #include <cub/device/device_radix_sort.cuh>
 #include <limits>
@@ -28,14 +28,13 @@ template <class S, class Key> struct ListArguments {
   int64_t num_gaussians;   // N
   int gaussians_per_warp;  // 1 to 32
   BlendMode mode;          // decides the bounds of footprints
-  int width, height;       // of the image, pixels
-  int columns;             // tiles side by side
+  TileGrid grid;           // of the image
   SavedForward<S> saved;   // projected and order are read; num_instances and slot_ranges are written
   const int32_t* radii;    // [N] pixels
   LookBack look_back;      // zero before
-  // Null where the instances are only counted:
+  // These are null where the instances are only counted:
   Key* keys;             // [capacity] tile
-  int32_t* values;       // [capacity] what goes along: the Gaussian, or the slot where gradients go by slot
+  int32_t* values;       // [capacity] sorted with the keys: the Gaussian, or its slot where gradients go to slots
   int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
 };
 
@@ -48,13 +47,14 @@ __device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t po
   FootprintTiles<S> tiles;
   if (gaussian >= 0) {
     const ProjectedGaussian<S> projected = list.saved.projected[gaussian];
-    const TileRect bounds = footprint_bounds(list.mode, list.width, list.height, projected.mean, list.radii, gaussian);
+    const TileRect bounds =
+        tile_bounds(list.mode, list.grid, projected.mean, bounding_radius<S>(list.mode, list.radii, gaussian));
     tiles = {projected.conic, projected.mean, projected.squared_reach, bounds};
   }
   if (list.saved.slot_ranges != nullptr && gaussian >= 0 && tiles.end() <= tiles.begin()) {
     list.saved.slot_ranges[2 * int64_t(gaussian)] = list.saved.slot_ranges[2 * int64_t(gaussian) + 1] = 0;
   }
-  return {gaussian, tiles, list.columns, shared, lane};
+  return {gaussian, tiles, list.grid.columns, shared, lane};
 }
 
 // Lists the tiles of one row a lane, from `slot` on and not beyond `end`. Neighbouring lanes write neighbouring places.
@@ -218,8 +218,7 @@ template <class Key, class S> ListArguments<S, Key> list_arguments(const Frame<S
   ListArguments<S, Key> list = {};
   list.num_gaussians = frame.inputs.num_gaussians;
   list.mode = frame.config.mode;
-  list.width = frame.camera.width, list.height = frame.camera.height;
-  list.columns = TileGrid(list.width, list.height).columns;
+  list.grid = TileGrid(frame.camera.width, frame.camera.height);
   list.saved = frame.saved;
   list.radii = frame.images.radii;
   return list;

@@ -50,7 +50,7 @@ __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const T
   const float4 gaussian = stage.gaussians[at.row];
   recentre(sums, {gaussian.x, gaussian.y}, tile.lane);
   __syncwarp();
-  if (at.row >= count || at.column >= kTensorFeatures) return;
+  if (at.row >= count || at.column >= kFastFeatures) return;
   sink.to_record(tile, __float_as_int(gaussian.z), __float_as_int(gaussian.w), kTensorRecord, [&](auto add) {
     add(2 * at.column, sums.moments[0]);
     add(2 * at.column + 1, sums.moments[1]);
@@ -102,7 +102,6 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kReadsIndices = true;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
-  static constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
 
   __device__ __forceinline__ int num_features() const {
     return kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
@@ -171,6 +170,7 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
 
   __device__ __forceinline__ void add_by_shuffles(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
                                                   S dx, S dy, int32_t index, int32_t position) {
+    constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
     S values[kTogether];
     column_moments(dL_dpower, dx, dy, values);
     if constexpr (kFeatures != kAnyFeatures) {
@@ -276,7 +276,7 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
         if (!tile.inside(arguments, k)) continue;
         const SegmentPixel<S> next_begin = segment_pixel(arguments.saved, tile, segment + 1, k);
         S behind = S(0);
-        for (int f = 0; f < kSegmentFeatures; ++f) {
+        for (int f = 0; f < kFastFeatures; ++f) {
           behind = fma(pixels.scaled.get(arguments, tile, k, f), next_begin.sums[f], behind);
         }
         resume_backward<kMode>(pixels.state[k], next_begin.transmittance, behind);
@@ -402,9 +402,9 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
   }
   bool known = false;                          // the number of features, when compiling
   if constexpr (sizeof(S) == sizeof(float)) {  // double is for checking: it has only the general kernel
-    known = arguments.num_features == kSegmentFeatures;
+    known = arguments.num_features == kFastFeatures;
     const int64_t segment_blocks = saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0;
-    if (known) launch_backward<S, kSegmentFeatures>(arguments, tiles + segment_blocks, stream);
+    if (known) launch_backward<S, kFastFeatures>(arguments, tiles + segment_blocks, stream);
   }
   if (!known) {
     arguments.scaled = allocate_scaled(arguments, scratch);

@@ -6,9 +6,9 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-constexpr size_t kMostKeys = 1024;  // more sizes than that are not remembered
-constexpr int64_t kGranularity = 1 << 16;
-constexpr int64_t kFirstCalls = 64;
+constexpr size_t kMostKeys = 1024;         // sizes that are remembered; each pins a few bytes for ever
+constexpr int64_t kGranularity = 1 << 16;  // instances: like views get blocks of one size, which allocators reuse
+constexpr int64_t kFirstCalls = 64;        // renderings after which the views are thought to be known
 
 // Room for what the next views may add: much, while few views have been counted.
 int64_t with_margin(int64_t count, int64_t calls) {

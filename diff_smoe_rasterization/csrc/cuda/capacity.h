@@ -1,8 +1,8 @@
 // How much memory the tile instances of a rendering get, before the GPU has counted them. The counts of earlier
 // renderings of the same size, mode and order of N are a good guess; a bad one costs time, never correctness
 // (rasterize_cuda.h). The background's gate is no part of the key: of a tensor the host does not know it.
-// What needed much more than the others is forgotten after a thousand renderings: the key sort and the memory follow
-// the capacity. This table of sizes is all that outlives a call.
+// A count is forgotten after a thousand renderings or two, so that one large view does not enlarge the key sort and the
+// memory for ever. This table of sizes is all that outlives a call.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -32,12 +32,12 @@ class InstanceCapacities {
   static InstanceCapacities& shared();
 
  private:
-  // The count of the latest rendering, written by the device whenever it gets there; pinned, never freed, because a
-  // captured graph may write it at any time.
   struct Count {
+    // Of the latest rendering that the device has finished. Pinned memory, which the device writes. It is never freed,
+    // because a captured graph may write it at any time.
     int64_t* latest = nullptr;
-    RecentGreatest recent;
-    int64_t calls = 0;
+    RecentGreatest recent;  // counts of earlier renderings
+    int64_t calls = 0;      // how often `likely` has read it
   };
 
   std::mutex mutex_;

@@ -1,10 +1,11 @@
-// What several kernels share: warps, scratch memory, the camera in shared memory.
+// What several kernels share: warps, the camera in shared memory.
 #pragma once
 
 #include <cstdint>
 
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
+#include "scratch.h"
 
 namespace dsmoe {
 namespace cuda {
@@ -13,12 +14,6 @@ constexpr int kWarp = 32;
 constexpr unsigned kAllLanes = 0xffffffffu;
 
 inline unsigned blocks_for(int64_t items, int block) { return static_cast<unsigned>((items + block - 1) / block); }
-
-template <class T> T* allocate(Scratch& scratch, int64_t count) {
-  void* memory = scratch.allocate(static_cast<size_t>(count) * sizeof(T));
-  if (memory == nullptr && count > 0) check(cudaErrorMemoryAllocation, "allocating scratch memory");
-  return static_cast<T*>(memory);
-}
 
 // Copies the camera to shared memory; all threads of the block take part. No barrier.
 template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Camera<S>& to) {

@@ -1,4 +1,4 @@
-// Stage times on a CUDA stream. While profiling is off it does nothing; while it is on, the pass waits for its kernels.
+// Stage times on a CUDA stream. While profiling is off it does nothing. While it is on, the pass waits for its kernels.
 #pragma once
 
 #include <cuda_runtime_api.h>

@@ -1,9 +1,11 @@
-// Where the sums over a warp's pixels go. Each Gaussian has a record of numbers, the moments of dL/dpower and then the
-// gradients of its features, and every warp that meets the Gaussian has a term for each number.
+// Where the sums over a warp's pixels go. Each Gaussian has a record of numbers: the moments of dL/dpower, then the
+// gradients of its features. Every warp that meets the Gaussian has a term for each number.
 //
-//   RecordSink     adds terms to the records by atomics, in any order; or, for gradients that are the same bits every
-//                  time, writes them to slots, one for each warp and instance, which project backward sums in order
-//   OutgrownSink   for the same bits where the instances outgrew their memory, so that no instance has a slot
+//   RecordSink     adds terms to the records by atomics, in any order. Where gradients must be the same bits every
+//   time,
+//                  it writes the terms to slots instead, one slot for each warp and instance. project_backward sums
+//                  the slots in order.
+//   OutgrownSink   gives the same bits where the instances outgrew their memory, so that no instance has a slot.
 #pragma once
 
 #include "tile_walk.cuh"

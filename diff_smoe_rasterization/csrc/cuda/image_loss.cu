@@ -1,18 +1,15 @@
-// L1 and SSIM: one kernel for the values and SSIM's derivatives by the local moments, one for the gradient, one that
-// adds up. A block computes one tile of one plane; windows run along rows, then along columns, in shared memory.
-#include "check.h"
+// L1 and SSIM. One kernel computes the values, and SSIM's derivatives by the local moments; one the gradient; one adds
+// up. A block computes one tile of one plane. Windows run along rows, then along columns, in shared memory.
 #include "dsmoe/image_loss.h"
+#include "tuning.cuh"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
 
-constexpr int kBlock = 256;
-constexpr int kSumBlock = 512;
-
-// The pixels of a tile, as many as shared memory has room for.
+// The pixels of a tile, and those that its windows reach.
 template <class S> struct Tile {
-  static constexpr int kWidth = sizeof(S) == 4 ? 32 : 16, kHeight = 16;
+  static constexpr int kWidth = kLossTileWidth<S>, kHeight = kLossTileHeight;
   static constexpr int kPaddedWidth = kWidth + 2 * kSsimRadius, kPaddedHeight = kHeight + 2 * kSsimRadius;
 };
 
@@ -36,11 +33,11 @@ template <class S> __device__ Place place_of_block(const ImageLoss<S>& loss) {
           tile / across * Tile<S>::kHeight, tile % across * Tile<S>::kWidth};
 }
 
-// Calls visit(i, row, column, index) for the pixels of the tile and the window's reach around it; index is -1 outside
-// the image.
+// Calls visit(row, column, index) for the pixels of the tile and those around it that its windows reach. row, column:
+// in that padded tile. index: in the image, or -1 outside of it.
 template <class S, class Visit> __device__ void for_each_padded(const ImageLoss<S>& loss, Place place, Visit visit) {
   using T = Tile<S>;
-  for (int i = threadIdx.x; i < T::kPaddedWidth * T::kPaddedHeight; i += kBlock) {
+  for (int i = threadIdx.x; i < T::kPaddedWidth * T::kPaddedHeight; i += kLossBlock) {
     const int row = place.row + i / T::kPaddedWidth - kSsimRadius;
     const int column = place.column + i % T::kPaddedWidth - kSsimRadius;
     const bool inside = 0 <= row && row < loss.height && 0 <= column && column < loss.width;
@@ -51,21 +48,27 @@ template <class S, class Visit> __device__ void for_each_padded(const ImageLoss<
 
 // The block's sum, in thread 0.
 __device__ double block_sum(double value) {
-  __shared__ double of_warps[32];
-  for (int offset = 16; offset > 0; offset /= 2) value += __shfl_down_sync(0xffffffffu, value, offset);
-  if (threadIdx.x % 32 == 0) of_warps[threadIdx.x / 32] = value;
+  __shared__ double of_warps[32];  // as many as a block may have
+  for (int offset = kWarp / 2; offset > 0; offset /= 2) value += __shfl_down_sync(kAllLanes, value, offset);
+  if (threadIdx.x % kWarp == 0) of_warps[threadIdx.x / kWarp] = value;
   __syncthreads();
-  if (threadIdx.x < 32) {
-    value = threadIdx.x < blockDim.x / 32 ? of_warps[threadIdx.x] : 0;
-    for (int offset = 16; offset > 0; offset /= 2) value += __shfl_down_sync(0xffffffffu, value, offset);
+  if (threadIdx.x < kWarp) {
+    value = threadIdx.x < blockDim.x / kWarp ? of_warps[threadIdx.x] : 0;
+    for (int offset = kWarp / 2; offset > 0; offset /= 2) value += __shfl_down_sync(kAllLanes, value, offset);
   }
   return value;
 }
 
+// What numbers of the images are multiplied by.
+template <class S> struct LossWeights {
+  SsimWindow<S> window;  // along each axis
+  S l1;                  // a pixel's |x - y|
+  S ssim;                // a pixel's SSIM
+};
+
 template <class S>
-__global__ void __launch_bounds__(kBlock)
-    value_kernel(const __grid_constant__ ImageLoss<S> loss, const __grid_constant__ SsimWindow<S> window, S l1_scale,
-                 S ssim_scale) {
+__global__ void __launch_bounds__(kLossBlock)
+    value_kernel(const __grid_constant__ ImageLoss<S> loss, const __grid_constant__ LossWeights<S> weights) {
   using T = Tile<S>;
   __shared__ S image[T::kPaddedHeight][T::kPaddedWidth], target[T::kPaddedHeight][T::kPaddedWidth];
   __shared__ S rows[kNumSsimMoments][T::kPaddedHeight][T::kWidth];
@@ -76,13 +79,13 @@ __global__ void __launch_bounds__(kBlock)
   });
   __syncthreads();
 
-  for (int i = threadIdx.x; i < T::kPaddedHeight * T::kWidth; i += kBlock) {
+  for (int i = threadIdx.x; i < T::kPaddedHeight * T::kWidth; i += kLossBlock) {
     const int row = i / T::kWidth, column = i % T::kWidth;
     S sums[kNumSsimMoments] = {};
 #pragma unroll
     for (int k = 0; k < kSsimTaps; ++k) {
       const S x = image[row][column + k], y = target[row][column + k];
-      const S weighted_x = window.taps[k] * x, weighted_y = window.taps[k] * y;
+      const S weighted_x = weights.window.taps[k] * x, weighted_y = weights.window.taps[k] * y;
       sums[0] += weighted_x;
       sums[1] += weighted_y;
       sums[2] += weighted_x * x;
@@ -96,20 +99,20 @@ __global__ void __launch_bounds__(kBlock)
 
   const int64_t map_size = loss.planes * loss.height * loss.width;
   double sum = 0;
-  for (int i = threadIdx.x; i < T::kHeight * T::kWidth; i += kBlock) {
+  for (int i = threadIdx.x; i < T::kHeight * T::kWidth; i += kLossBlock) {
     const int row = i / T::kWidth, column = i % T::kWidth;
     if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
     S means[kNumSsimMoments] = {};
 #pragma unroll
     for (int k = 0; k < kSsimTaps; ++k) {
 #pragma unroll
-      for (int m = 0; m < kNumSsimMoments; ++m) means[m] += window.taps[k] * rows[m][row + k][column];
+      for (int m = 0; m < kNumSsimMoments; ++m) means[m] += weights.window.taps[k] * rows[m][row + k][column];
     }
     const bool counts = in_margins(loss, place.row + row, place.column + column);
     const Ssim<S> pixel = ssim(SsimMoments<S>{means[0], means[1], means[2], means[3], means[4]});
     const S difference =
         image[row + kSsimRadius][column + kSsimRadius] - target[row + kSsimRadius][column + kSsimRadius];
-    sum += l1_scale * abs(difference) + (counts ? ssim_scale * pixel.value : S(0));
+    sum += weights.l1 * abs(difference) + (counts ? weights.ssim * pixel.value : S(0));
     if (loss.derivatives != nullptr) {
       const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
       loss.derivatives[index] = counts ? pixel.d_mean : S(0);
@@ -122,9 +125,8 @@ __global__ void __launch_bounds__(kBlock)
 }
 
 template <class S>
-__global__ void __launch_bounds__(kBlock)
-    gradient_kernel(const __grid_constant__ ImageLoss<S> loss, const __grid_constant__ SsimWindow<S> window, S l1_scale,
-                    S ssim_scale) {
+__global__ void __launch_bounds__(kLossBlock)
+    gradient_kernel(const __grid_constant__ ImageLoss<S> loss, const __grid_constant__ LossWeights<S> weights) {
   using T = Tile<S>;
   __shared__ S maps[kNumSsimDerivatives][T::kPaddedHeight][T::kPaddedWidth];
   __shared__ S rows[kNumSsimDerivatives][T::kPaddedHeight][T::kWidth];
@@ -138,40 +140,47 @@ __global__ void __launch_bounds__(kBlock)
   });
   __syncthreads();
 
-  for (int i = threadIdx.x; i < T::kPaddedHeight * T::kWidth; i += kBlock) {
+  for (int i = threadIdx.x; i < T::kPaddedHeight * T::kWidth; i += kLossBlock) {
     const int row = i / T::kWidth, column = i % T::kWidth;
 #pragma unroll
     for (int m = 0; m < kNumSsimDerivatives; ++m) {
       S sum = 0;
 #pragma unroll
-      for (int k = 0; k < kSsimTaps; ++k) sum += window.taps[k] * maps[m][row][column + k];
+      for (int k = 0; k < kSsimTaps; ++k) sum += weights.window.taps[k] * maps[m][row][column + k];
       rows[m][row][column] = sum;
     }
   }
   __syncthreads();
 
-  for (int i = threadIdx.x; i < T::kHeight * T::kWidth; i += kBlock) {
+  for (int i = threadIdx.x; i < T::kHeight * T::kWidth; i += kLossBlock) {
     const int row = i / T::kWidth, column = i % T::kWidth;
     if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
     S means[kNumSsimDerivatives] = {};
 #pragma unroll
     for (int k = 0; k < kSsimTaps; ++k) {
 #pragma unroll
-      for (int m = 0; m < kNumSsimDerivatives; ++m) means[m] += window.taps[k] * rows[m][row + k][column];
+      for (int m = 0; m < kNumSsimDerivatives; ++m) means[m] += weights.window.taps[k] * rows[m][row + k][column];
     }
     const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
     const S x = loss.image[index], y = target_value(loss, index);
-    loss.gradient[index] = l1_scale * sign(x - y) + ssim_scale * ssim_gradient(x, y, means[0], means[1], means[2]);
+    loss.gradient[index] = weights.l1 * sign(x - y) + weights.ssim * ssim_gradient(x, y, means[0], means[1], means[2]);
   }
 }
 
-// Adds the blocks' sums in a fixed order.
+template <class S> struct SumArguments {
+  const double* sums;  // [count] of the tiles
+  int64_t count;       // tiles
+  double offset;       // added to their sum
+  S* loss;             // [1] written
+};
+
+// Adds the tiles' sums in a fixed order.
 template <class S>
-__global__ void __launch_bounds__(kSumBlock) sum_kernel(const double* sums, int64_t count, double offset, S* loss) {
+__global__ void __launch_bounds__(kLossSumBlock) sum_kernel(const __grid_constant__ SumArguments<S> arguments) {
   double sum = 0;
-  for (int64_t i = threadIdx.x; i < count; i += kSumBlock) sum += sums[i];
+  for (int64_t i = threadIdx.x; i < arguments.count; i += kLossSumBlock) sum += arguments.sums[i];
   sum = block_sum(sum);
-  if (threadIdx.x == 0) *loss = static_cast<S>(offset + sum);
+  if (threadIdx.x == 0) *arguments.loss = static_cast<S>(arguments.offset + sum);
 }
 
 }  // namespace
@@ -183,16 +192,20 @@ template <class S> int64_t num_image_loss_sums(int64_t planes, int height, int w
 template <class S> void image_loss(const ImageLoss<S>& loss, void* stream) {
   const auto cuda_stream = static_cast<cudaStream_t>(stream);
   const int64_t blocks = num_blocks<S>(loss.planes, loss.height, loss.width);
-  const SsimWindow<S> window = ssim_window<S>();
-  const S l1_scale = static_cast<S>(loss.l1_scale()), ssim_scale = static_cast<S>(loss.ssim_scale());
+  const LossWeights<S> weights = {ssim_window<S>(), static_cast<S>(loss.l1_scale()), static_cast<S>(loss.ssim_scale())};
   const unsigned grid = static_cast<unsigned>(blocks);
-  value_kernel<S><<<grid, kBlock, 0, cuda_stream>>>(loss, window, l1_scale, ssim_scale);
+  value_kernel<<<grid, kLossBlock, 0, cuda_stream>>>(loss, weights);
   DSMOE_CHECK_LAUNCH("the loss");
   if (loss.gradient != nullptr) {
-    gradient_kernel<S><<<grid, kBlock, 0, cuda_stream>>>(loss, window, l1_scale, ssim_scale);
+    gradient_kernel<<<grid, kLossBlock, 0, cuda_stream>>>(loss, weights);
     DSMOE_CHECK_LAUNCH("the gradient of the loss");
   }
-  sum_kernel<S><<<1, kSumBlock, 0, cuda_stream>>>(loss.sums, blocks, loss.offset, loss.loss);
+  SumArguments<S> sum = {};
+  sum.sums = loss.sums;
+  sum.count = blocks;
+  sum.offset = loss.offset;
+  sum.loss = loss.loss;
+  sum_kernel<<<1, kLossSumBlock, 0, cuda_stream>>>(sum);
   DSMOE_CHECK_LAUNCH("the sum of the loss");
 }
 

@@ -8,16 +8,11 @@
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "event_clock.h"
+#include "scratch.h"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
-
-template <class T> T* allocate(Scratch& scratch, int64_t count) {
-  void* memory = scratch.allocate(static_cast<size_t>(count) * sizeof(T));
-  if (memory == nullptr && count > 0) check(cudaErrorMemoryAllocation, "allocating scratch memory");
-  return static_cast<T*>(memory);
-}
 
 template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream_t stream) {
   T* memory = allocate<T>(scratch, count);
@@ -25,7 +20,7 @@ template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream
   return memory;
 }
 
-// Memory for what the depth sort sorts. Without a depth order, project writes the order itself.
+// Memory for what the depth sort sorts. In a mode without a depth order, `project` fills saved.order itself.
 template <class S> DepthKeys<S> depth_keys(const Frame<S>& frame, Scratch& scratch) {
   const int64_t count = frame.inputs.num_gaussians;
   if (!needs_depth_order(frame.config.mode)) return {nullptr, frame.saved.order};
@@ -55,7 +50,7 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
                                  frame.inputs.num_gaussians);
 }
 
-// For how many instances there will be room.
+// Returns for how many instances there will be room.
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
   const int64_t likely = InstanceCapacities::shared().likely(key);

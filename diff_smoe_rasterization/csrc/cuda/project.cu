@@ -1,4 +1,5 @@
 // Stage 1: every Gaussian to the image plane.
+#include "../dispatch.h"
 #include "dsmoe/project.h"
 #include "sh_rows.cuh"
 
@@ -6,33 +7,38 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-__device__ uint32_t depth_bits(float depth) { return __float_as_uint(depth); }
-__device__ uint64_t depth_bits(double depth) { return __double_as_longlong(depth); }
+template <class S> struct ProjectArguments {
+  GaussianInputs<S> inputs;  // read
+  DeviceCamera<S> camera;    // read
+  RasterConfig<S> config;    // read
+  SavedForward<S> saved;     // projected and features are written
+  int32_t* radii;            // [N] pixels, written
+  DepthKeys<S> keys;         // written
+};
 
-// The features of a Gaussian, as one row of saved.features; where their number is known they stay in registers until
-// they are written.
-template <int kFeatures, class S>
-__device__ bool store_features(const Colors<S>& colors, Vec3<S> mean, const Camera<S>& camera,
-                               const RasterConfig<S>& config, S depth, S* out) {
-  if constexpr (kFeatures == 3) {
+// Writes the features of a Gaussian, one row of saved.features. Where their number is known they stay in registers
+// until they are written. Returns false where the Gaussian is culled.
+template <int kFeatures, class S> __device__ bool store_features(const ColorSource<S>& source, S depth, S* out) {
+  const RasterConfig<S>& config = source.config;
+  if constexpr (kFeatures == kFastFeatures) {
     RasterConfig<S> known = config;
-    known.num_channels = 3, known.depth = false, known.inverse_depth = false;
-    S features[3];
-    if (!write_features(colors, mean, camera, known, depth, features)) return false;
+    known.num_channels = kFastFeatures, known.depth = false, known.inverse_depth = false;
+    S features[kFastFeatures];
+    if (!write_features<S>({source.colors, source.mean, source.camera, known}, depth, features)) return false;
     *reinterpret_cast<float4*>(out) = make_float4(features[0], features[1], features[2], 0);
     return true;
   } else {
     for (int f = config.num_features(); f < feature_stride(config.num_features()); ++f) out[f] = S(0);
-    return write_features(colors, mean, camera, config, depth, out);
+    return write_features(source, depth, out);
   }
 }
 
 template <class S, int kFeatures, class Rows>
-__global__ void __launch_bounds__(kRowsBlock)
-    project_kernel(const __grid_constant__ GaussianInputs<S> inputs, const DeviceCamera<S> device_camera,
-                   const RasterConfig<S> config, const SavedForward<S> saved, int32_t* radii, const DepthKeys<S> keys) {
+__global__ void __launch_bounds__(kRowsBlock) project_kernel(const __grid_constant__ ProjectArguments<S> arguments) {
   __shared__ Camera<S> camera;
   extern __shared__ float4 shared_rows[];
+  const GaussianInputs<S>& inputs = arguments.inputs;
+  const RasterConfig<S>& config = arguments.config;
   const int64_t i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const bool exists = i < inputs.num_gaussians;
@@ -40,7 +46,7 @@ __global__ void __launch_bounds__(kRowsBlock)
   const Gaussian<S> gaussian = Rows::gaussian(inputs, own);
   S dc[3];
   if constexpr (Rows::kDcApart) store3(dc, load3(inputs.dc + 3 * own));
-  load_camera(device_camera, camera);
+  load_camera(arguments.camera, camera);
   __syncthreads();
   Projection<S> projection;
   projection.radius = 0;
@@ -64,46 +70,67 @@ __global__ void __launch_bounds__(kRowsBlock)
   if (!exists) return;
   const S depth = projection.gaussian.depth;
   if (radius > 0) {
-    S* features = saved.features + i * feature_stride(config.num_features());
-    if (!store_features<kFeatures>(colors, gaussian.mean, camera, config, depth, features)) radius = 0;
-    saved.projected[i] = projection.gaussian;
+    S* features = arguments.saved.features + i * feature_stride(config.num_features());
+    if (!store_features<kFeatures, S>({colors, gaussian.mean, camera, config}, depth, features)) radius = 0;
+    arguments.saved.projected[i] = projection.gaussian;
   }
-  radii[i] = radius;
+  arguments.radii[i] = radius;
+  const DepthKeys<S>& keys = arguments.keys;
   keys.gaussians[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
   if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);
 }
 
+template <class S> struct VisibleArguments {
+  int64_t num_gaussians;  // N
+  const S* means3D;       // [N, 3] world
+  const S* view;          // [4, 4] as Camera has it
+  S near;                 // view depth; what is not beyond is not visible
+  bool* visible;          // [N] written
+};
+
 template <class S>
-__global__ void mark_visible_kernel(int64_t num_gaussians, const S* means3D, const S* view, S near, bool* visible) {
-  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (i < num_gaussians) visible[i] = transform_point(view, load3(means3D + 3 * i)).z > near;
+__global__ void __launch_bounds__(kStoreBlock)
+    mark_visible_kernel(const __grid_constant__ VisibleArguments<S> arguments) {
+  const int64_t i = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
+  if (i >= arguments.num_gaussians) return;
+  arguments.visible[i] = transform_point(arguments.view, load3(arguments.means3D + 3 * i)).z > arguments.near;
 }
 
 }  // namespace
 
 template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work) {
   const GaussianInputs<S>& inputs = frame.inputs;
-  const RasterConfig<S>& config = frame.config;
   if (inputs.num_gaussians == 0) return;
+  ProjectArguments<S> arguments = {};
+  arguments.inputs = inputs;
+  arguments.camera = frame.camera;
+  arguments.config = frame.config;
+  arguments.saved = frame.saved;
+  arguments.radii = frame.images.radii;
+  arguments.keys = keys;
   dispatch_sh_rows(inputs, true, [&](auto type, size_t shared) {
     using Rows = typename decltype(type)::type;
     const auto launch = [&](auto kernel) {
-      kernel<<<blocks_for(inputs.num_gaussians, kRowsBlock), kRowsBlock, shared, work.stream>>>(
-          inputs, frame.camera, config, frame.saved, frame.images.radii, keys);
+      kernel<<<blocks_for(inputs.num_gaussians, kRowsBlock), kRowsBlock, shared, work.stream>>>(arguments);
       DSMOE_CHECK_LAUNCH("project");
     };
     if constexpr (Rows::kStaged) {
-      if (config.num_features() == 3) return launch(project_kernel<S, 3, Rows>);
+      if (frame.config.num_features() == kFastFeatures) return launch(project_kernel<S, kFastFeatures, Rows>);
     }
-    launch(project_kernel<S, 0, Rows>);
+    launch(project_kernel<S, kAnyFeatures, Rows>);
   });
 }
 
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work) {
-  const int64_t count = frame.inputs.num_gaussians;
-  if (count == 0) return;
-  mark_visible_kernel<<<blocks_for(count, 256), 256, 0, work.stream>>>(count, frame.inputs.means3D, frame.camera.view,
-                                                                       frame.camera.near, visible);
+  VisibleArguments<S> arguments = {};
+  arguments.num_gaussians = frame.inputs.num_gaussians;
+  arguments.means3D = frame.inputs.means3D;
+  arguments.view = frame.camera.view;
+  arguments.near = frame.camera.near;
+  arguments.visible = visible;
+  if (arguments.num_gaussians == 0) return;
+  const unsigned blocks = blocks_for(arguments.num_gaussians, kStoreBlock);
+  mark_visible_kernel<<<blocks, kStoreBlock, 0, work.stream>>>(arguments);
   DSMOE_CHECK_LAUNCH("mark_visible");
 }
 

@@ -10,16 +10,16 @@ constexpr int kCameraGradientSize = sizeof(CameraGradient<float>) / sizeof(float
 static_assert(kCameraGradientSize == 35, "view, projection and position lie side by side");
 
 template <class S> struct ProjectBackwardArguments {
-  GaussianInputs<S> inputs;
-  DeviceCamera<S> camera;
-  RasterConfig<S> config;
-  SavedForward<S> saved;
-  const int32_t* radii;
-  const S* dL_dgaussians;
-  const S* slots;  // or null
-  GaussianGradients<S> gradients;
-  S* camera_rows;       // [blocks * warps, 35] of each warp, or null
-  S* dL_dfeature_rows;  // [N, F] scratch, where slots are summed and the number of features is not known
+  GaussianInputs<S> inputs;        // of the forward pass
+  DeviceCamera<S> camera;          // likewise
+  RasterConfig<S> config;          // likewise
+  SavedForward<S> saved;           // projected, features, num_instances and slot_ranges are read
+  const int32_t* radii;            // [N] pixels; above 0 where a Gaussian was seen
+  const S* dL_dgaussians;          // [N, kNumGateMoments + F] the records
+  const S* slots;                  // [capacity, kSlotsPerInstance, kNumGateMoments + F], or null: as in BackwardPass
+  GaussianGradients<S> gradients;  // written
+  S* camera_rows;                  // [warps, kCameraGradientSize] each warp's sums, written; or null
+  S* dL_dfeature_rows;             // [N, F] scratch; null where the number of features is known
 };
 
 // The sum over the warp of the camera's gradients.
@@ -66,17 +66,25 @@ template <class S> __device__ GateMoments<S> moments_of(const S* record) {
   return {record[0], record[1], record[2], record[3], record[4], record[5]};
 }
 
-constexpr int kRecordLength = kNumGateMoments + 3;    // of three features
-constexpr int kMostRecordLength = kRecordLength + 2;  // with depth and inverse depth
+constexpr int kRecordLength = kNumGateMoments + kFastFeatures;  // of colours
+constexpr int kMostRecordLength = kRecordLength + 2;            // with depth and inverse depth
 using RecordRows = WarpRows<kRecordLength>;
 
-// Stores the gradients of a warp's Gaussians, zeros included, of those that exist. first: the warp's first Gaussian.
-// rows: of shared memory, with the gradients of the SH rows; it serves the others too: all lanes hand theirs on
-// together.
+// The gradients of a lane's Gaussian, but for those of its SH row.
+struct LaneGradient {
+  GaussianGradient<float> gaussian;
+  float dc[3];  // where degree 0 lies apart
+};
+
+// Stores the gradients of a warp's Gaussians, zeros included, as far as these exist. rows: the gradients of the SH
+// rows, in shared memory. That memory serves the other gradients too, so that the warp writes each array in one piece.
 template <class Rows>
-__device__ void store_gradients(const GaussianGradient<float>& own, const float (&dL_ddc)[3],
-                                const GaussianGradients<float>& to, int64_t first, const Rows& rows, int exist,
-                                int lane) {
+__device__ void store_gradients(const LaneGradient& gradient, const Rows& rows,
+                                const ProjectBackwardArguments<float>& arguments) {
+  const GaussianGradient<float>& own = gradient.gaussian;
+  const GaussianGradients<float>& to = arguments.gradients;
+  const int lane = rows.lane(), exist = rows.exist();
+  const int64_t first = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x - lane;
   if (to.shs != nullptr) rows.store(to.shs + first * Rows::kLength);
   if (lane < exist) {
     if (to.opacities != nullptr) to.opacities[first + lane] = own.opacity;
@@ -95,13 +103,13 @@ __device__ void store_gradients(const GaussianGradient<float>& own, const float 
   store_threes(to.means3D, own.mean, 0);
   store_threes(to.means2D, {own.mean2D.x, own.mean2D.y, 0}, 1);
   store_threes(to.scales, own.scale, 2);
-  if (Rows::kDcApart) store_threes(to.dc, load3(dL_ddc), 3);
+  if (Rows::kDcApart) store_threes(to.dc, load3(gradient.dc), 3);
 }
 
-// The common case: SH rows and the records of colours alone come through shared memory, everything else lives in
-// registers.
-template <bool kCamera, bool kColorsAlone, class Rows>
-__global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
+// The common case. The SH rows come through shared memory. So do the records where they are of colours only. All other
+// numbers live in registers.
+template <bool kCamera, bool kOnlyColors, class Rows>
+__global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : kRowsBackwardBlocks)
     known_backward_kernel(const __grid_constant__ ProjectBackwardArguments<float> arguments) {
   __shared__ Camera<float> camera;
   extern __shared__ float4 shared_rows[];
@@ -114,14 +122,14 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
   __syncthreads();
 
   RasterConfig<float> config = arguments.config;
-  config.num_channels = 3;
-  if constexpr (kColorsAlone) config.depth = false, config.inverse_depth = false;
+  config.num_channels = kFastFeatures;
+  if constexpr (kOnlyColors) config.depth = false, config.inverse_depth = false;
   float* memory = reinterpret_cast<float*>(shared_rows) +
                   warp * kWarp * (Rows::stride(Rows::kLength) + RecordRows::stride(kRecordLength));
   const Rows rows(memory, Rows::kLength, exist, lane);
   const RecordRows records(memory + kWarp * Rows::stride(Rows::kLength), kRecordLength, exist, lane);
   const unsigned all_seen = __ballot_sync(kAllLanes, seen);
-  if constexpr (kColorsAlone) records.load(arguments.dL_dgaussians + first * kRecordLength, all_seen);
+  if constexpr (kOnlyColors) records.load(arguments.dL_dgaussians + first * kRecordLength, all_seen);
   rows.load(arguments.inputs.shs + first * Rows::kLength, all_seen);
   Gaussian<float> own;
   float dc[3];
@@ -135,13 +143,13 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
   }
   wait_for_copies();
 
-  GaussianGradient<float> gradient = {};
+  LaneGradient gradient = {};
   CameraGradient<float> dL_dcamera = {};
-  float sh[Rows::kLength], dL_dsh[Rows::kLength] = {}, dL_ddc[3] = {};
+  float sh[Rows::kLength], dL_dsh[Rows::kLength] = {};
   if (seen) {
     const int size = kNumGateMoments + config.num_features();
-    float record[kColorsAlone ? kRecordLength : kMostRecordLength];
-    if constexpr (kColorsAlone) {
+    float record[kOnlyColors ? kRecordLength : kMostRecordLength];
+    if constexpr (kOnlyColors) {
       records.read(record);
     } else {
       for (int k = 0; k < kMostRecordLength; ++k) record[k] = k < size ? arguments.dL_dgaussians[i * size + k] : 0.0f;
@@ -149,18 +157,18 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? 1 : 5)
     add_slots(arguments, i, size, 0, record);
     const float color[3] = {features.x, features.y, features.z};
     rows.read(sh);
-    const auto from_color =
-        write_color_gradients(Rows::known_colors(dc, sh), own.mean, camera, config, color, record + kNumGateMoments,
-                              {nullptr, Rows::kDcApart ? dL_ddc : nullptr, dL_dsh});
+    const auto from_color = write_color_gradients<float>({Rows::known_colors(dc, sh), own.mean, camera, config},
+                                                         {color, record + kNumGateMoments},
+                                                         {nullptr, Rows::kDcApart ? gradient.dc : nullptr, dL_dsh});
     rows.write(dL_dsh);  // the row's registers are free from here on
     const auto gate = moments_backward(projected.conic, projected.opacity, moments_of(record));
-    gradient = project_backward(own, camera, config.projection_rules(),
-                                projected_gradient(gate, record + kNumGateMoments, from_color, config));
-    if constexpr (kCamera) dL_dcamera.add(gradient.camera);
+    gradient.gaussian = project_backward(own, camera, config.projection_rules(),
+                                         projected_gradient(gate, record + kNumGateMoments, from_color, config));
+    if constexpr (kCamera) dL_dcamera.add(gradient.gaussian.camera);
   } else {
     rows.write(dL_dsh);
   }
-  store_gradients(gradient, dL_ddc, arguments.gradients, first, rows, exist, lane);
+  store_gradients(gradient, rows, arguments);
   if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
 }
 
@@ -217,7 +225,8 @@ __global__ void __launch_bounds__(kRowsBlock)
     } else {
       store_zeros(ColorGradients<S>{nullptr, nullptr, to_colors.shs}, 0, inputs.num_sh);
     }
-    const auto from_color = write_color_gradients(colors, own.mean, camera, config, features, dL_dfeatures, to_colors);
+    const auto from_color =
+        write_color_gradients<S>({colors, own.mean, camera, config}, {features, dL_dfeatures}, to_colors);
     const auto gate = moments_backward(projected.conic, projected.opacity, moments_of(moments));
     const auto gradient = project_backward(own, camera, config.projection_rules(),
                                            projected_gradient(gate, dL_dfeatures, from_color, config));
@@ -265,7 +274,7 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
       };
       if constexpr (Rows::kKnown) {
         shared += sizeof(float) * kRowsBlock * RecordRows::stride(kRecordLength);
-        if (config.num_features() == 3) {
+        if (config.num_features() == kFastFeatures) {
           with_camera ? launch(known_backward_kernel<true, true, Rows>, shared)
                       : launch(known_backward_kernel<false, true, Rows>, shared);
         } else {

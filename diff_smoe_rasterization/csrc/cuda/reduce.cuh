@@ -8,7 +8,7 @@ namespace dsmoe {
 namespace cuda {
 
 // Sums kCount numbers over the lanes of a warp. In each step two lanes exchange partial sums, and each keeps half of
-// the numbers; so it takes fewer steps than kCount sums one by one. Afterwards values[0] is the sum of number `number`
+// the numbers. That takes fewer steps than kCount sums one by one. Afterwards values[0] is the sum of number `number`
 // in the lanes where `holds` is set; each number has one such lane.
 template <int kCount> class TransposedSum {
  public:

@@ -2,9 +2,9 @@
 // can give every segment to a warp of its own. Otherwise the warp with the longest list would decide how long the pass
 // takes. (Taming 3DGS, arXiv:2406.15643, notes such states every 32 Gaussians, and gives those to a warp.)
 //
-// Segment s of a tile holds entries [s L, (s + 1) L) of its list. A tile's first segment needs no state. The state of
-// another lies in row floor(begin / L) + s, with `begin` the tile's first instance: no two segments share a row,
-// because a tile's last row is at most floor(end / L), and the next tile's first one is above that.
+// Segment s of a tile holds entries [s L, (s + 1) L) of its list, where L is kSegmentLength. A tile's first segment
+// needs no state. That of another one lies in row floor(begin / L) + s, with `begin` the tile's first instance. No two
+// segments share a row: a tile's last row is at most floor(end / L), and the next tile's first row is above that.
 #pragma once
 
 #include "tile_walk.cuh"
@@ -13,12 +13,11 @@ namespace dsmoe {
 namespace cuda {
 
 static_assert(kSegmentLength % kWarp == 0, "a segment is a number of whole chunks");
-static_assert(kSegmentRow == kTileSize * kTileSize * (1 + kSegmentFeatures), "a row has a place for each pixel");
 
 // The state of one pixel where a segment begins.
 template <class S> struct alignas(4 * sizeof(S)) SegmentPixel {
-  S transmittance;           // in front of the segment
-  S sums[kSegmentFeatures];  // sum w c from there to the end of the list; in front of there until the end is known
+  S transmittance;        // in front of the segment
+  S sums[kFastFeatures];  // sum w c from there to the list's end; up to there, as long as the end is not reached
 };
 
 // The state of the lane's pixel k in segment 1, 2, ... of its tile.
@@ -31,7 +30,7 @@ __device__ SegmentPixel<S>& segment_pixel(const SavedForward<S>& saved, const Wa
 
 // Which kernels can walk segments.
 template <class S, int kFeatures>
-constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && kFeatures == kSegmentFeatures;
+constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && kFeatures == kFastFeatures;
 
 template <class S> __device__ bool has_segments(const SavedForward<S>& saved, const WarpTile<S>& tile) {
   return saved.segments != nullptr && tile.source.listed && tile.source.length > kSegmentLength;

@@ -1,27 +1,27 @@
-// How the SH coefficients of a warp reach its lanes: row by row through shared memory where they are floats, else
-// straight from global memory. What trainers use most is compiled in.
+// How the SH coefficients of a warp reach its lanes. Where they are floats they go row by row through shared memory,
+// else each lane reads global memory. The two shapes that trainers use most are known when compiling.
 #pragma once
 
 #include "dsmoe/arrays.h"
+#include "tuning.cuh"
 #include "warp_rows.cuh"
 
 namespace dsmoe {
 namespace cuda {
 
-constexpr int kRowsBlock = 128;                                                         // threads, one Gaussian each
 constexpr int kAllShLength = 3 * kMaxShCoefficients, kShRestLength = kAllShLength - 3;  // with degree 0, and without
 
-// kStaged: through shared memory. kLength: numbers a row, 0 where it is not known; where it is, colours are of degree
-// 3, and the shapes are given by scales and rotations.
+// kStaged: the rows go through shared memory. kLength: numbers a row, or 0 where that is not known when compiling.
+// Where it is known, the colours are of degree 3, and scales and rotations give the shapes.
 template <bool kStagedRows, int kRowLength> struct ShRows : WarpRows<kRowLength> {
   using WarpRows<kRowLength>::WarpRows;
   static constexpr bool kStaged = kStagedRows, kKnown = kRowLength > 0;
   static constexpr int kLength = kRowLength;
 
-  // Whether degree 0 lies apart, where that is known.
+  // Whether degree 0 lies apart. Only for known rows.
   static constexpr bool kDcApart = kLength == kShRestLength;
 
-  // Gaussian i. Where it is known what there is, all numbers are read at once, before any is used.
+  // Gaussian i. For known rows, all numbers are read before any of them is used.
   template <class S> static __device__ Gaussian<S> gaussian(const GaussianInputs<S>& in, int64_t i) {
     if constexpr (kKnown) {
       const float4 q = reinterpret_cast<const float4*>(in.rotations)[i];
@@ -43,8 +43,8 @@ template <class... T> bool are_vector_aligned(const T*... pointers) {
   return ((reinterpret_cast<std::uintptr_t>(pointers) % 16 == 0) && ...);
 }
 
-// Calls launch(TypeOf<ShRows<...>>, bytes of shared memory) with what fits the inputs. may_know: whether the caller's
-// own arrays allow the known rows.
+// Calls launch(TypeOf<ShRows<...>>, bytes of shared memory) with the rows that fit the inputs. may_know: whether the
+// caller's own arrays allow known rows.
 template <class S, class Launch> void dispatch_sh_rows(const GaussianInputs<S>& inputs, bool may_know, Launch launch) {
   const auto with = [&](auto type) {
     using Rows = typename decltype(type)::type;

@@ -3,9 +3,9 @@
 //   moments     [Gaussians, 6] = dL/dpower [Gaussians, 64 pixels] x [64 pixels, 6]: 1, u, v, u^2, u v, v^2
 //   dL/dfeature [Gaussians, 3] = weights   [Gaussians, 64 pixels] x [64 pixels, 3]: g'
 //
-// with u and v the pixel's place in the warp's 8x8, half-integers that TF32 holds exactly. The factors that it does not
-// hold are split in two, so that the products keep 21 bits. Eight Gaussians go at a time: their dL/dpower are the upper
-// rows of one 16-row operand, their weights the lower ones.
+// with u and v the pixel's place in the warp's 8x8. They are half-integers, which TF32 holds exactly. Factors that TF32
+// does not hold are split in two, so that the products keep 21 bits. Eight Gaussians go at a time: their dL/dpower are
+// the upper rows of one 16-row operand, their weights the lower ones.
 #pragma once
 
 #include "dsmoe/gate.h"
@@ -20,14 +20,13 @@ constexpr bool kHasTensorSums = true;
 constexpr bool kHasTensorSums = false;
 #endif
 
-constexpr int kTensorFeatures = 3;
 // Which kernels sum by tensor cores.
 template <class S, int kFeatures>
-constexpr bool kSumsByTensors = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kTensorFeatures;
+constexpr bool kSumsByTensors = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kFastFeatures;
 constexpr int kTensorSteps = 8;  // of 8 pixels each
 // Numbers between rows: the quads of a warp that read two rows at once meet different banks.
 constexpr int kTensorRow = kWarpTile * kWarpTile + 16;
-constexpr int kTensorRecord = kNumGateMoments + kTensorFeatures;
+constexpr int kTensorRecord = kNumGateMoments + kFastFeatures;
 constexpr float kWarpTileCentre = (kWarpTile - 1) / 2.0f;
 static_assert(kWarpTile == 8 && kLanePixels == 2, "the places of pixels in the operands");
 
@@ -79,17 +78,17 @@ inline __device__ void fill_moment_basis(TensorBasis& basis) {
 }
 
 // Fills the right-hand operand of the features from each lane's g' of its two pixels.
-inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&scaled)[kLanePixels][kTensorFeatures],
+inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&scaled)[kLanePixels][kFastFeatures],
                                            int lane) {
   for (int k = 0; k < kLanePixels; ++k) {
-    for (int f = 0; f < kTensorFeatures; ++f) stage.values[f][2 * lane + k] = scaled[k][f];
+    for (int f = 0; f < kFastFeatures; ++f) stage.values[f][2 * lane + k] = scaled[k][f];
   }
   __syncwarp();
   const TensorLane at(lane);
   const int feature = at.row / 2;
   for (int step = 0; step < kTensorSteps; ++step) {
     const auto number = [&](int k) {
-      if (feature >= kTensorFeatures) return 0.0f;
+      if (feature >= kFastFeatures) return 0.0f;
       const int owner = 8 * (step / 2) + 2 * at.column + step % 2;
       const float value = stage.values[feature][2 * owner + k];
       return at.row % 2 == 0 ? tf32_part(value) : value - tf32_part(value);

@@ -1,5 +1,6 @@
-// The rows of tiles that the Gaussians of a warp meet, dealt out evenly to its lanes, however many each Gaussian has.
-// The tiles of a row are exact: where the ellipse enters and leaves it (Speedy-Splat's AccuTile, arXiv:2412.00578).
+// The rows of tiles that the Gaussians of a warp meet. The lanes share all rows evenly, however many each Gaussian has.
+// The tiles of a row are exact: they lie between the points where the ellipse enters and leaves the row (Speedy-Splat's
+// AccuTile, arXiv:2412.00578).
 #pragma once
 
 #include <cstring>
@@ -11,18 +12,14 @@
 namespace dsmoe {
 namespace cuda {
 
-// The tiles that may hold pairs of a Gaussian; radii: [N].
-template <class S>
-__device__ TileRect footprint_bounds(BlendMode mode, int width, int height, Vec2<S> mean, const int32_t* radii,
-                                     int32_t gaussian) {
-  Camera<S> camera;
-  camera.width = width, camera.height = height;
-  return tile_bounds(mode, camera, mean, within_radius(mode) ? S(radii[gaussian]) : S(0));
+// What tile_bounds wants of a Gaussian: its radius, which is only read where the mode needs it. radii: [N].
+template <class S> __device__ S bounding_radius(BlendMode mode, const int32_t* radii, int32_t gaussian) {
+  return within_radius(mode) ? S(radii[gaussian]) : S(0);
 }
 
 template <class T> __device__ T from_lane(T value, int lane) { return __shfl_sync(kAllLanes, value, lane); }
 
-// The items of all lanes, numbered lane by lane: this says where each lane's items begin, and how many there are.
+// Numbers the items of all lanes, lane by lane: where each lane's items begin, and how many there are.
 class WarpLine {
  public:
   __device__ WarpLine(unsigned items, int lane) {
@@ -36,8 +33,8 @@ class WarpLine {
     total = __shfl_sync(kAllLanes, sum, kWarp - 1);
   }
 
-  // Returns the lane that has item k: the last one that begins at k or before. k may be beyond the items; then the
-  // result is some lane.
+  // Returns the lane that has item k: the last one that begins at k or before. Where k is beyond the items, the result
+  // is some lane.
   __device__ int owner(unsigned k) const {
     int lane = 0;
 #pragma unroll

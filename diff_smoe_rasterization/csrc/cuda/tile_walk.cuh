@@ -1,7 +1,7 @@
 // The tile walk: how a warp goes through the list of a tile. Every pass over pixels is a visitor of it.
 //
 // A warp owns a square of pixels, a quarter of a tile; each lane owns two of them, one below the other, so that they
-// share a Gaussian's terms in x. (Small squares for warps, inside larger tiles for the lists: HiGS, arXiv:2606.00352.)
+// share a Gaussian's terms in x. (HiGS, arXiv:2606.00352, also has small squares for warps inside larger tiles.)
 // The warp takes 32 entries of the list at a time, one a lane:
 //
 //   prefetch  each lane loads its entry of the next chunk, while the current one is visited
@@ -156,8 +156,9 @@ __device__ auto load_entry(const Visitor& visitor, int32_t position, const WalkR
     *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
   }
   if (!tile.source.listed) {
-    const TileRect bounds = footprint_bounds(arguments.config.mode, arguments.width, arguments.height,
-                                             entry.staged.gaussian.mean, arguments.images.radii, entry.gaussian);
+    const BlendMode mode = arguments.config.mode;
+    const TileRect bounds = tile_bounds(mode, TileGrid(arguments.width, arguments.height), entry.staged.gaussian.mean,
+                                        bounding_radius<S>(mode, arguments.images.radii, entry.gaussian));
     entry.valid =
         bounds.x0 <= tile.tile_x && tile.tile_x < bounds.x1 && bounds.y0 <= tile.tile_y && tile.tile_y < bounds.y1;
   }

@@ -1,6 +1,6 @@
-// Sizes that decide how fast the kernels are, each with its reason. No result depends on them but for the order in
-// which numbers are added. What the layout of saved memory depends on (kTileSize, kSegmentLength, kSlotsPerInstance)
-// is in constants.h and rasterize_cuda.h.
+// Sizes that decide how fast the kernels are, each with its reason. Results depend on them only through the order in
+// which numbers are added. Sizes that decide how memory is laid out are elsewhere: kTileSize in constants.h;
+// kSegmentLength and kSlotsPerInstance in rasterize_cuda.h; kBoxPoints in neighbors.h.
 #pragma once
 
 #include "device.cuh"
@@ -27,7 +27,7 @@ constexpr int kFeatureChunk = 4;
 constexpr int kBackwardBlocks = 5;
 constexpr int kGeneralBackwardBlocks = 1;
 
-// Sums by tensor cores: Gaussians that one warp sums together. They fill the 16 rows of an operand, eight rows for
+// Sums by tensor cores: how many Gaussians one warp sums together. They fill the 16 rows of an operand, eight rows for
 // dL/dpower and eight for the weights.
 constexpr int kTensorBatch = 8;
 
@@ -43,11 +43,43 @@ constexpr int kKeptRows = 96;
 // that it can hold, enough to hide the latency of loads.
 constexpr int kEnoughWarpsPerMultiprocessor = 32;
 
-// Threads a block of a kernel that writes one number a thread.
-constexpr int kStoreBlock = 256;
+// The projection and its backward pass.
+//
+// Threads a block, one Gaussian each. Each thread needs some 200 bytes of shared memory for its row of SH coefficients.
+// Small blocks waste less of a multiprocessor's shared memory and registers, which then hold more warps.
+constexpr int kRowsBlock = 128;
+// Blocks of the backward projection that one multiprocessor holds at once, in the common case: 5 x 128 threads leave
+// each thread 96 registers. With the camera's gradient, 35 more sums a thread would not fit them: the compiler decides.
+constexpr int kRowsBackwardBlocks = 5;
+constexpr int kCameraBackwardBlocks = 1;
 
-// Threads of the block that sums one column of a matrix.
+// Kernels whose threads do the same small work, one item each.
+//
+// Threads a block. 256 divides the threads that a multiprocessor holds, whatever the card (1024, 1536 or 2048).
+constexpr int kStoreBlock = 256;
+// Threads of the block that sums one column of a matrix. A power of two, because the sum halves their number.
 constexpr int kColumnBlock = 256;
+
+// Adam.
+//
+constexpr int kAdamBlock = 256;    // threads, as kStoreBlock
+constexpr int kAdamPerThread = 4;  // numbers, a block apart, so that the loads of all four are in flight together
+constexpr int kAdamMaxTensors =
+    16;  // of one launch: more than a trainer has, in 1 of the 4 KiB for a kernel's arguments
+
+// L1 and SSIM.
+//
+constexpr int kLossBlock = 256;  // threads: two pixels of a tile each in float, one in double
+// The pixels of a tile. With the reach of the windows around them, the maps of a tile must fit 48 KiB of shared memory,
+// which every card gives a block; double has room for half as many.
+constexpr int kLossTileHeight = 16;
+template <class S> constexpr int kLossTileWidth = sizeof(S) == 4 ? 32 : 16;
+constexpr int kLossSumBlock = 512;  // threads of the one block that adds up the tiles: more of them wait less often
+
+// Neighbours.
+//
+constexpr int kSearchBlock =
+    256;  // threads, a point each. They are the points of one box, and leave out the same boxes
 
 }  // namespace cuda
 }  // namespace dsmoe

@@ -1,5 +1,5 @@
-// Rows of floats, one for each Gaussian of a warp: side by side in global memory, and copied by the whole warp to and
-// from shared memory, where each lane has its own row.
+// Rows of floats, one for each Gaussian of a warp. They lie side by side in global memory. The whole warp copies them
+// to and from shared memory, where each lane has its own row.
 #pragma once
 
 #include <cuda_pipeline.h>
@@ -9,7 +9,7 @@
 namespace dsmoe {
 namespace cuda {
 
-// Where a float lies in shared memory, as the instruction below wants it.
+// Where a float lies in shared memory, in the form that the instruction below takes.
 struct SharedAddress {
   unsigned byte;
   __device__ explicit SharedAddress(const float* p) : byte(static_cast<unsigned>(__cvta_generic_to_shared(p))) {}
@@ -20,7 +20,7 @@ struct SharedAddress {
   }
 };
 
-// Copies a T from global memory to shared memory; asynchronously where the device can.
+// Copies a T from global memory to shared memory. Where the device can, the copy is asynchronous.
 template <class T> __device__ void copy_async(SharedAddress to, const float* from) {
   static_assert(sizeof(T) == 4 || sizeof(T) == 16, "the instruction's sizes");
 #if __CUDA_ARCH__ >= 800
@@ -41,9 +41,9 @@ inline __device__ void wait_for_copies() {
   __syncwarp();
 }
 
-// kLength: numbers a row, 0 where it is known at run time alone. Rows of known length travel four numbers at a time,
-// so they must begin at multiples of 16 bytes. In shared memory no two lanes that read the same place in their rows
-// meet a bank: rows are an odd number of words apart, or, to be read as vectors, an odd number of vectors.
+// kLength: numbers a row, or 0 where that is only known at run time. Rows of known length are copied four numbers at a
+// time, so their array must begin at a multiple of 16 bytes. In shared memory, lanes that read the same place of their
+// rows use different banks: rows are an odd number of words apart or, where they are read as vectors, of vectors.
 template <int kLength> class WarpRows {
  public:
   static constexpr bool kVectors = kLength % 4 == 0 && kLength > 0;  // a row is made of vectors
@@ -53,10 +53,12 @@ template <int kLength> class WarpRows {
   __device__ WarpRows(float* shared, int length, int exist, int lane)
       : shared_(shared), length_(kLength > 0 ? kLength : length), exist_(exist), lane_(lane) {}
 
+  __device__ int exist() const { return exist_; }
+  __device__ int lane() const { return lane_; }
   __device__ float* memory() const { return shared_; }
   __device__ float* own() const { return shared_ + lane_ * stride(length_); }
 
-  // Copies the rows that `wanted` marks; wait_for_copies() ends it.
+  // Begins to copy the rows that `wanted` marks. They are there after wait_for_copies().
   __device__ void load(const float* from, unsigned wanted) const {
     for_each_part(wanted, from, SharedAddress(shared_), [](auto part, const float* global, SharedAddress shared) {
       copy_async<decltype(part)>(shared, global);
@@ -73,7 +75,7 @@ template <int kLength> class WarpRows {
                   });
   }
 
-  // Between the lane's row and its registers.
+  // Copy the lane's row to registers, and back.
   __device__ void read(float (&row)[kLength > 0 ? kLength : 1]) const {
     if constexpr (kVectors) {
 #pragma unroll
@@ -99,8 +101,9 @@ template <int kLength> class WarpRows {
   }
 
  private:
-  // Visits what the marked rows are made of, vectors or single numbers, in memory order: a value of its type, where it
-  // lies in global memory, and where in shared memory. A vector that reaches into the next row is visited for either.
+  // Calls visit(value, global, shared) for all parts of the marked rows, in memory order. A part is a vector or a
+  // single number. value: of the part's type. global, shared: where it lies. A part that reaches into the next row is
+  // visited where either row is marked.
   template <class Global, class Shared, class Visit>
   __device__ void for_each_part(unsigned marked, Global global, Shared shared, Visit visit) const {
     if constexpr (kVectors) {

@@ -1,5 +1,5 @@
-// What every op asks of a tensor, in one vocabulary: "function: name is this; it must be that". ValueError for shapes,
-// TypeError for types and devices.
+// What every op asks of a tensor. All messages have one form: "function: name is this; it must be that". ValueError is
+// for shapes, TypeError for types and devices.
 #pragma once
 
 #include <ATen/ATen.h>

@@ -1,5 +1,5 @@
-// What the ops refuse. Errors name the function, the argument, what it is and what it must be: ValueError for shapes
-// and values, TypeError for types and devices. This is the only place that checks; Python adds none of these.
+// What the ops refuse. Errors name the function, the argument, what it is and what it must be. They are ValueError for
+// shapes and values, TypeError for types and devices. Python does not repeat these checks.
 #pragma once
 
 #include <cstring>
@@ -16,14 +16,14 @@ namespace binding {
 // Tensors and numbers of one rendering, before any memory is read.
 void check_arguments(const Inputs& inputs, const Options& options);
 
-// The backward op's own arguments; for a caller that is not our autograd formula.
+// The backward op's own arguments, since it can be called directly.
 void check_backward_arguments(const Inputs& inputs, const Options& options, const Images& images,
                               const Images& image_gradients, const InputMask& wanted);
 
 void check_contribution_arguments(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
                                   const at::Tensor& background_gate, const Options& options);
 
-// A tensor that some rendering made: unchanged, and of such a rendering. shape: -1 is any size.
+// A tensor that a rendering returned: its shape, type and device must be as they were. shape: -1 stands for any size.
 void check_result(const char* function, const char* name, const at::Tensor& tensor, const std::vector<int64_t>& shape,
                   at::ScalarType type, at::Device device);
 

@@ -60,16 +60,18 @@ py::dict saved() {
                   "cuda"_a = saved_arrays<dsmoe::cuda::SavedForward<float>, dsmoe::cuda::SavedSizes>());
 }
 
-// The core's list, for Python's own: names in the order of their numbers, each with its facts.
+// The core's list: names in the order of their numbers, each with the facts that Python asks for. `divides`: the
+// backward pass reads the images of the forward pass. `background_gate`: the mode's own, or None where the caller gives
+// it.
 py::dict blend_modes() {
   using namespace py::literals;
   py::dict modes;
   dsmoe::BlendModes::for_each([&](auto mode) {
     using Policy = dsmoe::Blend<decltype(mode)::value>;
+    py::object gate = py::none();
+    if (!Policy::kLearnsGate) gate = py::float_(Policy::background_gate(0.0));
     modes[Policy::kName] = py::dict("number"_a = static_cast<int>(decltype(mode)::value),
-                                    "cuts_by_alpha"_a = Policy::kCut == dsmoe::Cut::kAlpha,
-                                    "needs_depth_order"_a = Policy::kNeedsDepthOrder,
-                                    "stops_early"_a = Policy::kStopsEarly, "learns_gate"_a = Policy::kLearnsGate);
+                                    "divides"_a = Policy::kDivides, "background_gate"_a = gate);
   });
   return modes;
 }
@@ -87,7 +89,7 @@ py::dict build_info() {
 
 py::dict stage_times() {
   using namespace py::literals;
-  const dsmoe::cpu::StageTimes times = dsmoe::binding::stage_times();
+  const dsmoe::StageTimes times = dsmoe::binding::stage_times();
   return py::dict("project"_a = times.project, "sort"_a = times.sort, "bin"_a = times.bin, "blend"_a = times.blend,
                   "blend_backward"_a = times.blend_backward, "project_backward"_a = times.project_backward,
                   "forward_pairs"_a = times.forward_pairs, "backward_pairs"_a = times.backward_pairs);

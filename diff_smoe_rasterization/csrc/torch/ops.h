@@ -88,13 +88,32 @@ template <class Backend> Inputs checked(const Inputs& inputs, const Options& opt
   return dense;
 }
 
+// A call of `rasterize` or `radii`: its arguments, checked, and the device that they are on.
+template <class Backend> struct RenderingCall {
+  RenderingCall(const c10::OperatorHandle& op, torch::jit::Stack& stack)
+      : arguments(op, stack),
+        given(arguments.read<Inputs>()),
+        options(arguments.read<Options>()),
+        guard(checked_device()),
+        inputs(checked<Backend>(given, options)) {}
+
+  Arguments arguments;
+  const Inputs given;
+  const Options options;
+  const typename Backend::Guard guard;
+  const Inputs inputs;  // dense
+
+ private:
+  at::Device checked_device() const {
+    check_arguments(given, options);
+    return given[kMeans3D].device();
+  }
+};
+
 template <class Backend> void rasterize(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
-  Arguments arguments(op, *stack);
-  const auto given = arguments.read<Inputs>();
-  const auto options = arguments.read<Options>();
-  check_arguments(given, options);
-  const typename Backend::Guard guard(given[kMeans3D].device());
-  const Inputs inputs = checked<Backend>(given, options);
+  RenderingCall<Backend> call(op, *stack);
+  const Inputs& inputs = call.inputs;
+  const Options& options = call.options;
   const Images images = allocate_images(inputs, options);
   TensorMemory memory(inputs[kMeans3D]);
   dispatch(inputs[kMeans3D],
@@ -102,23 +121,20 @@ template <class Backend> void rasterize(const c10::OperatorHandle& op, torch::ji
   if (options.debug) {
     for (Image image : kDifferentiable) refuse_nan(std::string("rasterize: ") + kImageNames[image], images[image]);
   }
-  arguments.give_back(images[kColor], images[kRadii], images[kGateSum], images[kDepth], images[kInverseDepth],
-                      memory.take_saved());
+  call.arguments.give_back(images[kColor], images[kRadii], images[kGateSum], images[kDepth], images[kInverseDepth],
+                           memory.take_saved());
 }
 
 template <class Backend> void radii(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
-  Arguments arguments(op, *stack);
-  const auto given = arguments.read<Inputs>();
-  const auto options = arguments.read<Options>();
-  check_arguments(given, options);
-  const typename Backend::Guard guard(given[kMeans3D].device());
-  const Inputs inputs = checked<Backend>(given, options);
+  RenderingCall<Backend> call(op, *stack);
+  const Inputs& inputs = call.inputs;
+  const Options& options = call.options;
   Images images;
   images[kRadii] = at::empty({num_gaussians(inputs)}, inputs[kMeans3D].options().dtype(at::kInt));
   TensorMemory memory(inputs[kMeans3D]);
   dispatch(inputs[kMeans3D],
            [&](auto zero) { Backend::template radii<decltype(zero)>(inputs, options, images, memory); });
-  arguments.give_back(images[kRadii]);
+  call.arguments.give_back(images[kRadii]);
 }
 
 inline void check_length(const char* name, size_t length, size_t expected) {

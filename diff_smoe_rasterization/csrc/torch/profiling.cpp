@@ -9,13 +9,13 @@ namespace {
 
 std::atomic<bool> profiling{false};
 std::mutex latest_mutex;
-cpu::StageTimes latest;
+StageTimes latest;
 
 }  // namespace
 
 void set_profiling(bool enabled) { profiling = enabled; }
 
-cpu::StageTimes stage_times() {
+StageTimes stage_times() {
   const std::lock_guard<std::mutex> lock(latest_mutex);
   return latest;
 }

@@ -1,4 +1,4 @@
-// Where the time goes: the stage times of the last rendering and its backward pass, while profiling is on.
+// The stage times of the latest rendering and of the latest backward pass. They are taken while profiling is on.
 #pragma once
 
 #include "dsmoe/rasterize.h"
@@ -9,7 +9,7 @@ namespace binding {
 void set_profiling(bool enabled);
 
 // Of the latest forward pass, and of the latest backward pass; zeros where there was none.
-cpu::StageTimes stage_times();
+StageTimes stage_times();
 
 enum class Pass { kForward, kBackward };
 
@@ -22,12 +22,12 @@ class StageRecorder {
   StageRecorder& operator=(const StageRecorder&) = delete;
 
   // Null while profiling is off.
-  cpu::StageTimes* times() { return enabled_ ? &times_ : nullptr; }
+  StageTimes* times() { return enabled_ ? &times_ : nullptr; }
 
  private:
   const Pass pass_;
   const bool enabled_;
-  cpu::StageTimes times_;
+  StageTimes times_;
 };
 
 }  // namespace binding

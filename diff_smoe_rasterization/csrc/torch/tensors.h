@@ -2,7 +2,6 @@
 #pragma once
 
 #include <ATen/ATen.h>
-#include <c10/util/Optional.h>
 
 #include <algorithm>
 #include <array>
@@ -34,7 +33,6 @@ constexpr const char* kImageNames[] = {DSMOE_IMAGES(DSMOE_NAME_OF_IMAGE)};
 // The images that loss gradients arrive at, in the order of the backward op's arguments.
 constexpr std::array<Image, kNumImages - 1> kDifferentiable = {kColor, kGateSum, kDepth, kInverseDepth};
 
-using OptionalTensor = c10::optional<at::Tensor>;   // std::optional in newer torch
 using Inputs = std::array<at::Tensor, kNumInputs>;  // an absent input is an undefined tensor
 using Images = std::array<at::Tensor, kNumImages>;  // also their gradients, undefined where there is none
 using Saved = std::vector<at::Tensor>;              // the arrays of SavedForward, in the order of for_each_array

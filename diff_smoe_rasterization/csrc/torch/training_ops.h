@@ -1,6 +1,6 @@
-// The trainers' ops as torch calls them, once for all backends: training_schema.cpp says their signatures, a backend
-// registers `adam<Backend>` and its like under its dispatch key. A Backend has the functions that training_ops_cpu.cpp
-// and training_ops_cuda.cpp define.
+// The trainers' ops as torch calls them, once for all backends. training_schema.cpp has their signatures. A backend
+// registers `adam<Backend>` and the others under its dispatch key. training_ops_cpu.cpp and training_ops_cuda.cpp
+// define the Backends.
 #pragma once
 
 #include <ATen/ATen.h>
@@ -86,7 +86,7 @@ void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
                          rows > 0 && size > 0 ? size / rows : 1,
                          {static_cast<scalar_t>(rates[i]), static_cast<scalar_t>(root_scales[i])}});
     }
-    Backend::adam(tensors, constants, flags.defined() ? flags.data_ptr<bool>() : nullptr);
+    Backend::adam(tensors, AdamStep<scalar_t>{constants, flags.defined() ? flags.data_ptr<bool>() : nullptr});
   });
   for (at::TensorList list : {parameters, moments, squares}) note_change(list);
 }
@@ -171,7 +171,8 @@ GaussianTensors activate(const at::Tensor& opacities, const at::Tensor& scales, 
   const c10::DeviceGuard guard(opacities.device());
   const GaussianTensors values = empty_like(raw);
   AT_DISPATCH_FLOATING_TYPES(opacities.scalar_type(), "activate", [&] {
-    Backend::template activate<scalar_t>(pointers<const scalar_t>(raw), pointers<scalar_t>(values), opacities.size(0));
+    Backend::for_each_gaussian(Activate<scalar_t>{pointers<const scalar_t>(raw), pointers<scalar_t>(values)},
+                               opacities.size(0));
   });
   return values;
 }
@@ -199,9 +200,12 @@ GaussianTensors activate_backward(at::TensorList raw, at::TensorList values, con
                                      dense("dL_drotations", dL_drotations, values[2])};
   const GaussianTensors results = empty_like(raw_tensors);
   AT_DISPATCH_FLOATING_TYPES(raw[0].scalar_type(), "activate_backward", [&] {
-    Backend::template activate_backward<scalar_t>(
-        pointers<const scalar_t>(raw_tensors), pointers<const scalar_t>(value_tensors),
-        pointers<const scalar_t>(gradients), pointers<scalar_t>(results), raw[0].size(0));
+    ActivateBackward<scalar_t> pass = {};
+    pass.raw = pointers<const scalar_t>(raw_tensors);
+    pass.values = pointers<const scalar_t>(value_tensors);
+    pass.dL_dvalues = pointers<const scalar_t>(gradients);
+    pass.dL_draw = pointers<scalar_t>(results);
+    Backend::for_each_gaussian(pass, raw[0].size(0));
   });
   return results;
 }
@@ -224,9 +228,12 @@ void add_view(const at::Tensor& dL_dmeans2D, const at::Tensor& radii, const at::
   const c10::DeviceGuard guard(radii.device());
   const at::Tensor gradients = dL_dmeans2D.contiguous(), dense_radii = radii.contiguous();
   AT_DISPATCH_FLOATING_TYPES(gradients.scalar_type(), "add_view", [&] {
-    Backend::template add_view<scalar_t>(gradients.data_ptr<scalar_t>(), dense_radii.data_ptr<int32_t>(),
-                                         gradient_sum.data_ptr<scalar_t>(), view_count.data_ptr<scalar_t>(),
-                                         radii.size(0));
+    AddView<scalar_t> pass = {};
+    pass.dL_dmeans2D = gradients.data_ptr<scalar_t>();
+    pass.radii = dense_radii.data_ptr<int32_t>();
+    pass.gradient_sum = gradient_sum.data_ptr<scalar_t>();
+    pass.view_count = view_count.data_ptr<scalar_t>();
+    Backend::for_each_gaussian(pass, radii.size(0));
   });
   note_change({gradient_sum, view_count});
 }

@@ -12,9 +12,8 @@ namespace {
 constexpr int64_t kChunk = 1 << 14;  // Gaussians a thread takes at a time
 
 struct Cpu {
-  template <class S>
-  static void adam(const std::vector<AdamTensor<S>>& tensors, const AdamConstants<S>& constants, const bool* visible) {
-    cpu::adam(tensors, constants, visible, at::get_num_threads());
+  template <class S> static void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step) {
+    cpu::adam(tensors, step, at::get_num_threads());
   }
 
   template <class S> static int64_t num_image_loss_sums(const ImageLoss<S>& loss) {
@@ -23,27 +22,10 @@ struct Cpu {
 
   template <class S> static void image_loss(const ImageLoss<S>& loss) { cpu::image_loss(loss, at::get_num_threads()); }
 
-  template <class Function> static void for_each(int64_t count, Function function) {
+  template <class Pass> static void for_each_gaussian(const Pass& pass, int64_t count) {
     cpu::parallel_for(at::get_num_threads(), count, kChunk, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) function(i);
+      for (int64_t i = begin; i < end; ++i) pass(i);
     });
-  }
-
-  template <class S>
-  static void activate(const GaussianParameters<const S>& raw, const GaussianParameters<S>& values, int64_t count) {
-    for_each(count, [&](int64_t i) { dsmoe::activate(raw, values, i); });
-  }
-
-  template <class S>
-  static void activate_backward(const GaussianParameters<const S>& raw, const GaussianParameters<const S>& values,
-                                const GaussianParameters<const S>& dL_dvalues, const GaussianParameters<S>& dL_draw,
-                                int64_t count) {
-    for_each(count, [&](int64_t i) { dsmoe::activate_backward(raw, values, dL_dvalues, dL_draw, i); });
-  }
-
-  template <class S>
-  static void add_view(const S* dL_dmeans2D, const int32_t* radii, S* gradient_sum, S* view_count, int64_t count) {
-    for_each(count, [&](int64_t i) { dsmoe::add_view(dL_dmeans2D, radii, gradient_sum, view_count, i); });
   }
 };
 

@@ -12,9 +12,8 @@ namespace {
 void* current_stream() { return at::cuda::getCurrentCUDAStream().stream(); }
 
 struct Cuda {
-  template <class S>
-  static void adam(const std::vector<AdamTensor<S>>& tensors, const AdamConstants<S>& constants, const bool* visible) {
-    cuda::adam(tensors, constants, visible, current_stream());
+  template <class S> static void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step) {
+    cuda::adam(tensors, step, current_stream());
   }
 
   template <class S> static int64_t num_image_loss_sums(const ImageLoss<S>& loss) {
@@ -23,21 +22,8 @@ struct Cuda {
 
   template <class S> static void image_loss(const ImageLoss<S>& loss) { cuda::image_loss(loss, current_stream()); }
 
-  template <class S>
-  static void activate(const GaussianParameters<const S>& raw, const GaussianParameters<S>& values, int64_t count) {
-    cuda::activate(raw, values, count, current_stream());
-  }
-
-  template <class S>
-  static void activate_backward(const GaussianParameters<const S>& raw, const GaussianParameters<const S>& values,
-                                const GaussianParameters<const S>& dL_dvalues, const GaussianParameters<S>& dL_draw,
-                                int64_t count) {
-    cuda::activate_backward(raw, values, dL_dvalues, dL_draw, count, current_stream());
-  }
-
-  template <class S>
-  static void add_view(const S* dL_dmeans2D, const int32_t* radii, S* gradient_sum, S* view_count, int64_t count) {
-    cuda::add_view(dL_dmeans2D, radii, gradient_sum, view_count, count, current_stream());
+  template <class Pass> static void for_each_gaussian(const Pass& pass, int64_t count) {
+    cuda::for_each_gaussian(pass, count, current_stream());
   }
 };
 
@@ -52,13 +38,23 @@ at::Tensor mean_squared_neighbour_distances(const at::Tensor& points) {
   const at::Tensor given = points.contiguous(), low = given.amin(0), high = given.amax(0);
   const at::Tensor codes = at::empty({count}, given.options().dtype(at::kLong));
   AT_DISPATCH_FLOATING_TYPES(given.scalar_type(), "mean_squared_neighbour_distances", [&] {
-    cuda::morton_codes(given.data_ptr<scalar_t>(), count, low.data_ptr<scalar_t>(), high.data_ptr<scalar_t>(),
-                       codes.data_ptr<int64_t>(), current_stream());
+    cuda::MortonCodes<scalar_t> morton = {};
+    morton.points = given.data_ptr<scalar_t>();
+    morton.count = count;
+    morton.low = low.data_ptr<scalar_t>();
+    morton.high = high.data_ptr<scalar_t>();
+    morton.codes = codes.data_ptr<int64_t>();
+    cuda::morton_codes(morton, current_stream());
     const at::Tensor order = codes.argsort();
     const at::Tensor sorted = given.index_select(0, order);
     const at::Tensor boxes = at::empty({(count + cuda::kBoxPoints - 1) / cuda::kBoxPoints, 2, 3}, given.options());
-    cuda::mean_squared_distances(sorted.data_ptr<scalar_t>(), order.data_ptr<int64_t>(), count,
-                                 boxes.data_ptr<scalar_t>(), result.data_ptr<scalar_t>(), current_stream());
+    cuda::NeighborDistances<scalar_t> search = {};
+    search.points = sorted.data_ptr<scalar_t>();
+    search.count = count;
+    search.order = order.data_ptr<int64_t>();
+    search.boxes = boxes.data_ptr<scalar_t>();
+    search.result = result.data_ptr<scalar_t>();
+    cuda::mean_squared_distances(search, current_stream());
   });
   return result;
 }

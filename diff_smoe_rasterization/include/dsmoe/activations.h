@@ -1,5 +1,5 @@
-// From what an optimizer moves freely to what a Gaussian is made of: opacity = sigmoid(logit), scale = exp(log),
-// rotation = quaternion / |quaternion|. Each backward returns dL/dinput from the output and dL/doutput.
+// From the numbers that an optimizer moves freely to those of a Gaussian: opacity = sigmoid(logit), scale = exp(log),
+// rotation = quaternion / |quaternion|. Each backward function returns dL/dinput from the output and dL/doutput.
 #pragma once
 
 #include "dsmoe/hd.h"
@@ -12,7 +12,7 @@ template <class S> DSMOE_HD S sigmoid_backward(S value, S dL_dvalue) { return dL
 
 template <class S> DSMOE_HD S exp_backward(S value, S dL_dvalue) { return dL_dvalue * value; }
 
-// Length that a shorter quaternion is divided by instead.
+// A quaternion that is shorter than this is divided by this instead of its length, as torch's normalize does.
 constexpr double kShortestQuaternion = 1e-12;
 
 template <class S> DSMOE_HD S quaternion_length(const S* q) {
@@ -24,7 +24,8 @@ template <class S> DSMOE_HD void normalize_quaternion(const S* q, S* unit) {
   for (int i = 0; i < 4; ++i) unit[i] = q[i] * inverse;
 }
 
-// (g - u (u . g)) / |q|; a quaternion that is too short is only divided.
+// dL/dq = (g - u (u . g)) / |q| with g = dL/dunit. A quaternion that is too short was divided by a constant: there
+// dL/dq is g divided by it.
 template <class S> DSMOE_HD void normalize_quaternion_backward(const S* q, const S* dL_dunit, S* dL_dq) {
   const S length = quaternion_length(q);
   const bool normalized = length > S(kShortestQuaternion);

@@ -12,8 +12,8 @@ template <class S> struct AdamConstants {
   S epsilon;
 };
 
-// Those of one parameter. With bias correction in step t: rate = lr / (1 - beta1^t), root_scale = 1 / sqrt(1 -
-// beta2^t); without, lr and 1.
+// Constants of one parameter. With bias correction in step t: rate = lr / (1 - beta1^t) and
+// root_scale = 1 / sqrt(1 - beta2^t). Without: rate = lr and root_scale = 1.
 template <class S> struct AdamRates { S rate, root_scale; };
 
 template <class S>

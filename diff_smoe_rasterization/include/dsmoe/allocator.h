@@ -1,4 +1,4 @@
-// Memory that a pass asks its caller for. The caller decides whose it is and how it is made: torch's tensors, a pool, a
+// The memory that a pass asks its caller for. The caller decides where it comes from: torch's tensors, a pool, a
 // vector.
 #pragma once
 
@@ -11,10 +11,11 @@
 
 namespace dsmoe {
 
-// Memory for the duration of one call, at a multiple of 256 bytes, or null where there is none left. It is free again
-// when the call returns, on a GPU in the order of the stream.
+// Memory for the duration of one call. The callee does not use it after the call has returned; on a GPU, after the work
+// that the call has put on its stream.
 class Scratch {
  public:
+  // Returns `bytes` bytes at a multiple of 256, or null where there is no memory left.
   virtual void* allocate(size_t bytes) = 0;
 
  protected:
@@ -38,11 +39,12 @@ struct SavedArray {
 
 class Allocator : public Scratch {
  public:
-  // Memory for array number `index` of those that `for_each_array` names, at a multiple of 256 bytes, or null where
-  // there is none left. It must last until the backward pass has run, or until the caller knows that none will.
+  // Returns memory for array number `index` of those that `for_each_array` names, at a multiple of 256 bytes, or null
+  // where there is no memory left. It must last until the backward pass has run, or until the caller knows that none
+  // will.
   virtual void* keep(int index, const SavedArray& array) = 0;
 
-  // Later work on the same stream may take what `allocate` has given so far.
+  // Says that the callee has done with all that `allocate` has given so far. Later work on the same stream may use it.
   virtual void release() = 0;
 
  protected:
@@ -64,7 +66,7 @@ template <class T> SavedArray saved_array(const char* name, const T*, int64_t ro
   return {name, type_of(Number()), rows, static_cast<int>(sizeof(T) / sizeof(Number))};  // NOLINT: T may be a struct
 }
 
-// Asks for each of the saved arrays that has no memory yet and whose length is known. Throws std::bad_alloc.
+// Asks for memory for each saved array that has none yet and whose length is known. Throws std::bad_alloc.
 template <class Saved, class Sizes> void allocate_saved(Saved& saved, const Sizes& sizes, Allocator& memory) {
   int next = 0;
   for_each_array(saved, sizes, [&](const char* name, auto*& pointer, int64_t rows) {

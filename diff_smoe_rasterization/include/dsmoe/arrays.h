@@ -1,4 +1,4 @@
-// One Gaussian between the arrays of params.h and the values of project.h and sh.h, for both backends.
+// Loads and stores of one Gaussian: between the arrays of params.h and the values of project.h and sh.h.
 #pragma once
 
 #include "dsmoe/params.h"
@@ -26,30 +26,30 @@ template <class S> DSMOE_HD Gaussian<S> load_gaussian(const GaussianInputs<S>& i
   return out;
 }
 
-// Coefficients of spherical harmonics, read by number: degree 0 apart from the rest, or all in one array.
+// Reads coefficients of spherical harmonics by their number.
 template <class S> struct ShReader {
-  const S* dc;    // [3]
-  const S* rest;  // [K - 1, 3]
+  const S* dc;    // [3] degree 0
+  const S* rest;  // [K - 1, 3] the others
   DSMOE_HD Vec3<S> operator()(int k) const { return k == 0 ? load3(dc) : load3(rest + 3 * (k - 1)); }
 };
 
-// Their gradients, written likewise. Either may be null: that gradient is not wanted.
+// Writes gradients of coefficients by their number. Either array may be null. Then those gradients are not wanted.
 template <class S> struct ShWriter {
-  S* dc;
-  S* rest;
+  S* dc;    // [3]
+  S* rest;  // [K - 1, 3]
   DSMOE_HD void operator()(int k, Vec3<S> value) const {
     if (k == 0 && dc != nullptr) store3(dc, value);
     if (k > 0 && rest != nullptr) store3(rest + 3 * (k - 1), value);
   }
 };
 
-// The colours of one Gaussian: either given, or coefficients of spherical harmonics.
+// The colours of one Gaussian. They are either given, or made of coefficients of spherical harmonics.
 template <class S> struct Colors {
   const S* given;  // [C], or null
   const S* dc;     // [3], or null where shs holds degree 0
   const S* shs;    // [num_sh, 3], or null
-  int num_sh;
-  int sh_degree;
+  int num_sh;      // coefficients in shs
+  int sh_degree;   // active degree
 
   DSMOE_HD ShReader<S> sh() const { return dc != nullptr ? ShReader<S>{dc, shs} : ShReader<S>{shs, shs + 3}; }
 };
@@ -72,7 +72,7 @@ DSMOE_HD ColorGradients<S> color_gradients_of(const GaussianGradients<S>& g, int
   return {at(g.colors_precomp, num_channels), at(g.dc, 3), at(g.shs, 3 * num_sh)};
 }
 
-// Whether every number that colours a Gaussian is finite; one with a number that is not is culled.
+// Whether all numbers that a Gaussian's colour is made of are finite. Else the Gaussian is culled.
 template <class S> DSMOE_HD bool is_finite(const Colors<S>& colors, int num_channels) {
   bool finite = true;
   if (colors.given != nullptr) finite = finite && all_finite(colors.given, num_channels);
@@ -81,48 +81,59 @@ template <class S> DSMOE_HD bool is_finite(const Colors<S>& colors, int num_chan
   return finite;
 }
 
-template <class S>
-DSMOE_HD ShRules<S> sh_rules(const Colors<S>& colors, const Camera<S>& camera, const RasterConfig<S>& config) {
-  return {colors.sh_degree, config.clamp_color, load3(camera.position)};
-}
+// What the colour of one Gaussian on an image depends on.
+template <class S> struct ColorSource {
+  Colors<S> colors;
+  Vec3<S> mean;                   // of the Gaussian, world
+  const Camera<S>& camera;        // that sees it
+  const RasterConfig<S>& config;  // which features there are
 
-// Writes what the pixels blend of a Gaussian, [F]; depth is its view z. False where it is culled.
-template <class S>
-DSMOE_HD bool write_features(const Colors<S>& colors, Vec3<S> mean, const Camera<S>& camera,
-                             const RasterConfig<S>& config, S depth, S* features) {
+  DSMOE_HD ShRules<S> sh_rules() const { return {colors.sh_degree, config.clamp_color, load3(camera.position)}; }
+};
+
+// Writes the features of a Gaussian, [F]: what the pixels blend of it. depth: its view z. Returns false where the
+// Gaussian is culled.
+template <class S> DSMOE_HD bool write_features(const ColorSource<S>& source, S depth, S* features) {
+  const Colors<S>& colors = source.colors;
+  const RasterConfig<S>& config = source.config;
   if (!is_finite(colors, config.num_channels)) return false;
   if (colors.given != nullptr) {
     for (int c = 0; c < config.num_channels; ++c) features[c] = colors.given[c];
   } else {
-    store3(features, sh_color(sh_rules(colors, camera, config), mean, colors.sh()));
+    store3(features, sh_color(source.sh_rules(), source.mean, colors.sh()));
   }
   S* extra = features + config.num_channels;
   if (config.depth) *extra++ = depth;
   if (config.inverse_depth) *extra = S(1) / depth;
-  // Finite coefficients can add up to an infinite colour; times a weight of 0 it would reach pixels next to the
-  // Gaussian.
+  // Finite coefficients can add up to an infinite colour. Infinity times a weight of 0 is NaN, and would reach pixels
+  // next to the Gaussian.
   return all_finite(features, config.num_features());
 }
 
-// Writes the gradients of a Gaussian's colours, of the active degree; returns dL/dmean by way of them.
-// features, dL_dfeatures: [F].
+// The features of a Gaussian as the forward pass wrote them, and the gradients by them.
+template <class S> struct BlendedFeatures {
+  const S* values;      // [F]
+  const S* dL_dvalues;  // [F]
+};
+
+// Writes the gradients of a Gaussian's colours, of the active degree. Returns dL/dmean by way of the colours.
 template <class S>
-DSMOE_HD Vec3<S> write_color_gradients(const Colors<S>& colors, Vec3<S> mean, const Camera<S>& camera,
-                                       const RasterConfig<S>& config, const S* features, const S* dL_dfeatures,
+DSMOE_HD Vec3<S> write_color_gradients(const ColorSource<S>& source, const BlendedFeatures<S>& features,
                                        const ColorGradients<S>& out) {
+  const Colors<S>& colors = source.colors;
   if (colors.given != nullptr) {
     if (out.given != nullptr) {
-      for (int c = 0; c < config.num_channels; ++c) out.given[c] = dL_dfeatures[c];
+      for (int c = 0; c < source.config.num_channels; ++c) out.given[c] = features.dL_dvalues[c];
     }
     return {S(0), S(0), S(0)};
   }
   ShWriter<S> write = {out.dc, out.shs};
   if (colors.dc == nullptr && out.shs != nullptr) write = {out.shs, out.shs + 3};
-  return sh_color_backward(sh_rules(colors, camera, config), mean, colors.sh(), load3(features), load3(dL_dfeatures),
-                           write);
+  return sh_color_backward(source.sh_rules(), source.mean, colors.sh(), load3(features.values),
+                           load3(features.dL_dvalues), write);
 }
 
-// What a Gaussian's pixels hand back. dL_dfeatures: [F]. color: what write_color_gradients returned.
+// Puts together what a Gaussian's pixels hand back. dL_dfeatures: [F]. color: what write_color_gradients returned.
 template <class S>
 DSMOE_HD ProjectedGradient<S> projected_gradient(const GateGradient<S>& gate, const S* dL_dfeatures, Vec3<S> color,
                                                  const RasterConfig<S>& config) {
@@ -133,7 +144,7 @@ DSMOE_HD ProjectedGradient<S> projected_gradient(const GateGradient<S>& gate, co
   return out;
 }
 
-// Writes the gradients of Gaussian i, but for those of its colours.
+// Writes the gradients of Gaussian i, except those of its colours.
 template <class S>
 DSMOE_HD void store_gradient(const GaussianGradient<S>& g, const GaussianGradients<S>& out, int64_t i) {
   if (out.means3D != nullptr) store3(out.means3D + 3 * i, g.mean);
@@ -158,39 +169,51 @@ template <class S> DSMOE_HD void store_zeros(const ColorGradients<S>& out, int n
   clear(out.given, num_channels), clear(out.dc, 3), clear(out.shs, 3 * num_sh);
 }
 
-// Writes zeros for every gradient of Gaussian i.
+// Writes zeros to every gradient of Gaussian i.
 template <class S> DSMOE_HD void store_zeros(const GaussianGradients<S>& out, int num_channels, int num_sh, int64_t i) {
   store_gradient(GaussianGradient<S>{}, out, i);
   store_zeros(color_gradients_of(out, num_channels, num_sh, i), num_channels, num_sh);
 }
 
-// Projects Gaussian i, shape and features; features: [F]. The radius is 0 where it is culled, and then the rest means
-// nothing.
-template <class S>
-DSMOE_HD Projection<S> project_gaussian(const GaussianInputs<S>& in, const Camera<S>& camera,
-                                        const RasterConfig<S>& config, int64_t i, S* features) {
-  const Gaussian<S> gaussian = load_gaussian(in, i);
-  Projection<S> out = project(gaussian, camera, config.projection_rules());
-  if (out.radius > 0 && !write_features(colors_of(in, config.num_channels, i), gaussian.mean, camera, config,
-                                        out.gaussian.depth, features)) {
-    out.radius = 0;
+// One Gaussian of a rendering.
+template <class S> struct RenderedGaussian {
+  const GaussianInputs<S>& inputs;
+  const Camera<S>& camera;
+  const RasterConfig<S>& config;
+  int64_t index;  // of the Gaussian
+
+  DSMOE_HD ColorSource<S> color_source(Vec3<S> mean) const {
+    return {colors_of(inputs, config.num_channels, index), mean, camera, config};
   }
+};
+
+// Projects a Gaussian, and writes its features, [F]. The radius is 0 where the Gaussian is culled. Then the rest means
+// nothing.
+template <class S> DSMOE_HD Projection<S> project_gaussian(const RenderedGaussian<S>& of, S* features) {
+  const Gaussian<S> gaussian = load_gaussian(of.inputs, of.index);
+  Projection<S> out = project(gaussian, of.camera, of.config.projection_rules());
+  if (out.radius > 0 && !write_features(of.color_source(gaussian.mean), out.gaussian.depth, features)) out.radius = 0;
   return out;
 }
 
-// Writes the gradients of Gaussian i, but for coefficients above the active degree; returns its share of the camera's.
+// What the pixels of a Gaussian hand back to it.
+template <class S> struct PixelSums {
+  GateGradient<S> gate;         // by its shape and opacity on the image
+  BlendedFeatures<S> features;  // and the gradients by them
+};
+
+// Writes the gradients of a Gaussian, but for coefficients above the active degree. Returns the Gaussian's share of the
+// camera's gradient.
 template <class S>
-DSMOE_HD CameraShare<S> project_gaussian_backward(const GaussianInputs<S>& in, const Camera<S>& camera,
-                                                  const RasterConfig<S>& config, int64_t i, const S* features,
-                                                  const GateGradient<S>& gate, const S* dL_dfeatures,
+DSMOE_HD CameraShare<S> project_gaussian_backward(const RenderedGaussian<S>& of, const PixelSums<S>& sums,
                                                   const GaussianGradients<S>& out) {
-  const Gaussian<S> gaussian = load_gaussian(in, i);
-  const Vec3<S> color =
-      write_color_gradients(colors_of(in, config.num_channels, i), gaussian.mean, camera, config, features,
-                            dL_dfeatures, color_gradients_of(out, config.num_channels, in.num_sh, i));
-  const auto gradient = project_backward(gaussian, camera, config.projection_rules(),
-                                         projected_gradient(gate, dL_dfeatures, color, config));
-  store_gradient(gradient, out, i);
+  const RasterConfig<S>& config = of.config;
+  const Gaussian<S> gaussian = load_gaussian(of.inputs, of.index);
+  const Vec3<S> color = write_color_gradients(of.color_source(gaussian.mean), sums.features,
+                                              color_gradients_of(out, config.num_channels, of.inputs.num_sh, of.index));
+  const auto gradient = project_backward(gaussian, of.camera, config.projection_rules(),
+                                         projected_gradient(sums.gate, sums.features.dL_dvalues, color, config));
+  store_gradient(gradient, out, of.index);
   return gradient.camera;
 }
 

@@ -1,6 +1,6 @@
-// The blend modes. Each is a small policy: `accumulate` takes a pair front to back and returns its weight,
-// `background_gate` and `kDivides` make the pixel of the sums (pixel.h), `backward` takes the pairs back to front. A
-// policy also carries every fact of its mode. All other code asks the policy, or iterates BlendModes.
+// The blend modes. Each is a small policy. `accumulate` takes pairs front to back and returns the weight of each.
+// `background_gate` and `kDivides` say how the sums become a pixel (pixel.h). `backward` takes the pairs back to front.
+// A policy also carries every fact of its mode. All other code asks the policy, or iterates BlendModes.
 //
 // With alpha_i the gate logit, T_i = prod_{j<i} (1 - alpha_j) (Eq. 4), c_i the expert, w_i = alpha_i T_i, W = sum w_i
 // and T what is left behind the last pair:
@@ -19,8 +19,8 @@
 //
 //   gamma_i = w_i u_i - alpha_i / (1 - alpha_i) R_i,   dL/dc_i = w_i g'
 //
-// where b is g'.C: the pixel's own colour is what each expert is measured against. At lambda = 1 all terms in b cancel,
-// and alpha leaves them out.
+// where b = g'.C: each expert is compared with the pixel's own colour. At lambda = 1 all terms in b cancel, and the
+// mode alpha leaves them out.
 #pragma once
 
 #include <type_traits>
@@ -77,7 +77,7 @@ template <class Real> struct PairWeight {
   Mask<Real> contributes;  // to the numerator
 };
 
-// What the backward pass knows of a pixel; g' itself is one number a channel and stays with the caller.
+// What the backward pass knows of a pixel. The caller keeps g', which is one number for each channel.
 template <class Real> struct PixelBackward {
   Real transmittance;  // T behind the current pair
   Real suffix;         // R
@@ -89,7 +89,7 @@ template <class Real> struct PairGradient {
   Real weight;  // w; dL/dc = w g'
 };
 
-// Eq. 4 and the stop, shared by the modes with transmittance: the pair that would close the pixel is left out.
+// Eq. 4, for the modes with transmittance, and where a pixel stops: the pair that would close it is left out.
 template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state, const Gate<Real>& gate) {
   using S = Scalar<Real>;
   const Real before = state.transmittance;
@@ -116,16 +116,16 @@ DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, const 
   return {select(contributes, gamma, Real(S(0))), weight};
 }
 
-// The arithmetic of all modes: whether w_i holds T_i, or is alpha_i; and whether the denominator sums w_i, or alpha_i
-// of every pair that counts, seen or hidden. And the facts that the modes have in common.
+// The arithmetic of all modes, and the facts that most of them share. kTInNumerator: w_i is alpha_i T_i; else alpha_i.
+// kTInDenominator: the denominator sums w_i; else alpha_i of every pair that counts, even behind a full pixel.
 template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   static constexpr Cut kCut = Cut::kKernel;                  // which pairs count
-  static constexpr bool kWithinRadius = false;               // and only in the tiles of the 3-sigma square
+  static constexpr bool kWithinRadius = false;               // pairs outside the tiles of the 3-sigma square do not
   static constexpr bool kNeedsDepthOrder = kTInNumerator;    // pairs are taken front to back
   static constexpr bool kStopsEarly = kTInDenominator;       // once full, a pixel is done
   static constexpr bool kSuffixAboutBase = kTInDenominator;  // u_i = g'.c_i - b; else g'.c_i
-  static constexpr bool kDivides = true;                     // by D; else D is 1, and never formed
-  static constexpr bool kLearnsGate = false;                 // lambda is a variable
+  static constexpr bool kDivides = true;                     // a pixel is divided by D; else D is 1
+  static constexpr bool kLearnsGate = false;                 // the caller gives lambda, and may learn it
   template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda
 
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
@@ -183,8 +183,9 @@ DSMOE_HD constexpr bool within_radius(BlendMode mode) {
   return within;
 }
 
-// Continues in front of pairs that another walk has taken: `transmittance` is what they met, `behind` their sum w g'.c.
-// Where u is g'.c - b, their sum w b is b times the transmittance they took: sum w = T in front of them - T behind.
+// Continues a backward walk in front of pairs that another walk takes. transmittance: T in front of those pairs.
+// behind: their sum w g'.c. Where u is g'.c - b, the sum needs their sum w b too, which is b times
+// (T in front of them - T behind them).
 template <BlendMode kMode, class Real>
 DSMOE_HD void resume_backward(PixelBackward<Real>& pixel, Real transmittance, Real behind) {
   pixel.suffix = pixel.suffix + behind;

@@ -1,4 +1,4 @@
-// The camera: from world points to view space and to pixels, each backward under its forward.
+// The camera: from world points to view space and to pixels. Each backward function stands below its forward.
 #pragma once
 
 #include "dsmoe/constants.h"
@@ -6,8 +6,8 @@
 
 namespace dsmoe {
 
-// Matrices as the trainers pass them: element [4 * row + column] of the transposed matrix, so that a point is a row
-// vector to its left. view: world to view; projection: world to clip, principal point included.
+// Matrices are transposed, as the trainers pass them: a point is a row vector, to the left of the matrix. They are
+// stored row by row. view: world to view. projection: world to clip, with the principal point.
 template <class S> struct Camera {
   int width = 0, height = 0;       // pixels
   S tan_fov_x = 0, tan_fov_y = 0;  // tan of half the field of view
@@ -17,7 +17,7 @@ template <class S> struct Camera {
   S near = S(0.2);                 // view depth; nearer Gaussians are culled
 };
 
-// What one Gaussian adds to the gradient of its camera, as the vectors that it is made of.
+// What one Gaussian adds to the gradient of its camera: vectors, from which CameraGradient makes the matrices.
 template <class S> struct CameraShare {
   Vec3<S> point;         // the Gaussian's mean, world
   Vec3<S> dL_dview;      // by the point in view space
@@ -59,7 +59,7 @@ template <class S> DSMOE_HD Vec3<S> transform_point(const S* m, Vec3<S> p) {
           m[2] * p.x + m[6] * p.y + m[10] * p.z + m[14]};
 }
 
-// dL/dp. What the matrix gets is CameraShare's.
+// Returns dL/dp. The gradient by the matrix is CameraGradient's affair.
 template <class S> DSMOE_HD Vec3<S> transform_point_backward(const S* m, Vec3<S> dL_dout) {
   return {m[0] * dL_dout.x + m[1] * dL_dout.y + m[2] * dL_dout.z,
           m[4] * dL_dout.x + m[5] * dL_dout.y + m[6] * dL_dout.z,
@@ -71,7 +71,7 @@ template <class S> DSMOE_HD Mat3<S> view_rotation(const S* m) {
   return {{m[0], m[4], m[8]}, {m[1], m[5], m[9]}, {m[2], m[6], m[10]}};
 }
 
-// World to pixel coordinates; pixel centres are integers, NDC -1 and 1 are the outer edges of the border pixels.
+// World to pixel coordinates. Pixel centres are integers. NDC -1 and 1 are the outer edges of the border pixels.
 template <class S> DSMOE_HD Vec2<S> project_to_pixel(const Camera<S>& camera, Vec3<S> p) {
   const S* m = camera.projection;
   const Vec3<S> clip = transform_point(m, p);

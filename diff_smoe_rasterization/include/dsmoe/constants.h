@@ -7,9 +7,9 @@ namespace dsmoe {
 constexpr float kAlphaMax = 0.99f;          // alpha never reaches 1, so that transmittance can be divided back
 constexpr float kAlphaCut = 1.0f / 255.0f;  // `alpha` mode skips fainter pairs: invisible in 8 bits
 constexpr float kGateCut = 1e-5f;           // SMoE modes skip smaller kernels (the paper's rule; on G, not alpha)
-// exp(-4.5), G at 3 sigma. Under a background gate lambda a pair moves a pixel by at most alpha / lambda, so pairs with
-// alpha < lambda / 255 go as they do in `alpha` mode. Inside 3 sigma they stay: a Gaussian that is cut everywhere has
-// no gradient, and never comes back.
+// exp(-4.5), G at 3 sigma. Under a background gate lambda a pair changes a pixel by at most alpha / lambda. So pairs
+// with alpha < lambda / 255 do not count, as in `alpha` mode. Inside 3 sigma they do: a Gaussian that is cut everywhere
+// has no gradient, and would never come back.
 constexpr float kCoreKernel = 0.011108996538242306f;
 constexpr float kTransmittanceCut = 1e-4f;     // a pixel is full where the next pair would leave less
 constexpr float kGateSumCut = 1e-30f;          // below it no gate is open: the pixel takes the background

@@ -1,5 +1,6 @@
-// What one (Gaussian, pixel) pair adds to the sums that score its Gaussian: how much of an image, or of a map over it,
-// a Gaussian answers for. Only pairs that the blend took count, with their weight in the numerator of the blend mode.
+// What one (Gaussian, pixel) pair adds to the sums that score its Gaussian. The sums say how much of an image, or of a
+// map over it, is due to the Gaussian. Only pairs that the blend took count, with their weight in the numerator of the
+// blend mode.
 #pragma once
 
 #include "dsmoe/blend.h"

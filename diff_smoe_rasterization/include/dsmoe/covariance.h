@@ -1,4 +1,5 @@
-// Covariances: from scale and rotation to 3D, from 3D to the image plane, each backward under its forward.
+// Covariances: from scale and rotation to 3D, and from 3D to the image plane. Each backward function stands below its
+// forward.
 #pragma once
 
 #include "dsmoe/camera.h"
@@ -70,7 +71,7 @@ template <class S> DSMOE_HD Mat23<S> image_axes(const Mat23<S>& jacobian, const 
   return {transposed_times(rotation, jacobian.r0), transposed_times(rotation, jacobian.r1)};
 }
 
-// Of a given covariance: Sigma2D = M Sigma M^T, before the low-pass filter.
+// The image covariance of a given 3D covariance: Sigma2D = M Sigma M^T, before the low-pass filter.
 template <class S> DSMOE_HD Sym2<S> covariance_2d(const Mat23<S>& axes, const Sym3<S>& cov) {
   const Vec3<S> u = cov * axes.r0, v = cov * axes.r1;
   return {dot(axes.r0, u), dot(axes.r0, v), dot(axes.r1, v)};
@@ -98,8 +99,9 @@ DSMOE_HD Covariance2dGradient<S> covariance_2d_backward(const Mat23<S>& axes, co
   return {dL_dcovariance(axes, g), {S(2) * g.xx * u + g.xy * v, g.xy * u + S(2) * g.yy * v}};
 }
 
-// Of scale and rotation, Sigma = R S S^T R^T (3DGS Eq. 6): Sigma2D = L L^T with L = M R S. The determinant is the sum
-// of the squared minors of L: no term cancels, however long and thin the Gaussian is. scale holds the scale modifier.
+// The image covariance of scale and rotation. Sigma = R S S^T R^T (3DGS Eq. 6), so Sigma2D = L L^T with L = M R S. Its
+// determinant is the sum of the squared minors of L. No term of that sum cancels another, however long and thin the
+// Gaussian is. The scale has the scale modifier in it.
 template <class S> struct ImageFactor {
   Mat23<S> turned;  // M R
   Mat23<S> half;    // L
@@ -121,8 +123,8 @@ template <class S> struct ImageFactorGradient {
   Mat23<S> axes;
 };
 
-// By R through Sigma, of which column k of R contributes scale_k^2 r_k r_k^T: the derivative by Sigma is symmetric to
-// the last bit, so that a round Gaussian's unturned quaternion gets a gradient of exactly 0, and not rounding.
+// The derivative by R is taken through Sigma, to which column k of R adds scale_k^2 r_k r_k^T. The derivative by Sigma
+// is symmetric to the last bit. So the unturned quaternion of a round Gaussian has a gradient of exactly 0.
 template <class S>
 DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3<S> scale, const Mat3<S>& rotation,
                                                       const ImageFactor<S>& factor, const Sym2<S>& g) {
@@ -149,7 +151,7 @@ DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3
 template <class S> struct Conic {
   Sym2<S> inverse;   // per px^2
   Sym2<S> filtered;  // Sigma2D + low-pass, px^2
-  S determinant;     // of filtered; not above 0: no footprint
+  S determinant;     // of filtered; there is no footprint where it is not above 0
   S unfiltered;      // the determinant of Sigma2D
 };
 
@@ -172,7 +174,7 @@ template <class S> DSMOE_HD Conic<S> conic_of(const ImageFactor<S>& factor) {
   return make_conic(c, unfiltered, unfiltered + S(kLowPass) * (c.xx + c.yy + S(kLowPass)));
 }
 
-// Whether the filtered covariance is positive definite; a caller's own cov3D_precomp may be anything.
+// Whether the filtered covariance is positive definite. That of a caller's cov3D_precomp may not be.
 template <class S> DSMOE_HD bool is_ellipse(const Conic<S>& conic) {
   return conic.filtered.xx > S(0) && conic.determinant > S(0) && is_finite(conic.determinant);
 }

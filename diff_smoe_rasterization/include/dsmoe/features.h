@@ -6,6 +6,10 @@
 
 namespace dsmoe {
 
+// How many features have code of their own, in float: the colours of a usual rendering. Any other number takes the
+// general code.
+constexpr int kFastFeatures = 3;
+
 template <class S> DSMOE_HD FeatureRule feature_rule(const RasterConfig<S>& config, int feature) {
   return config.depth && feature == config.num_channels ? FeatureRule::kAveraged : FeatureRule::kBlended;
 }

@@ -1,5 +1,5 @@
-// One (Gaussian, pixel) pair: the projected kernel G (Eq. 1, 2), the gate logit alpha = min(0.99, o G), which pairs
-// count, and the derivative by everything the pair came from.
+// One (Gaussian, pixel) pair: the projected kernel G (Eq. 1, 2), the gate alpha = min(0.99, o G), whether the pair
+// counts, and the derivatives by all that the pair was made of.
 #pragma once
 
 #include "dsmoe/constants.h"
@@ -13,7 +13,7 @@ enum class Cut {
   kKernel,  // the paper: those of G >= 1e-5, and of the least alpha below
 };
 
-// The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels: d = pixel - mean, d.x fixed, d.y free.
+// The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels. d = pixel - mean; d.x is the same for all of them.
 template <class Real, class S> struct ColumnExponent {
   Real constant, linear;
   S quadratic;
@@ -34,7 +34,8 @@ template <class S> struct AlphaCut {
   DSMOE_HD S of(S opacity) const { return max(alpha_min, min(faint, opacity * S(kCoreKernel))); }
 };
 
-// The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. Negative: none does.
+// The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. Where it is negative
+// no pair counts.
 template <class S> DSMOE_HD S squared_reach(Cut cut, S opacity, S least_alpha) {
   if (!(opacity > S(0))) return S(-1);
   const S by_alpha = S(2) * log(opacity / (cut == Cut::kAlpha ? S(kAlphaCut) : least_alpha));
@@ -50,7 +51,7 @@ template <class Real> struct Gate {
 };
 
 template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
-  // Above 0 the conic is no ellipse, and the pair does not count: it must not overflow either.
+  // Where the exponent is above 0 the conic is no ellipse. Such a pair does not count, and must not overflow either.
   const Real kernel = exp(min(power, Real(S(0))));
   Gate<Real> gate;
   gate.logit = Real(opacity) * kernel;
@@ -69,7 +70,8 @@ template <class Real> DSMOE_HD Real gate_backward(const Gate<Real>& gate, Real g
   return gamma * max(Real(Scalar<Real>(1)), gate.logit * Real(Scalar<Real>(1.0 / kAlphaMax)));
 }
 
-// Sums over pixels of dL/dpower times 1, d.x, d.y, d.x^2, d.x d.y, d.y^2: all that a Gaussian's shape needs to know.
+// Sums over pixels of dL/dpower times 1, d.x, d.y, d.x^2, d.x d.y and d.y^2. The gradients of a Gaussian's shape on the
+// image need nothing else.
 template <class S> struct GateMoments { S one, x, y, xx, xy, yy; };
 constexpr int kNumGateMoments = 6;
 

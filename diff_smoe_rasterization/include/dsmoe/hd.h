@@ -1,4 +1,4 @@
-// Qualifiers for functions that run on host and device, and the scalar functions that the math needs.
+// Qualifiers for functions that run on host and device, and the scalar functions that the mathematics needs.
 #pragma once
 
 #include <cmath>
@@ -13,8 +13,8 @@
 
 namespace dsmoe {
 
-// The math headers call these unqualified, so that a SIMD pack brings its own by argument-dependent lookup.
-// A pack of pixels has a mask type and a scalar type; for a single pixel they are bool and the type itself.
+// The other headers call these functions unqualified, so that argument-dependent lookup finds those of a SIMD pack.
+// A pack of pixels has a mask type and a scalar type. For a single pixel they are bool and the type itself.
 template <class Real> struct RealTraits;
 template <> struct RealTraits<float> {
   using Scalar = float;
@@ -63,7 +63,7 @@ DSMOE_HD float reciprocal(float x) {
 }
 DSMOE_HD double reciprocal(double x) { return 1.0 / x; }
 
-// For bounds that carry a slack of a thousandth: in kernels the hardware's own, good to 22 bits.
+// For bounds that are widened by a thousandth. In kernels these are the hardware's own, good to 22 bits.
 DSMOE_HD float rough_reciprocal(float x) { return reciprocal(x); }
 DSMOE_HD double rough_reciprocal(double x) { return 1.0 / x; }
 DSMOE_HD float rough_sqrt(float x) {
@@ -86,7 +86,7 @@ DSMOE_HD float max(float a, float b) { return ::fmaxf(a, b); }
 template <class S> DSMOE_HD S clamp(S x, S low, S high) { return min(max(x, low), high); }
 template <class S> DSMOE_HD S select(bool mask, S a, S b) { return mask ? a : b; }
 
-// a b, rounded: in kernels no part of a fused multiply-add, so that equal products cancel exactly.
+// a b, rounded. In kernels it never becomes part of a fused multiply-add, so that equal products cancel exactly.
 DSMOE_HD float product(float a, float b) {
 #if defined(__CUDA_ARCH__)
   return __fmul_rn(a, b);
@@ -102,8 +102,8 @@ DSMOE_HD double product(double a, double b) {
 #endif
 }
 
-// a b - c d with one rounding error of the result instead of the products' (Kahan): determinants of long, thin
-// Gaussians cancel almost completely.
+// a b - c d, with an error of the result's rounding and not of the products' (Kahan). In determinants of long, thin
+// Gaussians the products cancel almost completely.
 template <class S> DSMOE_HD S difference_of_products(S a, S b, S c, S d) {
   const S cd = c * d;
   const S error = fma(-c, d, cd);

@@ -14,7 +14,7 @@ template <class S> struct ImageLoss {
   const uint8_t* target_bytes;  // y times 255 instead
   int64_t planes;
   int height, width;
-  int margin;  // pixels at each side that the mean of SSIM leaves out
+  int margin;  // pixels at each side of a plane that the mean of SSIM leaves out
   double l1_weight, ssim_weight, offset;
   S* loss;         // [1]
   S* gradient;     // [planes, height, width] by x, or null
@@ -42,14 +42,18 @@ template <class S> DSMOE_HD S sign(S value) { return S(value > 0) - S(value < 0)
 
 namespace cpu {
 
+// How many numbers ImageLoss::sums must have.
 int64_t num_image_loss_sums(int64_t planes, int height, int width);
+
+// Writes the loss, and the gradient where it is not null. All pointers are to memory of the host.
 template <class S> void image_loss(const ImageLoss<S>& loss, int num_threads);
 
 }  // namespace cpu
 
 namespace cuda {
 
-// The same on the current device. stream: a cudaStream_t.
+// The same on the current device, asynchronously on `stream`, a cudaStream_t. All pointers are to memory of the device.
+// Throws std::runtime_error where a launch fails.
 template <class S> int64_t num_image_loss_sums(int64_t planes, int height, int width);
 template <class S> void image_loss(const ImageLoss<S>& loss, void* stream);
 

@@ -1,5 +1,5 @@
-// Distances to the nearest other points, on a GPU. Points are sorted along a space-filling curve first, so that those
-// of a box of consecutive ones lie together and whole boxes can be left out.
+// Distances to the nearest other points, on a GPU. The caller first sorts the points along a space-filling curve. Then
+// kBoxPoints consecutive points lie close together, and the search leaves out whole boxes of them.
 #pragma once
 
 #include <cstdint>
@@ -8,17 +8,31 @@ namespace dsmoe {
 namespace cuda {
 
 constexpr int kNeighbors = 3;
-constexpr int kBoxPoints = 256;
+constexpr int kBoxPoints = 256;  // so many that few boxes are tested, so few that most of them are left out
 
-// Place of each point on the Morton curve through the bounding box. points: [N, 3]; low, high: [3]; codes: [N].
-template <class S>
-void morton_codes(const S* points, int64_t count, const S* low, const S* high, int64_t* codes, void* stream);
+// The place of each point on the Morton curve through their bounding box.
+template <class S> struct MortonCodes {
+  const S* points;  // [N, 3]
+  int64_t count;    // N
+  const S* low;     // [3] the least coordinates
+  const S* high;    // [3] the greatest ones
+  int64_t* codes;   // [N] written
+};
 
-// Mean squared distance of each point to the kNeighbors nearest others, or to as many as there are.
-// points: [N, 3] in any order, which decides the speed alone; order: [N] where the result of each goes;
-// boxes: [ceil(N / kBoxPoints), 2, 3] scratch; result: [N].
-template <class S>
-void mean_squared_distances(const S* points, const int64_t* order, int64_t count, S* boxes, S* result, void* stream);
+// Asynchronous on `stream`, a cudaStream_t. Throws std::runtime_error where the launch fails.
+template <class S> void morton_codes(const MortonCodes<S>& morton, void* stream);
+
+// The mean squared distance of each point to the kNeighbors nearest others, or to as many as there are.
+template <class S> struct NeighborDistances {
+  const S* points;       // [N, 3] in any order, which decides only the speed: that of the Morton curve is good
+  int64_t count;         // N
+  const int64_t* order;  // [N] where the result of each point goes
+  S* boxes;              // [ceil(N / kBoxPoints), 2, 3] scratch
+  S* result;             // [N] written
+};
+
+// Asynchronous on `stream`, a cudaStream_t. Throws std::runtime_error where a launch fails.
+template <class S> void mean_squared_distances(const NeighborDistances<S>& search, void* stream);
 
 }  // namespace cuda
 }  // namespace dsmoe

@@ -70,7 +70,7 @@ template <class S> struct SavedForward {
   int32_t* last_contributor = nullptr;        // [H, W] how many entries of the tile's list the numerator has seen
 };
 
-// What the lengths of those arrays follow from.
+// The numbers that decide how long those arrays are.
 struct SavedSizes {
   int64_t num_gaussians = 0;   // N
   int64_t num_features = 0;    // F; -1: not known
@@ -91,7 +91,7 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("instances", saved.instances, sizes.num_instances);
 }
 
-// Seconds of each stage, and the work the blend did, of the calls that were given this struct.
+// Seconds of each stage, and how much work the blend did. Each call that is given this struct adds to it.
 struct StageTimes {
   double project = 0, sort = 0, bin = 0, blend = 0;
   double blend_backward = 0, project_backward = 0;
@@ -120,7 +120,7 @@ template <class S> struct ContributionMap {
   ContributionSums<S> sums;
 };
 
-// Any of these may be null: that output was not used.
+// Any of these may be null. Then that output was not used.
 template <class S> struct ImageGradients {
   const S* color = nullptr;          // [C, H, W]
   const S* gate_sum = nullptr;       // [H, W]; gradient on the alpha image
@@ -128,7 +128,7 @@ template <class S> struct ImageGradients {
   const S* inverse_depth = nullptr;  // [H, W]
 };
 
-// Any of these may be null: that gradient is not wanted. The others are written whole.
+// Any of these may be null. Then that gradient is not wanted. The others are written whole.
 template <class S> struct GaussianGradients {
   S* means3D = nullptr;         // [N, 3]
   S* means2D = nullptr;         // [N, 3] dL/dpixel times (W/2, H/2), z = 0: what densification reads
@@ -141,6 +141,22 @@ template <class S> struct GaussianGradients {
   S* shs = nullptr;             // [N, K, 3]
   S* background = nullptr;      // [C + 1] by the colour, then by its gate
   CameraGradient<S>* camera = nullptr;
+};
+
+// One rendering, from its inputs to what it leaves for the backward pass. The backends differ in where the camera lies
+// and in what they save: cpu::Frame and cuda::Frame.
+template <class S, class BackendCamera, class BackendSaved> struct RenderingFrame {
+  GaussianInputs<S> inputs;  // what is rendered
+  BackendCamera camera;      // from where, and the size of the image
+  RasterConfig<S> config;    // how
+  ImageOutputs<S> images;    // where the results go
+  BackendSaved saved;        // filled by `forward`
+};
+
+// What a backward pass is given and what it writes.
+template <class S> struct Gradients {
+  ImageGradients<S> images;     // given, by the images
+  GaussianGradients<S> inputs;  // written, by the inputs
 };
 
 }  // namespace dsmoe

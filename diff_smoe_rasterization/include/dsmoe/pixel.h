@@ -1,4 +1,4 @@
-// A pixel behind its last pair: from its sums to its features, and where its backward pass begins.
+// A pixel behind its last pair: how its sums become its features, and how its backward pass begins.
 #pragma once
 
 #include <cmath>
@@ -7,7 +7,7 @@
 
 namespace dsmoe {
 
-// A feature is what a pixel blends: colour channels and, on request, z and 1 / z. This says how one is finished.
+// A feature is a number that a pixel blends: a colour channel or, on request, z or 1 / z. This says how it is finished.
 enum class FeatureRule {
   kBlended,   // by the mode: colour, and inverse depth over background 0
   kAveraged,  // divided by the gate sum in every mode: expected depth

@@ -1,5 +1,5 @@
-// One Gaussian from world to image plane, and its gradient back: composes camera, covariance, gate and tiles. Values go
-// in and come out; where they lie in memory is the backends' affair (arrays.h).
+// One Gaussian from the world to the image plane, and its gradient back. Values go in and come out. arrays.h loads and
+// stores them.
 #pragma once
 
 #include <cstdint>
@@ -11,7 +11,7 @@
 
 namespace dsmoe {
 
-// What shapes a Gaussian: its covariance is given, or made of scale and rotation.
+// What a Gaussian is made of, except its colours. Its covariance is given, or made of scale and rotation.
 template <class S> struct Gaussian {
   Vec3<S> mean;  // world
   S opacity;     // may exceed 1
@@ -40,7 +40,7 @@ template <class S> struct alignas(16) ProjectedGaussian {
 constexpr int kProjectedGaussianSize = 8;
 
 template <class S> struct Projection {
-  int32_t radius;  // pixels; 0 where the Gaussian is culled, and then the rest means nothing
+  int32_t radius;  // pixels; 0 where the Gaussian is culled: then the rest means nothing
   ProjectedGaussian<S> gaussian;
 };
 
@@ -56,9 +56,9 @@ template <class S> DSMOE_HD bool is_finite(const Gaussian<S>& g) {
   return all_finite(place, 4) && all_finite(shape, 7);
 }
 
-// The tiles that may hold pairs of a Gaussian; the radius counts where the mode is within_radius().
-template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, const Camera<S>& camera, Vec2<S> mean, S radius) {
-  const TileGrid grid(camera.width, camera.height);
+// The tiles that may hold pairs of a Gaussian. mean and radius: pixels. The radius is only read where the mode is
+// within_radius().
+template <class S> DSMOE_HD TileRect tile_bounds(BlendMode mode, TileGrid grid, Vec2<S> mean, S radius) {
   if (within_radius(mode)) return radius_rect(mean, radius, grid);
   return {0, 0, grid.columns, grid.rows};
 }
@@ -109,7 +109,7 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
   const Cut cut = cut_of(rules.mode);
   const S widest_reach = squared_reach(cut, S(1), S(0));
   const bool seen = within_radius(rules.mode)
-                        ? !tile_bounds(rules.mode, camera, pixel, radius).empty()
+                        ? !tile_bounds(rules.mode, TileGrid(camera.width, camera.height), pixel, radius).empty()
                         : meets_image(conic.inverse, pixel, widest_reach, camera.width, camera.height);
   if (!seen) return out;
   S opacity = gaussian.opacity;

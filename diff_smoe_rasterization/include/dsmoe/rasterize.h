@@ -5,14 +5,13 @@
 //     cpu::forward(frame, heap);                  // the images, and what the backward pass needs
 //     cpu::backward(frame, gradients);            // from gradients by the images to gradients by the inputs
 //
-// The stages that these two run, in their order, are declared below and can be called one by one. Then the caller
+// The stages that these two run are declared below in their order. They can be called one by one. Then the caller
 // allocates what `saved` points to.
 //
 // Results do not depend on config.num_threads, bit for bit.
 #pragma once
 
 #include <cstdint>
-#include <memory>
 #include <vector>
 
 #include "dsmoe/allocator.h"
@@ -21,25 +20,13 @@
 namespace dsmoe {
 namespace cpu {
 
-using dsmoe::StageTimes;
+using dsmoe::Gradients;
 
-// One rendering, from its inputs to what it leaves for the backward pass.
-template <class S> struct Frame {
-  GaussianInputs<S> inputs;
-  Camera<S> camera;
-  RasterConfig<S> config;
-  ImageOutputs<S> images;  // where the results go
-  SavedForward<S> saved;   // filled by `forward`
-};
-
-// What a backward pass is given and what it writes.
-template <class S> struct Gradients {
-  ImageGradients<S> images;
-  GaussianGradients<S> inputs;
-};
+// One rendering. All pointers are to memory of the host.
+template <class S> using Frame = RenderingFrame<S, Camera<S>, SavedForward<S>>;
 
 // Renders frame.inputs to frame.images and fills frame.saved. times: is added to, or null.
-// Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
+// Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots, and std::bad_alloc.
 template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* times = nullptr);
 
 // Writes gradients.inputs. `frame` is as `forward` left it.
@@ -48,7 +35,7 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& grad
 // Fills frame.images.radii as `forward` does, and nothing else.
 template <class S> void radii(const Frame<S>& frame, Scratch& scratch);
 
-// The sizes of what `forward` keeps; how many instances there are is not known yet.
+// The sizes of what `forward` keeps. How many instances there are is not known yet.
 template <class S> SavedSizes saved_sizes(const Frame<S>& frame) {
   SavedSizes sizes;
   sizes.num_gaussians = frame.inputs.num_gaussians;
@@ -58,18 +45,20 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame) {
   return sizes;
 }
 
-// Keeps everything until it is destroyed.
+// Memory of the host. Everything lasts as long as the object.
 class Heap final : public Allocator {
  public:
-  void* allocate(size_t bytes) override {
-    blocks_.emplace_back(new char[bytes]);
-    return blocks_.back().get();
-  }
-  void* keep(int, const SavedArray& array) override { return allocate(array.bytes()); }
-  void release() override {}
+  Heap() = default;
+  Heap(const Heap&) = delete;
+  Heap& operator=(const Heap&) = delete;
+  ~Heap();
+
+  void* allocate(size_t bytes) override;
+  void* keep(int index, const SavedArray& array) override;
+  void release() override;
 
  private:
-  std::vector<std::unique_ptr<char[]>> blocks_;
+  std::vector<void*> blocks_;
 };
 
 // Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are.

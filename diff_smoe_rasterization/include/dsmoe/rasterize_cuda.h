@@ -17,13 +17,14 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <type_traits>
 #include <vector>
 
 #include "dsmoe/allocator.h"
+#include "dsmoe/depth_bits.h"
+#include "dsmoe/features.h"
 #include "dsmoe/params.h"
 
-using cudaStream_t = struct CUstream_st*;  // as CUDA's own headers have it, which callers without CUDA lack
+using cudaStream_t = struct CUstream_st*;  // as in CUDA's own headers, which a caller need not have
 
 namespace dsmoe {
 namespace cuda {
@@ -41,10 +42,10 @@ template <class S> struct DeviceCamera {
 // Numbers between the rows of `features`: rows begin at multiples of four, so that they load as vectors.
 DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features + 3) / 4 * 4; }
 
-// Lists longer than this are walked in segments by the backward pass of float and three features, the rest whole.
+// The backward pass of float and kFastFeatures features walks lists longer than this in segments. All others it walks
+// whole.
 constexpr int kSegmentLength = 512;
-constexpr int kSegmentFeatures = 3;
-constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kSegmentFeatures);  // numbers
+constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kFastFeatures);  // numbers
 DSMOE_HD constexpr int64_t num_segment_rows(int64_t capacity) { return capacity / kSegmentLength + 1; }
 DSMOE_HD constexpr int64_t num_queue_entries(int64_t capacity) { return 1 + 4 * num_segment_rows(capacity); }
 
@@ -66,7 +67,7 @@ template <class S> struct SavedForward {
   int32_t* last_contributor = nullptr;  // [H, W] how many entries of the list the numerator has seen
 };
 
-// What the lengths of those arrays follow from.
+// The numbers that decide how long those arrays are.
 struct SavedSizes {
   int64_t num_gaussians = 0;  // N
   int64_t num_features = 0;   // F; -1: not known
@@ -95,27 +96,17 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("segment_queue", saved.segment_queue, !sizes.segments ? 0 : known ? 2 * num_queue_entries(sizes.capacity) : -1);
 }
 
-// Sets what is no array of its own, once the arrays are there.
+// Sets the fields that are no arrays of their own. Call it when the arrays have their memory.
 template <class S> void complete(SavedForward<S>& saved, const SavedSizes& sizes) {
   saved.num_instances = saved.tile_offsets + sizes.tiles + 1;
   saved.capacity = sizes.capacity;
   saved.instance_width = sizes.slots ? 2 : 1;
 }
 
-// One rendering, from its inputs to what it leaves for the backward pass.
-template <class S> struct Frame {
-  GaussianInputs<S> inputs;
-  DeviceCamera<S> camera;
-  RasterConfig<S> config;
-  ImageOutputs<S> images;  // where the results go
-  SavedForward<S> saved;   // filled by `forward`
-};
+using dsmoe::Gradients;
 
-// What a backward pass is given and what it writes.
-template <class S> struct Gradients {
-  ImageGradients<S> images;
-  GaussianGradients<S> inputs;
-};
+// One rendering. All pointers are to memory of the device.
+template <class S> using Frame = RenderingFrame<S, DeviceCamera<S>, SavedForward<S>>;
 
 // How a pass runs.
 struct Run {
@@ -137,7 +128,7 @@ void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& r
 // Fills frame.images.radii as `forward` does, and nothing else.
 template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory);
 
-// The sizes of what `forward` keeps; the capacity is not known yet.
+// The sizes of what `forward` keeps. The capacity is not known yet.
 template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run) {
   SavedSizes sizes;
   sizes.num_gaussians = frame.inputs.num_gaussians;
@@ -145,7 +136,7 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run)
   sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
   sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
   sizes.slots = run.deterministic;
-  sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kSegmentFeatures;
+  sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
   return sizes;
 }
 
@@ -167,17 +158,14 @@ class StreamMemory final : public Allocator {
   std::vector<void*> scratch_, kept_;
 };
 
-// The bits of a positive float, read as an integer, are in the order of the float.
-template <class S> using DepthBits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
-
 // What the depth sort sorts.
 template <class S> struct DepthKeys {
   DepthBits<S>* depths = nullptr;  // [N] the greatest number for culled Gaussians; null: no depth order is wanted
   int32_t* gaussians = nullptr;    // [N] 0, 1, 2, ...; ~i for a culled Gaussian i
 };
 
-// Whether the mode needs saved.order by depth. Where not, project gets saved.order itself as keys.gaussians, and
-// culled ones keep their places.
+// Whether the mode needs saved.order to be the depth order. Where it does not, the caller gives `project` saved.order
+// itself as keys.gaussians, and culled Gaussians keep their places.
 bool needs_depth_order(BlendMode mode);
 
 // How a stage runs.

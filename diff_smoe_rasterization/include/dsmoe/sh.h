@@ -1,4 +1,4 @@
-// View-dependent colour from real spherical harmonics up to degree 3, backward under forward.
+// View-dependent colour from real spherical harmonics up to degree 3. Each backward function stands below its forward.
 #pragma once
 
 #include "dsmoe/vec.h"
@@ -26,7 +26,7 @@ constexpr double kSh3_4 = -0.4570457994644658;
 constexpr double kSh3_5 = 1.445305721320277;
 constexpr double kSh3_6 = -0.5900435899266435;
 
-// One number per coefficient; those above the degree in use mean nothing.
+// One number per coefficient. Those above the degree in use mean nothing.
 template <class S> struct ShNumbers {
   S values[kMaxShCoefficients];
   DSMOE_HD S& operator[](int k) { return values[k]; }
@@ -84,7 +84,7 @@ template <class S> DSMOE_HD Vec3<S> sh_basis_backward(int degree, Vec3<S> d, con
   return out;
 }
 
-// The viewing direction; a Gaussian at the camera centre has none and is seen as degree 0 sees it.
+// The viewing direction. A Gaussian at the camera's centre has none, and shows its colour of degree 0.
 template <class S> struct ViewDirection {
   Vec3<S> unit;
   S inverse_length;  // of the offset from the camera

@@ -1,5 +1,5 @@
-// Which tiles, and which rows of a tile, a footprint meets: exact ellipse against axis-aligned band, and Inria's
-// tile rectangle. All tests are bounds, widened by kFootprintSlack: every pixel that counts passes them.
+// Which tiles, and which rows of a tile, a footprint meets: the exact ellipse against an axis-aligned band, and Inria's
+// tile rectangle. All tests are bounds, widened by kFootprintSlack, so that every pixel that counts passes them.
 #pragma once
 
 #include "dsmoe/constants.h"
@@ -13,12 +13,14 @@ struct TileRect {
   DSMOE_HD bool empty() const { return x0 >= x1 || y0 >= y1; }
 };
 
+// The tiles of an image.
 struct TileGrid {
   int columns, rows;
+  TileGrid() = default;
   DSMOE_HD TileGrid(int width, int height) : columns((width - 1) / kTileSize + 1), rows((height - 1) / kTileSize + 1) {}
 };
 
-// floor(x) and ceil(x), kept in [low, high], 0 <= low; also defined where x is beyond every integer.
+// floor(x) and ceil(x), clamped to [low, high] with 0 <= low. They are defined even where x is beyond every integer.
 template <class S> DSMOE_HD int floor_to_int(S x, int low, int high) {
   return static_cast<int>(clamp(x, S(low), S(high)));
 }
@@ -42,7 +44,8 @@ template <class S> struct Interval {
   DSMOE_HD bool empty() const { return !(low <= high); }
 };
 
-// The ellipse conic.xx u^2 + 2 conic.xy u v + conic.yy v^2 <= reach, centred at 0: its extent in u over a band of v.
+// The ellipse conic.xx u^2 + 2 conic.xy u v + conic.yy v^2 <= reach around 0. It says how far the ellipse extends in u
+// over a band of v.
 template <class S> class EllipseBand {
  public:
   EllipseBand() = default;
@@ -50,7 +53,8 @@ template <class S> class EllipseBand {
     reach_ = squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack);
     determinant_ = difference_of_products(conic.xx, conic.yy, conic.xy, conic.xy);
     inverse_xx_ = rough_reciprocal(conic.xx);
-    // The conic of a long needle may round to a determinant of 0 or less. Then its pairs fill a strip without end.
+    // The conic of a long needle may round to a determinant of 0 or less. Then the pairs that count fill an endless
+    // strip.
     const S scale = determinant_ > S(0) ? max(S(0), reach_ * rough_reciprocal(determinant_)) : S(INFINITY);
     v_extent_ = rough_sqrt(scale * conic.xx);
     // v where u is largest: on the line conic.xy u + conic.yy v = 0.
@@ -80,7 +84,7 @@ template <class S> class EllipseBand {
 // The tiles that a footprint meets, row by row, inside bounds.
 template <class S> class FootprintTiles {
  public:
-  // Meets none; nor does a negative reach.
+  // Meets no tile, as a negative reach does.
   DSMOE_HD FootprintTiles() : begin_(0), end_(0) {}
   DSMOE_HD FootprintTiles(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, TileRect bounds)
       : ellipse_(conic, squared_reach), mean_(mean), bounds_(bounds), begin_(0), end_(0) {

@@ -1,4 +1,4 @@
-// Small fixed-size algebra: only what the projection needs.
+// Small vectors and matrices, with what the projection needs of them.
 #pragma once
 
 #include "dsmoe/hd.h"
@@ -48,7 +48,7 @@ template <class S> DSMOE_HD Vec3<S> transposed_times(const Mat3<S>& m, Vec3<S> v
 template <class S> DSMOE_HD bool is_finite(S x) { return x - x == S(0); }
 template <class S> DSMOE_HD bool is_finite(Vec3<S> v) { return is_finite(v.x) && is_finite(v.y) && is_finite(v.z); }
 
-// 0 x is 0 for every finite x; NaN and infinity leave a NaN that survives the sums. Four sums, so that the
+// 0 x is 0 for every finite x. NaN and infinity give NaN, which stays in the sums. There are four sums, so that the
 // additions do not wait for each other.
 template <class S> DSMOE_HD bool all_finite(const S* values, int count) {
   S poison[4] = {S(0), S(0), S(0), S(0)};
