@@ -23,8 +23,8 @@ from typing import IO, Any, Dict, List, Optional, Tuple
 from ...trainer.errors import TrainerError
 from ...trainer.system.files import write_json_atomically
 from ...trainer.system.output_folder import locked
+from .names import ROW_NAME
 from .processes import die_with_parent, last_line
-from .rows import ROW_NAME
 
 LOG_NAME = "log.txt"
 SHARING = {"cuda": "cells_per_gpu", "cpu": "cells_at_once"}  # what a row's machine calls it, by device

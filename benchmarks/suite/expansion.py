@@ -111,6 +111,9 @@ def read_yaml(path: str) -> Any:
                     raise yaml.MarkedYAMLError(problem=f"{key.value!r} is there twice", problem_mark=key.start_mark)
             return node
 
+    # YAML 1.1, which PyYAML reads, takes 5e-3 for text.
+    number = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$")
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, "-+0123456789")
     try:
         with open(path, encoding="utf-8") as file:
             return yaml.load(file, Loader)

@@ -14,7 +14,8 @@ import torch.nn.functional as F
 
 from ...trainer.results.metrics import image_metrics, psnr, quantised
 from ..errors import BenchError
-from .lpips import LPIPS_KINDS, VARIABLES, Distance, lpips_network, net_of
+from .lpips import VARIABLES, Distance, lpips_network, net_of
+from .names import LPIPS_KINDS
 
 STRONG_GRADIENT = 0.05  # of luminance in [0, 1], per pixel: 13 grey levels from one pixel to the next
 EDGE_REACH = 3  # pixels in x and y
