@@ -5,6 +5,7 @@ are the harness's own. A rule that a reader would have to know beforehand is a r
 """
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 from pathlib import Path
@@ -75,14 +76,6 @@ def downscaler(config: TrainConfig, name: str) -> str:
     return name
 
 
-def common_bytes(num_primitives: int, bytes_per_primitive: Optional[int] = BYTES_PER_GAUSSIAN) -> Optional[int]:
-    """Size in the container that all methods are compared in: float32 numbers of a 3DGS Gaussian of SH degree 3.
-
-    None for primitives that are no such Gaussians.
-    """
-    return None if bytes_per_primitive is None else num_primitives * bytes_per_primitive
-
-
 def machine_of(device: str) -> Dict[str, Any]:
     """What a cell ran on."""
     return {"device": machine(device), "versions": versions()}
@@ -90,15 +83,11 @@ def machine_of(device: str) -> Dict[str, Any]:
 
 def project_commit() -> Optional[str]:
     """The commit of this project's files, "+" behind it where they were changed since; None where nothing says it."""
-    return os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT) or _commit_of_the_build()
-
-
-def _commit_of_the_build() -> Optional[str]:
-    try:
-        from ..._build_info import COMMIT
-    except ImportError:
-        return None
-    return COMMIT
+    known = os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT)
+    if known is None:
+        with contextlib.suppress(ImportError):
+            from ..._build_info import COMMIT as known
+    return known
 
 
 def commit_of(folder: str) -> Optional[str]:

@@ -141,7 +141,7 @@ def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
             (most, first), *others = sorted(cells.items(), key=lambda item: -len(item[1])) or [("", [])]
             for value, rare in others:
                 if len(rare) == len(first):
-                    raise ReportError("suite {}, scene {}".format(*place) + ": cells of different protocols stand in no "
+                    raise ReportError(f"suite {place[0]}, scene {place[1]}: cells of different protocols stand in no "
                                       f"common table: {name} is {most} in {first[0]} and {value} in {rare[0]}")
                 left_out[f"{name} is {value} in them and {most} in {len(first)} others of {place[1]}"] = rare
                 said = {cell: rules for cell, rules in said.items() if cell not in rare}

@@ -149,11 +149,11 @@ def test_a_share_is_what_a_gaussian_alone_lights_up(probe_of, mode):
     assert all(tensor.grad is None for tensor in probe.model.raw.values())
 
 
-def test_a_damaged_record_is_named(runs, tmp_path):
-    for text, told in (("{", "not valid json"), ("{}", "config lacks blend_mode")):
-        (tmp_path / mechanism.RECORD_NAME).write_text(text)
-        with pytest.raises(BenchError, match=f"mechanism.json.*{told}"):
-            mechanism.read_record(str(tmp_path))
+@pytest.mark.parametrize("text, told", [("{", "not valid json"), ("{}", "not the record"), ("[]", "not the record")])
+def test_a_damaged_record_is_named(text, told, tmp_path):
+    (tmp_path / mechanism.RECORD_NAME).write_text(text)
+    with pytest.raises(BenchError, match=f"mechanism.json.*{told}"):
+        mechanism.read_record(str(tmp_path))
 
 
 def test_the_command_trains_and_explains_its_errors(tiny_scene, tmp_path, capsys):
