@@ -25,7 +25,7 @@ def shown(table, *columns, **labels):
     found = [line for line in table.rows if line.source == tables.OURS
              and all(line.labels[index] == value for index, value in wanted.items())]
     assert len(found) == 1, [line.labels for line in table.rows]
-    texts = {column.full_name: cell.shown(column) for column, cell in zip(table.columns, found[0].cells)}
+    texts = dict(zip((column.full_name for column in table.columns), table.shown(found[0])))
     return [texts[column] for column in columns] if columns else texts
 
 
@@ -66,9 +66,9 @@ def test_the_papers_figures_stand_beside_ours_and_are_marked():
     table = table_of([row(), row(threshold=0.0002, psnr=30.0), row("fox")], "table1")
     printed = {line.labels: line.cells for line in table.rows if line.source == tables.PAPER}
     columns = [column.full_name for column in table.columns]
-    figures = [printed["sparse", "3DSMoES"][columns.index(f"Mip-NeRF 360 (ours: bonsai) {name}")].shown(None)
+    figures = [printed["sparse", "3DSMoES"][columns.index(f"Mip-NeRF 360 (ours: bonsai) {name}")].printed
                for name in ("PSNR [dB]", "SSIM", "LPIPS, paper's", "#G [M]", "own size [MB]")]
-    assert figures == ["24.43", "0.69", "0.39", "0.064", "15.4"] and printed["dense", "2DGS"][0].shown(None) == "26.88"
+    assert figures == ["24.43", "0.69", "0.39", "0.064", "15.4"] and printed["dense", "2DGS"][0].printed == "26.88"
     assert printed["sparse", "3DSMoES"][columns.index("fox PSNR [dB]")].value is None
     assert any("bonsai alone; the paper averages 9 scenes" in note for note in table.notes)
     assert any("Deep Blending and Tanks and Temples are left out" in note for note in table.notes)
