@@ -20,13 +20,13 @@ from ..errors import BenchError
 from . import require
 from .cell import SHARING, identity, shown
 from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite
-from .lpips import check_weights, files_of_weights
 from .names import CELL_NAME, CELLS_FOLDER, ROW_NAME, ROWS_NAME, SUITE_NAME, blend_of
 from .preparation import made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .rows import CellFile, CellRow, Row, cell_folders, read_object
 from .selection import chosen, earlier_rows, plan
+from .weights import check_weights, files_of_weights
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 

@@ -7,12 +7,10 @@ from typing import Callable, Dict, List, Sequence
 import numpy as np
 import torch
 
-from ..errors import BenchError
+from .weights import VARIABLES, net_of
 
 Distance = Callable[[torch.Tensor, torch.Tensor], float]  # of two images [3, H, W] in [0, 1]
 
-# Files of weights, .npz: conv1.weight [outputs, inputs, h, w], conv1.bias, ..., lin0.weight, ..., lin4.weight.
-VARIABLES = {"vgg": "DSMOE_LPIPS_VGG", "alex": "DSMOE_LPIPS_ALEX"}
 # ImageNet's mean and standard deviation, in terms of images in [-1, 1].
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 # Five blocks of convolutions (side, stride, padding), each followed by a ReLU; LPIPS compares what each block puts out.
@@ -20,11 +18,6 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 BLOCKS = {"alex": [[(11, 4, 2)], [(5, 1, 2)], [(3, 1, 1)], [(3, 1, 1)], [(3, 1, 1)]],  # Krizhevsky 2014
           "vgg": [count * [(3, 1, 1)] for count in (2, 2, 3, 3, 3)]}  # Simonyan and Zisserman 2014, configuration D
 POOLING = {"alex": [None, (3, 2), (3, 2), None, None], "vgg": [None, (2, 2), (2, 2), (2, 2), (2, 2)]}
-
-
-def net_of(kind: str) -> str:
-    """Which network a kind of LPIPS_KINDS is of: a key of BLOCKS."""
-    return "alex" if kind == "lpips_alex" else "vgg"
 
 
 def lpips_network(kind: str, device: str) -> Distance:
@@ -51,7 +44,7 @@ def lpips_network(kind: str, device: str) -> Distance:
 
 
 class FileLpips:
-    """LPIPS from a file of weights; see VARIABLES."""
+    """LPIPS from a file of weights; see weights.py."""
 
     def __init__(self, net: str, path: str, normalise: bool, device: str) -> None:
         """net: a key of BLOCKS. normalise: images in [0, 1] are taken to [-1, 1]. Raises OSError and ValueError."""
@@ -104,17 +97,3 @@ def arrays_of(path: str) -> Dict[str, np.ndarray]:
         raise
     except Exception as error:  # damaged files: numpy, zipfile and zlib raise many kinds
         raise ValueError(f"{path} is no .npz file that can be read ({type(error).__name__})") from error
-
-
-def check_weights(kinds: Sequence[str]) -> None:
-    """Raises BenchError where a variable names a file of weights that is wanted and not there."""
-    for kind in kinds:
-        variable = VARIABLES[net_of(kind)]
-        if os.environ.get(variable) and not os.path.isfile(os.environ[variable]):
-            raise BenchError(f"{variable}: {os.environ[variable]}: no such file, where the weights of {kind} must be; "
-                             "name it, or unset the variable to have torchmetrics download them")
-
-
-def files_of_weights() -> Dict[str, str]:
-    """The variables that name files of weights, with absolute paths: cells run in another folder."""
-    return {name: os.path.abspath(os.environ[name]) for name in VARIABLES.values() if os.environ.get(name)}

@@ -6,7 +6,6 @@ import shutil
 from typing import Any, Dict, List
 
 from ... import patches
-from ...trainer.scenes.synthetic import write_synthetic_scene
 from ...trainer.system.files import write_json_atomically
 from ..errors import BenchError
 from .names import CHECKOUTS, NATIVE
@@ -39,6 +38,8 @@ def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
     """The scene with its path; a synthetic one is made where it is not there yet, or was made otherwise."""
     if scene["path"] is not None:
         return scene
+    from ...trainer.scenes.synthetic import write_synthetic_scene  # it loads torch
+
     folder = os.path.join(results, "scenes", scene["name"])
     record = os.path.join(folder, "synthetic.json")  # written last
     if read_object(record) != scene["synthetic"]:

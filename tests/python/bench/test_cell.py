@@ -47,7 +47,7 @@ def test_the_process_of_a_cell_is_told_its_gpu_and_how_many_have_it(cell_file, t
     assert said[0] == "7" and said[-3:] == ["--inside", "--per-device", "2"]
 
 
-@pytest.mark.parametrize("module", ["cell", "report"])
+@pytest.mark.parametrize("module", ["cell", "engine", "report"])
 def test_what_needs_no_torch_does_not_load_it(module):
     """It takes seconds, of each cell once more."""
     program = (f"import sys, diff_smoe_rasterization.benchmarks.suite.{module}\n"

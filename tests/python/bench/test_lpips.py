@@ -9,16 +9,17 @@ from test_measure import step_image
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import lpips, measure
+from diff_smoe_rasterization.benchmarks.suite import weights as files
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures
 
 
 def test_weights_that_are_named_and_not_there_are_refused_where_they_are_wanted(monkeypatch, tmp_path):
     monkeypatch.setenv("DSMOE_LPIPS_ALEX", str(tmp_path / "absent.npz"))
-    lpips.check_weights(["lpips_vgg_std"])
+    files.check_weights(["lpips_vgg_std"])
     with pytest.raises(BenchError, match="DSMOE_LPIPS_ALEX: .*absent.npz: no such file, where the weights of lpips_al"):
-        lpips.check_weights(["lpips_vgg_std", "lpips_alex"])
+        files.check_weights(["lpips_vgg_std", "lpips_alex"])
     (tmp_path / "absent.npz").touch()
-    lpips.check_weights(["lpips_alex"])
+    files.check_weights(["lpips_alex"])
 
 
 @pytest.mark.parametrize("content, said", [
