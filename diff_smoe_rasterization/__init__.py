@@ -6,7 +6,7 @@ as with Inria's rasterizer of 2023; `blend_mode` in the settings is the one addi
 """
 import os
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, List
 
 from ._version import __version__
 from .settings import BLEND_MODES, OUTPUTS, Contributions, GaussianRasterizationSettings, Rendering
@@ -28,18 +28,25 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib
 
+    if name in _HOMES.values():
+        return importlib.import_module("." + name, __name__)
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(importlib.import_module("." + _HOMES[name], __name__), name)
     return value
 
 
+def __dir__() -> List[str]:
+    return sorted({*globals(), *_HOMES, *_HOMES.values()})
+
+
 # What is plain Python (settings, reference, the help of `dsmoe`) works without the compiled part; the names above
-# say why they cannot be had when they are asked for. To load it takes seconds, and registers torch's ops: the command
-# `dsmoe` does that where it renders, every other program here.
-if os.path.basename((getattr(sys, "argv", None) or [""])[0]) != "dsmoe":
+# say why they cannot be had when they are asked for. To load it takes seconds where torch is not loaded yet, so a
+# program pays for it when it asks for one of them. Where torch is loaded, the import registers torch's ops at once,
+# as programs expect that load an exported model; but for `dsmoe`, which does so where it renders.
+if "torch" in sys.modules and os.path.basename((getattr(sys, "argv", None) or [""])[0]) != "dsmoe":
     try:
         for _name in _HOMES:
             __getattr__(_name)

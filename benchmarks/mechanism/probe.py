@@ -63,7 +63,7 @@ class Probe:
 
     @torch.no_grad()
     def edges(self, chosen: torch.Tensor) -> Dict[str, Optional[float]]:
-        """Fractions near the strong edges of the training views (measure.EDGE_RULE).
+        """Fractions near the strong edges of the training views (protocol.EDGE_RULE).
 
         area: of the pixels. all: of the Gaussians whose centres lie inside an image, counted once a view. chosen: of
         those among them where the mask [N] (bool) is True; None where none is seen.

@@ -23,8 +23,8 @@ from typing import IO, Any, Dict, List, Optional, Tuple
 from ...trainer.errors import TrainerError
 from ...trainer.system.files import write_json_atomically
 from ...trainer.system.output_folder import locked
+from .names import ROW_NAME
 from .processes import die_with_parent, last_line
-from .rows import ROW_NAME
 
 LOG_NAME = "log.txt"
 SHARING = {"cuda": "cells_per_gpu", "cpu": "cells_at_once"}  # what a row's machine calls it, by device
@@ -68,8 +68,7 @@ def measured_row(cell: Dict[str, Any], output: str, started: float,
     return {**identity(cell), "ok": True, "reason": None,
             **{name: evaluation.metrics.get(name) for name in ("psnr", "psnr_float", "ssim", "psnr_edge")},
             "lpips": headline_lpips(outcome.lpips), "lpips_all": outcome.lpips, "num_gaussians": outcome.num_gaussians,
-            "size_bytes": {"own": outcome.own_bytes, "common": protocol.common_bytes(
-                outcome.num_gaussians, outcome.common_bytes_per_primitive)},
+            "size_bytes": {"own": outcome.own_bytes, "common": outcome.common_bytes},
             "train_seconds": outcome.train_seconds, "wall_seconds": time.time() - started, "fps": evaluation.fps,
             "peak_gpu_mib": outcome.peak_gpu_mib,
             "protocol": {**protocol.protocol_of(trained["protocol"], config, outcome.lpips), **outcome.notes},
@@ -172,14 +171,6 @@ def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: floa
         time.sleep(poll_seconds)
 
 
-def at_least_one(text: str) -> int:
-    """The number that a word of the command is. Raises ArgumentTypeError."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"is {number}; it must be at least 1")
-    return number
-
-
 def shown(value: Optional[float], form: str) -> str:
     """A figure as text; "-" where there is none, or an infinite one, for which json has no number."""
     return "-" if value is None else format(value, form)
@@ -200,7 +191,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
     parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
     parser.add_argument("--gpus", metavar="N,N", default="", help="take one of these GPUs")
-    parser.add_argument("--per-device", metavar="K", type=at_least_one,
+    parser.add_argument("--per-device", metavar="K", type=int,
                         help="cells that may have one GPU, or on the CPU this machine, at once; the row says it "
                              "(default: 1 with --gpus, else nothing is said)")
     parser.add_argument("--locks", metavar="FOLDER", help="where cells tell each other which GPU they have")

@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 from functools import partial
-from types import MappingProxyType
 from typing import IO, Any, Dict, List, Mapping, Optional, Sequence
 
 from ...trainer.system.files import write_json_atomically, write_text_atomically
@@ -21,24 +20,13 @@ from ..errors import BenchError
 from . import require
 from .cell import SHARING, identity, shown
 from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite
-from .lpips import check_weights, files_of_weights
-from .names import blend_of
-from .preparation import given, made_scene, prepared_method, what_is_missing
+from .names import CELL_NAME, CELLS_FOLDER, ROW_NAME, ROWS_NAME, SUITE_NAME, blend_of
+from .preparation import made_scene, prepared_method, what_is_missing
 from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
-from .rows import (
-    CELL_NAME,
-    CELLS_FOLDER,
-    ROW_NAME,
-    ROWS_NAME,
-    SUITE_NAME,
-    CellFile,
-    CellRow,
-    Row,
-    cell_folders,
-    read_object,
-)
+from .rows import CellFile, CellRow, Row, cell_folders, read_object
 from .selection import chosen, earlier_rows, plan
+from .weights import check_weights, files_of_weights
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 
@@ -61,13 +49,16 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     check_weights(suite.protocol["lpips"])
     cells = chosen(suite.cells, only)
     results = os.path.abspath(results or os.path.join("bench_results", suite.name))
-    found = earlier_rows(rows, suite.cells) if rows else {}
-    earlier = {name: row for name, row in found.items() if row["ok"] or not retry_failed}
+    earlier = earlier_rows(rows, suite.cells) if rows else {}
     check_folder(suite, results)
-    there = {cell["id"]: row for cell in cells for row in [row_of(results, cell, retry_failed)] if row is not None}
-    done = {**{cell["id"]: earlier[cell["id"]] for cell in cells if cell["id"] in earlier}, **there}
+    done: Dict[str, Row] = {}
+    for cell in cells:
+        known = [read_row(results, cell["id"]), earlier.get(cell["id"])]
+        usable = [row for row in known if row and (row["ok"] or not retry_failed)]
+        if usable:
+            done[cell["id"]] = usable[0]
     if rows:
-        print(f"{len(done) - len(there)} of {len(cells)} cells taken from {rows}")
+        print(f"{sum(row is earlier.get(name) for name, row in done.items())} of {len(cells)} cells taken from {rows}")
     to_do = [cell for cell in cells if cell["id"] not in done]
     absent = what_is_missing(to_do)
     if dry_run:
@@ -79,7 +70,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     words = command(suite, to_do, results, jobs, slurm, per_gpu) if to_do else None
     make_folder(results)
     with only_one(results) as lock:
-        write_cells(suite, cells, results, retry_failed, earlier)
+        write_cells(suite, cells, results, done)
         try:
             status = run_snakemake(words, lock, is_queued=slurm is not None) if words else 0
         finally:
@@ -104,23 +95,21 @@ def check_folder(suite: Suite, results: str) -> None:
     here = {"": {"name": suite.name}, "protocol.": suite.protocol,
             **{f"scene {scene['name']}: ": scene for scene in suite.scenes},
             **{f"method {method['label']}: ": method for method in suite.methods}}
-    differ: Dict[str, None] = {}  # in words, each once
+    differ: List[str] = []
     for name in cell_folders(results):
-        row = read_row(results, name)
         cell = read_object(os.path.join(results, CELLS_FOLDER, name, CELL_NAME), CellFile)
-        if row is None or cell is None:
+        if cell is None or read_row(results, name) is None:
             continue
         there = {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
                  f"scene {cell['scene'].get('name')}: ": cell["scene"],
                  f"method {cell['method'].get('label')}: ": cell["method"]}
-        for what in filter(here.__contains__, there):
-            for field in sorted({*there[what], *here[what]} - {*NOT_IN_THE_IDENTITY, "axes", "refused"}):
-                one, other = there[what].get(field), here[what].get(field)
-                if one != other:
-                    differ[f"{what}{field} is {one!r} there and {other!r} here"] = None
+        differ += [f"{what}{field} is {there[what].get(field)!r} there and {here[what].get(field)!r} here"
+                   for what in there if what in here
+                   for field in sorted({*there[what], *here[what]} - {*NOT_IN_THE_IDENTITY, "axes", "refused"})
+                   if there[what].get(field) != here[what].get(field)]
     if differ:
         raise BenchError(f"{results}: holds rows of another suite or of another protocol, which are not put together: "
-                         f"{'; '.join(differ)}. Choose another folder with -o")
+                         f"{'; '.join(dict.fromkeys(differ))}. Choose another folder with -o")
 
 
 def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
@@ -147,50 +136,32 @@ def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
         signal.signal(signal.SIGTERM, handler)
 
 
-def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, retry_failed: bool,
-                earlier: Mapping[str, Row] = MappingProxyType({})) -> None:
+def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, done: Mapping[str, Row]) -> None:
     """Writes RESULTS/suite.json and each cell's file, with scenes made and checkouts patched. Raises BenchError.
 
-    earlier: rows by their cell's name, for cells that have none here.
+    done: rows by their cell's name; those of elsewhere are written here, as the suite's own.
     """
-    check_folder(suite, results)  # again: another run may have been at work there
     scenes: Dict[str, Dict[str, Any]] = {}
     methods: Dict[str, Dict[str, Any]] = {}
     for cell in cells:
         folder = os.path.join(results, CELLS_FOLDER, cell["id"])
         file, row = os.path.join(folder, CELL_NAME), os.path.join(folder, ROW_NAME)
-        done = row_of(results, cell, retry_failed)
-        if done is None and cell["id"] in earlier:  # another suite may have had the cell
-            done = {**earlier[cell["id"]], **identity(cell)}
-            write_json_atomically(row, done)
-        if done is not None:
+        if cell["id"] in done:
+            if not os.path.isfile(row):
+                write_json_atomically(row, {**done[cell["id"]], **identity(cell)})
             if not os.path.isfile(file):
-                write_json_atomically(file, {**cell, "given": given(cell)})
+                write_json_atomically(file, cell)
             continue
         scene, method = cell["scene"]["name"], cell["method"]["label"]  # what no cell needs is not prepared
         if scene not in scenes:
             scenes[scene] = made_scene(cell["scene"], results)
         if method not in methods:
             methods[method] = prepared_method(cell["method"], results)
-        prepared = {**cell, "scene": scenes[scene], "method": methods[method], "given": given(cell)}
-        if read_object(file) != prepared:
-            write_json_atomically(file, prepared)
+        write_json_atomically(file, {**cell, "scene": scenes[scene], "method": methods[method]})
         if os.path.isfile(row):
             os.remove(row)
     said = {"name": suite.name, "protocol": suite.protocol, "cells": [cell["id"] for cell in suite.cells]}
     write_json_atomically(os.path.join(results, SUITE_NAME), said)
-
-
-def row_of(results: str, cell: Dict[str, Any], retry_failed: bool) -> Optional[Row]:
-    """The row of a cell that is done; None where it is to be run.
-
-    That is a failed one too with retry_failed, or where its paths have changed.
-    """
-    row = read_row(results, cell["id"])
-    if row is None or row["ok"]:
-        return row
-    before = read_object(os.path.join(results, CELLS_FOLDER, cell["id"], CELL_NAME)) or {}
-    return None if retry_failed or before.get("given", given(cell)) != given(cell) else row
 
 
 def read_row(results: str, name: str) -> Optional[Row]:

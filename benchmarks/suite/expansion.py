@@ -72,8 +72,11 @@ def expand(content: Any, folder: str) -> Suite:
                      f"scenes[{index}]", folder) for index, scene in enumerate(content["scenes"])]
     methods = [_method(method, f"methods[{index}]", protocol, folder)
                for index, method in enumerate(content["methods"])]
-    _names_are_unique(scenes, "scenes", "name")
-    _names_are_unique(methods, "methods", "label")
+    for field, key, items in (("scenes", "name", scenes), ("methods", "label", methods)):
+        names = [item[key] for item in items]
+        for index, name in enumerate(names):
+            if name in names[:index]:
+                raise BenchError(f"{field}[{index}].{key}: {name!r} is there already")
     _one_downscaler(scenes)
     cells: List[Dict[str, Any]] = []
     for scene, method in itertools.product(scenes, methods):
@@ -111,6 +114,9 @@ def read_yaml(path: str) -> Any:
                     raise yaml.MarkedYAMLError(problem=f"{key.value!r} is there twice", problem_mark=key.start_mark)
             return node
 
+    # YAML 1.1, which PyYAML reads, takes 5e-3 for text.
+    number = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$")
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, "-+0123456789")
     try:
         with open(path, encoding="utf-8") as file:
             return yaml.load(file, Loader)
@@ -300,13 +306,6 @@ def _paths(given: Dict[str, Any], where: str, folder: str) -> Dict[str, Any]:
             paths.append(path)
         found[field] = paths[0] if isinstance(value, str) else paths
     return found
-
-
-def _names_are_unique(items: List[Dict[str, Any]], field: str, key: str) -> None:
-    names = [item[key] for item in items]
-    for index, name in enumerate(names):
-        if name in names[:index]:
-            raise BenchError(f"{field}[{index}].{key}: {name!r} is there already")
 
 
 def _one_downscaler(scenes: List[Dict[str, Any]]) -> None:

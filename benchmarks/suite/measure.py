@@ -14,18 +14,16 @@ import torch.nn.functional as F
 
 from ...trainer.results.metrics import image_metrics, psnr, quantised
 from ..errors import BenchError
-from .lpips import LPIPS_KINDS, VARIABLES, Distance, lpips_network, net_of
+from .lpips import Distance, lpips_network
+from .names import LPIPS_KINDS
+from .protocol import EDGE_REACH, STRONG_GRADIENT
+from .weights import VARIABLES, net_of
 
-STRONG_GRADIENT = 0.05  # of luminance in [0, 1], per pixel: 13 grey levels from one pixel to the next
-EDGE_REACH = 3  # pixels in x and y
 LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601
-EDGE_RULE = (f"8-bit images, pixels within {EDGE_REACH} px (in x and y) of a pixel of the ground truth whose Rec. 601 "
-             f"luminance has a Sobel gradient of at least {STRONG_GRADIENT} per pixel; mean over test views that have "
-             "such pixels")
 
 
 def edge_mask(target: torch.Tensor) -> torch.Tensor:
-    """[H, W] bool: pixels near the strong gradients of a ground truth [3, H, W] in [0, 1]; see EDGE_RULE."""
+    """[H, W] bool: pixels near the strong gradients of a ground truth [3, H, W] in [0, 1]; see protocol.EDGE_RULE."""
     luminance = (target * target.new_tensor(LUMINANCE)[:, None, None]).sum(dim=0)
     padded = F.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate")
     sobel = target.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8  # of a ramp: its slope

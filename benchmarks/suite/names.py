@@ -1,9 +1,10 @@
-"""The names of the methods and blends a suite may ask for; what methods are is in the modules beside this one."""
+"""The names of what a suite may ask for, and of the files in RESULTS; the Snakefile repeats the latter."""
 from __future__ import annotations
 
 from typing import Any, Mapping
 
 NATIVE = "native"
+LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
 VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse
 # Of each public trainer, whether it can be patched to this package's rasterizer (patches/).
 CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
@@ -19,6 +20,13 @@ LACKS = {"3dgs-2023": ("antialiasing",), "3dgs-2024": (), "c3dgs": ("antialiasin
          **dict.fromkeys(("hac", "hac-plus"), (*OF_3DGS_ALONE, "sh_degree", "sh_degree_interval", "opacity_lr",
                                                "rotation_lr", "densify_from_iter", "densify_until_iter",
                                                "densification_interval"))}
+
+# In RESULTS:
+ROWS_NAME = "rows.jsonl"  # all rows, one a line
+CELLS_FOLDER = "cells"  # a folder for each cell, by its name
+CELL_NAME = "cell.json"  # in it: what is trained on what
+ROW_NAME = "row.json"  # in it too: what came out
+SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its cells, run or not
 
 # Options of the native trainer that a suite may set: those of the recipe. The others have a field of their own.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",

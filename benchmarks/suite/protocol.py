@@ -5,21 +5,24 @@ are the harness's own. A rule that a reader would have to know beforehand is a r
 """
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 from pathlib import Path
 from typing import Any, Dict, Optional
 
 from ...trainer.config import TrainConfig
-from ...trainer.scenes.images import image_size, target_size
-from ...trainer.scenes.scene import read_layout
-from ...trainer.system.environment import machine, versions
-from .measure import EDGE_RULE
 from .names import RECIPE
 
 COMMIT_VARIABLE = "DSMOE_COMMIT"  # says the project's commit where its files are no git checkout
 ROOT = str(Path(__file__).resolve().parents[2])  # of the sources, or of the installed package
 BYTES_PER_GAUSSIAN = 4 * 59  # float32 numbers: position 3, SH colours 48, opacity 1, scale 3, quaternion 4
+
+STRONG_GRADIENT = 0.05  # of luminance in [0, 1], per pixel: 13 grey levels from one pixel to the next
+EDGE_REACH = 3  # pixels in x and y
+EDGE_RULE = (f"8-bit images, pixels within {EDGE_REACH} px (in x and y) of a pixel of the ground truth whose Rec. 601 "
+             f"luminance has a Sobel gradient of at least {STRONG_GRADIENT} per pixel; mean over test views that have "
+             "such pixels")
 
 RULES = {
     "quantisation": "headline figures on 8-bit images (clamped, rounded); psnr_float on floats clamped to [0, 1]",
@@ -67,6 +70,9 @@ def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Di
 
 def downscaler(config: TrainConfig, name: str) -> str:
     """How images came to their size: as the files are, or resized by the loader."""
+    from ...trainer.scenes.images import image_size, target_size  # they load torch, which a suite does without
+    from ...trainer.scenes.scene import read_layout
+
     layout = read_layout(config)
     posed = (list(layout.test) or list(layout.train))[0]
     supplied = image_size(posed.path)
@@ -75,30 +81,20 @@ def downscaler(config: TrainConfig, name: str) -> str:
     return name
 
 
-def common_bytes(num_primitives: int, bytes_per_primitive: Optional[int] = BYTES_PER_GAUSSIAN) -> Optional[int]:
-    """Size in the container that all methods are compared in: float32 numbers of a 3DGS Gaussian of SH degree 3.
-
-    None for primitives that are no such Gaussians.
-    """
-    return None if bytes_per_primitive is None else num_primitives * bytes_per_primitive
-
-
 def machine_of(device: str) -> Dict[str, Any]:
     """What a cell ran on."""
+    from ...trainer.system.environment import machine, versions
+
     return {"device": machine(device), "versions": versions()}
 
 
 def project_commit() -> Optional[str]:
     """The commit of this project's files, "+" behind it where they were changed since; None where nothing says it."""
-    return os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT) or _commit_of_the_build()
-
-
-def _commit_of_the_build() -> Optional[str]:
-    try:
-        from ..._build_info import COMMIT
-    except ImportError:
-        return None
-    return COMMIT
+    known = os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT)
+    if known is None:
+        with contextlib.suppress(ImportError):
+            from ..._build_info import COMMIT as known
+    return known
 
 
 def commit_of(folder: str) -> Optional[str]:

@@ -1,26 +1,18 @@
-"""Rows, and the folder RESULTS in which they lie: engine.py and cell.py write it, the report reads it.
-
-The Snakefile, which Snakemake reads as a file of its own, repeats the names.
-"""
+"""Rows, and how they are read from the folder RESULTS: engine.py and cell.py write them, the report reads them."""
 from __future__ import annotations
 
 import json
 import math
 import os
-from typing import Any, Dict, Iterable, Iterator, List, Optional, Tuple, Type
+from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 from typing_extensions import Annotated
 
 from ...trainer.config import LEARNED
 from ..errors import BenchError
+from .names import CELLS_FOLDER, ROW_NAME, ROWS_NAME
 from .schema import first_mistake, must
-
-ROWS_NAME = "rows.jsonl"  # all rows, one a line
-CELLS_FOLDER = "cells"  # a folder for each cell, by its name
-CELL_NAME = "cell.json"  # in it: what is trained on what
-ROW_NAME = "row.json"  # in it too: what came out
-SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its cells, run or not
 
 Row = Dict[str, Any]
 
@@ -106,7 +98,7 @@ def read_rows(results: str) -> List[Row]:
     """The rows of a results folder (cells/*/row.json and rows.jsonl) or of one .jsonl file, sorted by cell.
 
     A cell's own row.json wins over rows.jsonl, and there the last line of a cell. Raises ReportError where there are
-    none, where one is damaged, or where a suite mixes protocols.
+    none, or where one is damaged.
     """
     listed = results if os.path.isfile(results) else os.path.join(results, ROWS_NAME)
     lines = _text(listed).split("\n") if os.path.isfile(listed) else []
@@ -116,7 +108,6 @@ def read_rows(results: str) -> List[Row]:
     if not found:
         raise ReportError(f"{results}: no rows: neither {CELLS_FOLDER}/*/{ROW_NAME} nor {ROWS_NAME}")
     rows = {row["cell"]: row for row in found}
-    _refuse_mixed_protocols(rows[name] for name in sorted(rows))
     return [rows[name] for name in sorted(rows)]
 
 
@@ -134,20 +125,36 @@ def _text(path: str) -> str:
         raise ReportError(f"{path}: not text in UTF-8 ({error})") from error
 
 
-def _refuse_mixed_protocols(rows: Iterable[Row]) -> None:
-    first: Dict[Tuple[str, str, str], Tuple[Any, str]] = {}
-    for row in rows:
-        for name, value in _rules(row) if row["ok"] else ():
-            known, cell = first.setdefault((row["suite"], row["scene"], name), (value, row["cell"]))
-            if known != value:
-                raise ReportError(f"suite {row['suite']}, scene {row['scene']}: cells of different protocols stand "
-                                  f"in no common table: {name} is {known!r} in {cell} and {value!r} in {row['cell']}")
+def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
+    """The rows that can stand in common tables, and in words which cannot: of each scene, those of a rarer protocol.
+
+    Raises ReportError where no protocol of a scene is the commonest.
+    """
+    left_out: Dict[str, List[str]] = {}  # why, and the cells
+    for place in sorted({(row["suite"], row["scene"]) for row in rows}):
+        said = {row["cell"]: _rules(row) for row in rows if row["ok"] and (row["suite"], row["scene"]) == place}
+        for name in sorted({name for rules in said.values() for name in rules}):
+            cells: Dict[str, List[str]] = {}  # by what they say of the rule
+            for cell, rules in said.items():
+                if name in rules:
+                    cells.setdefault(repr(rules[name]), []).append(cell)
+            (most, first), *others = sorted(cells.items(), key=lambda item: -len(item[1])) or [("", [])]
+            for value, rare in others:
+                if len(rare) == len(first):
+                    raise ReportError(f"suite {place[0]}, scene {place[1]}: cells of different protocols stand in no "
+                                      f"common table: {name} is {most} in {first[0]} and {value} in {rare[0]}")
+                left_out[f"{name} is {value} in them and {most} in {len(first)} others of {place[1]}"] = rare
+                said = {cell: rules for cell, rules in said.items() if cell not in rare}
+    gone = {cell for cells in left_out.values() for cell in cells}
+    return ([row for row in rows if row["cell"] not in gone],
+            [f"left out, since {why}: {', '.join(cells)}" for why, cells in left_out.items()])
 
 
-def _rules(row: Row) -> Iterator[Tuple[str, Any]]:
-    """(name, value) of each rule that the row states; the entries of one that is a dict stand alone."""
+def _rules(row: Row) -> Dict[str, Any]:
+    """The rules that the row states, by name; the entries of one that is a dict stand alone."""
+    found: Dict[str, Any] = {}
     for name, value in (row.get("protocol") or {}).items():
         if name in RULES or name.startswith(RULE_PREFIXES):
-            entries = {f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict) else {
-                name: value}
-            yield from ((key, entry) for key, entry in entries.items() if entry is not None)
+            found.update({f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict)
+                         else {name: value})
+    return {name: value for name, value in found.items() if value is not None}

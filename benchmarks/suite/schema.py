@@ -2,19 +2,16 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import fields
 from typing import Any, Dict, List, Literal, Tuple, Type
 
-import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 from typing_extensions import Annotated
 
 from ...settings import BLEND_MODES
 from ...trainer.config import LEARNED, PRINCIPAL_POINTS, SCHEDULES, TrainConfig
 from ..errors import BenchError
-from .lpips import LPIPS_KINDS
-from .names import CHECKOUTS, NATIVE, RECIPE, VARIANTS
+from .names import CHECKOUTS, LPIPS_KINDS, NATIVE, RECIPE, VARIANTS
 
 # The paper prints that its first of six thresholds is 0.005 and its fifth 0.0002.
 THRESHOLDS = (0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
@@ -47,7 +44,7 @@ Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Threshold = Annotated[float, Field(gt=0, le=1e6)]  # its digits become a part of file names
-Gate = Annotated[Any, must(lambda value: value == LEARNED or (type(value) in (int, float) and 0 <= value < np.inf),
+Gate = Annotated[Any, must(lambda value: value == LEARNED or (type(value) in (int, float) and 0 <= value < math.inf),
                            f"it must be a number of at least 0, or {LEARNED!r}")]
 Word = Annotated[Any, must(lambda value: type(value) in (str, int, float), "it must be text or a number")]
 Resolution = Annotated[int, must(lambda value: value == -1 or value >= 1, "it must be -1 or at least 1")]
@@ -123,18 +120,7 @@ def check(content: Any) -> None:
         SuiteFile.model_validate(content)
     except ValidationError as error:
         where, what = first_mistake(error)
-        number = re.search(r"^is '([^']*)'; it must be a valid number$", what)
-        if number and not math.isnan(as_number(number.group(1))):
-            what += f"; YAML takes it for text: write {np.format_float_positional(as_number(number.group(1)))}"
         raise BenchError(f"{where or 'the suite'}: {what}") from error
-
-
-def as_number(text: str) -> float:
-    """The number that a text is; NaN where it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
 
 
 def first_mistake(error: ValidationError) -> Tuple[str, str]:

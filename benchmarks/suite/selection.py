@@ -4,33 +4,22 @@ from __future__ import annotations
 from typing import Any, Dict, List, Mapping, Sequence
 
 from ..errors import BenchError
-from .cell import identity
 from .expansion import AXIS_OF
-from .names import blend_of
 from .rows import Row, read_rows
-from .schema import as_number
 
-SAID_BY_THE_ID = ("method", "variant", "blend_mode", "schedule", "densify_grad_threshold", "scene", "seed",
-                  "iterations")  # fields of a row
 SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")
 
 
 def earlier_rows(path: str, cells: List[Dict[str, Any]]) -> Dict[str, Row]:
     """The rows of a file, or of a folder of results, that are of these cells, by the cells' names.
 
-    Raises BenchError where none is, or where a row says something else of its cell than the cell does.
+    A name holds a checksum of all that decides the figures. Raises BenchError where no row is of a cell.
     """
-    rows = {row["cell"]: row for row in read_rows(path)}
-    found = [cell for cell in cells if cell["id"] in rows]
+    rows, names = read_rows(path), {cell["id"] for cell in cells}
+    found = {row["cell"]: row for row in rows if row["cell"] in names}
     if not found:
         raise BenchError(f"--rows {path}: none of its {len(rows)} rows is of a cell of this suite")
-    for cell in found:
-        row, expected = ({**said, "blend_mode": blend_of(said)} for said in (rows[cell["id"]], identity(cell)))
-        for field in SAID_BY_THE_ID:
-            if row.get(field) != expected[field]:
-                raise BenchError(f"--rows {path}: the row of cell {cell['id']}: {field} is {row.get(field)!r}; it must "
-                                 f"be {expected[field]!r}, as the suite has it")
-    return {cell["id"]: rows[cell["id"]] for cell in found}
+    return found
 
 
 def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, Any]]:
@@ -57,7 +46,10 @@ def _said(cell: Dict[str, Any], field: str) -> Any:
 
 
 def _same(value: Any, text: str) -> bool:
-    return value == as_number(text) if isinstance(value, float) else str(value).lower() == text.lower()
+    try:
+        return value == float(text) if isinstance(value, float) else str(value).lower() == text.lower()
+    except ValueError:
+        return False
 
 
 def plan(cells: List[Dict[str, Any]], done: Mapping[str, Row], absent: Sequence[str]) -> str:

@@ -60,6 +60,30 @@ def test_settings_and_reference_work_where_nothing_was_built(copied_package):
     assert not hasattr(package, "no_such_name")
 
 
+LAZY = """
+import pickle, sys
+import diff_smoe_rasterization as package
+assert "torch" not in sys.modules
+assert {*package.__all__, "losses", "rasterizer"} <= {*dir(package)}
+settings = package.GaussianRasterizationSettings
+assert pickle.loads(pickle.dumps(settings)) is settings and "torch" not in sys.modules
+assert package.losses.fused_ssim is package.fused_ssim and "torch" in sys.modules
+assert pickle.loads(pickle.dumps(package.rasterize)) is package.rasterize
+from diff_smoe_rasterization import *
+assert SparseGaussianAdam is package.SparseGaussianAdam
+"""
+EAGER = """
+import torch, diff_smoe_rasterization
+torch.ops.diff_smoe_rasterization.rasterize
+"""
+
+
+@pytest.mark.parametrize("program", [LAZY, EAGER])
+def test_torch_is_loaded_where_it_is_needed_and_its_ops_at_once_where_it_is_there(program):
+    path = os.pathsep.join(filter(None, [str(WHERE_THE_PACKAGE_LIES), os.environ.get("PYTHONPATH", "")]))
+    subprocess.run([sys.executable, "-c", program], check=True, env={**os.environ, "PYTHONPATH": path})
+
+
 def test_the_command_says_in_one_line_that_nothing_was_built(copied_package, capsys):
     main = copied_package[1](".cli").main
     assert main(["info"]) == 0

@@ -28,11 +28,16 @@ class Outcome:
     own_bytes: Optional[int]  # in the method's own container
     train_seconds: Optional[float]
     peak_gpu_mib: Optional[float]
-    common_bytes_per_primitive: Optional[int] = BYTES_PER_GAUSSIAN  # None: it does not fit into the common container
+    are_gaussians: bool = True  # those of 3DGS, which fit into the container that all methods are compared in
     commit: Optional[str] = None  # of the checkout
     history: List[Dict[str, Any]] = field(default_factory=list)
     renders: Dict[str, torch.Tensor] = field(default_factory=dict)  # [3, H, W] of the test views whose images are kept
     notes: Dict[str, Any] = field(default_factory=dict)  # of the row's protocol: further or other entries
+
+    @property
+    def common_bytes(self) -> Optional[int]:
+        """Size in the common container."""
+        return self.num_gaussians * BYTES_PER_GAUSSIAN if self.are_gaussians else None
 
 
 def run(cell: Dict[str, Any], output: str) -> Outcome:

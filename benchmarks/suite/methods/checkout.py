@@ -26,7 +26,7 @@ from ...errors import BenchError
 from ..measure import Measures
 from ..names import COUNTED_BY, RECIPE
 from ..processes import die_with_parent, last_line
-from ..protocol import BYTES_PER_GAUSSIAN, commit_of, config_of
+from ..protocol import commit_of, config_of
 from . import Outcome, require_test_views
 
 OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py")
@@ -276,7 +276,7 @@ def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
     return Outcome(scene=scene, evaluation=evaluation, lpips=measures.lpips_of(evaluation.metrics),
                    num_gaussians=rendered["num_gaussians"], own_bytes=shape.own_bytes(),
                    train_seconds=shape.train_seconds(trained), peak_gpu_mib=trained["peak_gpu_mib"],
-                   common_bytes_per_primitive=BYTES_PER_GAUSSIAN if shape.of_gaussians else None,
+                   are_gaussians=shape.of_gaussians,
                    commit=shape.method.get("commit") or commit_of(shape.method["path"]), renders=renders,
                    notes={"ground_truth_difference": difference, **shape.rules()})
 

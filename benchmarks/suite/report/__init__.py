@@ -18,7 +18,8 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from ....trainer.system.output_folder import make_folder
-from ..rows import CELLS_FOLDER, SUITE_NAME, ReportError, Row, read_rows
+from ..names import CELLS_FOLDER, SUITE_NAME
+from ..rows import ReportError, Row, of_one_protocol, read_rows
 from . import survey
 from .curves import Picture, draw_all
 from .groups import at_once, grouped, is_alone, safe_name, some
@@ -73,6 +74,8 @@ def report(results: str, output: str) -> str:
 def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Section:
     """Writes what a report has of one suite, but for its part of the page."""
     paper = read_paper()
+    absent = _absent(results, suite, rows)
+    rows, left_out = of_one_protocol(rows)
     tables = tables_of(suite, rows, paper)
     for table in tables:
         for form, text in (("md", to_markdown(table)), ("csv", to_csv(table)), ("tex", to_latex(table))):
@@ -82,7 +85,8 @@ def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Sect
     survey.write_survey(rows, paper["datasets"], os.path.join(output, "survey", safe_name(suite)))
     here = any(os.path.isdir(os.path.join(results, CELLS_FOLDER, row["cell"])) for row in rows)
     no_images = "No images: the suite asked for none." if here else "No images: rows of another folder."
-    return Section(suite, safe_name(suite), _counts(rows) + _absent(results, suite, rows), tables, pictures, scenes,
+    counts = "; ".join([_counts(rows) + absent, *left_out])
+    return Section(suite, safe_name(suite), counts, tables, pictures, scenes,
                    no_images, _protocols(rows))
 
 

@@ -78,7 +78,7 @@ def rate_distortion(groups: Sequence[Group]):
             for series, look in looks.items():
                 members = [group for group in groups if group.setting.series == series
                            and _drawn(group, quality) and _drawn(group, amount)]
-                points = sorted(((group.measured(amount).mean, *group.measured(quality)[:2]) for group in members),
+                points = sorted(((group.measured(amount).value, *group.measured(quality)[:2]) for group in members),
                                 key=lambda point: point[0])
                 if points:
                     xs, ys, spreads = zip(*points)
@@ -87,7 +87,7 @@ def rate_distortion(groups: Sequence[Group]):
         line[0].set_ylabel(column(quality).name + (" (lower is better)" if quality.startswith(LPIPS) else ""))
     for axis, amount in zip(axes[-1], amounts):
         axis.set_xlabel(column(amount).name)
-        _amounts(axis, [group.measured(amount).mean for group in groups if _drawn(group, amount)])
+        _amounts(axis, [group.measured(amount).value for group in groups if _drawn(group, amount)])
     legend(drawn, [Line2D([], [], label=series.label(), **look) for series, look in looks.items()])
     return drawn
 
@@ -144,7 +144,7 @@ def bars(groups: Sequence[Group]):
                        if group.setting.series == series and group.setting.amount() == amount]
             for index, group in enumerate(members):
                 color, (_, _, hatch) = styles[group.setting.series]
-                mean, spread, _ = group.measured(name)
+                mean, spread, *_ = group.measured(name)
                 if mean is not None:
                     axis.bar(place + (index - (len(members) - 1) / 2) * width, mean, width, color=color, hatch=hatch,
                              yerr=spread, capsize=3, ecolor=plt.rcParams["text.color"],
@@ -163,7 +163,7 @@ def bars(groups: Sequence[Group]):
 
 def _drawn(group: Group, name: str) -> bool:
     """Whether the figure has a place on an axis: one of amounts may be logarithmic."""
-    mean = group.measured(name).mean
+    mean = group.measured(name).value
     return mean is not None and math.isfinite(mean) and (mean > 0 or name not in AMOUNTS)
 
 

@@ -16,6 +16,7 @@ MILLION = 1e6
 TIMES = ("train_seconds", "wall_seconds", "fps")  # of cells that shared their machine these are not its own
 FIELDS = ("psnr", "psnr_float", "psnr_edge", "ssim", "num_gaussians", "peak_gpu_mib", *TIMES)
 SHARED, MACHINES_DIFFER = "shared", "machines differ"  # why there is no time
+DASH = "–"
 LPIPS = "lpips:"  # the figure's name goes on with its kind, such as lpips_alex
 
 
@@ -65,7 +66,7 @@ class Setting(NamedTuple):
         """What is varied along a curve, such as "0.005"."""
         if self.budget is not None:
             return f"{self.budget:,} Gaussians"
-        return "–" if self.threshold is None else f"{self.threshold:g}"
+        return DASH if self.threshold is None else f"{self.threshold:g}"
 
     def order(self) -> Tuple:
         """A sort key: methods as one list, thresholds from sparse to dense, alpha before the gated modes."""
@@ -75,12 +76,29 @@ class Setting(NamedTuple):
                 -(self.threshold or 0), mode, self.blend)
 
 
-class Measured(NamedTuple):
-    """A mean over seeds with its sample standard deviation; None: not measured, or fewer than two seeds."""
+class Cell(NamedTuple):
+    """A mean over seeds with its sample standard deviation; or a text in its place; printed: as the paper prints it."""
 
-    mean: Optional[float] = None
-    spread: Optional[float] = None
-    why: str = ""  # there is no mean
+    value: Optional[float] = None
+    spread: Optional[float] = None  # None: of fewer than two seeds
+    text: str = ""
+    printed: str = ""
+
+    def shown(self, digits: int, signed: bool = False, plus_minus: str = " ± ") -> str:
+        """As tables show it."""
+        if self.printed:
+            return self.printed
+        if self.value is None:
+            return self.text or DASH
+        value = round(self.value, digits) + 0.0  # no "-0.00"
+        spread = "" if self.spread is None else f"{plus_minus}{self.spread:,.{digits}f}"
+        return f"{value:{'+' if signed and value else ''},.{digits}f}{spread}"
+
+    def unrounded(self) -> str:
+        """The number, a whole one without ".0"; the text in its place."""
+        if self.printed or self.value is None:
+            return self.printed or self.text
+        return str(int(self.value)) if float(self.value).is_integer() else repr(self.value)
 
 
 class Group:
@@ -99,7 +117,7 @@ class Group:
         named = next((dataset for dataset, scenes in datasets.items() if self.scene in scenes), None)
         return (self.rows + self.failed)[0].get("dataset", named)
 
-    def measured(self, name: str) -> Measured:
+    def measured(self, name: str) -> Cell:
         """The figure's mean and spread over seeds."""
         return over([self], name, lambda figures: figures[0])
 
@@ -181,7 +199,7 @@ def safe_name(name: str) -> str:
 
 
 def over(groups: Sequence[Group], name: str, combine: Callable[[List[float]], float],
-         seeds: Optional[Set[int]] = None) -> Measured:
+         seeds: Optional[Set[int]] = None) -> Cell:
     """Mean and spread of combine([the figure of each group]) over the seeds that all groups have it of.
 
     seeds: no others. What combine gives as NaN is left out. Times are of one machine, or there are none.
@@ -189,14 +207,14 @@ def over(groups: Sequence[Group], name: str, combine: Callable[[List[float]], fl
     found = [{seed for seed, figures in group.figures.items() if name in figures} for group in groups]
     common = set.intersection(*found, *([] if seeds is None else [seeds]))
     if name in TIMES and not common and not all(is_alone(row) for group in groups for row in group.rows):
-        return Measured(why=SHARED)
+        return Cell(text=SHARED)
     if name in TIMES and len({device_of(group.by_seed[seed]) for group in groups for seed in common}) > 1:
-        return Measured(why=MACHINES_DIFFER)
+        return Cell(text=MACHINES_DIFFER)
     values = [combine([group.figures[seed][name] for group in groups]) for seed in sorted(common)]
     values = [value for value in values if not math.isnan(value)]
     if not values or math.inf in values:
-        return Measured(math.inf if values else None)
-    return Measured(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
+        return Cell(math.inf if values else None)
+    return Cell(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
 
 
 def difference(figures: Sequence[float]) -> float:

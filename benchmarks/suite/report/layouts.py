@@ -10,6 +10,7 @@ from typing import Any, Dict, List, Optional, Sequence, Set, Tuple
 from ..rows import Row
 from .groups import (
     SHARED,
+    Cell,
     Group,
     Setting,
     device_of,
@@ -23,7 +24,7 @@ from .groups import (
     safe_name,
     some,
 )
-from .tables import OURS, PAPER, Cell, Column, Table, TableRow, cell, column, printed, without_empty_columns
+from .tables import OURS, PAPER, Column, Table, TableRow, column, printed, without_empty_columns
 
 Paper = Dict[str, Any]
 END_NAMES = ("sparse", "dense")
@@ -162,8 +163,8 @@ def deltas(groups: Sequence[Group], paper: Paper, base: str, blend: str) -> Tabl
         if group.setting.blend != base or gated is None:
             continue
         failed = [f"{either.setting.blend} failed" for either in (group, gated) if not either.rows]
-        cells_ = [cell(over((group, gated), name, difference)) for name in differences]
-        cells_ += [cell(over((group, gated), name, ratio)) for name in ratios]
+        cells_ = [over((group, gated), name, difference) for name in differences]
+        cells_ += [over((group, gated), name, ratio) for name in ratios]
         if failed:
             cells_[0] = Cell(text=", ".join(failed))
         labels = (group.scene, group.setting.label(blend=False), group.setting.amount())
@@ -229,7 +230,7 @@ def _averages(setting: Setting, settings: Dict[Setting, Dict[str, Group]], scene
         return [Cell(text=text if name == "psnr" else "") for name in names]
     seeds = Cell(text=f"{len(common)} of {len(common) + len(left_out)}") if left_out else Cell(len(common))
     groups = [by_scene[scene] for scene in scenes]
-    return [seeds if name == SEEDS else cell(over(groups, name, statistics.fmean, common)) for name in names]
+    return [seeds if name == SEEDS else over(groups, name, statistics.fmean, common) for name in names]
 
 
 def _beside(setting: Setting, settings: Dict[Setting, Dict[str, Group]], scenes: Sequence[str]) -> List[Group]:
@@ -270,7 +271,7 @@ def _unequal(one: Row, other: Row) -> str:
 def _seeds_cell(group: Group, name: str) -> Cell:
     if name == "psnr" and group.failed and not group.rows:
         return Cell(text="failed")
-    return cell(group.measured(name))
+    return group.measured(name)
 
 
 def _printed(names: Sequence[str], values: Optional[Sequence[str]], name: str) -> Cell:

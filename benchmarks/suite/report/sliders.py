@@ -1,17 +1,17 @@
 """The images of a report: ground truth, renderings and their errors, of every scene, setting and view that has them."""
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from typing import Any, Dict, List, Sequence
 
 import matplotlib
 import numpy as np
-import torch
 from PIL import Image
 
-from ....trainer.results.metrics import psnr
-from ..rows import CELLS_FOLDER, ReportError, Row
+from ..names import CELLS_FOLDER
+from ..rows import ReportError, Row
 from .groups import Group, grouped, safe_name
 from .layouts import end_of
 
@@ -82,8 +82,8 @@ def _views(results: str, groups: Sequence[Group], output: str, folder: str) -> L
             if own_truth.shape != truth.shape or (own_truth != truth).any() or image.shape != truth.shape:
                 raise ReportError(f"{source}: view {name}: its ground truth or its rendering's size {image.shape} is "
                                   f"not that of {first} {truth.shape}: these cells cannot be compared")
-            decibels = psnr(*(torch.from_numpy(pixels.transpose(2, 0, 1).astype(np.float32)) / 255
-                              for pixels in (image, truth)))
+            squares = np.square(image.astype(np.float64) - truth)
+            decibels = 10 * math.log10(255 ** 2 / squares.mean()) if squares.any() else math.inf
             path = _copied(os.path.join(source, "render", name), output, folder, f"{stem}-{safe_name(blend)}.png")
             layers.append({"label": blend, "path": path, "note": f"{decibels:.2f} dB"})
             path = os.path.join(folder, f"{stem}-{safe_name(blend)}-error.png")

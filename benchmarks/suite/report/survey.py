@@ -36,9 +36,9 @@ def submethod(group: Group) -> str:
 
 def survey_row(group: Group) -> List[str]:
     """A line of the survey's table: means over seeds, unrounded; empty where nothing was measured."""
-    size = group.measured("size_own_mb").mean
-    count = group.measured("num_gaussians").mean
-    return [submethod(group), *(_text(group.measured(name).mean) for name in ("psnr", "ssim", LPIPS_FIGURE)),
+    size = group.measured("size_own_mb").value
+    count = group.measured("num_gaussians").value
+    return [submethod(group), *(_text(group.measured(name).value) for name in ("psnr", "ssim", LPIPS_FIGURE)),
             "" if size is None else str(round(size * 1e6)), "" if count is None else str(round(count))]
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 import csv
 import io
 import itertools
-from typing import Dict, List, NamedTuple, Optional, Tuple
+from typing import Dict, List, NamedTuple, Tuple
 
-from .groups import LPIPS, Measured
+from .groups import LPIPS, Cell
 
-DASH = "–"
 OURS, PAPER = "ours", "paper"
 # How a figure is headed and with how many digits it is printed.
 FIGURES: Dict[str, Tuple[str, int]] = {
@@ -35,30 +34,6 @@ class Column(NamedTuple):
         return f"{self.group} {self.name}".strip()
 
 
-class Cell(NamedTuple):
-    """A figure with its spread, or a text in its place; printed: as the paper prints it."""
-
-    value: Optional[float] = None
-    spread: Optional[float] = None
-    text: str = ""
-    printed: str = ""
-
-    def shown(self, column: Column, plus_minus: str = " ± ") -> str:
-        if self.printed:
-            return self.printed
-        if self.value is None:
-            return self.text or DASH
-        value = round(self.value, column.digits) + 0.0  # no "-0.00"
-        spread = "" if self.spread is None else f"{plus_minus}{self.spread:,.{column.digits}f}"
-        return f"{value:{'+' if column.signed and value else ''},.{column.digits}f}{spread}"
-
-    def unrounded(self) -> str:
-        """The number, a whole one without ".0"; the text in its place."""
-        if self.printed or self.value is None:
-            return self.printed or self.text
-        return str(int(self.value)) if float(self.value).is_integer() else repr(self.value)
-
-
 class TableRow(NamedTuple):
     """Labels, then one cell for each column; source: OURS, or PAPER for figures that are the paper's."""
 
@@ -82,21 +57,19 @@ class Table(NamedTuple):
         groups = itertools.groupby(self.columns, key=lambda column: column.group)
         return [(group, len(list(columns))) for group, columns in groups]
 
+    def shown(self, row: TableRow, plus_minus: str = " ± ") -> List[str]:
+        """The figures of a row as they are shown."""
+        return [cell.shown(column.digits, column.signed, plus_minus) for cell, column in zip(row.cells, self.columns)]
+
     def lines(self, plus_minus: str = " ± ") -> List[List[str]]:
-        """The words of each row: source, labels, figures as they are shown."""
-        return [[row.source, *row.labels, *(cell.shown(column, plus_minus) for cell, column in
-                                            zip(row.cells, self.columns))] for row in self.rows]
+        """The words of each row: source, labels, figures."""
+        return [[row.source, *row.labels, *self.shown(row, plus_minus)] for row in self.rows]
 
 
 def column(name: str, group: str = "", difference: bool = False) -> Column:
     """The column of a figure, or of its differences."""
     heading, digits = (LPIPS_NAMES.get(name[len(LPIPS):], name), 3) if name.startswith(LPIPS) else FIGURES[name]
     return Column("Δ " + heading if difference else heading, digits, group, difference)
-
-
-def cell(figure: Measured) -> Cell:
-    """A measured figure as a cell."""
-    return Cell(figure.mean, figure.spread, figure.why)
 
 
 def printed(text: str) -> Cell:

@@ -4,7 +4,6 @@ The small trainers are those of the patches' tests; they make up their scene, wh
 """
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import random
@@ -16,10 +15,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import small_dbs
 import torch
 from bench_commands import ABOVE, wait_for
 from PIL import Image
+from small_trainers import PATCHES, small_trainers, write_dbs
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.benchmarks.errors import BenchError
@@ -29,19 +28,7 @@ from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.methods import checkout as shapes
 from diff_smoe_rasterization.benchmarks.suite.methods import observer
 
-pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
-
-PATCHES = Path(__file__).resolve().parents[1] / "patches"
 ITERATIONS = 7
-
-
-def small_trainers():
-    """The modules of the patches' tests that make checkouts."""
-    sys.path.insert(0, str(PATCHES))
-    try:
-        return importlib.import_module("checkouts")
-    finally:
-        sys.path.remove(str(PATCHES))
 
 
 @pytest.fixture(scope="module")
@@ -129,17 +116,14 @@ def test_a_patched_checkout_gives_a_row(name, small, tmp_path):
     row = row_of(small.cell(name), output)
     assert row["ok"], row["reason"]
     assert (row["method"], row["variant"], row["blend_mode"]) == (name, "patched", "smoe")
-    assert row["schedule"] == (None if name == "hac" else "3dgs")
     for figure in ("psnr", "psnr_float", "ssim", "fps", "num_gaussians"):
         assert row[figure] > 0, figure
-    protocol = row["protocol"]
-    assert protocol["schedule"] == row["schedule"] and protocol["recipe"] == {} and protocol["scale_recipe"] is False
-    assert protocol["densify_grad_threshold"] == 0.0001 and protocol["sh_degree"] == (None if name == "hac" else 3)
-    assert row["size_bytes"]["common"] == (None if name == "hac" else 236 * row["num_gaussians"])
-    if name == "c3dgs":
-        assert row["train_seconds"] is None  # the small one does not say how long compression took
-    else:
-        assert 0 < row["train_seconds"] < row["wall_seconds"]
+    protocol, is_hac = row["protocol"], name == "hac"
+    assert protocol["schedule"] == row["schedule"] == (None if is_hac else "3dgs") and protocol["recipe"] == {}
+    assert protocol["densify_grad_threshold"] == 0.0001 and protocol["sh_degree"] == (None if is_hac else 3)
+    assert row["size_bytes"]["common"] == (None if is_hac else 236 * row["num_gaussians"])
+    # The small c3dgs does not say how long compression took.
+    assert row["train_seconds"] is None if name == "c3dgs" else 0 < row["train_seconds"] < row["wall_seconds"]
     # The ground truth was rounded to 8 bits on its way here: a quarter of a grey level on average.
     assert 0 < row["protocol"]["ground_truth_difference"] < 0.5 / 255
     assert row["protocol"]["test_views"] == len(row["per_view"]) == 1
@@ -152,7 +136,7 @@ def test_a_trainer_that_would_choose_on_the_test_views_is_kept_from_it(small, tm
     """Of Deformable Beta Splatting's --eval the split alone is taken; the mean of the training views is its model."""
     with np.load(small.scene.parent / "views.npz") as file:
         views = {name: file[name] for name in file.files}
-    checkout = small_dbs.write(tmp_path / "dbs", views)
+    checkout = write_dbs(tmp_path / "dbs", views)
     row = row_of(small.cell("dbs", variant="unpatched", blend_mode="alpha", path=str(checkout),
                             arguments=["--cap_max", 12]), tmp_path / "out")
     assert row["ok"], row["reason"]
@@ -214,27 +198,22 @@ def test_a_checkout_must_have_the_same_split(names, wrong):
             shapes.matched(SimpleNamespace(test=test), seen, "taming")
 
 
-def test_steady_means_neither_reset_nor_size_prune(small):
-    cell = small.cell("3dgs-2023", schedules=["steady"])
-    words = shapes.ThreeDGS(cell, shapes.config_of(cell), "out").train_arguments()
-    assert words[words.index("--opacity_reset_interval") + 1] == str(ITERATIONS + 1)
-    cell = small.cell("3dgs-2023")
-    assert "--opacity_reset_interval" not in shapes.ThreeDGS(cell, shapes.config_of(cell), "out").train_arguments()
-
-
-def rules_and_words(cell):
-    """What the row's protocol would say, and the words of the trainer's command."""
-    shape = shapes.SHAPES[cell["method"]["name"]](cell, shapes.config_of(cell), "out")
-    return shape.rules(), shape.train_arguments()
-
-
-def test_an_option_of_the_suite_reaches_a_checkout_also_where_it_is_our_default(small):
-    """0.05 is not the default of 3DGS of 2024."""
-    rules, words = rules_and_words(small.cell("3dgs-2024", options={"opacity_lr": 0.05, "antialiasing": True}))
-    assert words[words.index("--opacity_lr") + 1] == "0.05" and "--antialiasing" in words and "True" not in words
-    assert rules["recipe"] == {"opacity_lr": 0.05, "antialiasing": True} and rules["scale_recipe"] is False
-    rules, words = rules_and_words(small.cell("3dgs-2024", options={"antialiasing": False, "sh_degree_interval": 1000}))
-    assert not [word for word in words if "antialiasing" in word or "sh_degree" in word or word == "--opacity_lr"]
+@pytest.mark.parametrize("name, axes, there, absent, recipe", [
+    ("3dgs-2023", {"schedules": ["steady"]}, ["--opacity_reset_interval", str(ITERATIONS + 1)], [], {}),
+    ("3dgs-2023", {}, [], ["--opacity_reset_interval", "--opacity_lr"], {}),
+    # 0.05, which is our default, is not that of 3DGS of 2024.
+    ("3dgs-2024", {"options": {"opacity_lr": 0.05, "antialiasing": True}}, ["--opacity_lr", "0.05"], ["True"],
+     {"opacity_lr": 0.05, "antialiasing": True}),
+    ("3dgs-2024", {"options": {"antialiasing": False, "sh_degree_interval": 1000}}, [],
+     ["--antialiasing", "--sh_degree_interval"], {"antialiasing": False, "sh_degree_interval": 1000})])
+def test_the_protocol_reaches_a_checkout(name, axes, there, absent, recipe, small):
+    """Steady means neither reset nor size prune. What the suite does not say of the recipe is the trainer's own."""
+    cell = small.cell(name, **axes)
+    shape = shapes.SHAPES[name](cell, shapes.config_of(cell), "out")
+    words = shape.train_arguments()
+    assert " ".join(there) in " ".join(words) and not {*absent} & {*words}
+    assert ("--antialiasing" in words) == recipe.get("antialiasing", False)
+    assert shape.rules()["recipe"] == recipe and shape.rules()["scale_recipe"] is False
 
 
 @pytest.mark.slow
@@ -277,18 +256,14 @@ def test_a_trainer_ends_with_its_cell(small, tmp_path):
 def test_a_fused_checkout_is_a_copy_of_its_own(small, tmp_path):
     cell = small.cell("3dgs-2023", variant="fused")
     assert cell["method"]["label"] == "3dgs-2023-fused" and "refused" not in cell["method"]
-    patched = small.cell("3dgs-2023")["method"]["path"]
-    losses = [Path(path, "utils", "loss_utils.py").read_text() for path in (cell["method"]["path"], patched)]
+    fused, patched = (small.cell("3dgs-2023", variant=variant)["method"]["path"] for variant in ("fused", "patched"))
+    losses = [Path(path, "utils", "loss_utils.py").read_text() for path in (fused, patched)]
     assert ["@fused_where_equal" in text for text in losses] == [True, False]
     row = row_of(cell, tmp_path / "out")
     assert row["ok"] and row["variant"] == "fused"
     assert row["protocol"]["arguments"][-4:] == ["--blend_mode", "smoe", "--background_gate", "0.0"]
     # A checkout that was fused already is used as it is, and is not the patched one.
-    without_record = str(tmp_path / "without record")
-    shutil.copytree(cell["method"]["path"], without_record, ignore=shutil.ignore_patterns(".dsmoe_patch"))
-    for path, variant, expected in ((cell["method"]["path"], "fused", cell["method"]["path"]),
-                                    (without_record, "fused", without_record), (without_record, "patched", None),
-                                    (cell["method"]["path"], "patched", None),
+    for path, variant, expected in ((fused, "fused", fused), (fused, "patched", None),
                                     (patched, "fused", str(tmp_path / "checkouts" / "fused-path"))):
         method = dict(cell["method"], label="fused", path=path, variant=variant)
         method = preparation.prepared_method(method, str(tmp_path))

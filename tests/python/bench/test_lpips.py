@@ -1,4 +1,4 @@
-"""LPIPS from files of weights, against torch's own modules; and where there are none."""
+"""LPIPS from files of weights, against its definition; and where there are none."""
 from __future__ import annotations
 
 import numpy as np
@@ -9,16 +9,17 @@ from test_measure import step_image
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import lpips, measure
+from diff_smoe_rasterization.benchmarks.suite import weights as files
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures
 
 
 def test_weights_that_are_named_and_not_there_are_refused_where_they_are_wanted(monkeypatch, tmp_path):
     monkeypatch.setenv("DSMOE_LPIPS_ALEX", str(tmp_path / "absent.npz"))
-    lpips.check_weights(["lpips_vgg_std"])
+    files.check_weights(["lpips_vgg_std"])
     with pytest.raises(BenchError, match="DSMOE_LPIPS_ALEX: .*absent.npz: no such file, where the weights of lpips_al"):
-        lpips.check_weights(["lpips_vgg_std", "lpips_alex"])
+        files.check_weights(["lpips_vgg_std", "lpips_alex"])
     (tmp_path / "absent.npz").touch()
-    lpips.check_weights(["lpips_alex"])
+    files.check_weights(["lpips_alex"])
 
 
 @pytest.mark.parametrize("content, said", [
@@ -60,43 +61,35 @@ def made_up_weights(path, net="alex", seed=0):
     return arrays
 
 
-def modules(net):
-    """Torch's modules in torchvision's order of the network's layers: numbers of channels, and maximum poolings."""
-    nn = torch.nn
-    if net == "alex":
-        return [nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(),
-                nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, 1, 1), nn.ReLU(), nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(),
-                nn.Conv2d(256, 256, 3, 1, 1), nn.ReLU()]
-    layers = []
-    for word in "64 64 M 128 128 M 256 256 256 M 512 512 512 M 512 512 512".split():  # configuration D of its paper
-        layers += [nn.MaxPool2d(2, 2)] if word == "M" else [nn.Conv2d(1, 1, 3, 1, 1), nn.ReLU()]
-    return layers
+# torchvision's networks as torch's functions: (kernel's side, stride, padding), M a maximum pooling, and | where LPIPS
+# looks.
+NETWORKS = {"alex": ["11 4 2", "|", "M 3 2", "5 1 2", "|", "M 3 2", "3 1 1", "|", "3 1 1", "|", "3 1 1", "|"],
+            "vgg": "3 1 1;3 1 1;|;M 2 2;3 1 1;3 1 1;|;M 2 2;3 1 1;3 1 1;3 1 1;|;M 2 2;3 1 1;3 1 1;3 1 1;|;M 2 2;"
+                   "3 1 1;3 1 1;3 1 1;|".split(";")}
 
 
-def lpips_by_modules(net, arrays, image, target, normalise):
-    """LPIPS by torch's modules in float64, of the last ReLU of each block (VGG), of each ReLU (AlexNet)."""
-    nn = torch.nn
-    layers = modules(net)
-    convolutions = [layer for layer in layers if isinstance(layer, nn.Conv2d)]
-    for index, layer in enumerate(convolutions):
-        layer.weight = nn.Parameter(torch.from_numpy(arrays[f"conv{index + 1}.weight"]))
-        layer.bias = nn.Parameter(torch.from_numpy(arrays[f"conv{index + 1}.bias"]))
+def lpips_in_double(net, arrays, image, target, normalise):
+    """LPIPS by its definition, in float64."""
     # Of [0, 1], ImageNet's; of [-1, 1] as LPIPS prints them, rounded.
     mean, deviation = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]) if normalise else \
         ([-0.030, -0.088, -0.188], [0.458, 0.448, 0.450])
-    mean, deviation = (np.array(values)[:, None, None] for values in (mean, deviation))
-    total, index = 0.0, 0
-    with torch.no_grad():
-        a, b = (torch.from_numpy((x.double().numpy() - mean) / deviation)[None] for x in (image, target))
-        for place, layer in enumerate(layers):
-            a, b = layer.double()(a), layer(b)
-            ends_a_block = place + 1 == len(layers) or isinstance(layers[place + 1], nn.MaxPool2d)
-            if isinstance(layer, nn.ReLU) and (net == "alex" or ends_a_block):
-                unit_a, unit_b = (nn.functional.normalize(x, dim=1).numpy()[0] for x in (a, b))
-                weight = arrays[f"lin{index}.weight"].astype(np.float64).reshape(-1, 1, 1)
-                total += float((weight * (unit_a - unit_b) ** 2).sum(axis=0).mean())
-                index += 1
-    assert index == 5
+    a, b = ((x.double() - torch.tensor(mean).double()[:, None, None]) / torch.tensor(deviation)[:, None, None]
+            for x in (image, target))
+    total, layer, looks = 0.0, 0, 0
+    for word in NETWORKS[net]:
+        if word == "|":
+            weight = torch.from_numpy(arrays[f"lin{looks}.weight"]).double().reshape(-1, 1, 1)
+            units = (torch.nn.functional.normalize(x, dim=0) for x in (a, b))
+            total += float((weight * (next(units) - next(units)) ** 2).sum(dim=0).mean())
+            looks += 1
+        elif word.startswith("M"):
+            a, b = (torch.nn.functional.max_pool2d(x[None], *map(int, word[2:].split()))[0] for x in (a, b))
+        else:
+            layer += 1
+            weight, bias = (torch.from_numpy(arrays[f"conv{layer}.{name}"]).double() for name in ("weight", "bias"))
+            _, stride, padding = map(int, word.split())
+            a, b = (torch.conv2d(x[None], weight, bias, stride, padding)[0].relu() for x in (a, b))
+    assert looks == 5
     return total
 
 
@@ -113,7 +106,7 @@ def weights(request, tmp_path):
 
 
 @pytest.mark.parametrize("normalise", [True, False])
-def test_lpips_of_a_file_agrees_with_torchs_modules(weights, normalise):
+def test_lpips_of_a_file_agrees_with_the_definition(weights, normalise):
     """[0, 1] normalised by ImageNet's mean and deviation is [-1, 1] shifted and scaled as LPIPS has it."""
     net, path = weights
     random = np.random.RandomState(1)
@@ -121,7 +114,7 @@ def test_lpips_of_a_file_agrees_with_torchs_modules(weights, normalise):
     network = lpips.FileLpips(net, path, normalise, "cpu")
     assert network(image, image) == 0
     with np.load(path) as file:
-        expected = lpips_by_modules(net, {name: file[name] for name in file.files}, image, target, normalise)
+        expected = lpips_in_double(net, {name: file[name] for name in file.files}, image, target, normalise)
     # The float32 network is 1e-5 off the float64 one: sums of some thousand terms.
     assert network(image, target) == pytest.approx(expected, rel=1e-4)
     closer = 0.9 * target + 0.1 * image

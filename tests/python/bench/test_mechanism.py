@@ -11,7 +11,6 @@ from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.mechanism import record as mechanism
 from diff_smoe_rasterization.benchmarks.mechanism.probe import Probe
 from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.training.checkpoint import CHECKPOINT_NAME, load_checkpoint
@@ -93,8 +92,8 @@ def test_states_are_dense_after_a_reset(watched_run):
     _, record = watched_run
     assert [reset["iteration"] for reset in record["resets"]] == RESETS
     # Every 100; one step and every ten after a reset, up to the end: nothing is as far as 300 from the last reset.
-    expected = {100, 200, *(reset + 1 for reset in RESETS), *range(70, 300, 10)}
-    assert [state["iteration"] for state in record["states"]] == sorted(expected)
+    assert [state["iteration"] for state in record["states"]] == sorted(
+        {100, 200, *(reset + 1 for reset in RESETS), *range(70, 300, 10)})
 
 
 def test_opacities_after_a_reset(runs):
@@ -150,22 +149,9 @@ def test_a_share_is_what_a_gaussian_alone_lights_up(probe_of, mode):
     assert all(tensor.grad is None for tensor in probe.model.raw.values())
 
 
-def test_a_folder_with_a_run_is_not_overwritten(watched_run, tmp_path):
-    with pytest.raises(TrainerError, match="already holds"):
-        mechanism.run(watched_run[0], progress=False)
-    (tmp_path / "results.json").touch()
-    with pytest.raises(TrainerError, match="holds results.json but no config.json"):
-        mechanism.run(watched_run[0].changed(output=str(tmp_path)), progress=False)
-
-
-@pytest.mark.parametrize("text, told", [
-    ("{", "not valid json"), ("{}", "config lacks blend_mode"), ("[]", "config lacks blend_mode"),
-    ("densifications", "densifications lacks size"), ("states", "states lacks iteration")])
-def test_a_damaged_record_is_named(runs, tmp_path, text, told):
-    record = json.loads(json.dumps(runs["alpha"][1]))
-    del record["densifications"][-1]["size"]
-    damaged = {"densifications": record, "states": {**record, "states": None}}
-    (tmp_path / mechanism.RECORD_NAME).write_text(json.dumps(damaged[text]) if text in damaged else text)
+@pytest.mark.parametrize("text, told", [("{", "not valid json"), ("{}", "not the record"), ("[]", "not the record")])
+def test_a_damaged_record_is_named(text, told, tmp_path):
+    (tmp_path / mechanism.RECORD_NAME).write_text(text)
     with pytest.raises(BenchError, match=f"mechanism.json.*{told}"):
         mechanism.read_record(str(tmp_path))
 
@@ -182,6 +168,7 @@ def test_the_command_trains_and_explains_its_errors(tiny_scene, tmp_path, capsys
     assert "already holds" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # seconds of matplotlib
 def test_three_figures_show_the_series_of_all_runs(runs, tmp_path, capsys, monkeypatch):
     pytest.importorskip("matplotlib", reason="figures need matplotlib")
     from diff_smoe_rasterization.benchmarks.mechanism import plots as mechanism_plots
@@ -190,10 +177,7 @@ def test_three_figures_show_the_series_of_all_runs(runs, tmp_path, capsys, monke
     folders, records = [config.output for config, _ in runs.values()], [record for _, record in runs.values()]
     assert mechanism.main(["plot", str(tmp_path), "-o", str(tmp_path)]) == 1
     assert "mechanism.json" in capsys.readouterr().err
-    words = [folders[0], os.path.join(folders[1], "mechanism.json")]
-    assert mechanism.main(["plot", *words, "-o", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 3 and all(map(os.path.isfile, printed))
+    assert mechanism.main(["plot", *folders, "-o", str(tmp_path)]) == 0
     assert sorted(os.listdir(tmp_path)) == sorted(
         f"mechanism-{name}{end}" for name in ("opacity", "pruning", "densification")
         for end in (".png", "-light.svg"))
