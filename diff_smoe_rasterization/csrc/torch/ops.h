@@ -4,6 +4,7 @@
 #pragma once
 
 #include <ATen/Dispatch.h>
+#include <ATen/core/dispatch/Dispatcher.h>  // OperatorHandle
 #include <ATen/core/stack.h>
 #include <torch/library.h>
 
