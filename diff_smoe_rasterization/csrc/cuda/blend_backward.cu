@@ -1,5 +1,6 @@
 // From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures.
 #include "../dispatch.h"
+#include "capacity.h"
 #include "dsmoe/params.h"
 #include "gradient_sinks.cuh"
 #include "reduce.cuh"
@@ -323,6 +324,13 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   count_pairs(arguments, tile.lane, met);
 }
 
+template <class S> Slots<S> allocate_slots(const SavedForward<S>& saved, int length, const Work& work) {
+  const int64_t count = saved.capacity * kSlotsPerInstance;
+  const Slots<S> slots = {allocate<S>(*work.scratch, count * length), allocate<uint8_t>(*work.scratch, count)};
+  check(cudaMemsetAsync(slots.written, 0, count, work.stream), "clearing gradients");
+  return slots;
+}
+
 template <class S> S* allocate_scaled(const BackwardArguments<S>& arguments, Scratch& scratch) {
   return allocate<S>(scratch, int64_t(arguments.width) * arguments.height * arguments.num_features);
 }
@@ -395,8 +403,8 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
   arguments.num_features = config.num_features();
   arguments.tiles = static_cast<int>(tiles);
   arguments.sink.records = pass.dL_dgaussians;
-  arguments.sink.slots = pass.slots;
   arguments.sink.length = kNumGateMoments + arguments.num_features;
+  if (saved.instance_width == 2) arguments.sink.slots = allocate_slots<S>(saved, arguments.sink.length, work);
   if (dL_dbackground != nullptr) {
     arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
   }
@@ -410,8 +418,13 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
     arguments.scaled = allocate_scaled(arguments, scratch);
     launch_backward<S, kAnyFeatures>(arguments, tiles, stream);
   }
-  if (pass.slots != nullptr && !pass.fits && frame.inputs.num_gaussians > 0)
-    backward_outgrown(arguments, scratch, stream);
+  if (arguments.sink.slots.terms != nullptr && frame.inputs.num_gaussians > 0) {
+    sum_slots<S>({frame.inputs.num_gaussians, arguments.sink.length, saved, frame.images.radii, arguments.sink.slots,
+                  arguments.sink.records},
+                 stream);
+    // Only in a captured graph may later contents have more instances than there is room for.
+    if (is_capturing(stream)) backward_outgrown(arguments, scratch, stream);
+  }
   if (dL_dbackground != nullptr) {
     sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
   }

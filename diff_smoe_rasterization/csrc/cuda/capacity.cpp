@@ -10,9 +10,9 @@ constexpr size_t kMostKeys = 1024;         // sizes that are remembered; each pi
 constexpr int64_t kGranularity = 1 << 16;  // instances: like views get blocks of one size, which allocators reuse
 constexpr int64_t kFirstCalls = 64;        // renderings after which the views are thought to be known
 
-// Room for what the next views may add: much, while few views have been counted.
-int64_t with_margin(int64_t count, int64_t calls) {
-  const int64_t margin = calls < kFirstCalls ? count : count / 8;
+// Room for what the next views may add.
+int64_t with_margin(int64_t count, bool large) {
+  const int64_t margin = large ? count : count / 8;
   return (count + margin + kGranularity) / kGranularity * kGranularity;
 }
 
@@ -31,7 +31,7 @@ InstanceCapacities::Key InstanceCapacities::key(int device, int64_t width, int64
   return {device, width, height, blend_mode, bits};
 }
 
-int64_t InstanceCapacities::likely(const Key& key) {
+int64_t InstanceCapacities::likely(const Key& key, bool mendable) {
   const std::lock_guard<std::mutex> lock(mutex_);
   const auto found = counts_.find(key);
   if (found == counts_.end()) return -1;
@@ -39,7 +39,8 @@ int64_t InstanceCapacities::likely(const Key& key) {
   const int64_t latest = *static_cast<volatile int64_t*>(count.latest);  // the device writes it
   count.recent.add(latest);
   const int64_t greatest = count.recent.greatest();
-  return greatest < 0 ? -1 : with_margin(greatest, count.calls++);
+  const bool few = count.calls++ < kFirstCalls;  // views have been counted
+  return greatest < 0 ? -1 : with_margin(greatest, few && !mendable);
 }
 
 void InstanceCapacities::learn(const Key& key, const int64_t* num_instances, cudaStream_t stream) {

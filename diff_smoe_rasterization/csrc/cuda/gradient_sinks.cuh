@@ -2,36 +2,37 @@
 // gradients of its features. Every warp that meets the Gaussian has a term for each number.
 //
 //   RecordSink     adds terms to the records by atomics, in any order. Where gradients must be the same bits every
-//   time,
-//                  it writes the terms to slots instead, one slot for each warp and instance. project_backward sums
+//                  time, it writes the terms to slots instead, one slot for each warp and instance. slot_sums.cuh sums
 //                  the slots in order.
 //   OutgrownSink   gives the same bits where the instances outgrew their memory, so that no instance has a slot.
 #pragma once
 
+#include "slot_sums.cuh"
 #include "tile_walk.cuh"
 
 namespace dsmoe {
 namespace cuda {
 
 template <class S> struct RecordSink {
-  S* records;  // [N, length] sums
-  S* slots;    // [capacity, kSlotsPerInstance, length], which take the place of the records; or null
-  int length;  // numbers a record
+  S* records;      // [N, length] sums
+  Slots<S> slots;  // which take the place of the records, where there are any
+  int length;      // numbers a record
 
   static constexpr bool kOnlyOutgrown = false;
 
   // Whether the warps of this tile have terms for this sink.
-  __device__ bool takes(const WarpTile<S>& tile) const { return slots == nullptr || tile.source.listed; }
+  __device__ bool takes(const WarpTile<S>& tile) const { return slots.terms == nullptr || tile.source.listed; }
 
   // Calls put(add), where add(number, term) adds to the record of a Gaussian, which lies at `position` of the list.
   // numbers: those of a record, a constant where the caller has one.
   template <class Put>
   __device__ __forceinline__ void to_record(const WarpTile<S>& tile, int32_t gaussian, int32_t position, int numbers,
                                             Put put) const {
-    if (slots != nullptr) {
-      const uint32_t slot = tile.source.slot(position);
-      S* record = slots + (int64_t(slot) * kSlotsPerInstance + tile.quarter) * numbers;
-      put([record](int number, S term) { record[number] = term; });
+    if (slots.terms != nullptr) {
+      const int64_t slot = int64_t(tile.source.slot(position)) * kSlotsPerInstance + tile.quarter;
+      S* terms = slots.terms + slot * numbers;
+      slots.written[slot] = 1;
+      put([terms](int number, S term) { terms[number] = term; });
     } else {
       S* record = records + int64_t(gaussian) * numbers;
       put([record](int number, S term) { atomicAdd(record + number, term); });

@@ -1,5 +1,6 @@
 // The order of the stages, and the memory between them. A capacity that turns out too small costs time, not
 // correctness (rasterize_cuda.h), so only the first call of a kind waits for the number of instances.
+#include <algorithm>
 #include <limits>
 #include <stdexcept>
 #include <string>
@@ -19,6 +20,8 @@ template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream
   if (count > 0) check(cudaMemsetAsync(memory, 0, count * sizeof(T), stream), "clearing scratch memory");
   return memory;
 }
+
+constexpr int64_t kMostSlots = std::numeric_limits<uint32_t>::max();  // their numbers have 32 bits
 
 // Memory for what the depth sort sorts. In a mode without a depth order, `project` fills saved.order itself.
 template <class S> DepthKeys<S> depth_keys(const Frame<S>& frame, Scratch& scratch) {
@@ -53,11 +56,21 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
 // Returns for how many instances there will be room.
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
-  const int64_t likely = InstanceCapacities::shared().likely(key);
+  const int64_t likely = InstanceCapacities::shared().likely(key, run.deterministic);
   if (is_capturing(run.stream)) return likely < 0 ? 8 * frame.inputs.num_gaussians + 1024 : likely;
-  if (likely >= 0 && !run.deterministic) return likely;
+  if (likely >= 0) return likely;
   count_instances(frame, work);
   return read(frame.saved.num_instances, "projecting Gaussians", run.stream);
+}
+
+// Lists the instances, with room for `sizes.capacity`. What depends on the capacity is allocated anew.
+template <class S>
+void list_with_capacity(Frame<S>& frame, const SavedSizes& sizes, Allocator& memory, const Work& work) {
+  frame.saved.instances = nullptr, frame.saved.segments = nullptr, frame.saved.segment_queue = nullptr;
+  allocate_saved(frame.saved, sizes, memory);
+  complete(frame.saved, sizes);
+  bin(frame, work);
+  memory.release();
 }
 
 }  // namespace
@@ -81,16 +94,20 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
 
   const auto key = capacity_key(frame);
   sizes.capacity = choose_capacity(frame, key, run, work);
+  if (run.deterministic) sizes.capacity = std::min(sizes.capacity, kMostSlots);
   memory.release();
-  if (run.deterministic && sizes.capacity > std::numeric_limits<uint32_t>::max()) {
-    throw std::overflow_error("rasterize: " + std::to_string(sizes.capacity) +
-                              " tile instances; with deterministic=True the most is " +
-                              std::to_string(std::numeric_limits<uint32_t>::max()));
+  list_with_capacity(frame, sizes, memory, work);
+  if (run.deterministic && !is_capturing(run.stream)) {  // each instance must have its slot
+    const int64_t count = read(saved.num_instances, "listing instances", run.stream);
+    if (count > kMostSlots) {
+      throw std::overflow_error("rasterize: " + std::to_string(count) +
+                                " tile instances; with deterministic=True the most is " + std::to_string(kMostSlots));
+    }
+    if (count > sizes.capacity) {
+      sizes.capacity = count;
+      list_with_capacity(frame, sizes, memory, work);
+    }
   }
-  allocate_saved(saved, sizes, memory);
-  complete(saved, sizes);
-  bin(frame, work);
-  memory.release();
   InstanceCapacities::shared().learn(key, saved.num_instances, run.stream);
   clock.end(&StageTimes::bin);
 
@@ -112,10 +129,6 @@ void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& r
   BackwardPass<S> pass;
   pass.gradients = gradients;
   pass.dL_dgaussians = allocate_zeros<S>(memory, count * record, run.stream);
-  if (frame.saved.instance_width == 2) {    // as the forward pass has decided
-    pass.fits = !is_capturing(run.stream);  // the count of a captured graph's next contents is not known
-    pass.slots = allocate_zeros<S>(memory, frame.saved.capacity * kSlotsPerInstance * record, run.stream);
-  }
   blend_backward(frame, pass, work);
   clock.end(&StageTimes::blend_backward);
   project_backward(frame, pass, work);

@@ -13,13 +13,11 @@ template <class S> struct ProjectBackwardArguments {
   GaussianInputs<S> inputs;        // of the forward pass
   DeviceCamera<S> camera;          // likewise
   RasterConfig<S> config;          // likewise
-  SavedForward<S> saved;           // projected, features, num_instances and slot_ranges are read
+  SavedForward<S> saved;           // projected and features are read
   const int32_t* radii;            // [N] pixels; above 0 where a Gaussian was seen
   const S* dL_dgaussians;          // [N, kNumGateMoments + F] the records
-  const S* slots;                  // [capacity, kSlotsPerInstance, kNumGateMoments + F], or null: as in BackwardPass
   GaussianGradients<S> gradients;  // written
   S* camera_rows;                  // [warps, kCameraGradientSize] each warp's sums, written; or null
-  S* dL_dfeature_rows;             // [N, F] scratch; null where the number of features is known
 };
 
 // The sum over the warp of the camera's gradients.
@@ -35,31 +33,6 @@ __device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, i
     }
   };
   store_sums(dL_dcamera.view), store_sums(dL_dcamera.projection), store_sums(dL_dcamera.position);
-}
-
-// Adds a Gaussian's slots to its record, numbers `first` to first + kCount of `size`, where there are slots and as many
-// numbers.
-template <int kCount, class S>
-__device__ void add_slots(const ProjectBackwardArguments<S>& arguments, int64_t i, int size, int first,
-                          S (&record)[kCount]) {
-  if (arguments.slots == nullptr || overflows(arguments.saved)) return;
-  double sums[kCount];
-  for (int k = 0; k < kCount; ++k) sums[k] = record[k];
-  const int64_t end = arguments.saved.slot_ranges[2 * i + 1] * kSlotsPerInstance;
-  for (int64_t slot = arguments.saved.slot_ranges[2 * i] * kSlotsPerInstance; slot < end; ++slot) {
-    for (int k = 0; k < kCount; ++k) {
-      if (first + k < size) sums[k] += double(arguments.slots[slot * size + first + k]);
-    }
-  }
-  for (int k = 0; k < kCount; ++k) record[k] = static_cast<S>(sums[k]);
-}
-
-// Numbers `first` to first + kCount of Gaussian i's record.
-template <int kCount, class S>
-__device__ void load_record(const ProjectBackwardArguments<S>& arguments, int64_t i, int size, int first,
-                            S (&record)[kCount]) {
-  for (int k = 0; k < kCount; ++k) record[k] = arguments.dL_dgaussians[i * size + first + k];
-  add_slots(arguments, i, size, first, record);
 }
 
 template <class S> __device__ GateMoments<S> moments_of(const S* record) {
@@ -154,7 +127,6 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : 
     } else {
       for (int k = 0; k < kMostRecordLength; ++k) record[k] = k < size ? arguments.dL_dgaussians[i * size + k] : 0.0f;
     }
-    add_slots(arguments, i, size, 0, record);
     const float color[3] = {features.x, features.y, features.z};
     rows.read(sh);
     const auto from_color = write_color_gradients<float>({Rows::known_colors(dc, sh), own.mean, camera, config},
@@ -203,17 +175,8 @@ __global__ void __launch_bounds__(kRowsBlock)
   ProjectedGaussian<S> projected = {};
   if (seen) own = load_gaussian(inputs, i), projected = arguments.saved.projected[i];
   const S* features = arguments.saved.features + i * feature_stride(num_features);
-  S moments[kNumGateMoments];
-  S* dL_dfeatures = arguments.dL_dfeature_rows + i * num_features;
-  if (seen) {
-    const int size = kNumGateMoments + num_features;
-    load_record(arguments, i, size, 0, moments);
-    for (int f = 0; f < num_features; ++f) {
-      S number[1];
-      load_record(arguments, i, size, kNumGateMoments + f, number);
-      dL_dfeatures[f] = number[0];
-    }
-  }
+  const S* record = arguments.dL_dgaussians + i * (kNumGateMoments + num_features);
+  const S* dL_dfeatures = record + kNumGateMoments;
   if constexpr (Rows::kStaged) wait_for_copies();
 
   CameraGradient<S> dL_dcamera = {};
@@ -227,7 +190,7 @@ __global__ void __launch_bounds__(kRowsBlock)
     }
     const auto from_color =
         write_color_gradients<S>({colors, own.mean, camera, config}, {features, dL_dfeatures}, to_colors);
-    const auto gate = moments_backward(projected.conic, projected.opacity, moments_of(moments));
+    const auto gate = moments_backward(projected.conic, projected.opacity, moments_of(record));
     const auto gradient = project_backward(own, camera, config.projection_rules(),
                                            projected_gradient(gate, dL_dfeatures, from_color, config));
     store_gradient(gradient, arguments.gradients, i);
@@ -258,7 +221,6 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
   arguments.dL_dgaussians = dL_dgaussians;
-  arguments.slots = pass.slots;
   arguments.gradients = gradients;
   const bool with_camera = gradients.camera != nullptr;
   const int64_t blocks = blocks_for(inputs.num_gaussians, kRowsBlock), warps = blocks * (kRowsBlock / kWarp);
@@ -282,7 +244,6 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
                       : launch(known_backward_kernel<false, false, Rows>, shared);
         }
       } else {
-        arguments.dL_dfeature_rows = allocate<S>(scratch, inputs.num_gaussians * config.num_features());
         with_camera ? launch(project_backward_kernel<S, true, Rows>, shared)
                     : launch(project_backward_kernel<S, false, Rows>, shared);
       }

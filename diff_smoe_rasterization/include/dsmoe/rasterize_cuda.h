@@ -196,10 +196,6 @@ constexpr int kSlotsPerInstance = 4;  // one for each quarter of a tile
 template <class S> struct BackwardPass {
   Gradients<S> gradients;      // given by the images, wanted by the inputs
   S* dL_dgaussians = nullptr;  // [N, kNumGateMoments + F] a Gaussian's record: the sums over its pixels; zero before
-  // [capacity, kSlotsPerInstance, kNumGateMoments + F], zero before, in place of the records where the instances fit;
-  // or null.
-  S* slots = nullptr;
-  bool fits = false;  // with slots: the instances are known to fit their memory, so the way for others is left out
 };
 
 // From image gradients to the records, and to the gradient by the background.
