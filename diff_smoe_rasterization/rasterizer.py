@@ -64,7 +64,7 @@ def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settin
                                  dc=dc, shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
                                  cov3D_precomp=cov3D_precomp)
     *images, saved = rasterize_op(inputs, options)
-    return _rendering(images, outputs), Splats(images[1], saved, inputs[-1], options)
+    return _rendering(images, outputs), Splats(images, saved, inputs, options)
 
 
 def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings,
