@@ -310,5 +310,5 @@ def config_from_arguments(arguments: argparse.Namespace) -> TrainConfig:
     With --scale-recipe the milestones that are not given keep their share of the iterations.
     """
     options = given_options(arguments)
-    config = TrainConfig(**options).validate()
-    return config.shortened().changed(**options) if getattr(arguments, "scale_recipe", False) else config
+    config = TrainConfig(**options)
+    return config.shortened().changed(**options) if getattr(arguments, "scale_recipe", False) else config.validate()

@@ -73,7 +73,7 @@ class GateStrategy(SteadyStrategy):
 
     def after_step(self, step: Step) -> None:
         if step.iteration in self.removals:
-            self.remove(len(self.removals) - self.removals.index(step.iteration))
+            self.remove(1 + sum(later > step.iteration for later in self.removals))
         elif (self.options.moves > 0 and self.removals[-1] < step.iteration <= self.moves_end
               and step.iteration % self.move_interval == 0):
             self.move()
