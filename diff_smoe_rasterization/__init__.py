@@ -52,6 +52,6 @@ if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",
     __path__.append(_beside)
 
 __all__ = ["BLEND_MODES", "Contributions", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer",
-           "Importance", "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info", "distCUDA2",
-           "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
+           "Importance", "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info",
+           "distCUDA2", "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
            "settings_from_camera", "stage_times"]

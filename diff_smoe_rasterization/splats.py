@@ -19,7 +19,7 @@ class Splats:
 
     def __init__(self, images: Sequence[torch.Tensor], saved: Sequence[torch.Tensor],
                  inputs: Sequence[Optional[torch.Tensor]], options: Sequence[Any]):
-        """images, saved: what the op `rasterize` returned. inputs, options: what it was given, for_backward left out."""
+        """images, saved: what the op `rasterize` returned. inputs, options: what it was given, without for_backward."""
         background, background_gate = (inputs[INPUTS.index(name)] for name in ("bg", "background_gate"))
         assert background is not None
         self._color, self._radii, self._gate_sum = (image.detach() for image in images[:3])
@@ -56,8 +56,8 @@ class Splats:
                    share_weights: Optional[torch.Tensor] = None) -> Importance:
         """What each Gaussian is worth to the image: its share of the pixels, and what its removal would change.
 
-        pixel_weights: [H, W] e, any numbers, such as a mask; None: 1. share_weights: [H, W] e of the shares, where it is
-        another one, such as the error of each pixel; None: pixel_weights.
+        pixel_weights: [H, W] e, any numbers, such as a mask; None: 1. share_weights: [H, W] e of the shares, where it
+        is another one, such as the error of each pixel; None: pixel_weights.
         Both are of the Gaussians' type and device. The colour image, and the alpha image where it was asked for, must
         be as they were rendered: an image that was edited in place since gives other numbers.
 

@@ -44,10 +44,11 @@ template <class Real> struct Removal {
   Mask<Real> left;   // something else is in the pixel
 };
 
-// total - part. Nothing where that may be the rounding of two equal sums, since a pixel's only owner has to be known.
+// total - part. Nothing where that may be the rounding of two sums of equal terms, which other kernels may round
+// otherwise: a pixel's only owner has to be known.
 template <class Real> DSMOE_HD Real rest_of(Real total, Real part) {
   using S = Scalar<Real>;
-  constexpr S kRounding = sizeof(S) == sizeof(float) ? S(0x1p-20) : S(0x1p-49);  // 8 times that of one operation
+  constexpr S kRounding = sizeof(S) == sizeof(float) ? S(0x1p-17) : S(0x1p-46);  // of 64 operations
   const Real rest = total - part;
   return select(rest > total * Real(kRounding), rest, Real(S(0)));
 }

@@ -14,7 +14,7 @@ import torch
 from ..config import parse_options
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
 from ..scenes.images import View, as_float
-from .strategy import Step, SteadyStrategy, StrategyContext
+from .strategy import SteadyStrategy, Step, StrategyContext
 
 # Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, removals are at 8,200 to 12,700, moves end
 # at 20,000.

@@ -5,7 +5,7 @@ given number.
 """
 from __future__ import annotations
 
-from typing import Any, Dict, Tuple
+from typing import Dict, Tuple
 
 import torch
 
