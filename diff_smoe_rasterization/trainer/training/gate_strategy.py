@@ -35,11 +35,14 @@ class GateOptions:
     """What `--strategy-options` may set."""
 
     overshoot: float = 10.0  # growth ends at so many times the budget; 0: wherever the threshold leads
-    removals: int = 4  # steps down to the budget
+    removals: int = 16  # steps down to the budget
     views: int = 96  # training views that a decision looks at
     moves: float = 0.1  # the most Gaussians that move at a time, as a part of all; 0: none
     worth: float = 0.2  # a Gaussian moves where its cost is below this part of the error at its new place
-    anneal: float = 1.0  # behind the moves all learning rates but the positions' fall to this part of themselves
+    opacity_weight: float = 0.0  # of the mean opacity in the loss
+    scale_weight: float = 0.0  # of the mean scale in the loss
+    anneal: float = 0.1  # behind the moves all learning rates but the positions' fall to this part of themselves
+    position_rate: float = 4.0  # multiplies the learning rate of positions
 
 
 class Scores(NamedTuple):
@@ -57,6 +60,7 @@ class GateStrategy(SteadyStrategy):
         config = context.config
         self.options: GateOptions = parse_options(config.strategy_options, GateOptions)
         self.start = context.model.num_gaussians
+        context.optimizer.position_factor = self.options.position_rate
         until = config.densify_until_iter
         self.growth_ends = round(GROWTH_ENDS * until)
         count = self.options.removals
@@ -70,6 +74,14 @@ class GateStrategy(SteadyStrategy):
             span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
             share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
             self.context.optimizer.scale_other_rates(self.options.anneal**share)
+
+    def after_backward(self, step: Step) -> None:
+        raw = self.context.model.raw
+        if self.options.opacity_weight or self.options.scale_weight:
+            opacities, scales, _ = self.context.model.activated()
+            raw["opacities"].grad += self.options.opacity_weight / opacities.numel() * opacities * (1 - opacities)
+            raw["scales"].grad += self.options.scale_weight / scales.numel() * scales
+        super().after_backward(step)
 
     def after_step(self, step: Step) -> None:
         if step.iteration in self.removals:

@@ -34,7 +34,8 @@ def counts_of(trainer):
 @pytest.mark.parametrize("budget", [40, 250], ids=["below_the_points", "above_the_points"])
 def test_gate_overshoots_and_ends_with_the_budget(tiny_config, budget, mode):
     config = tiny_config.changed(densification_interval=2, densify_grad_threshold=1e-6)
-    counts = counts_of(trainer_of(config, schedule="gate", budget=budget, blend_mode=mode))
+    counts = counts_of(trainer_of(config, schedule="gate", budget=budget, blend_mode=mode,
+                                  strategy_options="removals=4"))
     # densify_until_iter is 30: growth ends before 16, removals are at 16, 19, 22 and 25.
     assert counts[0] > 100 and counts[15] > 1.2 * max(counts[0], budget)
     changes = [i for i in range(16, len(counts)) if counts[i] != counts[i - 1]]
@@ -110,6 +111,22 @@ def test_scores_are_what_the_views_lose(tiny_config, mode):
     # float32 images; a pixel's squared change is of their last digits' size nowhere that matters.
     assert float(scores.costs[index]) == pytest.approx(float(cost), rel=1e-4)
     assert 0.2 * float(error) < float(scores.errors.sum()) <= float(error) * (1 + 1e-5)
+
+
+def test_rates_of_gate_fall_behind_the_moves(tiny_config):
+    """Positions move at four times their rate all along; the others fall to a tenth from step 40 to the last."""
+    config = tiny_config.changed(iterations=80, position_lr_max_steps=80, schedule="gate", budget=60)
+    plain, trainer = trainer_of(config, schedule="steady"), trainer_of(config)
+
+    def rates(one):
+        return torch.tensor([group["lr"] for group in one.optimizer.adam.param_groups])
+
+    for iteration, factor in ((20, 1.0), (40, 1.0), (60, 0.1**0.5), (80, 0.1)):
+        while trainer.iteration < iteration:
+            trainer.step()
+            plain.step()
+        ratio = rates(trainer) / rates(plain)
+        torch.testing.assert_close(ratio, torch.tensor([4.0] + [factor] * 5))
 
 
 def test_removal_keeps_the_costliest(tiny_config):
