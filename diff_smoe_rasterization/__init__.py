@@ -9,7 +9,7 @@ import sys
 from typing import TYPE_CHECKING, Any, List
 
 from ._version import __version__
-from .settings import BLEND_MODES, OUTPUTS, Contributions, GaussianRasterizationSettings, Rendering
+from .settings import BLEND_MODES, OUTPUTS, Contributions, GaussianRasterizationSettings, Importance, Rendering
 
 _HOMES = {"build_info": "extension", "set_profiling": "extension", "stage_times": "extension", "fused_ssim": "losses",
           "distCUDA2": "neighbors", "FusedAdam": "optimizers", "SparseGaussianAdam": "optimizers",
@@ -60,6 +60,6 @@ if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",
     __path__.append(_beside)
 
 __all__ = ["BLEND_MODES", "Contributions", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer",
-           "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info", "distCUDA2",
-           "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
+           "Importance", "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info",
+           "distCUDA2", "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
            "settings_from_camera", "stage_times", "visible_radii"]

@@ -168,6 +168,10 @@ def _fake_contributions(pixel_weights, radii, *others):
     return sums(), torch.empty_like(radii), sums(), sums()
 
 
+def _fake_importance(pixel_weights, share_weights, color, gate_sum, bg, radii, *others):
+    return tuple(pixel_weights.new_empty(radii.shape) for _ in range(3))
+
+
 if _CAN_REGISTER:
     _NAME = "diff_smoe_rasterization::"
     torch.library.register_fake(_NAME + "rasterize", _fake_rasterize)
@@ -175,5 +179,6 @@ if _CAN_REGISTER:
     torch.library.register_fake(_NAME + "radii", _fake_radii)
     torch.library.register_fake(_NAME + "mark_visible", _fake_mark_visible)
     torch.library.register_fake(_NAME + "contributions", _fake_contributions)
+    torch.library.register_fake(_NAME + "importance", _fake_importance)
     torch.library.register_autograd(_NAME + "rasterize", _backward, setup_context=_keep)
     torch.library.register_autograd(_NAME + "rasterize_backward", _refuse_second_derivative)

@@ -279,8 +279,9 @@ def _train(arguments: argparse.Namespace) -> None:
     config = _train_config(arguments)
     set_up_process(config.device)
     blend = blend_name(config.blend_mode, config.background_gate)
-    print(f"{printable(config.scene)} -> {printable(config.output)}: blend mode {blend}, schedule {config.schedule}, "
-          f"{config.iterations} iterations, seed {config.seed}")
+    budget = f" to {config.budget} Gaussians" if config.budget else ""
+    print(f"{printable(config.scene)} -> {printable(config.output)}: blend mode {blend}, strategy "
+          f"{config.schedule}{budget}, {config.iterations} iterations, seed {config.seed}")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)
     print(results_table([row]))
     if row["psnr"] is None:

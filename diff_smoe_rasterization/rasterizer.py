@@ -64,7 +64,7 @@ def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settin
                                  colors_precomp=colors_precomp, scales=scales, rotations=rotations,
                                  cov3D_precomp=cov3D_precomp)
     *images, saved = rasterize_op(inputs, options)
-    return _rendering(images, outputs), Splats(images[_RADII], saved, inputs[_BACKGROUND_GATE], options)
+    return _rendering(images, outputs), Splats(images, saved, inputs, options)
 
 
 def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings,
@@ -118,7 +118,6 @@ def _arguments(settings, outputs, means3D, opacities, **tensors):
 
 
 _OUTPUTS = frozenset(OUTPUTS)
-_RADII, _BACKGROUND_GATE = IMAGES.index("radii"), INPUTS.index("background_gate")
 
 # The options that are computed, with their places; the others are settings of the same name. `rasterize_op` decides
 # for_backward, which is the last one.

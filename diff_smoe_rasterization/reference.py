@@ -26,7 +26,7 @@ from typing import NamedTuple, Optional, Sequence, Tuple
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from .settings import OUTPUTS, Contributions, GaussianRasterizationSettings, Rendering, resolve_blend
+from .settings import OUTPUTS, Contributions, GaussianRasterizationSettings, Importance, Rendering, resolve_blend
 
 
 def _float32(value):
@@ -148,6 +148,39 @@ def contributions(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaus
     scores = [of_all(total) for total in sums]
     scores[1] = scores[1].to(torch.int32)
     return of_all(splats.position), of_all(splats.depth), Contributions(*scores)
+
+
+def importance(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
+               pixel_weights: torch.Tensor, share_weights: torch.Tensor, dc: _Absent = None, shs: _Absent = None,
+               colors_precomp: _Absent = None, scales: _Absent = None, rotations: _Absent = None,
+               cov3D_precomp: _Absent = None) -> Importance:
+    """What each Gaussian is worth to the image: each is left out, and the image blended again without it.
+
+    pixel_weights, share_weights: [height, width]. The others are the arguments of `rasterize`. Culled Gaussians have 0.
+    """
+    with torch.no_grad():
+        mode, gate = mode_and_gate(settings)
+        gaussians = _gather(means3D, None, opacities, dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        order = visible(gaussians, settings, mode)[1]
+        splats = project(_rows(gaussians, order), settings)
+        x = torch.arange(settings.image_width).to(splats.depth).repeat(settings.image_height)
+        y = torch.arange(settings.image_height).to(splats.depth).repeat_interleave(settings.image_width)
+        alpha = pair_alphas(splats, x, y, pair_counts(splats, x, y, settings, mode, gate))
+        count, weights = len(order), pixel_weights.reshape(-1)
+        # With a channel for each Gaussian, the image is the map of their shares.
+        share = blend(alpha, torch.eye(count).to(alpha), splats.depth, alpha.new_zeros(count), mode, gate)[:count]
+        image = blend(alpha, splats.color, splats.depth, settings.bg, mode, gate)[:len(settings.bg)]
+        costs = alpha.new_zeros(count)
+        for k in range(count):
+            others = alpha.clone()
+            others[k] = 0
+            without = blend(others, splats.color, splats.depth, settings.bg, mode, gate)[:len(settings.bg)]
+            costs[k] = (weights * (without - image).square()).sum()
+
+    def of_all(values):
+        return values.new_zeros(len(means3D)).index_copy(0, order, values)
+
+    return Importance(of_all(share @ share_weights.reshape(-1)), of_all(share.square() @ weights), of_all(costs))
 
 
 def mode_and_gate(settings):

@@ -96,6 +96,19 @@ class Contributions(NamedTuple):
     distances: torch.Tensor  # [N] sum of |pixel - centre| in pixels
 
 
+class Importance(NamedTuple):
+    """What each of N Gaussians is worth to an image: what `Splats.importance` returns. A culled Gaussian has 0.
+
+    Sums over the pixels, with e the weight of a pixel. C is a pixel's colour, and f, the Gaussian's share of it, is its
+    weight in the numerator divided by the denominator: dC/dc of its colour c. The shares of a pixel's Gaussians, and of
+    its background, make 1; in `smoe_tn` less.
+    """
+
+    shares: torch.Tensor  # [N] sum e f
+    squared_shares: torch.Tensor  # [N] sum e f^2
+    removal_costs: torch.Tensor  # [N] sum e |C' - C|^2, over all channels; C' is the pixel without the Gaussian
+
+
 OUTPUTS = ("alpha", "depth", "inverse_depth")
 """The optional outputs of `rasterize`."""
 

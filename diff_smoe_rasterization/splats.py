@@ -5,8 +5,8 @@ from typing import Any, Optional, Sequence
 
 import torch
 
-from .extension import _C  # noqa: F401  (loading it registers the ops)
-from .settings import Contributions
+from .autograd import INPUTS  # which also registers the ops
+from .settings import Contributions, Importance
 
 _OPS = torch.ops.diff_smoe_rasterization
 
@@ -17,10 +17,13 @@ class Splats:
     Nothing here has a gradient. What a culled Gaussian (radius 0) has is 0 everywhere.
     """
 
-    def __init__(self, radii: torch.Tensor, saved: Sequence[torch.Tensor], background_gate: Optional[torch.Tensor],
-                 options: Sequence[Any]):
-        """saved: what the op `rasterize` saved. background_gate, options: what it was given, for_backward left out."""
-        self._radii = radii
+    def __init__(self, images: Sequence[torch.Tensor], saved: Sequence[torch.Tensor],
+                 inputs: Sequence[Optional[torch.Tensor]], options: Sequence[Any]):
+        """images, saved: what the op `rasterize` returned. inputs, options: what it was given, without for_backward."""
+        background, background_gate = (inputs[INPUTS.index(name)] for name in ("bg", "background_gate"))
+        assert background is not None
+        self._color, self._radii, self._gate_sum = (image.detach() for image in images[:3])
+        self._background = background.detach()
         self._saved = [tensor.detach() for tensor in saved]
         self._projected = self._saved[0]
         # A tensor is copied: an optimizer may change it before anybody asks for contributions.
@@ -45,13 +48,42 @@ class Splats:
         the host does not wait.
         Raises ValueError or TypeError where pixel_weights does not fit.
         """
-        if not isinstance(pixel_weights, torch.Tensor):
-            raise TypeError(f"contributions: pixel_weights is of type {type(pixel_weights).__name__}; it must be a "
-                            "torch.Tensor")
+        _check_map("contributions", "pixel_weights", pixel_weights)
         return Contributions(*_OPS.contributions(pixel_weights.detach(), self._radii, self._saved,
                                                  self._background_gate, *self._options))
+
+    def importance(self, pixel_weights: Optional[torch.Tensor] = None,
+                   share_weights: Optional[torch.Tensor] = None) -> Importance:
+        """What each Gaussian is worth to the image: its share of the pixels, and what its removal would change.
+
+        pixel_weights: [H, W] e, any numbers, such as a mask; None: 1. share_weights: [H, W] e of the shares, where it
+        is another one, such as the error of each pixel; None: pixel_weights.
+        Both are of the Gaussians' type and device. The colour image, and the alpha image where it was asked for, must
+        be as they were rendered: an image that was edited in place since gives other numbers.
+
+        The removal's image is that of a rendering without the Gaussian, but for one thing: behind a pixel that was full
+        (T < 1e-4) nothing is known. Without one of its Gaussians such a pixel may take more, of a weight below
+        T / (1 - alpha). Where nothing else is in a pixel, it shows the background's colour.
+
+        Sums are exact and reproducible as those of `contributions`. Raises ValueError or TypeError where a map does not
+        fit.
+        """
+        if pixel_weights is None:
+            pixel_weights = torch.ones_like(self._gate_sum[0])
+        if share_weights is None:
+            share_weights = pixel_weights
+        _check_map("importance", "pixel_weights", pixel_weights)
+        _check_map("importance", "share_weights", share_weights)
+        return Importance(*_OPS.importance(pixel_weights.detach(), share_weights.detach(), self._color, self._gate_sum,
+                                           self._background, self._radii, self._saved, self._background_gate,
+                                           *self._options))
 
     def _of_visible(self, values: torch.Tensor) -> torch.Tensor:
         """Returns a copy with zeros for culled Gaussians, whose rows may hold anything."""
         culled = self._radii <= 0
         return values.masked_fill(culled if values.dim() == 1 else culled[:, None], 0)
+
+
+def _check_map(function: str, name: str, value: Any) -> None:
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")

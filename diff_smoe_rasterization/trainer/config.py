@@ -6,15 +6,16 @@ import dataclasses
 import json
 import os
 from dataclasses import dataclass, field
-from typing import Any, Dict, List, Optional, Sequence, Union
+from typing import Any, Dict, List, Optional, Sequence, Type, TypeVar, Union
 
 from ..settings import BACKGROUND_GATE_VARIABLE, BLEND_MODES, resolve_background_gate, resolve_blend_mode
 from .errors import ConfigError
 from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
-SCHEDULES = ("3dgs", "steady")
+SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
 PRINCIPAL_POINTS = ("scene", "centre")
+Options = TypeVar("Options")
 LEARNED = "learned"  # the background gate that a training finds
 
 
@@ -52,8 +53,13 @@ class TrainConfig:
     init_points: int = _option(
         0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
            "0: all points, respectively 100,000")
-    schedule: str = _option(
-        "3dgs", "3dgs: the original recipe; steady: no opacity reset and no size prune", choices=SCHEDULES)
+    budget: int = _option(0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed; 0: none")
+    schedule: Optional[str] = _option(
+        None, "how Gaussians are added and removed. 3dgs: the original recipe; steady: no opacity reset and no size "
+              "prune; gate: grow beyond the budget, remove what changes the images least, move the rest to where the "
+              "error is; mcmc: relocation and noise (default: gate with --budget, else 3dgs)",
+        choices=SCHEDULES, flags=("--strategy", "--schedule"))
+    strategy_options: str = _option("", "settings of `gate`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
     device: str = _option("cpu", "where tensors live", choices=("cpu", "cuda"))
     sh_degree: int = _option(3, "highest spherical-harmonics degree, 0 to 3")
@@ -85,6 +91,7 @@ class TrainConfig:
         try:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
+            self.schedule = self.schedule or ("gate" if self.budget else "3dgs")
         except ValueError as error:
             raise ConfigError(str(error)) from error
 
@@ -97,6 +104,12 @@ class TrainConfig:
         self._require("iterations", self.iterations >= 1, "at least 1")
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
+        self._require("budget", self.budget >= 0, "at least 0")
+        needs_budget = self.schedule in ("gate", "mcmc")
+        self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.schedule}")
+        enough = self.iterations >= self.densify_until_iter > 1 or self.schedule != "gate"
+        self._require("iterations", enough, "at least --densify-until-iter with --strategy gate, whose removals end "
+                      "there; --scale-recipe shortens all of it")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
         self._require("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "between 0 and 1")
         self._require("background_gate_bound", 0.0 <= self.background_gate_bound < 1.0, "at least 0 and below 1")
@@ -109,6 +122,11 @@ class TrainConfig:
         for name in ("densify_from_iter", "densify_until_iter", "eval_every", "checkpoint_every"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         return self
+
+    @property
+    def most_points(self) -> int:
+        """How many points to start from at most, 0: any number. Only `gate` starts from more than the budget."""
+        return 0 if self.schedule == "gate" else self.budget
 
     def _require(self, name: str, holds: bool, requirement: str) -> None:
         if not holds:
@@ -235,6 +253,21 @@ def _flag(option: dataclasses.Field[Any]) -> str:
 _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
 
 
+def parse_options(text: str, kind: Type[Options]) -> Options:
+    """A dataclass of numbers from `NAME=X,...`; what is not named keeps its default. Raises ConfigError."""
+    known = {option.name: type(option.default) for option in dataclasses.fields(kind)}
+    values = {}
+    for part in filter(None, text.split(",")):
+        name, _, value = part.partition("=")
+        if name not in known:
+            raise ConfigError(f"--strategy-options: {name!r} is unknown; it may name {', '.join(known)}")
+        try:
+            values[name] = known[name](value)
+        except ValueError as error:
+            raise ConfigError(f"--strategy-options: {name} is {value!r}; it must be a number") from error
+    return kind(**values)
+
+
 def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), defaults: bool = True) -> None:
     """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser.
 
@@ -277,5 +310,5 @@ def config_from_arguments(arguments: argparse.Namespace) -> TrainConfig:
     With --scale-recipe the milestones that are not given keep their share of the iterations.
     """
     options = given_options(arguments)
-    config = TrainConfig(**options).validate()
-    return config.shortened().changed(**options) if getattr(arguments, "scale_recipe", False) else config
+    config = TrainConfig(**options)
+    return config.shortened().changed(**options) if getattr(arguments, "scale_recipe", False) else config.validate()

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import math
-from typing import Callable, Dict, Tuple
+from typing import Callable, Dict, Optional, Tuple
 
 import torch
 
@@ -107,6 +107,7 @@ class GaussianOptimizer:
         self.model = model
         self.config = config
         self.extent = extent
+        self.position_factor = 1.0  # a strategy's, of the positions' learning rate
         rates = {
             "means3D": config.position_lr_init * extent,
             "dc": config.feature_lr,
@@ -115,6 +116,7 @@ class GaussianOptimizer:
             "scales": config.scaling_lr,
             "rotations": config.rotation_lr,
         }
+        self.rates = rates
         self.adam = FusedAdam([{"params": [model.raw[name]], "lr": rates[name], "name": name} for name in PARAMETERS],
                               eps=ADAM_EPSILON)
 
@@ -123,7 +125,17 @@ class GaussianOptimizer:
         config = self.config
         rate = exponential_rate(iteration, config.position_lr_init, config.position_lr_final,
                                 config.position_lr_max_steps)
-        self._group("means3D")["lr"] = rate * self.extent
+        self._group("means3D")["lr"] = rate * self.extent * self.position_factor
+
+    @property
+    def position_rate(self) -> float:
+        """The learning rate of positions in this step, world units."""
+        return self._group("means3D")["lr"]
+
+    def scale_other_rates(self, factor: float) -> None:
+        """Sets the learning rates of all but the positions to a part of what the options say."""
+        for name in PARAMETERS[1:]:
+            self._group(name)["lr"] = factor * self.rates[name]
 
     def step(self) -> None:
         """Steps every parameter that has a gradient, then drops the gradients."""
@@ -146,6 +158,25 @@ class GaussianOptimizer:
     def set_opacity_logits(self, logits: torch.Tensor) -> None:
         """Sets all opacity logits [N, 1] and forgets their moments."""
         self._replace("opacities", lambda tensor, new: new.clone(), logits)
+
+    @torch.no_grad()
+    def overwrite(self, rows: torch.Tensor, raw: Dict[str, torch.Tensor], like: Optional[torch.Tensor] = None) -> None:
+        """Puts Gaussians, raw parameters as in PARAMETERS, in place of those in other rows [M], which differ.
+
+        Their moments start at zero; like: rows [M] whose second moments they take over instead.
+        """
+        for name in PARAMETERS:
+            tensor = self.model.raw[name]
+            tensor.index_copy_(0, rows, raw[name])
+            state = self.adam.state.get(tensor)
+            if not state:
+                continue
+            squares = state["exp_avg_sq"]
+            state["exp_avg"].index_fill_(0, rows, 0)
+            if like is None:
+                squares.index_fill_(0, rows, 0)
+            else:
+                squares.index_copy_(0, rows, squares.index_select(0, like))
 
     def replace_all(self, raw: Dict[str, torch.Tensor]) -> None:
         """Sets every parameter, any number of rows, and forgets all moments."""

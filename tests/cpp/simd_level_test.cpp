@@ -78,6 +78,25 @@ template <class S> std::vector<S> contributions_at(const SimdLevel& level, const
   return flat;
 }
 
+// What each instance's Gaussian is worth to its tile, three numbers each.
+template <class S> std::vector<S> importance_at(const SimdLevel& level, const Scene<S>& scene, Rendering<S>& r) {
+  const auto config = scene.raster_config();
+  const auto saved = r.saved();
+  std::vector<S> weights;
+  for (int64_t pixel = 0; pixel < scene.pixels(); ++pixel) weights.push_back(brute_force_pixel_weight<S>(pixel));
+  ImportanceMap<S> map;
+  map.color = r.color.data();
+  map.pixel_weights = map.share_weights = weights.data();
+  std::vector<Importance<S>> out(r.instances.size(), Importance<S>{-1, -1, -1});
+  const TileImportances<S> importances = {map, out.data()};
+  for_each_tile(
+      config, saved, scene.camera.width, scene.camera.height, kImportanceArrays + 2 * config.num_channels,
+      [&](const Tile<S>& tile, S* scratch) { return kernels_of<S>(level).importance(tile, importances, scratch); });
+  std::vector<S> flat;
+  for (const auto& i : out) flat.insert(flat.end(), {i.share, i.squared_share, i.removal_cost});
+  return flat;
+}
+
 template <class S>
 void expect_close(const std::vector<S>& a, const std::vector<S>& b, double tolerance, const char* name) {
   expect_near_all(std::vector<double>(a.begin(), a.end()), std::vector<double>(b.begin(), b.end()), tolerance);
@@ -96,6 +115,7 @@ template <class S> void expect_levels_agree(BlendMode mode, bool depths) {
   Rendering<S> expected = render_at(kBaselineLevel, scene);
   const auto expected_gradient = backward_at(kBaselineLevel, scene, expected, weights);
   const auto expected_contributions = contributions_at(kBaselineLevel, scene, expected);
+  const auto expected_importance = importance_at(kBaselineLevel, scene, expected);
   for (const SimdLevel* level : available_levels()) {
     Rendering<S> actual = render_at(*level, scene);
     // With and without fused multiply-add: an ulp here and there in some dozens of terms.
@@ -109,6 +129,8 @@ template <class S> void expect_levels_agree(BlendMode mode, bool depths) {
     // Sums over a tile's 256 pixels.
     expect_close(backward_at(*level, scene, expected, weights), expected_gradient, 256 * epsilon, level->name);
     expect_close(contributions_at(*level, scene, expected), expected_contributions, 256 * epsilon, level->name);
+    // Roundings in front of a pair grow by 1 / (1 - alpha) <= 100.
+    expect_close(importance_at(*level, scene, expected), expected_importance, 100 * 256 * epsilon, level->name);
   }
 }
 

@@ -41,6 +41,7 @@ def test_the_package_brings_every_public_header():
 def test_type_checkers_find_the_types_of_public_functions():
     assert (INSTALLED / "py.typed").is_file() and "py.typed" in load_setup().packages()["package_data"][SOURCE.name]
     functions = [diff_smoe_rasterization.GaussianRasterizer.forward, reference.rasterize, reference.contributions,
+                 reference.importance,
                  *(getattr(diff_smoe_rasterization, name) for name in diff_smoe_rasterization.__all__)]
     for function in filter(inspect.isfunction, functions):
         unknown = set(inspect.signature(function).parameters) - set(function.__annotations__) - {"self"}

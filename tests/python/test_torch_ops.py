@@ -103,10 +103,23 @@ def test_opcheck_of_contributions(mode):
     torch.library.opcheck(op, arguments, **parts)
 
 
+@SHAPES
+def test_opcheck_of_importance(mode):
+    scene = random_scene(mode, 20, 20, 18, dtype=torch.float32)
+    images, saved = op_results(scene)
+    op, weights = torch.ops.diff_smoe_rasterization.importance.default, random_normal((18, 20), 1, torch.float32)
+    arguments = op_arguments(scene, "importance", saved=list(saved.values()), pixel_weights=weights,
+                             share_weights=weights, **{name: images[name] for name in ("radii", "color", "gate_sum")})
+    parts = {} if weights.device.type == "cpu" else {
+        "test_utils": ("test_schema", "test_autograd_registration", "test_faketensor")}
+    torch.library.opcheck(op, arguments, **parts)
+
+
 def test_compiled_contributions_equal_eager(mode):
     def score(settings, pixel_weights, **inputs):
         rendering, splats = diff_smoe_rasterization.rasterize_with_splats(settings=settings, **inputs)
-        return (rendering.color, splats.centers, splats.depths, *splats.contributions(pixel_weights))
+        return (rendering.color, splats.centers, splats.depths, *splats.contributions(pixel_weights),
+                *splats.importance(pixel_weights))
 
     scene = random_scene(mode, 60, 40, 30, dtype=torch.float32, degree=1)
     pixel_weights = random_normal((30, 40), 1, torch.float32).abs()

@@ -6,6 +6,7 @@
 
 #include "dsmoe/contribution.h"
 #include "dsmoe/params.h"
+#include "dsmoe/removal.h"
 
 namespace dsmoe {
 namespace cpu {
@@ -36,6 +37,13 @@ template <class S> struct TileContributions {
   Contribution<S>* instances;  // [I] by slot; the tile's are written whole
 };
 
+// What each Gaussian is worth to a tile's pixels.
+template <class S> struct TileImportances {
+  const ImportanceMap<S>& map;
+  Importance<S>* instances;  // [I] by slot; the tile's are written whole
+};
+constexpr int kImportanceArrays = 7;  // numbers a pixel besides its channels
+
 // Numbers of scratch memory that one tile needs, for any of the kernels.
 inline int64_t tile_scratch_size(int num_features) {
   return static_cast<int64_t>(kTilePixels) * (num_features + 5) + 16 * num_features;
@@ -46,6 +54,7 @@ template <class S> struct TileKernels {
   int64_t (*forward)(const Tile<S>& tile, const ImageOutputs<S>& images, S* scratch);
   int64_t (*backward)(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch);
   int64_t (*contributions)(const Tile<S>& tile, const TileContributions<S>& contributions, S* scratch);
+  int64_t (*importance)(const Tile<S>& tile, const TileImportances<S>& importances, S* scratch);
 };
 
 // One of these per instruction set that the compiler can build for.

@@ -19,12 +19,14 @@
 #include "tile_backward_impl.h"
 #include "tile_contributions_impl.h"
 #include "tile_forward_impl.h"
+#include "tile_importance_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kAvx2Level = {"avx2",
-                              {avx2::forward<float>, avx2::backward<float>, avx2::contributions<float>},
-                              {avx2::forward<double>, avx2::backward<double>, avx2::contributions<double>}};
+const SimdLevel kAvx2Level = {
+    "avx2",
+    {avx2::forward<float>, avx2::backward<float>, avx2::contributions<float>, avx2::importance<float>},
+    {avx2::forward<double>, avx2::backward<double>, avx2::contributions<double>, avx2::importance<double>}};
 }  // namespace cpu
 }  // namespace dsmoe
 

@@ -21,12 +21,14 @@
 #include "tile_backward_impl.h"
 #include "tile_contributions_impl.h"
 #include "tile_forward_impl.h"
+#include "tile_importance_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kAvx512Level = {"avx512",
-                                {avx512::forward<float>, avx512::backward<float>, avx512::contributions<float>},
-                                {avx512::forward<double>, avx512::backward<double>, avx512::contributions<double>}};
+const SimdLevel kAvx512Level = {
+    "avx512",
+    {avx512::forward<float>, avx512::backward<float>, avx512::contributions<float>, avx512::importance<float>},
+    {avx512::forward<double>, avx512::backward<double>, avx512::contributions<double>, avx512::importance<double>}};
 }  // namespace cpu
 }  // namespace dsmoe
 

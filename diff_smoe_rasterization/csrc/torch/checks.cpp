@@ -138,9 +138,8 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
   }
 }
 
-void check_contribution_arguments(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
-                                  const at::Tensor& background_gate, const Options& options) {
-  const char* function = "contributions";
+void check_contribution_arguments(const char* function, const at::Tensor& pixel_weights, const at::Tensor& radii,
+                                  const Saved& saved, const at::Tensor& background_gate, const Options& options) {
   check_options(function, options);
   check_result(function, "radii", radii, {radii.numel()}, at::kInt, radii.device());
   TORCH_CHECK_VALUE(!saved.empty(), function, ": saved has length 0; it must be what rasterize returned");
@@ -149,6 +148,18 @@ void check_contribution_arguments(const at::Tensor& pixel_weights, const at::Ten
   check_shape(function, "pixel_weights", pixel_weights, {options.image_height, options.image_width});
   if (background_gate.defined()) check_like(function, "background_gate", background_gate, "means3D", saved[0]);
   check_background_gate(function, background_gate);
+}
+
+void check_importance_images(const ImportanceImages& images, const at::Tensor& like, const Options& options) {
+  const char* function = "importance";
+  const auto check_image = [&](const char* name, const at::Tensor& image, const Shape& shape) {
+    check_like(function, name, image, "means3D", like);
+    check_shape(function, name, image, shape);
+  };
+  check_image("share_weights", images.share_weights, {options.image_height, options.image_width});
+  check_image("color", images.color, {"C", options.image_height, options.image_width});
+  check_image("gate_sum", images.gate_sum, {1, options.image_height, options.image_width});
+  check_image("bg", images.background, {images.color.size(0)});
 }
 
 void check_result(const char* function, const char* name, const at::Tensor& tensor, const std::vector<int64_t>& shape,

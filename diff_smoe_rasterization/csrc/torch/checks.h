@@ -20,8 +20,17 @@ void check_arguments(const Inputs& inputs, const Options& options);
 void check_backward_arguments(const Inputs& inputs, const Options& options, const Images& images,
                               const Images& image_gradients, const InputMask& wanted);
 
-void check_contribution_arguments(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
-                                  const at::Tensor& background_gate, const Options& options);
+// Those of an op that goes over what a rendering saved.
+void check_contribution_arguments(const char* function, const at::Tensor& pixel_weights, const at::Tensor& radii,
+                                  const Saved& saved, const at::Tensor& background_gate, const Options& options);
+
+// The tensors of the op `importance` besides those of `contributions`.
+struct ImportanceImages {
+  at::Tensor share_weights;    // [H, W]
+  at::Tensor color, gate_sum;  // [C, H, W] and [1, H, W]
+  at::Tensor background;       // [C]
+};
+void check_importance_images(const ImportanceImages& images, const at::Tensor& like, const Options& options);
 
 // A tensor that a rendering returned: its shape, type and device must be as they were. shape: -1 stands for any size.
 void check_result(const char* function, const char* name, const at::Tensor& tensor, const std::vector<int64_t>& shape,

@@ -205,7 +205,7 @@ template <class Backend> void contributions(const c10::OperatorHandle& op, torch
   const auto saved = arguments.read<Saved>();
   const auto background_gate = arguments.read<at::Tensor>();
   const auto options = arguments.read<Options>();
-  check_contribution_arguments(pixel_weights, radii, saved, background_gate, options);
+  check_contribution_arguments("contributions", pixel_weights, radii, saved, background_gate, options);
   const typename Backend::Guard guard(radii.device());
   const auto real = [&] { return at::empty({radii.numel()}, pixel_weights.options()); };
   const at::Tensor weights = real(), pixels = at::empty_like(radii), blend_weights = real(), distances = real();
@@ -222,6 +222,44 @@ template <class Backend> void contributions(const c10::OperatorHandle& op, torch
   arguments.give_back(weights, pixels, blend_weights, distances);
 }
 
+template <class Backend> void importance(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  Arguments arguments(op, *stack);
+  const auto pixel_weights = arguments.read<at::Tensor>();
+  ImportanceImages images;
+  for (auto* image : {&images.share_weights, &images.color, &images.gate_sum, &images.background})
+    arguments.read(*image);
+  const auto radii = arguments.read<at::Tensor>();
+  const auto saved = arguments.read<Saved>();
+  const auto background_gate = arguments.read<at::Tensor>();
+  const auto options = arguments.read<Options>();
+  check_contribution_arguments("importance", pixel_weights, radii, saved, background_gate, options);
+  check_importance_images(images, saved[0], options);
+  const typename Backend::Guard guard(radii.device());
+  const auto sums = [&] { return at::empty({radii.numel()}, pixel_weights.options()); };
+  const at::Tensor shares = sums(), squared_shares = sums(), removal_costs = sums();
+  const at::Tensor weights = pixel_weights.contiguous();
+  for (auto* image : {&images.share_weights, &images.color, &images.gate_sum, &images.background}) {
+    *image = image->contiguous();
+  }
+  dispatch(weights, [&](auto zero) {
+    using S = decltype(zero);
+    RasterConfig<S> config = blend_config<S>(background_gate, options);
+    config.num_channels = static_cast<int>(images.color.size(0));
+    config.background = data<S>(images.background);
+    config.depth = options.depth;
+    config.inverse_depth = options.inverse_depth;
+    ImportanceMap<S> map;
+    map.color = data<S>(images.color);
+    map.pixel_weights = data<S>(weights);
+    map.share_weights = data<S>(images.share_weights);
+    map.sums.shares = mutable_data<S>(shares);
+    map.sums.squared_shares = mutable_data<S>(squared_shares);
+    map.sums.removal_costs = mutable_data<S>(removal_costs);
+    Backend::template importance<S>(images.gate_sum, radii, saved, config, options, map);
+  });
+  arguments.give_back(shares, squared_shares, removal_costs);
+}
+
 template <class Backend>
 at::Tensor mark_visible(const at::Tensor& positions, const at::Tensor& viewmatrix, double near) {
   const typename Backend::Guard guard(positions.device());
@@ -234,6 +272,7 @@ template <class Backend> void register_ops(torch::Library& m) {
   m.impl("rasterize_backward", torch::CppFunction::makeFromBoxedFunction<&rasterize_backward<Backend>>());
   m.impl("radii", torch::CppFunction::makeFromBoxedFunction<&radii<Backend>>());
   m.impl("contributions", torch::CppFunction::makeFromBoxedFunction<&contributions<Backend>>());
+  m.impl("importance", torch::CppFunction::makeFromBoxedFunction<&importance<Backend>>());
   m.impl("mark_visible", &mark_visible<Backend>);
 }
 

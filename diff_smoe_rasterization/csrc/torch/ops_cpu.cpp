@@ -74,6 +74,19 @@ struct Cpu {
     cpu::contributions(own, {data<S>(pixel_weights), sums});
   }
 
+  template <class S>
+  static void importance(const at::Tensor& gate_sum, const at::Tensor& radii, const Saved& saved,
+                         const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
+    cpu::Frame<S> own;
+    own.inputs.num_gaussians = radii.numel();
+    own.config = config;
+    own.config.num_threads = at::get_num_threads();
+    set_image(own.camera, options);
+    own.saved = unpack<S>("importance", saved, cpu::saved_sizes(own), radii.device());
+    own.saved.gate_sum = mutable_data<S>(gate_sum);
+    cpu::importance(own, map);
+  }
+
   static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {
     const at::Tensor visible = at::empty({positions.size(0)}, at::kBool);
     dispatch(positions, [&](auto zero) {

@@ -85,6 +85,24 @@ struct Cuda {
     cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream});
   }
 
+  template <class S>
+  static void importance(const at::Tensor& gate_sum, const at::Tensor& radii, const Saved& saved,
+                         const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
+    cuda::Frame<S> own;
+    own.inputs.num_gaussians = radii.numel();
+    own.config = config;
+    own.images.radii = mutable_data<int32_t>(radii);
+    set_image(own.camera, options);
+    const cuda::Run how = run(options, nullptr);
+    own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
+    own.saved.gate_sum = mutable_data<S>(gate_sum);
+    TensorMemory memory(gate_sum);
+    cuda::Work work;
+    work.stream = how.stream;
+    work.scratch = &memory;
+    cuda::importance(own, map, work);
+  }
+
   static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {
     const at::Tensor visible = at::empty({positions.size(0)}, positions.options().dtype(at::kBool));
     dispatch(positions, [&](auto zero) {

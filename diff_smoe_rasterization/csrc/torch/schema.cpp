@@ -36,6 +36,12 @@ const std::string kContributions =
     "contributions(Tensor pixel_weights, Tensor radii, Tensor[] saved, Tensor? background_gate, " +
     without_comma(kOptions) + ") -> (Tensor pixel_weights, Tensor pixels, Tensor blend_weights, Tensor distances)";
 
+// From the images of one rendering, weights of its pixels [H, W] and what it saved: what each Gaussian is worth.
+const std::string kImportance =
+    "importance(Tensor pixel_weights, Tensor share_weights, Tensor color, Tensor gate_sum, Tensor bg, Tensor radii, "
+    "Tensor[] saved, Tensor? background_gate, " +
+    without_comma(kOptions) + ") -> (Tensor shares, Tensor squared_shares, Tensor removal_costs)";
+
 }  // namespace
 
 TORCH_LIBRARY(diff_smoe_rasterization, m) {
@@ -43,5 +49,6 @@ TORCH_LIBRARY(diff_smoe_rasterization, m) {
   m.def(kRasterizeBackward.c_str());
   m.def(kRadii.c_str());
   m.def(kContributions.c_str());
+  m.def(kImportance.c_str());
   m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near) -> Tensor");
 }

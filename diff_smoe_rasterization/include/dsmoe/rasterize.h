@@ -76,6 +76,10 @@ template <class S> void blend(const Frame<S>& frame, StageTimes* times = nullptr
 // neither features nor images but last_contributor.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map);
 
+// Walks the tile lists once more, and sums what each Gaussian is worth to the image. `frame` is as `forward` left it;
+// of its images only the gate sum is read, through saved.
+template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map);
+
 // Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
 // visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible);

@@ -210,6 +210,10 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
 // images but last_contributor.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work);
 
+// Walks the tile lists once more, and sums what each Gaussian is worth to the image, by atomics as `contributions`.
+// `frame` is as `forward` left it; of its images the radii are read, and through saved the gate sum.
+template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map, const Work& work);
+
 // Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
 // visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work);

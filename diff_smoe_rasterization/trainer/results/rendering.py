@@ -1,13 +1,16 @@
 """One image of a GaussianModel through the package's public rasterizer."""
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Tuple
 
 import torch
 
 from ...settings import BackgroundGate, GaussianRasterizationSettings, Rendering
 from ..model import GaussianModel
 from ..scenes.cameras import Camera
+
+if TYPE_CHECKING:
+    from ...splats import Splats
 
 Rasterize = Callable[..., Rendering]
 
@@ -43,6 +46,17 @@ class Renderer:
 
         arguments: further ones of `rasterize`, means2D or outputs, or colors_precomp in place of the SH colours.
         """
+        return self._render(self.rasterize, camera, background, background_gate, **arguments)
+
+    @torch.no_grad()
+    def with_splats(self, camera: Camera) -> Tuple[Rendering, Splats]:
+        """An image, and what its pixels say of each Gaussian."""
+        from ... import rasterize_with_splats
+
+        return self._render(rasterize_with_splats, camera)
+
+    def _render(self, function: Callable[..., Any], camera: Camera, background: Optional[torch.Tensor] = None,
+                background_gate: Optional[torch.Tensor] = None, **arguments: Any) -> Any:
         model = self.model
         settings = self._settings_of(camera)
         if background is not None:
@@ -53,8 +67,7 @@ class Renderer:
         if "colors_precomp" not in arguments:
             arguments.update(model.color_arguments())
         opacities, scales, rotations = model.activated()
-        return self.rasterize(model.raw["means3D"], opacities, settings, scales=scales,
-                              rotations=rotations, **arguments)
+        return function(model.raw["means3D"], opacities, settings, scales=scales, rotations=rotations, **arguments)
 
     def _settings_of(self, camera: Camera) -> GaussianRasterizationSettings:
         """The camera's settings; its matrices stay on the device, where sending them anew would hold up the step."""

@@ -50,7 +50,7 @@ def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layo
     layout = layout or read_layout(config)
     images = load_views(list(layout.train) + list(layout.test), config, progress)
     train, test = images[:len(layout.train)], images[len(layout.train):]
-    points = layout.points.subset(config.init_points, config.seed)
+    points = layout.points.subset(config.init_points, config.seed).subset(config.most_points, config.seed)
     extent = scene_extent(np.stack([view.camera.center for view in train]))
     return Scene(layout.kind, train, test, points, extent, layout.split)
 

@@ -31,7 +31,8 @@ from .background_gate import LearnedGate
 from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
 from .order import ViewOrder
 from .randomness import random_state, restore_random_state, seed_everything
-from .strategy import STRATEGIES, Step, StrategyContext
+from .strategies import STRATEGIES
+from .strategy import Step, StrategyContext
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
 LOSS_NAME = "loss.png"
@@ -70,8 +71,8 @@ class Trainer:
         self.renderer = Renderer(
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate))
-        self.strategy = STRATEGIES[config.schedule](StrategyContext(
-            config, self.model, self.optimizer, scene.extent, [view.camera for view in scene.train], self.renderer))
+        self.strategy = STRATEGIES[str(config.schedule)](StrategyContext(
+            config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer))
         self.order = ViewOrder(len(scene.train), config.seed)
         self.watch = Stopwatch(config.device)
         self.iteration = 0
@@ -86,7 +87,7 @@ class Trainer:
         config, model = self.config, self.model
         if model.num_gaussians == 0:
             raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
-                               "try another --densify-grad-threshold or --schedule steady")
+                               "try another --densify-grad-threshold or --strategy steady")
         self.iteration += 1
         self.optimizer.set_position_rate(self.iteration)
         if self.iteration % config.sh_degree_interval == 0:

@@ -1,12 +1,12 @@
 """Where Gaussians are added and removed: one small interface, and the recipe of 3DGS behind it.
 
-A new strategy is one class with the hooks below and one line in STRATEGIES. What it may need of the run, extra
+A new strategy is one class with the hooks below and one line in strategies.py. What it may need of the run, extra
 renderings of training views included, is in StrategyContext.
 """
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Callable, Dict, Sequence
+from typing import Any, Dict, Optional, Sequence, Tuple
 
 import torch
 
@@ -14,7 +14,9 @@ from ...gaussians import add_view
 from ...settings import Rendering
 from ..config import TrainConfig
 from ..model import PARAMETERS, GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
+from ..results.rendering import Renderer
 from ..scenes.cameras import Camera
+from ..scenes.images import View
 
 MIN_OPACITY = 0.005  # fainter Gaussians are pruned
 RESET_OPACITY = 0.01  # an opacity reset leaves no Gaussian above this
@@ -31,8 +33,8 @@ class StrategyContext:
     model: GaussianModel
     optimizer: GaussianOptimizer
     extent: float  # scene extent, world units
-    cameras: Sequence[Camera]  # the training views
-    render: Callable[..., Rendering]  # render(camera, **rasterize arguments), for passes of the strategy's own
+    views: Sequence[View]  # for training
+    render: Renderer  # for passes of the strategy's own
 
 
 @dataclass
@@ -54,6 +56,7 @@ class Strategy:
     """
 
     def __init__(self, context: StrategyContext) -> None:
+        """May change the first Gaussians; a resumed run replaces them and loads the state."""
         self.context = context
 
     def before_backward(self, step: Step) -> None:
@@ -89,11 +92,11 @@ class ThreeDGSStrategy(Strategy):
 
     def after_backward(self, step: Step) -> None:
         config = self.context.config
-        if step.iteration >= config.densify_until_iter:
+        if step.iteration >= self.densify_until:
             return
         self._observe(step)
         if step.iteration > config.densify_from_iter and step.iteration % config.densification_interval == 0:
-            self.densify(self._mean_gradients())
+            self.densify(self._mean_gradients(), *self.growth(step.iteration))
             self.prune(large_too=self.prunes_large and step.iteration > config.opacity_reset_interval)
             self._forget_statistics()
         # On white, 3DGS resets once more where densification starts.
@@ -101,10 +104,28 @@ class ThreeDGSStrategy(Strategy):
         if self.resets_opacity and (step.iteration % config.opacity_reset_interval == 0 or starts_on_white):
             self.reset_opacities()
 
-    def densify(self, gradients: torch.Tensor) -> None:
-        """Clones small and splits large Gaussians whose mean gradient [N] reaches the threshold."""
+    @property
+    def densify_until(self) -> int:
+        """The step before which densification ends."""
+        return self.context.config.densify_until_iter
+
+    def growth(self, iteration: int) -> Tuple[int, Optional[int]]:
+        """How many Gaussians a densification adds at least and, but for None, at most."""
+        budget = self.context.config.budget
+        return 0, max(0, budget - self.context.model.num_gaussians) if budget else None
+
+    def densify(self, gradients: torch.Tensor, least: int = 0, most: Optional[int] = None) -> None:
+        """Clones small and splits large Gaussians whose mean gradient [N] reaches the threshold.
+
+        Where those are fewer than `least` or more than `most`, so many of the largest gradients are taken.
+        """
         config, model = self.context.config, self.context.model
         wanted = gradients >= config.densify_grad_threshold
+        if least > 0 or most is not None:
+            count = max(int(wanted.sum()), least)
+            count = min(count, int((gradients > 0).sum()), count if most is None else most)
+            wanted = torch.zeros_like(wanted)
+            wanted[torch.topk(gradients, count).indices] = True
         large = model.scales.detach().max(dim=1).values > config.percent_dense * self.context.extent
         parents = wanted & large
         clones = self._rows(wanted & ~large)
@@ -164,7 +185,3 @@ class SteadyStrategy(ThreeDGSStrategy):
 
     resets_opacity = False
     prunes_large = False
-
-
-STRATEGIES = {"3dgs": ThreeDGSStrategy, "steady": SteadyStrategy}
-"""Strategies by the name that --schedule takes."""

@@ -14,7 +14,8 @@ from diff_smoe_rasterization.trainer.results.rendering import package_rasterizer
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.training import loop
 from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
-from diff_smoe_rasterization.trainer.training.strategy import STRATEGIES, Strategy
+from diff_smoe_rasterization.trainer.training.strategies import STRATEGIES
+from diff_smoe_rasterization.trainer.training.strategy import Strategy
 
 
 @pytest.fixture
@@ -193,7 +194,7 @@ def test_a_strategy_sees_every_stage_of_a_step(tiny_config, scene, monkeypatch):
         def after_backward(self, step):
             assert step.means2D.grad.shape == (self.context.model.num_gaussians, 3) and step.means2D.grad.any()
             self.before_step = self.context.model.raw["means3D"].detach().clone()
-            other = self.context.render(self.context.cameras[0], outputs=("alpha",))
+            other = self.context.render(self.context.views[0].camera, outputs=("alpha",))
             seen.append(("after", tuple(other.alpha.shape), bool((step.rendering.radii > 0).any())))
 
         def after_step(self, step):

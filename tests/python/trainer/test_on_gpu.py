@@ -71,11 +71,13 @@ def test_a_step_does_not_wait_for_the_device(config, scene, options):
     assert all(torch.isfinite(trainer.model.raw[name]).all() for name in PARAMETERS)
 
 
-@pytest.mark.parametrize("schedule", ["3dgs", "steady"])
+@pytest.mark.parametrize("schedule", ["3dgs", "steady", "gate", "mcmc"])
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_a_whole_run(config, schedule, mode):
-    config = config.changed(schedule=schedule, blend_mode=mode, eval_every=10)
+    budget = 100 if schedule in ("gate", "mcmc") else 0
+    config = config.changed(schedule=schedule, budget=budget, blend_mode=mode, eval_every=10)
     row = train(config, progress=False)
+    assert not budget or row["num_gaussians"] == budget
     assert row["protocol"]["device"] == "cuda" and math.isfinite(row["psnr"]) and row["fps"] > 0
     with open(os.path.join(config.output, "history.json"), encoding="utf-8") as file:
         assert [entry["iteration"] for entry in json.load(file)] == [10, 20, 30]

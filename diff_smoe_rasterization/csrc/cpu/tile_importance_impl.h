@@ -1,0 +1,121 @@
+// One tile's share of what each Gaussian is worth to the image: the forward walk once more, beside its finished pixels.
+// Included once per instruction set.
+#pragma once
+
+#include "dsmoe/removal.h"
+#include "tile_walk_impl.h"
+
+namespace dsmoe {
+namespace cpu {
+namespace DSMOE_SIMD {
+
+template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor {
+ public:
+  using P = Pack<S>;
+  static constexpr BlendMode kMode = kBlendMode;
+  static constexpr bool kBackToFront = false;
+
+  DSMOE_HD ImportanceVisitor(const Tile<S>& tile, Scratch<S> scratch, const TileImportances<S>& out)
+      : num_channels_(kFeatures != kAnyFeatures ? kFeatures : tile.config.num_channels),
+        background_(tile.config.background),
+        background_gate_(tile.config.gate_of_background()),
+        transmittance_(scratch.pixels()),
+        gate_sum_(scratch.pixels()),
+        last_(scratch.pixels()),
+        end_transmittance_(scratch.pixels()),
+        end_gate_sum_(scratch.pixels()),
+        weight_(scratch.pixels()),
+        share_weight_(scratch.pixels()),
+        channels_{scratch.next},
+        out_(out) {
+    for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(1);
+    for (int i = 0; i < kTilePixels * (kImportanceArrays - 1 + 2 * num_channels_); ++i) gate_sum_.values[i] = S(0);
+  }
+
+  // Returns how many entries of the list some numerator has seen.
+  DSMOE_HD int64_t read(const Tile<S>& tile) const {
+    const int64_t pixels = static_cast<int64_t>(tile.width) * tile.height;
+    int64_t num_seen = 0;
+    TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
+      last_.pixel(x, y) = S(tile.saved.last_contributor[index]);
+      end_transmittance_.pixel(x, y) = tile.saved.final_transmittance[index];
+      end_gate_sum_.pixel(x, y) = tile.saved.gate_sum[index];
+      weight_.pixel(x, y) = out_.map.pixel_weights[index];
+      share_weight_.pixel(x, y) = out_.map.share_weights[index];
+      for (int c = 0; c < num_channels_; ++c) value_of(c).pixel(x, y) = out_.map.color[c * pixels + index];
+      num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
+    });
+    return num_seen;
+  }
+
+  DSMOE_HD bool done() const { return false; }
+  DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
+    features_ = gaussian.features;
+    position_ = P(gaussian.position);
+    sum_ = no_importance<P>();
+  }
+  DSMOE_HD void begin_strip() {}
+  DSMOE_HD bool wants(int strip, int row) {
+    not_past_ = position_ < last_.load(strip, row);
+    return !Blend<kMode>::kStopsEarly || any(not_past_);
+  }
+
+  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P, S) {
+    PixelState<P> state = {transmittance_.load(strip, row), gate_sum_.load(strip, row)};
+    const PixelEnd<P> end = {end_transmittance_.load(strip, row), end_gate_sum_.load(strip, row), background_gate_};
+    const auto removal = remove_pair<kMode>(state, end, gate, not_past_);
+    transmittance_.store(strip, row, state.transmittance);
+    gate_sum_.store(strip, row, state.gate_sum);
+    P squared = S(0);
+    for (int c = 0; c < num_channels_; ++c) {
+      const P value = value_of(c).load(strip, row), distance = P(features_[c]) - value;
+      const P front = front_of(c).load(strip, row);
+      const P change = channel_change<kMode>(removal, distance, front, value, P(background_[c]));
+      squared = fma(change, change, squared);
+      front_of(c).store(strip, row, fma(removal.weight, distance, front));
+    }
+    add_pair(sum_, removal, squared, share_weight_.load(strip, row), weight_.load(strip, row));
+  }
+
+  DSMOE_HD void end_strip(P) {}
+  DSMOE_HD void end(const ListedGaussian<S>& gaussian) const {
+    out_.instances[gaussian.slot] = {sum_lanes(sum_.share), sum_lanes(sum_.squared_share),
+                                     sum_lanes(sum_.removal_cost)};
+  }
+
+ private:
+  DSMOE_HD PixelArray<S> value_of(int c) const { return {channels_.values + 2 * c * kTilePixels}; }
+  DSMOE_HD PixelArray<S> front_of(int c) const { return {channels_.values + (2 * c + 1) * kTilePixels}; }
+
+  const int num_channels_;
+  const S* const background_;
+  const S background_gate_;
+  const PixelArray<S> transmittance_, gate_sum_, last_, end_transmittance_, end_gate_sum_, weight_, share_weight_;
+  const PixelArray<S> channels_;  // two arrays a channel: C, and A
+  const TileImportances<S>& out_;
+  const S* features_ = nullptr;
+  P position_;
+  Mask<P> not_past_;
+  Importance<P> sum_;
+};
+
+template <class S, BlendMode kMode, int kFeatures>
+int64_t importance_of_tile(const Tile<S>& tile, const TileImportances<S>& out, S* memory) {
+  ImportanceVisitor<S, kMode, kFeatures> visitor(tile, {memory}, out);
+  const int64_t num_seen = visitor.read(tile);
+  const int64_t end = Blend<kMode>::kStopsEarly ? tile.begin + num_seen : tile.end;
+  for (int64_t i = end; i < tile.end; ++i) out.instances[tile.saved.instances[i].slot] = no_importance<S>();
+  return walk_tile(tile, tile.begin, end, tile.config.num_features(), visitor);
+}
+
+template <class S> int64_t importance(const Tile<S>& tile, const TileImportances<S>& out, S* scratch) {
+  int64_t pairs = 0;
+  dispatch_blend(tile.config.mode, tile.config.num_channels, [&](auto mode, auto channels) {
+    pairs = importance_of_tile<S, decltype(mode)::value, decltype(channels)::value>(tile, out, scratch);
+  });
+  return pairs;
+}
+
+}  // namespace DSMOE_SIMD
+}  // namespace cpu
+}  // namespace dsmoe

@@ -1,0 +1,109 @@
+// What a Gaussian has in a pixel, and what the pixel would be without it: for each pair, front to back.
+//
+// Without pair k what lies behind it is seen through no alpha_k: with q_k = alpha_k / (1 - alpha_k), its weights and
+// the transmittance T are multiplied by 1 + q_k. With C and D as in blend.h,
+//
+//   D'_k = sum_{j<k} w_j + (1 + q_k) (sum_{j>k} w_j + lambda T)
+//   C'_k - C = (q_k (sum_{j>k} w_j (c_j - C) + lambda T (bg - C)) - w_k (c_k - C)) / D'_k
+//
+// All w_j (c_j - C) and lambda T (bg - C) together are 0. So one walk front to back knows what lies behind from the sum
+// A_k = sum_{j<k} w_j (c_j - C) of what lies in front:
+//
+//   C'_k - C = -((1 + q_k) w_k (c_k - C) + q_k A_k) / D'_k
+//
+// The ablations divide by sum alpha, of which alpha_k goes; in smoe_std nothing is seen through anything, so q_k is 0.
+// A pixel that no other Gaussian and no background's gate is in shows the background's colour. This is exact but for
+// what lies behind a pixel's early stop, of which nothing is known.
+#pragma once
+
+#include "dsmoe/pixel.h"
+
+namespace dsmoe {
+
+// What is summed over the pixels of each Gaussian, each number times a weight of the pixel's.
+template <class Real> struct Importance {
+  Real share;          // f = w / D: how the pixel's colour follows the Gaussian's
+  Real squared_share;  // f^2
+  Real removal_cost;   // |C' - C|^2, summed over the channels
+};
+constexpr int kNumImportances = 3;
+
+template <class Real> DSMOE_HD Importance<Real> no_importance() {
+  const Real zero = Scalar<Real>(0);
+  return {zero, zero, zero};
+}
+
+// A pair's removal; each channel joins through channel_change.
+template <class Real> struct Removal {
+  Mask<Real> takes;  // the pair has a part in the pixel
+  Real weight;       // w
+  Real share;        // f
+  Real own;          // of c - C in C' - C
+  Real front;        // of A
+  Real value;        // of C: smoe_tn only
+  Mask<Real> left;   // something else is in the pixel
+};
+
+// total - part. Nothing where that may be the rounding of two sums of equal terms, which other kernels may round
+// otherwise: a pixel's only owner has to be known.
+template <class Real> DSMOE_HD Real rest_of(Real total, Real part) {
+  using S = Scalar<Real>;
+  constexpr S kRounding = sizeof(S) == sizeof(float) ? S(0x1p-17) : S(0x1p-46);  // of 64 operations
+  const Real rest = total - part;
+  return select(rest > total * Real(kRounding), rest, Real(S(0)));
+}
+
+// Moves `state` past a pair. end: the pixel behind its last pair. wanted: the walk has not passed the pixel's last
+// pair.
+template <BlendMode kMode, class Real>
+DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>& end, const Gate<Real>& gate,
+                                   Mask<Real> wanted) {
+  using S = Scalar<Real>;
+  constexpr bool kSeesThrough = Blend<kMode>::kNeedsDepthOrder, kCountsWeights = Blend<kMode>::kStopsEarly;
+  const Real zero = S(0), one = S(1);
+  const auto by = feature_end<kMode>(FeatureRule::kBlended, end);
+  const Real in_front = state.gate_sum;
+  const auto pair = Blend<kMode>::accumulate(state, gate);
+  const Mask<Real> blended = pair.contributes & wanted;
+  Removal<Real> out;
+  out.takes = by.open & (kSeesThrough && !kCountsWeights ? gate.counts : blended);
+  out.weight = select(blended, pair.weight, zero);
+  out.share = out.weight / select(by.open, by.denominator, one);
+  const Real odds = kSeesThrough ? select(blended, gate.alpha / (one - gate.alpha), zero) : zero;
+  const Real behind = kCountsWeights ? rest_of(abs(state.transmittance), end.transmittance) + by.weight
+                                     : rest_of(end.gate_sum, state.gate_sum);
+  const Real sum = kCountsWeights ? in_front + (one + odds) * behind : in_front + behind;
+  out.left = Blend<kMode>::kDivides ? sum >= Real(S(kGateSumCut)) : sum >= zero;
+  const Real inverse = Blend<kMode>::kDivides ? one / select(out.left, sum, one) : one;
+  out.own = -((one + odds) * out.weight) * inverse;
+  out.front = -odds * inverse;
+  out.value = zero;
+  if constexpr (kSeesThrough && !kCountsWeights) {
+    out.value = fma(odds, end.gate_sum - one, gate.alpha) * inverse;
+  } else {
+    // With nothing behind, what is left is what lies in front, and no digit of it is lost to c - C.
+    out.own = select(behind > zero, out.own, zero);
+    out.front = select(behind > zero, out.front, inverse);
+  }
+  return out;
+}
+
+// C' - C in one channel. distance: c - C; front: A; value: C.
+template <BlendMode kMode, class Real>
+DSMOE_HD Real channel_change(const Removal<Real>& removal, Real distance, Real front, Real value, Real background) {
+  Real change = fma(removal.own, distance, removal.front * front);
+  if (Blend<kMode>::kNeedsDepthOrder && !Blend<kMode>::kStopsEarly) change = fma(removal.value, value, change);
+  return select(removal.left, change, background - value);
+}
+
+// squared_change: |C' - C|^2. share_weight, weight: of the pixel, in maps of the caller's.
+template <class Real>
+DSMOE_HD void add_pair(Importance<Real>& sum, const Removal<Real>& removal, Real squared_change, Real share_weight,
+                       Real weight) {
+  const Real zero = Scalar<Real>(0);
+  sum.share = sum.share + select(removal.takes, share_weight * removal.share, zero);
+  sum.squared_share = sum.squared_share + select(removal.takes, weight * removal.share * removal.share, zero);
+  sum.removal_cost = sum.removal_cost + select(removal.takes, weight * squared_change, zero);
+}
+
+}  // namespace dsmoe

@@ -1,0 +1,180 @@
+"""The strategy `gate`: to a given number of Gaussians, those that explain most.
+
+It grows well beyond the budget, removes in steps the Gaussians whose removal changes the training views least, and then
+moves the cheapest of what is left to where the error is. Cost and error are sums over pixels of squared colours, so
+they can be compared: `Splats.importance`. The rules and what they are worth: docs/trainer.md.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Dict, List, NamedTuple, Optional, Tuple
+
+import torch
+
+from ..config import parse_options
+from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
+from ..scenes.images import View, as_float
+from .strategy import SteadyStrategy, Step, StrategyContext
+
+# Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, removals are at 8,200 to 12,700, moves end
+# at 20,000.
+GROWTH_ENDS = 8 / 15
+REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
+MOVES_END = 4 / 3
+MOVE_INTERVAL = 1 / 30
+
+# A split along the longest axis: each child's offset and scale, in standard deviations of its parent, and the opacity
+# at which both together cover what the parent did.
+CHILD_OFFSET = 0.5
+CHILD_SCALE = 0.65
+CHILD_COVER = 0.744
+
+
+@dataclass(frozen=True)
+class GateOptions:
+    """What `--strategy-options` may set."""
+
+    overshoot: float = 10.0  # growth ends at so many times the budget; 0: wherever the threshold leads
+    removals: int = 16  # steps down to the budget
+    views: int = 96  # training views that a decision looks at
+    moves: float = 0.1  # the most Gaussians that move at a time, as a part of all; 0: none
+    worth: float = 0.2  # a Gaussian moves where its cost is below this part of the error at its new place
+    opacity_weight: float = 0.0  # of the mean opacity in the loss
+    scale_weight: float = 0.0  # of the mean scale in the loss
+    anneal: float = 0.1  # behind the moves all learning rates but the positions' fall to this part of themselves
+    position_rate: float = 4.0  # multiplies the learning rate of positions
+
+
+class Scores(NamedTuple):
+    """Sums over the training views that were looked at."""
+
+    costs: torch.Tensor  # [N] squared change of the images on the Gaussian's removal
+    errors: torch.Tensor  # [N] squared error of the images where the Gaussian is, by its share
+
+
+class GateStrategy(SteadyStrategy):
+    """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
+
+    def __init__(self, context: StrategyContext) -> None:
+        super().__init__(context)
+        config = context.config
+        self.options: GateOptions = parse_options(config.strategy_options, GateOptions)
+        self.start = context.model.num_gaussians
+        context.optimizer.position_factor = self.options.position_rate
+        until = config.densify_until_iter
+        self.growth_ends = round(GROWTH_ENDS * until)
+        count = self.options.removals
+        self.removals = [round(until * (REMOVALS_BEGIN + (REMOVALS_END - REMOVALS_BEGIN) * i / count))
+                         for i in range(count)]
+        self.move_interval = max(1, round(MOVE_INTERVAL * until))
+        self.moves_end = round(MOVES_END * until)
+
+    def before_backward(self, step: Step) -> None:
+        if self.options.anneal != 1:
+            span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
+            share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
+            self.context.optimizer.scale_other_rates(self.options.anneal**share)
+
+    def after_backward(self, step: Step) -> None:
+        raw = self.context.model.raw
+        if self.options.opacity_weight or self.options.scale_weight:
+            opacities, scales, _ = self.context.model.activated()
+            raw["opacities"].grad += self.options.opacity_weight / opacities.numel() * opacities * (1 - opacities)
+            raw["scales"].grad += self.options.scale_weight / scales.numel() * scales
+        super().after_backward(step)
+
+    def after_step(self, step: Step) -> None:
+        if step.iteration in self.removals:
+            self.remove(1 + sum(later > step.iteration for later in self.removals))
+        elif (self.options.moves > 0 and self.removals[-1] < step.iteration <= self.moves_end
+              and step.iteration % self.move_interval == 0):
+            self.move()
+
+    @property
+    def densify_until(self) -> int:
+        return self.growth_ends
+
+    def growth(self, iteration: int) -> Tuple[int, Optional[int]]:
+        """At least what reaches the budget and at most what reaches the overshoot, in equal steps."""
+        config, now = self.context.config, self.context.model.num_gaussians
+        steps = -(-(self.growth_ends - iteration) // config.densification_interval)
+        least = -(-max(0, config.budget - now) // steps)
+        if self.options.overshoot == 0:
+            return least, None
+        goal = max(round(self.options.overshoot * config.budget), 2 * self.start)
+        return least, -(-max(0, goal - now) // steps)
+
+    def remove(self, steps_left: int) -> None:
+        """Removes the cheapest, down to the budget in steps of equal ratios. steps_left: with this one."""
+        model, budget = self.context.model, self.context.config.budget
+        if model.num_gaussians <= budget:
+            return
+        ratio = model.num_gaussians / budget
+        kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
+        costs = self.score().costs
+        mask = torch.zeros_like(costs, dtype=torch.bool)
+        mask[torch.topk(costs, kept).indices] = True
+        self.context.optimizer.keep(mask)
+        self._forget_statistics()
+
+    def move(self) -> None:
+        """Moves the cheapest Gaussians to others, drawn by their error, which are split there."""
+        scores = self.score()
+        count = int(self.options.moves * len(scores.costs))
+        costs, sources = torch.topk(scores.costs, count, largest=False)
+        errors = scores.errors.clone()
+        errors[sources] = 0
+        count = min(count, int((errors > 0).sum()))
+        if count == 0:
+            return
+        targets = torch.multinomial(errors, count)
+        errors, order = errors[targets].sort(descending=True)
+        worth = (costs[:count] < self.options.worth * errors).nonzero().squeeze(1)
+        self.split(targets[order][worth], sources[worth])
+
+    def split(self, parents: torch.Tensor, places: torch.Tensor) -> None:
+        """Splits Gaussians in two along their longest axis. parents: rows; places: rows that the second children take.
+
+        The children begin without Adam's first moment, and with their parent's second one.
+        """
+        raw = {name: self.context.model.raw[name].detach().index_select(0, parents) for name in PARAMETERS}
+        scales = raw["scales"].exp()
+        axis = scales.argmax(dim=1, keepdim=True)
+        directions = quaternion_to_matrix(raw["rotations"]).gather(2, axis.unsqueeze(1).expand(-1, 3, 1)).squeeze(2)
+        offsets = CHILD_OFFSET * scales.gather(1, axis) * directions
+        opacities = raw["opacities"].sigmoid()
+        children = torch.minimum(opacities, (1 - (1 - opacities).sqrt()) / CHILD_COVER)
+        raw["opacities"] = inverse_sigmoid(children)
+        raw["scales"] = torch.where(torch.arange(3, device=axis.device) == axis, (CHILD_SCALE * scales).log(),
+                                    raw["scales"])
+        means = raw["means3D"]
+        for rows, place in ((parents, means + offsets), (places, means - offsets)):
+            self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
+
+    def score(self) -> Scores:
+        """Renders training views, and sums what each Gaussian is worth to them."""
+        zeros = self.context.model.raw["means3D"].new_zeros(self.context.model.num_gaussians)
+        costs, errors = zeros, zeros.clone()
+        for view in self._some_views():
+            rendering, splats = self.context.render.with_splats(view.camera)
+            error = (rendering.color - as_float(view.image)).square().sum(0)
+            mask = view.mask_float()
+            weights = torch.ones_like(error) if mask is None else mask[0]
+            importance = splats.importance(weights, weights * error)
+            costs += importance.removal_costs
+            errors += importance.shares
+        return Scores(costs, errors)
+
+    def _some_views(self) -> List[View]:
+        """Views as evenly spread as their order is, from a random one on."""
+        views = self.context.views
+        count = min(self.options.views, len(views))
+        first = int(torch.randint(len(views), ()))
+        return [views[(first + i * len(views) // count) % len(views)] for i in range(count)]
+
+    def state_dict(self) -> Dict[str, Any]:
+        return {**super().state_dict(), "start": self.start}
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.start = state["start"]

@@ -1,0 +1,136 @@
+// A pixel without one of its pairs: against the paper's sums over the others.
+#include "dsmoe/removal.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "all_modes.h"
+
+namespace dsmoe {
+namespace {
+
+struct Pixel {
+  std::vector<double> alpha, color;  // front to back
+  double background = 0.3, background_gate = 0;
+  int size() const { return static_cast<int>(alpha.size()); }
+};
+
+// The colour by Eq. 3, 6, 7 or 8 without pair `omitted`, -1 for none.
+double color_of(BlendMode mode, const Pixel& pixel, int omitted) {
+  double numerator = 0, sum_weight = 0, sum_alpha = 0, transmittance = 1;
+  for (int i = 0; i < pixel.size(); ++i) {
+    if (i == omitted) continue;
+    const double weight = mode == BlendMode::kSmoeStd ? pixel.alpha[i] : pixel.alpha[i] * transmittance;
+    numerator += weight * pixel.color[i];
+    sum_weight += weight;
+    sum_alpha += pixel.alpha[i];
+    transmittance *= 1 - pixel.alpha[i];
+  }
+  if (mode == BlendMode::kAlpha) return numerator + transmittance * pixel.background;
+  const bool by_weight = mode == BlendMode::kSmoe;
+  const double gate = by_weight ? pixel.background_gate * transmittance : 0;
+  const double denominator = (by_weight ? sum_weight : sum_alpha) + gate;
+  return denominator > 0 ? (numerator + gate * pixel.background) / denominator : pixel.background;
+}
+
+// dC/dc of pair i: the colour of a pixel in which that pair has 1, and all else 0.
+double share_of(BlendMode mode, Pixel pixel, int i) {
+  for (int j = 0; j < pixel.size(); ++j) pixel.color[j] = i == j;
+  pixel.background = 0;
+  return color_of(mode, pixel, -1);
+}
+
+template <BlendMode kMode, class S> void expect_omissions(const Pixel& pixel, double tolerance) {
+  std::vector<Gate<S>> gates;
+  for (const double alpha : pixel.alpha) gates.push_back({S(alpha), S(alpha), true});
+  PixelState<S> state = PixelState<S>::open();
+  for (const auto& gate : gates) Blend<kMode>::accumulate(state, gate);
+  const PixelEnd<S> end = state.end(S(pixel.background_gate));
+  const S value = S(color_of(kMode, pixel, -1)), background = S(pixel.background);
+  state = PixelState<S>::open();
+  S front = 0;
+  for (int i = 0; i < pixel.size(); ++i) {
+    const auto removal = remove_pair<kMode>(state, end, gates[i], true);
+    const S distance = S(pixel.color[i]) - value;
+    const S change = channel_change<kMode>(removal, distance, front, value, background);
+    front = fma(removal.weight, distance, front);
+    EXPECT_TRUE(removal.takes);
+    EXPECT_NEAR(removal.share, share_of(kMode, pixel, i), tolerance) << i;
+    EXPECT_NEAR(change, color_of(kMode, pixel, i) - color_of(kMode, pixel, -1), tolerance) << i;
+  }
+}
+
+// Far from full: (1 - 0.6)^8 > 1e-4.
+Pixel layers(double opacity) {
+  Pixel pixel;
+  for (int i = 0; i < 8; ++i) {
+    pixel.alpha.push_back(opacity * (0.5 + 0.5 * std::sin(7 * i + 1)));
+    pixel.color.push_back(0.5 + 0.5 * std::cos(5 * i));
+  }
+  return pixel;
+}
+
+template <class Mode> struct RemovalIn : testing::Test {};
+TYPED_TEST_SUITE(RemovalIn, AllModes);
+
+TYPED_TEST(RemovalIn, EqualsTheSumsOverTheOthers) {
+  constexpr BlendMode kMode = TypeParam::value;
+  for (const double gate : {0.0, 0.03, 1.0}) {
+    for (const double opacity : {0.6, 0.01}) {
+      Pixel pixel = layers(opacity);
+      pixel.background_gate = kMode == BlendMode::kSmoe ? gate : 0;
+      // Some dozens of roundings; where the sums are small, of transmittances near 1 in place of them.
+      expect_omissions<kMode, double>(pixel, 1e-15 * 20 / opacity);
+      expect_omissions<kMode, float>(pixel, 6e-8 * 20 / opacity);
+    }
+  }
+}
+
+TYPED_TEST(RemovalIn, ShowsTheBackgroundWithoutTheOnlyOwner) {
+  for (const double alpha : {0.99, 0.3, 1e-6}) {
+    Pixel pixel;
+    pixel.alpha = {alpha}, pixel.color = {0.9};
+    // The background behind the owner is seen through 1 - alpha, and its digits with it.
+    expect_omissions<TypeParam::value, double>(pixel, 4e-16 / (1 - alpha));
+    expect_omissions<TypeParam::value, float>(pixel, 2e-7 / (1 - alpha));
+  }
+}
+
+TYPED_TEST(RemovalIn, ShowsTheVeilInFrontOfAWall) {
+  for (const double veil : {0.1, 1e-3, 1e-5}) {
+    Pixel pixel;
+    pixel.alpha = {veil, 0.9}, pixel.color = {0.2, 0.8};
+    // smoe_tn keeps no sum of the weights in front: 1 - T has lost the veil's digits.
+    const double lost = TypeParam::value == BlendMode::kSmoeTn ? 1 / veil : 1;
+    expect_omissions<TypeParam::value, double>(pixel, 1e-14 * lost);
+    expect_omissions<TypeParam::value, float>(pixel, 2e-6 * lost);
+  }
+}
+
+TEST(Removal, OfAPairThatIsNotThereIsNothing) {
+  PixelState<double> state = PixelState<double>::open();
+  const PixelEnd<double> end = {0.5, 0.5, 0.0};
+  const Gate<double> absent = {0.7, 0.7, false};
+  auto sum = no_importance<double>();
+  const double nan = std::numeric_limits<double>::quiet_NaN();
+  add_pair(sum, remove_pair<BlendMode::kSmoe>(state, end, absent, true), nan, nan, nan);
+  EXPECT_EQ(sum.share, 0);
+  EXPECT_EQ(sum.squared_share, 0);
+  EXPECT_EQ(sum.removal_cost, 0);
+}
+
+TEST(Removal, WeighsItsThreeSums) {
+  PixelState<double> state = PixelState<double>::open();
+  const Gate<double> gate = {0.5, 0.5, true};
+  auto sum = no_importance<double>();
+  add_pair(sum, remove_pair<BlendMode::kAlpha>(state, {0.5, 0.5, 1.0}, gate, true), 9.0, 3.0, 2.0);
+  EXPECT_EQ(sum.share, 1.5);
+  EXPECT_EQ(sum.squared_share, 0.5);
+  EXPECT_EQ(sum.removal_cost, 18);
+}
+
+}  // namespace
+}  // namespace dsmoe

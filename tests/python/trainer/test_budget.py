@@ -1,0 +1,230 @@
+"""Trainings to a number of Gaussians: what the strategies promise, and the rules behind them one by one."""
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from test_resume import Killed, kill_at, ply_bytes
+
+from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization.trainer.config import TrainConfig
+from diff_smoe_rasterization.trainer.errors import ConfigError
+from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.training.loop import Trainer, train
+from diff_smoe_rasterization.trainer.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
+
+
+def trainer_of(config, **options):
+    config = config.changed(**options)
+    return Trainer(config, load_scene(config, progress=False))
+
+
+def counts_of(trainer):
+    """The number of Gaussians behind each step, from the first points on."""
+    counts = [trainer.model.num_gaussians]
+    while trainer.iteration < trainer.config.iterations:
+        trainer.step()
+        counts.append(trainer.model.num_gaussians)
+    return counts
+
+
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+@pytest.mark.parametrize("budget", [40, 250], ids=["below_the_points", "above_the_points"])
+def test_gate_overshoots_and_ends_with_the_budget(tiny_config, budget, mode):
+    config = tiny_config.changed(densification_interval=2, densify_grad_threshold=1e-6)
+    counts = counts_of(trainer_of(config, schedule="gate", budget=budget, blend_mode=mode,
+                                  strategy_options="removals=4"))
+    # densify_until_iter is 30: growth ends before 16, removals are at 16, 19, 22 and 25.
+    assert counts[0] > 100 and counts[15] > 1.2 * max(counts[0], budget)
+    changes = [i for i in range(16, len(counts)) if counts[i] != counts[i - 1]]
+    assert changes == [16, 19, 22, 25] and counts[-1] == budget
+    ratios = [counts[i - 1] / counts[i] for i in changes]
+    assert max(ratios) < 1.05 * min(ratios), "steps of equal ratios"
+
+
+def test_gate_adds_what_the_threshold_leaves_out(tiny_config):
+    """No gradient reaches the threshold; the budget is reached all the same."""
+    counts = counts_of(trainer_of(tiny_config, schedule="gate", budget=200, densify_grad_threshold=1e3))
+    assert counts[0] < 150 and counts[-1] == 200
+
+
+@pytest.mark.parametrize("schedule", ["3dgs", "steady", "mcmc"])
+@pytest.mark.parametrize("budget", [50, 250])
+def test_the_others_stay_below_the_budget(tiny_config, schedule, budget):
+    config = tiny_config.changed(densification_interval=2, densify_grad_threshold=1e-6, opacity_reset_interval=1000)
+    counts = counts_of(trainer_of(config, schedule=schedule, budget=budget))
+    assert counts[0] == min(budget, trainer_of(config).model.num_gaussians)
+    assert max(counts) == budget, "the budget is used"
+    assert counts[-1] > 0.9 * budget
+
+
+def test_without_a_budget_3dgs_is_as_it_was(tiny_config, tmp_path):
+    free = tiny_config.changed(output=str(tmp_path / "free"))
+    roomy = tiny_config.changed(output=str(tmp_path / "roomy"), budget=100_000, schedule="3dgs")
+    train(free, progress=False)
+    train(roomy, progress=False)
+    # A roomy budget takes the same Gaussians; topk and the threshold give the same mask.
+    assert ply_bytes(free) == ply_bytes(roomy)
+
+
+@pytest.mark.parametrize("schedule, killed_at", [("gate", 14), ("gate", 24), ("gate", 39), ("mcmc", 24)])
+def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, schedule, killed_at):
+    """Checkpoints at 10, 20, 30 lie in growth, between removals and among moves."""
+    straight = tiny_config.changed(schedule=schedule, budget=120, output=str(tmp_path / "straight"),
+                                   densification_interval=4)
+    row = train(straight, progress=False)
+    broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
+    with monkeypatch.context() as patch:
+        kill_at(patch, killed_at)
+        with pytest.raises(Killed):
+            train(broken, progress=False)
+    torch.manual_seed(12345)
+    assert train(broken, resume=True, progress=False)["num_gaussians"] == row["num_gaussians"] == 120
+    assert ply_bytes(broken) == ply_bytes(straight)
+
+
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_scores_are_what_the_views_lose(tiny_config, mode):
+    """The cost of a Gaussian, and all errors together, against renderings of all training views."""
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60, blend_mode=mode,
+                         **({"background_gate": 0.05} if mode == "smoe" else {}))
+    with torch.no_grad():
+        trainer.model.raw["opacities"] -= 1.0  # no pixel is full
+    scores = trainer.strategy.score()
+    index = int(scores.costs.argmax())
+    others = torch.arange(trainer.model.num_gaussians) != index
+
+    def images(rows):
+        model, (opacities, scales, rotations) = trainer.model, trainer.model.activated()
+        settings = [view.camera.settings(trainer.renderer.background, 0, mode)._replace(
+            background_gate=0.05 if mode == "smoe" else None) for view in trainer.scene.train]
+        return [rasterize(model.raw["means3D"][rows], opacities[rows], one, shs=model.raw["dc"][rows],
+                          scales=scales[rows], rotations=rotations[rows]).color for one in settings]
+
+    with torch.no_grad():
+        all_of_them, without = images(slice(None)), images(others)
+        cost = sum((a - b).double().square().sum() for a, b in zip(all_of_them, without))
+        error = sum((image - view.image_float()).double().square().sum()
+                    for image, view in zip(all_of_them, trainer.scene.train))
+    # float32 images; a pixel's squared change is of their last digits' size nowhere that matters.
+    assert float(scores.costs[index]) == pytest.approx(float(cost), rel=1e-4)
+    assert 0.2 * float(error) < float(scores.errors.sum()) <= float(error) * (1 + 1e-5)
+
+
+def test_rates_of_gate_fall_behind_the_moves(tiny_config):
+    """Positions move at four times their rate all along; the others fall to a tenth from step 40 to the last."""
+    config = tiny_config.changed(iterations=80, position_lr_max_steps=80, schedule="gate", budget=60)
+    plain, trainer = trainer_of(config, schedule="steady"), trainer_of(config)
+
+    def rates(one):
+        return torch.tensor([group["lr"] for group in one.optimizer.adam.param_groups])
+
+    for iteration, factor in ((20, 1.0), (40, 1.0), (60, 0.1**0.5), (80, 0.1)):
+        while trainer.iteration < iteration:
+            trainer.step()
+            plain.step()
+        ratio = rates(trainer) / rates(plain)
+        torch.testing.assert_close(ratio, torch.tensor([4.0] + [factor] * 5))
+
+
+def test_removal_keeps_the_costliest(tiny_config):
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    costs = trainer.strategy.score().costs
+    kept = trainer.model.raw["means3D"][costs >= costs.sort(descending=True).values[59]].detach().clone()
+    trainer.strategy.remove(1)
+    assert torch.equal(trainer.model.raw["means3D"], kept)
+
+
+def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    strategy, count = trainer.strategy, trainer.model.num_gaussians
+    costs, errors = torch.full((count,), 5.0), torch.zeros(count)
+    costs[7], errors[3], costs[8], errors[4] = 0.5, 10.0, 1.0, 4.0
+    errors[7] = 1e6  # the cheapest is no place for another one
+    monkeypatch.setattr(strategy, "score", lambda: type("Scores", (), {"costs": costs, "errors": errors}))
+    moved = []
+    monkeypatch.setattr(strategy, "split", lambda parents, places: moved.append((parents.tolist(), places.tolist())))
+    strategy.move()
+    assert moved == [([3], [7])], "8 costs 1, more than a fifth of the error at 4"
+
+
+def test_children_lie_on_the_longest_axis(tiny_config):
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    for _ in range(2):
+        trainer.step()
+    model, adam = trainer.model, trainer.optimizer.adam
+    with torch.no_grad():
+        model.raw["scales"][5] = torch.tensor([0.1, 0.4, 0.2]).log()
+        model.raw["rotations"][5] = torch.tensor([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])  # y becomes -x
+        model.raw["opacities"][5] = torch.logit(torch.tensor(0.5))
+        mean = model.raw["means3D"][5].clone()
+        second = {name: adam.state[model.raw[name]]["exp_avg_sq"][5].clone() for name in ("means3D", "scales")}
+        trainer.strategy.split(torch.tensor([5]), torch.tensor([9]))
+        for row, side in ((5, 1), (9, -1)):
+            torch.testing.assert_close(model.raw["means3D"][row] - mean, torch.tensor([-0.2 * side, 0, 0]))
+            torch.testing.assert_close(model.scales[row], torch.tensor([0.1, 0.4 * 0.65, 0.2]))
+            assert float(model.opacities[row]) == pytest.approx((1 - math.sqrt(0.5)) / 0.744, abs=1e-6)
+            for name, squares in second.items():
+                assert not adam.state[model.raw[name]]["exp_avg"][row].any()
+                assert torch.equal(adam.state[model.raw[name]]["exp_avg_sq"][row], squares)
+
+
+@pytest.mark.parametrize("opacity", [0.02, 0.5, 0.98])
+@pytest.mark.parametrize("copies", [1, 2, 5, 50])
+def test_copies_look_as_the_one_before(opacity, copies):
+    """The criterion of the paper: the same peak, and the same integral along a line through the centre."""
+    new, factor = (float(x) for x in divided(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies])))
+    assert 1 - (1 - new)**copies == pytest.approx(opacity, rel=1e-12)
+    x = torch.linspace(-12, 12, 20_001, dtype=torch.float64)
+    old_kernel, new_kernel = torch.exp(-x**2 / 2), torch.exp(-x**2 / (2 * factor**2))
+    assert (1 - (1 - new * new_kernel)**copies).sum() == pytest.approx(float((opacity * old_kernel).sum()), rel=1e-9)
+
+
+def test_mcmc_regularises_opacities_and_scales(tiny_config):
+    trainer = trainer_of(tiny_config, schedule="mcmc", budget=100)
+    raw = trainer.model.raw
+    expected = (OPACITY_WEIGHT * raw["opacities"].sigmoid().mean() + SCALE_WEIGHT * raw["scales"].exp().mean())
+    gradients = torch.autograd.grad(expected, [raw["opacities"], raw["scales"]])
+    for name in ("opacities", "scales"):
+        raw[name].grad = torch.zeros_like(raw[name])
+    with torch.no_grad():
+        trainer.strategy.after_backward(None)
+    torch.testing.assert_close(raw["opacities"].grad, gradients[0])
+    torch.testing.assert_close(raw["scales"].grad, gradients[1])
+
+
+def test_noise_shakes_the_faint_only(tiny_config):
+    trainer = trainer_of(tiny_config, schedule="mcmc", budget=100)
+    trainer.optimizer.set_position_rate(1)
+    with torch.no_grad():
+        trainer.model.raw["opacities"][:50] = torch.logit(torch.tensor(0.001))
+        trainer.model.raw["opacities"][50:] = torch.logit(torch.tensor(0.9))
+        before = trainer.model.raw["means3D"].clone()
+        trainer.strategy.shake()
+    moved = (trainer.model.raw["means3D"] - before).abs().max(1).values
+    assert (moved[:50] > 0).all() and moved[50:].max() < 1e-12 * moved[:50].max()
+
+
+@pytest.mark.parametrize("options, words", [
+    (dict(schedule="gate"), "--budget is 0; it must be at least 4 with --strategy gate"),
+    (dict(schedule="mcmc"), "--budget is 0; it must be at least 4 with --strategy mcmc"),
+    (dict(budget=-1), "--budget is -1; it must be at least 0"),
+    (dict(budget=100, iterations=7000), "--iterations is 7000; it must be at least --densify-until-iter"),
+])
+def test_what_cannot_be_is_said(options, words):
+    with pytest.raises(ConfigError, match=words):
+        TrainConfig(**options).validate()
+
+
+@pytest.mark.parametrize("text, words", [
+    ("views=x", "views is 'x'; it must be a number"), ("speed=1", "'speed' is unknown"), ("views", "views is ''")])
+def test_settings_of_gate_are_checked(tiny_config, text, words):
+    with pytest.raises(ConfigError, match="--strategy-options: " + words):
+        trainer_of(tiny_config, schedule="gate", budget=60, strategy_options=text)
+
+
+def test_a_budget_asks_for_gate():
+    assert TrainConfig(budget=100).schedule == "gate" and TrainConfig().schedule == "3dgs"
+    assert TrainConfig(budget=100, schedule="steady").schedule == "steady"
