@@ -19,12 +19,14 @@
 #include "tile_backward_impl.h"
 #include "tile_contributions_impl.h"
 #include "tile_forward_impl.h"
+#include "tile_gate_map_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kAvx2Level = {"avx2",
-                              {avx2::forward<float>, avx2::backward<float>, avx2::contributions<float>},
-                              {avx2::forward<double>, avx2::backward<double>, avx2::contributions<double>}};
+const SimdLevel kAvx2Level = {
+    "avx2",
+    {avx2::forward<float>, avx2::backward<float>, avx2::contributions<float>, avx2::gate_map<float>},
+    {avx2::forward<double>, avx2::backward<double>, avx2::contributions<double>, avx2::gate_map<double>}};
 }  // namespace cpu
 }  // namespace dsmoe
 

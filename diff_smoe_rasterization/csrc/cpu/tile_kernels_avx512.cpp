@@ -21,12 +21,14 @@
 #include "tile_backward_impl.h"
 #include "tile_contributions_impl.h"
 #include "tile_forward_impl.h"
+#include "tile_gate_map_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kAvx512Level = {"avx512",
-                                {avx512::forward<float>, avx512::backward<float>, avx512::contributions<float>},
-                                {avx512::forward<double>, avx512::backward<double>, avx512::contributions<double>}};
+const SimdLevel kAvx512Level = {
+    "avx512",
+    {avx512::forward<float>, avx512::backward<float>, avx512::contributions<float>, avx512::gate_map<float>},
+    {avx512::forward<double>, avx512::backward<double>, avx512::contributions<double>, avx512::gate_map<double>}};
 }  // namespace cpu
 }  // namespace dsmoe
 

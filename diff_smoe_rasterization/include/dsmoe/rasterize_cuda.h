@@ -226,6 +226,10 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
 // images but last_contributor.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work);
 
+// Walks the tile lists once more, and finds in each pixel the Gaussian with the greatest gate. It reads of the frame
+// what `contributions` does.
+template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work);
+
 // Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
 // visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work);
