@@ -5,7 +5,7 @@ from typing import Optional, Sequence, Tuple
 
 import torch
 
-from .autograd import IMAGES, INPUTS, OPTIONS, rasterize_op
+from .autograd import INPUTS, OPTIONS, rasterize_op
 from .extension import BACKENDS, build_info
 from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 from .splats import Splats

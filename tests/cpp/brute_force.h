@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 #include <numeric>
+#include <utility>
 #include <vector>
 
 #include "dispatch.h"
@@ -23,6 +24,10 @@ template <class S> struct BruteForce {
   std::vector<double> margin;
   int64_t num_pairs = 0;                            // that count
   std::vector<Contribution<double>> contributions;  // of each Gaussian, under brute_force_pixel_weight
+  // Of each pixel: the Gaussian of the greatest weight, or -1; how far, relatively, the second greatest is below it;
+  // and how many pairs contribute.
+  std::vector<int32_t> greatest, num_contributing;
+  std::vector<double> lead;
 
   double smallest_margin() const { return *std::min_element(margin.begin(), margin.end()); }
 };
@@ -62,6 +67,8 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
     auto state = PixelState<S>::open();
     std::vector<S> sums(num_features);
     double margin = std::numeric_limits<double>::infinity();
+    int32_t greatest = -1, num_contributing = 0;
+    double greatest_weight = 0, second_weight = 0;
     auto decide = [&](double value, double threshold) { margin = std::min(margin, std::abs(value / threshold - 1)); };
     for (const int64_t i : order) {
       const auto& g = projected[i];
@@ -91,10 +98,20 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
       }
       const auto pair = Blend<kMode>::accumulate(state, gate);
       add_pair<double>(out.contributions[i], pair.contributes, brute_force_pixel_weight<S>(pixel), pair.weight, dx, dy);
+      num_contributing += pair.contributes;
+      if (pair.contributes && pair.weight > greatest_weight) {
+        greatest = static_cast<int32_t>(i);
+        second_weight = std::exchange(greatest_weight, double(pair.weight));
+      } else if (pair.contributes) {
+        second_weight = std::max(second_weight, double(pair.weight));
+      }
       for (int f = 0; f < num_features; ++f) sums[f] += pair.weight * features[i * num_features + f];
     }
     if (state.gate_sum > S(0)) decide(state.gate_sum, kGateSumCut);
     out.margin.push_back(margin);
+    out.greatest.push_back(greatest);
+    out.num_contributing.push_back(num_contributing);
+    out.lead.push_back(greatest < 0 ? 1 : 1 - second_weight / greatest_weight);
     out.gate_sum[pixel] = state.gate_sum;
     const auto end = state.end(config.gate_of_background());
     int f = 0;

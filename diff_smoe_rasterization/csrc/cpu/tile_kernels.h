@@ -55,6 +55,7 @@ template <class S> struct TileKernels {
   int64_t (*backward)(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch);
   int64_t (*contributions)(const Tile<S>& tile, const TileContributions<S>& contributions, S* scratch);
   int64_t (*importance)(const Tile<S>& tile, const TileImportances<S>& importances, S* scratch);
+  int64_t (*gate_map)(const Tile<S>& tile, const GateMap& map, S* scratch);
 };
 
 // One of these per instruction set that the compiler can build for.

@@ -16,17 +16,11 @@
 
 #define DSMOE_SIMD avx2
 #define DSMOE_SIMD_BYTES 32
-#include "tile_backward_impl.h"
-#include "tile_contributions_impl.h"
-#include "tile_forward_impl.h"
-#include "tile_importance_impl.h"
+#include "tile_kernels_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kAvx2Level = {
-    "avx2",
-    {avx2::forward<float>, avx2::backward<float>, avx2::contributions<float>, avx2::importance<float>},
-    {avx2::forward<double>, avx2::backward<double>, avx2::contributions<double>, avx2::importance<double>}};
+constexpr SimdLevel kAvx2Level = {"avx2", avx2::kernels<float>(), avx2::kernels<double>()};
 }  // namespace cpu
 }  // namespace dsmoe
 

@@ -18,17 +18,11 @@
 
 #define DSMOE_SIMD avx512
 #define DSMOE_SIMD_BYTES 64
-#include "tile_backward_impl.h"
-#include "tile_contributions_impl.h"
-#include "tile_forward_impl.h"
-#include "tile_importance_impl.h"
+#include "tile_kernels_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kAvx512Level = {
-    "avx512",
-    {avx512::forward<float>, avx512::backward<float>, avx512::contributions<float>, avx512::importance<float>},
-    {avx512::forward<double>, avx512::backward<double>, avx512::contributions<double>, avx512::importance<double>}};
+constexpr SimdLevel kAvx512Level = {"avx512", avx512::kernels<float>(), avx512::kernels<double>()};
 }  // namespace cpu
 }  // namespace dsmoe
 

@@ -1,17 +1,10 @@
 // The tile kernels for any machine: 16-byte packs, which SSE2 and NEON have.
 #define DSMOE_SIMD baseline
 #define DSMOE_SIMD_BYTES 16
-#include "tile_backward_impl.h"
-#include "tile_contributions_impl.h"
-#include "tile_forward_impl.h"
-#include "tile_importance_impl.h"
+#include "tile_kernels_impl.h"
 
 namespace dsmoe {
 namespace cpu {
-const SimdLevel kBaselineLevel = {
-    "baseline",
-    {baseline::forward<float>, baseline::backward<float>, baseline::contributions<float>, baseline::importance<float>},
-    {baseline::forward<double>, baseline::backward<double>, baseline::contributions<double>,
-     baseline::importance<double>}};
+constexpr SimdLevel kBaselineLevel = {"baseline", baseline::kernels<float>(), baseline::kernels<double>()};
 }  // namespace cpu
 }  // namespace dsmoe

@@ -135,6 +135,12 @@ template <class S> struct ImportanceMap {
   ImportanceSums<S> sums;
 };
 
+// Of each pixel; both are written whole.
+struct GateMap {
+  int32_t* gaussians = nullptr;  // [H, W] the one with the greatest gate, the nearest of equal ones; -1 where none is
+  int32_t* counts = nullptr;     // [H, W] how many Gaussians the numerator has
+};
+
 // Any of these may be null. Then that output was not used.
 template <class S> struct ImageGradients {
   const S* color = nullptr;          // [C, H, W]

@@ -80,6 +80,10 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
 // of its images only the gate sum is read, through saved.
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map);
 
+// Walks the tile lists once more, and finds in each pixel the Gaussian with the greatest gate. It reads of the frame
+// what `contributions` does.
+template <class S> void gate_map(const Frame<S>& frame, const GateMap& map);
+
 // Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
 // visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible);

@@ -214,6 +214,10 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
 // `frame` is as `forward` left it; of its images the radii are read, and through saved the gate sum.
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map, const Work& work);
 
+// Walks the tile lists once more, and finds in each pixel the Gaussian with the greatest gate. It reads of the frame
+// what `contributions` does.
+template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work);
+
 // Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
 // visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work);

@@ -1,0 +1,21 @@
+// Which Gaussian has the greatest gate in each pixel.
+#include "dsmoe/rasterize.h"
+#include "tile_kernels.h"
+#include "tile_loop.h"
+
+namespace dsmoe {
+namespace cpu {
+
+template <class S> void gate_map(const Frame<S>& frame, const GateMap& map) {
+  const auto& kernels = tile_kernels<S>();
+  for_each_tile(frame.config, frame.saved, frame.camera.width, frame.camera.height, 0,
+                [&](const Tile<S>& tile, S* scratch) { return kernels.gate_map(tile, map, scratch); });
+}
+
+#define DSMOE_INSTANTIATE(S) template void gate_map(const Frame<S>&, const GateMap&);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cpu
+}  // namespace dsmoe

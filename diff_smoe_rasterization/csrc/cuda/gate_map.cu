@@ -1,0 +1,98 @@
+// Which Gaussian has the greatest gate in each pixel. The kernel repeats the blend's walk, without features; each lane
+// keeps the greatest weight of its own pixels.
+#include "../dispatch.h"
+#include "dsmoe/params.h"
+#include "reduce.cuh"
+#include "tile_walk.cuh"
+
+namespace dsmoe {
+namespace cuda {
+namespace {
+
+// What the walk knows of a lane's pixels.
+template <class S> struct MappedPixels {
+  PixelState<S> state[kLanePixels];
+  S greatest_weight[kLanePixels];
+  int32_t greatest[kLanePixels];  // the Gaussian of that weight
+  int32_t count[kLanePixels];     // pairs that contributed
+};
+
+// All gates of a pixel have one denominator, so the greatest weight is the greatest gate.
+template <class S, BlendMode kMode> struct GateMapVisitor {
+  static constexpr bool kBackToFront = false, kStopsEarly = false;
+  static constexpr bool kReadsFeatures = false, kReadsIndices = true;
+
+  __device__ __forceinline__ void begin_chunk(int32_t) {}
+
+  __device__ __forceinline__ void visit(const WarpStage<S, GateMapVisitor>& stage, int j, int32_t) {
+    const ProjectedGaussian<S> gaussian = stage.gaussians[j].gaussian;
+    const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
+    const ColumnExponent<S, S> exponent(gaussian.conic, dx);
+    const S least_alpha = cut.of(gaussian.opacity);
+#pragma unroll
+    for (int k = 0; k < kLanePixels; ++k) {
+      const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
+      const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
+      pixels.count[k] += pair.contributes;
+      if (!pair.contributes || !(pair.weight > pixels.greatest_weight[k])) continue;
+      pixels.greatest_weight[k] = pair.weight;
+      pixels.greatest[k] = stage.indices[j];
+    }
+  }
+
+  const BlendArguments<S>& arguments;
+  const WarpTile<S>& tile;
+  MappedPixels<S>& pixels;
+  AlphaCut<S> cut;
+};
+
+template <class S, BlendMode kMode>
+__global__ void __launch_bounds__(kWalkBlock)
+    gate_map_kernel(const __grid_constant__ BlendArguments<S> arguments, GateMap map) {
+  __shared__ StagedGaussian<S, false> staged[kWarpsPerTile][kWarp];
+  __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
+  const WarpTile<S> tile(arguments);
+  if (tile.empty) return;
+
+  MappedPixels<S> pixels;
+  int32_t seen = 0;  // entries of the list that the numerator of some pixel has seen
+  for (int k = 0; k < kLanePixels; ++k) {
+    const bool inside = tile.inside(arguments, k);
+    pixels.state[k] = PixelState<S>::open();
+    pixels.greatest_weight[k] = S(0);
+    pixels.greatest[k] = -1;
+    pixels.count[k] = 0;
+    const int32_t last = inside ? arguments.saved.last_contributor[tile.pixel_index(arguments, k)] : 0;
+    seen = seen > last ? seen : last;
+  }
+  using Visitor = GateMapVisitor<S, kMode>;
+  Visitor visitor = {arguments, tile, pixels, arguments.config.alpha_cut()};
+  const int warp = threadIdx.x / kWarp;
+  const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
+  walk_tile(stage, {0, max_over_lanes(seen)}, visitor);
+  for (int k = 0; k < kLanePixels; ++k) {
+    if (!tile.inside(arguments, k)) continue;
+    const int64_t index = tile.pixel_index(arguments, k);
+    map.gaussians[index] = pixels.greatest[k];
+    map.counts[index] = pixels.count[k];
+  }
+}
+
+}  // namespace
+
+template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work) {
+  const BlendArguments<S> arguments = blend_arguments(frame, work);
+  const unsigned tiles = static_cast<unsigned>(num_tiles(frame.camera.width, frame.camera.height));
+  dispatch_blend(frame.config.mode, kAnyFeatures, [&](auto mode, auto) {
+    gate_map_kernel<S, decltype(mode)::value><<<tiles, kWalkBlock, 0, work.stream>>>(arguments, map);
+    DSMOE_CHECK_LAUNCH("gate_map");
+  });
+}
+
+#define DSMOE_INSTANTIATE(S) template void gate_map(const Frame<S>&, const GateMap&, const Work&);
+DSMOE_INSTANTIATE(float)
+DSMOE_INSTANTIATE(double)
+#undef DSMOE_INSTANTIATE
+
+}  // namespace cuda
+}  // namespace dsmoe

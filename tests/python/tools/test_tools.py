@@ -1,0 +1,197 @@
+"""The C++ tools as programs: pictures of a made-up model against the package's, messages, figures."""
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from diff_smoe_rasterization import io, rasterize, settings_from_camera
+from diff_smoe_rasterization.gaussians import activate
+
+ROOT = Path(__file__).resolve().parents[3]
+FOLDER = Path(os.environ.get("DSMOE_TOOLS", ROOT / "build" / "cpp" / "tools"))
+WIDTH, HEIGHT, FOCAL = 61, 47, 55.0
+LEVELS = 1  # of 255: both round the same float32 image, up to the order of a sum
+MODES = [("alpha", None), ("smoe", 0.0), ("smoe", 0.05), ("smoe", 1.0), ("smoe_tn", None), ("smoe_std", None)]
+
+
+def tool(name, *arguments, status=0):
+    """Runs a tool; returns what it said. Skips the test where the tool is not built."""
+    path = FOLDER / name
+    if not path.is_file():
+        pytest.skip(f"{path} is not built: cmake needs OpenCV (apt-get install libopencv-dev)")
+    done = subprocess.run([path, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                          timeout=120)
+    assert done.returncode == status, done.stdout
+    return done.stdout
+
+
+def model(mode=None, gate=None):
+    random = np.random.RandomState(7)
+    n = 150
+
+    def uniform(low, high, *shape):
+        return random.uniform(low, high, (n, *shape)).astype(np.float32)
+
+    return io.Gaussians(means3D=uniform(-1, 1, 3), dc=uniform(-1, 1, 1, 3), shs=uniform(-0.3, 0.3, 8, 3),
+                        opacity_logits=uniform(-2, 3, 1), log_scales=uniform(-4, -1.5, 3),
+                        rotations=uniform(-1, 1, 4), blend_mode=mode, background_gate=gate)
+
+
+def pose():
+    """World to view: turned about y, and 3 in front of the origin."""
+    angle = 0.4
+    R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    return R, np.array([0.1, -0.2, 3.0])
+
+
+def package_rendering(gaussians, mode, gate, background=(0.0, 0.0, 0.0), **options):
+    R, t = pose()
+    K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
+    if mode == "smoe":
+        options["background_gate"] = gate
+    settings = settings_from_camera(K, R, t, WIDTH, HEIGHT, torch.tensor(background), 2, blend_mode=mode, **options)
+    values = [torch.from_numpy(np.asarray(array)) for array in (gaussians.opacity_logits, gaussians.log_scales,
+                                                                gaussians.rotations)]
+    opacities, scales, rotations = activate(*values)
+    return rasterize(torch.from_numpy(gaussians.means3D), opacities, settings, scales=scales, rotations=rotations,
+                     dc=torch.from_numpy(gaussians.dc), shs=torch.from_numpy(gaussians.shs), outputs=("alpha",))
+
+
+def write_cameras(folder, kind):
+    """One camera at `pose` in a file of that kind; returns its path."""
+    R, t = pose()
+    path = folder / kind
+    if kind == "colmap":
+        camera = io.ColmapCamera(1, "PINHOLE", WIDTH, HEIGHT, np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]))
+        angle = np.arctan2(R[0, 2], R[0, 0])
+        image = io.ColmapImage(1, "view.jpg", 1, np.array([np.cos(angle / 2), 0, np.sin(angle / 2), 0]), t)
+        io.write_colmap(path, io.ColmapModel({1: camera}, [image], io.Points(np.zeros((1, 3)))))
+    elif kind == "cameras.json":
+        path.write_text(json.dumps([{"id": 0, "img_name": "view", "width": WIDTH, "height": HEIGHT, "fx": FOCAL,
+                                     "fy": FOCAL, "rotation": R.T.tolist(), "position": (-R.T @ t).tolist()}]))
+    else:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = R.T @ np.diag([1.0, -1.0, -1.0]), -R.T @ t
+        path.write_text(json.dumps({"fl_x": FOCAL, "w": WIDTH, "h": HEIGHT, "frames": [
+            {"file_path": "./images/view.png", "transform_matrix": matrix.tolist()}]}))
+    return path
+
+
+def levels(image):
+    """[3, H, W] from 0 to 1 -> [H, W, 3] as a PNG has it."""
+    return np.rint(np.clip(np.asarray(image), 0, 1) * 255).astype(int).transpose(1, 2, 0)
+
+
+@pytest.mark.parametrize("mode, gate", MODES)
+def test_render_draws_what_the_package_draws(tmp_path, mode, gate):
+    gaussians = model(mode, gate)
+    io.write_gaussians(tmp_path / "model.ply", gaussians)
+    cameras = write_cameras(tmp_path, "cameras.json")
+    tool("dsmoe_render", tmp_path / "model.ply", "--cameras", cameras, "--background", "0.2,0.4,0.6", "--device", "cpu",
+         "-o", tmp_path / "out.png")
+    actual = np.asarray(Image.open(tmp_path / "out.png").convert("RGB")).astype(int)
+    expected = levels(package_rendering(gaussians, mode, gate, (0.2, 0.4, 0.6)).color)
+    assert actual.shape == expected.shape and expected.std() > 20
+    assert np.abs(actual - expected).max() <= LEVELS
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms.json", "cameras.json"])
+def test_all_camera_files_mean_the_same_view(tmp_path, kind):
+    gaussians = model()
+    io.write_gaussians(tmp_path / "model.ply", gaussians)
+    tool("dsmoe_render", tmp_path / "model.ply", "--cameras", write_cameras(tmp_path, kind), "--blend", "alpha",
+         "--device", "cpu", "-o", tmp_path / "out")
+    files = [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+    assert [path.name for path in files] == ["view.png"]
+    actual = np.asarray(Image.open(files[0]).convert("RGB")).astype(int)
+    assert np.abs(actual - levels(package_rendering(gaussians, "alpha", None).color)).max() <= LEVELS
+
+
+def test_alpha_is_the_gate_sum(tmp_path):
+    gaussians = model("smoe", 0.05)
+    io.write_gaussians(tmp_path / "model.ply", gaussians)
+    cameras = write_cameras(tmp_path, "cameras.json")
+    tool("dsmoe_render", tmp_path / "model.ply", "--cameras", cameras, "--show", "alpha", "--device", "cpu", "-o",
+         tmp_path / "alpha.png")
+    alpha = np.asarray(Image.open(tmp_path / "alpha.png")).astype(int)
+    expected = levels(package_rendering(gaussians, "smoe", 0.05).alpha.reshape(1, HEIGHT, WIDTH))[..., 0]
+    assert np.abs(alpha - expected).max() <= LEVELS
+
+
+@pytest.mark.parametrize("show, end", [("depth", "png"), ("depth", "exr"), ("gates", "png"), ("count", "png"),
+                                       ("gates", "mp4")])
+def test_an_orbit_becomes_pictures_and_videos(tmp_path, show, end):
+    io.write_gaussians(tmp_path / "model.ply", model("smoe", 0.0))
+    frames = 3 if end == "mp4" else 1
+    out = tmp_path / f"out.{end}"
+    tool("dsmoe_render", tmp_path / "model.ply", "--orbit", "--frames", frames, "--size", "65x33", "--show", show,
+         "--device", "cpu", "-o", out)
+    if end == "png":
+        picture = np.asarray(Image.open(out))
+        assert picture.shape == (33, 65, 3) and len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
+    assert out.stat().st_size > 1000
+
+
+def test_a_model_of_no_known_blend_needs_one(tmp_path):
+    io.write_gaussians(tmp_path / "model.ply", model())
+    said = tool("dsmoe_render", tmp_path / "model.ply", "--orbit", "-o", tmp_path / "out.mp4", status=2)
+    assert "pass --blend" in said and not (tmp_path / "out.mp4").exists()
+
+
+def test_another_blend_than_the_trained_one_is_said(tmp_path):
+    io.write_gaussians(tmp_path / "model.ply", model("smoe", 0.0))
+    said = tool("dsmoe_render", tmp_path / "model.ply", "--orbit", "--frames", 1, "--size", 32, "--blend", "alpha",
+                "--device", "cpu", "-o", tmp_path / "out.png")
+    assert "trained with the blend smoe" in said
+
+
+def test_a_splat_is_drawn_as_its_ply(tmp_path):
+    gaussians = model("alpha")
+    flat = io.Gaussians(gaussians.means3D, gaussians.dc, np.zeros((150, 0, 3), np.float32), gaussians.opacity_logits,
+                        gaussians.log_scales, gaussians.rotations, "alpha")
+    io.write_gaussians(tmp_path / "model.ply", flat)
+    rotation = flat.rotations / np.linalg.norm(flat.rotations, axis=1, keepdims=True)
+    rows = np.zeros(150, dtype=[("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+    rows["mean"], rows["scale"] = flat.means3D, np.exp(flat.log_scales)
+    rows["color"][:, :3] = np.rint(np.clip(0.5 + 0.28209479 * flat.dc[:, 0], 0, 1) * 255)
+    rows["color"][:, 3] = np.rint(255 / (1 + np.exp(-flat.opacity_logits[:, 0])))
+    rows["rotation"] = np.clip(np.rint(rotation * 128 + 128), 0, 255)
+    (tmp_path / "model.splat").write_bytes(rows.tobytes())
+    pictures = []
+    for name in ("model.ply", "model.splat"):
+        tool("dsmoe_render", tmp_path / name, "--cameras", write_cameras(tmp_path, "cameras.json"), "--device", "cpu",
+             "-o", tmp_path / "out.png")
+        pictures.append(np.asarray(Image.open(tmp_path / "out.png")).astype(int))
+    # 8 bits of a quaternion turn a Gaussian by up to half a degree, and 30 Gaussians lie on a pixel.
+    assert np.abs(pictures[0] - pictures[1]).mean() < 1 and np.abs(pictures[0] - pictures[1]).max() < 12
+
+
+@pytest.mark.parametrize("name", ["dsmoe_render", "dsmoe_fit2d"])
+def test_help_and_wrong_options(name):
+    assert f"usage: {name}" in tool(name, "--help")
+    assert "--colour" in tool(name, "--colour", status=2)
+
+
+def psnr_of(said):
+    return float(said.split("PSNR ")[1].split()[0])
+
+
+def test_two_equal_kernels_make_a_sharp_edge_under_the_gate(tmp_path):
+    """Figure 2."""
+    said = tool("dsmoe_fit2d", "--edge", 64, "--kernels", 2, "--shape", "equal", "-o", tmp_path)
+    assert psnr_of(said) >= 40
+    names = {"reconstruction.png", "gates.png", "segments.png", "profile.png", "profile.csv", "kernels.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_two_kernels_cannot_under_the_weighted_sum(tmp_path):
+    """Figure 3."""
+    said = tool("dsmoe_fit2d", "--edge", 64, "--kernels", 2, "--mixture", "sum", "-o", tmp_path)
+    assert psnr_of(said) < 20

@@ -1,0 +1,44 @@
+// Command lines: options by getopt_long, and their values as numbers. Errors name the option and what it must be.
+#pragma once
+
+#include <map>
+#include <string>
+#include <vector>
+
+namespace dsmoe::tools {
+
+/// An option of a program.
+struct OptionRule {
+  const char* name;         // without the two dashes
+  char letter = 0;          // a short name, or 0
+  bool takes_value = true;  // else it is a flag
+};
+
+/// What a command line says.
+class CommandLine {
+ public:
+  /// Throws UsageError for an option that is not in `rules`, twice there, or without its value.
+  CommandLine(int argc, char** argv, const std::vector<OptionRule>& rules);
+
+  bool has(const std::string& name) const { return values_.count(name) != 0; }
+  const std::vector<std::string>& arguments() const { return arguments_; }  // that belong to no option
+
+  // Each returns `missing` where the option is absent.
+  std::string text(const std::string& name, const std::string& missing) const;
+  double number(const std::string& name, double missing, double least, double most) const;
+  int whole(const std::string& name, int missing, int least, int most) const;
+  /// One of `choices`.
+  std::string choice(const std::string& name, const std::string& missing,
+                     const std::vector<std::string>& choices) const;
+  /// `count` finite numbers with commas between them.
+  std::vector<double> numbers(const std::string& name, const std::vector<double>& missing, std::size_t count) const;
+
+ private:
+  std::map<std::string, std::string> values_;
+  std::vector<std::string> arguments_;
+};
+
+/// Splits text at a character; "a,,b" has three parts.
+std::vector<std::string> split(const std::string& text, char separator);
+
+}  // namespace dsmoe::tools

@@ -1,0 +1,121 @@
+#include "model.h"
+
+#include <algorithm>
+#include <cctype>
+#include <cmath>
+#include <cstdio>
+#include <filesystem>
+#include <utility>
+
+#include "dsmoe/blend.h"
+#include "dsmoe/gaussians.h"
+#include "errors.h"
+#include "io/cursor.h"
+#include "io/splat.h"
+
+namespace dsmoe::tools {
+namespace {
+
+template <class T> T median(std::vector<T> values) {
+  const auto middle = values.begin() + values.size() / 2;
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+std::string file_extension(const std::string& path) {
+  std::string extension = std::filesystem::path(path).extension().string();
+  for (char& c : extension) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
+  return extension;
+}
+
+}  // namespace
+
+Model activated(io::GaussianModel raw) {
+  Model model;
+  model.count = static_cast<int64_t>(raw.count);
+  model.sh_degree = raw.sh_degree;
+  model.opacities.resize(raw.count);
+  model.scales.resize(3 * raw.count);
+  model.rotations.resize(4 * raw.count);
+  const GaussianParameters<const float> from = {raw.opacity_logits.data(), raw.log_scales.data(), raw.rotations.data()};
+  const GaussianParameters<float> to = {model.opacities.data(), model.scales.data(), model.rotations.data()};
+  for (int64_t i = 0; i < model.count; ++i) activate(from, to, i);
+  model.means3D = std::move(raw.means3D);
+  model.dc = std::move(raw.dc);
+  model.shs = std::move(raw.shs);
+  return model;
+}
+
+io::GaussianModel read_model(const std::string& path) {
+  const std::string extension = file_extension(path);
+  if (extension == ".splat") return io::read_splat(path);
+  if (extension == ".spz") {
+    throw UsageError(path + ": .spz is not read, as its library is in no Debian package; convert it to .ply first");
+  }
+  return io::read_gaussians(path);
+}
+
+std::vector<std::string> blend_names() {
+  std::vector<std::string> names;
+  BlendModes::for_each([&](auto mode) { names.emplace_back(Blend<mode()>::kName); });
+  return names;
+}
+
+BlendChoice choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
+                         std::optional<double> background_gate) {
+  const std::vector<std::string> names = blend_names();
+  const bool is_splat = file_extension(file) == ".splat";  // which viewers blend by alpha
+  const std::string recorded = is_splat ? "alpha" : model.blend_mode;
+  const std::string chosen = mode.empty() ? recorded : mode;
+  if (chosen.empty()) {
+    throw UsageError(file +
+                     " does not say which blend it was trained with (no `comment blend_mode`); pass --blend, "
+                     "which is alpha for files of other 3DGS programs");
+  }
+  const auto found = std::find(names.begin(), names.end(), chosen);
+  if (found == names.end()) {
+    throw io::FormatError(file + ": records the blend mode " + io::printable(chosen) + ", which is none of ours");
+  }
+  BlendChoice choice;
+  choice.mode = static_cast<BlendMode>(found - names.begin());
+  if (!recorded.empty() && chosen != recorded) {
+    std::fprintf(stderr, "note: %s was trained with the blend %s; in %s its Gaussians show another scene\n",
+                 file.c_str(), recorded.c_str(), chosen.c_str());
+  }
+  if (choice.mode != BlendMode::kSmoe) {
+    if (background_gate) throw UsageError("--background-gate is for --blend smoe only");
+    return choice;
+  }
+  if (background_gate && model.background_gate && *background_gate != *model.background_gate) {
+    std::fprintf(stderr, "note: %s was trained with the background gate %s; with %s its Gaussians show another scene\n",
+                 file.c_str(), io::shortest_text(*model.background_gate).c_str(),
+                 io::shortest_text(*background_gate).c_str());
+  }
+  // A file that records no gate was trained with Eq. 7.
+  choice.background_gate = background_gate.value_or(model.background_gate.value_or(0));
+  if (choice.background_gate == 1) choice = {};  // the family's member that alpha blending is
+  return choice;
+}
+
+Extent extent_of(const Model& model) {
+  Extent extent = {{0, 0, 0}, 1};
+  std::vector<float> coordinates[3];
+  for (int64_t i = 0; i < model.count; ++i) {
+    const float* mean = &model.means3D[3 * i];
+    if (!std::isfinite(mean[0]) || !std::isfinite(mean[1]) || !std::isfinite(mean[2])) continue;
+    for (int axis = 0; axis < 3; ++axis) coordinates[axis].push_back(mean[axis]);
+  }
+  if (coordinates[0].empty()) return extent;
+  for (int axis = 0; axis < 3; ++axis) extent.centre[axis] = median(coordinates[axis]);
+  std::vector<double> distances;
+  for (std::size_t i = 0; i < coordinates[0].size(); ++i) {
+    double squared = 0;
+    for (int axis = 0; axis < 3; ++axis) squared += std::pow(coordinates[axis][i] - extent.centre[axis], 2);
+    distances.push_back(std::sqrt(squared));
+  }
+  const double radius = median(distances);
+  if (radius > 0) extent.radius = radius;
+  return extent;
+}
+
+}  // namespace dsmoe::tools

@@ -1,0 +1,146 @@
+#include "views.h"
+
+#include <cmath>
+#include <filesystem>
+#include <map>
+#include <stdexcept>
+
+#include "io/file.h"
+
+namespace dsmoe::tools {
+namespace {
+
+using Vector = std::array<double, 3>;
+
+Vector cross(const Vector& a, const Vector& b) {
+  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
+}
+
+double dot(const Vector& a, const Vector& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+Vector scaled(const Vector& a, double factor) { return {factor * a[0], factor * a[1], factor * a[2]}; }
+
+Vector sum(const Vector& a, const Vector& b) { return {a[0] + b[0], a[1] + b[1], a[2] + b[2]}; }
+
+Vector unit(const Vector& a) { return scaled(a, 1 / std::sqrt(dot(a, a))); }
+
+/// By rows, of a quaternion (w, x, y, z) of unit length.
+std::array<double, 9> rotation_matrix(const std::array<double, 4>& q) {
+  const auto [w, x, y, z] = q;
+  return {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),  //
+          2 * (x * y + w * z),     1 - 2 * (x * x + z * z), 2 * (y * z - w * x),  //
+          2 * (x * z - w * y),     2 * (y * z + w * x),     1 - 2 * (x * x + y * y)};
+}
+
+/// -R p, for the translation of a camera at p.
+Vector translation_of(const std::array<double, 9>& r, const Vector& p) {
+  return {-dot({r[0], r[1], r[2]}, p), -dot({r[3], r[4], r[5]}, p), -dot({r[6], r[7], r[8]}, p)};
+}
+
+}  // namespace
+
+View resized(const View& view, int width, int height) {
+  const double across = double(width) / view.width, down = double(height) / view.height;
+  View out = view;
+  out.width = width, out.height = height;
+  out.fx *= across, out.cx *= across;
+  out.fy *= down, out.cy *= down;
+  return out;
+}
+
+Camera<float> camera_of(const View& view) {
+  Camera<float> camera;
+  camera.width = view.width, camera.height = view.height;
+  camera.tan_fov_x = static_cast<float>(view.width / (2 * view.fx));
+  camera.tan_fov_y = static_cast<float>(view.height / (2 * view.fy));
+  // World to view, and view to clip: pixel fx X / Z + cx is NDC x = 2 (fx / width X / Z + cx / width) - 1. Nothing
+  // reads clip z, as culling is by view depth.
+  const double clip[4][4] = {{2 * view.fx / view.width, 0, 2 * view.cx / view.width - 1, 0},
+                             {0, 2 * view.fy / view.height, 2 * view.cy / view.height - 1, 0},
+                             {0, 0, 1, 0},
+                             {0, 0, 1, 0}};
+  double matrix[4][4] = {};
+  for (int row = 0; row < 3; ++row) {
+    for (int column = 0; column < 3; ++column) matrix[row][column] = view.rotation[3 * row + column];
+    matrix[row][3] = view.translation[row];
+  }
+  matrix[3][3] = 1;
+  for (int row = 0; row < 4; ++row) {
+    for (int column = 0; column < 4; ++column) {
+      double product = 0;
+      for (int k = 0; k < 4; ++k) product += clip[row][k] * matrix[k][column];
+      camera.view[4 * column + row] = static_cast<float>(matrix[row][column]);  // transposed, as camera.h says
+      camera.projection[4 * column + row] = static_cast<float>(product);
+    }
+  }
+  for (int axis = 0; axis < 3; ++axis) {
+    double centre = 0;
+    for (int row = 0; row < 3; ++row) centre -= matrix[row][axis] * matrix[row][3];
+    camera.position[axis] = static_cast<float>(centre);
+  }
+  return camera;
+}
+
+std::vector<View> read_views(const std::string& path, ImageSize size) {
+  if (std::filesystem::is_directory(path)) {
+    const std::string folder = io::find_colmap_folder(path);
+    return views_of(io::read_colmap(folder), folder);
+  }
+  return parse_json_views(io::read_file(path), path, size);
+}
+
+std::vector<View> views_of(const io::ColmapModel& model, const std::string& folder) {
+  std::map<std::uint32_t, const io::ColmapCamera*> cameras;
+  for (const io::ColmapCamera& camera : model.cameras) {
+    const std::string name = camera.model->name;
+    if (name != "PINHOLE" && name != "SIMPLE_PINHOLE") {
+      throw io::FormatError(folder + ": camera " + std::to_string(camera.id) + " has the model " + name +
+                            "; only PINHOLE and SIMPLE_PINHOLE, without lens distortion, can be rendered "
+                            "(`colmap image_undistorter` makes such a scene)");
+    }
+    cameras[camera.id] = &camera;
+  }
+  std::vector<View> views;
+  for (const io::ColmapImage& image : model.images) {
+    const io::ColmapCamera& camera = *cameras.at(image.camera_id);
+    const auto param = [&](std::size_t from_end) { return camera.params[camera.params.size() - from_end]; };
+    View view;  // SIMPLE_PINHOLE is f, cx, cy; PINHOLE fx, fy, cx, cy
+    view.name = image.name;
+    view.width = static_cast<int>(camera.width), view.height = static_cast<int>(camera.height);
+    view.fx = camera.params[0], view.fy = param(3);
+    view.cx = param(2), view.cy = param(1);
+    view.rotation = rotation_matrix(image.qvec);
+    view.translation = image.tvec;
+    views.push_back(view);
+  }
+  return views;
+}
+
+std::vector<View> orbit_views(const Orbit& orbit) {
+  constexpr double kPi = 3.14159265358979323846;
+  if (!(dot(orbit.up, orbit.up) > 0)) throw std::invalid_argument("the up direction of an orbit must not be zero");
+  // The plane of the circle: two directions across `up`, of which any will do.
+  const Vector up = unit(orbit.up);
+  const Vector helper = std::abs(up[2]) < 0.9 ? Vector{0, 0, 1} : Vector{1, 0, 0};
+  const Vector ahead = unit(cross(cross(up, helper), up)), aside = cross(up, ahead);
+  const double elevation = orbit.elevation * kPi / 180;
+
+  std::vector<View> views;
+  for (int i = 0; i < orbit.count; ++i) {
+    const double angle = 2 * kPi * i / orbit.count;
+    const Vector around = sum(scaled(ahead, -std::cos(angle)), scaled(aside, std::sin(angle)));
+    const Vector outward = sum(scaled(around, std::cos(elevation)), scaled(up, std::sin(elevation)));
+    const Vector z = scaled(outward, -1), x = unit(cross(z, up)), y = cross(z, x);
+    View view;
+    view.name = "orbit_" + std::to_string(i);
+    view.width = orbit.width, view.height = orbit.height;
+    view.fx = view.fy = orbit.width / (2 * std::tan(orbit.field_of_view * kPi / 360));
+    view.cx = orbit.width / 2.0, view.cy = orbit.height / 2.0;
+    view.rotation = {x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]};
+    view.translation = translation_of(view.rotation, sum(orbit.target, scaled(outward, orbit.distance)));
+    views.push_back(view);
+  }
+  return views;
+}
+
+}  // namespace dsmoe::tools

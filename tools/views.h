@@ -1,0 +1,59 @@
+// From where a scene is seen: views of COLMAP scenes and of json files, and an orbit around a model.
+#pragma once
+
+#include <array>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "dsmoe/camera.h"
+#include "io/colmap.h"
+
+namespace dsmoe::tools {
+
+/// A pinhole camera; view axes are x right, y down, z forward. The centre of the top left pixel is (0.5, 0.5).
+struct View {
+  std::string name;
+  int width = 0, height = 0;               // pixels
+  double fx = 0, fy = 0;                   // pixels
+  double cx = 0, cy = 0;                   // principal point, pixels
+  std::array<double, 9> rotation = {};     // [3, 3] world to view, by rows
+  std::array<double, 3> translation = {};  // x_view = rotation x_world + translation
+};
+
+/// The same view at another image size; intrinsics scale with the axes.
+View resized(const View& view, int width, int height);
+
+/// The camera that the rasterizer takes.
+Camera<float> camera_of(const View& view);
+
+/// Of images whose file does not say it; 0: not known.
+struct ImageSize {
+  int width = 0, height = 0;  // pixels
+};
+
+/// Reads a COLMAP folder, a transforms.json (NeRF, instant-ngp, Nerfstudio) or a cameras.json (Inria's 3DGS).
+/// Throws io::IoError: file, place and reason.
+std::vector<View> read_views(const std::string& path, ImageSize size);
+
+/// Throws FormatError for cameras with lens distortion.
+std::vector<View> views_of(const io::ColmapModel& model, const std::string& folder);
+
+/// The bytes of a json file, which `file` names in errors: a list is a cameras.json, an object a transforms.json.
+/// Throws FormatError, also where neither the file nor `size` says how large the images are.
+std::vector<View> parse_json_views(std::string_view bytes, const std::string& file, ImageSize size);
+
+struct Orbit {
+  int count = 120;                           // views
+  std::array<double, 3> target = {0, 0, 0};  // world
+  double distance = 1;                       // world
+  double elevation = 20;                     // degrees above the plane
+  std::array<double, 3> up = {0, -1, 0};     // world
+  double field_of_view = 50;                 // degrees, across
+  int width = 1280, height = 720;            // pixels
+};
+
+/// Views on a circle around the target. Throws std::invalid_argument where `up` is zero.
+std::vector<View> orbit_views(const Orbit& orbit);
+
+}  // namespace dsmoe::tools
