@@ -37,19 +37,19 @@ inline void step_and_forget_gradients(std::vector<dsmoe::AdamParameter>& paramet
 class Gaussians {
  public:
   enum Parameter { kMeans, kDc, kShs, kOpacities, kScales, kRotations, kCount };
-  using Rows = std::vector<torch::Tensor>;  // a tensor for each parameter
 
   // Round Gaussians as wide as the distance to their neighbours.
   Gaussians(const Scene& scene, const Recipe& recipe) : recipe_(recipe), extent_(scene.extent) {
     const int64_t count = scene.points.size(0), coefficients = (recipe.sh_degree + 1) * (recipe.sh_degree + 1);
     const auto like = scene.colors.options();
     const auto log_scales = dsmoe::distCUDA2(scene.points).clamp_min(1e-7).sqrt().log().to(torch::kFloat);
-    const Rows values = {scene.points.to(torch::kFloat),
-                         ((scene.colors - 0.5) / 0.28209479177387814).unsqueeze(1),  // 1 / (2 sqrt(pi))
-                         torch::zeros({count, coefficients - 1, 3}, like),
-                         torch::full({count, 1}, 0.1, like).logit(),
-                         log_scales.unsqueeze(1).repeat({1, 3}),
-                         torch::tensor({1.f, 0.f, 0.f, 0.f}, like).repeat({count, 1})};
+    const std::vector<torch::Tensor> values = {
+        scene.points.to(torch::kFloat),
+        ((scene.colors - 0.5) / 0.28209479177387814).unsqueeze(1),  // 1 / (2 sqrt(pi))
+        torch::zeros({count, coefficients - 1, 3}, like),
+        torch::full({count, 1}, 0.1, like).logit(),
+        log_scales.unsqueeze(1).repeat({1, 3}),
+        torch::tensor({1.f, 0.f, 0.f, 0.f}, like).repeat({count, 1})};
     const double rates[] = {0,
                             recipe.feature_lr,
                             recipe.feature_lr / 20,
@@ -75,7 +75,7 @@ class Gaussians {
   }
 
   void begin_iteration(int iteration) {
-    const double share = std::min(1.0, 1.0 * iteration / recipe_.iterations);
+    const double share = 1.0 * iteration / recipe_.iterations;
     parameters_[kMeans].lr = extent_ * std::exp((1 - share) * std::log(recipe_.position_lr_init) +
                                                 share * std::log(recipe_.position_lr_final));
     if (iteration % recipe_.sh_degree_interval == 0 && active_sh_degree_ < recipe_.sh_degree) ++active_sh_degree_;
@@ -88,7 +88,10 @@ class Gaussians {
     dsmoe::add_view(dL_dmeans2D, radii, gradient_sum_, view_count_);
     if (iteration > recipe_.densify_from && iteration % recipe_.densification_interval == 0) {
       densify();
-      prune(/*large_too=*/iteration > recipe_.opacity_reset_interval);
+      const auto now = activated();
+      auto doomed = now.opacities.squeeze(1) < 0.005;  // and, after the first reset, those larger than a tenth
+      if (iteration > recipe_.opacity_reset_interval) doomed |= std::get<0>(now.scales.max(1)) > 0.1 * extent_;
+      change_rows(~doomed, {});
       forget_statistics();
     }
     if (iteration % recipe_.opacity_reset_interval == 0) {
@@ -125,7 +128,7 @@ class Gaussians {
     const auto clones = (wanted & ~large).nonzero().squeeze(1), parents = (wanted & large).nonzero().squeeze(1);
     // Two children for each parent, at places drawn from its own distribution.
     const auto sources = torch::cat({clones, parents, parents});
-    Rows added;
+    std::vector<torch::Tensor> added;
     for (const auto& parameter : parameters_) added.push_back(parameter.value.detach().index_select(0, sources));
     const auto child = [&](Parameter parameter) { return added[parameter].slice(0, clones.size(0)); };
     const auto offsets = torch::randn_like(child(kScales)) * child(kScales).exp();
@@ -134,16 +137,8 @@ class Gaussians {
     change_rows(~(wanted & large), added);
   }
 
-  // Removes faint Gaussians and, if asked, those larger than a tenth of the scene.
-  void prune(bool large_too) {
-    const auto now = activated();
-    auto doomed = now.opacities.squeeze(1) < 0.005;
-    if (large_too) doomed |= std::get<0>(now.scales.max(1)) > 0.1 * extent_;
-    change_rows(~doomed, {});
-  }
-
   // Keeps the Gaussians where the mask is set and appends others, whose moments are zero.
-  void change_rows(const torch::Tensor& mask, const Rows& added) {
+  void change_rows(const torch::Tensor& mask, const std::vector<torch::Tensor>& added) {
     const auto kept = mask.nonzero().squeeze(1);
     for (int i = 0; i < kCount; ++i) {
       auto& [value, lr, moment, square, step] = parameters_[i];

@@ -22,7 +22,7 @@ struct View {
 struct Scene {
   std::vector<View> train, test;
   torch::Tensor points, colors;  // [N, 3] world, double; [N, 3] in [0, 1]
-  double extent = 1;             // 1.1 times the largest distance of a training camera from their mean
+  double extent;                 // 1.1 times the largest distance of a training camera from their mean
 };
 
 // Vectors [N, 3] turned by quaternions [N, 4] (w, x, y, z) of any length.
@@ -36,18 +36,14 @@ inline torch::Tensor rotated(const torch::Tensor& vectors, const torch::Tensor& 
 inline View load_view(const dsmoe::io::ColmapImage& posed, const dsmoe::io::ColmapCamera& camera,
                       const std::string& folder, int divisor, torch::Device device) {
   const std::string path = folder + "/" + posed.name, model = camera.model->name;
-  if (model != "PINHOLE" && model != "SIMPLE_PINHOLE") {
-    throw std::runtime_error(path + ": camera model " + model + "; undistort first: colmap image_undistorter");
-  }
+  if (model != "PINHOLE" && model != "SIMPLE_PINHOLE") throw std::runtime_error(path + ": undistort first: " + model);
   cv::Mat pixels = cv::imread(path, cv::IMREAD_COLOR | cv::IMREAD_IGNORE_ORIENTATION);
   if (pixels.empty()) throw std::runtime_error(path + ": not a readable image");
   if (divisor > 1) cv::resize(pixels, pixels, {}, 1.0 / divisor, 1.0 / divisor, cv::INTER_AREA);
   const double sx = 1.0 * pixels.cols / camera.width, sy = 1.0 * pixels.rows / camera.height;
   const auto last = camera.params.end();  // PINHOLE is fx, fy, cx, cy; SIMPLE_PINHOLE f, cx, cy
-  const auto K =
-      torch::tensor({sx * camera.params[0], 0.0, sx * last[-2], 0.0, sy * last[-3], sy * last[-1], 0.0, 0.0, 1.0},
-                    torch::kDouble)
-          .view({3, 3});
+  const auto K = torch::tensor(
+      {{sx * camera.params[0], 0., sx * last[-2]}, {0., sy * last[-3], sy * last[-1]}, {0., 0., 1.}}, torch::kDouble);
   const auto quaternion = torch::tensor(at::ArrayRef<double>(posed.qvec), torch::kDouble).repeat({3, 1});
   const auto rotation = rotated(torch::eye(3, torch::kDouble), quaternion).t();
   const auto translation = torch::tensor(at::ArrayRef<double>(posed.tvec), torch::kDouble);
@@ -62,16 +58,16 @@ inline Scene load_scene(const std::string& folder, const std::string& images, in
   for (const auto& camera : model.cameras) cameras[camera.id] = &camera;
   std::sort(model.images.begin(), model.images.end(), [](const auto& a, const auto& b) { return a.name < b.name; });
   Scene scene;
-  std::vector<torch::Tensor> centers;
   for (size_t i = 0; i < model.images.size(); ++i) {
     const auto& posed = model.images[i];
     auto& views = i % kHoldOut == 0 ? scene.test : scene.train;
     views.push_back(load_view(posed, *cameras.at(posed.camera_id), folder + "/" + images, divisor, device));
-    if (i % kHoldOut != 0) centers.push_back(views.back().settings.campos);
   }
+  std::vector<torch::Tensor> centers;
+  for (const View& view : scene.train) centers.push_back(view.settings.campos);
   const auto all = torch::stack(centers);
   const double radius = (all - all.mean(0, true)).norm(2, 1).max().item<double>();
-  if (radius > 1e-6) scene.extent = 1.1 * radius;
+  scene.extent = radius > 1e-6 ? 1.1 * radius : 1;
   auto& cloud = model.points.cloud;
   if (cloud.colors.empty()) cloud.colors.assign(3 * cloud.count, 128);
   const auto count = static_cast<int64_t>(cloud.count);

@@ -23,19 +23,16 @@ struct Blend {
   dsmoe::GaussianRasterizationSettings settings(const View& view) const {
     auto result = view.settings;
     result.blend_mode = mode;
-    if (!logarithm.empty()) {
-      result.background_gate = 0.03 + logarithm[0].value.exp();
-    } else if (mode == "smoe") {
-      result.background_gate = number;
-    }
+    if (mode == "smoe") result.background_gate = number;
+    if (!logarithm.empty()) result.background_gate = 0.03 + logarithm[0].value.exp();
     return result;
   }
 
   double gate() const { return logarithm.empty() ? number : 0.03 + logarithm[0].value.exp().item<double>(); }
 };
 
-// Mean PSNR and SSIM over the views, of images as an 8-bit file would hold them.
-std::pair<double, double> evaluate(const std::vector<View>& views, const Gaussians& gaussians, const Blend& blend) {
+// Prints mean PSNR and SSIM over the views, of images as an 8-bit file would hold them.
+void evaluate(const std::vector<View>& views, const Gaussians& gaussians, const Blend& blend) {
   const torch::NoGradGuard no_grad;
   double psnr = 0, ssim = 0;
   for (const View& view : views) {
@@ -44,14 +41,13 @@ std::pair<double, double> evaluate(const std::vector<View>& views, const Gaussia
     psnr -= 10 * std::log10((image - target).square().mean().item<double>()) / views.size();
     ssim += dsmoe::fused_ssim(image, target).item<double>() / views.size();
   }
-  return {psnr, ssim};
+  std::printf("\ntest PSNR %.2f dB, SSIM %.4f, background gate %.4f\n", psnr, ssim, blend.gate());
 }
 
 void show_progress(int iteration, int iterations, double seconds, double loss, int64_t count) {
   const std::string bar(30 * static_cast<int64_t>(iteration) / iterations, '=');
-  std::printf("\r[%-30s] %d/%d, %.1f it/s, loss %.4f, %lld Gaussians  ", bar.c_str(), iteration, iterations,
-              iteration / seconds, loss, static_cast<long long>(count));
-  std::fflush(stdout);
+  std::fprintf(stderr, "\r[%-30s] %d/%d, %.1f it/s, loss %.4f, %lld Gaussians  ", bar.c_str(), iteration, iterations,
+               iteration / seconds, loss, static_cast<long long>(count));
 }
 
 void train(const std::string& folder, const std::string& output, std::map<std::string, std::string> options) {
@@ -63,16 +59,15 @@ void train(const std::string& folder, const std::string& output, std::map<std::s
   Gaussians gaussians(scene, recipe);
   Blend blend(options["--blend-mode"], options["--background-gate"], device);
 
-  std::vector<size_t> order;  // views, each once before any comes again
+  std::vector<const View*> left;  // of an epoch: each view is seen once before any comes again
   const auto begin = std::chrono::steady_clock::now();
   for (int iteration = 1; iteration <= recipe.iterations; ++iteration) {
-    if (order.empty()) {
-      order.resize(scene.train.size());
-      std::iota(order.begin(), order.end(), size_t(0));
-      std::shuffle(order.begin(), order.end(), random);
+    if (left.empty()) {
+      for (const View& view : scene.train) left.push_back(&view);
+      std::shuffle(left.begin(), left.end(), random);
     }
-    const View& view = scene.train[order.back()];
-    order.pop_back();
+    const View& view = *left.back();
+    left.pop_back();
     gaussians.begin_iteration(iteration);
     const auto means2D = torch::zeros({gaussians.count(), 3}, device).requires_grad_();
     const auto rendering = gaussians.render(blend.settings(view), means2D);
@@ -93,8 +88,7 @@ void train(const std::string& folder, const std::string& output, std::map<std::s
   const auto path = std::filesystem::path(output) / "point_cloud" / ("iteration_" + options["--iterations"]);
   std::filesystem::create_directories(path);
   gaussians.save(path / "point_cloud.ply", blend.mode, blend.gate());
-  const auto [psnr, ssim] = evaluate(scene.test, gaussians, blend);
-  std::printf("\ntest PSNR %.2f dB, SSIM %.4f, background gate %.4f\n", psnr, ssim, blend.gate());
+  evaluate(scene.test, gaussians, blend);
 }
 
 }  // namespace
@@ -114,7 +108,6 @@ int main(int argc, char** argv) {
       options[argv[i]] = argv[i + 1];
     }
     train(argv[1], argv[2], options);
-    return 0;
   } catch (const std::exception& error) {
     std::fprintf(stderr, "%s\n", error.what());
     return 1;

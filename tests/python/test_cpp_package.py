@@ -1,4 +1,4 @@
-"""C++ programs that use the installed Python package through CMake: tests/cpp/consumer, the documentation's, a trainer."""
+"""C++ programs that use the installed Python package through CMake: consumers, the documentation's, a trainer."""
 from __future__ import annotations
 
 import inspect
@@ -34,16 +34,18 @@ def run(*words, **options):
 
 
 def build(source, folder, *options, prefixes=None):
-    """Configures and builds a project, by default against the installed package; skips where a library that it needs is absent."""
+    """Configures and builds a project, by default against the installed package.
+
+    Skips where GoogleTest or OpenCV, which it needs, is absent.
+    """
     generator = ["-G", "Ninja"] if shutil.which("ninja") else []
     where = ";".join(map(str, prefixes)) if prefixes else extension.cmake_prefix_path()
     configured = subprocess.run(["cmake", "-S", str(source), "-B", str(folder), *generator,
                                  f"-DCMAKE_PREFIX_PATH={where}", *options],
                                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, universal_newlines=True)
-    missing = re.search('Could not find a package configuration file provided by "(GTest|OpenCV)"|Could NOT find (GTest)',
-                        configured.stdout)
+    missing = re.search('(?:configuration file provided by "|Could NOT find )(GTest|OpenCV)', configured.stdout)
     if configured.returncode and missing:
-        pytest.skip(f"{missing.group(1) or missing.group(2)} is not installed")
+        pytest.skip(f"{missing.group(1)} is not installed")
     assert configured.returncode == 0, configured.stdout
     return run("cmake", "--build", folder)
 
@@ -58,7 +60,7 @@ def test_the_command_says_where_cmake_looks(capsys):
 def fields_of(struct):
     """The names of the fields of a struct of dsmoe/torch.h, in order."""
     text = (ROOT / "diff_smoe_rasterization" / "include" / "dsmoe" / "torch.h").read_text()
-    body = re.search(r"struct %s {\n(.*?)\n};" % struct, text, re.DOTALL).group(1)
+    body = text.partition(f"struct {struct} {{\n")[2].partition("\n};")[0]
     return re.findall(r"^  [\w:<>]+ (\w+)(?: = [^;]*)?;", body, re.MULTILINE)
 
 
