@@ -1,4 +1,5 @@
-"""Builds the torch extension. Metadata: pyproject.toml; files and compiler flags: sources.txt.
+"""Builds libdsmoe.so, which needs no Python, and the extension _C over it. Metadata: pyproject.toml; files and compiler
+flags: sources.txt.
 
 Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA), TORCH_CUDA_ARCH_LIST, MAX_JOBS;
 DSMOE_CUDA_ARCH=all compiles for every card where none is seen; DSMOE_CORE_FOLDER=DIR links the libraries that CMake has
@@ -15,6 +16,9 @@ import setuptools
 
 ROOT = Path(__file__).resolve().parent
 PACKAGE = "diff_smoe_rasterization"
+LIBRARY = "libdsmoe"
+# Where a C++ program finds what libdsmoe.so needs. Python has loaded it before.
+LIBRARY_PATHS = ("$ORIGIN/../torch/lib", "$ORIGIN/../nvidia/cu13/lib", "$ORIGIN/../nvidia/cuda_runtime/lib")
 # What is compiled for where no card is seen. A kernel runs on later cards of the same major number too; cards after the
 # last compile its PTX when they first run it. EVERY_CARD: what torch's own builds are for, and 11.0. The usual ones are
 # the oldest that the toolkit knows, for its major number, and these.
@@ -127,13 +131,13 @@ def compiled_libraries(torch):
 
 
 def extension():
-    """Returns the arguments of setup() that build `diff_smoe_rasterization._C`."""
+    """Returns the arguments of setup() that build libdsmoe.so and `diff_smoe_rasterization._C`."""
     torch, cpp_extension = import_build_tools()
     sources = read_sources()
     without_cuda = reasons_against_cuda(sources["cuda"], torch, cpp_extension.CUDA_HOME)
     groups = ["core", "io", "torch"] + ([] if without_cuda else ["cuda", "torch_cuda"])
     libraries = {group: path for group, path in compiled_libraries(torch).items() if group in groups}
-    flags = sources["flags"] + ["-g0", "-fvisibility=hidden", "-pthread"]
+    flags = sources["flags"] + ["-g0", "-pthread"]
     if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
         flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
     nvcc_flags = ["-O3"]
@@ -141,30 +145,46 @@ def extension():
         nvcc_flags += architecture_flags(nvcc_of(cpp_extension.CUDA_HOME), torch)
     folders = [str(ROOT / PACKAGE / folder) for folder in ("include", "csrc")]
     make = cpp_extension.CppExtension if without_cuda else cpp_extension.CUDAExtension
-    module = make(
-        f"{PACKAGE}._C",
+    library = make(
+        f"{PACKAGE}.{LIBRARY}",
         [f"{PACKAGE}/{path}" for group in groups if group not in libraries for path in sources[group]],
         include_dirs=folders,
+        # C++ programs that link the library call what it exports; calls inside need not go through the table for that.
+        extra_compile_args={"cxx": flags + ["-fno-semantic-interposition"], "nvcc": nvcc_flags},
+        extra_link_args=["-pthread", f"-Wl,-soname,{LIBRARY}.so", *(f"-Wl,-rpath,{path}" for path in LIBRARY_PATHS),
+                         "-Wl,--whole-archive", *libraries.values(), "-Wl,--no-whole-archive"],
+    )
+    library.libraries.remove("torch_python")
+    module = cpp_extension.CppExtension(
+        f"{PACKAGE}._C",
+        [f"{PACKAGE}/{path}" for path in sources["python"]],
+        include_dirs=folders,
         define_macros=[] if without_cuda else [("DSMOE_WITH_CUDA", None)],
-        extra_compile_args={"cxx": flags, "nvcc": nvcc_flags},
-        extra_objects=list(libraries.values()),
-        extra_link_args=["-pthread"] + (["-Wl,--exclude-libs,ALL"] if libraries else []),
+        extra_compile_args={"cxx": flags + ["-fvisibility=hidden"]},
+        extra_link_args=["-Wl,-rpath,$ORIGIN"],
     )
     built_against = {
         "TORCH_VERSION": torch.__version__,
         "CUDA_VERSION": None if without_cuda else torch.version.cuda,
         "WITHOUT_CUDA_BECAUSE": "; ".join(without_cuda),
+        "CXX11_ABI": torch.compiled_with_cxx11_abi(),
         "COMMIT": commit(),
     }
 
     class BuildExtension(cpp_extension.BuildExtension):
         def run(self):
+            module.extra_objects = [os.path.join(self.build_lib, self.get_ext_filename(library.name))]
             super().run()
             lines = ['"""What the extension was built against; readable even where it cannot be loaded."""']
             lines += [f"{name} = {value!r}" for name, value in built_against.items()]
             Path(self.get_ext_fullpath(module.name)).with_name("_build_info.py").write_text("\n".join(lines) + "\n")
 
-    return {"ext_modules": [module], "cmdclass": {"build_ext": BuildExtension}}
+        def get_ext_filename(self, name):
+            if name.endswith(LIBRARY):  # no module: a name without the tag of a Python
+                return os.path.join(*name.split(".")) + ".so"
+            return super().get_ext_filename(name)
+
+    return {"ext_modules": [library, module], "cmdclass": {"build_ext": BuildExtension}}
 
 
 def commit():
@@ -188,7 +208,7 @@ def packages():
     names = list(folders)
     for name, folder in folders.items():
         names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
-    data = {PACKAGE: ["include/dsmoe/*.h", "py.typed"],
+    data = {PACKAGE: ["include/dsmoe/*.h", "csrc/io/*.h", "cmake/*.cmake", "py.typed"],
             f"{PACKAGE}.patches": ["shims/*/*/*.py"],  # shims are no packages of ours
             f"{PACKAGE}.benchmarks.suite": ["Snakefile", "shipped/*.yaml", "shipped/scenes/*.yaml"],
             f"{PACKAGE}.benchmarks.suite.report": ["*.json", "page.*"]}

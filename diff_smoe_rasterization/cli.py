@@ -111,6 +111,8 @@ def build_parser() -> argparse.ArgumentParser:
     _add_bench_arguments(bench)
 
     info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
+    info.add_argument("--cmake", action="store_true",
+                      help="print only what CMAKE_PREFIX_PATH needs for find_package(diff_smoe_rasterization) in C++")
     info.set_defaults(run=_info)
 
     completion = commands.add_parser("completion", help="a script by which a shell completes commands and options",
@@ -360,6 +362,11 @@ def _render(arguments: argparse.Namespace) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> None:
+    if arguments.cmake:
+        from .extension import cmake_prefix_path
+
+        print(cmake_prefix_path())
+        return
     from .trainer.system.environment import describe
 
     print(describe())

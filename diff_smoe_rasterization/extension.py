@@ -73,6 +73,11 @@ def build_info() -> Dict[str, Any]:
             "without_cuda_because": _recorded("WITHOUT_CUDA_BECAUSE") or None}
 
 
+def cmake_prefix_path() -> str:
+    """Returns what CMAKE_PREFIX_PATH needs for find_package(diff_smoe_rasterization) in C++: this package and torch."""
+    return ";".join([os.path.dirname(os.path.abspath(__file__)), torch.utils.cmake_prefix_path])
+
+
 def set_profiling(enabled: bool) -> None:
     """Turns the clock of `stage_times` on or off; it is off at first. It covers the whole process.
 

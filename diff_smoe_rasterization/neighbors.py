@@ -1,10 +1,7 @@
 """Distances to the nearest points, from which trainers take the first scales."""
 from __future__ import annotations
 
-import numpy as np
 import torch
-
-_NEIGHBOURS = 3
 
 
 def distCUDA2(points: torch.Tensor) -> torch.Tensor:
@@ -23,20 +20,7 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     if not bool(finite.all()):
         index = int((~finite).nonzero()[0])
         raise ValueError(f"distCUDA2: points[{index}] is not finite")
-    if points.device.type == "cpu":
-        distances = mean_squared_neighbour_distance(points.numpy())
-        return torch.from_numpy(distances).to(points.dtype)
     from .extension import _C  # noqa: F401  (loading it registers the op)
 
     return torch.ops.diff_smoe_rasterization.mean_squared_neighbour_distances(points)
 
-
-def mean_squared_neighbour_distance(positions: np.ndarray) -> np.ndarray:
-    """[N] float64, what `distCUDA2` computes, of finite positions [N, 3]."""
-    from scipy.spatial import cKDTree  # takes longer to import than this package
-
-    others = min(_NEIGHBOURS, len(positions) - 1)
-    if others < 1:
-        return np.zeros(len(positions))
-    distances, _ = cKDTree(positions).query(positions, k=others + 1, workers=-1)
-    return (distances[:, 1:] ** 2).mean(axis=1)

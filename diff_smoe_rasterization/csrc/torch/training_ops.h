@@ -238,5 +238,11 @@ void add_view(const at::Tensor& dL_dmeans2D, const at::Tensor& radii, const at::
   note_change({gradient_sum, view_count});
 }
 
+// Of `mean_squared_neighbour_distances`, whose implementations share no more.
+inline void check_points(const at::Tensor& points) {
+  check_real("mean_squared_neighbour_distances", "points", points);
+  check_shape("mean_squared_neighbour_distances", "points", points, {"N", 3});
+}
+
 }  // namespace binding
 }  // namespace dsmoe

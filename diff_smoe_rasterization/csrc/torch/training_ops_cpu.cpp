@@ -3,6 +3,7 @@
 #include <torch/library.h>
 
 #include "cpu/parallel.h"
+#include "dsmoe/neighbors.h"
 #include "training_ops.h"
 
 namespace dsmoe {
@@ -29,6 +30,16 @@ struct Cpu {
   }
 };
 
+at::Tensor mean_squared_neighbour_distances(const at::Tensor& points) {
+  check_points(points);
+  const at::Tensor dense = points.contiguous(), result = at::empty({points.size(0)}, points.options());
+  AT_DISPATCH_FLOATING_TYPES(points.scalar_type(), "mean_squared_neighbour_distances", [&] {
+    cpu::mean_squared_distances(dense.data_ptr<scalar_t>(), points.size(0), result.data_ptr<scalar_t>(),
+                                at::get_num_threads());
+  });
+  return result;
+}
+
 }  // namespace
 }  // namespace binding
 }  // namespace dsmoe
@@ -39,4 +50,5 @@ TORCH_LIBRARY_IMPL(diff_smoe_rasterization, CPU, m) {
   m.impl("activate", &dsmoe::binding::activate<dsmoe::binding::Cpu>);
   m.impl("activate_backward", &dsmoe::binding::activate_backward<dsmoe::binding::Cpu>);
   m.impl("add_view", &dsmoe::binding::add_view<dsmoe::binding::Cpu>);
+  m.impl("mean_squared_neighbour_distances", &dsmoe::binding::mean_squared_neighbour_distances);
 }

@@ -28,9 +28,7 @@ struct Cuda {
 };
 
 at::Tensor mean_squared_neighbour_distances(const at::Tensor& points) {
-  const char* function = "mean_squared_neighbour_distances";
-  check_real(function, "points", points);
-  check_shape(function, "points", points, {"N", 3});
+  check_points(points);
   const c10::DeviceGuard guard(points.device());
   const int64_t count = points.size(0);
   const at::Tensor result = at::empty({count}, points.options());

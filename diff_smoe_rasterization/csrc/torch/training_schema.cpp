@@ -20,6 +20,6 @@ TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m) {
       "Tensor? dL_drotations) -> (Tensor, Tensor, Tensor)");
   // For densification: adds |dL_dmeans2D[:, :2]| and 1 where radii > 0. All [N] but dL_dmeans2D [N, 3].
   m.def("add_view(Tensor dL_dmeans2D, Tensor radii, Tensor(a!) gradient_sum, Tensor(b!) view_count) -> ()");
-  // Mean squared distance of each point [N, 3] to its three nearest others. Only on a GPU.
+  // Mean squared distance of each point [N, 3] to its three nearest others.
   m.def("mean_squared_neighbour_distances(Tensor points) -> Tensor");
 }

@@ -1,13 +1,24 @@
-// Distances to the nearest other points, on a GPU. The caller first sorts the points along a space-filling curve. Then
-// kBoxPoints consecutive points lie close together, and the search leaves out whole boxes of them.
+// Distances to the nearest other points, on the CPU and on a GPU.
 #pragma once
 
 #include <cstdint>
 
 namespace dsmoe {
-namespace cuda {
 
 constexpr int kNeighbors = 3;
+
+namespace cpu {
+
+// Mean squared distance of each point to the kNeighbors nearest others, or to as many as there are.
+// points: [N, 3], finite; result: [N].
+template <class S> void mean_squared_distances(const S* points, int64_t count, S* result, int num_threads);
+
+}  // namespace cpu
+
+// On a GPU, points are sorted along a space-filling curve first, so that those of a box of consecutive ones lie
+// together and whole boxes can be left out.
+namespace cuda {
+
 constexpr int kBoxPoints = 256;  // so many that few boxes are tested, so few that most of them are left out
 
 // The place of each point on the Morton curve through their bounding box.

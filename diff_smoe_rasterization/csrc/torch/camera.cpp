@@ -1,0 +1,57 @@
+// From a calibrated pinhole camera to the settings of a rendering, as camera.py does it for Python.
+#include "check_tensor.h"
+#include "dsmoe/torch.h"
+
+namespace dsmoe {
+namespace {
+
+// Clip range of the projection matrix. Nothing reads clip z (culling uses view depth), so it only has to be finite.
+constexpr double kClipNear = 0.01, kClipFar = 100;
+
+}  // namespace
+
+GaussianRasterizationSettings settings_from_camera(const at::Tensor& K, const at::Tensor& R, const at::Tensor& t,
+                                                   int64_t width, int64_t height, const at::Tensor& bg,
+                                                   int64_t sh_degree, double scale_modifier) {
+  const char* function = "settings_from_camera";
+  binding::check_shape(function, "K", K, {3, 3});
+  binding::check_shape(function, "R", R, {3, 3});
+  binding::check_shape(function, "t", t, {3});
+  const at::Tensor intrinsics = K.to(at::kDouble), rotation = R.to(at::kDouble), translation = t.to(at::kDouble);
+  const double fx = intrinsics[0][0].item<double>(), fy = intrinsics[1][1].item<double>();
+  TORCH_CHECK_VALUE(fx > 0 && fy > 0, function, ": K has the focal lengths ", fx, " and ", fy,
+                    "; both must be positive");
+  const at::Tensor identity = at::eye(3, rotation.options());
+  const double error = (rotation.mm(rotation.t()) - identity).abs().max().item<double>();
+  TORCH_CHECK_VALUE(error < 1e-3 && at::det(rotation).item<double>() > 0, function, ": R must be a rotation");
+
+  const at::Tensor last = identity.new_zeros({1, 4});
+  last[0][3].fill_(1);
+  const at::Tensor view = at::cat({at::cat({rotation, translation.unsqueeze(1)}, 1), last}, 0);
+  // The rasterizer puts NDC x at pixel index ((x + 1) width - 1) / 2, so that a point at fx X/Z + cx (COLMAP's
+  // coordinates, half a pixel above the index) needs x = 2 fx/width X/Z + 2 cx/width - 1; y likewise.
+  const at::Tensor size = identity.new_ones({2, 1}), centre = identity.new_zeros({1, 3});
+  size[0].fill_(static_cast<double>(width));
+  size[1].fill_(static_cast<double>(height));
+  centre[0][2].fill_(1);
+  const at::Tensor image = 2 * intrinsics.narrow(0, 0, 2) / size - centre;
+  const at::Tensor lower = identity.new_zeros({2, 4});
+  lower[0][2].fill_(kClipFar / (kClipFar - kClipNear));
+  lower[0][3].fill_(-kClipNear * kClipFar / (kClipFar - kClipNear));
+  lower[1][2].fill_(1);
+  const at::Tensor clip = at::cat({at::cat({image, identity.new_zeros({2, 1})}, 1), lower}, 0);
+
+  const auto place = [&](const at::Tensor& matrix) { return matrix.contiguous().to(bg.device(), bg.scalar_type()); };
+  GaussianRasterizationSettings settings;
+  settings.image_height = height, settings.image_width = width;
+  settings.tanfovx = static_cast<double>(width) / (2 * fx), settings.tanfovy = static_cast<double>(height) / (2 * fy);
+  settings.bg = bg;
+  settings.scale_modifier = scale_modifier;
+  settings.viewmatrix = place(view.t());
+  settings.projmatrix = place(clip.mm(view).t());
+  settings.sh_degree = sh_degree;
+  settings.campos = place(-rotation.t().mv(translation));
+  return settings;
+}
+
+}  // namespace dsmoe

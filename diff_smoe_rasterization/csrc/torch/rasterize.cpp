@@ -1,0 +1,194 @@
+// dsmoe/torch.h: the op `rasterize` with its arguments by name, and its gradient for C++. Python has its own autograd
+// formula over the same ops (autograd.py), which torch.compile sees through.
+#include <torch/csrc/autograd/custom_function.h>
+
+#include <algorithm>
+#include <string_view>
+
+#include "call_op.h"
+#include "dsmoe/torch.h"
+#include "tensors.h"
+
+namespace dsmoe {
+namespace {
+
+using binding::Inputs;
+using binding::kNumImages;
+using binding::kNumInputs;
+using torch::autograd::AutogradContext;
+using torch::autograd::variable_list;
+
+constexpr double kMaxBackgroundGate = 1e30;  // that and a background's colour still make a float32 number
+
+// The settings, with what the op takes under a name of the settings but as something else.
+struct Given : GaussianRasterizationSettings {
+  using Settings = GaussianRasterizationSettings;
+  Given(const Settings& settings, const RasterizeArguments& arguments);
+
+  int64_t blend_mode = 0;
+  double fixed_background_gate = 0;
+  at::Tensor background_gate;
+  bool depth = false, inverse_depth = false, for_backward = false;
+
+ private:
+  void resolve_blend();
+};
+
+Given::Given(const Settings& settings, const RasterizeArguments& arguments) : Settings(settings) {
+  resolve_blend();
+  for (const std::string& name : arguments.outputs) {
+    TORCH_CHECK_VALUE(name == "alpha" || name == "depth" || name == "inverse_depth", "rasterize: outputs holds '", name,
+                      "'; it may hold alpha, depth, inverse_depth");
+    depth |= name == "depth";
+    inverse_depth |= name == "inverse_depth";
+  }
+}
+
+void Given::resolve_blend() {
+  blend_mode = -1;
+  BlendModes::for_each([&](auto mode) {
+    if (Settings::blend_mode == Blend<decltype(mode)::value>::kName) blend_mode = static_cast<int64_t>(mode());
+  });
+  TORCH_CHECK_VALUE(blend_mode >= 0, "rasterize: blend_mode is '", Settings::blend_mode,
+                    "'; it must be alpha, smoe, smoe_tn or smoe_std");
+  const auto alpha = static_cast<int64_t>(BlendMode::kAlpha), smoe = static_cast<int64_t>(BlendMode::kSmoe);
+  const std::optional<BackgroundGate>& gate = Settings::background_gate;
+  const bool is_one = gate && !gate->tensor.defined() && gate->number == 1;
+  fixed_background_gate = blend_mode == alpha ? 1 : 0;
+  if (!gate || (blend_mode == alpha && is_one)) return;
+  TORCH_CHECK_VALUE(blend_mode == smoe, "rasterize: background_gate is given, but blend_mode is '",
+                    Settings::blend_mode, "'; only 'smoe' knows it");
+  if (gate->tensor.defined()) {
+    background_gate = gate->tensor;
+    return;
+  }
+  TORCH_CHECK_VALUE(0 <= gate->number && gate->number <= kMaxBackgroundGate, "rasterize: background_gate is ",
+                    gate->number, "; it must be a number, 0 or more and at most ", kMaxBackgroundGate);
+  fixed_background_gate = gate->number;
+  if (is_one) blend_mode = alpha;
+}
+
+// The op's tensors in their order; absent ones are undefined.
+Inputs gather(const at::Tensor& means3D, const at::Tensor& opacities, const Given& given,
+              const RasterizeArguments& arguments) {
+  struct : RasterizeArguments {
+    at::Tensor means3D, opacities, bg, viewmatrix, projmatrix, campos, background_gate;
+  } all;
+  static_cast<RasterizeArguments&>(all) = arguments;
+  all.means3D = means3D, all.opacities = opacities, all.bg = given.bg, all.viewmatrix = given.viewmatrix;
+  all.projmatrix = given.projmatrix, all.campos = given.campos, all.background_gate = given.background_gate;
+  Inputs inputs;
+  const auto add = [&](int index, std::string_view schema, const at::Tensor& tensor) {
+    if (schema == "Tensor") {
+      TORCH_CHECK_VALUE(tensor.defined(), "rasterize: ", binding::kInputNames[index], " is undefined");
+    } else if (!tensor.defined() || (tensor.numel() == 0 && (means3D.numel() > 0 || tensor.dim() == 1))) {
+      return;
+    }
+    inputs[index] = tensor;
+  };
+#define DSMOE_ADD(enumerator, schema, name) add(binding::enumerator, schema, all.name);
+  DSMOE_INPUTS(DSMOE_ADD)
+#undef DSMOE_ADD
+  return inputs;
+}
+
+// The op's other arguments in their order.
+std::vector<c10::IValue> gather_options(const Given& given) {
+  std::vector<c10::IValue> options;
+#define DSMOE_ADD(type, schema, name) options.emplace_back(static_cast<type>(given.name));
+  DSMOE_OPTIONS(DSMOE_ADD)
+#undef DSMOE_ADD
+  return options;
+}
+
+// What autograd takes: the tensors that are present, and what says how the op is called with them.
+struct Call {
+  variable_list tensors;
+  c10::List<bool> present;  // kNumInputs
+  std::vector<c10::IValue> options;
+};
+
+// The images, and behind them what the backend saves.
+variable_list call_rasterize(const Call& call) {
+  static const c10::OperatorHandle op = binding::find_op("rasterize");
+  torch::jit::Stack stack;
+  auto next = call.tensors.begin();
+  for (const bool present : call.present) stack.push_back(present ? c10::IValue(*next++) : c10::IValue());
+  stack.insert(stack.end(), call.options.begin(), call.options.end());
+  binding::call_boxed(op, stack);
+  variable_list results;
+  for (int i = 0; i < kNumImages; ++i) results.push_back(stack[i].toTensor());
+  for (const at::Tensor& tensor : stack[kNumImages].toTensorVector()) results.push_back(tensor);
+  return results;
+}
+
+struct Rasterize : torch::autograd::Function<Rasterize> {
+  // tensors: those of the call, where autograd sees them.
+  static variable_list forward(AutogradContext* context, at::TensorList tensors, const Call& call) {
+    variable_list results = call_rasterize(call), kept = tensors.vec();
+    kept.insert(kept.end(), results.begin(), results.end());
+    context->save_for_backward(std::move(kept));
+    context->saved_data["present"] = call.present;
+    context->saved_data["options"] = c10::ivalue::Tuple::create(call.options);
+    context->set_materialize_grads(false);
+    context->mark_non_differentiable({results[binding::kRadii]});
+    results.resize(kNumImages);
+    return results;
+  }
+
+  static variable_list backward(AutogradContext* context, variable_list image_gradients) {
+    static const c10::OperatorHandle op = binding::find_op("rasterize_backward");
+    TORCH_CHECK(!at::GradMode::is_enabled(), "rasterize: second derivatives are not implemented; leave out ",
+                "create_graph");
+    const variable_list kept = context->get_saved_variables();
+    const c10::List<bool> present = context->saved_data["present"].toBoolList();
+    c10::List<bool> wanted;
+    size_t count = 0;  // of the tensors
+    for (const bool here : present) wanted.push_back(here && context->needs_input_grad(count++));
+    const auto images = kept.begin() + static_cast<int64_t>(count), saved = images + kNumImages;
+
+    torch::jit::Stack stack;
+    for (binding::Image image : binding::kDifferentiable) {
+      const at::Tensor& gradient = image_gradients[image];
+      stack.push_back(gradient.defined() ? c10::IValue(gradient) : c10::IValue());
+    }
+    torch::jit::push(stack, variable_list(kept.begin(), images), present, variable_list(images, saved),
+                     variable_list(saved, kept.end()));
+    for (const c10::IValue& option : context->saved_data["options"].toTupleRef().elements()) stack.push_back(option);
+    stack.emplace_back(wanted);
+    binding::call_boxed(op, stack);
+
+    const variable_list results = stack[0].toTensorVector();
+    auto next = results.begin();
+    variable_list gradients;
+    for (int i = 0; i < kNumInputs; ++i) {
+      if (present[i]) gradients.push_back(wanted[i] ? *next++ : at::Tensor());
+    }
+    gradients.emplace_back();  // by the call
+    return gradients;
+  }
+};
+
+}  // namespace
+
+Rendering rasterize(const at::Tensor& means3D, const at::Tensor& opacities,
+                    const GaussianRasterizationSettings& settings, const RasterizeArguments& arguments) {
+  Given given(settings, arguments);
+  Call call;
+  for (const at::Tensor& tensor : gather(means3D, opacities, given, arguments)) {
+    call.present.push_back(tensor.defined());
+    if (tensor.defined()) call.tensors.push_back(tensor);
+  }
+  given.for_backward = at::GradMode::is_enabled() && std::any_of(call.tensors.begin(), call.tensors.end(),
+                                                                 [](const auto& t) { return t.requires_grad(); });
+  call.options = gather_options(given);
+  const variable_list images =
+      given.for_backward ? Rasterize::apply(at::TensorList(call.tensors), call) : call_rasterize(call);
+  const auto& wanted = arguments.outputs;
+  const bool alpha = std::find(wanted.begin(), wanted.end(), "alpha") != wanted.end();
+  const auto if_asked = [&](bool asked, binding::Image image) { return asked ? images[image] : at::Tensor(); };
+  return {images[binding::kColor], images[binding::kRadii], if_asked(alpha, binding::kGateSum),
+          if_asked(given.depth, binding::kDepth), if_asked(given.inverse_depth, binding::kInverseDepth)};
+}
+
+}  // namespace dsmoe

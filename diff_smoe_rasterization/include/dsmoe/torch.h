@@ -1,0 +1,93 @@
+// The rasterizer for LibTorch: arguments, names and results of Python's `rasterize`, differentiable, on the device of
+// its tensors. With C++20's designated initialisers:
+//
+//     dsmoe::GaussianRasterizationSettings settings;  // fill the camera and the background
+//     settings.blend_mode = "smoe";
+//     const dsmoe::Rendering rendering = dsmoe::rasterize(
+//         means3D, opacities, settings, {.shs = shs, .scales = scales, .rotations = rotations, .outputs = {"alpha"}});
+//     rendering.color.sum().backward();
+//
+// Errors are c10::Error: c10::ValueError for shapes and values, c10::TypeError for types and devices.
+#pragma once
+
+#include <ATen/ATen.h>
+
+#include <cstdint>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace dsmoe {
+
+/// How much the background weighs in `smoe`, 0 or more: a number, or a tensor of one element, which gets a gradient.
+/// The number 1 is alpha blending, bit for bit. The value of a tensor on a GPU is not checked.
+struct BackgroundGate {
+  BackgroundGate(double number) : number(number) {}
+  BackgroundGate(at::Tensor tensor) : tensor(std::move(tensor)) {}
+  double number = 0;
+  at::Tensor tensor;  // undefined: the number counts
+};
+
+/// Camera and options of one rendering: the fields of Python's class of this name, in its order. Environment variables
+/// are not read. Matrices are transposed, as every 3DGS trainer passes them: a row vector times the matrix.
+struct GaussianRasterizationSettings {
+  int64_t image_height = 0;  // pixels
+  int64_t image_width = 0;   // pixels
+  double tanfovx = 0;        // tan of half the horizontal field of view
+  double tanfovy = 0;
+  at::Tensor bg;                     // [C] background colour, C = 3 unless colors_precomp has other channels
+  double scale_modifier = 1;         // multiplies every scale
+  at::Tensor viewmatrix;             // [4, 4] world to view, transposed
+  at::Tensor projmatrix;             // [4, 4] world to clip (view and projection), transposed
+  int64_t sh_degree = 0;             // active degree, 0 to 3; shs may hold more
+  at::Tensor campos;                 // [3] camera centre, world
+  bool prefiltered = false;          // the caller asserts that every point lies in front of the near plane
+  bool debug = false;                // check inputs and results for NaN; slower
+  bool antialiasing = false;         // scale opacity by sqrt(det(cov2D) / det(cov2D + 0.3 I))
+  double near = 0.2;                 // Gaussians with view depth <= near are culled
+  double alpha_min = 0;              // SMoE modes: also skip alpha below this; 0 is the paper's rule
+  bool strict = false;               // raise where an attribute is NaN or infinite, instead of culling that Gaussian
+  std::string blend_mode = "alpha";  // "alpha", "smoe", "smoe_tn" or "smoe_std"
+  bool deterministic = false;        // CUDA: gradients equal bit for bit from run to run; slower
+  bool clamp_color = true;           // colours from shs are at least 0
+  std::optional<BackgroundGate> background_gate;  // `smoe` only; absent: 0
+};
+
+/// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.
+struct RasterizeArguments {
+  at::Tensor means2D;                // [N, 3]; only its gradient is of use: dL/d(pixel) times (W/2, H/2), z = 0
+  at::Tensor dc;                     // [N, 1, 3] where shs [N, K - 1, 3] holds only the other coefficients
+  at::Tensor shs;                    // [N, K, 3] spherical harmonics, K >= (sh_degree + 1)^2
+  at::Tensor colors_precomp;         // [N, C] instead of shs
+  at::Tensor scales;                 // [N, 3] standard deviations, world
+  at::Tensor rotations;              // [N, 4] quaternions (w, x, y, z), used as given
+  at::Tensor cov3D_precomp;          // [N, 6] (xx, xy, xz, yy, yz, zz) instead of scales and rotations
+  std::vector<std::string> outputs;  // images to return beside the colour: "alpha", "depth", "inverse_depth"
+};
+
+/// What `rasterize` returns; an output that was not asked for is undefined. Until the backward pass has run, its images
+/// must not be changed in place: torch then raises an error.
+struct Rendering {
+  at::Tensor color;          // [C, H, W]
+  at::Tensor radii;          // [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
+  at::Tensor alpha;          // [1, H, W]; the gate sum W = sum alpha_i T_i; smoe_tn, smoe_std: sum alpha_i
+  at::Tensor depth;          // [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
+  at::Tensor inverse_depth;  // [1, H, W]; 1 / z blended as a colour, over background 0
+};
+
+/// Renders N Gaussians. means3D: [N, 3] centres, world. opacities: [N, 1] or [N]; may exceed 1. All tensors have one
+/// type, float32 or float64, and one device. Gradients reach every tensor, those of the settings too; second
+/// derivatives do not exist. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
+Rendering rasterize(const at::Tensor& means3D, const at::Tensor& opacities,
+                    const GaussianRasterizationSettings& settings, const RasterizeArguments& arguments = {});
+
+/// The settings of a pinhole camera, transposed matrices included, as Python's function of this name. K: [3, 3]
+/// intrinsics in pixels; as in COLMAP, the centre of the top left pixel is (0.5, 0.5). R, t: [3, 3] and [3], world to
+/// view: x_view = R x_world + t, with x right, y down, z forward. bg: [C]; the matrices get its type and its device.
+/// They have gradients with respect to R, t and, in the projection, K.
+GaussianRasterizationSettings settings_from_camera(const at::Tensor& K, const at::Tensor& R, const at::Tensor& t,
+                                                   int64_t width, int64_t height, const at::Tensor& bg,
+                                                   int64_t sh_degree = 3, double scale_modifier = 1);
+
+}  // namespace dsmoe

@@ -1,0 +1,115 @@
+// Trains Gaussians on a COLMAP scene: the recipe of 3DGS, with any blend mode and background gate.
+#include <chrono>
+#include <cstdio>
+#include <filesystem>
+#include <random>
+
+#include "gaussians.h"
+
+namespace {
+
+// Blend mode, and the background's gate lambda of `smoe`: a number, or learned with the scene as 0.03 + exp(p), from 1.
+struct Blend {
+  std::string mode;
+  double number = 0;
+  std::vector<dsmoe::AdamParameter> logarithm;  // p, where it is learned
+
+  Blend(const std::string& mode, const std::string& gate, torch::Device device) : mode(mode) {
+    if (mode != "smoe") return;
+    if (gate != "learned") number = std::stod(gate);
+    if (gate == "learned") logarithm.push_back({torch::full({1}, std::log(0.97), device).requires_grad_(), 0.01});
+  }
+
+  dsmoe::GaussianRasterizationSettings settings(const View& view) const {
+    auto result = view.settings;
+    result.blend_mode = mode;
+    if (mode == "smoe") result.background_gate = number;
+    if (!logarithm.empty()) result.background_gate = 0.03 + logarithm[0].value.exp();
+    return result;
+  }
+
+  double gate() const { return logarithm.empty() ? number : 0.03 + logarithm[0].value.exp().item<double>(); }
+};
+
+// Prints mean PSNR and SSIM over the views, of images as an 8-bit file would hold them.
+void evaluate(const std::vector<View>& views, const Gaussians& gaussians, const Blend& blend) {
+  const torch::NoGradGuard no_grad;
+  double psnr = 0, ssim = 0;
+  for (const View& view : views) {
+    const auto image = (gaussians.render(blend.settings(view)).color.clamp(0, 1) * 255).round() / 255;
+    const auto target = view.image.to(torch::kFloat) / 255;
+    psnr -= 10 * std::log10((image - target).square().mean().item<double>()) / views.size();
+    ssim += dsmoe::fused_ssim(image, target).item<double>() / views.size();
+  }
+  std::printf("\ntest PSNR %.2f dB, SSIM %.4f, background gate %.4f\n", psnr, ssim, blend.gate());
+}
+
+void show_progress(int iteration, int iterations, double seconds, double loss, int64_t count) {
+  const std::string bar(30 * static_cast<int64_t>(iteration) / iterations, '=');
+  std::fprintf(stderr, "\r[%-30s] %d/%d, %.1f it/s, loss %.4f, %lld Gaussians  ", bar.c_str(), iteration, iterations,
+               iteration / seconds, loss, static_cast<long long>(count));
+}
+
+void train(const std::string& folder, const std::string& output, std::map<std::string, std::string> options) {
+  const torch::Device device(options["--device"]);
+  torch::manual_seed(std::stoull(options["--seed"]));
+  std::mt19937_64 random(std::stoull(options["--seed"]));
+  const Recipe recipe = Recipe::of(std::stoi(options["--iterations"]));
+  const Scene scene = load_scene(folder, options["--images"], std::stoi(options["--divisor"]), device);
+  Gaussians gaussians(scene, recipe);
+  Blend blend(options["--blend-mode"], options["--background-gate"], device);
+
+  std::vector<const View*> left;  // of an epoch: each view is seen once before any comes again
+  const auto begin = std::chrono::steady_clock::now();
+  for (int iteration = 1; iteration <= recipe.iterations; ++iteration) {
+    if (left.empty()) {
+      for (const View& view : scene.train) left.push_back(&view);
+      std::shuffle(left.begin(), left.end(), random);
+    }
+    const View& view = *left.back();
+    left.pop_back();
+    gaussians.begin_iteration(iteration);
+    const auto means2D = torch::zeros({gaussians.count(), 3}, device).requires_grad_();
+    const auto rendering = gaussians.render(blend.settings(view), means2D);
+    const auto loss = dsmoe::l1_ssim_loss(rendering.color, view.image, recipe.lambda_dssim);
+    loss.backward();
+    const bool last = iteration == recipe.iterations;  // it changes nothing: no reset may touch what is saved
+    if (!last) {
+      gaussians.control_density(iteration, means2D.grad(), rendering.radii);
+      gaussians.step();
+      step_and_forget_gradients(blend.logarithm);
+    }
+    if (last || iteration % 100 == 0 || (device.is_cpu() && iteration % 10 == 0)) {
+      const std::chrono::duration<double> seconds = std::chrono::steady_clock::now() - begin;
+      show_progress(iteration, recipe.iterations, seconds.count(), loss.item<double>(), gaussians.count());
+    }
+  }
+
+  const auto path = std::filesystem::path(output) / "point_cloud" / ("iteration_" + options["--iterations"]);
+  std::filesystem::create_directories(path);
+  gaussians.save(path / "point_cloud.ply", blend.mode, blend.gate());
+  evaluate(scene.test, gaussians, blend);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  std::map<std::string, std::string> options = {{"--blend-mode", "alpha"},
+                                                {"--background-gate", "learned"},
+                                                {"--iterations", "30000"},
+                                                {"--divisor", "1"},
+                                                {"--images", "images"},
+                                                {"--device", "cpu"},
+                                                {"--seed", "0"}};
+  try {
+    if (argc < 3 || argc % 2 == 0) throw std::invalid_argument("usage: train SCENE OUT [--OPTION VALUE]...");
+    for (int i = 3; i < argc; i += 2) {
+      if (options.count(argv[i]) == 0) throw std::invalid_argument(std::string(argv[i]) + ": no such option");
+      options[argv[i]] = argv[i + 1];
+    }
+    train(argv[1], argv[2], options);
+  } catch (const std::exception& error) {
+    std::fprintf(stderr, "%s\n", error.what());
+    return 1;
+  }
+}

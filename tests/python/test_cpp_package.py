@@ -1,0 +1,175 @@
+"""C++ programs that use the installed Python package through CMake: consumers, the documentation's, a trainer."""
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+
+import diff_smoe_rasterization
+from diff_smoe_rasterization import extension
+from diff_smoe_rasterization import settings as settings_module
+from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.scenes.synthetic import write_synthetic_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+INSTALLED = Path(diff_smoe_rasterization.__file__).parent
+CONSUMER = ROOT / "tests" / "cpp" / "consumer"
+
+needs_cmake = pytest.mark.skipif(not (shutil.which("cmake") and shutil.which("c++")), reason="needs cmake and c++")
+
+
+def run(*words, **options):
+    """What a command prints; its output is the error where it fails."""
+    result = subprocess.run([str(word) for word in words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                            universal_newlines=True, **options)
+    assert result.returncode == 0, result.stdout
+    return result.stdout
+
+
+def build(source, folder, *options, prefixes=None):
+    """Configures and builds a project, by default against the installed package.
+
+    Skips where GoogleTest or OpenCV, which it needs, is absent.
+    """
+    generator = ["-G", "Ninja"] if shutil.which("ninja") else []
+    where = ";".join(map(str, prefixes)) if prefixes else extension.cmake_prefix_path()
+    configured = subprocess.run(["cmake", "-S", str(source), "-B", str(folder), *generator,
+                                 f"-DCMAKE_PREFIX_PATH={where}", *options],
+                                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, universal_newlines=True)
+    missing = re.search('(?:configuration file provided by "|Could NOT find )(GTest|OpenCV)', configured.stdout)
+    if configured.returncode and missing:
+        pytest.skip(f"{missing.group(1)} is not installed")
+    assert configured.returncode == 0, configured.stdout
+    return run("cmake", "--build", folder)
+
+
+def test_the_command_says_where_cmake_looks(capsys):
+    assert main(["info", "--cmake"]) == 0
+    ours, torchs = capsys.readouterr().out.strip().split(";")
+    assert (Path(ours) / "cmake" / "diff_smoe_rasterization-config.cmake").is_file()
+    assert (Path(torchs) / "Torch" / "TorchConfig.cmake").is_file()
+
+
+def fields_of(struct):
+    """The names of the fields of a struct of dsmoe/torch.h, in order."""
+    text = (ROOT / "diff_smoe_rasterization" / "include" / "dsmoe" / "torch.h").read_text()
+    body = text.partition(f"struct {struct} {{\n")[2].partition("\n};")[0]
+    return re.findall(r"^  [\w:<>]+ (\w+)(?: = [^;]*)?;", body, re.MULTILINE)
+
+
+def test_cpp_has_pythons_names():
+    assert (fields_of("GaussianRasterizationSettings")
+            == list(settings_module.GaussianRasterizationSettings._fields))
+    arguments = list(inspect.signature(diff_smoe_rasterization.rasterize).parameters)
+    assert ["means3D", "opacities", "settings", *fields_of("RasterizeArguments")] == arguments
+    assert fields_of("Rendering") == list(settings_module.Rendering._fields)
+
+
+@needs_cmake
+@pytest.mark.parametrize("name", ["core", "io", "cuda", "torch"])
+def test_a_strangers_project_uses_the_package(tmp_path, name):
+    if name == "cuda":
+        if "cuda" not in extension.BACKENDS:
+            with pytest.raises(AssertionError, match="has no dsmoe::cuda"):
+                build(CONSUMER, tmp_path, "-DCONSUMER=cuda")
+            return
+        if not os.path.isdir(os.environ.get("CUDA_HOME", "/usr/local/cuda")):
+            pytest.skip("its own calls of CUDA need the toolkit's headers")
+    build(CONSUMER, tmp_path, f"-DCONSUMER={name}")
+    status = subprocess.run([str(tmp_path / f"consumer_{name}")], cwd=str(tmp_path), stdout=subprocess.PIPE,
+                            stderr=subprocess.STDOUT, universal_newlines=True)
+    assert status.returncode in ((0, 77) if name == "cuda" else (0,)), status.stdout
+
+
+@needs_cmake
+@pytest.mark.slow
+def test_a_strangers_project_uses_what_cmake_installs(tmp_path):
+    """dsmoe::torch by CMake, against find_package(Torch): compiled, installed, and used from outside the tree."""
+    library_folder = os.path.join(os.path.dirname(torch.__file__), "lib")
+    options = [f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}", f"-DCMAKE_LIBRARY_PATH={library_folder}",
+               "-DDSMOE_TORCH=ON", "-DDSMOE_CUDA=OFF"]
+    configured = subprocess.run(["cmake", "-S", str(ROOT), "-B", str(tmp_path), *options], stdout=subprocess.PIPE,
+                                stderr=subprocess.STDOUT, universal_newlines=True)
+    if configured.returncode and "cannot find the CUDA" in " ".join(configured.stdout.split()):
+        pytest.skip("find_package(Torch) asks for a CUDA toolkit here")
+    assert configured.returncode == 0, configured.stdout
+    run("cmake", "--build", tmp_path, "--parallel", os.cpu_count(), "--target", "dsmoe_libraries", "dsmoe_torch")
+    run("cmake", "--install", tmp_path, "--prefix", tmp_path / "installed")
+    build(CONSUMER, tmp_path / "consumer", "-DCONSUMER=torch", f"-DCMAKE_LIBRARY_PATH={library_folder}",
+          prefixes=[tmp_path / "installed", torch.utils.cmake_prefix_path])
+    run(tmp_path / "consumer" / "consumer_torch")
+
+
+@needs_cmake
+def test_a_package_of_another_torch_is_not_found(tmp_path):
+    package = tmp_path / "site" / "diff_smoe_rasterization"
+    (package / "cmake").mkdir(parents=True)
+    for path in (INSTALLED / "cmake").iterdir():
+        shutil.copy(str(path), str(package / "cmake"))
+    shutil.copy(str(INSTALLED / "_version.py"), str(package))
+    (package / "_build_info.py").write_text("TORCH_VERSION = '0.4.1'\nCUDA_VERSION = None\nCXX11_ABI = True\n")
+    prefixes = extension.cmake_prefix_path().replace(str(INSTALLED), str(package))
+    result = subprocess.run(["cmake", "-S", str(CONSUMER), "-B", str(tmp_path / "build"), "-DCONSUMER=core",
+                             f"-DCMAKE_PREFIX_PATH={prefixes}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                            universal_newlines=True)
+    assert result.returncode != 0
+    assert "built against torch 0.4.1" in " ".join(result.stdout.split())
+
+
+def documented_programs():
+    """The programs of docs/cpp.md, by the target that the comment in their first line names."""
+    blocks = re.findall(r"```cpp\n(// dsmoe::(\w+)[^\n]*\n.*?)```", (ROOT / "docs" / "cpp.md").read_text(), re.DOTALL)
+    return {name: text for text, name in blocks}
+
+
+def test_every_target_is_documented_by_a_program():
+    assert sorted(documented_programs()) == ["core", "cuda", "io", "torch"]
+
+
+@needs_cmake
+@pytest.mark.parametrize("name", ["core", "io", pytest.param("cuda", marks=pytest.mark.slow),
+                                  pytest.param("torch", marks=pytest.mark.slow)])
+def test_documented_programs_are_built_and_run(tmp_path, name):
+    if name == "cuda" and "cuda" not in extension.BACKENDS:
+        pytest.skip("built without CUDA")
+    (tmp_path / "program.cpp").write_text(documented_programs()[name])
+    (tmp_path / "CMakeLists.txt").write_text(f"""cmake_minimum_required(VERSION 3.21)
+project(program LANGUAGES CXX)
+find_package(diff_smoe_rasterization 0.1 REQUIRED COMPONENTS {name})
+add_executable(program program.cpp)
+target_link_libraries(program PRIVATE dsmoe::{name})
+""")
+    build(tmp_path, tmp_path / "build")
+    if name != "cuda":  # whose program needs a GPU
+        run(tmp_path / "build" / "program", cwd=str(tmp_path))
+
+
+@needs_cmake
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [[], ["--blend-mode", "smoe"], ["--blend-mode", "smoe", "--background-gate", "0"]])
+def test_the_cpp_trainer_is_as_good_as_pythons(tmp_path_factory, tmp_path, options):
+    """Same scene, recipe and number of steps; the order of views and the places of split Gaussians are others."""
+    folder = tmp_path_factory.getbasetemp() / "cpp_trainer"
+    if not (folder / "train").is_file():
+        build(ROOT / "integrations" / "libtorch", folder, "-DCMAKE_BUILD_TYPE=Release")
+    write_synthetic_scene(str(tmp_path / "scene"), views=24, width=100, height=75, points=1000, supersampling=1)
+    printed = run(folder / "train", tmp_path / "scene", tmp_path / "cpp", "--iterations", "300", *options)
+    ours = float(re.search(r"test PSNR ([0-9.]+) dB", printed).group(1))
+    assert main(["train", str(tmp_path / "scene"), "-o", str(tmp_path / "python"), "--iterations", "300", "--quiet",
+                 "--scale-recipe", *options]) == 0
+    theirs = json.loads((tmp_path / "python" / "results.json").read_text())[0]
+    assert abs(ours - theirs["psnr"]) < 1, (ours, theirs["psnr"])  # seeds of one program differ by up to 0.9 here
+    model = diff_smoe_rasterization.io.read_gaussians(
+        str(tmp_path / "cpp" / "point_cloud" / "iteration_300" / "point_cloud.ply"))
+    assert abs(len(model.means3D) / theirs["num_gaussians"] - 1) < 0.1  # seeds: 5%
+    assert model.blend_mode == (options[1] if options else "alpha")
+    assert (model.background_gate is not None) == (model.blend_mode == "smoe")
+    if "--background-gate" in options:
+        assert model.background_gate == 0
