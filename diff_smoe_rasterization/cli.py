@@ -65,25 +65,33 @@ def build_parser() -> argparse.ArgumentParser:
     render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
     render.add_argument("-o", "--output", metavar="DIR", required=True,
                         help="folder for the images: new, empty, or of an earlier rendering")
-    render.add_argument("--scene", help="folder whose cameras are rendered (default: the run's; needed for a .ply)")
     render.add_argument("--split", choices=("test", "train", "all"), default="test",
                         help="which cameras (default: test)")
-    render.add_argument("--blend-mode", choices=BLEND_MODES,
-                        help="needed for a .ply that does not record it; must agree where it does")
-    render.add_argument("--background-gate", type=float, metavar="X",
-                        help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
+    _add_model_options(render, "whose cameras are rendered (default: the run's; needed for a .ply)")
     render.add_argument("--resolution", type=int, metavar="N",
                         help="as in train (default: the run's, for a .ply -1)")
     render.add_argument("--principal-point", choices=PRINCIPAL_POINTS,
                         help="as in train (default: the run's, for a .ply scene)")
-    render.add_argument("--white-background", action="store_true", default=None,
-                        help="white background (default: the run's, for a .ply black)")
     render.add_argument("--depth", action="store_true",
                         help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
     render.add_argument("--alpha", action="store_true",
                         help="also NAME.alpha.png: how much of a pixel Gaussians cover, 8 bits")
     _add_device(render)
     render.set_defaults(run=_render)
+
+    export = commands.add_parser("export", help="write a trained model for other programs, or as a page to look at",
+                                 description="Writes a trained model as one file. A page (.html) shows it in a "
+                                             "browser by the blend that it was trained with; other viewers show a .ply "
+                                             "or a .splat by alpha.")
+    export.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
+    export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
+    export.add_argument("--format", choices=("html", "ply", "splat"),
+                        help="default: by the ending of FILE, else html")
+    export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
+                        help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
+                             "holds degree 0)")
+    _add_model_options(export, "whose test views the page begins with (default: the run's)")
+    export.set_defaults(run=_export)
 
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
                                 description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, "
@@ -118,7 +126,7 @@ def build_parser() -> argparse.ArgumentParser:
                                                  "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
     completion.add_argument("shell", choices=("bash", "zsh"))
     completion.set_defaults(run=_completion)
-    for command in (train, evaluate, render, run, info, completion):
+    for command in (train, evaluate, render, export, run, info, completion):
         command.set_defaults(command_parser=command)
     return parser
 
@@ -156,6 +164,17 @@ def main(argv: Optional[List[str]] = None) -> int:
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to render (default: cpu)")
+
+
+def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
+    """What says how a trained model is opened; scene: what its folder is for."""
+    parser.add_argument("--scene", help="folder " + scene)
+    parser.add_argument("--blend-mode", choices=BLEND_MODES,
+                        help="needed for a .ply that does not record it; must agree where it does")
+    parser.add_argument("--background-gate", type=float, metavar="X",
+                        help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
+    parser.add_argument("--white-background", action="store_true", default=None,
+                        help="white background (default: the run's, for a .ply black)")
 
 
 def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
@@ -355,6 +374,16 @@ def _render(arguments: argparse.Namespace) -> None:
                           background_gate=arguments.background_gate,
                           outputs=[name for name in ("depth", "alpha") if getattr(arguments, name)])
     print(f"{len(paths)} images in {arguments.output}")
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from .export.command import export
+
+    path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree, arguments.scene,
+                           arguments.blend_mode, arguments.background_gate, arguments.white_background)
+    print(f"{path}: {os.path.getsize(path):,} bytes")
+    if warning:
+        print(warning)
 
 
 def _info(arguments: argparse.Namespace) -> None:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -73,6 +73,20 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
                     background_gate=gate)
 
 
+def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
+             rasterize: Optional[Rasterize] = None) -> Tuple[Renderer, str]:
+    """A renderer for the model of the run that config is of, and its .ply.
+
+    Raises TrainerError where the run has not ended, and where what is asked disagrees with it.
+    """
+    ply = trained_model_path(config.output, config.iterations)
+    mode = agreed_blend_mode(config.output, config.blend_mode, asked_blend_mode)
+    if config.background_gate != LEARNED:
+        recorded = Recorded(mode, float(config.background_gate))
+        asked_gate = agreed_background_gate(config.output, mode, recorded, asked_gate)
+    return open_renderer(config, ply, mode, device, rasterize, asked_gate), ply
+
+
 def _gate_of(config: TrainConfig) -> Optional[float]:
     """The gate that a run names; None where it was learned, which its .ply alone says."""
     return None if config.background_gate == LEARNED else float(config.background_gate)
@@ -94,12 +108,9 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     check_device(device)
     own_record(folder, RENDER)  # refused before anything is read
     if ply is None:
-        ply = trained_model_path(config.output, config.iterations)
-        blend_mode = agreed_blend_mode(config.output, config.blend_mode, blend_mode)
-        if config.background_gate != LEARNED:
-            recorded = Recorded(blend_mode, float(config.background_gate))
-            background_gate = agreed_background_gate(config.output, blend_mode, recorded, background_gate)
-    renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
+        renderer, ply = open_run(config, blend_mode, background_gate, device, rasterize)
+    else:
+        renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
     cameras = load_cameras(config, split)
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views")

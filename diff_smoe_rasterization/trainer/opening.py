@@ -1,0 +1,50 @@
+"""A trained model, by its run's folder or its .ply alone: how it is rendered, and where it can be looked at from."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import List, Optional
+
+from .config import TrainConfig
+from .inspection import open_renderer, open_run
+from .results.rendering import Renderer
+from .scenes.cameras import Camera
+from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points
+from .scenes.scene import load_cameras
+from .system.files import is_folder
+from .training.loop import check_device
+
+
+@dataclass(frozen=True)
+class Trained:
+    """An opened model."""
+
+    config: TrainConfig  # the run's; of a .ply only background, resolution and scene mean something
+    ply: str
+    renderer: Renderer
+    cameras: List[Camera]  # of the scene's test views, else of its training views; one on the orbit without a scene
+    orbit: Orbit
+
+
+def open_trained(source: str, scene: Optional[str] = None, blend_mode: Optional[str] = None,
+                 background_gate: Optional[float] = None, white_background: Optional[bool] = None,
+                 device: str = "cpu") -> Trained:
+    """Opens the output folder of `dsmoe train`, or a .ply.
+
+    scene: the folder whose cameras are taken; by default the run's, and none where that is not there. blend_mode,
+    background_gate: needed for a .ply that does not record them; they must agree where something does. Raises
+    TrainerError.
+    """
+    check_device(device)
+    options = {name: value for name, value in (("scene", scene), ("white_background", white_background))
+               if value is not None}
+    if is_folder(source):
+        config = TrainConfig.load(source).changed(**options)
+        renderer, ply = open_run(config, blend_mode, background_gate, device)
+    else:
+        config, ply = TrainConfig(blend_mode="alpha", **options).validate(), source
+        renderer = open_renderer(config, ply, blend_mode, device, asked_gate=background_gate)
+    if scene or is_folder(config.scene):
+        every = load_cameras(config, "all")
+        return Trained(config, ply, renderer, load_cameras(config, "test") or every, orbit_of_cameras(every))
+    orbit = orbit_of_points(renderer.model.raw["means3D"].detach().cpu().double().numpy())
+    return Trained(config, ply, renderer, orbit.cameras(1, default_camera()), orbit)
