@@ -60,11 +60,15 @@ def build_parser() -> argparse.ArgumentParser:
     _add_device(evaluate)
     evaluate.set_defaults(run=_eval)
 
-    render = commands.add_parser("render", help="write images of a trained run or a .ply",
-                                 description="Writes one PNG for every camera of a scene.")
+    render = commands.add_parser("render", help="write images or a video of a trained run or a .ply",
+                                 description="Writes one PNG for every camera of a scene, or a video around it.")
     render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
-    render.add_argument("-o", "--output", metavar="DIR", required=True,
-                        help="folder for the images: new, empty, or of an earlier rendering")
+    render.add_argument("-o", "--output", metavar="DIR|VIDEO", required=True,
+                        help="folder for the images: new, empty, or of an earlier rendering; with --orbit also a file "
+                             "that ends in .mp4 (needs imageio-ffmpeg) or .gif")
+    render.add_argument("--orbit", action="store_true", help="once around what the scene's cameras look at")
+    render.add_argument("--frames", type=int, default=120, metavar="N", help="of an orbit (default: 120)")
+    render.add_argument("--fps", type=float, default=30.0, metavar="X", help="of a video (default: 30)")
     render.add_argument("--split", choices=("test", "train", "all"), default="test",
                         help="which cameras (default: test)")
     _add_model_options(render, "whose cameras are rendered (default: the run's; needed for a .ply)")
@@ -361,9 +365,11 @@ def _with_lpips(net: str, device: str) -> Measure:
 def _render(arguments: argparse.Namespace) -> None:
     from .trainer.inspection import render_images
 
-    overrides = {name: getattr(arguments, name) for name in ("scene", "resolution", "principal_point",
-                                                             "white_background")
-                 if getattr(arguments, name) is not None}
+    overrides = _overrides(arguments)
+    outputs = [name for name in ("depth", "alpha") if getattr(arguments, name)]
+    if arguments.orbit:
+        _render_orbit(arguments, overrides, outputs)
+        return
     if is_folder(arguments.source):
         config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
     else:
@@ -371,16 +377,30 @@ def _render(arguments: argparse.Namespace) -> None:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
-                          background_gate=arguments.background_gate,
-                          outputs=[name for name in ("depth", "alpha") if getattr(arguments, name)])
+                          background_gate=arguments.background_gate, outputs=outputs)
     print(f"{len(paths)} images in {arguments.output}")
+
+
+def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outputs: List[str]) -> None:
+    from .trainer.filming import film
+    from .trainer.opening import open_trained
+
+    trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
+                           **overrides)
+    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs))
+
+
+def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
+    """The options of a run that a command was given in their place."""
+    names = ("scene", "resolution", "principal_point", "white_background")
+    return {name: getattr(arguments, name) for name in names if getattr(arguments, name, None) is not None}
 
 
 def _export(arguments: argparse.Namespace) -> None:
     from .export.command import export
 
-    path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree, arguments.scene,
-                           arguments.blend_mode, arguments.background_gate, arguments.white_background)
+    path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
+                           arguments.blend_mode, arguments.background_gate, **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from typing import Optional, Tuple
+from typing import Any, Optional, Tuple
 
 from .. import io
 from ..trainer.errors import TrainerError
@@ -19,8 +19,8 @@ VIEWS = 16  # of a page, at most
 
 
 def export(source: str, path: Optional[str] = None, form: Optional[str] = None, sh_degree: Optional[int] = None,
-           scene: Optional[str] = None, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
-           white_background: Optional[bool] = None) -> Tuple[str, str]:
+           blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
+           **options: Any) -> Tuple[str, str]:
     """Writes the model of a run's folder or of a .ply; returns the file's path and a warning, which may be empty.
 
     form: one of FORMATS; None: by the ending of `path`, else html. path: None: model.FORM. sh_degree: the highest
@@ -30,7 +30,7 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
     if form not in FORMATS:
         raise TrainerError(f"{path}: its ending is none of {', '.join(FORMATS)}; say which --format it is")
     path = path or f"model.{form}"
-    trained = open_trained(source, scene, blend_mode, background_gate, white_background)
+    trained = open_trained(source, blend_mode, background_gate, **options)
     gaussians = io.read_gaussians(trained.ply)
     if sh_degree is not None:
         gaussians = dataclasses.replace(gaussians, shs=gaussians.shs[:, :(sh_degree + 1) ** 2 - 1])

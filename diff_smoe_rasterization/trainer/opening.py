@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import List, Optional
+from typing import Any, List, Optional
 
 from .config import TrainConfig
 from .inspection import open_renderer, open_run
@@ -25,25 +25,22 @@ class Trained:
     orbit: Orbit
 
 
-def open_trained(source: str, scene: Optional[str] = None, blend_mode: Optional[str] = None,
-                 background_gate: Optional[float] = None, white_background: Optional[bool] = None,
-                 device: str = "cpu") -> Trained:
+def open_trained(source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
+                 device: str = "cpu", **options: Any) -> Trained:
     """Opens the output folder of `dsmoe train`, or a .ply.
 
-    scene: the folder whose cameras are taken; by default the run's, and none where that is not there. blend_mode,
-    background_gate: needed for a .ply that does not record them; they must agree where something does. Raises
-    TrainerError.
+    blend_mode, background_gate: needed for a .ply that does not record them; they must agree where something does.
+    options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. None are where the
+    run's scene is not there. Raises TrainerError.
     """
     check_device(device)
-    options = {name: value for name, value in (("scene", scene), ("white_background", white_background))
-               if value is not None}
     if is_folder(source):
         config = TrainConfig.load(source).changed(**options)
         renderer, ply = open_run(config, blend_mode, background_gate, device)
     else:
         config, ply = TrainConfig(blend_mode="alpha", **options).validate(), source
         renderer = open_renderer(config, ply, blend_mode, device, asked_gate=background_gate)
-    if scene or is_folder(config.scene):
+    if "scene" in options or is_folder(config.scene):
         every = load_cameras(config, "all")
         return Trained(config, ply, renderer, load_cameras(config, "test") or every, orbit_of_cameras(every))
     orbit = orbit_of_points(renderer.model.raw["means3D"].detach().cpu().double().numpy())
