@@ -97,6 +97,17 @@ def build_parser() -> argparse.ArgumentParser:
     _add_model_options(export, "whose test views the page begins with (default: the run's)")
     export.set_defaults(run=_export)
 
+    view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
+                               description="Serves a live viewer of a run's model, of the checkpoints of a training "
+                                           "that goes on, or of a .ply. It needs viser.")
+    view.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
+    _add_model_options(view, "at whose first test view it begins (default: the run's)")
+    view.add_argument("--host", default="127.0.0.1", help="address to serve at; 0.0.0.0: to the network too "
+                                                          "(default: 127.0.0.1, this machine only)")
+    view.add_argument("--port", type=int, default=8080, help="or the next free one (default: 8080)")
+    _add_device(view)
+    view.set_defaults(run=_view)
+
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
                                 description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, "
                                             "Scaffold-GS, HAC or HAC++, which then knows the options --blend_mode "
@@ -130,7 +141,7 @@ def build_parser() -> argparse.ArgumentParser:
                                                  "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
     completion.add_argument("shell", choices=("bash", "zsh"))
     completion.set_defaults(run=_completion)
-    for command in (train, evaluate, render, export, run, info, completion):
+    for command in (train, evaluate, render, export, view, run, info, completion):
         command.set_defaults(command_parser=command)
     return parser
 
@@ -404,6 +415,16 @@ def _export(arguments: argparse.Namespace) -> None:
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)
+
+
+def _view(arguments: argparse.Namespace) -> None:
+    from .view.following import Followed
+    from .view.server import Viewer
+
+    viewer = Viewer(Followed(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
+                             **_overrides(arguments)), arguments.host, arguments.port)
+    print(f"{viewer.address}: open it in a browser; Ctrl-C ends", flush=True)
+    viewer.wait()
 
 
 def _info(arguments: argparse.Namespace) -> None:

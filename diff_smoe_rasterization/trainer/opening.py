@@ -2,10 +2,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, List, Optional
+from typing import Any, List, Optional, Tuple
 
 from .config import TrainConfig
 from .inspection import open_renderer, open_run
+from .model import GaussianModel
 from .results.rendering import Renderer
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points
@@ -40,8 +41,18 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
     else:
         config, ply = TrainConfig(blend_mode="alpha", **options).validate(), source
         renderer = open_renderer(config, ply, blend_mode, device, asked_gate=background_gate)
-    if "scene" in options or is_folder(config.scene):
+    cameras, orbit = places(config, renderer.model, needed="scene" in options)
+    return Trained(config, ply, renderer, cameras, orbit)
+
+
+def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:
+    """Where a model is looked at from: the test views of config.scene, else its training views, and their orbit.
+
+    Where the scene is not there, it is an orbit about the Gaussians and one camera on it. needed: raise TrainerError
+    then.
+    """
+    if needed or is_folder(config.scene):
         every = load_cameras(config, "all")
-        return Trained(config, ply, renderer, load_cameras(config, "test") or every, orbit_of_cameras(every))
-    orbit = orbit_of_points(renderer.model.raw["means3D"].detach().cpu().double().numpy())
-    return Trained(config, ply, renderer, orbit.cameras(1, default_camera()), orbit)
+        return load_cameras(config, "test") or every, orbit_of_cameras(every)
+    orbit = orbit_of_points(model.raw["means3D"].detach().cpu().double().numpy())
+    return orbit.cameras(1, default_camera()), orbit
