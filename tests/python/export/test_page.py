@@ -70,6 +70,34 @@ def test_a_browser_shows_what_is_rendered(browser, tmp_path, mode, gate, degree,
 
 
 @pytest.mark.slow
+def test_a_gpu_that_cannot_blend_32_bit_floats_is_told_of(browser, tmp_path):  # noqa: F811
+    """Sums of 11 bits: a few grey levels where a pixel has many Gaussians, and the page says so."""
+    gaussians = io.Gaussians(**{**vars(cloud()), "blend_mode": "alpha"})
+    model, page = str(tmp_path / "model.ply"), str(tmp_path / "page.html")
+    io.write_gaussians(model, gaussians)
+    assert main(["export", model, "-o", page]) == 0
+    without = """const get = WebGL2RenderingContext.prototype.getExtension;
+        WebGL2RenderingContext.prototype.getExtension = function(name) {
+          return name === "EXT_float_blend" ? null : get.call(this, name);
+        };"""
+    script = browser("Page.addScriptToEvaluateOnNewDocument", source=without)["identifier"]
+    browser("Page.enable")
+    try:
+        browser.open(f"file://{page}", *SIZE)
+        browser.wait_until("document.body && document.body.dataset.drawn === 'true'")
+        assert "16-bit sums" in browser.value("document.body.innerText")
+        browser.value("byId('panel').hidden = true, 0")
+        picture = browser.picture()
+    finally:
+        browser("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+        browser("Page.disable")
+    trained = open_trained(model)
+    with torch.no_grad():
+        rendered = trained.renderer(trained.cameras[0].resized(*SIZE)).color
+    assert psnr(picture, to_image(rendered)) >= 35
+
+
+@pytest.mark.slow
 def test_the_mouse_turns_it_and_the_switch_shows_what_other_viewers_do(browser, tmp_path):  # noqa: F811
     model, page = str(tmp_path / "model.ply"), str(tmp_path / "page.html")
     io.write_gaussians(model, io.Gaussians(**{**vars(cloud()), "blend_mode": "smoe", "background_gate": 0.03}))
