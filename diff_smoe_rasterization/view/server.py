@@ -56,6 +56,12 @@ class Controls:
             control.visible = self.beside.value
         self.other_gate.disabled = self.other_mode.value != "smoe"
 
+    def follow(self, before: Blend, after: Blend) -> None:
+        """Takes the background gate that a training has learned meanwhile, where nobody has set another."""
+        for gate in (self.gate, self.other_gate):
+            if gate.value == before.background_gate:
+                gate.value = after.background_gate
+
     def look(self) -> Look:
         beside = Blend(self.other_mode.value, self.other_gate.value) if self.beside.value else None
         return Look(Blend(self.mode.value, self.gate.value), self.shown.value, beside, self.split.value)
@@ -136,13 +142,23 @@ class Viewer:
             self._wake.clear()
             if time.monotonic() - self._polled > POLL_SECONDS:
                 self._polled = time.monotonic()
-                if self.followed.poll():
-                    self._all_changed()
+                self._follow()
             look = self.controls.look()
             for client in list(self._clients.values()):
                 if client.wants_picture():
                     text = client.show(self.followed, look)
                     self.controls.text.content = text
+
+    def _follow(self) -> None:
+        before = Blend.of(self.followed.renderer)
+        try:
+            if self.followed.poll():
+                self.controls.follow(before, Blend.of(self.followed.renderer))
+                self._all_changed()
+        except TrainerError as error:  # as where the run is being replaced: what was there stays in sight
+            if self.followed.progress != str(error):
+                self.followed.progress = str(error)
+                self._all_changed()
 
 
 class _Client:

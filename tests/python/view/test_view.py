@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+import os
 
 import numpy as np
 import pytest
@@ -94,6 +95,10 @@ def test_a_training_is_followed_to_its_end(tiny_scene, tmp_path):  # noqa: F811
     assert followed.progress == "training, iteration 1 of 6" and not followed.poll()
     assert float(followed.renderer.background_gate) == pytest.approx(run.trainer.background_gate)
     first = followed.renderer.model.raw["means3D"].detach().clone()
+    os.rename(config.output + "/checkpoint.pt", config.output + "/away")
+    with pytest.raises(ValueError, match="no such file yet"):
+        followed.poll()
+    os.rename(config.output + "/away", config.output + "/checkpoint.pt")
     run.train()
     assert followed.poll() and followed.progress == "trained, 6 iterations"
     assert not torch.equal(followed.renderer.model.raw["means3D"], first) and not followed.poll()
@@ -121,6 +126,8 @@ def test_a_browser_shows_the_rendering_of_its_camera(model, browser, tmp_path): 
         viewer.controls.mode.value = "alpha"
         other = settled(browser, client, viewer)
         assert psnr(other, expected(viewer, client, camera_of)) > 35 and psnr(shot, other) < 30
+        viewer.controls.follow(Blend("smoe", 0.03), Blend("smoe", 0.5))
+        assert viewer.controls.gate.value == 0.5, "a training has learned another gate"
         browser.drag((200, 250), (260, 270))
         turned = settled(browser, client, viewer)
         assert psnr(turned, expected(viewer, client, camera_of)) > 35 and psnr(turned, other) < 30
