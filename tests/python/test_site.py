@@ -4,6 +4,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +31,26 @@ def test_every_link_of_a_page_leads_somewhere(stage):
                if not re.match(r"https?:|mailto:", target) and not (page.parent / target).exists()
                and target != "cpp_headers.md"]  # made by stage.py
     assert not missing
+
+
+def test_every_dsmoe_command_of_a_page_can_be_typed(stage):
+    from diff_smoe_rasterization.cli import build_parser
+
+    typed = []
+    for page in stage.markdown_files():
+        text = re.sub(r"\\\n\s*", "", page.read_text(encoding="utf-8"))  # lines that go on
+        for line in re.findall(r"^ {4}(dsmoe .*)$", text, re.MULTILINE):
+            words = shlex.split(re.sub(r"[()]", "", line), comments=True)
+            commands = " ".join(words).split(" && ")
+            typed += [(page.name, command) for command in commands if command.startswith("dsmoe ")]
+    assert len(typed) > 25
+    refused = []
+    for name, command in typed:
+        try:
+            build_parser().parse_args([word if word != "N" else "4" for word in command.split()[1:]])
+        except SystemExit:
+            refused.append(f"{name}: {command}")
+    assert not refused
 
 
 def test_the_page_of_headers_has_declarations_and_no_bodies(stage):
