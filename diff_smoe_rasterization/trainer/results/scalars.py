@@ -9,13 +9,18 @@ from typing import Any, List
 FOLDER = "tensorboard"
 
 
+def is_installed() -> bool:
+    """Whether there is a tensorboard; it is not loaded for that."""
+    return importlib.util.find_spec("tensorboard") is not None
+
+
 class Scalars:
     """What TensorBoard shows of a run; without tensorboard it does nothing, and `active` is False."""
 
     def __init__(self, output: str, iteration: int) -> None:
         """output: the run's folder. iteration: that the run goes on from; what was written later is not shown."""
         self._writer: Any = None
-        if importlib.util.find_spec("tensorboard") is None:
+        if not is_installed():
             return
         try:
             from torch.utils.tensorboard import SummaryWriter

@@ -1,16 +1,19 @@
 """What a training writes for TensorBoard, where that is installed."""
 from __future__ import annotations
 
-import importlib.util
-
 import pytest
 
 from diff_smoe_rasterization.trainer.results import scalars
 from diff_smoe_rasterization.trainer.training.loop import train
 
 
-def test_without_tensorboard_nothing_is_written(tiny_config, tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+@pytest.fixture
+def no_tensorboard():
+    """Here it is used where it is installed."""
+
+
+def test_without_tensorboard_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(scalars, "is_installed", lambda: False)
     log = scalars.Scalars(str(tmp_path), 0)
     log.add(1, loss=1.0)
     log.close()
