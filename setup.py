@@ -209,6 +209,7 @@ def packages():
     for name, folder in folders.items():
         names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
     data = {PACKAGE: ["include/dsmoe/*.h", "csrc/io/*.h", "cmake/*.cmake", "py.typed"],
+            f"{PACKAGE}.export": ["page/*"],
             f"{PACKAGE}.patches": ["shims/*/*/*.py"],  # shims are no packages of ours
             f"{PACKAGE}.benchmarks.suite": ["Snakefile", "shipped/*.yaml", "shipped/scenes/*.yaml"],
             f"{PACKAGE}.benchmarks.suite.report": ["*.json", "page.*"]}

@@ -60,30 +60,53 @@ def build_parser() -> argparse.ArgumentParser:
     _add_device(evaluate)
     evaluate.set_defaults(run=_eval)
 
-    render = commands.add_parser("render", help="write images of a trained run or a .ply",
-                                 description="Writes one PNG for every camera of a scene.")
+    render = commands.add_parser("render", help="write images or a video of a trained run or a .ply",
+                                 description="Writes one PNG for every camera of a scene, or a video around it.")
     render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
-    render.add_argument("-o", "--output", metavar="DIR", required=True,
-                        help="folder for the images: new, empty, or of an earlier rendering")
-    render.add_argument("--scene", help="folder whose cameras are rendered (default: the run's; needed for a .ply)")
+    render.add_argument("-o", "--output", metavar="DIR|VIDEO", required=True,
+                        help="folder for the images: new, empty, or of an earlier rendering; with --orbit also a file "
+                             "that ends in .mp4 (needs imageio-ffmpeg) or .gif")
+    render.add_argument("--orbit", action="store_true", help="once around what the scene's cameras look at")
+    render.add_argument("--frames", type=int, default=120, metavar="N", help="of an orbit (default: 120)")
+    render.add_argument("--fps", type=float, default=30.0, metavar="X", help="of a video (default: 30)")
     render.add_argument("--split", choices=("test", "train", "all"), default="test",
                         help="which cameras (default: test)")
-    render.add_argument("--blend-mode", choices=BLEND_MODES,
-                        help="needed for a .ply that does not record it; must agree where it does")
-    render.add_argument("--background-gate", type=float, metavar="X",
-                        help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
+    _add_model_options(render, "whose cameras are rendered (default: the run's; needed for a .ply)")
     render.add_argument("--resolution", type=int, metavar="N",
                         help="as in train (default: the run's, for a .ply -1)")
     render.add_argument("--principal-point", choices=PRINCIPAL_POINTS,
                         help="as in train (default: the run's, for a .ply scene)")
-    render.add_argument("--white-background", action="store_true", default=None,
-                        help="white background (default: the run's, for a .ply black)")
     render.add_argument("--depth", action="store_true",
                         help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
     render.add_argument("--alpha", action="store_true",
                         help="also NAME.alpha.png: how much of a pixel Gaussians cover, 8 bits")
     _add_device(render)
     render.set_defaults(run=_render)
+
+    export = commands.add_parser("export", help="write a trained model for other programs, or as a page to look at",
+                                 description="Writes a trained model as one file. A page (.html) shows it in a "
+                                             "browser by the blend that it was trained with; other viewers show a .ply "
+                                             "or a .splat by alpha.")
+    export.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
+    export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
+    export.add_argument("--format", choices=("html", "ply", "splat"),
+                        help="default: by the ending of FILE, else html")
+    export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
+                        help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
+                             "holds degree 0)")
+    _add_model_options(export, "whose test views the page begins with (default: the run's)")
+    export.set_defaults(run=_export)
+
+    view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
+                               description="Serves a live viewer of a run's model, of the checkpoints of a training "
+                                           "that goes on, or of a .ply. It needs viser.")
+    view.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
+    _add_model_options(view, "at whose first test view it begins (default: the run's)")
+    view.add_argument("--host", default="127.0.0.1", help="address to serve at; 0.0.0.0: to the network too "
+                                                          "(default: 127.0.0.1, this machine only)")
+    view.add_argument("--port", type=int, default=8080, help="or the next free one (default: 8080)")
+    _add_device(view)
+    view.set_defaults(run=_view)
 
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
                                 description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, "
@@ -120,7 +143,7 @@ def build_parser() -> argparse.ArgumentParser:
                                                  "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
     completion.add_argument("shell", choices=("bash", "zsh"))
     completion.set_defaults(run=_completion)
-    for command in (train, evaluate, render, run, info, completion):
+    for command in (train, evaluate, render, export, view, run, info, completion):
         command.set_defaults(command_parser=command)
     return parser
 
@@ -158,6 +181,17 @@ def main(argv: Optional[List[str]] = None) -> int:
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to render (default: cpu)")
+
+
+def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
+    """What says how a trained model is opened; scene: what its folder is for."""
+    parser.add_argument("--scene", help="folder " + scene)
+    parser.add_argument("--blend-mode", choices=BLEND_MODES,
+                        help="needed for a .ply that does not record it; must agree where it does")
+    parser.add_argument("--background-gate", type=float, metavar="X",
+                        help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
+    parser.add_argument("--white-background", action="store_true", default=None,
+                        help="white background (default: the run's, for a .ply black)")
 
 
 def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
@@ -346,9 +380,11 @@ def _with_lpips(net: str, device: str) -> Measure:
 def _render(arguments: argparse.Namespace) -> None:
     from .trainer.inspection import render_images
 
-    overrides = {name: getattr(arguments, name) for name in ("scene", "resolution", "principal_point",
-                                                             "white_background")
-                 if getattr(arguments, name) is not None}
+    overrides = _overrides(arguments)
+    outputs = [name for name in ("depth", "alpha") if getattr(arguments, name)]
+    if arguments.orbit:
+        _render_orbit(arguments, overrides, outputs)
+        return
     if is_folder(arguments.source):
         config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
     else:
@@ -356,9 +392,43 @@ def _render(arguments: argparse.Namespace) -> None:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
-                          background_gate=arguments.background_gate,
-                          outputs=[name for name in ("depth", "alpha") if getattr(arguments, name)])
+                          background_gate=arguments.background_gate, outputs=outputs)
     print(f"{len(paths)} images in {arguments.output}")
+
+
+def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outputs: List[str]) -> None:
+    from .trainer.filming import film
+    from .trainer.opening import open_trained
+
+    trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
+                           **overrides)
+    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs))
+
+
+def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
+    """The options of a run that a command was given in their place."""
+    names = ("scene", "resolution", "principal_point", "white_background")
+    return {name: getattr(arguments, name) for name in names if getattr(arguments, name, None) is not None}
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from .export.command import export
+
+    path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
+                           arguments.blend_mode, arguments.background_gate, **_overrides(arguments))
+    print(f"{path}: {os.path.getsize(path):,} bytes")
+    if warning:
+        print(warning)
+
+
+def _view(arguments: argparse.Namespace) -> None:
+    from .view.following import Followed
+    from .view.server import Viewer
+
+    viewer = Viewer(Followed(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
+                             **_overrides(arguments)), arguments.host, arguments.port)
+    print(f"{viewer.address}: open it in a browser; Ctrl-C ends", flush=True)
+    viewer.wait()
 
 
 def _info(arguments: argparse.Namespace) -> None:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mo
 from .results.pictures import file_names
 from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import read_results, result_row, write_results
+from .scenes.cameras import Camera
 from .scenes.scene import load_cameras, load_scene
 from .system.files import write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
@@ -73,6 +74,20 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
                     background_gate=gate)
 
 
+def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
+             rasterize: Optional[Rasterize] = None) -> Tuple[Renderer, str]:
+    """A renderer for the model of the run that config is of, and its .ply.
+
+    Raises TrainerError where the run has not ended, and where what is asked disagrees with it.
+    """
+    ply = trained_model_path(config.output, config.iterations)
+    mode = agreed_blend_mode(config.output, config.blend_mode, asked_blend_mode)
+    if config.background_gate != LEARNED:
+        recorded = Recorded(mode, float(config.background_gate))
+        asked_gate = agreed_background_gate(config.output, mode, recorded, asked_gate)
+    return open_renderer(config, ply, mode, device, rasterize, asked_gate), ply
+
+
 def _gate_of(config: TrainConfig) -> Optional[float]:
     """The gate that a run names; None where it was learned, which its .ply alone says."""
     return None if config.background_gate == LEARNED else float(config.background_gate)
@@ -94,25 +109,31 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     check_device(device)
     own_record(folder, RENDER)  # refused before anything is read
     if ply is None:
-        ply = trained_model_path(config.output, config.iterations)
-        blend_mode = agreed_blend_mode(config.output, config.blend_mode, blend_mode)
-        if config.background_gate != LEARNED:
-            recorded = Recorded(blend_mode, float(config.background_gate))
-            background_gate = agreed_background_gate(config.output, blend_mode, recorded, background_gate)
-    renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
+        renderer, ply = open_run(config, blend_mode, background_gate, device, rasterize)
+    else:
+        renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
     cameras = load_cameras(config, split)
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views")
+    return write_images(renderer, cameras, folder, said_of_images(config, ply, renderer), outputs)
+
+
+def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, of: str,
+                 outputs: Sequence[str] = ()) -> List[str]:
+    """Writes a PNG per camera into `folder`; returns the paths.
+
+    of: what they show, for the folder's record: images of something else are removed. folder and outputs are as in
+    `render_images`. Raises TrainerError.
+    """
     beside = {"depth": ".depth.npy", "alpha": ".alpha.png"}
     stems = file_names([camera.name for camera in cameras])
     written = [stem + ending for stem in stems for ending in (".png", *map(beside.get, outputs))]
     if len({*written}) < len(written):
-        raise TrainerError(f"{config.scene}: names of cameras differ only by {' or '.join(beside.values())}; "
-                           "rename one")
+        raise TrainerError(f"{of}: names of cameras differ only by {' or '.join(beside.values())}; rename one")
+    own_record(folder, RENDER)  # refused before the folder is made
     make_folder(folder)
     with only_one(folder), torch.no_grad():
         earlier = own_record(folder, RENDER)
-        of = _said_of_images(config, ply, renderer)
         kept = earlier.files if of == earlier.of else []  # those of another split
         write_record(folder, RENDER, Record(of, sorted({*kept, *written})), earlier.files)
         remove_files(folder, written)  # a link in their place would be followed
@@ -127,7 +148,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     return [path + ".png" for path in paths]
 
 
-def _said_of_images(config: TrainConfig, ply: str, renderer: Renderer) -> str:
+def said_of_images(config: TrainConfig, ply: str, renderer: Renderer) -> str:
     """What images show, for their folder's record: other words, and they are not kept beside each other."""
     model = os.stat(ply)
     return (f"{os.path.abspath(ply)}, {model.st_size} bytes of {model.st_mtime_ns}, on "

@@ -9,6 +9,7 @@ import torch
 from devices import without_cuda_because
 
 from diff_smoe_rasterization.settings import BLEND_MODES
+from diff_smoe_rasterization.trainer.results import scalars
 
 
 def pytest_addoption(parser):
@@ -63,3 +64,9 @@ def mode(request):
 def no_blend_mode_in_the_environment(monkeypatch):
     for name in ("DSMOE_BLEND_MODE", "DSMOE_BACKGROUND_GATE"):
         monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture(autouse=True)
+def no_tensorboard(monkeypatch):
+    """Trainings leave the same files whether tensorboard is installed or not, and need no seconds to load it."""
+    monkeypatch.setattr(scalars, "is_installed", lambda: False)

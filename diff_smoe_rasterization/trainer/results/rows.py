@@ -108,11 +108,14 @@ def blend_name(blend_mode: str, background_gate: Union[float, str, None]) -> str
     return f"smoe {background_gate if isinstance(background_gate, str) else format(background_gate, '.3g')}"
 
 
-def viewer_warning(row: Dict[str, Any]) -> str:
-    """What whoever opens the row's .ply in a viewer has to know; empty where it is blended by alpha."""
+def viewer_warning(row: Dict[str, Any], form: str = "ply") -> str:
+    """What whoever opens the row's model in a viewer has to know; empty where it is blended by alpha.
+
+    form: the model file's ending.
+    """
     if row["blend_mode"] == "alpha" or row.get("background_gate") == 1:
         return ""
-    return (f"note: the {row['blend_mode']} .ply holds gates; viewers of 3DGS blend them by alpha and show another "
+    return (f"note: the {row['blend_mode']} .{form} holds gates; viewers of 3DGS blend them by alpha and show another "
             "image, mostly too dark: use `dsmoe render`")
 
 

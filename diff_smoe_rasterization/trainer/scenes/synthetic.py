@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ... import io
 from .cameras import Camera
+from .orbit import look_at
 
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (u [R], v [R]) -> colours [R, 3]
 
@@ -190,15 +191,6 @@ def trace(objects: Sequence, origins: np.ndarray, directions: np.ndarray) -> Tup
     return points, colors * (AMBIENT + (1 - AMBIENT) * lambert)[:, None]
 
 
-def look_at(name: str, eye: np.ndarray, target: np.ndarray, width: int, height: int, focal: float) -> Camera:
-    """A camera at `eye` that sees `target` in its centre, upright."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(name, rotation, -rotation @ eye, focal, focal, width / 2, height / 2, width, height)
-
-
 def view_cameras(count: int, width: int, height: int) -> List[Camera]:
     """Cameras on two rings around the objects, looking inward."""
     cameras = []
@@ -207,7 +199,9 @@ def view_cameras(count: int, width: int, height: int) -> List[Camera]:
         radius, level = (2.7, 1.2) if index % 2 else (3.2, 2.1)
         eye = np.array([radius * math.cos(angle), level, radius * math.sin(angle)])
         target = np.array([0.25 * math.cos(3 * angle), 0.55, 0.25 * math.sin(3 * angle)])
-        cameras.append(look_at(f"view_{index:03d}.png", eye, target, width, height, 0.9 * width))
+        rotation, focal = look_at(eye, target, np.array([0.0, 1.0, 0.0])), 0.9 * width
+        cameras.append(Camera(f"view_{index:03d}.png", rotation, -rotation @ eye, focal, focal, width / 2, height / 2,
+                              width, height))
     return cameras
 
 

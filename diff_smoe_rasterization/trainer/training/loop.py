@@ -1,6 +1,7 @@
 """The training loop: one step, a run of them with progress, and the whole of `dsmoe train`."""
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import os
@@ -19,6 +20,7 @@ from ..results.modelfile import FOLDER, model_path, save_model
 from ..results.pictures import loss_plot
 from ..results.rendering import Rasterize, Renderer, background_color
 from ..results.rows import RESULTS_NAME, result_row, write_results
+from ..results.scalars import Scalars, scalar_files
 from ..scenes.images import as_float
 from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
 from ..system.environment import extension_info
@@ -180,6 +182,7 @@ class Run:
         self.progress = progress
         self.history: List[Dict[str, Any]] = []
         self.losses: List[Tuple[int, float]] = []  # iteration and loss, as often as the loss is looked at
+        self.scalars: Optional[Scalars] = None  # of the run in progress
 
     def resume(self) -> bool:
         """Continues from the folder's checkpoint; False where there is none yet."""
@@ -201,8 +204,10 @@ class Run:
     def train(self) -> Dict[str, Any]:
         """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
         trainer, config = self.trainer, self.trainer.config
-        with progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
-                          disable=not self.progress, dynamic_ncols=True) as bar, DelayedInterrupt() as interrupt:
+        self.scalars = Scalars(config.output, trainer.iteration)
+        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
+                               disable=not self.progress, dynamic_ncols=True)
+        with contextlib.closing(self.scalars), new_bar as bar, DelayedInterrupt() as interrupt:
             trainer.watch.start()
             ends = trainer.iteration >= config.iterations
             while not ends:
@@ -239,11 +244,15 @@ class Run:
                                                       "losses": self.losses})
 
     def _show(self, bar: Any, loss: float) -> None:
+        if not (self.progress or self.scalars.active):
+            return
+        trainer = self.trainer
+        gate = {"gate": trainer.background_gate} if trainer.gate else {}
+        quality, count = trainer.training_psnr(), trainer.model.num_gaussians
+        self.scalars.add(trainer.iteration, loss=loss, psnr=quality, gaussians=count, **gate)
         if self.progress:
-            trainer = self.trainer
-            gate = {"gate": f"{trainer.background_gate:.4f}"} if trainer.gate else {}
-            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{trainer.training_psnr():.2f}", **gate,
-                            gaussians=trainer.model.num_gaussians, refresh=False)
+            shown = {name: f"{value:.4f}" for name, value in gate.items()}
+            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{quality:.2f}", **shown, gaussians=count, refresh=False)
 
     def _evaluate(self, bar: Any) -> None:
         trainer = self.trainer
@@ -252,6 +261,8 @@ class Run:
         self.history.append({"iteration": trainer.iteration, **evaluation.metrics,
                              "num_gaussians": trainer.model.num_gaussians, "train_seconds": trainer.watch.seconds})
         write_json_atomically(self._path(HISTORY_NAME), self.history)
+        self.scalars.add(trainer.iteration, **{f"test__{name}": value for name, value in evaluation.metrics.items()
+                                               if value is not None})
         if self.progress and evaluation.metrics["psnr"] is not None:
             bar.write(f"iteration {trainer.iteration}: test PSNR {evaluation.metrics['psnr']:.2f} dB, "
                       f"SSIM {evaluation.metrics['ssim']:.4f}, {trainer.model.num_gaussians} Gaussians")
@@ -339,6 +350,6 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         record = Record(os.path.abspath(config.scene), sorted({*(models if resume else ()), model}))
         write_record(config.output, TRAIN, record, models)
         if overwrite:
-            remove_files(config.output, [*PRODUCTS, model])
+            remove_files(config.output, [*PRODUCTS, model, *scalar_files(config.output)])
         config.save(config.output)
         return run.train()

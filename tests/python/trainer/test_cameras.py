@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import rasterize, settings_from_camera
 from diff_smoe_rasterization.trainer.scenes.cameras import Camera, scene_extent
-from diff_smoe_rasterization.trainer.scenes.synthetic import look_at
+from diff_smoe_rasterization.trainer.scenes.orbit import look_at
 
 
 @pytest.fixture
@@ -100,7 +100,9 @@ def test_resizing_scales_pixel_coordinates(camera):
 
 
 def test_look_at_puts_the_target_into_the_centre_upright():
-    camera = look_at("a.png", np.array([2.0, 1.0, -3.0]), np.array([0.1, 0.4, 0.2]), 64, 48, 50.0)
+    eye = np.array([2.0, 1.0, -3.0])
+    rotation = look_at(eye, np.array([0.1, 0.4, 0.2]), np.array([0.0, 1.0, 0.0]))
+    camera = Camera("a.png", rotation, -rotation @ eye, 50.0, 50.0, 32.0, 24.0, 64, 48)
     np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), rtol=0, atol=1e-12)
     assert np.linalg.det(camera.rotation) == pytest.approx(1.0)
     pixels = colmap_pixels(camera, np.array([[0.1, 0.4, 0.2], [0.1, 0.5, 0.2]]))

@@ -1,0 +1,1 @@
+"""Trained models in forms that others show: `dsmoe export`. It uses the trainer's functions and the package's files."""

@@ -1,0 +1,41 @@
+"""A way around a trained model, as a video or as images."""
+from __future__ import annotations
+
+from typing import Iterator, Sequence
+
+import torch
+from PIL import Image
+
+from .errors import TrainerError
+from .inspection import said_of_images, to_image, write_images
+from .opening import Trained
+from .results.video import check_video, is_video, write_video
+from .scenes.cameras import Camera
+from .system.progress import progress_bar
+
+
+def film(trained: Trained, path: str, frames: int = 120, fps: float = 30.0, outputs: Sequence[str] = ()) -> str:
+    """Goes once around the scene and writes what is seen; returns a line that says what was written.
+
+    path: a file that ends in .mp4 or .gif, else a folder for PNGs as `render_images` takes it. outputs: further images
+    in such a folder. Raises TrainerError.
+    """
+    if frames < 1:
+        raise TrainerError(f"--frames is {frames}; it must be at least 1")
+    if not 0 < fps <= 1000:
+        raise TrainerError(f"--fps is {fps:g}; it must be above 0 and at most 1000")
+    cameras = trained.orbit.cameras(frames, trained.cameras[0])
+    if not is_video(path):
+        of = f"{said_of_images(trained.config, trained.ply, trained.renderer)}, an orbit of {frames}"
+        return f"{len(write_images(trained.renderer, cameras, path, of, outputs))} images in {path}"
+    if outputs:
+        raise TrainerError(f"{path}: a video has room for colours only; with --{outputs[0]} -o names a folder")
+    check_video(path)
+    write_video(path, _images(trained, cameras), fps)
+    return f"{path}: {frames} frames, {frames / fps:.3g} s"
+
+
+def _images(trained: Trained, cameras: Sequence[Camera]) -> Iterator[Image.Image]:
+    with torch.no_grad():
+        for camera in progress_bar(cameras, desc="frames", unit="frame", leave=False):
+            yield to_image(trained.renderer(camera).color)

@@ -1,0 +1,58 @@
+"""A trained model, by its run's folder or its .ply alone: how it is rendered, and where it can be looked at from."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, List, Optional, Tuple
+
+from .config import TrainConfig
+from .inspection import open_renderer, open_run
+from .model import GaussianModel
+from .results.rendering import Renderer
+from .scenes.cameras import Camera
+from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points
+from .scenes.scene import load_cameras
+from .system.files import is_folder
+from .training.loop import check_device
+
+
+@dataclass(frozen=True)
+class Trained:
+    """An opened model."""
+
+    config: TrainConfig  # the run's; of a .ply only background, resolution and scene mean something
+    ply: str
+    renderer: Renderer
+    cameras: List[Camera]  # of the scene's test views, else of its training views; one on the orbit without a scene
+    orbit: Orbit
+
+
+def open_trained(source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
+                 device: str = "cpu", **options: Any) -> Trained:
+    """Opens the output folder of `dsmoe train`, or a .ply.
+
+    blend_mode, background_gate: needed for a .ply that does not record them; they must agree where something does.
+    options: of TrainConfig, in place of the run's; `scene` is the folder whose cameras are taken. None are where the
+    run's scene is not there. Raises TrainerError.
+    """
+    check_device(device)
+    if is_folder(source):
+        config = TrainConfig.load(source).changed(**options)
+        renderer, ply = open_run(config, blend_mode, background_gate, device)
+    else:
+        config, ply = TrainConfig(blend_mode="alpha", **options).validate(), source
+        renderer = open_renderer(config, ply, blend_mode, device, asked_gate=background_gate)
+    cameras, orbit = places(config, renderer.model, needed="scene" in options)
+    return Trained(config, ply, renderer, cameras, orbit)
+
+
+def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:
+    """Where a model is looked at from: the test views of config.scene, else its training views, and their orbit.
+
+    Where the scene is not there, it is an orbit about the Gaussians and one camera on it. needed: raise TrainerError
+    then.
+    """
+    if needed or is_folder(config.scene):
+        every = load_cameras(config, "all")
+        return load_cameras(config, "test") or every, orbit_of_cameras(every)
+    orbit = orbit_of_points(model.raw["means3D"].detach().cpu().double().numpy())
+    return orbit.cameras(1, default_camera()), orbit

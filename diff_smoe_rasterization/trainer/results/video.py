@@ -1,0 +1,61 @@
+"""Images one after the other as one file: .mp4 by imageio-ffmpeg, .gif by Pillow."""
+from __future__ import annotations
+
+import os
+from typing import Iterable
+
+import numpy as np
+from PIL import Image
+
+from ..errors import TrainerError
+
+FORMATS = (".mp4", ".gif")
+
+
+def is_video(path: str) -> bool:
+    """Whether the path's ending is one that `write_video` writes."""
+    return os.path.splitext(path)[1].lower() in FORMATS
+
+
+def check_video(path: str) -> None:
+    """Raises TrainerError where this environment cannot write such a file."""
+    if path.lower().endswith(".mp4"):
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            raise TrainerError(f"{path}: for .mp4 imageio-ffmpeg is needed (pip install imageio-ffmpeg); .gif and a "
+                               "folder of PNGs need nothing") from error
+
+
+def write_video(path: str, images: Iterable[Image.Image], fps: float) -> None:
+    """Writes RGB images of one size, with so many a second. The file is whole or absent. Raises OSError."""
+    folder, name = os.path.split(os.path.abspath(path))
+    os.makedirs(folder, exist_ok=True)
+    partial = os.path.join(folder, ".part-" + name)  # the ending says which format
+    try:
+        (_write_gif if partial.lower().endswith(".gif") else _write_mp4)(partial, iter(images), fps)
+        os.replace(partial, path)
+    finally:
+        if os.path.exists(partial):
+            os.remove(partial)
+
+
+def _write_gif(path: str, images: Iterable[Image.Image], fps: float) -> None:
+    first, *others = images
+    first.save(path, save_all=True, append_images=others, duration=max(20, round(1000 / fps)), loop=0)
+
+
+def _write_mp4(path: str, images: Iterable[Image.Image], fps: float) -> None:
+    """H.264 as every player reads it, which takes even sizes only: an odd last row or column is left out."""
+    import imageio_ffmpeg
+
+    writer = None
+    for image in images:
+        size = image.width // 2 * 2, image.height // 2 * 2
+        if writer is None:
+            writer = imageio_ffmpeg.write_frames(path, size, fps=fps, codec="libx264", pix_fmt_out="yuv420p",
+                                                 quality=8, macro_block_size=1, ffmpeg_log_level="error")
+            writer.send(None)
+        writer.send(np.ascontiguousarray(np.asarray(image)[:size[1], :size[0]]))
+    if writer is not None:
+        writer.close()

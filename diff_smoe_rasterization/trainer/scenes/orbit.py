@@ -1,0 +1,92 @@
+"""An orbit: the point that a scene's cameras look at, and a ring of cameras about it."""
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import List, Sequence
+
+import numpy as np
+
+from .cameras import Camera
+
+FIELD_OF_VIEW = 0.9  # radians, of a camera that no scene gives
+SIZE = (800, 600)  # pixels, likewise
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """A ring of camera positions about a point, all of which look at it."""
+
+    target: np.ndarray  # [3] world
+    up: np.ndarray  # [3] unit, world
+    start: np.ndarray  # [3] the first position, from the target
+
+    def eyes(self, count: int) -> np.ndarray:
+        """[count, 3] positions in the world: once around, evenly, counter-clockwise seen from above."""
+        along = self.up * (self.start @ self.up)
+        out = self.start - along
+        side = np.cross(self.up, out)
+        angles = 2 * math.pi * np.arange(count)[:, None] / count
+        return self.target + along + np.cos(angles) * out + np.sin(angles) * side
+
+    def cameras(self, count: int, like: Camera) -> List[Camera]:
+        """Cameras on the ring, with the size and the focal length of another and a centred principal point."""
+        centred = like.centred()
+        cameras = []
+        for index, eye in enumerate(self.eyes(count)):
+            rotation = look_at(eye, self.target, self.up)
+            cameras.append(dataclasses.replace(centred, name=f"orbit_{index:04d}", rotation=rotation,
+                                               translation=-rotation @ eye))
+        return cameras
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """[3, 3] world to view of a camera at `eye` that sees `target` in its centre, upright."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:  # it looks straight up or down
+        right = np.cross(forward, up[[1, 2, 0]])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
+    """The orbit of a capture: as far from the target and as high above it as the cameras are on average.
+
+    The target is the point nearest to all optical axes. Where they run parallel, it lies in front of the cameras by
+    twice their spread.
+    """
+    centers = np.stack([camera.center for camera in cameras])
+    forwards = np.stack([camera.rotation[2] for camera in cameras])
+    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
+    # Sum of (I - d d^T)(p - c) over the axes is 0.
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    left = across.sum(axis=0)
+    if np.linalg.cond(left) < 1e4:
+        target = np.linalg.solve(left, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+    else:
+        spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+        target = centers.mean(axis=0) + forwards.mean(axis=0) * 2 * (spread or 1.0)
+    offsets = centers - target
+    heights = offsets @ up
+    outward = offsets - heights[:, None] * up
+    first = outward[0] if np.linalg.norm(outward[0]) > 1e-9 else np.cross(up, up[[1, 2, 0]])
+    radius = float(np.linalg.norm(outward, axis=1).mean())
+    return Orbit(target, up, first / np.linalg.norm(first) * radius + heights.mean() * up)
+
+
+def orbit_of_points(positions: np.ndarray) -> Orbit:
+    """An orbit about the middle of points [N, 3], for a model without a scene; -y is up, as COLMAP mostly has it."""
+    target = np.median(positions, axis=0)
+    size = float(np.percentile(np.linalg.norm(positions - target, axis=1), 90)) or 1.0
+    distance = size / math.tan(FIELD_OF_VIEW / 2)
+    return Orbit(target, np.array([0.0, -1.0, 0.0]), distance * np.array([0.0, -0.3, -1.0]))
+
+
+def default_camera() -> Camera:
+    """A camera at the origin for where no scene gives one; only its size and its intrinsics are meant."""
+    width, height = SIZE
+    focal = height / (2 * math.tan(FIELD_OF_VIEW / 2))
+    return Camera("default", np.eye(3), np.zeros(3), focal, focal, width / 2, height / 2, width, height)

@@ -1,0 +1,119 @@
+"""Puts the repository's pages, and what they link to, where MkDocs reads them; makes the pages of the C++ headers.
+
+python stage.py FOLDER writes FOLDER/mkdocs.yml and FOLDER/pages. Every page lies there where it lies in the repository,
+so its links work as they are.
+"""
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Iterator, List
+
+ROOT = Path(__file__).resolve().parents[2]
+SITE = Path(__file__).resolve().parent
+LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
+INCLUDE = ROOT / "diff_smoe_rasterization" / "include" / "dsmoe"
+IO = ROOT / "diff_smoe_rasterization" / "csrc" / "io"
+
+# The headers in the order in which one reads them; others follow by name.
+FIRST = ("rasterize.h", "rasterize_cuda.h", "params.h", "allocator.h", "torch.h")
+IO_HEADERS = ("ply.h", "point_cloud.h", "colmap.h")
+
+
+def main(folder: Path) -> None:
+    """Writes everything anew."""
+    shutil.rmtree(folder, ignore_errors=True)
+    pages = folder / "pages"
+    for page in markdown_files():
+        copy(page, pages)
+        for target in LINK.findall(page.read_text(encoding="utf-8")):
+            path = (page.parent / target).resolve()
+            if path.is_file() and ROOT in path.parents and path.suffix != ".md":
+                copy(path, pages)
+    (pages / "docs" / "site" / "cpp_headers.md").write_text(header_pages(), encoding="utf-8")
+    settings = (SITE / "mkdocs.yml").read_text(encoding="utf-8")
+    (folder / "mkdocs.yml").write_text(settings.replace("REPOSITORY", str(ROOT)), encoding="utf-8")
+
+
+def markdown_files() -> Iterator[Path]:
+    """The pages that git knows, or would take; without git all that lie in the folders that have pages."""
+    try:
+        listed = subprocess.run(["git", "-C", str(ROOT), "ls-files", "-co", "--exclude-standard", "*.md"], check=True,
+                                stdout=subprocess.PIPE, universal_newlines=True).stdout.splitlines()
+    except (OSError, subprocess.CalledProcessError):
+        found = [*ROOT.glob("*.md")]
+        for name in ("docs", "examples", "integrations", "patches", "benchmarks"):
+            found += (ROOT / name).rglob("*.md")
+        listed = [str(path.relative_to(ROOT)) for path in found]
+    return (ROOT / name for name in sorted(listed) if (ROOT / name).is_file() and not name.startswith("tests/"))
+
+
+def copy(path: Path, pages: Path) -> None:
+    target = pages / path.relative_to(ROOT)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, target)
+
+
+def header_pages() -> str:
+    """One page with every public header: its comments and its declarations, bodies of functions left out."""
+    names = [name for name in FIRST if (INCLUDE / name).is_file()]
+    names += sorted(path.name for path in INCLUDE.glob("*.h") if path.name not in FIRST)
+    headers = [(f"dsmoe/{name}", INCLUDE / name) for name in names]
+    headers += [(f"io/{name}", IO / name) for name in IO_HEADERS]
+    lines = ["# C++", "", "The public headers, with their comments; bodies of functions are left out. [C++ without",
+             "torch](../cpp.md) says how to build against them. `DSMOE_HD` marks what compiles for host and device."]
+    for name, path in headers:
+        text = path.read_text(encoding="utf-8")
+        lines += ["", f"## {name}", "", *introduction(text), "", "```cpp", *declarations(text), "```"]
+    return "\n".join(lines) + "\n"
+
+
+def introduction(text: str) -> List[str]:
+    """The comment at a header's top, as a paragraph; its indented lines stay code."""
+    lines: List[str] = []
+    for line in text.splitlines():
+        if not line.startswith("//"):
+            break
+        content = line[2:]
+        lines.append(content[1:] if content.startswith("     ") else content.strip())
+    return lines
+
+
+def declarations(text: str) -> List[str]:
+    """What stands between a header's includes and its end, with the body of each function made a semicolon."""
+    begin = re.search(r"^namespace dsmoe", text, re.MULTILINE)
+    lines = text[begin.start():].splitlines() if begin else []
+    out: List[str] = []
+    inside_body = False  # of a function; Google style closes it by a brace at the depth where it began
+    indent = 0
+    for line in lines:
+        depth = len(line) - len(line.lstrip())
+        if inside_body:
+            if line.strip().startswith("}") and depth == indent:
+                inside_body = False
+            continue
+        opens = re.match(r"^(?!.*\b(struct|class|enum|union|namespace)\b[^()]*\{$)(.*\)[^{}]*)\{(.*)$", line)
+        if not opens or line.strip().startswith("//"):
+            out.append(line)
+            continue
+        out.append(opens.group(2).split(" : ")[0].rstrip() + ";")
+        if line.count("{") > line.count("}"):
+            inside_body = True
+            indent = depth if not line.startswith("    ") or depth < 4 else _beginning(out)
+    return out
+
+
+def _beginning(out: List[str]) -> int:
+    """The indentation of the declaration that the last line continues."""
+    for line in reversed(out[:-1]):
+        depth = len(line) - len(line.lstrip())
+        if depth < 4 and line.strip():
+            return depth
+    return 0
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]).resolve())

@@ -1,0 +1,129 @@
+"""`dsmoe export`: files that other programs read, what they lose, and what is refused."""
+from __future__ import annotations
+
+import dataclasses
+import struct
+
+import numpy as np
+import pytest
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.export import html
+
+QUARTER = np.sqrt(0.5)  # cos and sin of an eighth turn
+
+
+def gaussians(blend_mode="smoe", background_gate=0.25, **arrays):
+    """Two Gaussians: the second is larger, and both turned by quarter turns."""
+    arrays = {"means3D": [[1, 2, 3], [4, 5, 6]], "dc": [[[0, 1, -1]], [[9, 0, -9]]],
+              "shs": np.arange(48 * 2 - 6).reshape(2, 15, 3) / 50 - 0.5, "opacity_logits": [[0], [np.log(3)]],
+              "log_scales": np.log([[0.1, 0.2, 0.3], [1, 2, 3]]),
+              "rotations": [[2, 0, 0, 2], [0, 1, 0, 0]], **arrays}
+    arrays = {name: np.asarray(array, np.float32) for name, array in arrays.items()}
+    return io.Gaussians(**arrays, blend_mode=blend_mode, background_gate=background_gate)
+
+
+@pytest.fixture
+def model(tmp_path):
+    path = str(tmp_path / "trained.ply")
+    io.write_gaussians(path, gaussians())
+    return path
+
+
+def test_a_ply_records_its_blend_and_says_that_viewers_show_it_wrongly(model, tmp_path, capsys):
+    copy = str(tmp_path / "copy.ply")
+    assert main(["export", model, "-o", copy, "--sh-degree", "1"]) == 0
+    assert "the smoe .ply holds gates; viewers of 3DGS blend them by alpha" in capsys.readouterr().out
+    before, after = io.read_gaussians(model), io.read_gaussians(copy)
+    assert (after.blend_mode, after.background_gate, after.sh_degree) == ("smoe", 0.25, 1)
+    assert np.array_equal(after.shs, before.shs[:, :3]) and np.array_equal(after.log_scales, before.log_scales)
+
+
+def test_a_model_of_alpha_goes_without_a_warning(tmp_path, capsys):
+    model, copy = str(tmp_path / "trained.ply"), str(tmp_path / "copy.ply")
+    io.write_gaussians(model, gaussians("alpha", None))
+    assert main(["export", model, "-o", copy]) == 0
+    assert "viewers" not in capsys.readouterr().out
+
+
+def test_a_splat_file_has_32_bytes_a_gaussian_the_largest_first(model, tmp_path, capsys):
+    path = tmp_path / "model.splat"
+    assert main(["export", model, "-o", str(path)]) == 0
+    assert "the smoe .splat holds gates" in capsys.readouterr().out
+    content = path.read_bytes()
+    assert len(content) == 64
+    first, second = struct.iter_unpack("<6f8B", content)
+    assert first[:3] == (4, 5, 6) and first[3:6] == pytest.approx((1, 2, 3))
+    assert first[6:10] == (255, 128, 0, 191)  # colours are cut to [0, 1]; opacity 3/4
+    assert first[10:] == (128, 255, 128, 128)  # half a turn about x
+    assert second[:3] == (1, 2, 3) and second[3:6] == pytest.approx((0.1, 0.2, 0.3))
+    # 0.5 + 0.2821 (0, 1, -1)
+    assert second[6:10] == (128, 199, 56, 128)
+    eighth = round(128 + 128 * QUARTER)
+    assert second[10:] == (eighth, 128, 128, eighth)
+
+
+def test_a_page_holds_every_gaussian_to_the_bits_it_promises():
+    random = np.random.RandomState(0)
+    model = gaussians(means3D=random.normal(0, 9, (50, 3)), dc=random.normal(0, 1, (50, 1, 3)),
+                      shs=random.normal(0, 0.3, (50, 15, 3)), opacity_logits=random.normal(0, 4, (50, 1)),
+                      log_scales=random.normal(-4, 2, (50, 3)), rotations=random.normal(0, 1, (50, 4)))
+    count, first, second = html.pack(model)
+    assert (count, len(first), len(second)) == (50, 50 * 32, 50 * 48)
+    records = np.frombuffer(first, html.RECORD)
+    assert np.array_equal(records["position"], model.means3D)
+    opacity = 1 / (1 + np.exp(-model.opacity_logits[:, 0]))
+    assert np.allclose(records["opacity"], opacity, rtol=2**-11, atol=2**-25)  # float16 has 11 bits
+    assert np.allclose(records["log_scales"], model.log_scales, rtol=2**-11)
+    vectors = records["rotation"] / 32767 / np.sqrt(2)
+    real = np.sqrt(1 - (vectors**2).sum(axis=1))
+    assert (real > 0.5 - 1e-4).all(), "of a unit quaternion's components the largest is 1/2 or more"
+    for mine, theirs in zip(np.column_stack([real, vectors]), model.rotations):
+        # The same axes but for their signs; 16 bits of each component make 1e-4 of a turn.
+        assert np.allclose(np.abs(axes(mine).T @ axes(theirs / np.linalg.norm(theirs))), np.eye(3), atol=2e-4)
+    bytes_of = np.frombuffer(second, np.uint8).reshape(50, 48)
+    scale = bytes_of[:, :2].copy().view("<f2").astype(float)
+    steps = bytes_of[:, 2:47].copy().view(np.int8).reshape(50, 15, 3)
+    assert np.abs(steps * scale[:, :, None] / 127 - model.shs).max() <= (scale.max() / 127) * 0.51
+
+
+def axes(q):
+    w, x, y, z = q
+    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                     [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                     [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+
+
+def test_a_page_leaves_out_what_the_rasterizer_culls():
+    positions = np.array([[1, 2, np.nan], [4, 5, 6]], np.float32)
+    count, first, _ = html.pack(dataclasses.replace(gaussians(), means3D=positions))
+    assert count == 1 and np.frombuffer(first, html.RECORD)["position"].tolist() == [[4, 5, 6]]
+
+
+def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
+    path = tmp_path / "page.html"
+    assert main(["export", model, "-o", str(path)]) == 0
+    text = path.read_text(encoding="utf-8")
+    assert "{{" not in text and "http" not in text and "src=" not in text
+    assert '"mode": "smoe", "gate": 0.25' in text
+
+
+@pytest.mark.parametrize("arguments, text", [
+    (["-o", "model.obj"], "model.obj: its ending is none of html, ply, splat"),
+    (["-o", "trained.ply"], "is the model itself"),
+    (["-o", "a.html", "--blend-mode", "alpha"], "trained with the blend mode smoe, not alpha"),
+    (["-o", "a.html", "--background-gate", "0.5"], "trained with the background gate 0.25, not 0.5"),
+])
+def test_what_cannot_be_written_is_refused(model, tmp_path, monkeypatch, capsys, arguments, text):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", model, *arguments]) == 1
+    assert text in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["trained.ply"]
+
+
+def test_a_page_refuses_the_ablations(tmp_path, capsys):
+    model = str(tmp_path / "trained.ply")
+    io.write_gaussians(model, gaussians("smoe_tn", None))
+    assert main(["export", model, "-o", str(tmp_path / "a.html")]) == 1
+    assert "a page shows alpha and smoe, but the model was trained with smoe_tn" in capsys.readouterr().err

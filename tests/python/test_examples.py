@@ -1,0 +1,94 @@
+"""The programs of examples/ run as they stand, and do what they say."""
+from __future__ import annotations
+
+import contextlib
+import io as io_of_text
+import json
+import os
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_scene import one_thread  # noqa: F401
+
+from diff_smoe_rasterization import io
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+def run(name, *arguments, folder):
+    """Runs a program in a folder, in this process: another would load torch again; returns what it prints."""
+    before, output = (os.getcwd(), sys.argv, list(sys.path)), io_of_text.StringIO()
+    os.chdir(str(folder))
+    sys.argv, sys.path[:0] = [name, *map(str, arguments)], [str(EXAMPLES)]
+    try:
+        with contextlib.redirect_stdout(output):
+            runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+    finally:
+        os.chdir(before[0])
+        sys.argv, sys.path[:] = before[1], before[2]
+    return output.getvalue()
+
+
+def is_a_picture(path):
+    return np.asarray(Image.open(path)).std() > 20
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A model that train.py has made, and what it printed."""
+    folder = tmp_path_factory.mktemp("examples")
+    text = run("train.py", "--iterations", "120", "-o", "model.ply", folder=folder)
+    return folder / "model.ply", text
+
+
+def test_training_lowers_the_loss_and_records_the_blend(model):
+    path, text = model
+    losses = [float(value) for value in re.findall(r"loss ([\d.]+)", text)]
+    assert losses[-1] < 0.8 * losses[0]
+    stored = io.read_gaussians(path)
+    assert (stored.blend_mode, stored.background_gate, stored.sh_degree) == ("smoe", 0.03, 0)
+
+
+def test_a_ply_is_rendered(model, tmp_path):
+    run("render_ply.py", model[0], folder=tmp_path)
+    assert is_a_picture(tmp_path / "image.png")
+
+
+def test_further_images_are_written(model, tmp_path):
+    text = run("further_images.py", model[0], folder=tmp_path)
+    for name in ("color", "depth", "inverse_depth"):
+        assert is_a_picture(tmp_path / "images" / f"{name}.png"), name
+    assert (tmp_path / "images" / "alpha.png").is_file()
+    nearest, farthest = map(float, re.findall(r"from ([\d.]+) to ([\d.]+)", text)[0])
+    assert 0.2 < nearest < farthest < 12, "within the room, which is 8 units wide"
+
+
+def test_scores_tell_which_gaussians_matter(model, tmp_path):
+    text = run("scores.py", model[0], folder=tmp_path)
+    best, any_ = map(float, re.findall(r"([\d.]+) dB", text))
+    assert best > any_ + 2
+    assert len(io.read_gaussians(tmp_path / "smaller.ply").means3D) == len(io.read_gaussians(model[0]).means3D) // 2
+
+
+def test_an_own_blend_learns_a_sharper_edge(tmp_path):
+    text = run("own_blend.py", "--steps", "25", folder=tmp_path)
+    quality, power = zip(*((float(db), float(p)) for db, p in re.findall(r"([\d.]+) dB with the power ([\d.]+)", text)))
+    assert quality[-1] > quality[0] + 5 and power[-1] > 2 and is_a_picture(tmp_path / "edge.png")
+
+
+def test_the_notebook_runs_from_top_to_bottom():
+    notebook = json.loads((EXAMPLES / "blends.ipynb").read_text(encoding="utf-8"))
+    variables = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            assert not cell["outputs"], "it is stored without outputs"
+            exec("".join(cell["source"]), variables)
+    assert variables["learned"] == pytest.approx(0.03, rel=0.1)
+    alpha, smoe = variables["alpha"].color, variables["smoe"].color
+    # Half a standard deviation right of the middle, alpha still mixes the background in.
+    assert (smoe - alpha)[:, 40, 66].abs().max() > 0.1
