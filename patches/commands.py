@@ -74,7 +74,7 @@ def _options(arguments: Namespace) -> Dict[str, Any]:
 
 def _remarks(planned: engine.Plan, arguments: Namespace) -> List[str]:
     """The notes on a checkout, and what to type where rules that an option asks for are still not applied."""
-    options = dict.fromkeys(rule.option for rule in planned.requested if rule.pending and not planned.written)
+    options = dict.fromkeys(rule.option for rule in planned.requested if rule.pending)
     if not options:
         return list(planned.notes)
     try:

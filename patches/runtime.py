@@ -17,6 +17,10 @@ from diff_smoe_rasterization.settings import (
     training_background_gate,
 )
 
+SHIMS = Path(__file__).resolve().parent / "shims"
+RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
+USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
+
 
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode: $DSMOE_BLEND_MODE, else "alpha"; and of --background_gate: "".
@@ -26,6 +30,18 @@ def default_blend() -> Tuple[str, str]:
     Raises ValueError where DSMOE_BLEND_MODE names no mode.
     """
     return resolve_blend_mode(None), ""
+
+
+def saved_blend_of(dataset: Any) -> Dict[str, Any]:
+    """Returns what `blend_of` does, for a function that renders a trained model.
+
+    What is not typed as an option is what the model's cfg_args records, whatever default `dataset` brought.
+    """
+    saved = _saved(dataset)
+    for option in ("blend_mode", "background_gate"):
+        if getattr(dataset, "model_path", "") and not _is_typed(option):
+            setattr(dataset, option, saved.get(option))
+    return blend_of(dataset)
 
 
 def blend_of(dataset: Any) -> Dict[str, Any]:
@@ -40,8 +56,7 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
     _check_renderer()
     given = getattr(dataset, "blend_mode", None)
     mode = given or "alpha"
-    cfg_args = Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
-    saved = _saved(cfg_args) if getattr(dataset, "model_path", "") else {}
+    cfg_args, saved = Path(getattr(dataset, "model_path", "") or ".", "cfg_args"), _saved(dataset)
     whence = _whence("blend_mode", mode, functools.partial(resolve_blend_mode, None), saved.get("blend_mode"), cfg_args)
     if mode not in BLEND_MODES:
         raise ValueError(f"the blend mode is {mode!r}, {whence}; it must be one of {', '.join(BLEND_MODES)}")
@@ -85,9 +100,10 @@ def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any,
     """
     name, flag, variable = option.replace("_", " "), "--" + option, "DSMOE_" + option.upper()
     there = {variable: of_variable() if os.environ.get(variable) else None, str(cfg_args): saved}
-    is_flag = any(word.startswith(flag[:4]) and flag.startswith(word.partition("=")[0]) for word in sys.argv)
     agreeing = [source for source, other in there.items() if other == value]
-    whence = f"as {flag} says" if is_flag else f"as in {' and '.join(agreeing)}" if agreeing else "the default"
+    whence = f"as in {' and '.join(agreeing)}" if agreeing else "the default"
+    if _is_typed(option):
+        whence = f"as {flag} says"
     # Rendering without the flag never comes here: it has the value of cfg_args.
     if saved not in (None, value):
         _warn(f"{cfg_args} is of a run with {name} {saved}, but this one has {value}, {whence}; a training overwrites "
@@ -97,16 +113,51 @@ def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any,
     return whence
 
 
-def say_rasterizer(flavour: str) -> None:
-    """Says on stderr that `dsmoe run` has its effect: this process has imported this package's rasterizer."""
+def rasterizer_of_run() -> Dict[str, Any]:
+    """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
+
+    The first rasterizer that is made is noted for `dsmoe run`, which else says at the end that there was none.
+    """
+    from diff_smoe_rasterization import GaussianRasterizer
+
+    flavour, used = os.environ[RASTERIZER_VARIABLE], os.environ.get(USED_VARIABLE, "")
+    module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
+    original = GaussianRasterizer.__init__
+
+    def noted(self: Any, *arguments: Any, **keywords: Any) -> None:
+        GaussianRasterizer.__init__ = original
+        if os.path.isdir(os.path.dirname(used)):
+            Path(used).touch()
+        original(self, *arguments, **keywords)
+
+    GaussianRasterizer.__init__ = noted
     mode = resolve_blend_mode(None)
     gate = f", background gate {resolve_background_gate(mode, None)}" if mode == "smoe" else ""
     _say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
+    return {name: getattr(module, name) for name in module.__all__}
 
 
-def say_stand_in(name: str) -> None:
-    """Says on stderr that this process has imported what this package has in place of a package that is missing."""
-    _say(f"{name} could not be imported: this package's own takes its place")
+def is_installed(module: str) -> bool:
+    """Whether a package can be imported from elsewhere; then it takes the place of the stand-in in shims/ that asks.
+
+    module: of the package, one that may fail to load. Where it cannot be had, that is said on stderr.
+    """
+    import torch  # noqa: F401  (its libraries are the extensions')
+
+    name, path = module.partition(".")[0], sys.path[:]
+    ours = sys.modules.pop(name)
+    sys.path[:] = [folder for folder in path if Path(folder).resolve() != SHIMS]
+    try:
+        importlib.import_module(module)
+        return True
+    except Exception:  # an extension that was built for another torch fails in many ways
+        for loaded in [loaded for loaded in sys.modules if (loaded + ".").startswith(name + ".")]:
+            del sys.modules[loaded]
+        sys.modules[name] = ours
+        _say(f"{name} could not be imported: this package's own takes its place")
+        return False
+    finally:
+        sys.path[:] = path
 
 
 def optional_import(name: str) -> Any:
@@ -172,8 +223,10 @@ def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(ssim)
     def call(*arguments: Any, **keywords: Any) -> Any:
-        if not can_be_fused(*arguments, **keywords) or not is_the_same(arguments[0].device, arguments[0].shape):
+        if keywords or arguments[2:] not in ((), (11,), (11, True)) or not can_be_fused(*arguments[:2]):
             return ssim(*arguments, **keywords)
+        if not is_the_same(arguments[0].device, arguments[0].shape):
+            return ssim(*arguments)
         from diff_smoe_rasterization import fused_ssim
 
         return fused_ssim(*arguments[:2])
@@ -181,29 +234,13 @@ def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def can_be_fused(*arguments: Any, **keywords: Any) -> bool:
-    """Whether `fused_ssim` has what is asked for by these arguments of a trainer's ssim."""
+def can_be_fused(img1: Any, img2: Any) -> bool:
+    """Whether `fused_ssim` has what is asked for of these images."""
     import torch
 
-    as_fused = {"window_size": 11, "size_average": True}
-    if not 2 <= len(arguments) <= 4 or not set(keywords) <= set(as_fused):
-        return False
-    img1, img2, *rest = arguments
-    asked = {**as_fused, **dict(zip(as_fused, rest)), **keywords}
-    return (all(type(asked[name]) is type(value) and asked[name] == value for name, value in as_fused.items())
-            and isinstance(img1, torch.Tensor) and isinstance(img2, torch.Tensor) and img1.dim() in (3, 4)
-            and img1.shape == img2.shape and img1.dtype == img2.dtype == torch.float32 and img1.device == img2.device
-            and not is_autocast(img1.device.type) and not (img2.requires_grad and torch.is_grad_enabled()))
-
-
-def is_autocast(device_type: str) -> bool:
-    """Whether autocast is on for a type of device."""
-    import torch
-
-    try:
-        return torch.is_autocast_enabled(device_type)
-    except TypeError:  # torch before 2.4
-        return torch.is_autocast_cpu_enabled() if device_type == "cpu" else torch.is_autocast_enabled()
+    return (img1.dim() in (3, 4) and img1.shape == img2.shape and img1.dtype == img2.dtype == torch.float32
+            and img1.device == img2.device and not torch.is_autocast_enabled() and not torch.is_autocast_cpu_enabled()
+            and not (img2.requires_grad and torch.is_grad_enabled()))
 
 
 def difference_of_ssim(ssim: Callable[..., Any], device: Any, shape: Any) -> str:
@@ -297,10 +334,17 @@ def _check_renderer() -> None:
                            f"the patch? type: dsmoe patch check {checkout}")
 
 
-def _saved(cfg_args: Path) -> Dict[str, Any]:
-    """Returns the constants in the text of a Namespace, none where it is no such text. Evaluates nothing."""
+def _is_typed(option: str) -> bool:
+    """Whether an option is on the command line, as argparse takes it: also `--blend smoe`."""
+    flag = "--" + option
+    return any(word.startswith(flag[:4]) and flag.startswith(word.partition("=")[0]) for word in sys.argv)
+
+
+def _saved(dataset: Any) -> Dict[str, Any]:
+    """Returns the constants in a model's cfg_args, a Namespace as text; none where there is none."""
+    folder = getattr(dataset, "model_path", "")
     try:
-        call = ast.parse(cfg_args.read_text(), mode="eval").body
+        call = ast.parse(Path(folder, "cfg_args").read_text(), mode="eval").body if folder else None
     except (OSError, ValueError, SyntaxError):
         return {}
     return {keyword.arg: keyword.value.value for keyword in getattr(call, "keywords", ())
