@@ -40,13 +40,24 @@ def other_files(root: Path) -> Dict[str, bytes]:
     return found
 
 
+def files_beside(root: Path) -> Dict[str, bytes]:
+    """Returns the Python files of a project in which a checkout is bundled, as SuGaR's are, that rasterize too."""
+    found = {}
+    for pattern in () if (root / ".git").exists() else ("*.py", "*/*.py"):
+        for path in root.resolve().parent.glob(pattern):
+            is_other = any((folder / GR).exists() for folder in path.parents)
+            if not is_other and path.is_file() and RASTERIZER.encode() in path.read_bytes():
+                found["../" + path.relative_to(root.resolve().parent).as_posix()] = path.read_bytes()
+    return found
+
+
 def notes(root: Path, files: Dict[str, bytes], trainer: Trainer) -> List[str]:
     """Says which scripts keep the original rasterizer, make settings without a blend mode, or render without one.
 
     files: those that rules look at.
     """
     files = {name: data for name, data in files.items() if not name.startswith("submodules/")}
-    scripts = {**files, **other_files(root)}
+    scripts = {**files, **other_files(root), **files_beside(root)}
     imported = set().union(*(_imports(data) for data in scripts.values()))
     lines = []
     for name, data in sorted(scripts.items()):

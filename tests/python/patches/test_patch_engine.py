@@ -330,6 +330,7 @@ def test_a_link_out_of_the_checkout_is_refused(tmp_path):
 
 
 SCRIPTS = {  # of the user's own: text, what is said of it
+    "../refine/model.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
     "tools/own.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
     "tools/deep/own.py": ("from diff_gaussian_rasterization._C import mark_visible\n", "imports the original"),
     "whole.py": ("import diff_gaussian_rasterization as dgr\n", "imports the original"),
@@ -350,10 +351,10 @@ SCRIPTS = {  # of the user's own: text, what is said of it
 
 
 def test_scripts_that_keep_the_original_or_have_no_mode_are_named(tmp_path):
-    make(tmp_path, {**{name: text for name, (text, _) in SCRIPTS.items()},
-                    "train.py": "from lib import film\n" + TRAIN})
+    tmp_path = make(tmp_path / "bundled", {**{name: text for name, (text, _) in SCRIPTS.items()},
+                                           "train.py": "from lib import film\n" + TRAIN})
     for _ in range(2):  # before the patch, and when it is there
-        notes = {note.partition(":")[0]: note for note in patches.plan(tmp_path).notes}
+        notes = {note.partition(": ")[0]: note for note in patches.plan(tmp_path).notes}
         assert set(notes) == {name for name, (_, word) in SCRIPTS.items() if word}
         assert all(SCRIPTS[name][1] in note for name, note in notes.items())
         patches.apply(tmp_path)

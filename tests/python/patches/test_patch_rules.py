@@ -40,6 +40,9 @@ BEFORE_AND_AFTER = [
      f"import torch\nfrom {RUNTIME} import nan_without_network\n\n"
      "@nan_without_network\ndef lpips(x, y):\n    return x\n"),
     ("blender-images", "np.array(a * 255.0, dtype=np.byte)\n", "np.array(a * 255.0, dtype=np.uint8)\n"),
+    ("numpy-types", "levels = a.astype(np.int)  # of the octree\n", "levels = a.astype(int)  # of the octree\n"),
+    ("numpy-types", "a = numpy.zeros(3, numpy.float)\n", "a = numpy.zeros(3, float)\n"),
+    ("numpy-types", "np.int32, np.float64, np.bool_, np.integer, mine.np.int, torch.int\n", None),
     ("eigh-in-parts", "import torch\nS, R = torch.linalg.eigh(cov, UPLO='U')\n",
      f"import torch\nfrom {RUNTIME} import eigh_in_parts\n\nS, R = eigh_in_parts(cov, UPLO='U')\n"),
     ("eigh-in-parts", "torch.linalg.eigh(cov, out=both)\n", None),
