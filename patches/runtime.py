@@ -201,35 +201,33 @@ def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-# Of the largest value. A variance E[x^2] - E[x]^2 of the first pair below is 4e-3 of E[x^2]: what float32 rounds off,
-# some 1e-7, becomes some 1e-5 to 1e-4 of it; another window, border or constant makes several per cent.
+# Of the largest value. Of a variance E[x^2] - E[x]^2 float32 rounds off some 1e-7 of E[x^2], which may be 1e-4 of the
+# variance; another window, border or constant makes several per cent.
 SSIM_ROUNDING = 1e-3
 
 
 def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a trainer's ssim(img1, img2, window_size=11, size_average=True), by `fused_ssim` where that can be.
+    """Returns a trainer's ssim(img1, img2, ...), by `fused_ssim` where that can be.
 
-    img1, img2: [3, H, W] or [B, 3, H, W]. When images of a shape come first, both are computed of pairs of that shape:
-    where they differ in value or gradient the trainer's own stays, and a line on stderr says so. It is also called for
-    other windows and types, means of each image, under autocast, and for gradients by img2: the kernel has none of it.
+    img1, img2: [3, H, W] or [B, 3, H, W]. Of the first images of a shape both are computed: where they differ in value
+    or gradient the trainer's own stays, and a line on stderr says so. It is also called for other arguments and types, and
+    for gradients by img2: the kernel has none of it.
     """
-    @functools.lru_cache(maxsize=None)
-    def is_the_same(device: Any, shape: Any) -> bool:
-        found = difference_of_ssim(ssim, device, shape)
-        if found:
-            _say(f"--fuse: {ssim.__module__}.{ssim.__name__} is not SSIM as it is fused here ({found}): it is computed "
-                 "as before")
-        return not found
+    differences: Dict[Any, str] = {}
 
     @functools.wraps(ssim)
-    def call(*arguments: Any, **keywords: Any) -> Any:
-        if keywords or arguments[2:] not in ((), (11,), (11, True)) or not can_be_fused(*arguments[:2]):
-            return ssim(*arguments, **keywords)
-        if not is_the_same(arguments[0].device, arguments[0].shape):
-            return ssim(*arguments)
+    def call(*images: Any, **keywords: Any) -> Any:
         from diff_smoe_rasterization import fused_ssim
 
-        return fused_ssim(*arguments[:2])
+        if keywords or len(images) != 2 or not can_be_fused(*images):
+            return ssim(*images, **keywords)
+        case = images[0].device, images[0].shape
+        if case not in differences:
+            differences[case] = difference_of(fused_ssim, ssim, *images)
+            if differences[case]:
+                _say(f"--fuse: {ssim.__module__}.{ssim.__name__} is not SSIM as it is fused here "
+                     f"({differences[case]}): it is computed as before")
+        return ssim(*images) if differences[case] else fused_ssim(*images)
 
     return call
 
@@ -239,38 +237,28 @@ def can_be_fused(img1: Any, img2: Any) -> bool:
     import torch
 
     return (img1.dim() in (3, 4) and img1.shape == img2.shape and img1.dtype == img2.dtype == torch.float32
-            and img1.device == img2.device and not torch.is_autocast_enabled() and not torch.is_autocast_cpu_enabled()
-            and not (img2.requires_grad and torch.is_grad_enabled()))
+            and img1.device == img2.device and not (img2.requires_grad and torch.is_grad_enabled()))
 
 
-def difference_of_ssim(ssim: Callable[..., Any], device: Any, shape: Any) -> str:
-    """What a trainer's ssim and `fused_ssim` differ in on two pairs of images of a shape; empty where in nothing.
-
-    One pair has little contrast, so that SSIM's constants count. The other leaves [0, 1], and its SSIM is negative.
-    """
+def difference_of(fused: Callable[..., Any], own: Callable[..., Any], img1: Any, img2: Any) -> str:
+    """What two similarities of images differ in, their gradients by img1 too; empty where in nothing."""
     import torch
 
-    from diff_smoe_rasterization import fused_ssim
+    def value_and_gradient(similarity: Callable[..., Any]) -> Any:
+        image = img1.detach().clone().requires_grad_()
+        value = similarity(image, img2.detach().clone())
+        return (value.detach(), *torch.autograd.grad(value, image))
 
-    def value_and_gradient(similarity: Callable[..., Any], one: Any, other: Any) -> Any:
-        img1 = one.clone().requires_grad_()
-        value = similarity(img1, other)
-        return (value.detach(), *torch.autograd.grad(value, img1))
-
-    generator = torch.Generator().manual_seed(0)
     with torch.inference_mode(False), torch.enable_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
-        noise = [torch.rand(tuple(shape), generator=generator).to(device) for _ in range(2)]
-        for pair in ((0.4 + 0.1 * noise[0], 0.5 + 0.1 * noise[1]),
-                     (1.4 * (1 - noise[0]) - 0.2 + 0.05 * noise[1], noise[0])):
-            try:
-                for ours, theirs in zip(value_and_gradient(fused_ssim, *pair), value_and_gradient(ssim, *pair)):
-                    if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
-                        return f"it gives {theirs.dtype} {list(theirs.shape)}, not {ours.dtype} {list(ours.shape)}"
-                    differs, largest = float((ours - theirs).abs().max()), float(ours.abs().max())
-                    if not differs <= SSIM_ROUNDING * largest:  # NaN is no such number
-                        return f"they differ by {differs:.1e} where the largest value is {largest:.1e}"
-            except Exception as error:  # whatever another function has against the pair: the training goes on
-                return f"it raises {error!r}"
+        try:
+            for ours, theirs in zip(value_and_gradient(fused), value_and_gradient(own)):
+                if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
+                    return f"it gives {theirs.dtype} {list(theirs.shape)}, not {ours.dtype} {list(ours.shape)}"
+                differs, largest = float((ours - theirs).abs().max()), float(ours.abs().max())
+                if not differs <= SSIM_ROUNDING * largest:  # NaN is no such number
+                    return f"they differ by {differs:.1e} where the largest value is {largest:.1e}"
+        except Exception as error:  # whatever another function has against the images: the training goes on
+            return f"it raises {error!r}"
     return ""
 
 

@@ -364,7 +364,7 @@ def test_scripts_that_keep_the_original_or_have_no_mode_are_named(tmp_path):
 LOAD = "checkpoint = torch.load(path)\n"
 
 
-def test_check_says_what_is_applied_and_what_to_type(tmp_path, dsmoe):
+def test_check_says_what_is_applied(tmp_path, dsmoe):
     checkout = make(tmp_path / "a checkout", {"utils/loading.py": LOAD})
     said = dsmoe("patch", "apply", checkout, "--dry-run")
     assert said.status == 0 and said.out == patches.diff(checkout)
@@ -373,11 +373,10 @@ def test_check_says_what_is_applied_and_what_to_type(tmp_path, dsmoe):
     assert "already patched" in dsmoe("patch", "apply", checkout).out
     said = dsmoe("patch", "check", checkout, "--modernise")
     assert "modernise checkpoint-load: not applied in train.py, utils/loading.py: torch 2.6" in said.out
-    assert said.out.splitlines()[-1].endswith(f"type: dsmoe patch apply --modernise '{checkout}'")
     assert dsmoe("patch", "apply", "--modernise", checkout).status == 0
     said = dsmoe("patch", "check", checkout)
     assert "modernise checkpoint-load: applied in train.py, utils/loading.py: torch 2.6" in said.out
-    assert "not applied" not in said.out and "type: " not in said.out
+    assert "not applied" not in said.out
     shutil.rmtree(checkout / RECORD)
     said = dsmoe("patch", "diff", checkout)
     assert said.status == 0 and "not known without .dsmoe_patch" in said.err
