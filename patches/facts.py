@@ -75,7 +75,7 @@ def _of_call(call: ast.Call, made: Set[str]) -> Iterator[str]:
     if called_name(call) == "GaussianRasterizationSettings":
         yield from (f"sets {name}" for name in keywords if name)
         yield "blends as it says" if {None, "blend_mode"} & set(keywords) else "blends by default"
-    elif _renders(call, made):
+    elif _renders(call, made) and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
         yield from (f"takes {name}" for name in keywords if name)
     else:
         yield f"calls {called_name(call)}"
@@ -107,7 +107,7 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     if foreign:
         return None, f"it imports {', '.join(foreign)}, another rasterizer, which would render in this one's place"
     if not facts & {f"imports {name}" for name in NAMES}:
-        return None, f"{GR} imports GaussianRasterizationSettings neither from {RASTERIZER} nor from {INTEGRATIONS}"
+        return None, f"nothing imports GaussianRasterizationSettings from {RASTERIZER} or {INTEGRATIONS}"
     known = {contract.name: _known(contract) for contract in CONTRACTS}
     said = {"sets": "its GaussianRasterizationSettings have {}", "takes": "its rasterizer is called with {}",
             "needs": "it imports {}"}

@@ -73,7 +73,7 @@ def test_drift_is_refused_by_file_and_rule(tmp_path, name, old, new, rule, dsmoe
 def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
     refused(make(tmp_path / "missing", {"render.py": None}), "render.py: rule pipe-blend-mode: there is no such file")
     refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py: is not Python", "11:1")
-    refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", f"{GR} imports")
+    refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", "nothing imports Gaussian")
     refused(make(tmp_path / "checkout"), "no trainer 'x'", *patches.TRAINERS, trainer="x")
     refused(tmp_path / "checkout", "hac", trainer="hac")
     refused(tmp_path / "checkout/arguments", f"there is no {GR} in", f"such as {tmp_path / 'checkout'}")
