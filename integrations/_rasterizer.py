@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from collections import namedtuple
 from inspect import Parameter, Signature
-from typing import Any, Dict, Tuple
+from typing import Any, Dict, Sequence, Tuple
 
 import torch
 
@@ -83,8 +83,9 @@ def classes_of(contract: str, module: str) -> Tuple[type, type, Any]:
     further = [name for name in entry.arguments if name not in ("means3D", "means2D", "opacities")]
     place = further.index("colors_precomp") + 1
     positional = ["means3D", "means2D", *further[:place], "opacities", *further[place:]]
-    of_function = _signature([*(renamed.get(name, name) for name in positional), "raster_settings"], required=99)
-    of_module = _signature(["self", *entry.arguments], required=4)
+    of_function = _signature(*(renamed.get(name, name) for name in positional), "raster_settings")
+    required = ("self", "means3D", "means2D", "opacities")
+    of_module = _signature(*required, absent=[name for name in entry.arguments if name not in required])
     returns = ", ".join(f"{name} {RESULTS[name][0]}" for name in entry.results)
 
     def render(settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, ...]:
@@ -115,8 +116,7 @@ def classes_of(contract: str, module: str) -> Tuple[type, type, Any]:
     return settings_class, GaussianRasterizer, rasterize_gaussians
 
 
-def _signature(names: list, required: int) -> Signature:
-    """A signature of these names; those behind the required ones default to None."""
-    return Signature([Parameter(name, Parameter.POSITIONAL_OR_KEYWORD,
-                                default=Parameter.empty if place < required else None)
-                      for place, name in enumerate(names)])
+def _signature(*required: str, absent: Sequence[str] = ()) -> Signature:
+    """A signature of these names; the second ones default to None."""
+    return Signature([*(Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in required),
+                      *(Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, default=None) for name in absent)])

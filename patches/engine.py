@@ -77,10 +77,11 @@ def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = No
              for name in scripts.python_files(root, with_submodules="modernise" in options)}
     now = dict(files)
     files.update(recorded.before if recorded else {})
-    known, reason = facts.recognise(facts.of_files({name: files[name] for name in facts.LOOKED_AT if name in files}))
+    found = facts.of_files({name: files[name] for name in facts.LOOKED_AT if name in files})
+    known, reason = facts.recognise(found)
     name = trainer or (recorded.manifest["trainer"] if recorded else None)
     chosen = by_name(name) if name else known
-    if GR not in files or chosen is None:
+    if GR not in files or chosen is None or facts.uses_another_rasterizer(found):
         return Plan(root, Verdict("unknown", None, [reason if GR in files else _no_renderer(root)]), options, recorded)
     patch = Patch(files, chosen)
     requested = [rule._replace(pending=()) if rule.option in before else rule for rule in patch.request(options)]

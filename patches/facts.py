@@ -101,6 +101,11 @@ def _renders(node: ast.AST, made: Set[str]) -> bool:
     return is_object and getattr(called, "id", "") in made
 
 
+def uses_another_rasterizer(facts: Set[str]) -> bool:
+    """Whether one of another name is imported, which no patch and no run can take the place of."""
+    return bool(_those(facts, "uses "))
+
+
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     """Returns the rasterizer whose API is called and "", or None and why it is none that is known."""
     foreign = sorted(_those(facts, "uses "))

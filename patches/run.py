@@ -100,7 +100,7 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
         known, reason = facts.recognise(found)
         if known and trainer is None:
             return known.flavour, f"{known.name if (folder / GR).is_file() else 'the trainer'} in {folder}", []
-        is_other = any(fact.startswith("uses ") for fact in found)
+        is_other = facts.uses_another_rasterizer(found)
         if trainer is not None and (is_other or found and not any(fact.startswith("keeps ") for fact in found)):
             raise PatchError(f"{folder}: {reason}; --trainer {trainer} cannot help")
         if found and not (known and known.flavour == by_name[trainer]):

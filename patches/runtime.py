@@ -210,8 +210,8 @@ def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
     """Returns a trainer's ssim(img1, img2, ...), by `fused_ssim` where that can be.
 
     img1, img2: [3, H, W] or [B, 3, H, W]. Of the first images of a shape both are computed: where they differ in value
-    or gradient the trainer's own stays, and a line on stderr says so. It is also called for other arguments and types, and
-    for gradients by img2: the kernel has none of it.
+    or gradient the trainer's own stays, and a line on stderr says so. It is also called for other arguments and types,
+    and for gradients by img2: the kernel has none of it.
     """
     differences: Dict[Any, str] = {}
 

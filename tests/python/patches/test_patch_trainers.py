@@ -123,3 +123,17 @@ def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
     (note,) = patches.apply(tmp_path, trainer="3dgs-2023").notes
     assert "--trainer 3dgs-2023" in note and "3dgs-2024" in note and "another API" in note
     assert patches.plan(tmp_path).notes == ()  # it was said when it was chosen
+
+
+def test_a_fork_that_no_contract_fits_is_patched_with_a_warning_and_one_of_another_rasterizer_is_not(tmp_path):
+    call = BY_NAME.format("color, radii").replace("get_xyz)", "get_xyz, degrees=pc.degrees)")  # reduced-3dgs
+    make(tmp_path / "fork", {GR: RENDERER.replace(ONE_LINE, call)})
+    refused(tmp_path / "fork", "unknown", "its rasterizer is called with degrees, which no rasterizer has")
+    (note,) = patches.apply(tmp_path / "fork", trainer="3dgs-2023").notes
+    assert "--trainer 3dgs-2023: its rasterizer is called with degrees" in note
+    private = RENDERER.replace("import math", "from diff_gaussian_rasterization._C import kmeans_cuda\nimport math")
+    refused(make(tmp_path / "private", {GR: private}), "it imports diff_gaussian_rasterization._C.kmeans_cuda, which")
+    both = RENDERER + "\n\ndef render_imp():\n    from diff_gaussian_rasterization_ms import GaussianRasterizer\n"
+    for trainer in (None, "3dgs-2023"):  # Mini-Splatting
+        refused(make(tmp_path / "both", {GR: both}), "it imports diff_gaussian_rasterization_ms, another rasterizer",
+                trainer=trainer)
