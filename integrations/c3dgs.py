@@ -11,7 +11,7 @@ import torch
 from diff_smoe_rasterization import GaussianRasterizer, rasterize_gaussians
 from diff_smoe_rasterization.rasterizer import _checks
 
-from ._settings import settings_with
+from ._rasterizer import settings_with
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "GaussianRasterizerIndexed", "rasterize_gaussians",
            "rasterize_gaussians_indexed"]

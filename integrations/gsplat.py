@@ -9,6 +9,8 @@ import torch.nn.functional as functional
 from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize
 from diff_smoe_rasterization.settings import BackgroundGate
 
+from ._rasterizer import share_of_gaussians
+
 __all__ = ["rasterization"]
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -40,7 +42,8 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
             the host, which on a GPU waits for them.
         near_plane: Gaussians with view depth <= near_plane are culled.
         backgrounds: [C, D]; None is black. The background of a depth is 0.
-        render_mode: "RGB", and D for depth sum(w z) or ED for depth sum(w z) / sum(w), alone or as the last channel.
+        render_mode: "RGB", and ED for the depth sum(w z) / sum(w) or D for that times alphas, alone or as the last
+            channel.
         rasterize_mode: "classic" or "antialiased".
         covars: [N, 3, 3] in place of quats and scales, which are then ignored.
         blend_mode: one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha".
@@ -50,7 +53,8 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
 
     Returns:
         renders: [C, H, W, X], X = D, 1 or D + 1 by render_mode.
-        alphas: [C, H, W, 1], sum(w); in `smoe_tn` and `smoe_std`, where it is the sum of alpha, it may exceed 1.
+        alphas: [C, H, W, 1], the share of the pixel that the background does not have, by which callers composite:
+            sum(w) in `alpha`, and 1 wherever a gate is open where the background has no gate.
         meta: means2d [C, N, 2], pixels, which receives the gradient of the images by them (also in pixels) and passes
             none on; radii [C, N, 2] int32, 3 sigma of the longer axis twice, 0 where not seen; depths [C, N]; width,
             height, n_cameras, n_batches; batch_ids, camera_ids and gaussian_ids are None, as always without `packed`.
@@ -100,11 +104,11 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         color = colors[camera] if colors.dim() > len(color_shape) else colors
         rendering = rasterize(means, opacities, settings, means2D=_in_ndc(means2d[camera], width, height),
                               outputs=("alpha", "depth") if with_depth else ("alpha",), **{color_name: color}, **shape)
-        images = [rendering.color] if with_color else []
+        images, share = [rendering.color] if with_color else [], share_of_gaussians(rendering.alpha, settings)
         if with_depth:
-            images.append(rendering.depth if "ED" in render_mode else rendering.depth * rendering.alpha)
+            images.append(rendering.depth if "ED" in render_mode else rendering.depth * share)
         renders.append(torch.cat(images).permute(1, 2, 0))
-        alphas.append(rendering.alpha.permute(1, 2, 0))
+        alphas.append(share.permute(1, 2, 0))
         radii.append(rendering.radii)
     meta = {"means2d": means2d, "radii": torch.stack(radii)[..., None].repeat(1, 1, 2), "depths": depths,
             "width": width, "height": height, "n_cameras": num_cameras, "n_batches": 1, "batch_ids": None,

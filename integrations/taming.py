@@ -10,7 +10,7 @@ import torch
 import diff_smoe_rasterization
 from diff_smoe_rasterization import SparseGaussianAdam, fused_ssim, rasterize_with_splats
 
-from ._settings import settings_with
+from ._rasterizer import settings_with
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "fused_ssim",
            "rasterize_gaussians"]

@@ -1,24 +1,25 @@
 """How each kind of rule changes a syntax tree (LibCST keeps all that it does not touch: comments, blanks, quotes).
 
-A codemod takes a tree, a Found, in which it counts, and what the rule says. It returns the tree with the rule applied.
+A codemod takes a tree and a Found, in which it counts. It returns the tree with the rule applied.
 """
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Callable, Collection, Dict, List, Optional, Sequence
+from typing import Callable, Collection, Dict, List, Optional
 
 import libcst as cst
 import libcst.matchers as m
+from libcst.codemod import CodemodContext
+from libcst.codemod.visitors import AddImportsVisitor, ImportItem
 from libcst.helpers import get_full_name_for_node
 from libcst.metadata import MetadataWrapper, ScopeProvider
 
-from .trainers import INTEGRATIONS, RASTERIZER, RUNTIME, Rule
+from .trainers import INTEGRATIONS, RASTERIZER, RUNTIME, Entry
 
 SETTINGS = m.Call(func=m.Name("GaussianRasterizationSettings"))
 SUPER_INIT = m.SimpleStatementLine(body=[m.Expr(m.Call(func=m.Attribute(
     value=m.Call(func=m.Name("super")), attr=m.Name("__init__")))), m.ZeroOrMore()])
 DOCSTRING = m.SimpleStatementLine(body=[m.Expr(m.SimpleString() | m.ConcatenatedString()), m.ZeroOrMore()])
-IMPORT = m.SimpleStatementLine(body=[m.Import() | m.ImportFrom(), m.ZeroOrMore()])
 MODEL_LINE = "self.blend_mode, self.background_gate = default_blend()"
 
 
@@ -65,12 +66,12 @@ def statement(text: str) -> cst.SimpleStatementLine:
     return cst.parse_statement(text)
 
 
-def with_line(block, place: int, text: str):
-    """Returns a module or block with one more statement."""
+def with_line(block: cst.IndentedBlock, place: int, text: str) -> cst.IndentedBlock:
+    """Returns a block with one more statement."""
     return block.with_changes(body=[*block.body[:place], statement(text), *block.body[place:]])
 
 
-def has_line(block, text: str) -> bool:
+def has_line(block: cst.IndentedBlock, text: str) -> bool:
     """Whether it has that statement, whatever the comments around it."""
     wanted = statement(text).body[0]
     return any(m.matches(line, m.SimpleStatementLine(body=[m.DoNotCare()])) and line.body[0].deep_equals(wanted)
@@ -78,27 +79,12 @@ def has_line(block, text: str) -> bool:
 
 
 def with_import(module: cst.Module, source: str, name: str) -> cst.Module:
-    """Returns the module with `from source import name` after the imports at its top, unless it is there."""
-    line = f"from {source} import {name}"
-    if has_line(module, line):
-        return module
-    place = int(bool(module.body) and m.matches(module.body[0], DOCSTRING))
-    for index, node in enumerate(module.body):
-        if isinstance(node, (cst.FunctionDef, cst.ClassDef, cst.If)):
-            break
-        if m.matches(node, IMPORT):
-            place = index + 1
-    return with_line(module, place, line)
+    """Returns the module with `from source import name` at its top, unless it is there."""
+    return AddImportsVisitor(CodemodContext(), [ImportItem(source, name)]).transform_module(module)
 
 
 def keywords_of(call: cst.Call) -> Dict[str, cst.BaseExpression]:
     return {argument.keyword.value: argument.value for argument in call.args if argument.keyword}
-
-
-def import_rasterizer(tree: cst.Module, found: Found, rule: Rule) -> cst.Module:
-    ours = f"{INTEGRATIONS}.{rule.flavour}"
-    found.done = len(m.findall(tree, m.ImportFrom(module=named(ours), relative=[])))
-    return renamed_import(tree, found, RASTERIZER, ours)
 
 
 def renamed_import(tree: cst.Module, found: Found, foreign: str, ours: str,
@@ -114,7 +100,13 @@ def renamed_import(tree: cst.Module, found: Found, foreign: str, ours: str,
     return each_node(tree, m.ImportFrom(module=named(foreign), relative=[]), change)
 
 
-def settings_blend_mode(tree: cst.Module, found: Found, rule: Rule) -> cst.Module:
+def rasterizer_import(tree: cst.Module, found: Found, flavour: str) -> cst.Module:
+    ours = f"{INTEGRATIONS}.{flavour}"
+    found.done = len(m.findall(tree, m.ImportFrom(module=named(ours), relative=[])))
+    return renamed_import(tree, found, RASTERIZER, ours)
+
+
+def settings_blend(tree: cst.Module, found: Found) -> cst.Module:
     """The settings call gets `**pipe.blend`; `pipe` is the parameter that its `debug=pipe.debug` names."""
     wrapper = MetadataWrapper(tree)
     scopes = wrapper.resolve(ScopeProvider)
@@ -132,28 +124,22 @@ def settings_blend_mode(tree: cst.Module, found: Found, rule: Rule) -> cst.Modul
             found.misfits += 1
         else:
             found.pending += 1
-            # Before the last one: then every comma, comment and closing parenthesis stays where it is.
-            *before, last = call.args
-            more = cst.Arg(cst.parse_expression(f"{pipe}.blend"), star="**", comma=comma_after(before))
-            return call.with_changes(args=[*before, more, last])
+            first = cst.Arg(cst.parse_expression(f"{pipe}.blend"), star="**", comma=comma_before(call))
+            return call.with_changes(args=[first, *call.args])
         return call
 
     return each_node(wrapper.module, SETTINGS, change)
 
 
-def comma_after(arguments: Sequence[cst.Arg]) -> cst.Comma:
-    """Returns a comma as the last of the arguments has it, line break and indent, without its comment."""
-    comma = arguments[-1].comma if arguments else None
-    if not isinstance(comma, cst.Comma):
-        return cst.Comma(whitespace_after=cst.SimpleWhitespace(" "))
-    blank = comma.whitespace_after
+def comma_before(call: cst.Call) -> cst.Comma:
+    """Returns a comma with the line break and the indent that are before the arguments of a call, without a comment."""
+    blank = call.whitespace_before_args
     if isinstance(blank, cst.ParenthesizedWhitespace):
-        blank = cst.ParenthesizedWhitespace(indent=blank.indent, last_line=blank.last_line)
-        return cst.Comma(whitespace_after=blank)
-    return comma
+        return cst.Comma(whitespace_after=cst.ParenthesizedWhitespace(indent=blank.indent, last_line=blank.last_line))
+    return cst.Comma(whitespace_after=cst.SimpleWhitespace(" "))
 
 
-def model_parameter(tree: cst.Module, found: Found, rule: Rule) -> cst.Module:
+def model_options(tree: cst.Module, found: Found) -> cst.Module:
     """ModelParams gets a statement that makes the options --blend_mode and --background_gate of two attributes."""
     def in_init(init: cst.FunctionDef) -> List[cst.FunctionDef]:
         if has_line(init.body, MODEL_LINE):
@@ -171,13 +157,13 @@ def model_parameter(tree: cst.Module, found: Found, rule: Rule) -> cst.Module:
     return with_import(tree, RUNTIME, "default_blend") if found.pending else tree
 
 
-def pipe_blend_mode(tree: cst.Module, found: Found, rule: Rule) -> cst.Module:
+def pipe_blend(tree: cst.Module, found: Found, entry: Entry) -> cst.Module:
     """The function that gets both groups begins with `pipe.blend = blend_of(dataset)`."""
-    line = f"{rule.pipe}.blend = blend_of({rule.dataset})"
+    line = f"{entry.pipe}.blend = {entry.blend}({entry.dataset})"
 
     def change(function: cst.FunctionDef) -> List[cst.FunctionDef]:
         parameters = {node.name.value for node in m.findall(function.params, m.Param())}
-        if not {rule.dataset, rule.pipe} <= parameters:
+        if not {entry.dataset, entry.pipe} <= parameters:
             return [function]
         if has_line(function.body, line):
             found.done += 1
@@ -186,8 +172,8 @@ def pipe_blend_mode(tree: cst.Module, found: Found, rule: Rule) -> cst.Module:
         place = int(m.matches(function.body.body[0], DOCSTRING))
         return [function.with_changes(body=with_line(function.body, place, line))]
 
-    tree = each_line(tree, m.FunctionDef(name=m.Name(rule.function), body=m.IndentedBlock()), change)
-    return with_import(tree, RUNTIME, "blend_of") if found.pending else tree
+    tree = each_line(tree, m.FunctionDef(name=m.Name(entry.function), body=m.IndentedBlock()), change)
+    return with_import(tree, RUNTIME, entry.blend) if found.pending else tree
 
 
 def call_of_ours(tree: cst.Module, found: Found, foreign: str, ours: str, positional: int,
@@ -226,8 +212,3 @@ def decorated(tree: cst.Module, found: Found, function: str, decorator: str) -> 
 
     tree = each_line(tree, m.FunctionDef(name=m.Name(function)), change)
     return with_import(tree, RUNTIME, decorator) if found.pending else tree
-
-
-CODEMODS: Dict[str, Callable[[cst.Module, Found, Rule], cst.Module]] = {
-    "import-rasterizer": import_rasterizer, "settings-blend-mode": settings_blend_mode,
-    "model-parameter": model_parameter, "pipe-blend-mode": pipe_blend_mode}

@@ -1,13 +1,11 @@
 """What `dsmoe patch apply|check|diff|revert` prints."""
 from __future__ import annotations
 
-import shlex
 import sys
 from argparse import Namespace
-from typing import Any, Dict, Iterable, List
+from typing import Any, Dict, Iterable
 
 from . import engine
-from .errors import PatchError
 
 
 def apply(arguments: Namespace) -> int:
@@ -32,7 +30,7 @@ def apply(arguments: Namespace) -> int:
         written = "would be" if arguments.dry_run else "was"
         print(f"{arguments.path}: already patched ({verdict.trainer}); nothing {written} written")
         _print_lines(verdict.reasons)
-    _print_lines(_remarks(planned, arguments))
+    _print_lines(planned.notes)
     return 0
 
 
@@ -42,7 +40,7 @@ def check(arguments: Namespace) -> int:
     verdict = planned.verdict
     print(f"{arguments.path}: {verdict}" + (f" ({verdict.trainer})" if verdict.trainer else ""))
     if verdict in ("patchable", "patched"):
-        _print_lines((*verdict.reasons, *_remarks(planned, arguments)))
+        _print_lines((*verdict.reasons, *planned.notes))
         return 0
     print(f"dsmoe patch: error: {engine.refusal(verdict)}", file=sys.stderr)
     return 1
@@ -70,21 +68,6 @@ def revert(arguments: Namespace) -> int:
 
 def _options(arguments: Namespace) -> Dict[str, Any]:
     return {name: getattr(arguments, name) for name in ("modernise", "trainer", "fuse")}
-
-
-def _remarks(planned: engine.Plan, arguments: Namespace) -> List[str]:
-    """The notes on a checkout, and what to type where rules that an option asks for are still not applied."""
-    options = dict.fromkeys(rule.option for rule in planned.requested if rule.pending and not planned.written)
-    if not options:
-        return list(planned.notes)
-    try:
-        before = "" if engine.pending(planned) else "undo your edit of patched files, then "
-        words = ["--" + option for option in options] + (["--trainer", arguments.trainer] if arguments.trainer else [])
-        command = " ".join(map(shlex.quote, ["dsmoe", "patch", "apply", *words, str(arguments.path)]))
-        advice = f"to apply what is not, {before}type: {command}"
-    except PatchError as error:
-        advice = f"cannot be applied as it is: {error}"
-    return [*planned.notes, f"{', '.join(options)}: {advice}"]
 
 
 def _print_lines(lines: Iterable[str]) -> None:

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import difflib
 import io
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, Tuple, Union
 
 from diff_smoe_rasterization._version import __version__
 
-from . import facts, scripts, source
+from . import facts, record, scripts
 from .errors import PatchError
 from .merge import without_patch
-from .record import FOLDER, Record, check_writable, put_back, remove_rest, replace_file
+from .record import FOLDER, Record
 from .trainers import GR, TRAINERS, Trainer, names
 
 if TYPE_CHECKING:
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
 PathLike = Union[str, Path]
+OPTIONS = ("modernise", "fuse")
 
 
 class Verdict(str):
@@ -45,7 +45,7 @@ class Plan(NamedTuple):
 
     root: Path
     verdict: Verdict
-    options: Tuple[str, ...]  # of the patch, "modernise" and "fuse"; also those that it was made with
+    options: Tuple[str, ...]  # of OPTIONS; also those that it was made with
     record: Optional[Record]
     changes: Tuple[Change, ...] = ()
     remarks: Tuple[str, ...] = ()  # which scripts no rule reaches, which files are left as they are
@@ -58,7 +58,7 @@ class Plan(NamedTuple):
         notes = list(self.remarks)
         for option in self.options:
             rules = [rule for rule in self.requested if rule.option == option]
-            notes += [rule.note(self.written) for rule in rules if rule.files]
+            notes += [rule.note() for rule in rules if rule.files]
             skipped = [rule.rule for rule in rules if not rule.files]
             notes += [f"{option}: skipped, nothing matches: {', '.join(skipped)}"] if skipped else []
         return tuple(notes)
@@ -70,42 +70,39 @@ def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = No
     from .patch import Patch
 
     root = _root(path)
-    record = Record.in_force(root)
-    before = options_of(record)
-    options = tuple(name for name, wanted in (("modernise", modernise), ("fuse", fuse)) if wanted or name in before)
-
-    def read(name: str) -> Optional[bytes]:
-        return record.original(name) if record and name in record.files else read_file(root / name)
-
-    known, why_unknown = facts.recognise(facts.of_checkout(read))
-    name = trainer or (record.manifest["trainer"] if record else None)
+    recorded = Record.in_force(root)
+    before = recorded.options if recorded else ()
+    options = tuple(name for name, wanted in zip(OPTIONS, (modernise, fuse)) if wanted or name in before)
+    files = {name: (root / name).read_bytes()
+             for name in scripts.python_files(root, with_submodules="modernise" in options)}
+    now = dict(files)
+    files.update(recorded.before if recorded else {})
+    found = facts.of_files({name: files[name] for name in facts.LOOKED_AT if name in files})
+    known, reason = facts.recognise(found)
+    name = trainer or (recorded.manifest["trainer"] if recorded else None)
     chosen = by_name(name) if name else known
-    if read(GR) is None or chosen is None:
-        reason = _no_renderer(root) if read(GR) is None else why_unknown
-        return Plan(root, Verdict("unknown", None, [reason]), options, record)
-    files = {name: read(name) for name in scripts.python_files(root)}
-    if "modernise" in options:
-        files.update((name, read(name)) for name in scripts.build_files(root))
+    if GR not in files or chosen is None or facts.uses_another_rasterizer(found):
+        return Plan(root, Verdict("unknown", None, [reason if GR in files else _no_renderer(root)]), options, recorded)
     patch = Patch(files, chosen)
-    requested = patch.request(options, lambda name: read_file(root / name))
+    requested = [rule._replace(pending=()) if rule.option in before else rule for rule in patch.request(options)]
     changes = patch.changes()
     state, reasons = patch.state()
-    if record and not patch.problems:
-        state, reasons = _state_by_record(root, record, changes, chosen)
-    elif state == "patchable" and (root / FOLDER / "manifest.json").exists():
+    if recorded and not patch.problems:
+        state, reasons = _state_by_record(recorded, now, changes, chosen)
+    elif state == "patchable" and (root / FOLDER).exists():
         reasons = [f"no file is patched any more: `apply` replaces the {FOLDER} that is there, `revert` removes it"]
-    if trainer and known and known.flavour != chosen.flavour:
-        patch.notes.insert(0, f"--trainer {trainer}: by what it imports and calls this is {known.name}, whose "
-                              f"rasterizer has another API ({known.flavour}, not {chosen.flavour})")
-    remarks = (*patch.notes, *scripts.notes(root, files, chosen))
-    return Plan(root, Verdict(state, chosen.name, reasons), options, record, changes, remarks, requested)
+    warnings = [] if not trainer or known and known.flavour == chosen.flavour else [
+        f"--trainer {trainer}: by what it imports and calls this is {known.name}, whose rasterizer has another API "
+        f"({known.flavour}, not {chosen.flavour})" if known else f"--trainer {trainer}: {reason}"]
+    return Plan(root, Verdict(state, chosen.name, reasons), options, recorded, changes,
+                (*warnings, *patch.notes, *scripts.notes(root, files, chosen)), tuple(requested))
 
 
 def plan(path: PathLike, **options: Any) -> Plan:
     """Plans a patch, with the options of `inspect`. Raises PatchError where it is refused."""
     planned = inspect(path, **options)
-    can_be_finished = planned.verdict == "half-patched" and planned.record and planned.record.can_be_finished()
-    if planned.verdict in ("patchable", "patched") or can_be_finished:
+    states = set(planned.record.states().values()) if planned.record else {"not finished"}
+    if planned.verdict in ("patchable", "patched") or states <= {"patched", "original"}:
         return planned
     raise PatchError(refusal(planned.verdict))
 
@@ -128,50 +125,44 @@ def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     Raises PatchError where it is refused, and then every file is as it was; where the disk fails, as before any patch.
     """
     planned = plan(path, modernise=modernise, trainer=trainer, fuse=fuse)
-    root, record, todo = planned.root, planned.record, pending(planned)
+    root, todo = planned.root, pending(planned)
     if not todo:
-        if record and not record.manifest["complete"]:
-            record.note_complete(True)
         return planned
     before = {change.name: change.before for change in planned.changes}
     after = {change.name: change.after for change in planned.changes}
-    check_writable(root, todo)
-    failing = FOLDER
+    record.check_writable(root, todo)
     try:
-        if record:
-            record.take_back()  # so that each file is the original, or patched by this plan
-        elif (root / FOLDER / "manifest.json").exists():  # of a patch of which nothing is left
-            Record.load(root).remove()
-        begun = Record.begin(root, before, after, {
-            "version": __version__, "trainer": planned.verdict.trainer, "options": planned.options,
-            "rules": {change.name: change.rules for change in planned.changes}})
-        for failing, data in after.items():
-            replace_file(root, root / failing, data)
-        begun.note_complete(True)
+        if planned.record:
+            record.write_files(root, planned.record.before)
+        record.remove(root)
+        Record.make(root, before, after, {"version": __version__, "trainer": planned.verdict.trainer,
+                                          "options": planned.options})
+        record.write_files(root, after)
     except OSError as error:
-        put_back(root, before)
-        remove_rest(root)
-        raise PatchError(f"{failing}: cannot be written, so all was put back: {error}") from None
-    return planned._replace(written=True)
+        if (root / FOLDER).exists():  # of this patch or of the one before
+            record.write_files(root, before)
+        record.remove(root)
+        raise PatchError(f"{error.filename2 or error.filename or FOLDER}: cannot be written, so all was put back: "
+                         f"{error}") from None
+    return planned._replace(written=True, requested=tuple(rule._replace(pending=()) for rule in planned.requested))
 
 
 def pending(planned: Plan) -> Dict[str, bytes]:
     """Returns what `apply` would write, by the files' names. Raises PatchError where it refuses."""
-    record = planned.record
-    if planned.verdict == "patched" and record is None:
+    recorded = planned.record
+    if planned.verdict == "patched" and recorded is None:
         if planned.options and planned.changes:
             raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
                              f"checkout is patched and has no {FOLDER}: take the patch back by your version control, "
                              f"then apply it with {words_of(planned.options)}")
         return {}
-    edited = [name for name, state in record.states().items() if state == "changed"] if record else []
-    if edited and planned.options == options_of(record):
-        return {}  # nothing is written over an edit
-    if edited:
+    edited = [name for name, state in recorded.states().items() if state == "changed"] if recorded else []
+    if recorded and edited:
+        if planned.options == recorded.options:
+            return {}  # nothing is written over an edit
         raise PatchError(f"{edited[0]}: was changed since it was patched: undo your edit, then apply it with "
                          f"{words_of(planned.options)}")
-    wanted = {name: record.original(name) for name in record.files} if record else {}
-    wanted.update((change.name, change.after) for change in planned.changes)
+    wanted = {**(recorded.before if recorded else {}), **{change.name: change.after for change in planned.changes}}
     return {name: data for name, data in wanted.items() if (planned.root / name).read_bytes() != data}
 
 
@@ -188,24 +179,23 @@ def revert(path: PathLike) -> Reverted:
     where an edit is of the patch's own lines, where a patched file is gone, and where there is no record.
     """
     root = _root(path)
-    record = Record.load(root)
-    if record is None and remove_rest(root):
+    recorded = Record.in_force(root)
+    if recorded is None and record.remove(root):
         return Reverted()
-    if record is None:
+    if recorded is None:
         raise PatchError(f"{root}: there is no {FOLDER}, so nothing can be put back: it was not patched, or by hand")
-    states = record.states() if Record.in_force(root) else {}
-    back = {name: record.original(name) for name, state in states.items() if state in ("patched", "changed")}
+    states = recorded.states()
+    back = {name: recorded.before[name] for name, state in states.items() if state in ("patched", "changed")}
     edited = [name for name in back if states[name] == "changed"]
     for name, state in states.items():
-        if state == "gone" or name in edited and record.patched(name) is None:
+        if state == "gone" or name in edited and name not in recorded.after:
             raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. Undo your edit; or copy what lies in "
                              f"{FOLDER}/originals over the checkout, by which your edit is lost, and delete {FOLDER}")
     for name in edited:
-        back[name] = without_patch(name, back[name], record.patched(name), (root / name).read_bytes())
-    check_writable(root, back)
-    record.note_complete(False)  # an interruption leaves what `apply` can finish too
-    put_back(root, back)
-    record.remove()
+        back[name] = without_patch(name, back[name], recorded.after[name], (root / name).read_bytes())
+    record.check_writable(root, back)
+    record.write_files(root, back)
+    record.remove(root)
     reverted = Reverted(back)
     reverted.edited = tuple(edited)
     return reverted
@@ -213,32 +203,26 @@ def revert(path: PathLike) -> Reverted:
 
 _SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
           "replaced": "was changed since, and is not patched any more; `revert` leaves it, and puts back the others",
-          "original": "is the original, though the record says that it was patched; `revert` puts back the others too"}
+          "original": "is not patched, or not any more: `apply` finishes the patch, `revert` takes it back"}
 
 
-def _state_by_record(root: Path, record: Record, changes: Tuple[Change, ...],
+def _state_by_record(recorded: Record, now: Dict[str, bytes], changes: Tuple[Change, ...],
                      trainer: Trainer) -> Tuple[str, List[str]]:
     """How a checkout is that has a record: `patched`, or what the record and the files disagree in."""
     from .patch import Patch
 
-    states = record.states()
+    states = recorded.states()
+    edited = [name for name, state in states.items() if state == "changed"]
     if set(states.values()) <= {"patched", "changed"}:
-        by = ", with ".join(filter(None, [f"by version {record.manifest['version']}", words_of(options_of(record))]))
-        is_current = all(read_file(root / change.name) == change.after for change in changes)
-        files = {} if is_current else {name: read_file(root / name) for name in scripts.python_files(root)}
-        if is_current or Patch(files, trainer).state()[0] == "patched":
+        by = ", with ".join(filter(None, [f"by version {recorded.manifest['version']}", words_of(recorded.options)]))
+        is_current = all(now.get(change.name) == change.after for change in changes)
+        if is_current or Patch(now, trainer).state()[0] == "patched":
             return "patched", [by] + [f"{name}: was edited since; every rule for the blend mode is still applied"
-                                      for name, state in states.items() if state == "changed"]
-        if "changed" not in states.values():
-            return "patched", [by, f"its rules were others: to bring it up to date, type: dsmoe patch apply {root}"]
-    if record.can_be_finished():
-        return "half-patched", ["the patch was interrupted: `apply` finishes it, `revert` takes it back"]
+                                      for name in edited]
+        if not edited:
+            return "patched", [by, f"its rules were others: to bring it up to date, type: dsmoe patch apply "
+                                   f"{recorded.root}"]
     return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
-
-
-def options_of(record: Optional[Record]) -> Tuple[str, ...]:
-    """The options that a patch was made with."""
-    return tuple(record.manifest["options"]) if record else ()
 
 
 def words_of(options: Tuple[str, ...]) -> str:
@@ -263,12 +247,8 @@ def _root(path: PathLike) -> Path:
 def _no_renderer(root: Path) -> str:
     """Says that a folder is no checkout, and which one beside it is."""
     above = root.resolve()
-    near = [folder for folder in (*above.parents, *sorted(above.glob("*/"))) if os.path.isfile(str(folder / GR))]
+    near = [folder for folder in (*above.parents, *sorted(above.glob("*/"))) if (folder / GR).is_file()]
     return f"there is no {GR} in {root}; wanted is the checkout's folder" + (f", such as {near[0]}" if near else "")
-
-
-def read_file(path: Path) -> Optional[bytes]:
-    return path.read_bytes() if path.is_file() else None
 
 
 def refusal(verdict: Verdict) -> str:
@@ -279,9 +259,15 @@ def refusal(verdict: Verdict) -> str:
 
 def diff_of(name: str, before: bytes, after: bytes) -> str:
     """Returns the unified diff of one file."""
-    old, new = (io.StringIO(source.decode(name, data)[0], newline="\n").readlines() for data in (before, after))
+    old, new = (io.StringIO(_text(data), newline="\n").readlines() for data in (before, after))
     lines = difflib.unified_diff(old, new, "a/" + name, "b/" + name)
     return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in lines)
+
+
+def _text(data: bytes) -> str:
+    import libcst
+
+    return data.decode(libcst.parse_module(data).encoding)
 
 
 def have_libcst() -> None:

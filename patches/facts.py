@@ -1,76 +1,160 @@
-"""What a checkout imports and calls, from which it is told which trainer it is. Needs no LibCST."""
+"""What a checkout imports and calls, from which it is told which rasterizer's API it calls. Needs no LibCST."""
 from __future__ import annotations
 
 import ast
-from typing import Callable, Iterator, Optional, Set, Tuple
+import re
+from typing import Dict, Iterator, List, Mapping, Optional, Set, Tuple
+
+from diff_smoe_rasterization.integrations.contracts import (
+    ARGUMENTS,
+    CONTRACTS,
+    NAMES,
+    RESULTS,
+    SETTINGS,
+    Contract,
+)
+from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
 from .source import called_name, python_tree
-from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINERS, Trainer, names
+from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINERS, Trainer
 
 PATCHED = "imports from " + INTEGRATIONS
-LOOKED_AT = (GR, "scene/gaussian_model.py", "train.py", "render.py")
-KNOWN_SETTINGS = {
-    "image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
-    "sh_degree", "campos", "prefiltered", "debug", "antialiasing", "pixel_weights", "clamp_color", "blend_mode",
-    "background_gate"}
+LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
+OTHER_RASTERIZER = re.compile(r"diff_(gauss|surfel)\w*")
+RENDERERS = {"render", "prefilter_voxel", "*"}
 
 
-def of_checkout(read: Callable[[str], Optional[bytes]]) -> Set[str]:
-    """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "unpacks 2 results".
+def of_files(files: Mapping[str, bytes]) -> Set[str]:
+    """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "returns color, radii".
 
-    read: the bytes of a file of the checkout, or None where there is no such file.
+    files: those of a checkout, by name. One that is no Python shows nothing: a rule will say so.
     """
     facts: Set[str] = set()
-    for name in LOOKED_AT:
-        nodes = list(ast.walk(python_tree(read(name) or b"")))  # where it is not Python, a rule will say so
-        rasterizers = {"rasterizer"} | {target.id for node in nodes if isinstance(node, ast.Assign)
-                                        and _makes_rasterizer(node.value)
-                                        for target in node.targets if isinstance(target, ast.Name)}
-        for node in nodes:
-            facts.update(_of_node(node, rasterizers))
+    for data in files.values():
+        tree = python_tree(data)
+        in_try = {id(node) for outer in ast.walk(tree) if isinstance(outer, ast.Try) and outer.handlers
+                  for line in outer.body for node in ast.walk(line)}
+        made = _names_of_rasterizers(tree)
+        for node in ast.walk(tree):
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                facts.update(_of_import(node, id(node) in in_try))
+            elif isinstance(node, ast.Call):
+                facts.update(_of_call(node, made))
+            elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
+                facts.add("reads invdepthmap")
+            elif isinstance(node, ast.Assign) and _renders(node.value, made) and isinstance(node.targets[0], ast.Tuple):
+                results = [getattr(one, "id", "_") for one in node.targets[0].elts]
+                if not any(isinstance(one, ast.Starred) for one in node.targets[0].elts):
+                    facts.add("returns " + ", ".join(results))
     return facts
 
 
-def _of_node(node: ast.AST, rasterizers: Set[str]) -> Iterator[str]:
-    if isinstance(node, ast.ImportFrom) and node.module:
-        is_ours = node.module.startswith(INTEGRATIONS + ".")
-        if is_ours:
+def _of_import(node: ast.AST, may_fail: bool) -> Iterator[str]:
+    names = [alias.name for alias in node.names]
+    is_whole = isinstance(node, ast.Import)
+    for module in names if is_whole else [node.module or ""]:
+        package, last = module.partition(".")[0], module.rpartition(".")[2]
+        yield "imports " + last
+        if package != RASTERIZER and OTHER_RASTERIZER.fullmatch(package):
+            yield "uses " + package
+        if package == RASTERIZER:
+            yield "keeps the original" if is_whole else "keeps the original by name"
+        if module == "gaussian_renderer" and (is_whole or RENDERERS & set(names)):
+            yield "renders"
+        if module.startswith(INTEGRATIONS + "."):
             yield PATCHED
-        if is_ours or node.module == RASTERIZER:
-            yield from (f"imports {alias.name}" for alias in node.names)
-        else:
-            yield "imports " + node.module.rpartition(".")[2]
-    elif isinstance(node, ast.Import):
-        yield from ("imports " + alias.name.rpartition(".")[2] for alias in node.names)
-    elif isinstance(node, ast.Call) and called_name(node) == "GaussianRasterizationSettings":
-        yield from (f"sets {keyword.arg}" for keyword in node.keywords if keyword.arg)  # not **pipe.blend
-    elif isinstance(node, ast.Call) and called_name(node) == "visible_filter":
-        yield "calls visible_filter"
-    elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
-        yield "reads invdepthmap"
-    elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and isinstance(node.targets[0], ast.Tuple):
-        called, results = node.value.func, node.targets[0].elts
-        if ((_makes_rasterizer(called) or getattr(called, "id", "") in rasterizers)
-                and not any(isinstance(one, ast.Starred) for one in results)):
-            yield f"unpacks {len(results)} results"
+        if not is_whole and module.startswith((RASTERIZER, INTEGRATIONS + ".")):
+            yield from (f"imports {name}" for name in names)
+        if not is_whole and package == RASTERIZER and not may_fail:
+            prefix = "" if module == RASTERIZER else module + "."
+            yield from (f"needs {prefix}{name}" for name in names if name != "*")
 
 
-def _makes_rasterizer(node: ast.AST) -> bool:
-    return isinstance(node, ast.Call) and getattr(node.func, "id", "") == "GaussianRasterizer"
+def _of_call(call: ast.Call, made: Set[str]) -> Iterator[str]:
+    keywords = [keyword.arg for keyword in call.keywords]  # None: **pipe.blend
+    if called_name(call) == "GaussianRasterizationSettings":
+        yield from (f"sets {name}" for name in keywords if name)
+        yield "blends as it says" if {None, "blend_mode"} & set(keywords) else "blends by default"
+    elif _renders(call, made) and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
+        yield from (f"takes {name}" for name in keywords if name)
+    else:
+        yield f"calls {called_name(call)}"
+
+
+def _names_of_rasterizers(tree: ast.Module) -> Set[str]:
+    """The names by which a file knows the class GaussianRasterizer and objects of it."""
+    aliases = {alias.asname or alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)
+               for alias in node.names if alias.name.startswith("GaussianRasterizer")}
+    objects = {target.id for node in ast.walk(tree) if isinstance(node, ast.Assign)
+               and isinstance(node.value, ast.Call) and getattr(node.value.func, "id", "") in aliases
+               for target in node.targets if isinstance(target, ast.Name)}
+    return aliases | objects | ({"rasterizer"} if aliases else set())
+
+
+def _renders(node: ast.AST, made: Set[str]) -> bool:
+    """Whether it is a call of an object, rasterizer(...) or GaussianRasterizer(...)(...), and not of the class."""
+    if not isinstance(node, ast.Call):
+        return False
+    called = node.func.func if isinstance(node.func, ast.Call) else node.func
+    is_object = isinstance(node.func, ast.Call) or not any(
+        keyword.arg == "raster_settings" for keyword in node.keywords)
+    return is_object and getattr(called, "id", "") in made
+
+
+def uses_another_rasterizer(facts: Set[str]) -> bool:
+    """Whether one of another name is imported, which no patch and no run can take the place of."""
+    return bool(_those(facts, "uses "))
+
+
+def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
+    """Returns the rasterizer whose API is called and "", or None and why it is none that is known."""
+    foreign = sorted(_those(facts, "uses "))
+    if foreign:
+        return None, f"it imports {', '.join(foreign)}, another rasterizer, which would render in this one's place"
+    if not facts & {f"imports {name}" for name in NAMES}:
+        return None, f"nothing imports GaussianRasterizationSettings from {RASTERIZER} or {INTEGRATIONS}"
+    known = {contract.name: _known(contract) for contract in CONTRACTS}
+    said = {"sets": "its GaussianRasterizationSettings have {}", "takes": "its rasterizer is called with {}",
+            "needs": "it imports {}"}
+    for kind, text in said.items():
+        names = _those(facts, kind + " ") - set().union(*(entry[kind] for entry in known.values()))
+        if names:
+            return None, (text.format(", ".join(sorted(names))) + ", which no rasterizer has that is known here "
+                          f"({', '.join(sorted(known))})")
+    shown = [contract for contract in CONTRACTS if not contract.signs or facts & set(contract.signs)]
+    fitting = [contract for contract in shown
+               if all(_those(facts, kind + " ") <= known[contract.name][kind] for kind in said)]
+    for contract in fitting:
+        if all(_fits(found, contract.results) for found in _those(facts, "returns ")):
+            return contract, ""
+    nearest = (fitting or shown)[0]
+    found = next((found for found in sorted(_those(facts, "returns ")) if not _fits(found, nearest.results)), "")
+    return None, (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which "
+                  f"it resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
+
+
+def _those(facts: Set[str], kind: str) -> Set[str]:
+    return {fact[len(kind):] for fact in facts if fact.startswith(kind)}
+
+
+def _known(contract: Contract) -> Dict[str, Set[str]]:
+    ours = set(GaussianRasterizationSettings._fields[len(SETTINGS) + 1:]) - {"clamp_color"}
+    return {"sets": {*SETTINGS, *contract.settings} | ours, "takes": {*ARGUMENTS, *contract.arguments},
+            "needs": {*NAMES, *contract.names}}
+
+
+def _fits(found: str, results: Tuple[str, ...]) -> bool:
+    """Whether what a caller names its results by can be these."""
+    names: List[str] = found.split(", ")
+    return len(names) == len(results) and all(
+        name.startswith("_") or RESULTS.get(result, ("", ""))[1] in name.lower()
+        and not (result == "depth" and "inv" in name.lower()) for name, result in zip(names, results))
 
 
 def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
     """Returns the trainer and "", or None and why it is none that is known."""
-    if "imports GaussianRasterizationSettings" not in facts:
-        return None, f"{GR} imports GaussianRasterizationSettings neither from {RASTERIZER} nor from {INTEGRATIONS}"
-    foreign = sorted({fact[5:] for fact in facts if fact.startswith("sets ")} - KNOWN_SETTINGS)
-    if foreign:
-        return None, (f"its GaussianRasterizationSettings have {', '.join(foreign)}, which no trainer has that is "
-                      f"known here ({', '.join(names())})")
-    nearest = next(trainer for trainer in TRAINERS
-                   if any(facts.issuperset(sign.split(" and ")) for sign in trainer.signs))
-    results = {int(fact.split()[1]) for fact in facts if fact.startswith("unpacks ")} - {nearest.results}
-    if results:
-        return None, (f"its rasterizer returns {min(results)} results; that of {nearest.name}, which it resembles, "
-                      f"returns {nearest.results}")
-    return nearest, ""
+    contract, reason = contract_of(facts)
+    if contract is None:
+        return None, reason
+    return next(trainer for trainer in TRAINERS
+                if trainer.flavour == contract.name and facts.issuperset(trainer.signs)), ""

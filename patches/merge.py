@@ -18,12 +18,9 @@ def without_patch(name: str, original: bytes, patched: bytes, edited: bytes) -> 
     """
     base, before, now = (data.splitlines(keepends=True) for data in (patched, original, edited))
     undo, edits = _hunks(base, before), _hunks(base, now)
-    shift = 0
     for edit in edits:
-        first, last, lines = edit
         if edit not in undo and any(_meet(edit, hunk) for hunk in undo):
-            raise PatchError(_conflict(name, f"line {first + shift + 1}", base[first:last], lines))
-        shift += len(lines) - (last - first)
+            raise PatchError(_conflict(name, "you have edited what the patch wrote", base, now))
     merged = list(base)
     for first, last, lines in sorted(undo + [edit for edit in edits if edit not in undo], reverse=True):
         merged[first:last] = lines
@@ -43,8 +40,8 @@ def _meet(one: Hunk, other: Hunk) -> bool:
     return one[0] < other[1] and other[0] < one[1] or one[0] == one[1] == other[0] == other[1]
 
 
-def _conflict(name: str, where: str, patched: List[bytes], edited: List[bytes]) -> str:
+def _conflict(name: str, reason: str, patched: List[bytes], edited: List[bytes]) -> str:
     texts = ([line.decode("utf-8", "replace").rstrip("\r\n") for line in lines] for lines in (patched, edited))
     lines = list(difflib.unified_diff(*texts, lineterm="", n=0))[2:]
-    return (f"{name}: {where}: you have edited what the patch wrote; nothing was touched. Undo that edit "
-            "(- the patch's, + yours), then revert:\n" + "\n".join("  " + line for line in lines))
+    return (f"{name}: {reason}; nothing was touched. Undo that edit (- the patch's, + yours), then revert:\n"
+            + "\n".join("  " + line for line in lines))

@@ -39,6 +39,16 @@ def unsigned_bytes(tree: cst.Module, found: Found) -> cst.Module:
     return each_node(tree, m.Arg(keyword=m.Name("dtype"), value=named("np.byte", "numpy.byte")), change)
 
 
+def builtin_types(tree: cst.Module, found: Found) -> cst.Module:
+    """`np.int` becomes `int`."""
+    def change(_, name: cst.Attribute) -> cst.Name:
+        found.pending += 1
+        return name.attr
+
+    old = m.OneOf(*map(m.Name, ("int", "float", "bool", "object")))
+    return each_node(tree, m.Attribute(value=named("np", "numpy"), attr=old), change)
+
+
 def optional_import(tree: cst.Module, found: Found, names: Tuple[str, ...]) -> cst.Module:
     """`import wandb` at the top of a module becomes `wandb = optional_import("wandb")`."""
     def change(line: cst.SimpleStatementLine) -> List[cst.SimpleStatementLine]:
@@ -129,6 +139,8 @@ OPTIONS = {
                  ("def lpips",), partial(decorated, function="lpips", decorator="nan_without_network")),
         Optional("blender-images", "new Pillow releases take no signed bytes for a picture",
                  ("np.byte", "numpy.byte"), unsigned_bytes),
+        Optional("numpy-types", "NumPy 1.24 and later have no np.int, np.float, np.bool and np.object",
+                 ("np.", "numpy."), builtin_types),
         Optional("eigh-in-parts",
                  "cuSOLVER of CUDA 12.8 and later fails on the many covariances that c3dgs gives it at once",
                  ("linalg.eigh", "eigh_in_parts"), partial(call_of_ours, foreign="torch.linalg.eigh",

@@ -1,11 +1,10 @@
-"""PATH/.dsmoe_patch: the originals, byte for byte, and what they became. Complete before the first file is patched.
+"""PATH/.dsmoe_patch: the files as they were, and what they became. It is complete before the first file is patched.
 
     .dsmoe_patch/originals/NAME    the file as it was
     .dsmoe_patch/patched/NAME      the file as it became, by which `revert` tells the user's edits from the patch
-    .dsmoe_patch/manifest.json     {"files": {name: {"before": sha256, "after": [sha256]}}, "complete": ..., ...}
+    .dsmoe_patch/manifest.json     {"format", "version", "trainer", "options", "files": {NAME: {"before": sha256}}}
 
-A file is the original, patched, or changed by someone else: its checksum says which, whatever moment an interruption
-came at. "complete" says that the last file was written: else it was an interruption, not the user, that left originals.
+It is made beside and then renamed, so that it is there as a whole or not at all.
 """
 from __future__ import annotations
 
@@ -21,38 +20,37 @@ from typing import Any, Dict, Iterable, Mapping, Optional
 from .errors import PatchError
 
 FOLDER = ".dsmoe_patch"
+UNFINISHED = ".dsmoe_patch.unfinished"  # a record that is being made or removed
 FORMAT = 1
 PACKAGE = b"diff_smoe_rasterization"  # what a patched file imports from
-
-
-def sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
 
 
 class Record:
     """The record of a checkout that was patched."""
 
-    def __init__(self, root: Path, manifest: Mapping[str, Any]) -> None:
+    def __init__(self, root: Path) -> None:
+        """Raises OSError, ValueError, KeyError or TypeError where it cannot be read."""
         self.root, self.folder = root, root / FOLDER
-        self.manifest, self.files = manifest, manifest["files"]
+        self.manifest = json.loads((self.folder / "manifest.json").read_text(encoding="utf-8"))
+        if self.manifest["format"] != FORMAT:
+            raise ValueError(f"its format is {self.manifest['format']!r}, not {FORMAT}")
+        self.options = tuple(self.manifest["options"])
+        self.before: Dict[str, bytes] = {}
+        self.after: Dict[str, bytes] = {}  # without files whose copy is gone
+        for name, hashes in self.manifest["files"].items():
+            self.before[name] = (self.folder / "originals" / name).read_bytes()
+            if hashlib.sha256(self.before[name]).hexdigest() != hashes["before"]:
+                raise ValueError(f"the original of {name} is not what was recorded")
+            if (self.folder / "patched" / name).is_file():
+                self.after[name] = (self.folder / "patched" / name).read_bytes()
 
     @classmethod
     def load(cls, root: Path) -> Optional[Record]:
         """Returns the record, or None where the checkout has none. Raises PatchError where it cannot be read."""
-        try:
-            text = (root / FOLDER / "manifest.json").read_text(encoding="utf-8")
-        except FileNotFoundError:
+        if not (root / FOLDER).exists():
             return None
-        except OSError as error:
-            raise PatchError(f"{FOLDER}/manifest.json: the record of the patch cannot be read: {error}") from None
         try:
-            record = cls(root, json.loads(text))
-            if record.manifest["format"] != FORMAT:
-                raise ValueError(f"its format is {record.manifest['format']!r}, not {FORMAT}")
-            for name, hashes in record.files.items():
-                if sha256(record.original(name)) != hashes["before"]:
-                    raise ValueError(f"the original of {name} is not what was recorded")
-            return record
+            return cls(root)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise PatchError(f"{FOLDER}/manifest.json: the record of the patch is damaged ({error}); put the files "
                              f"back from your version control, then delete {FOLDER}") from None
@@ -61,71 +59,49 @@ class Record:
     def in_force(cls, root: Path) -> Optional[Record]:
         """Returns the record, or None where the checkout has none or none of its files is patched any more."""
         record = cls.load(root)
-        states = set(record.states().values()) if record else set()
-        is_interrupted = states == {"original"} and not record.manifest["complete"]
-        return record if is_interrupted or states & {"patched", "changed"} else None
+        return record if record and {"patched", "changed"} & set(record.states().values()) else None
 
-    @classmethod
-    def begin(cls, root: Path, before: Mapping[str, bytes], after: Mapping[str, bytes], notes: Mapping) -> Record:
+    @staticmethod
+    def make(root: Path, before: Mapping[str, bytes], after: Mapping[str, bytes], notes: Mapping[str, Any]) -> None:
         """Writes the record of a patch that is about to be made, while every file is the original."""
-        for name, data in before.items():
-            for folder, content in (("originals", data), ("patched", after[name])):
-                copy = root / FOLDER / folder / name
+        shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+        for folder, files in (("originals", before), ("patched", after)):
+            for name, data in files.items():
+                copy = root / UNFINISHED / folder / name
                 copy.parent.mkdir(parents=True, exist_ok=True)
-                replace_file(root, copy, content)
-        replace_file(root, root / FOLDER / ".gitignore", b"*\n")
-        files = {name: {"before": sha256(data), "after": [sha256(after[name])]} for name, data in before.items()}
-        record = cls(root, {"format": FORMAT, **notes, "files": files})
-        record.note_complete(False)
-        return record
-
-    def note_complete(self, complete: bool) -> None:
-        """Notes whether every file was written."""
-        self.manifest = {**self.manifest, "complete": complete}
-        replace_file(self.root, self.folder / "manifest.json", (json.dumps(self.manifest, indent=1) + "\n").encode())
-
-    def original(self, name: str) -> bytes:
-        return (self.folder / "originals" / name).read_bytes()
-
-    def patched(self, name: str) -> Optional[bytes]:
-        """The file as it became; None where the copy is of a patch that was interrupted."""
-        path = self.folder / "patched" / name
-        data = path.read_bytes() if path.is_file() else b""
-        return data if sha256(data) == self.files[name]["after"][-1] else None
+                copy.write_bytes(data)
+        (root / UNFINISHED / ".gitignore").write_text("*\n")
+        files = {name: {"before": hashlib.sha256(data).hexdigest()} for name, data in before.items()}
+        text = json.dumps({"format": FORMAT, **notes, "files": files}, indent=1)
+        (root / UNFINISHED / "manifest.json").write_text(text + "\n", encoding="utf-8")
+        os.replace(root / UNFINISHED, root / FOLDER)
 
     def states(self) -> Dict[str, str]:
         """Returns of each file whether it is "original", "patched", or "changed", "replaced" or "gone" since."""
-        return {name: self._state(name, hashes) for name, hashes in self.files.items()}
+        return {name: self._state(name) for name in self.before}
 
-    def _state(self, name: str, hashes: Mapping) -> str:
+    def _state(self, name: str) -> str:
         if not (self.root / name).is_file():
             return "gone"
-        data = (self.root / name).read_bytes()
-        now = sha256(data)
-        if now == hashes["before"]:
-            return "original"
-        if now in hashes["after"]:
-            return "patched"
+        now, after = (self.root / name).read_bytes(), self.after.get(name, b"")
+        if now in (self.before[name], after):
+            return "original" if now == self.before[name] else "patched"
         # One that imported this package and no longer does was replaced, as by git checkout.
-        return "replaced" if PACKAGE in (self.patched(name) or b"") and PACKAGE not in data else "changed"
-
-    def can_be_finished(self) -> bool:
-        """Whether it is of a patch that was interrupted, and nobody has changed a file since."""
-        return not self.manifest["complete"] and set(self.states().values()) <= {"patched", "original"}
-
-    def take_back(self) -> None:
-        """Puts the originals of all files that are patched back; an interruption leaves what can be finished."""
-        self.note_complete(False)
-        put_back(self.root, {name: self.original(name) for name in self.files})
-
-    def remove(self) -> None:
-        """Removes the record; the manifest first, without which the rest means nothing."""
-        (self.folder / "manifest.json").unlink()
-        shutil.rmtree(self.folder)
+        return "replaced" if PACKAGE in after and PACKAGE not in now else "changed"
 
 
-def put_back(root: Path, files: Mapping[str, bytes]) -> None:
-    """Writes those files that are not these bytes."""
+def remove(root: Path) -> bool:
+    """Removes the record, and what an interruption left of one; returns whether there was something."""
+    was_there = (root / FOLDER).exists() or (root / UNFINISHED).exists()
+    shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+    if (root / FOLDER).exists():
+        os.replace(root / FOLDER, root / UNFINISHED)
+        shutil.rmtree(root / UNFINISHED)
+    return was_there
+
+
+def write_files(root: Path, files: Mapping[str, bytes]) -> None:
+    """Writes those files that are not these bytes, each at once or not at all, while there is a record."""
     for name, data in files.items():
         if (root / name).read_bytes() != data:
             replace_file(root, root / name, data)
@@ -144,37 +120,12 @@ def check_writable(root: Path, names: Iterable[str]) -> None:
 
 
 def replace_file(root: Path, path: Path, data: bytes) -> None:
-    """Writes a file at once or not at all. One that was there keeps mode and owner; a link's target is written.
-
-    What an interruption leaves of it lies in the record's folder, and goes with it.
-    """
+    """Writes a file, which keeps mode and owner; a link's target is written."""
     target = path.resolve()
     handle, temporary = tempfile.mkstemp(dir=str(root / FOLDER), prefix="unfinished_")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        if target.exists():
-            shutil.copymode(str(target), temporary)
-            if os.geteuid() == 0:  # in a container root patches a user's checkout
-                shutil.chown(temporary, target.stat().st_uid, target.stat().st_gid)
-        else:
-            os.chmod(temporary, 0o644)
-        os.replace(temporary, str(target))
-    except BaseException:
-        os.unlink(temporary)
-        raise
-
-
-def remove_rest(root: Path) -> bool:
-    """Removes what is left of a patch that was interrupted before it changed a file; returns whether there was such."""
-    folder = root / FOLDER
-    for copy in (folder / "originals").rglob("*"):
-        file = root / copy.relative_to(folder / "originals")
-        if copy.is_file() and not (file.is_file() and file.read_bytes() == copy.read_bytes()):
-            return False
-    if folder.is_dir():
-        shutil.rmtree(folder)
-        return True
-    return False
+    with os.fdopen(handle, "wb") as file:
+        file.write(data)
+    shutil.copymode(str(target), temporary)
+    if os.geteuid() == 0:  # in a container root patches a user's checkout
+        shutil.chown(temporary, target.stat().st_uid, target.stat().st_gid)
+    os.replace(temporary, str(target))

@@ -1,56 +1,57 @@
 """`dsmoe run`: a command of an unmodified trainer, with this package's rasterizer in front of its own.
 
-PYTHONPATH names a folder of shims/, in which `diff_gaussian_rasterization` is the module of integrations whose API the
-trainer calls. DSMOE_BLEND_MODE is the mode, and in `smoe` DSMOE_BACKGROUND_GATE the background's gate. Whatever the
-command starts has them. dsmoe becomes the command (exec), so that its exit status and signals are the command's own.
+PYTHONPATH names shims/, in which `diff_gaussian_rasterization` is the module of integrations whose API the trainer
+calls. DSMOE_BLEND_MODE is the mode, and in `smoe` DSMOE_BACKGROUND_GATE the background's gate. Whatever the command
+starts has them. Exit status and signals are the command's own, unless nothing was rendered: that is an error.
 """
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
 
+from diff_smoe_rasterization.integrations.contracts import CONTRACTS
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
 
 from . import facts
-from .engine import read_file
 from .errors import PatchError
 from .record import Record
-from .trainers import RASTERIZER, TRAINERS, names
+from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE
+from .trainers import GR, RASTERIZER, TRAINERS, names
 
-SHIMS = Path(__file__).resolve().parent / "shims"
-STAND_INS = {"simple_knn": "simple_knn._C", "fused_ssim": "fused_ssim", "torch_scatter": "torch_scatter",
-             "weighted_distance": "weighted_distance._C"}
-PROBE = """
-import importlib, importlib.util, json, sys
-def usable(module):
-    if importlib.util.find_spec(module.partition(".")[0]) is None:
-        return False
-    try:
-        import torch
-        importlib.import_module(module)
-        return True
-    except Exception:
-        return False
-print(json.dumps({"version": sys.version.split()[0], "ours": importlib.util.find_spec(sys.argv[1]) is not None,
-                  "usable": [name for name in sys.argv[2:] if usable(name)]}))
-"""
+FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
+FORWARDED = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
         background_gate: Optional[float] = None) -> NoReturn:
-    """Becomes the command. Raises PatchError where it would not run with this rasterizer."""
+    """Runs the command, and ends as it ends. Raises PatchError where it would not run, or did not, with this
+    rasterizer."""
     environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
     for line in lines:
         print("dsmoe run: " + line, file=sys.stderr)
     sys.stdout.flush()
     sys.stderr.flush()
-    os.execvpe(words[0], list(words), environment)
+    with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
+        used = Path(folder, "used")
+        child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)})
+        for number in FORWARDED:
+            signal.signal(number, lambda number, _: child.send_signal(number))
+        signal.signal(signal.SIGINT, lambda *_: None)  # a terminal sends it to the command too
+        status, is_used = child.wait(), used.exists()
+    if status == 0 and not is_used:
+        raise PatchError("the command ended without an error, but this package's rasterizer rendered nothing: what was "
+                         f"trained or rendered was not {blend_mode}. A command that renders nothing needs no dsmoe run")
+    if status < 0:
+        signal.signal(-status, signal.SIG_DFL)
+        os.kill(os.getpid(), -status)
+    sys.exit(status)
 
 
 def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
@@ -66,50 +67,49 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         is_script = words[0].endswith(".py") and Path(words[0]).is_file()
         raise PatchError(f"{words[0]}: " + (f"is not executable; type: python {words[0]}" if is_script else
                                             "there is no such command"))
-    flavour, found = _flavour(words, trainer)
-    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, BACKGROUND_GATE_VARIABLE: str(gate)}
+    flavour, found, warnings = _flavour(words, trainer)
+    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, BACKGROUND_GATE_VARIABLE: str(gate),
+                   RASTERIZER_VARIABLE: flavour}
     if gate is None:
         del environment[BACKGROUND_GATE_VARIABLE]
     if "PYTHONPYCACHEPREFIX" not in environment:
         environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
-    usable, lines = _ask_python(words, environment)
-    absent = [name for name, module in STAND_INS.items() if module not in usable]
-    folders = [str(SHIMS / name) for name in [flavour, *absent]]
-    environment["PYTHONPATH"] = os.pathsep.join(folders + list(filter(None, [environment.get("PYTHONPATH")])))
+    environment["PYTHONPATH"] = os.pathsep.join([str(SHIMS), *filter(None, [environment.get("PYTHONPATH")])])
+    _check_python(words, environment)
     said_gate = f", background gate {gate}" if gate is not None else ""
     return environment, [f"{found}: {RASTERIZER} will be {flavour} of this package, blend mode {blend_mode}{said_gate};"
-                         " each process that imports it says so", *lines]
+                         " each process that imports it says so", *(f"warning: {warning}" for warning in warnings)]
 
 
-def flavours() -> Tuple[str, ...]:
-    """The rasterizers whose API there is a shim for."""
-    return tuple(sorted(folder.name for folder in SHIMS.iterdir() if (folder / RASTERIZER).is_dir()))
-
-
-def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str]:
-    """Returns the flavour, and for which trainer it was chosen."""
-    by_name = {**{name: name for name in flavours()}, **{known.name: known.flavour for known in TRAINERS}}
+def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, List[str]]:
+    """Returns the flavour, for which trainer it was chosen, and what speaks against it."""
+    by_name = {**{name: name for name in FLAVOURS}, **{known.name: known.flavour for known in TRAINERS}}
     if trainer is not None and trainer not in by_name:
         raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(names())}, or for "
-                         f"another trainer the rasterizer whose API it calls: {', '.join(flavours())}")
+                         f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
     reasons = []
     folders = _folders(words)
     for folder in folders:
-        found = facts.of_checkout(lambda name, folder=folder: read_file(folder / name))
-        if facts.PATCHED in found or Record.in_force(folder):
-            raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
-                             "without (render.py, which reads it from cfg_args)")
         for path in (folder / RASTERIZER, folder / f"{RASTERIZER}.py"):
             if folder == folders[0] and path.exists():  # where Python looks first
                 raise PatchError(f"{path} would be imported before this package's; move it away")
+        found = facts.of_files(_files(folder, everywhere=folder == folders[0]))
+        if facts.PATCHED in found or Record.in_force(folder):
+            raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
+                             "without (render.py, which reads it from cfg_args)")
         known, reason = facts.recognise(found)
         if known and trainer is None:
-            return known.flavour, f"{known.name} in {folder}"
-        reasons.append(f"{folder}: {reason}")
+            return known.flavour, f"{known.name if (folder / GR).is_file() else 'the trainer'} in {folder}", []
+        is_other = facts.uses_another_rasterizer(found)
+        if trainer is not None and (is_other or found and not any(fact.startswith("keeps ") for fact in found)):
+            raise PatchError(f"{folder}: {reason}; --trainer {trainer} cannot help")
+        if found and not (known and known.flavour == by_name[trainer]):
+            reasons.append(f"{folder}: " + (reason or f"by what it imports and calls this is {known.flavour}"))
     if trainer is not None:
-        return by_name[trainer], trainer
+        return by_name[trainer], trainer, reasons or [f"no file that imports {RASTERIZER} was found"][bool(reasons):]
     raise PatchError("no trainer that is known was found; name it with --trainer, or the rasterizer whose API it calls "
-                     f"({', '.join(flavours())}):\n  " + "\n  ".join(reasons))
+                     f"({', '.join(FLAVOURS)}):\n  " + "\n  ".join(
+                         reasons or [f"there is no {GR} in {', '.join(map(str, folders))}"]))
 
 
 def _folders(words: Sequence[str]) -> List[Path]:
@@ -119,27 +119,24 @@ def _folders(words: Sequence[str]) -> List[Path]:
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
-def _ask_python(words: Sequence[str], environment: Dict[str, str]) -> Tuple[List[str], List[str]]:
-    """Returns which of STAND_INS the command's Python has itself, and a warning where it may not have this package.
+def _files(folder: Path, everywhere: bool) -> Dict[str, bytes]:
+    """Returns the files by which a trainer is recognised: those of 3DGS, else, if so asked, all that rasterize."""
+    if (folder / GR).is_file():
+        return {name: (folder / name).read_bytes() for name in facts.LOOKED_AT if (folder / name).is_file()}
+    found = {}
+    for pattern in ("*.py", "*/*.py", "*/*/*.py") if everywhere else ():
+        for path in folder.glob(pattern):
+            if not {"submodules", "site-packages"} & set(path.parts) and path.is_file():
+                data = path.read_bytes()
+                if re.search(rb"^\s*(from|import) diff_(gauss|surfel)", data, re.MULTILINE):
+                    found[str(path)] = data
+    return found
 
-    Raises PatchError where it has not.
-    """
-    is_python = re.fullmatch(r"python[0-9.]*t?", os.path.basename(words[0])) is not None
-    python = words[0] if is_python else next((name for name in ("python", "python3")
-                                              if shutil.which(name, path=environment.get("PATH"))), None)
-    if python is None:
-        return list(STAND_INS.values()), []
-    asked = subprocess.run([python, "-c", PROBE, "diff_smoe_rasterization", *STAND_INS.values()], env=environment,
-                           stdout=subprocess.PIPE, stderr=subprocess.PIPE, universal_newlines=True)
-    try:
-        answer = json.loads(asked.stdout.splitlines()[-1])
-    except (ValueError, IndexError):
-        said = asked.stderr.strip() or "it printed nothing"
-        raise PatchError(f"{python} cannot be asked what it can import: {said}") from None
-    if answer["ours"]:
-        return answer["usable"], []
-    message = (f"{python} (Python {answer['version']}) cannot import diff_smoe_rasterization; install it there: "
-               f"{python} -m pip install PATH_OF_THIS_PROJECT")
-    if is_python:
-        raise PatchError(message)
-    return answer["usable"], [message + f", unless {words[0]} starts another Python"]
+
+def _check_python(words: Sequence[str], environment: Dict[str, str]) -> None:
+    """Raises PatchError where the command is a Python that has not this package."""
+    if re.fullmatch(r"python[0-9.]*t?", os.path.basename(words[0])):
+        code = "import importlib.util, sys; sys.exit(importlib.util.find_spec('diff_smoe_rasterization') is None)"
+        if subprocess.call([words[0], "-c", code], env=environment) != 0:
+            raise PatchError(f"{words[0]} cannot import diff_smoe_rasterization; install it there: {words[0]} -m pip "
+                             "install PATH_OF_THIS_PROJECT")

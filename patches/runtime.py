@@ -17,6 +17,10 @@ from diff_smoe_rasterization.settings import (
     training_background_gate,
 )
 
+SHIMS = Path(__file__).resolve().parent / "shims"
+RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
+USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
+
 
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode: $DSMOE_BLEND_MODE, else "alpha"; and of --background_gate: "".
@@ -26,6 +30,18 @@ def default_blend() -> Tuple[str, str]:
     Raises ValueError where DSMOE_BLEND_MODE names no mode.
     """
     return resolve_blend_mode(None), ""
+
+
+def saved_blend_of(dataset: Any) -> Dict[str, Any]:
+    """Returns what `blend_of` does, for a function that renders a trained model.
+
+    What is not typed as an option is what the model's cfg_args records, whatever default `dataset` brought.
+    """
+    saved = _saved(dataset)
+    for option in ("blend_mode", "background_gate"):
+        if getattr(dataset, "model_path", "") and not _is_typed(option):
+            setattr(dataset, option, saved.get(option))
+    return blend_of(dataset)
 
 
 def blend_of(dataset: Any) -> Dict[str, Any]:
@@ -40,8 +56,7 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
     _check_renderer()
     given = getattr(dataset, "blend_mode", None)
     mode = given or "alpha"
-    cfg_args = Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
-    saved = _saved(cfg_args) if getattr(dataset, "model_path", "") else {}
+    cfg_args, saved = Path(getattr(dataset, "model_path", "") or ".", "cfg_args"), _saved(dataset)
     whence = _whence("blend_mode", mode, functools.partial(resolve_blend_mode, None), saved.get("blend_mode"), cfg_args)
     if mode not in BLEND_MODES:
         raise ValueError(f"the blend mode is {mode!r}, {whence}; it must be one of {', '.join(BLEND_MODES)}")
@@ -85,9 +100,10 @@ def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any,
     """
     name, flag, variable = option.replace("_", " "), "--" + option, "DSMOE_" + option.upper()
     there = {variable: of_variable() if os.environ.get(variable) else None, str(cfg_args): saved}
-    is_flag = any(word.startswith(flag[:4]) and flag.startswith(word.partition("=")[0]) for word in sys.argv)
     agreeing = [source for source, other in there.items() if other == value]
-    whence = f"as {flag} says" if is_flag else f"as in {' and '.join(agreeing)}" if agreeing else "the default"
+    whence = f"as in {' and '.join(agreeing)}" if agreeing else "the default"
+    if _is_typed(option):
+        whence = f"as {flag} says"
     # Rendering without the flag never comes here: it has the value of cfg_args.
     if saved not in (None, value):
         _warn(f"{cfg_args} is of a run with {name} {saved}, but this one has {value}, {whence}; a training overwrites "
@@ -97,16 +113,51 @@ def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any,
     return whence
 
 
-def say_rasterizer(flavour: str) -> None:
-    """Says on stderr that `dsmoe run` has its effect: this process has imported this package's rasterizer."""
+def rasterizer_of_run() -> Dict[str, Any]:
+    """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
+
+    The first rasterizer that is made is noted for `dsmoe run`, which else says at the end that there was none.
+    """
+    from diff_smoe_rasterization import GaussianRasterizer
+
+    flavour, used = os.environ[RASTERIZER_VARIABLE], os.environ.get(USED_VARIABLE, "")
+    module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
+    original = GaussianRasterizer.__init__
+
+    def noted(self: Any, *arguments: Any, **keywords: Any) -> None:
+        GaussianRasterizer.__init__ = original
+        if os.path.isdir(os.path.dirname(used)):
+            Path(used).touch()
+        original(self, *arguments, **keywords)
+
+    GaussianRasterizer.__init__ = noted
     mode = resolve_blend_mode(None)
     gate = f", background gate {resolve_background_gate(mode, None)}" if mode == "smoe" else ""
     _say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
+    return {name: getattr(module, name) for name in module.__all__}
 
 
-def say_stand_in(name: str) -> None:
-    """Says on stderr that this process has imported what this package has in place of a package that is missing."""
-    _say(f"{name} could not be imported: this package's own takes its place")
+def is_installed(module: str) -> bool:
+    """Whether a package can be imported from elsewhere; then it takes the place of the stand-in in shims/ that asks.
+
+    module: of the package, one that may fail to load. Where it cannot be had, that is said on stderr.
+    """
+    import torch  # noqa: F401  (its libraries are the extensions')
+
+    name, path = module.partition(".")[0], sys.path[:]
+    ours = sys.modules.pop(name)
+    sys.path[:] = [folder for folder in path if Path(folder).resolve() != SHIMS]
+    try:
+        importlib.import_module(module)
+        return True
+    except Exception:  # an extension that was built for another torch fails in many ways
+        for loaded in [loaded for loaded in sys.modules if (loaded + ".").startswith(name + ".")]:
+            del sys.modules[loaded]
+        sys.modules[name] = ours
+        _say(f"{name} could not be imported: this package's own takes its place")
+        return False
+    finally:
+        sys.path[:] = path
 
 
 def optional_import(name: str) -> Any:
@@ -150,90 +201,64 @@ def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-# Of the largest value. A variance E[x^2] - E[x]^2 of the first pair below is 4e-3 of E[x^2]: what float32 rounds off,
-# some 1e-7, becomes some 1e-5 to 1e-4 of it; another window, border or constant makes several per cent.
+# Of the largest value. Of a variance E[x^2] - E[x]^2 float32 rounds off some 1e-7 of E[x^2], which may be 1e-4 of the
+# variance; another window, border or constant makes several per cent.
 SSIM_ROUNDING = 1e-3
 
 
 def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a trainer's ssim(img1, img2, window_size=11, size_average=True), by `fused_ssim` where that can be.
+    """Returns a trainer's ssim(img1, img2, ...), by `fused_ssim` where that can be.
 
-    img1, img2: [3, H, W] or [B, 3, H, W]. When images of a shape come first, both are computed of pairs of that shape:
-    where they differ in value or gradient the trainer's own stays, and a line on stderr says so. It is also called for
-    other windows and types, means of each image, under autocast, and for gradients by img2: the kernel has none of it.
+    img1, img2: [3, H, W] or [B, 3, H, W]. Of the first images of a shape both are computed: where they differ in value
+    or gradient the trainer's own stays, and a line on stderr says so. It is also called for other arguments and types,
+    and for gradients by img2: the kernel has none of it.
     """
-    @functools.lru_cache(maxsize=None)
-    def is_the_same(device: Any, shape: Any) -> bool:
-        found = difference_of_ssim(ssim, device, shape)
-        if found:
-            _say(f"--fuse: {ssim.__module__}.{ssim.__name__} is not SSIM as it is fused here ({found}): it is computed "
-                 "as before")
-        return not found
+    differences: Dict[Any, str] = {}
 
     @functools.wraps(ssim)
-    def call(*arguments: Any, **keywords: Any) -> Any:
-        if not can_be_fused(*arguments, **keywords) or not is_the_same(arguments[0].device, arguments[0].shape):
-            return ssim(*arguments, **keywords)
+    def call(*images: Any, **keywords: Any) -> Any:
         from diff_smoe_rasterization import fused_ssim
 
-        return fused_ssim(*arguments[:2])
+        if keywords or len(images) != 2 or not can_be_fused(*images):
+            return ssim(*images, **keywords)
+        case = images[0].device, images[0].shape
+        if case not in differences:
+            differences[case] = difference_of(fused_ssim, ssim, *images)
+            if differences[case]:
+                _say(f"--fuse: {ssim.__module__}.{ssim.__name__} is not SSIM as it is fused here "
+                     f"({differences[case]}): it is computed as before")
+        return ssim(*images) if differences[case] else fused_ssim(*images)
 
     return call
 
 
-def can_be_fused(*arguments: Any, **keywords: Any) -> bool:
-    """Whether `fused_ssim` has what is asked for by these arguments of a trainer's ssim."""
+def can_be_fused(img1: Any, img2: Any) -> bool:
+    """Whether `fused_ssim` has what is asked for of these images."""
     import torch
 
-    as_fused = {"window_size": 11, "size_average": True}
-    if not 2 <= len(arguments) <= 4 or not set(keywords) <= set(as_fused):
-        return False
-    img1, img2, *rest = arguments
-    asked = {**as_fused, **dict(zip(as_fused, rest)), **keywords}
-    return (all(type(asked[name]) is type(value) and asked[name] == value for name, value in as_fused.items())
-            and isinstance(img1, torch.Tensor) and isinstance(img2, torch.Tensor) and img1.dim() in (3, 4)
-            and img1.shape == img2.shape and img1.dtype == img2.dtype == torch.float32 and img1.device == img2.device
-            and not is_autocast(img1.device.type) and not (img2.requires_grad and torch.is_grad_enabled()))
+    return (img1.dim() in (3, 4) and img1.shape == img2.shape and img1.dtype == img2.dtype == torch.float32
+            and img1.device == img2.device and not (img2.requires_grad and torch.is_grad_enabled()))
 
 
-def is_autocast(device_type: str) -> bool:
-    """Whether autocast is on for a type of device."""
+def difference_of(fused: Callable[..., Any], own: Callable[..., Any], img1: Any, img2: Any) -> str:
+    """What two similarities of images differ in, their gradients by img1 too; empty where in nothing."""
     import torch
 
-    try:
-        return torch.is_autocast_enabled(device_type)
-    except TypeError:  # torch before 2.4
-        return torch.is_autocast_cpu_enabled() if device_type == "cpu" else torch.is_autocast_enabled()
+    def value_and_gradient(similarity: Callable[..., Any]) -> Any:
+        image = img1.detach().clone().requires_grad_()
+        value = similarity(image, img2.detach().clone())
+        return (value.detach(), *torch.autograd.grad(value, image))
 
-
-def difference_of_ssim(ssim: Callable[..., Any], device: Any, shape: Any) -> str:
-    """What a trainer's ssim and `fused_ssim` differ in on two pairs of images of a shape; empty where in nothing.
-
-    One pair has little contrast, so that SSIM's constants count. The other leaves [0, 1], and its SSIM is negative.
-    """
-    import torch
-
-    from diff_smoe_rasterization import fused_ssim
-
-    def value_and_gradient(similarity: Callable[..., Any], one: Any, other: Any) -> Any:
-        img1 = one.clone().requires_grad_()
-        value = similarity(img1, other)
-        return (value.detach(), *torch.autograd.grad(value, img1))
-
-    generator = torch.Generator().manual_seed(0)
     with torch.inference_mode(False), torch.enable_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
-        noise = [torch.rand(tuple(shape), generator=generator).to(device) for _ in range(2)]
-        for pair in ((0.4 + 0.1 * noise[0], 0.5 + 0.1 * noise[1]),
-                     (1.4 * (1 - noise[0]) - 0.2 + 0.05 * noise[1], noise[0])):
-            try:
-                for ours, theirs in zip(value_and_gradient(fused_ssim, *pair), value_and_gradient(ssim, *pair)):
-                    if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
-                        return f"it gives {theirs.dtype} {list(theirs.shape)}, not {ours.dtype} {list(ours.shape)}"
-                    differs, largest = float((ours - theirs).abs().max()), float(ours.abs().max())
-                    if not differs <= SSIM_ROUNDING * largest:  # NaN is no such number
-                        return f"they differ by {differs:.1e} where the largest value is {largest:.1e}"
-            except Exception as error:  # whatever another function has against the pair: the training goes on
-                return f"it raises {error!r}"
+        try:
+            for ours, theirs in zip(value_and_gradient(fused), value_and_gradient(own)):
+                if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
+                    return f"it gives {theirs.dtype} {list(theirs.shape)}, not {ours.dtype} {list(ours.shape)}"
+                differs, largest = float((ours - theirs).abs().max()), float(ours.abs().max())
+                if not differs <= SSIM_ROUNDING * largest:  # NaN is no such number
+                    return f"they differ by {differs:.1e} where the largest value is {largest:.1e}"
+        except Exception as error:  # whatever another function has against the images: the training goes on
+            return f"it raises {error!r}"
     return ""
 
 
@@ -297,10 +322,17 @@ def _check_renderer() -> None:
                            f"the patch? type: dsmoe patch check {checkout}")
 
 
-def _saved(cfg_args: Path) -> Dict[str, Any]:
-    """Returns the constants in the text of a Namespace, none where it is no such text. Evaluates nothing."""
+def _is_typed(option: str) -> bool:
+    """Whether an option is on the command line, as argparse takes it: also `--blend smoe`."""
+    flag = "--" + option
+    return any(word.startswith(flag[:4]) and flag.startswith(word.partition("=")[0]) for word in sys.argv)
+
+
+def _saved(dataset: Any) -> Dict[str, Any]:
+    """Returns the constants in a model's cfg_args, a Namespace as text; none where there is none."""
+    folder = getattr(dataset, "model_path", "")
     try:
-        call = ast.parse(cfg_args.read_text(), mode="eval").body
+        call = ast.parse(Path(folder, "cfg_args").read_text(), mode="eval").body if folder else None
     except (OSError, ValueError, SyntaxError):
         return {}
     return {keyword.arg: keyword.value.value for keyword in getattr(call, "keywords", ())

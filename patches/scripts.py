@@ -7,28 +7,23 @@ import re
 from pathlib import Path
 from typing import Dict, Iterator, List, Set
 
-from .source import called_name, python_tree
-from .trainers import GR, INTEGRATIONS, RASTERIZER, Trainer
+from . import facts
+from .source import python_tree
+from .trainers import GR, INTEGRATIONS, RASTERIZER, RUNTIME, Trainer
 
 # Not all folders: outputs hold copies of the code, environments whole packages.
 FOLDERS = ("", "arguments", "compression", "gaussian_renderer", "lpipsPyTorch", "scene", "utils")
-RENDERERS = {"render", "prefilter_voxel", "*"}
 SETTINGS = "GaussianRasterizationSettings"
 # Signs of an environment, of a run's output and of another checkout.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR)
 
 
-def python_files(root: Path) -> Iterator[str]:
-    """Yields the names of the checkout's Python files, relative to it."""
-    for folder in FOLDERS:
-        yield from (path.relative_to(root).as_posix() for path in sorted((root / folder).glob("*.py"))
-                    if path.is_file())
-
-
-def build_files(root: Path) -> Iterator[str]:
-    """Yields the names of the Python files that say how the checkout's submodules are built."""
-    for pattern in ("setup.py", "backend.py"):
-        yield from (path.relative_to(root).as_posix() for path in sorted((root / "submodules").glob("*/" + pattern)))
+def python_files(root: Path, with_submodules: bool = False) -> Iterator[str]:
+    """Yields the names of the files that rules look at: the checkout's, and how its submodules are built."""
+    patterns = [f"{folder}/*.py".lstrip("/") for folder in FOLDERS]
+    patterns += ["submodules/*/setup.py", "submodules/*/backend.py"] if with_submodules else []
+    for pattern in patterns:
+        yield from (path.relative_to(root).as_posix() for path in sorted(root.glob(pattern)) if path.is_file())
 
 
 def other_files(root: Path) -> Dict[str, bytes]:
@@ -45,42 +40,44 @@ def other_files(root: Path) -> Dict[str, bytes]:
     return found
 
 
+def files_beside(root: Path) -> Dict[str, bytes]:
+    """Returns the Python files of a project in which a checkout is bundled, as SuGaR's are, that rasterize too."""
+    found = {}
+    for pattern in () if (root / ".git").exists() else ("*.py", "*/*.py"):
+        for path in root.resolve().parent.glob(pattern):
+            is_other = any((folder / GR).exists() for folder in path.parents)
+            if not is_other and path.is_file() and RASTERIZER.encode() in path.read_bytes():
+                found["../" + path.relative_to(root.resolve().parent).as_posix()] = path.read_bytes()
+    return found
+
+
 def notes(root: Path, files: Dict[str, bytes], trainer: Trainer) -> List[str]:
     """Says which scripts keep the original rasterizer, make settings without a blend mode, or render without one.
 
     files: those that rules look at.
     """
     files = {name: data for name, data in files.items() if not name.startswith("submodules/")}
-    scripts = {**files, **other_files(root)}
-    reached = _reached(scripts, trainer)
+    scripts = {**files, **other_files(root), **files_beside(root)}
+    imported = set().union(*(_imports(data) for data in scripts.values()))
     lines = []
     for name, data in sorted(scripts.items()):
         if not any(word in data for word in (RASTERIZER.encode(), b"gaussian_renderer", SETTINGS.encode())):
             continue
-        nodes = list(ast.walk(python_tree(data)))
-        if any(_imports_original(node, name in files) for node in nodes):
+        found = facts.of_files({name: data})
+        # `from ... import` is a rule's (patch.py) in the files that are looked at.
+        if "keeps the original" in found or "keeps the original by name" in found and name not in files:
             lines.append(f"{name}: imports the original rasterizer, which no rule changes there; this package's is "
                          f"`from {INTEGRATIONS}.{trainer.flavour} import ...`")
-        elif name != GR and any(map(_makes_settings, nodes)):
+        elif name != GR and "blends by default" in found:
             lines.append(f"{name}: makes {SETTINGS} of its own without a blend mode, which no rule gives it: without "
                          f"`blend_mode=...` it is $DSMOE_BLEND_MODE, else alpha")
-        if name not in reached and not re.search(rb"\.blend\s*=[^=]", data) and any(map(_renders, nodes)):
-            lines.append(f"{name}: renders, but no rule reaches it: before it renders it needs the statement "
-                         "`pipe.blend = blend_of(dataset)`, or it stops with an AttributeError")
+        is_reached = (name in {entry.file for entry in trainer.entries} or re.search(rb"\.blend\s*=[^=]", data)
+                      or name[:-len(".py")].replace("/", ".") in imported)
+        if "renders" in found and not is_reached:
+            lines.append(f"{name}: renders, but no rule reaches it: before it renders it needs the statements "
+                         f"`from {RUNTIME} import saved_blend_of` and `pipe.blend = saved_blend_of(dataset)`, or it "
+                         "stops with an AttributeError")
     return lines
-
-
-def _reached(scripts: Dict[str, bytes], trainer: Trainer) -> Set[str]:
-    """A script is reached where a rule works in it, or where one that is reached imports it."""
-    reached = {rule.file for rule in trainer.entries}
-    frontier = list(reached)
-    while frontier:
-        for module in _imports(scripts.get(frontier.pop(), b"")):
-            path = module.replace(".", "/")
-            new = {path + ".py", path + "/__init__.py"} & set(scripts) - reached
-            reached |= new
-            frontier += new
-    return reached
 
 
 def _imports(data: bytes) -> Set[str]:
@@ -92,22 +89,3 @@ def _imports(data: bytes) -> Set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             modules |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
     return modules
-
-
-def _renders(node: ast.AST) -> bool:
-    """Whether it takes what renders from the renderer."""
-    if isinstance(node, ast.ImportFrom):
-        return node.module == "gaussian_renderer" and any(alias.name in RENDERERS for alias in node.names)
-    return isinstance(node, ast.Import) and any(alias.name == "gaussian_renderer" for alias in node.names)
-
-
-def _imports_original(node: ast.AST, is_looked_at: bool) -> bool:
-    """Whether it imports the rasterizer; `from ... import` is a rule's (patch.py) in the files that are looked at."""
-    if isinstance(node, ast.ImportFrom):
-        return not is_looked_at and not node.level and (node.module or "").partition(".")[0] == RASTERIZER
-    return isinstance(node, ast.Import) and any(alias.name.partition(".")[0] == RASTERIZER for alias in node.names)
-
-
-def _makes_settings(node: ast.AST) -> bool:
-    return (isinstance(node, ast.Call) and called_name(node) == SETTINGS
-            and not {"blend_mode", None} & {keyword.arg for keyword in node.keywords})  # None: **settings

@@ -8,7 +8,7 @@ import pytest
 import torch
 from comparison import assert_all_close, assert_close, one_thread, threshold_margin
 from devices import on_the_cpu, random_normal
-from scenes import camera_settings, random_scene
+from scenes import camera_settings, random_scene, with_gates
 
 from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.integrations.gsplat import rasterization
@@ -55,6 +55,18 @@ def reference_renderings(inputs, cameras, outputs=("alpha", "depth")):
             **inputs) for c in cameras]
 
 
+def shares(inputs, cameras):
+    """What `alphas` are: the reference's pictures of Gaussians that are all 1, over black.
+
+    In `smoe_tn`, whose weights do not sum to 1, the background has no share where such a picture is not black.
+    """
+    ones = {name: tensor for name, tensor in inputs.items() if name not in ("shs", "colors_precomp")}
+    ones["colors_precomp"] = torch.ones(len(inputs["means3D"]), 1, dtype=torch.float64)
+    black = [camera._replace(bg=torch.zeros(1, dtype=torch.float64)) for camera in cameras]
+    pictures = channels_last([image.color for image in reference_renderings(ones, black)])
+    return (pictures > 0).to(pictures) if cameras[0].blend_mode == "smoe_tn" else pictures
+
+
 def gaussians_of(inputs):
     """The reference's own table of the inputs."""
     return reference._gather(*(inputs.get(name) for name in (
@@ -85,7 +97,7 @@ def test_a_batch_of_cameras_is_the_references(mode, degree, rasterize_mode):
     expected = reference_renderings(scene.inputs, cameras)
     assert renders.shape == (2, HEIGHT, WIDTH, channels) and alphas.shape == (2, HEIGHT, WIDTH, 1)
     assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
-    assert_close(alphas, channels_last([image.alpha for image in expected]), TOLERANCE, "alphas")
+    assert_close(alphas, shares(scene.inputs, cameras), TOLERANCE, "alphas")
     radii = torch.stack([image.radii for image in expected])
     assert (radii > 0).any() and (radii == 0).any()
     assert meta["radii"].dtype == torch.int32
@@ -101,12 +113,34 @@ def test_render_modes(mode, render_mode, width):
     renders, alphas, _ = rasterization(**arguments_of(scene, cameras), blend_mode=mode, render_mode=render_mode)
     expected = reference_renderings(scene.inputs, cameras)
     assert renders.shape == (2, HEIGHT, WIDTH, width)
-    assert_close(alphas, channels_last([image.alpha for image in expected]), TOLERANCE, "alphas")
+    assert_close(alphas, shares(scene.inputs, cameras), TOLERANCE, "alphas")
     if "RGB" in render_mode:
         assert_close(renders[..., :3], channels_last([image.color for image in expected]), TOLERANCE, "color")
     if "D" in render_mode:
-        depths = [image.depth * (1 if "ED" in render_mode else image.alpha) for image in expected]
-        assert_close(renders[..., -1:], channels_last(depths), TOLERANCE, "depth")
+        depths = channels_last([image.depth for image in expected])
+        assert_close(renders[..., -1:], depths * (1 if "ED" in render_mode else alphas.cpu()), TOLERANCE, "depth")
+
+
+@with_gates
+def test_what_callers_composite_is_the_rendering_over_that_background(mode):
+    """splatfacto renders over black, and adds (1 - alphas) times a background; gradients go the same way."""
+    scene = random_scene(mode, 20, seed=39, channels=3, scale=0.02)
+    cameras = make_cameras(mode, 3)
+    kind = {"blend_mode": cameras[0].blend_mode, "background_gate": cameras[0].background_gate}
+    weights, gradients, images = random_normal((2, HEIGHT, WIDTH, 3), 40), [], []
+    names = ("means", "opacities", "colors", "scales")
+    for composites in (False, True):
+        arguments = arguments_of(scene, cameras)
+        leaves = [arguments[name].detach().clone().requires_grad_() for name in names]
+        arguments.update(zip(names, leaves))
+        backgrounds = arguments.pop("backgrounds")
+        image, alphas, _ = rasterization(**arguments, backgrounds=None if composites else backgrounds, **kind)
+        images.append(image + (1 - alphas) * backgrounds[:, None, None] if composites else image)
+        gradients.append(torch.autograd.grad((images[-1] * weights).sum(), leaves))
+    assert (alphas == 0).any() and (alphas > 0.2).any()
+    assert_close(images[1], images[0], TOLERANCE, "image")
+    for name, one, other in zip(names, *gradients):
+        assert_close(other, one, TOLERANCE, name)
 
 
 def test_depth_is_a_sum_of_weighted_depths(mode):
@@ -120,8 +154,7 @@ def test_depth_is_a_sum_of_weighted_depths(mode):
     assert_close(meta["depths"], in_view[..., 2], TOLERANCE, "depths")
     arguments.update(colors=in_view[..., 2:3], backgrounds=None)
     image, _, _ = rasterization(**arguments, blend_mode=mode)
-    # A colour is divided by the gate sum in the SMoE modes, and not in `alpha`.
-    assert_close(depth, image if mode == "alpha" else image * alphas, TOLERANCE, "depth")
+    assert_close(depth, image, TOLERANCE, "depth")
 
 
 def test_every_camera_may_have_its_colours(mode):
@@ -147,6 +180,7 @@ def test_gradients_are_the_references(mode):
     means2d = meta["means2d"]
     means2d.retain_grad()  # as gsplat's strategies do
     weights, alpha_weights = random_normal(renders.shape, 36), random_normal(alphas.shape, 37)
+    alpha_weights *= mode == "alpha"  # in the other modes, without a gate, alphas are constant
     ((renders * weights).sum() + (alphas * alpha_weights).sum()).backward()
 
     leaves = {name: tensor.detach().cpu().requires_grad_(True) for name, tensor in scene.inputs.items()}

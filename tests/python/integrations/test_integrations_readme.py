@@ -6,19 +6,22 @@ from pathlib import Path
 
 import torch
 
+from diff_smoe_rasterization.integrations.contracts import CONTRACTS
+
 README = Path(__file__).resolve().parents[3] / "integrations" / "README.md"
 
 
 def test_the_examples_run():
     text = README.read_text(encoding="utf-8")
-    preamble, *flavours = re.split(r"^## (\w+)$", text, flags=re.MULTILINE)
+    preamble, *flavours = re.split(r"^## ([\w, ]+)$", text, flags=re.MULTILINE)
     names, sections = flavours[::2], flavours[1::2]
-    assert names == ["inria", "inria_2024", "taming", "c3dgs", "scaffold", "gsplat"]
+    assert names == ["inria", "inria_2024", "depth, depth_alpha", "taming", "c3dgs", "scaffold", "gsplat",
+                     "Which projects"]
     torch.manual_seed(0)
     variables = {}
     example = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
     exec(example.search(preamble).group(1), variables)
-    for name, section in zip(names, sections):
+    for name, section in zip(names[:-1], sections):
         code, = example.findall(section)
         exec(code, variables)
         if name == "gsplat":
@@ -34,8 +37,19 @@ def test_the_examples_run():
             assert ((variables["accum_count"] > 0) <= (variables["radii"] > 0)).all()
         if name == "inria":
             variables["from_inria"] = variables["color"]
+        if name == "depth, depth_alpha":
+            assert (variables["over_white"] >= variables["color"]).all() and variables["depth"].max() > 1
         if name == "c3dgs":
             used = torch.zeros(40, dtype=torch.bool).index_fill(0, variables["sh_indices"], True)
             assert torch.equal(variables["sh_codebook"].grad.flatten(1).any(1), used)
         if name == "inria_2024":
             assert (variables["dc"] != variables["shs"][:, :1]).any() and variables["inverse_depth"].max() > 0.1
+
+
+def test_the_table_is_that_of_the_contracts():
+    rows = {cells[2].strip(" `"): cells for cells in (line.split("|") for line in README.read_text().splitlines())
+            if len(cells) == 5}
+    for contract in CONTRACTS:
+        _, used_by, _, results, _ = rows[contract.name]
+        assert used_by.strip() == contract.used_by
+        assert contract.name == "taming" or results.strip().startswith(", ".join(contract.results))

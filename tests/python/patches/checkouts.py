@@ -114,7 +114,7 @@ def contents(folder, record=True):
     found = {}
     for path in sorted(Path(folder).rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if record or not (name + "/").startswith(RECORD + "/"):
+        if record or not (name + "/").startswith((RECORD + "/", RECORD + ".unfinished/")):
             data = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
             found[name] = stat.S_IMODE(path.lstat().st_mode), data
     return found

@@ -51,31 +51,29 @@ def test_every_form_of_text_comes_back(tmp_path, form):
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("name, old, new, rule, count", [
-    (GR, "debug=pipe.debug", "debug=False", "settings-blend-mode", 0),
-    (GR, "debug=pipe.debug", "debug=other.debug", "settings-blend-mode", 0),
-    (GR, "image_height=camera.height", "camera.height", "settings-blend-mode", 0),
-    (GR, "# slow\n    )\n", "# slow\n    )\n    settings = "
-     "GaussianRasterizationSettings(image_height=1, debug=pipe.debug)\n", "settings-blend-mode", 2),
-    (GR, "\n\ndef render(", "from diff_gaussian_rasterization import rasterize\n\n\ndef render(",
-     "import-rasterizer", 2),
-    (ARGS, "class ModelParams", "class SceneParams", "model-parameter", 0),
-    (ARGS, 'super().__init__(parser, "Loading', 'ParamGroup.__init__(self, parser, "Loading', "model-parameter", 0),
-    ("train.py", "def training(dataset", "def training(scene", "pipe-blend-mode", 0),
-    ("train.py", "def training(", "def training(dataset, pipe):\n    pass\n\n\ndef training(", "pipe-blend-mode", 2),
-    ("render.py", "pipeline : object", "args : object", "pipe-blend-mode", 0)])
-def test_drift_is_refused_by_file_and_rule(tmp_path, name, old, new, rule, count, dsmoe):
+@pytest.mark.parametrize("name, old, new, rule", [
+    (GR, "debug=pipe.debug", "debug=False", "settings-blend-mode: 1 that look alike"),
+    (GR, "debug=pipe.debug", "debug=other.debug", "settings-blend-mode: 1 that look alike"),
+    (GR, "image_height=camera.height", "camera.height", "settings-blend-mode: 1 that look alike"),
+    (GR, "# slow\n    )\n", "# slow\n    )\n    settings = GaussianRasterizationSettings(image_height=1)\n",
+     "settings-blend-mode: 1 that look alike"),
+    (ARGS, "class ModelParams", "class SceneParams", "model-parameter: no match"),
+    (ARGS, 'super().__init__(parser, "Loading', 'ParamGroup.__init__(self, parser, "Loading',
+     "model-parameter: no match"),
+    ("train.py", "def training(dataset", "def training(scene", "pipe-blend-mode: no match"),
+    ("render.py", "pipeline : object", "args : object", "pipe-blend-mode: no match")])
+def test_drift_is_refused_by_file_and_rule(tmp_path, name, old, new, rule, dsmoe):
     assert CHECKOUT[name].count(old) == 1
     make(tmp_path, {name: CHECKOUT[name].replace(old, new)})
-    refused(tmp_path, f"{name}: rule {rule}: {count} matches instead of 1")
+    refused(tmp_path, f"{name}: rule {rule}")
     said = dsmoe("patch", "check", tmp_path)
     assert said.status == 1 and ": drifted (3dgs-2023)" in said.out and f"{name}: rule {rule}" in said.err
 
 
 def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
     refused(make(tmp_path / "missing", {"render.py": None}), "render.py: rule pipe-blend-mode: there is no such file")
-    refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py: is not Python", "line 11")
-    refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", f"{GR} imports")
+    refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py: is not Python", "11:1")
+    refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", "nothing imports Gaussian")
     refused(make(tmp_path / "checkout"), "no trainer 'x'", *patches.TRAINERS, trainer="x")
     refused(tmp_path / "checkout", "hac", trainer="hac")
     refused(tmp_path / "checkout/arguments", f"there is no {GR} in", f"such as {tmp_path / 'checkout'}")
@@ -127,8 +125,8 @@ def killed_at(step, action):
 
 
 @pytest.mark.parametrize("begin, action, interruptions", [
-    (lambda path: None, patches.apply, 15), (patches.apply, patches.revert, 5),
-    pytest.param(patches.apply, lambda path: patches.apply(path, modernise=True), 20, marks=pytest.mark.slow)])
+    (lambda path: None, patches.apply, 5), (patches.apply, patches.revert, 5),
+    pytest.param(patches.apply, lambda path: patches.apply(path, modernise=True), 10, marks=pytest.mark.slow)])
 def test_a_kill_leaves_what_can_be_finished_or_put_back(tmp_path, begin, action, interruptions):
     before = contents(make(tmp_path / "fresh"))
     whole = {True: None, False: None}
@@ -147,19 +145,19 @@ def test_a_kill_leaves_what_can_be_finished_or_put_back(tmp_path, begin, action,
         patches.apply(finished)
         assert contents(finished, record=False) in whole.values()
         for path in (finished, torn):
-            if (path / RECORD).exists():
+            if contents(path) != before:
                 patches.revert(path)
             assert contents(path) == before
 
 
-@pytest.mark.parametrize("failing", ["train.py", ".dsmoe_patch/originals/train.py"])
+@pytest.mark.parametrize("failing", ["train.py", RECORD])
 def test_a_full_disk_changes_nothing(tmp_path, monkeypatch, failing):
     make(tmp_path)
     replace, calls = os.replace, []
 
     def full(source, target):
         calls.append(target)
-        if target == str(tmp_path / failing) and calls.count(target) == 1:
+        if str(target) == str(tmp_path / failing) and calls.count(target) == 1:
             raise OSError(28, "No space left on device")
         replace(source, target)
 
@@ -199,9 +197,10 @@ def test_an_edit_is_neither_overwritten_nor_lost(tmp_path):
 
 
 @pytest.mark.parametrize("old, new, words", [
-    ("blend_of(dataset)", "blend_of(other)", ["train.py: line 7: ", "\n  -    pipe.blend = blend_of(dataset)",
-                                              "\n  +    pipe.blend = blend_of(other)"]),
-    ("    pipe.blend", "    if 1:\n        pipe.blend", ["train.py: line 7: "]),
+    ("blend_of(dataset)", "blend_of(other)", [
+        "train.py: you have edited what the patch wrote", "\n  -    pipe.blend = blend_of(dataset)",
+        "\n  +    pipe.blend = blend_of(other)"]),
+    ("    pipe.blend", "    if 1:\n        pipe.blend", ["train.py: you have edited"]),
     ("    pipe.blend", "    if 1:\n      \\\n    pipe.blend", ["train.py: your edit needs statements of the patch"])])
 def test_an_edit_of_the_patchs_own_lines_is_shown(tmp_path, old, new, words):
     patches.apply(make(tmp_path))
@@ -226,11 +225,9 @@ def test_a_patch_by_rules_of_before_is_known_and_brought_up_to_date(tmp_path):
     original = contents(make(tmp_path))
     former = {name: text.replace("**pipe.blend,", "blend_mode=pipe.blend_mode,").replace(".blend = ", ".blend_mode = ")
               for name, text in PATCHED.items()}
-    record = Record.begin(tmp_path, *({name: text.encode() for name, text in texts.items()}
-                                      for texts in (CHECKOUT, former)),
-                          {"version": "0", "trainer": "3dgs-2023", "options": []})
+    Record.make(tmp_path, *({name: text.encode() for name, text in texts.items()} for texts in (CHECKOUT, former)),
+                {"version": "0", "trainer": "3dgs-2023", "options": []})
     make(tmp_path, former)
-    record.note_complete(True)
     verdict = patches.check(tmp_path)
     assert verdict == "patched" and verdict.reasons[0] == "by version 0"
     assert f"to bring it up to date, type: dsmoe patch apply {tmp_path}" in verdict.reasons[1]
@@ -271,10 +268,12 @@ def test_what_is_patched_beside_replaced_files_is_put_back(tmp_path):
     assert "c++14" in (tmp_path / setup).read_text() and "a later version" in (tmp_path / "train.py").read_text()
 
 
-def test_a_file_that_was_restored_or_removed_is_reported(tmp_path):
+def test_a_file_that_was_restored_is_patched_again_and_one_that_was_removed_is_reported(tmp_path):
     patches.apply(make(tmp_path))
     (tmp_path / "train.py").write_text(TRAIN)
-    refused(tmp_path, "half-patched", "train.py: is the original")
+    verdict = patches.check(tmp_path)
+    assert verdict == "half-patched" and verdict.reasons[0].startswith("train.py: is not patched, or not any more")
+    assert patches.apply(tmp_path).written and patches.check(tmp_path) == "patched"
     (tmp_path / "train.py").unlink()
     refused(tmp_path, "train.py: was removed since", call=patches.revert)
 
@@ -331,6 +330,7 @@ def test_a_link_out_of_the_checkout_is_refused(tmp_path):
 
 
 SCRIPTS = {  # of the user's own: text, what is said of it
+    "../refine/model.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
     "tools/own.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
     "tools/deep/own.py": ("from diff_gaussian_rasterization._C import mark_visible\n", "imports the original"),
     "whole.py": ("import diff_gaussian_rasterization as dgr\n", "imports the original"),
@@ -351,10 +351,10 @@ SCRIPTS = {  # of the user's own: text, what is said of it
 
 
 def test_scripts_that_keep_the_original_or_have_no_mode_are_named(tmp_path):
-    make(tmp_path, {**{name: text for name, (text, _) in SCRIPTS.items()},
-                    "train.py": "from lib import film\n" + TRAIN})
+    tmp_path = make(tmp_path / "bundled", {**{name: text for name, (text, _) in SCRIPTS.items()},
+                                           "train.py": "from lib import film\n" + TRAIN})
     for _ in range(2):  # before the patch, and when it is there
-        notes = {note.partition(":")[0]: note for note in patches.plan(tmp_path).notes}
+        notes = {note.partition(": ")[0]: note for note in patches.plan(tmp_path).notes}
         assert set(notes) == {name for name, (_, word) in SCRIPTS.items() if word}
         assert all(SCRIPTS[name][1] in note for name, note in notes.items())
         patches.apply(tmp_path)
@@ -364,7 +364,7 @@ def test_scripts_that_keep_the_original_or_have_no_mode_are_named(tmp_path):
 LOAD = "checkpoint = torch.load(path)\n"
 
 
-def test_check_says_what_is_applied_and_what_to_type(tmp_path, dsmoe):
+def test_check_says_what_is_applied(tmp_path, dsmoe):
     checkout = make(tmp_path / "a checkout", {"utils/loading.py": LOAD})
     said = dsmoe("patch", "apply", checkout, "--dry-run")
     assert said.status == 0 and said.out == patches.diff(checkout)
@@ -373,15 +373,10 @@ def test_check_says_what_is_applied_and_what_to_type(tmp_path, dsmoe):
     assert "already patched" in dsmoe("patch", "apply", checkout).out
     said = dsmoe("patch", "check", checkout, "--modernise")
     assert "modernise checkpoint-load: not applied in train.py, utils/loading.py: torch 2.6" in said.out
-    assert said.out.splitlines()[-1].endswith(f"type: dsmoe patch apply --modernise '{checkout}'")
     assert dsmoe("patch", "apply", "--modernise", checkout).status == 0
     said = dsmoe("patch", "check", checkout)
     assert "modernise checkpoint-load: applied in train.py, utils/loading.py: torch 2.6" in said.out
-    assert "not applied" not in said.out and "type: " not in said.out
-    (checkout / "utils/loading.py").write_text("from diff_smoe_rasterization import io\n" + LOAD)
-    said = dsmoe("patch", "check", checkout)
-    assert "modernise checkpoint-load: applied in train.py, not applied in utils/loading.py: " in said.out
-    assert "undo your edit of patched files, then type: dsmoe patch apply --modernise" in said.out
+    assert "not applied" not in said.out
     shutil.rmtree(checkout / RECORD)
     said = dsmoe("patch", "diff", checkout)
     assert said.status == 0 and "not known without .dsmoe_patch" in said.err
@@ -400,12 +395,14 @@ def test_what_is_typed_wrongly_shows_the_usage(tmp_path, dsmoe, monkeypatch):
 
 def test_the_readme_has_every_trainer_rule_and_state():
     from diff_smoe_rasterization.patches.optional import OPTIONS
+    from diff_smoe_rasterization.patches.patch import rules_of
     from diff_smoe_rasterization.patches.trainers import TRAINERS
 
     text = (Path(__file__).resolve().parents[3] / "patches" / "README.md").read_text()
     cells = {line.split(" | ")[0].strip(" |`"): line for line in text.splitlines() if line.startswith("| `")}
     for trainer in TRAINERS:
-        assert f"`{trainer.flavour}`" in cells[trainer.name] and {rule.name for rule in trainer.rules} <= set(cells)
+        assert f"`{trainer.flavour}`" in cells[trainer.name]
+        assert {rule.name for rule in rules_of(trainer)} <= set(cells)
         assert all(f"`{rule.function}`" in cells[trainer.name] for rule in trainer.entries)
     assert {rule.name for rules in OPTIONS.values() for rule in rules} <= set(cells)
     assert all(state in text for state in engine.STATES)

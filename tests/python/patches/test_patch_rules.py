@@ -40,13 +40,16 @@ BEFORE_AND_AFTER = [
      f"import torch\nfrom {RUNTIME} import nan_without_network\n\n"
      "@nan_without_network\ndef lpips(x, y):\n    return x\n"),
     ("blender-images", "np.array(a * 255.0, dtype=np.byte)\n", "np.array(a * 255.0, dtype=np.uint8)\n"),
+    ("numpy-types", "levels = a.astype(np.int)  # of the octree\n", "levels = a.astype(int)  # of the octree\n"),
+    ("numpy-types", "a = numpy.zeros(3, numpy.float)\n", "a = numpy.zeros(3, float)\n"),
+    ("numpy-types", "np.int32, np.float64, np.bool_, np.integer, mine.np.int, torch.int\n", None),
     ("eigh-in-parts", "import torch\nS, R = torch.linalg.eigh(cov, UPLO='U')\n",
-     f"import torch\nfrom {RUNTIME} import eigh_in_parts\nS, R = eigh_in_parts(cov, UPLO='U')\n"),
+     f"import torch\nfrom {RUNTIME} import eigh_in_parts\n\nS, R = eigh_in_parts(cov, UPLO='U')\n"),
     ("eigh-in-parts", "torch.linalg.eigh(cov, out=both)\n", None),
     ("unique-rows", "import torch\na, b = torch.unique(c, return_inverse=True, dim=0)  # rows\n",
-     f"import torch\nfrom {RUNTIME} import unique_rows\na, b = unique_rows(c, return_inverse=True, dim=0)  # rows\n"),
+     f"import torch\nfrom {RUNTIME} import unique_rows\n\na, b = unique_rows(c, return_inverse=True, dim=0)  # rows\n"),
     ("unique-rows", "a = torch.unique(\n    c, dim=0,\n    sorted=False, return_counts=True)\n",
-     f"from {RUNTIME} import unique_rows\na = unique_rows(\n    c, dim=0,\n    sorted=False, return_counts=True)\n"),
+     f"from {RUNTIME} import unique_rows\n\na = unique_rows(\n    c, dim=0,\n    sorted=False, return_counts=True)\n"),
     ("unique-rows", "torch.unique(c)\ntorch.unique(c, return_inverse=True)\n", None),
     ("unique-rows", "torch.unique(c, dim=1)\ntorch.unique(c, dim=-1)\ntorch.unique(c, dim=d)\n", None),
     ("unique-rows", "torch.unique(c, dim=0, return_index=True)\n", None),
@@ -60,7 +63,7 @@ BEFORE_AND_AFTER = [
     ("fused-loss", "class Metrics:\n    def ssim(self, img1, img2):\n        return 1\n", None),
     ("fused-loss", "@torch.jit.script\ndef ssim(img1, img2):\n    return 1\n", None),
     ("fused-adam", "import torch\noptimizer = torch.optim.Adam(l, lr=0.0, eps=1e-15)  # all\n",
-     "import torch\nfrom diff_smoe_rasterization import FusedAdam\n"
+     "import torch\nfrom diff_smoe_rasterization import FusedAdam\n\n"
      "optimizer = FusedAdam(l, lr=0.0, eps=1e-15)  # all\n"),
     ("fused-adam", "from apex.optimizers import FusedAdam\na = FusedAdam(l) if fast else torch.optim.Adam(l)\n", None),
     ("fused-adam", "class FusedAdam(torch.optim.Adam): pass\na = torch.optim.Adam(l)\n", None),

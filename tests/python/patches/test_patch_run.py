@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,13 +12,14 @@ from checkouts import PACKAGE_PARENT, contents, environment
 from tiny import GR, RENDERER, make
 
 from diff_smoe_rasterization import patches
+from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES
 from diff_smoe_rasterization.patches import run
 from diff_smoe_rasterization.settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 
 SHOW = """import os, sys
 sys.path.insert(0, "")
-import diff_gaussian_rasterization
-print(diff_gaussian_rasterization.GaussianRasterizer.__module__, os.environ["DSMOE_BLEND_MODE"], sys.argv[1:])
+from diff_gaussian_rasterization import GaussianRasterizer
+print(GaussianRasterizer.__module__, os.environ["DSMOE_BLEND_MODE"], sys.argv[1:])
 import gaussian_renderer
 sys.exit(7)
 """
@@ -42,45 +44,52 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path, python):
     assert contents(tmp_path) == before
 
 
-def test_it_becomes_the_command(monkeypatch, dsmoe):
-    """So that signals and exit status are the command's own."""
-    called = []
-    monkeypatch.setattr(os, "execvpe", lambda *words: called.append(words))
-    monkeypatch.setattr(run, "_ask_python", lambda *_: ([], []))
-    dsmoe(*RUN, "--trainer", "scaffold", "--", sys.executable, "show.py")
-    (name, words, variables), = called
-    assert name == sys.executable and words == [sys.executable, "show.py"] and variables["DSMOE_BLEND_MODE"] == "smoe"
-    folders = variables["PYTHONPATH"].split(os.pathsep)
-    assert folders[:5] == [str(run.SHIMS / name) for name in ("scaffold", *run.STAND_INS)]
+ENDS = {  # what a command does, and how `dsmoe run` ends then
+    "made(None)": (0, ""), "pass": (1, "rendered nothing: what was trained or rendered was not smoe"),
+    "import os, signal; os.kill(os.getpid(), signal.SIGTERM)": (-15, ""), "sys.exit(3)": (3, "")}
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("code", ENDS)
+def test_it_ends_as_the_command_unless_nothing_was_rendered(code, tmp_path, python):
+    script = f"import sys\nfrom diff_gaussian_rasterization import GaussianRasterizer as made\n{code}\n"
+    make(tmp_path, {"x.py": script})
+    result = python("-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py", cwd=tmp_path)
+    status, said = ENDS[code]
+    assert result.status == status and said in result.err, result.err
+
+
+def test_a_signal_reaches_the_command(tmp_path):
+    make(tmp_path, {"x.py": "import signal, time\nsignal.signal(signal.SIGTERM, lambda *_: exit(5))\n"
+                            "print('ready', flush=True)\ntime.sleep(60)\n"})
+    process = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py"],
+                               cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert process.stdout.readline() == b"ready\n"
+    process.terminate()
+    assert process.wait() == 5
+    process.stdout.close()
+
+
 def test_stand_ins_only_for_what_is_missing(tmp_path, python):
     """What the command's Python can import itself is left to it. Each stand-in says that it is used."""
-    variables = environment()  # has simple_knn and fused_ssim, and no weighted_distance
-    made, _ = run.prepare([sys.executable, "x.py"], "smoe", "hac", variables)
-    folders = made["PYTHONPATH"].split(os.pathsep)
-    assert folders[0] == str(run.SHIMS / "scaffold") and str(run.SHIMS / "weighted_distance") in folders
-    assert str(run.SHIMS / "simple_knn") not in folders and made["PYTHONPATH"].endswith(variables["PYTHONPATH"])
-    code = "from simple_knn._C import distCUDA2; import fused_ssim; fused_ssim.fused_ssim"
-    shims = [str(run.SHIMS / name) for name in ("simple_knn", "fused_ssim", "weighted_distance")]
-    result = python("-c", code, cwd=tmp_path, PYTHONPATH=os.pathsep.join([*shims, variables["PYTHONPATH"]]))
-    assert [line.split()[1] for line in result.err.splitlines()] == ["simple_knn", "fused_ssim"], result.err
-
-
-def test_every_flavour_has_its_shim():
-    assert set(run.flavours()) >= {known.flavour for known in run.TRAINERS}
-    for flavour in run.flavours():
-        text = (run.SHIMS / flavour / "diff_gaussian_rasterization/__init__.py").read_text()
-        assert f"from diff_smoe_rasterization.integrations.{flavour} import *" in text
-        assert f'say_rasterizer("{flavour}")' in text
+    code = ("from simple_knn._C import distCUDA2; import fused_ssim, torch_scatter; "
+            "from weighted_distance._C import weightedDistance; "
+            "print(distCUDA2.__module__, fused_ssim.fused_ssim.__module__, torch_scatter.__file__)")
+    variables = environment()["PYTHONPATH"]  # has simple_knn, fused_ssim and torch_scatter, and no weighted_distance
+    result = python("-c", code, cwd=tmp_path, PYTHONPATH=os.pathsep.join([str(run.SHIMS), variables]))
+    assert result.status == 0 and "shims" not in result.out and result.out.startswith("simple_knn._C fused_ssim ")
+    assert [line.split()[1] for line in result.err.splitlines()] == ["weighted_distance"], result.err
+    broken = tmp_path / "broken/fused_ssim"
+    broken.mkdir(parents=True)
+    (broken / "__init__.py").write_text("raise OSError('undefined symbol')\n")
+    result = python("-c", "import fused_ssim; print(fused_ssim.fused_ssim.__module__)", cwd=tmp_path,
+                    PYTHONPATH=os.pathsep.join([str(run.SHIMS), str(broken.parent), str(PACKAGE_PARENT)]))
+    assert result.out == "diff_smoe_rasterization.losses\n" and "own takes its place" in result.err
 
 
 @pytest.mark.parametrize("mode", BLEND_MODES)
 def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
     """That which is asked for, else the variable's, else the recommended one; and none in other modes than smoe."""
     words = [sys.executable, "show.py"]
-    monkeypatch.setattr(run, "_ask_python", lambda *_: (run.STAND_INS.values(), []))  # takes seconds
     for variable, asked, gate in (("", None, RECOMMENDED_BACKGROUND_GATE), ("0.25", None, 0.25), ("0.25", 0.0, 0.0)):
         monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
         if mode == "smoe" or asked is None:
@@ -93,7 +102,9 @@ def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
 
 
 OURS = RENDERER.replace("diff_gaussian_rasterization import", "diff_smoe_rasterization.integrations.inria import")
+ABS = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
 PYTHON = [*RUN, "--", sys.executable, "train.py"]
+AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
 
 
 @pytest.mark.parametrize("files, words, said", [
@@ -101,15 +112,46 @@ PYTHON = [*RUN, "--", sys.executable, "train.py"]
     ({}, [*RUN, "--"], "there is no command"), ({}, ["run", "--blend_mode", "smoe", "--"], "there is no command"),
     ({}, [*RUN, "--", "no-such-command"], "no-such-command: there is no such command"),
     ({"tool.py": ""}, [*RUN, "--", "./tool.py"], "./tool.py: is not executable; type: python ./tool.py"),
-    ({GR: None}, PYTHON, "name it with --trainer, or the rasterizer whose API it calls (c3dgs, inria, inria_2024"),
+    ({GR: None}, PYTHON, "name it with --trainer, or the rasterizer whose API it calls (c3dgs, depth"),
     ({}, [*RUN, "--trainer", "nerf", "--", sys.executable], "there is no trainer 'nerf'; it must be one of 3dgs-2023"),
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
-    ({GR: OURS}, PYTHON, "is patched already: run the command itself, with --blend_mode")])
+    ({GR: OURS}, PYTHON, "is patched already: run the command itself, with --blend_mode"),
+    # Under --trainer too: AbsGS, Mini-Splatting, and a renderer of no rasterizer at all.
+    ({GR: ABS}, PYTHON, "it imports diff_gaussian_rasterization_abs, another rasterizer"),
+    ({GR: ABS}, AS_INRIA, "it imports diff_gaussian_rasterization_abs, another rasterizer"),
+    ({GR: RENDERER + ABS.replace("_abs", "_ms")}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
+    ({GR: "from gsplat import rasterization\n"}, AS_INRIA, "nothing imports GaussianRasterizationSettings from")])
 def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_path, dsmoe, monkeypatch):
     monkeypatch.chdir(make(tmp_path, files))
     result = dsmoe(*words)
     assert result.status in (1, 2) and said in result.err and "Traceback" not in result.err
+
+
+def test_what_speaks_against_a_trainer_that_is_named_is_said(tmp_path, dsmoe, monkeypatch):
+    """reduced-3dgs: its call has other keywords."""
+    one_line = "    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)\n"
+    renderer = RENDERER.replace(one_line, "    draw = GaussianRasterizer(raster_settings=settings)\n"
+                                          "    color, radii = draw(means3D=1, degrees=2)\n")
+    monkeypatch.chdir(make(tmp_path, {GR: renderer}))
+    _, lines = run.prepare([sys.executable, "train.py"], "smoe", "inria", environment())
+    assert "warning: " in lines[1] and "its rasterizer is called with degrees, which no rasterizer has" in lines[1]
+    said = dsmoe(*PYTHON)
+    assert said.status == 1 and "degrees" in said.err and said.err.count(GR) == 0  # no folder without a renderer
+
+
+def test_a_trainer_of_another_layout_is_recognised_by_its_rasterizer(tmp_path, monkeypatch):
+    """dreamgaussian, SplaTAM, SuGaR: settings and calls lie elsewhere, under other names."""
+    (tmp_path / "main.py").write_text("import deep.renderer\n")
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep/renderer.py").write_text(
+        "from diff_gaussian_rasterization import GaussianRasterizationSettings as Camera\n"
+        "from diff_gaussian_rasterization import GaussianRasterizer as Renderer\n"
+        "image, radii, depth, alpha = Renderer(raster_settings=Camera())(means3D=1)\n"
+        "rasterizer = MeshRasterizer()\nfragments = rasterizer(meshes, cameras=1)\n")  # of pytorch3d
+    monkeypatch.chdir(tmp_path)
+    made, lines = run.prepare([sys.executable, "main.py"], "smoe", None, environment())
+    assert made["DSMOE_RASTERIZER"] == "depth_alpha" and lines[0].startswith(f"the trainer in {tmp_path}: ")
 
 
 def test_a_python_without_the_package_is_named(tmp_path, dsmoe, monkeypatch):
@@ -118,12 +160,11 @@ def test_a_python_without_the_package_is_named(tmp_path, dsmoe, monkeypatch):
     other.chmod(0o755)
     monkeypatch.chdir(make(tmp_path / "trainer"))
     said = dsmoe(*RUN, "--", other, "train.py")
-    assert said.status == 1 and f"{other} (Python" in said.err and "cannot import diff_smoe_rasterization" in said.err
+    assert said.status == 1 and f"{other} cannot import diff_smoe_rasterization" in said.err
 
 
-def test_a_patched_checkout_is_refused_until_nothing_of_the_patch_is_left(tmp_path, monkeypatch):
+def test_a_patched_checkout_is_refused_until_nothing_of_the_patch_is_left(tmp_path):
     pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
-    monkeypatch.setattr(run, "_ask_python", lambda *_: ([], []))
     patches.apply(make(tmp_path))
     words = [sys.executable, str(tmp_path / "train.py")], "smoe", None, environment()
     with pytest.raises(patches.PatchError, match="patched already"):
@@ -144,4 +185,6 @@ def test_the_package_brings_the_shims_and_nothing_beside_itself():
     brought = {path for pattern in packages["package_data"]["diff_smoe_rasterization.patches"]
                for path in (root / "patches").glob(pattern)}
     assert brought == set((root / "patches/shims").rglob("*.py")) != set()
-    assert {folder.name for folder in run.SHIMS.iterdir()} == set(run.flavours()) | set(run.STAND_INS)
+    for contract in CONTRACTS:
+        module = importlib.import_module(f"diff_smoe_rasterization.integrations.{contract.name}")
+        assert {*NAMES, *contract.names} <= set(module.__all__)

@@ -156,6 +156,27 @@ def test_training_again_in_another_mode_is_named(monkeypatch, tmp_path):
         runtime.blend_of(run("alpha", model_path=""))
 
 
+def test_a_rendering_takes_the_saved_mode_whatever_default_it_brings(monkeypatch, tmp_path):
+    """InstantSplat's render.py makes ModelParams with defaults, which then win over cfg_args."""
+    (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe', background_gate=0.5)")
+
+    def rendered(*words):
+        monkeypatch.setattr(sys, "argv", ["render.py", *words])
+        typed = dict(zip(words[::2], words[1::2]))
+        return runtime.saved_blend_of(run(typed.get("--blend_mode", "alpha"), typed.get("--background_gate", ""),
+                                          model_path=str(tmp_path)))
+
+    assert rendered() == {"blend_mode": "smoe", "background_gate": 0.5}
+    with pytest.warns(UserWarning, match="is of a run with background gate 0.5"):
+        assert rendered("--background_gate", "0") == {"blend_mode": "smoe", "background_gate": 0}
+    with pytest.warns(UserWarning, match="is of a run with blend mode smoe"):
+        assert rendered("--blend_mode", "alpha") == ALPHA
+    (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3)")
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe")
+    with pytest.warns(UserWarning, match="records no blend mode, so it is alpha"):
+        assert rendered() == ALPHA
+
+
 def test_a_renderer_with_another_rasterizer_is_refused(monkeypatch, tmp_path):
     """As after `git checkout gaussian_renderer`: the mode would be recorded, and ignored."""
     theirs = SimpleNamespace(GaussianRasterizationSettings=namedtuple("Settings", "image_height debug"),

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -15,18 +16,17 @@ from tiny import GR, RENDER, RENDERER, TRAIN, make, refused  # noqa: E402
 from diff_smoe_rasterization import patches  # noqa: E402
 from diff_smoe_rasterization.patches import facts  # noqa: E402
 
-STATEMENTS = ("from diff_smoe_rasterization.", "**pipe.blend,", "**pipe.blend, debug=pipe.debug,",
+STATEMENTS = ("from diff_smoe_rasterization.", "**pipe.blend,",
               "self.blend_mode, self.background_gate = default_blend()", "pipe.blend = blend_of(dataset)",
-              "pipeline.blend = blend_of(dataset)", "pipeline_params.blend = blend_of(model_params)")
+              "pipeline.blend = saved_blend_of(dataset)", "pipeline_params.blend = blend_of(model_params)")
 
 
 def only_statements_change(diff):
     """Asserts that a diff takes imports of the rasterizer away and adds what a patch adds."""
     lines = [line for line in diff.splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")]
     removed, added = ([line[1:].strip() for line in lines if line[0] == sign] for sign in "-+")
-    assert removed and all(line.startswith(("from diff_gaussian_rasterization import", "prefiltered=False, debug="))
-                           for line in removed), removed
-    assert all(line.startswith(STATEMENTS) or "**pipe.blend," in line for line in added), added
+    assert removed and all(line.startswith("from diff_gaussian_rasterization import") for line in removed), removed
+    assert all(not line or line.startswith(STATEMENTS) for line in added), added
 
 
 @pytest.mark.parametrize("name", TRAINERS)
@@ -44,7 +44,7 @@ def test_each_trainer_is_recognised_patched_and_put_back(name, tmp_path):
     assert not any("from diff_gaussian_rasterization import" in text for text in texts.values())
     assert texts[GR].count("**pipe.blend,") == texts[GR].count("GaussianRasterizationSettings(")
     for file, functions in ENTRIES[name].items():
-        assert texts[file].count(".blend = blend_of(") == len(functions)
+        assert len(re.findall(r"\.blend = (saved_)?blend_of\(", texts[file])) == len(functions)
     assert patches.check(checkout) == "patched"
     patches.revert(checkout)
     assert contents(checkout) == before
@@ -86,7 +86,10 @@ ANTIALIASED = RENDERER.replace("prefiltered=False,", "antialiasing=pipe.antialia
     (RENDERER, "everything", TRAIN, "3dgs-2023"),
     (RENDERER, "color, radii, depth", DEPTH_LOSS, "3dgs-2024"),  # of August
     (ANTIALIASED, "color, radii, depth", TRAIN, "3dgs-2024"),  # of September
-    (RENDERER, "color, radii, depth", TRAIN, None), (RENDERER, "color,", TRAIN, None),
+    (RENDERER, "color, radii, depth", TRAIN, "3dgs-depth"),  # of 4DGaussians and others
+    (RENDERER, "color, _, _", TRAIN, "3dgs-depth"), (RENDERER, "color, radii, depth, alpha", TRAIN, "3dgs-depth-alpha"),
+    (RENDERER, "color, radii, inv_depth", TRAIN, None), (RENDERER, "color, radii, weights", TRAIN, None),
+    (RENDERER, "color, radii, count, score", TRAIN, None), (RENDERER, "color,", TRAIN, None),
     (RENDERER.replace("bg=bg_color", "kernel_size=0.1"), "color, radii", TRAIN, None)])
 def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, results, train, trainer):
     count = len(getattr(ast.parse(results).body[0].value, "elts", "12"))
@@ -112,7 +115,7 @@ def prefilter_voxel(camera, pc, pipe):
     assert planned.verdict.trainer == "scaffold-gs" and planned.notes == ()
     assert (tmp_path / GR).read_text().count("**pipe.blend,") == 2
     for name, count in (("train.py", 2), ("render.py", 1)):
-        assert (tmp_path / name).read_text().count(".blend = blend_of(dataset)") == count
+        assert len(re.findall(r"\.blend = (saved_)?blend_of\(dataset\)", (tmp_path / name).read_text())) == count
 
 
 def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
@@ -120,3 +123,17 @@ def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
     (note,) = patches.apply(tmp_path, trainer="3dgs-2023").notes
     assert "--trainer 3dgs-2023" in note and "3dgs-2024" in note and "another API" in note
     assert patches.plan(tmp_path).notes == ()  # it was said when it was chosen
+
+
+def test_a_fork_that_no_contract_fits_is_patched_with_a_warning_and_one_of_another_rasterizer_is_not(tmp_path):
+    call = BY_NAME.format("color, radii").replace("get_xyz)", "get_xyz, degrees=pc.degrees)")  # reduced-3dgs
+    make(tmp_path / "fork", {GR: RENDERER.replace(ONE_LINE, call)})
+    refused(tmp_path / "fork", "unknown", "its rasterizer is called with degrees, which no rasterizer has")
+    (note,) = patches.apply(tmp_path / "fork", trainer="3dgs-2023").notes
+    assert "--trainer 3dgs-2023: its rasterizer is called with degrees" in note
+    private = RENDERER.replace("import math", "from diff_gaussian_rasterization._C import kmeans_cuda\nimport math")
+    refused(make(tmp_path / "private", {GR: private}), "it imports diff_gaussian_rasterization._C.kmeans_cuda, which")
+    both = RENDERER + "\n\ndef render_imp():\n    from diff_gaussian_rasterization_ms import GaussianRasterizer\n"
+    for trainer in (None, "3dgs-2023"):  # Mini-Splatting
+        refused(make(tmp_path / "both", {GR: both}), "it imports diff_gaussian_rasterization_ms, another rasterizer",
+                trainer=trainer)

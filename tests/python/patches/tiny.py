@@ -51,15 +51,16 @@ def render_sets(dataset : object, iteration : int, pipeline : object):
     return render(None, None, pipeline, None)'''
 CHECKOUT = {GR: RENDERER, ARGS: ARGUMENTS, "train.py": TRAIN, "render.py": RENDER}
 BLEND_OF = "import render\nfrom diff_smoe_rasterization.patches.runtime import blend_of\n"
+SAVED_BLEND_OF = BLEND_OF.replace("import blend_of", "import saved_blend_of")
 PATCHED = {
     GR: RENDERER.replace("diff_gaussian_rasterization import", "diff_smoe_rasterization.integrations.inria import")
-    .replace("# never\n", "# never\n        **pipe.blend,\n"),
-    ARGS: "from diff_smoe_rasterization.patches.runtime import default_blend\n" + ARGUMENTS.replace(
+    .replace("RasterizationSettings(\n", "RasterizationSettings(\n        **pipe.blend,\n"),
+    ARGS: "from diff_smoe_rasterization.patches.runtime import default_blend\n\n" + ARGUMENTS.replace(
         "sh_degree = 3\n", "sh_degree = 3\n        self.blend_mode, self.background_gate = default_blend()\n"),
     "train.py": TRAIN.replace("import render\n", BLEND_OF).replace(
         "checkpoint):\n", "checkpoint):\n    pipe.blend = blend_of(dataset)\n"),
-    "render.py": RENDER.replace("import render\n", BLEND_OF).replace(
-        'sets."\n', 'sets."\n    pipeline.blend = blend_of(dataset)\n')}
+    "render.py": RENDER.replace("import render\n", SAVED_BLEND_OF).replace(
+        'sets."\n', 'sets."\n    pipeline.blend = saved_blend_of(dataset)\n')}
 
 
 def make(folder, changes=None):

@@ -1,0 +1,122 @@
+"""Makes the classes of a rasterizer of Inria's kind from its entry in contracts.py."""
+from __future__ import annotations
+
+from collections import namedtuple
+from inspect import Parameter, Signature
+from typing import Any, Dict, Sequence, Tuple
+
+import torch
+
+import diff_smoe_rasterization
+from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
+from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization.settings import resolve_blend
+
+from .contracts import RESULTS, contract_of
+
+ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",)}
+
+
+def settings_with(name: str, module: str) -> type:
+    """Returns the package's settings as a class whose thirteenth field is `name`.
+
+    A field that the package has too moves there with its default; another one has the default None.
+    module: the name of the module whose class it is, by which pickle finds it.
+    """
+    fields = [field for field in Settings._fields if field != name]
+    fields.insert(fields.index("debug") + 1, name)
+    defaults = {name: None, **Settings._field_defaults}
+    return namedtuple("GaussianRasterizationSettings", fields, module=module,
+                      defaults=[defaults[field] for field in fields if field in defaults])
+
+
+def share_of_gaussians(gate_sum: torch.Tensor, settings: Settings) -> torch.Tensor:
+    """Returns the share beta of each pixel that the background does not have, so C = beta G + (1 - beta) bg.
+
+    gate_sum: W = sum(alpha T), [1, H, W], of the output `alpha`. With the background gate lambda beta is
+    W / (W + lambda (1 - W)), by W + T = 1. So it is W in `alpha`; and with gate 0 it is 1 wherever a gate is open, as
+    in `smoe_tn` and `smoe_std`.
+    """
+    mode, gate = resolve_blend(settings)
+    if mode == "alpha":
+        return gate_sum
+    if not isinstance(gate, torch.Tensor) and gate == 0:
+        return (gate_sum > 0).to(gate_sum.dtype)
+    total = gate_sum + gate * (1 - gate_sum)
+    return torch.where(total > 0, gate_sum / torch.where(total > 0, total, 1), torch.zeros_like(total))
+
+
+def results_of(contract: str, settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, ...]:
+    """Renders as `rasterize`, and returns the results of a contract in its order, as RESULTS explains them."""
+    names = contract_of(contract).results
+    outputs = sorted({output for name in names for output in ON_REQUEST.get(name, ())})
+    rendering = rasterize(settings=settings, outputs=outputs, **inputs)
+    found = {"color": rendering.color, "radii": rendering.radii, "inverse_depth": rendering.inverse_depth}
+    if "alpha" in outputs:
+        found["alpha"] = share_of_gaussians(rendering.alpha, settings)
+    if "depth" in outputs:
+        found["depth"] = rendering.depth * found["alpha"]
+    return tuple(found[name] for name in names)
+
+
+def scaled_gradients(confidence: torch.Tensor, tensors: Dict[str, Any]) -> Dict[str, Any]:
+    """Returns the tensors of N Gaussians, whose gradients will be multiplied by the confidence [N, 1] or [N]."""
+    def scaled(tensor: Any) -> Any:
+        if tensor is None or tensor.numel() == 0 or not tensor.requires_grad:
+            return tensor
+        tensor = tensor.view_as(tensor)
+        tensor.register_hook(lambda grad: grad * confidence.reshape(-1, *[1] * (grad.dim() - 1)))
+        return tensor
+
+    return {name: tensor if name == "means2D" else scaled(tensor) for name, tensor in tensors.items()}
+
+
+def classes_of(contract: str, module: str) -> Tuple[type, type, Any]:
+    """Returns GaussianRasterizationSettings, GaussianRasterizer and rasterize_gaussians of a contract.
+
+    module: the name of the module whose they are.
+    """
+    entry = contract_of(contract)
+    own = [name for name in entry.settings if name not in Settings._fields]
+    settings_class = settings_with(own[0], module) if own else Settings
+    renamed = {"shs": "sh", "cov3D_precomp": "cov3Ds_precomp"}
+    further = [name for name in entry.arguments if name not in ("means3D", "means2D", "opacities")]
+    place = further.index("colors_precomp") + 1
+    positional = ["means3D", "means2D", *further[:place], "opacities", *further[place:]]
+    of_function = _signature(*(renamed.get(name, name) for name in positional), "raster_settings")
+    required = ("self", "means3D", "means2D", "opacities")
+    of_module = _signature(*required, absent=[name for name in entry.arguments if name not in required])
+    returns = ", ".join(f"{name} {RESULTS[name][0]}" for name in entry.results)
+
+    def render(settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, ...]:
+        densify = inputs.pop("means2D_densify", None)
+        if densify is not None:  # one gradient of the image, which both receive
+            inputs["means2D"] = densify if inputs["means2D"] is None else inputs["means2D"] + densify
+        confidence = getattr(settings, "confidence", None)
+        return results_of(contract, settings, inputs if confidence is None else scaled_gradients(confidence, inputs))
+
+    def rasterize_gaussians(*values: Any, **named: Any) -> Tuple[torch.Tensor, ...]:
+        given = of_function.bind(*values, **named).arguments
+        settings = given.pop("raster_settings")
+        back = {new: old for old, new in renamed.items()}
+        return render(settings, {back.get(name, name): value for name, value in given.items()})
+
+    class GaussianRasterizer(diff_smoe_rasterization.GaussianRasterizer):
+        def forward(*values: Any, **named: Any) -> Tuple[torch.Tensor, ...]:
+            given = of_module.bind(*values, **named).arguments
+            return render(given.pop("self").raster_settings, given)
+
+    GaussianRasterizer.forward.__signature__ = of_module
+    GaussianRasterizer.__doc__ = f"Renders as `rasterize`; used by {entry.used_by}.\n\nA call returns {returns}."
+    rasterize_gaussians.__signature__ = of_function
+    rasterize_gaussians.__doc__ = f"Renders as `rasterize`, whose shapes and errors are these.\n\nReturns: {returns}."
+    for made in (GaussianRasterizer, rasterize_gaussians):
+        made.__module__ = module
+        made.__qualname__ = made.__name__
+    return settings_class, GaussianRasterizer, rasterize_gaussians
+
+
+def _signature(*required: str, absent: Sequence[str] = ()) -> Signature:
+    """A signature of these names; the second ones default to None."""
+    return Signature([*(Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in required),
+                      *(Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, default=None) for name in absent)])

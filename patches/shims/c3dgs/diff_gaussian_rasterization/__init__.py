@@ -1,5 +1,0 @@
-"""For `dsmoe run`: what a trainer imports from diff_gaussian_rasterization, from this project's module c3dgs."""
-from diff_smoe_rasterization.integrations.c3dgs import *  # noqa: F401, F403
-from diff_smoe_rasterization.patches.runtime import say_rasterizer
-
-say_rasterizer("c3dgs")

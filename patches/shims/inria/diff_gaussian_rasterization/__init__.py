@@ -1,5 +1,0 @@
-"""For `dsmoe run`: what a trainer imports from diff_gaussian_rasterization, from this project's module inria."""
-from diff_smoe_rasterization.integrations.inria import *  # noqa: F401, F403
-from diff_smoe_rasterization.patches.runtime import say_rasterizer
-
-say_rasterizer("inria")
