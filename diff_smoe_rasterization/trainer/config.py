@@ -24,6 +24,11 @@ def _option(default: Any, text: str, **extra: Any) -> Any:
     return field(default=default, metadata={"help": text, **extra})
 
 
+def _recipe(published: Any, gate: Any, text: str) -> Any:
+    """A field of the recipe that --strategy gate sets otherwise: None until `__post_init__` knows the strategy."""
+    return _option(None, f"{text} (default: {published}; gate: {gate})", published=published, gate=gate)
+
+
 @dataclass
 class TrainConfig:
     """Options of one training run; defaults are those of 3D Gaussian Splatting (the 2023 release).
@@ -67,12 +72,12 @@ class TrainConfig:
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
 
     lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
-    position_lr_init: float = _option(0.00016, "first learning rate of positions, times the scene extent")
-    position_lr_final: float = _option(0.0000016, "last learning rate of positions, times the scene extent")
+    position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
+    position_lr_final: float = _recipe(0.0000016, 0.0000064, "last learning rate of positions, times the scene extent")
     position_lr_max_steps: int = _option(30_000, "step at which the last position learning rate is reached")
-    feature_lr: float = _option(0.0025, "learning rate of base colours; higher SH bands take a 20th of it")
+    feature_lr: float = _recipe(0.0025, 0.005, "learning rate of base colours; higher SH bands take a 20th of it")
     opacity_lr: float = _option(0.05, "learning rate of opacity logits")
-    scaling_lr: float = _option(0.005, "learning rate of log scales")
+    scaling_lr: float = _recipe(0.005, 0.01, "learning rate of log scales")
     rotation_lr: float = _option(0.001, "learning rate of quaternions")
 
     densify_grad_threshold: float = _option(
@@ -80,7 +85,8 @@ class TrainConfig:
     percent_dense: float = _option(
         0.01, "largest scale, as a part of the scene extent, that is cloned; larger ones are split")
     densify_from_iter: int = _option(500, "densification starts after this step")
-    densify_until_iter: int = _option(15_000, "densification stops before this step")
+    densify_until_iter: int = _recipe(
+        15_000, 18_000, "densification stops before this step; with gate, which it scales, the last removal")
     densification_interval: int = _option(100, "steps between two densifications")
     opacity_reset_interval: int = _option(3000, "steps between two opacity resets")
 
@@ -92,6 +98,9 @@ class TrainConfig:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
             self.schedule = self.schedule or ("gate" if self.budget else "3dgs")
+            for name, value in _recipe_of(self.schedule).items():
+                if getattr(self, name) is None:
+                    setattr(self, name, value)
         except ValueError as error:
             raise ConfigError(str(error)) from error
 
@@ -134,9 +143,15 @@ class TrainConfig:
             raise ConfigError(f"{flag} is {getattr(self, name)!r}; it must be {requirement}")
 
     def changed(self, **options: Any) -> TrainConfig:
-        """A validated copy with some options set; another blend mode takes its own background gate."""
+        """A validated copy with some options set.
+
+        Another blend mode takes its own background gate, and another strategy what of the recipe is at its default.
+        """
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
             options = {"background_gate": None, **options}
+        if options.get("schedule", self.schedule) != self.schedule:
+            usual = _recipe_of(str(self.schedule))
+            options = {**{name: None for name in usual if getattr(self, name) == usual[name]}, **options}
         return dataclasses.replace(self, **options).validate()
 
     def shortened(self) -> TrainConfig:
@@ -144,7 +159,7 @@ class TrainConfig:
 
         The densification interval stays, as far as ten densifications fit. What is not at its default is kept.
         """
-        default = TrainConfig(blend_mode=self.blend_mode)
+        default = TrainConfig(blend_mode=self.blend_mode, schedule=self.schedule)
         share = self.iterations / default.iterations
         milestones = {name: max(1, round(getattr(default, name) * share)) for name in (
             "position_lr_max_steps", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
@@ -218,6 +233,12 @@ class TrainConfig:
             if option.name not in harmless and mine != theirs:
                 texts.append(f"{_flag(option)} is {mine!r} here and {theirs!r} there")
         return texts
+
+
+def _recipe_of(schedule: str) -> Dict[str, Any]:
+    """What a strategy sets of the recipe, by option, where strategies differ."""
+    of = "gate" if schedule == "gate" else "published"
+    return {option.name: option.metadata[of] for option in dataclasses.fields(TrainConfig) if of in option.metadata}
 
 
 def holds_run(folder: str) -> bool:

@@ -107,7 +107,6 @@ class GaussianOptimizer:
         self.model = model
         self.config = config
         self.extent = extent
-        self.position_factor = 1.0  # a strategy's, of the positions' learning rate
         rates = {
             "means3D": config.position_lr_init * extent,
             "dc": config.feature_lr,
@@ -125,7 +124,7 @@ class GaussianOptimizer:
         config = self.config
         rate = exponential_rate(iteration, config.position_lr_init, config.position_lr_final,
                                 config.position_lr_max_steps)
-        self._group("means3D")["lr"] = rate * self.extent * self.position_factor
+        self._group("means3D")["lr"] = rate * self.extent
 
     @property
     def position_rate(self) -> float:

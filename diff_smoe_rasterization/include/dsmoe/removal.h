@@ -44,11 +44,11 @@ template <class Real> struct Removal {
   Mask<Real> left;   // something else is in the pixel
 };
 
-// total - part. Nothing where that may be the rounding of two sums of equal terms, which other kernels may round
-// otherwise: a pixel's only owner has to be known.
+// total - part. Nothing where that may be the rounding of two sums of equal terms, since a pixel's only owner has to be
+// known: two kernels may contract operations otherwise.
 template <class Real> DSMOE_HD Real rest_of(Real total, Real part) {
   using S = Scalar<Real>;
-  constexpr S kRounding = sizeof(S) == sizeof(float) ? S(0x1p-17) : S(0x1p-46);  // of 64 operations
+  constexpr S kRounding = sizeof(S) == sizeof(float) ? S(0x1p-20) : S(0x1p-49);  // of 8 operations
   const Real rest = total - part;
   return select(rest > total * Real(kRounding), rest, Real(S(0)));
 }
@@ -70,8 +70,7 @@ DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>
   out.weight = select(blended, pair.weight, zero);
   out.share = out.weight / select(by.open, by.denominator, one);
   const Real odds = kSeesThrough ? select(blended, gate.alpha / (one - gate.alpha), zero) : zero;
-  const Real behind = kCountsWeights ? rest_of(abs(state.transmittance), end.transmittance) + by.weight
-                                     : rest_of(end.gate_sum, state.gate_sum);
+  const Real behind = rest_of(end.gate_sum, state.gate_sum) + by.weight;
   const Real sum = kCountsWeights ? in_front + (one + odds) * behind : in_front + behind;
   out.left = Blend<kMode>::kDivides ? sum >= Real(S(kGateSumCut)) : sum >= zero;
   const Real inverse = Blend<kMode>::kDivides ? one / select(out.left, sum, one) : one;

@@ -16,8 +16,8 @@ from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
 from ..scenes.images import View, as_float
 from .strategy import SteadyStrategy, Step, StrategyContext
 
-# Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, removals are at 8,200 to 12,700, moves end
-# at 20,000.
+# Milestones, as parts of densify_until_iter (18,000): growth ends at 9,600, sixteen removals are at 9,840 to 16,590,
+# moves are every 600 until 24,000.
 GROWTH_ENDS = 8 / 15
 REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
 MOVES_END = 4 / 3
@@ -39,10 +39,7 @@ class GateOptions:
     views: int = 96  # training views that a decision looks at
     moves: float = 0.1  # the most Gaussians that move at a time, as a part of all; 0: none
     worth: float = 0.2  # a Gaussian moves where its cost is below this part of the error at its new place
-    opacity_weight: float = 0.0  # of the mean opacity in the loss
-    scale_weight: float = 0.0  # of the mean scale in the loss
     anneal: float = 0.1  # behind the moves all learning rates but the positions' fall to this part of themselves
-    position_rate: float = 4.0  # multiplies the learning rate of positions
 
 
 class Scores(NamedTuple):
@@ -60,7 +57,6 @@ class GateStrategy(SteadyStrategy):
         config = context.config
         self.options: GateOptions = parse_options(config.strategy_options, GateOptions)
         self.start = context.model.num_gaussians
-        context.optimizer.position_factor = self.options.position_rate
         until = config.densify_until_iter
         self.growth_ends = round(GROWTH_ENDS * until)
         count = self.options.removals
@@ -74,14 +70,6 @@ class GateStrategy(SteadyStrategy):
             span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
             share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
             self.context.optimizer.scale_other_rates(self.options.anneal**share)
-
-    def after_backward(self, step: Step) -> None:
-        raw = self.context.model.raw
-        if self.options.opacity_weight or self.options.scale_weight:
-            opacities, scales, _ = self.context.model.activated()
-            raw["opacities"].grad += self.options.opacity_weight / opacities.numel() * opacities * (1 - opacities)
-            raw["scales"].grad += self.options.scale_weight / scales.numel() * scales
-        super().after_backward(step)
 
     def after_step(self, step: Step) -> None:
         if step.iteration in self.removals:
