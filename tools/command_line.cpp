@@ -58,7 +58,7 @@ int CommandLine::whole(const std::string& name, int missing, int least, int most
 
 std::string CommandLine::choice(const std::string& name, const std::string& missing,
                                 const std::vector<std::string>& choices) const {
-  const std::string value = text(name, missing);
+  std::string value = text(name, missing);
   if (!has(name) || std::find(choices.begin(), choices.end(), value) != choices.end()) return value;
   std::string known;
   for (const std::string& choice : choices) known += (known.empty() ? "" : ", ") + choice;

@@ -61,7 +61,7 @@ std::vector<int32_t> relevant_kernels(const std::vector<Ellipse>& ellipses, Mixt
                                       const PixelRect<double>& rect) {
   double floor = kFaint;  // the kernel itself is what the weighted sum holds
   if (mixture == Mixture::kGated) {
-    double best = -INFINITY;
+    double best = -HUGE_VAL;
     for (const Ellipse& ellipse : ellipses) best = std::max(best, ellipse.least(rect));
     floor += best;
   }
@@ -79,7 +79,7 @@ struct Gates {
 
   void evaluate(const std::vector<Ellipse>& ellipses, const std::vector<int32_t>& chosen, Mixture mixture, int x,
                 int y) {
-    double best = -INFINITY;
+    double best = -HUGE_VAL;
     values.clear();
     greatest = -1;
     for (const int32_t i : chosen) {
@@ -189,7 +189,7 @@ double loss_and_gradient(const Mixture2d& model, const std::vector<float>& targe
                          std::vector<Kernel>& gradient) {
   const std::size_t pixels = static_cast<std::size_t>(model.width) * model.height;
   const std::vector<Ellipse> ellipses = ellipses_of(model);
-  const double side = longer_side(model), scale = 1.0 / (3.0 * pixels);
+  const double side = longer_side(model), scale = 1 / (3.0 * model.width * model.height);
   const bool gated = model.mixture == Mixture::kGated;
   std::vector<std::vector<Kernel>> gradients(kBands, std::vector<Kernel>(model.kernels.size()));
   std::vector<double> losses(kBands);
@@ -229,16 +229,18 @@ Fit::Fit(const std::vector<float>& target, int width, int height, const FitOptio
     : target_(target), options_(options), moment_(options.kernels), square_(options.kernels) {
   model_.width = width, model_.height = height;
   model_.mixture = options.mixture, model_.shape = options.shape;
-  const std::size_t pixels = static_cast<std::size_t>(width) * height;
   const double side = longer_side(model_);
   // A kernel's share of the picture, as the square of two bandwidths.
-  const double bandwidth = 0.5 * std::sqrt(pixels / (side * side) / options.kernels);
+  const double bandwidth = 0.5 * std::sqrt(width / side * (height / side) / options.kernels);
   std::mt19937 random(options.seed);
   for (int i = 0; i < options.kernels; ++i) {
-    const std::size_t pixel = random() % pixels;
-    const double along = -std::log(bandwidth);
-    model_.kernels.push_back({(pixel % width + 0.5) / side, (pixel / width + 0.5) / side, along, 0, along, 0,
-                              target[pixel], target[pixels + pixel], target[2 * pixels + pixel]});
+    const auto x = static_cast<int>(random() % width), y = static_cast<int>(random() % height);
+    Kernel kernel = {};
+    kernel.x = (x + 0.5) / side, kernel.y = (y + 0.5) / side;
+    kernel.log_xx = kernel.log_yy = -std::log(bandwidth);
+    const std::size_t pixels = target.size() / 3, pixel = static_cast<std::size_t>(y) * width + x;
+    kernel.red = target[pixel], kernel.green = target[pixels + pixel], kernel.blue = target[2 * pixels + pixel];
+    model_.kernels.push_back(kernel);
   }
 }
 

@@ -32,10 +32,11 @@ GaussianModel parse_splat(std::string_view bytes, const std::string& file) {
   model.dc.reserve(3 * model.count);
   model.opacity_logits.reserve(model.count);
   model.rotations.reserve(4 * model.count);
-  const auto read_finite = [&](const char* what, double least) {
-    const ByteCursor begin = cursor;
+  const auto read_finite = [&](const char* what, float least) {
+    const std::size_t offset = cursor.offset();
     const auto value = cursor.read<float>(what);
-    if (!std::isfinite(value) || value < least) begin.fail(what, "is " + shortest_text(value));
+    if (!std::isfinite(value) || value < least)
+      ByteCursor(bytes, file, offset).fail(what, "is " + shortest_text(value));
     return value;
   };
   for (std::size_t i = 0; i < model.count; ++i) {

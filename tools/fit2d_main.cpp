@@ -47,9 +47,9 @@ Results in FOLDER
 
 The last line on the terminal is the PSNR.
 
-Figure 2 of the paper:   dsmoe_fit2d --edge 128 --kernels 2 --shape equal -o figure2
-Figure 3:                dsmoe_fit2d --edge 128 --kernels 6 --mixture sum -o figure3
-Figure 10:               dsmoe_fit2d photo.jpg --width 300 --kernels 2000 -o figure10
+Figure 2 of the paper:   dsmoe_fit2d --edge 128 --kernels 2 --shape equal --rate 0.05 -o figure2
+Figure 3:                dsmoe_fit2d --edge 128 --kernels 6 --mixture sum --rate 0.05 -o figure3
+Figure 10:               dsmoe_fit2d photo.jpg --width 300 --kernels 2000 --iterations 1000 -o figure10
 )";
 
 const std::vector<OptionRule> kOptions = {

@@ -1,0 +1,195 @@
+// Views: json files, the matrices of a view, orbits.
+#include "views.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <stdexcept>
+
+#include "io_test_support.h"
+
+namespace dsmoe::tools {
+namespace {
+
+using io::expect_contains;
+using io::format_error_of;
+
+constexpr const char* kTransforms = R"({"w": 64, "h": 48, "fl_x": 50, "cx": 30, "k1": 0, "frames": [
+  {"file_path": "a.png", "transform_matrix": [[0,0,1,5],[1,0,0,6],[0,1,0,7],[0,0,0,1]]},
+  {"file_path": "b.png", "fl_x": 40, "fl_y": 41, "cy": 20,
+   "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]})";
+constexpr const char* kInria = R"([{"id": 0, "img_name": "v", "width": 64, "height": 48, "fx": 50, "fy": 51,
+  "position": [5, 6, 7], "rotation": [[0, 0, -1], [1, 0, 0], [0, -1, 0]]}])";
+
+/// A point of the world in the view.
+std::array<double, 3> seen(const View& view, const std::array<double, 3>& p) {
+  std::array<double, 3> out = view.translation;
+  for (int row = 0; row < 3; ++row) {
+    for (int k = 0; k < 3; ++k) out[row] += view.rotation[3 * row + k] * p[k];
+  }
+  return out;
+}
+
+#if DSMOE_WITH_JSON
+TEST(JsonViews, TransformsHaveOpenGlAxesAndValuesOfTheirFrame) {
+  const std::vector<View> views = parse_json_views(kTransforms, "t.json", {});
+  ASSERT_EQ(views.size(), 2u);
+  EXPECT_EQ(views[0].name, "a.png");
+  EXPECT_EQ(views[0].fx, 50);
+  EXPECT_EQ(views[0].fy, 50);
+  EXPECT_EQ(views[0].cx, 30);
+  EXPECT_EQ(views[0].cy, 24);
+  EXPECT_EQ(views[1].fx, 40);
+  EXPECT_EQ(views[1].fy, 41);
+  EXPECT_EQ(views[1].cy, 20);
+  // Columns of the matrix: right is world y, up is world z, back is world x. One step ahead is (-1, 0, 0).
+  EXPECT_EQ(seen(views[0], {5, 6, 7}), (std::array<double, 3>{0, 0, 0}));
+  EXPECT_EQ(seen(views[0], {4, 6, 7}), (std::array<double, 3>{0, 0, 1}));
+  EXPECT_EQ(seen(views[0], {5, 7, 7}), (std::array<double, 3>{1, 0, 0}));
+  EXPECT_EQ(seen(views[0], {5, 6, 8}), (std::array<double, 3>{0, -1, 0}));
+}
+
+TEST(JsonViews, InriaCamerasAreTheSameViewInOurAxes) {
+  const std::vector<View> views = parse_json_views(kInria, "cameras.json", {});
+  ASSERT_EQ(views.size(), 1u);
+  EXPECT_EQ(seen(views[0], {4, 6, 7}), (std::array<double, 3>{0, 0, 1}));
+  EXPECT_EQ(seen(views[0], {5, 7, 7}), (std::array<double, 3>{1, 0, 0}));
+  EXPECT_EQ(seen(views[0], {5, 6, 8}), (std::array<double, 3>{0, -1, 0}));
+  EXPECT_EQ(views[0].fy, 51);
+  EXPECT_EQ(views[0].cx, 32);
+}
+
+TEST(JsonViews, AnAngleOfViewIsThatOfTheWholeWidth) {
+  const std::string text = R"({"camera_angle_x": 1.5707963267948966, "frames": [{"file_path": "a",
+    "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]})";
+  const std::vector<View> views = parse_json_views(text, "t.json", {200, 100});
+  EXPECT_EQ(views[0].width, 200);
+  EXPECT_EQ(views[0].height, 100);
+  EXPECT_NEAR(views[0].fx, 100, 1e-12);  // tan(45 degrees) is 1 but for rounding
+  EXPECT_NEAR(views[0].fy, 100, 1e-12);
+  expect_contains(format_error_of([&] { parse_json_views(text, "t.json", {}); }), "--size");
+}
+
+TEST(JsonViews, RefuseWithPlaceAndReason) {
+  const auto expect_refused = [](const char* valid, const std::string& from, const std::string& to,
+                                 const std::string& place, const std::string& reason) {
+    std::string text = valid;
+    const std::size_t at = text.find(from);
+    ASSERT_NE(at, std::string::npos) << from;
+    text.replace(at, from.size(), to);
+    const std::string message = format_error_of([&] { parse_json_views(text, "c.json", {}); });
+    expect_contains(message, "c.json" + place);
+    expect_contains(message, reason);
+  };
+  expect_refused(kInria, "\"v\", ", "\"v\" ", ", byte ", "not valid json");
+  expect_refused(kInria, "50", "NaN", ", byte ", "not valid json");
+  expect_refused(kInria, "50", "1e999", "", "not valid json");
+  expect_refused(kInria, "64", "-64", ": camera 0: `width`", "-64");
+  expect_refused(kInria, "64", "6.5", ": camera 0: `width`", "whole number");
+  expect_refused(kInria, "64", "1e300", ": camera 0: `width`", "1e+300");
+  expect_refused(kInria, "50", "0", ": camera 0: `fx`", "must be a number from");
+  expect_refused(kInria, "50", "true", ": camera 0: `fx`", "true");
+  expect_refused(kInria, "[5, 6, 7]", "[5, 6]", ": camera 0: `position`", "3 numbers");
+  expect_refused(kInria, "[5, 6, 7]", "7", ": camera 0: `position`", "3 numbers");
+  expect_refused(kInria, "[0, 0, -1]", "[0, 0, 1]", ": camera 0: `rotation`", "mirrors");
+  expect_refused(kInria, "[0, 0, -1]", "[0, 0, 0]", ": camera 0: `rotation`", "no rotation");
+  expect_refused(kInria, "\"img_name\"", "\"name\"", ": camera 0", "`img_name` is missing");
+  expect_refused(kTransforms, "\"k1\": 0", "\"k1\": 0.1", ": `k1`", "distortion");
+  expect_refused(kTransforms, "\"frames\"", "\"views\"", "", "`frames` is missing");
+  expect_refused(kTransforms, "\"a.png\"", "3", ": frame 0: `file_path`", "must be a text");
+  expect_refused(kTransforms, "\"fl_x\": 40", "\"fl_x\": \"40\"", ": frame 1: `fl_x`", "40");
+  for (const char* text : {"", "3", "[]", "[3]", "{\"frames\": []}", "{\"frames\": 3}", "nul"}) {
+    EXPECT_THROW(parse_json_views(text, "c.json", {}), io::FormatError) << text;
+  }
+}
+
+TEST(JsonViews, DamageIsSurvived) {
+  for (const char* valid : {kTransforms, kInria}) {
+    io::expect_survives_damage(
+        valid, [](const std::string& b) { parse_json_views(b, "damaged", {}); }, 1000);
+  }
+}
+#else
+TEST(JsonViews, SayThatThisBuildHasNone) {
+  expect_contains(format_error_of([&] { parse_json_views(kInria, "c.json", {}); }), "nlohmann");
+}
+#endif
+
+TEST(View, HasTheMatricesOfItsNumbers) {
+  const Orbit orbit;
+  View view = orbit_views(orbit)[17];
+  view.fx = 900, view.fy = 800, view.cx = 600, view.cy = 400;
+  const Camera<float> camera = camera_of(view);
+  const std::array<double, 3> point = {0.2, -0.1, 0.3};
+  const std::array<double, 3> expected = seen(view, point);
+  const Vec3<float> p = {0.2f, -0.1f, 0.3f};
+  const Vec3<float> actual = transform_point(camera.view, p);
+  // All of float32's numbers here are below 2, those in pixels below 1000.
+  EXPECT_NEAR(actual.x, expected[0], 1e-6);
+  EXPECT_NEAR(actual.y, expected[1], 1e-6);
+  EXPECT_NEAR(actual.z, expected[2], 1e-6);
+  // The rasterizer's pixel centres are whole numbers, a View's lie half a pixel further.
+  const Vec2<float> pixel = project_to_pixel(camera, p);
+  EXPECT_NEAR(pixel.x, 900 * expected[0] / expected[2] + 600 - 0.5, 1e-3);
+  EXPECT_NEAR(pixel.y, 800 * expected[1] / expected[2] + 400 - 0.5, 1e-3);
+  EXPECT_NEAR(camera.tan_fov_x, 1280 / (2 * 900.0), 1e-6);
+  const std::array<double, 3> centre = seen(view, {camera.position[0], camera.position[1], camera.position[2]});
+  for (const double x : centre) EXPECT_NEAR(x, 0, 1e-6);
+}
+
+TEST(View, KeepsWhatItShowsAtAnotherSize) {
+  const View view = orbit_views({})[0];
+  const View half = resized(view, view.width / 2, view.height / 4);
+  EXPECT_EQ(half.fx, view.fx / 2);
+  EXPECT_EQ(half.cx, view.cx / 2);
+  EXPECT_EQ(half.fy, view.fy / 4);
+  EXPECT_EQ(half.cy, view.cy / 4);
+}
+
+TEST(Orbit, LooksAtItsTargetFromItsDistanceWithUpAbove) {
+  Orbit orbit;
+  orbit.count = 8;
+  orbit.target = {1, 2, 3};
+  orbit.distance = 5;
+  orbit.elevation = 30;
+  for (const std::array<double, 3>& up : {std::array<double, 3>{0, -1, 0}, {0, 0, 2}, {1, 1, -1}}) {
+    orbit.up = up;
+    const double length = std::sqrt(up[0] * up[0] + up[1] * up[1] + up[2] * up[2]);
+    for (const View& view : orbit_views(orbit)) {
+      const std::array<double, 3> target = seen(view, orbit.target);
+      EXPECT_NEAR(target[0], 0, 1e-12);
+      EXPECT_NEAR(target[1], 0, 1e-12);
+      EXPECT_NEAR(target[2], 5, 1e-12);
+      const std::array<double, 3> above = seen(view, {1 + up[0] / length, 2 + up[1] / length, 3 + up[2] / length});
+      EXPECT_NEAR(above[0], 0, 1e-12);
+      EXPECT_NEAR(above[1], -std::cos(M_PI / 6), 1e-12);     // y is down
+      EXPECT_NEAR(above[2], 5 - std::sin(M_PI / 6), 1e-12);  // the camera is 30 degrees above
+    }
+  }
+  orbit.up = {0, 0, 0};
+  EXPECT_THROW(orbit_views(orbit), std::invalid_argument);
+}
+
+TEST(ColmapViews, NeedNoLensDistortion) {
+  io::ColmapModel model;
+  model.cameras.push_back({7, io::find_camera_model("SIMPLE_PINHOLE"), 64, 48, {50, 30, 20}});
+  io::ColmapImage image;
+  image.camera_id = 7, image.name = "a/b.jpg";
+  image.qvec = {std::sqrt(0.5), 0, 0, std::sqrt(0.5)};  // a quarter turn about z
+  image.tvec = {1, 2, 3};
+  model.images.push_back(image);
+  const View view = views_of(model, "folder")[0];
+  EXPECT_EQ(view.fx, 50);
+  EXPECT_EQ(view.fy, 50);
+  EXPECT_EQ(view.cx, 30);
+  EXPECT_EQ(view.cy, 20);
+  const std::array<double, 3> turned = seen(view, {1, 0, 0});
+  EXPECT_NEAR(turned[0], 1, 1e-12);
+  EXPECT_NEAR(turned[1], 3, 1e-12);
+  EXPECT_NEAR(turned[2], 3, 1e-12);
+  model.cameras[0].model = io::find_camera_model("OPENCV");
+  expect_contains(format_error_of([&] { views_of(model, "folder"); }), "folder: camera 7 has the model OPENCV");
+}
+
+}  // namespace
+}  // namespace dsmoe::tools
