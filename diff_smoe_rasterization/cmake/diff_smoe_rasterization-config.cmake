@@ -68,6 +68,11 @@ foreach(name IN LISTS dsmoe_components)
   endif()
 endforeach()
 set_property(TARGET dsmoe::io PROPERTY INTERFACE_INCLUDE_DIRECTORIES "${dsmoe_package}/csrc")  # "io/ply.h"
+if("cuda" IN_LIST diff_smoe_rasterization_FIND_COMPONENTS AND TARGET dsmoe::cuda)  # its callers have device pointers
+  include(CMakeFindDependencyMacro)
+  find_dependency(CUDAToolkit)
+  set_property(TARGET dsmoe::cuda APPEND PROPERTY INTERFACE_LINK_LIBRARIES CUDA::cudart)
+endif()
 foreach(name IN LISTS diff_smoe_rasterization_FIND_COMPONENTS)
   if(NOT diff_smoe_rasterization_${name}_FOUND AND diff_smoe_rasterization_FIND_REQUIRED_${name})
     set(diff_smoe_rasterization_FOUND FALSE)

@@ -46,11 +46,14 @@ Given::Given(const Settings& settings, const RasterizeArguments& arguments) : Se
 
 void Given::resolve_blend() {
   blend_mode = -1;
+  std::string names;
   BlendModes::for_each([&](auto mode) {
-    if (Settings::blend_mode == Blend<decltype(mode)::value>::kName) blend_mode = static_cast<int64_t>(mode());
+    const std::string name = Blend<decltype(mode)::value>::kName;
+    names += (names.empty() ? "" : ", ") + name;
+    if (Settings::blend_mode == name) blend_mode = static_cast<int64_t>(mode());
   });
-  TORCH_CHECK_VALUE(blend_mode >= 0, "rasterize: blend_mode is '", Settings::blend_mode,
-                    "'; it must be alpha, smoe, smoe_tn or smoe_std");
+  TORCH_CHECK_VALUE(blend_mode >= 0, "rasterize: blend_mode is '", Settings::blend_mode, "'; it must be one of ",
+                    names);
   const auto alpha = static_cast<int64_t>(BlendMode::kAlpha), smoe = static_cast<int64_t>(BlendMode::kSmoe);
   const std::optional<BackgroundGate>& gate = Settings::background_gate;
   const bool is_one = gate && !gate->tensor.defined() && gate->number == 1;

@@ -222,7 +222,8 @@ TEST(Torch, WhatDoesNotFitIsRefused) {
     edit(bad);
     expect_error<c10::ValueError>([&] { bad.render(); }, text);
   };
-  refused([](Scene& s) { s.settings.blend_mode = "mean"; }, "blend_mode is 'mean'; it must be alpha, smoe");
+  refused([](Scene& s) { s.settings.blend_mode = "mean"; },
+          "blend_mode is 'mean'; it must be one of alpha, smoe, smoe_tn, smoe_std");
   refused([](Scene& s) { s.settings.blend_mode = "smoe_tn"; }, "only 'smoe' knows it");
   refused([](Scene& s) { s.settings.background_gate = -0.1; }, "background_gate is -0.1; it must be a number");
   refused([](Scene& s) { s.arguments.outputs = {"color"}; }, "outputs holds 'color'; it may hold alpha");
