@@ -11,8 +11,9 @@ from ..settings import RECOMMENDED_BACKGROUND_GATE, resolve_background_gate
 from ..trainer.inspection import to_image
 from ..trainer.results.rendering import Renderer
 from ..trainer.scenes.cameras import Camera
+from .gate_map import largest_gates
 
-SHOWN = ("colour", "gates", "depth", "coverage")
+SHOWN = ("colour", "gates", "largest gate", "depth", "coverage")
 LINE = (255, 255, 255)  # between two blends
 
 
@@ -38,7 +39,8 @@ class Look:
     """What a viewer is asked to show."""
 
     blend: Blend
-    shown: str = "colour"  # one of SHOWN; gates: each Gaussian in a colour of its own, blended
+    # One of SHOWN; gates: each Gaussian in a colour of its own, blended; largest gate: not blended, the gate map.
+    shown: str = "colour"
     beside: Optional[Blend] = None  # right of the split
     split: float = 0.5  # of the width
 
@@ -62,6 +64,8 @@ def _of_blend(renderer: Renderer, camera: Camera, blend: Blend, shown: str) -> n
                    background_gate=gate)
     if shown == "gates":
         image = own(camera, colors_precomp=own_colours(renderer.model.num_gaussians).to(renderer.background)).color
+    elif shown == "largest gate":
+        image = _gate_map(own, camera)
     elif shown == "depth":
         image = near_is_bright(own(camera, outputs=("depth",)).depth).expand(3, -1, -1)
     elif shown == "coverage":
@@ -69,6 +73,14 @@ def _of_blend(renderer: Renderer, camera: Camera, blend: Blend, shown: str) -> n
     else:
         image = own(camera).color
     return np.asarray(to_image(image)).copy()
+
+
+def _gate_map(renderer: Renderer, camera: Camera) -> torch.Tensor:
+    """[3, H, W] the colour of the Gaussian with the largest gate, and the background where none is open."""
+    largest = largest_gates(renderer.model, renderer.settings_of(camera)).to(renderer.background.device)
+    colours = torch.cat([own_colours(renderer.model.num_gaussians).to(renderer.background),
+                         renderer.background[None]])
+    return colours[largest].permute(2, 0, 1)  # -1 is the last row
 
 
 def own_colours(count: int) -> torch.Tensor:

@@ -15,9 +15,11 @@ from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.inspection import to_image
 from diff_smoe_rasterization.trainer.opening import open_trained
+from diff_smoe_rasterization.trainer.results.rendering import Renderer
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.training.loop import Run, Trainer
 from diff_smoe_rasterization.view.following import Followed
+from diff_smoe_rasterization.view.gate_map import largest_gates
 from diff_smoe_rasterization.view.picture import SHOWN, Blend, Look, own_colours, picture
 
 
@@ -71,6 +73,22 @@ def test_gates_have_distinct_colours_and_show_the_one_that_is_open(opened):
     expected = np.asarray(to_image(own_colours(1)[0][:, None, None]))[0, 0]
     center = image.reshape(-1, 3)[(image.reshape(-1, 3) == expected).all(axis=1)]
     assert len(center) > 20
+
+
+@pytest.mark.parametrize("mode, gate", [("alpha", 1.0), ("smoe", 0.0), ("smoe", 0.03), ("smoe_tn", 0.0),
+                                        ("smoe_std", 0.0)])
+def test_the_gate_map_has_the_largest_weight_of_each_pixel(opened, mode, gate):
+    """A rendering with a channel for each Gaussian says all weights, but for what divides them."""
+    model, camera = opened.renderer.model, opened.cameras[0].resized(100, 75)  # more than one block
+    renderer = Renderer(model, mode, torch.zeros(60), background_gate=gate)
+    with torch.no_grad():
+        weights = renderer(camera, colors_precomp=torch.eye(60)).color
+    best = weights.topk(2, dim=0)
+    found = largest_gates(model, renderer.settings_of(camera))
+    assert torch.equal(found < 0, best.values[0] == 0)
+    clear = best.values[0] > 1.0001 * best.values[1]  # rounding may turn what is closer
+    assert clear.double().mean() > 0.5 and torch.equal(found[clear], best.indices[0][clear])
+    assert len(found.unique()) > 20
 
 
 def test_near_is_bright(opened):
