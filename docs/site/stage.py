@@ -1,7 +1,7 @@
 """Puts the repository's pages, and what they link to, where MkDocs reads them; makes the pages of the C++ headers.
 
 python stage.py FOLDER writes FOLDER/mkdocs.yml and FOLDER/pages. Every page lies there where it lies in the repository,
-so its links work as they are.
+so its links work as they are; a link to a folder leads to its README.md, or to a list of its files.
 """
 from __future__ import annotations
 
@@ -28,14 +28,20 @@ def main(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     pages = folder / "pages"
     for page in markdown_files():
-        copy(page, pages)
-        for target in LINK.findall(page.read_text(encoding="utf-8")):
+        text = page.read_text(encoding="utf-8")
+        for target in {*LINK.findall(text)}:
             path = (page.parent / target).resolve()
-            if path.is_file() and ROOT in path.parents and path.suffix != ".md":
+            if ROOT not in path.parents:
+                continue
+            if path.is_dir():
+                text = text.replace(f"]({target})", f"]({target.rstrip('/')}/README.md)")
+                write_listing(path, pages)
+            elif path.is_file() and path.suffix != ".md":
                 copy(path, pages)
-    (pages / "docs" / "site" / "cpp_headers.md").write_text(header_pages(), encoding="utf-8")
+        write(pages / page.relative_to(ROOT), text)
+    write(pages / "docs" / "site" / "cpp_headers.md", header_pages())
     settings = (SITE / "mkdocs.yml").read_text(encoding="utf-8")
-    (folder / "mkdocs.yml").write_text(settings.replace("REPOSITORY", str(ROOT)), encoding="utf-8")
+    write(folder / "mkdocs.yml", settings.replace("REPOSITORY", str(ROOT)))
 
 
 def markdown_files() -> Iterator[Path]:
@@ -49,6 +55,22 @@ def markdown_files() -> Iterator[Path]:
             found += (ROOT / name).rglob("*.md")
         listed = [str(path.relative_to(ROOT)) for path in found]
     return (ROOT / name for name in sorted(listed) if (ROOT / name).is_file() and not name.startswith("tests/"))
+
+
+def write_listing(folder: Path, pages: Path) -> None:
+    """The page of a folder that another page links to, where it has none: its files."""
+    if (folder / "README.md").is_file():
+        return
+    files = [path for path in sorted(folder.iterdir()) if path.is_file()]
+    for path in files:
+        copy(path, pages)
+    name = folder.relative_to(ROOT)
+    write(pages / name / "README.md", f"# {name}\n\n" + "".join(f"- [{path.name}]({path.name})\n" for path in files))
+
+
+def write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 def copy(path: Path, pages: Path) -> None:
