@@ -156,7 +156,7 @@ std::vector<View> choose_views(const CommandLine& line, const Model& model) {
 enum class Show { kColor, kAlpha, kDepth, kGates, kCount };
 const std::vector<std::string> kShowNames = {"color", "alpha", "depth", "gates", "count"};
 
-/// Makes pictures of what a view shows. Colours of numbers span those of the first picture.
+/// Makes pictures of what a view shows. Colours of numbers span those of the first picture that has a Gaussian.
 class Painter {
  public:
   Painter(Show show, bool numbers) : show_(show), numbers_(numbers) {}
@@ -184,23 +184,25 @@ class Painter {
  private:
   /// Pixels without a Gaussian are black, and do not count for the span.
   Picture in_colors(const Picture& numbers, const std::vector<float>& alpha) {
-    if (!span_) {
-      span_ = {INFINITY, -INFINITY};
-      for (std::size_t i = 0; i < alpha.size(); ++i) {
-        if (!(alpha[i] > 0)) continue;
-        span_->first = std::min(span_->first, numbers.values[i]);
-        span_->second = std::max(span_->second, numbers.values[i]);
-      }
-      if (span_->first <= span_->second) {
-        std::printf("%s: blue is %g, red is %g\n", kShowNames[static_cast<std::size_t>(show_)].c_str(), span_->first,
-                    span_->second);
-      }
-    }
-    Picture colors = heat_map(numbers, span_->first, span_->second);
+    if (!span_) find_span(numbers.values, alpha);
+    const auto [low, high] = span_.value_or(std::pair(0.0f, 1.0f));
+    Picture colors = heat_map(numbers, low, high);
     for (std::size_t i = 0; i < alpha.size(); ++i) {
       for (int c = 0; c < 3 && !(alpha[i] > 0); ++c) colors.values[c * alpha.size() + i] = 0;
     }
     return colors;
+  }
+
+  /// Stays empty where the picture is.
+  void find_span(const std::vector<float>& numbers, const std::vector<float>& alpha) {
+    for (std::size_t i = 0; i < alpha.size(); ++i) {
+      if (!(alpha[i] > 0)) continue;
+      if (!span_) span_ = {numbers[i], numbers[i]};
+      span_ = {std::min(span_->first, numbers[i]), std::max(span_->second, numbers[i])};
+    }
+    if (!span_) return;
+    std::printf("%s: blue is %g, red is %g\n", kShowNames[static_cast<std::size_t>(show_)].c_str(), span_->first,
+                span_->second);
   }
 
   Show show_;

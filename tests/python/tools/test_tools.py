@@ -114,6 +114,14 @@ def test_all_camera_files_mean_the_same_view(tmp_path, kind):
     assert np.abs(actual - levels(package_rendering(gaussians, "alpha", None).color)).max() <= LEVELS
 
 
+def test_no_name_in_a_file_leads_out_of_the_folder(tmp_path):
+    io.write_gaussians(tmp_path / "model.ply", model("alpha"))
+    cameras = write_cameras(tmp_path, "transforms.json")
+    cameras.write_text(cameras.read_text().replace("./images/view.png", "../../outside/view.png"))
+    tool("dsmoe_render", tmp_path / "model.ply", "--cameras", cameras, "--device", "cpu", "-o", tmp_path / "a" / "out")
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png")] == ["a/out/outside/view.png"]
+
+
 def test_alpha_is_the_gate_sum(tmp_path):
     gaussians = model("smoe", 0.05)
     io.write_gaussians(tmp_path / "model.ply", gaussians)
