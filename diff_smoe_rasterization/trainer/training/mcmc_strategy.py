@@ -94,6 +94,7 @@ def divided(opacities: torch.Tensor, copies: torch.Tensor) -> Tuple[torch.Tensor
     new = 1 - (1 - old) ** (1 / n)
     j = torch.arange(1.0, MOST_COPIES + 1, dtype=torch.float64, device=opacities.device)
     log_binomials = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
-    terms = (log_binomials + j * new.log()).exp() / j.sqrt() * torch.where(j % 2 == 1, 1.0, -1.0)
+    signs = 2 * (j % 2) - 1
+    terms = signs * (log_binomials + j * new.log()).exp() / j.sqrt()
     sums = terms.masked_fill(j > n, 0).sum(1)
     return new.squeeze(1).to(opacities), (old.squeeze(1) / sums).to(opacities)
