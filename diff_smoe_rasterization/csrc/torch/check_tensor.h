@@ -10,6 +10,8 @@
 namespace dsmoe {
 namespace binding {
 
+using OptionalTensor = c10::optional<at::Tensor>;  // std::optional in newer torch
+
 // "float32", as Python calls it.
 std::string dtype_name(at::ScalarType type);
 

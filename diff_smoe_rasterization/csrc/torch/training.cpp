@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "call_op.h"
+#include "check_tensor.h"
 #include "dsmoe/torch_training.h"
 #include "tensors.h"
 

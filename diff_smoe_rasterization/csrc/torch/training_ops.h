@@ -21,8 +21,6 @@
 namespace dsmoe {
 namespace binding {
 
-using OptionalTensor = c10::optional<at::Tensor>;  // std::optional in newer torch
-
 // Autograd must notice where a tensor was changed in place after it was saved.
 inline void note_change(at::TensorList tensors) {
   for (const at::Tensor& tensor : tensors) tensor.unsafeGetTensorImpl()->bump_version();
