@@ -145,9 +145,9 @@ def watched(strategy: ThreeDGSStrategy, recorder: Recorder) -> ThreeDGSStrategy:
             recorder.before_change(step)
             super().after_backward(step)
 
-        def densify(self, gradients: torch.Tensor) -> None:
+        def densify(self, gradients: torch.Tensor, *limits: Any) -> None:
             recorder.before_densification(gradients, self.view_count > 0)
-            super().densify(gradients)
+            super().densify(gradients, *limits)
 
         def prune(self, large_too: bool) -> None:
             recorder.before_prune(large_too)
