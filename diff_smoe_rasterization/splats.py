@@ -23,10 +23,10 @@ class Splats:
         background, background_gate = (inputs[INPUTS.index(name)] for name in ("bg", "background_gate"))
         assert background is not None
         self._color, self._radii, self._gate_sum = (image.detach() for image in images[:3])
-        self._background = background.detach()
         self._saved = [tensor.detach() for tensor in saved]
         self._projected = self._saved[0]
-        # A tensor is copied: an optimizer may change it before anybody asks for contributions.
+        # Copies: an optimizer may change these before anybody asks for sums.
+        self._background = background.detach().clone()
         self._background_gate = None if background_gate is None else background_gate.detach().clone()
         self._options = (*options, False)
 

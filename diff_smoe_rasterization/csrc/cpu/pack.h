@@ -3,8 +3,7 @@
 // Included once per instruction set, by a file that has set DSMOE_SIMD (the namespace, so that each set's code has
 // its own symbols) and DSMOE_SIMD_BYTES (the register's size: 64 is AVX-512, 32 is AVX2 with FMA, 16 any machine). It
 // uses the compilers' vector types. Where those make poor masks or no FMA, it uses intrinsics. The compilers' own
-// macros
-// (__AVX2__ ...) cannot choose: GCC expands them before it sees the target pragma.
+// macros (__AVX2__ ...) cannot choose: GCC expands them before it sees the target pragma.
 #pragma once
 
 #include <cstdint>

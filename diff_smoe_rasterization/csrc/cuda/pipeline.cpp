@@ -1,5 +1,6 @@
 // The order of the stages, and the memory between them. A capacity that turns out too small costs time, not
-// correctness (rasterize_cuda.h), so only the first call of a kind waits for the number of instances.
+// correctness (rasterize_cuda.h). So only the first call of a kind waits for the number of instances, and every one
+// whose gradients are reproducible, because each instance must have its slot then.
 #include <algorithm>
 #include <limits>
 #include <stdexcept>
@@ -22,6 +23,12 @@ template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream
 }
 
 constexpr int64_t kMostSlots = std::numeric_limits<uint32_t>::max();  // their numbers have 32 bits
+
+void check_slots(int64_t instances) {
+  if (instances <= kMostSlots) return;
+  throw std::overflow_error("rasterize: " + std::to_string(instances) +
+                            " tile instances; with deterministic=True the most is " + std::to_string(kMostSlots));
+}
 
 // Memory for what the depth sort sorts. In a mode without a depth order, `project` fills saved.order itself.
 template <class S> DepthKeys<S> depth_keys(const Frame<S>& frame, Scratch& scratch) {
@@ -56,11 +63,14 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
 // Returns for how many instances there will be room.
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
-  const int64_t likely = InstanceCapacities::shared().likely(key, run.deterministic);
-  if (is_capturing(run.stream)) return likely < 0 ? 8 * frame.inputs.num_gaussians + 1024 : likely;
-  if (likely >= 0) return likely;
+  const bool capturing = is_capturing(run.stream), mendable = run.deterministic && !capturing;
+  int64_t capacity = InstanceCapacities::shared().likely(key, mendable);
+  if (capacity < 0 && capturing) capacity = 8 * frame.inputs.num_gaussians + 1024;
+  if (capacity >= 0) return run.deterministic ? std::min(capacity, kMostSlots) : capacity;
   count_instances(frame, work);
-  return read(frame.saved.num_instances, "projecting Gaussians", run.stream);
+  const auto count = read(frame.saved.num_instances, "projecting Gaussians", run.stream);
+  if (run.deterministic) check_slots(count);
+  return count;
 }
 
 // Lists the instances, with room for `sizes.capacity`. What depends on the capacity is allocated anew.
@@ -94,15 +104,11 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
 
   const auto key = capacity_key(frame);
   sizes.capacity = choose_capacity(frame, key, run, work);
-  if (run.deterministic) sizes.capacity = std::min(sizes.capacity, kMostSlots);
   memory.release();
   list_with_capacity(frame, sizes, memory, work);
   if (run.deterministic && !is_capturing(run.stream)) {  // each instance must have its slot
     const int64_t count = read(saved.num_instances, "listing instances", run.stream);
-    if (count > kMostSlots) {
-      throw std::overflow_error("rasterize: " + std::to_string(count) +
-                                " tile instances; with deterministic=True the most is " + std::to_string(kMostSlots));
-    }
+    check_slots(count);
     if (count > sizes.capacity) {
       sizes.capacity = count;
       list_with_capacity(frame, sizes, memory, work);

@@ -24,8 +24,8 @@ template <class S> struct SlotSums {
 
 // Where the instances outgrew their memory there is nothing to sum, and nothing is written.
 //
-// A warp sums the records of 32 Gaussians, one after the other. Each lane adds every third slot, say, of one number, in
-// double; so neighbouring lanes read neighbouring numbers.
+// A warp sums the records of 32 Gaussians, one after the other. The lanes take `rows` slots at a time, a lane one
+// number of a slot, in double; so neighbouring lanes read neighbouring numbers.
 template <class S>
 __global__ void __launch_bounds__(kStoreBlock) sum_slots_kernel(const __grid_constant__ SlotSums<S> arguments) {
   if (overflows(arguments.saved)) return;

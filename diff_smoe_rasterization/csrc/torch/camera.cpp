@@ -19,8 +19,10 @@ GaussianRasterizationSettings settings_from_camera(const at::Tensor& K, const at
   binding::check_shape(function, "t", t, {3});
   const at::Tensor intrinsics = K.to(at::kDouble), rotation = R.to(at::kDouble), translation = t.to(at::kDouble);
   const double fx = intrinsics[0][0].item<double>(), fy = intrinsics[1][1].item<double>();
-  TORCH_CHECK_VALUE(fx > 0 && fy > 0, function, ": K has the focal lengths ", fx, " and ", fy,
-                    "; both must be positive");
+  const at::Tensor pinhole = intrinsics.clone();
+  pinhole[0][1].fill_(0), pinhole[1][0].fill_(0), pinhole[2].copy_(at::eye(3, intrinsics.options())[2]);
+  TORCH_CHECK_VALUE(fx > 0 && fy > 0 && at::equal(intrinsics, pinhole), function, ": K is ", intrinsics,
+                    "; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0");
   const at::Tensor identity = at::eye(3, rotation.options());
   const double error = (rotation.mm(rotation.t()) - identity).abs().max().item<double>();
   TORCH_CHECK_VALUE(error < 1e-3 && at::det(rotation).item<double>() > 0, function, ": R must be a rotation");

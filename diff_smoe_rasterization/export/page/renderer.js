@@ -1,4 +1,5 @@
-// Draws Gaussians by WebGL2 as the rasterizer does: docs/method.md has the equations.
+// Draws Gaussians by WebGL2 by the rasterizer's equations (docs/method.md), but for the early stop: a full pixel goes on
+// taking what little is left, at most 0.01 of its colour.
 //
 // Each Gaussian is a quad, drawn front to back into a float image that holds (S, W) = (sum w c, sum w), w = alpha T.
 // The blend function (ONE_MINUS_DST_ALPHA, ONE) makes the weights: T in front of a pair is 1 - W, since the weights sum

@@ -13,7 +13,8 @@
 //
 // The ablations divide by sum alpha, of which alpha_k goes; in smoe_std nothing is seen through anything, so q_k is 0.
 // A pixel that no other Gaussian and no background's gate is in shows the background's colour. This is exact but for
-// what lies behind a pixel's early stop, of which nothing is known.
+// what lies behind a pixel's early stop, of which nothing is known, and for owners behind a pair that have less than
+// 1e-6 of W in float: their weights are lost in the rounding of W.
 #pragma once
 
 #include "dsmoe/pixel.h"
