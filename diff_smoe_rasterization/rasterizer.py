@@ -73,7 +73,7 @@ def visible_radii(means3D: torch.Tensor, settings: GaussianRasterizationSettings
     """Returns the radii [N] int32, in pixels, that `rasterize` would return for Gaussians of finite colours.
 
     A radius of 0 means that the Gaussian is not visible. Nothing is blended, so this costs only the projection. It has
-    no gradient. Arguments and errors are those of `rasterize`.
+    no gradient. The arguments are those of `rasterize` that a radius depends on; errors are as there.
     """
     # A radius depends neither on the opacity nor on the colour.
     inputs, options = _arguments(settings._replace(bg=means3D.new_zeros(1)), (), means3D,

@@ -1,4 +1,4 @@
-"""Drops the Gaussians that gave least to images: python examples/scores.py model.ply -o smaller.ply"""
+"""Drops the Gaussians that change images least: python examples/scores.py model.ply -o smaller.ply"""
 import argparse
 import dataclasses
 import math
@@ -18,13 +18,12 @@ gaussians, options = load(arguments.model)
 views = [look_at((2.7 * math.cos(angle), 1.6, 2.7 * math.sin(angle)), (0.0, 0.6, 0.0), **options)
          for angle in torch.arange(8) * math.pi / 4]
 
-# A Gaussian's score: the weights alpha T that it blended with, summed over all pixels of all views.
+# A Gaussian's score: the squared change of all views if it were not there.
 score, images = torch.zeros(len(gaussians["means3D"])), []
 with torch.no_grad():
     for settings in views:
         rendering, splats = rasterize_with_splats(settings=settings, **gaussians)
-        everywhere = torch.ones(settings.image_height, settings.image_width)
-        score += splats.contributions(pixel_weights=everywhere).blend_weights
+        score += splats.importance().removal_costs
         images.append(rendering.color)
 
 

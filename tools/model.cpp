@@ -39,7 +39,8 @@ Model activated(io::GaussianModel raw) {
   model.rotations.resize(4 * raw.count);
   const GaussianParameters<const float> from = {raw.opacity_logits.data(), raw.log_scales.data(), raw.rotations.data()};
   const GaussianParameters<float> to = {model.opacities.data(), model.scales.data(), model.rotations.data()};
-  for (int64_t i = 0; i < model.count; ++i) activate(from, to, i);
+  const Activate<float> activate = {from, to};
+  for (int64_t i = 0; i < model.count; ++i) activate(i);
   model.means3D = std::move(raw.means3D);
   model.dc = std::move(raw.dc);
   model.shs = std::move(raw.shs);
@@ -79,8 +80,8 @@ BlendChoice choose_blend(const io::GaussianModel& model, const std::string& file
   BlendChoice choice;
   choice.mode = static_cast<BlendMode>(found - names.begin());
   if (!recorded.empty() && chosen != recorded) {
-    std::fprintf(stderr, "note: %s was trained with the blend %s; in %s its Gaussians show another scene\n",
-                 file.c_str(), recorded.c_str(), chosen.c_str());
+    std::fprintf(stderr, "note: %s %s the blend %s; in another one Gaussians show another scene\n", file.c_str(),
+                 is_splat ? "does not say its blend; viewers take it for" : "was trained with", recorded.c_str());
   }
   if (choice.mode != BlendMode::kSmoe) {
     if (background_gate) throw UsageError("--background-gate is for --blend smoe only");

@@ -80,7 +80,7 @@ class TensorMemory final : public Allocator {
 
   void* keep(int index, const SavedArray& array) override {
     if (saved_.size() <= static_cast<size_t>(index)) saved_.resize(index + 1);
-    saved_[index] = {};  // before the new one, where an array is asked for again
+    saved_[index] = at::Tensor();  // freed before the new one, where an array is asked for again
     saved_[index] = at::empty(saved_shape(array), options_.dtype(scalar_type(array.type)));
     return saved_[index].data_ptr();
   }
