@@ -6,6 +6,7 @@ starts has them. Exit status and signals are the command's own, unless nothing w
 """
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -26,7 +27,7 @@ from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE
 from .trainers import GR, RASTERIZER, TRAINERS, names
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
-FORWARDED = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
@@ -40,18 +41,46 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
     sys.stderr.flush()
     with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
         used = Path(folder, "used")
-        child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)})
-        for number in FORWARDED:
-            signal.signal(number, lambda number, _: child.send_signal(number))
-        signal.signal(signal.SIGINT, lambda *_: None)  # a terminal sends it to the command too
-        status, is_used = child.wait(), used.exists()
+        status, is_used = _status_of(words, {**environment, USED_VARIABLE: str(used)}), used.exists()
     if status == 0 and not is_used:
         raise PatchError("the command ended without an error, but this package's rasterizer rendered nothing: what was "
                          f"trained or rendered was not {blend_mode}. A command that renders nothing needs no dsmoe run")
     if status < 0:
-        signal.signal(-status, signal.SIG_DFL)
+        with contextlib.suppress(OSError):  # SIGKILL has no handler
+            signal.signal(-status, signal.SIG_DFL)
         os.kill(os.getpid(), -status)
     sys.exit(status)
+
+
+def _status_of(words: Sequence[str], environment: Dict[str, str]) -> int:
+    """Runs the command, to which signals of this process go, and returns its exit status; -N where signal N ended it."""
+    child: Optional[subprocess.Popen] = None
+    early: List[int] = []  # signals that came while the command was being started
+
+    def forward(number: int, _: object) -> None:
+        if child is None:
+            early.append(number)
+        elif number != signal.SIGINT or not _is_in_foreground():
+            child.send_signal(number)
+
+    for number in FORWARDED:
+        if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup: the command inherits that, but no handler
+            signal.signal(number, forward)
+    child = subprocess.Popen(list(words), env=environment)
+    for number in early:
+        child.send_signal(number)
+    for number in FORWARDED:
+        signal.signal(number, forward)
+    return child.wait()
+
+
+def _is_in_foreground() -> bool:
+    """Whether a terminal sends its SIGINT to this process group, in which the command is too."""
+    try:
+        with open("/dev/tty") as terminal:
+            return os.tcgetpgrp(terminal.fileno()) == os.getpgrp()
+    except OSError:
+        return False
 
 
 def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],

@@ -116,7 +116,8 @@ def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any,
 def rasterizer_of_run() -> Dict[str, Any]:
     """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
 
-    The first rasterizer that is made is noted for `dsmoe run`, which else says at the end that there was none.
+    The first rasterizer that is made, or function that is called, is noted for `dsmoe run`, which else says at the end
+    that nothing was rendered.
     """
     from diff_smoe_rasterization import GaussianRasterizer
 
@@ -124,17 +125,30 @@ def rasterizer_of_run() -> Dict[str, Any]:
     module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
     original = GaussianRasterizer.__init__
 
-    def noted(self: Any, *arguments: Any, **keywords: Any) -> None:
-        GaussianRasterizer.__init__ = original
+    @functools.lru_cache(maxsize=None)
+    def note() -> None:
         if os.path.isdir(os.path.dirname(used)):
             Path(used).touch()
+
+    def noted(self: Any, *arguments: Any, **keywords: Any) -> None:
+        GaussianRasterizer.__init__ = original
+        note()
         original(self, *arguments, **keywords)
+
+    def noting(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            note()
+            return function(*arguments, **keywords)
+
+        return call
 
     GaussianRasterizer.__init__ = noted
     mode = resolve_blend_mode(None)
     gate = f", background gate {resolve_background_gate(mode, None)}" if mode == "smoe" else ""
     _say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
-    return {name: getattr(module, name) for name in module.__all__}
+    offered = {name: getattr(module, name) for name in module.__all__}
+    return {name: noting(value) if name.startswith("rasterize_") else value for name, value in offered.items()}
 
 
 def is_installed(module: str) -> bool:

@@ -16,6 +16,7 @@ from ..io import Gaussians
 from ..trainer.errors import TrainerError
 from ..trainer.scenes.cameras import Camera
 from ..trainer.scenes.orbit import Orbit
+from .rows import finite_rows
 
 PAGE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "page")
 MODES = ("alpha", "smoe")
@@ -63,10 +64,7 @@ def pack(gaussians: Gaussians) -> Tuple[int, bytes, bytes]:
     Harmonics have 8 bits each and for each Gaussian one scale: float16 scale, then coefficients as multiples of
     scale / 127, the three channels of each together, in a whole number of texels of 16 bytes.
     """
-    arrays = [gaussians.means3D, gaussians.opacity_logits, gaussians.log_scales, gaussians.rotations,
-              gaussians.dc[:, 0], gaussians.shs.reshape(len(gaussians.shs), -1)]
-    finite = np.isfinite(np.hstack(arrays)).all(axis=1)
-    position, logit, log_scales, rotations, dc, harmonics = (array[finite] for array in arrays)
+    position, logit, log_scales, rotations, dc, harmonics = finite_rows(gaussians)
     records = np.zeros(len(position), RECORD)
     records["position"] = position
     records["opacity"] = 1 / (1 + np.exp(-logit[:, 0].astype(np.float64)))

@@ -6,16 +6,16 @@ import dataclasses
 import json
 import os
 from dataclasses import dataclass, field
-from typing import Any, Dict, List, Optional, Sequence, Type, TypeVar, Union
+from typing import Any, Dict, List, Optional, Sequence, Union
 
 from ..settings import BACKGROUND_GATE_VARIABLE, BLEND_MODES, resolve_background_gate, resolve_blend_mode
 from .errors import ConfigError
+from .gate_options import parse_gate_options
 from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
 SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
 PRINCIPAL_POINTS = ("scene", "centre")
-Options = TypeVar("Options")
 LEARNED = "learned"  # the background gate that a training finds
 
 
@@ -116,9 +116,13 @@ class TrainConfig:
         self._require("budget", self.budget >= 0, "at least 0")
         needs_budget = self.schedule in ("gate", "mcmc")
         self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.schedule}")
-        enough = self.iterations >= self.densify_until_iter > 1 or self.schedule != "gate"
-        self._require("iterations", enough, "at least --densify-until-iter with --strategy gate, whose removals end "
-                      "there; --scale-recipe shortens all of it")
+        if self.schedule == "gate":
+            parse_gate_options(self.strategy_options)
+            self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy gate")
+            self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter "
+                          "with --strategy gate, whose removals end there; --scale-recipe shortens all of it")
+        self._require("strategy_options", not self.strategy_options or self.schedule == "gate",
+                      f"left out with --strategy {self.schedule}: only gate has some")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
         self._require("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "between 0 and 1")
         self._require("background_gate_bound", 0.0 <= self.background_gate_bound < 1.0, "at least 0 and below 1")
@@ -145,13 +149,15 @@ class TrainConfig:
     def changed(self, **options: Any) -> TrainConfig:
         """A validated copy with some options set.
 
-        Another blend mode takes its own background gate, and another strategy what of the recipe is at its default.
+        Another blend mode takes its own background gate, and another strategy what of the recipe is at its default and
+        its own options.
         """
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
             options = {"background_gate": None, **options}
         if options.get("schedule", self.schedule) != self.schedule:
             usual = _recipe_of(str(self.schedule))
-            options = {**{name: None for name in usual if getattr(self, name) == usual[name]}, **options}
+            options = {**{name: None for name in usual if getattr(self, name) == usual[name]},
+                       "strategy_options": "", **options}
         return dataclasses.replace(self, **options).validate()
 
     def shortened(self) -> TrainConfig:
@@ -272,21 +278,6 @@ def _flag(option: dataclasses.Field[Any]) -> str:
 
 
 _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
-
-
-def parse_options(text: str, kind: Type[Options]) -> Options:
-    """A dataclass of numbers from `NAME=X,...`; what is not named keeps its default. Raises ConfigError."""
-    known = {option.name: type(option.default) for option in dataclasses.fields(kind)}
-    values = {}
-    for part in filter(None, text.split(",")):
-        name, _, value = part.partition("=")
-        if name not in known:
-            raise ConfigError(f"--strategy-options: {name!r} is unknown; it may name {', '.join(known)}")
-        try:
-            values[name] = known[name](value)
-        except ValueError as error:
-            raise ConfigError(f"--strategy-options: {name} is {value!r}; it must be a number") from error
-    return kind(**values)
 
 
 def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), defaults: bool = True) -> None:

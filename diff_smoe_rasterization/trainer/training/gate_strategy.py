@@ -6,12 +6,12 @@ they can be compared: `Splats.importance`. The rules and what they are worth: do
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
 import torch
 
-from ..config import parse_options
+from ..errors import ConfigError
+from ..gate_options import parse_gate_options
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
 from ..scenes.images import View, as_float
 from .strategy import SteadyStrategy, Step, StrategyContext
@@ -30,18 +30,6 @@ CHILD_SCALE = 0.65
 CHILD_COVER = 0.744
 
 
-@dataclass(frozen=True)
-class GateOptions:
-    """What `--strategy-options` may set."""
-
-    overshoot: float = 10.0  # growth ends at so many times the budget; 0: wherever the threshold leads
-    removals: int = 16  # steps down to the budget
-    views: int = 96  # training views that a decision looks at
-    moves: float = 0.1  # the most Gaussians that move at a time, as a part of all; 0: none
-    worth: float = 0.2  # a Gaussian moves where its cost is below this part of the error at its new place
-    anneal: float = 0.1  # behind the moves all learning rates but the positions' fall to this part of themselves
-
-
 class Scores(NamedTuple):
     """Sums over the training views that were looked at."""
 
@@ -55,15 +43,29 @@ class GateStrategy(SteadyStrategy):
     def __init__(self, context: StrategyContext) -> None:
         super().__init__(context)
         config = context.config
-        self.options: GateOptions = parse_options(config.strategy_options, GateOptions)
+        self.options = parse_gate_options(config.strategy_options)
         self.start = context.model.num_gaussians
         until = config.densify_until_iter
         self.growth_ends = round(GROWTH_ENDS * until)
         count = self.options.removals
-        self.removals = [round(until * (REMOVALS_BEGIN + (REMOVALS_END - REMOVALS_BEGIN) * i / count))
+        last = config.iterations - 1  # the last iteration changes nothing
+        self.removals = [min(last, round(until * (REMOVALS_BEGIN + (REMOVALS_END - REMOVALS_BEGIN) * i / count)))
                          for i in range(count)]
         self.move_interval = max(1, round(MOVE_INTERVAL * until))
         self.moves_end = round(MOVES_END * until)
+        self._check_reach()
+
+    def _check_reach(self) -> None:
+        """Raises ConfigError where growth cannot lead to the budget: a densification doubles at most."""
+        config = self.context.config
+        densifications = sum(iteration > config.densify_from_iter for iteration in range(
+            0, self.growth_ends, config.densification_interval))
+        most = self.start * 2**densifications
+        if most < config.budget:
+            raise ConfigError(f"--budget is {config.budget}; it must be at most {most}: that is what {self.start} points "
+                              f"reach with one densification each --densification-interval "
+                              f"{config.densification_interval} between --densify-from-iter "
+                              f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
 
     def before_backward(self, step: Step) -> None:
         if self.options.anneal != 1:
@@ -132,7 +134,7 @@ class GateStrategy(SteadyStrategy):
         offsets = CHILD_OFFSET * scales.gather(1, axis) * directions
         opacities = raw["opacities"].sigmoid()
         children = torch.minimum(opacities, (1 - (1 - opacities).sqrt()) / CHILD_COVER)
-        raw["opacities"] = inverse_sigmoid(children)
+        raw["opacities"] = inverse_sigmoid(children.clamp(max=1 - 1e-6))  # of 1 it is infinite
         raw["scales"] = torch.where(torch.arange(3, device=axis.device) == axis, (CHILD_SCALE * scales).log(),
                                     raw["scales"])
         means = raw["means3D"]

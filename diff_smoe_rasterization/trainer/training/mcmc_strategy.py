@@ -55,9 +55,10 @@ class MCMCStrategy(Strategy):
         self.context.optimizer.overwrite(dead, self._divide(drawn))
 
     def grow(self) -> None:
-        """Adds Gaussians at others, drawn by opacity, up to the budget."""
+        """Adds Gaussians, at least one, at others, drawn by opacity, up to the budget."""
         model, budget = self.context.model, self.context.config.budget
-        count = min(budget, int((1 + GROWTH) * model.num_gaussians)) - model.num_gaussians
+        now = model.num_gaussians
+        count = min(budget, max(now + 1, int((1 + GROWTH) * now))) - now
         if count <= 0:
             return
         drawn = torch.multinomial(model.opacities.squeeze(1), count, replacement=True)

@@ -10,6 +10,7 @@ import pytest
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.export import html
+from diff_smoe_rasterization.export.splat import splat_bytes
 
 QUARTER = np.sqrt(0.5)  # cos and sin of an eighth turn
 
@@ -62,6 +63,14 @@ def test_a_splat_file_has_32_bytes_a_gaussian_the_largest_first(model, tmp_path,
     assert second[6:10] == (128, 199, 56, 128)
     eighth = round(128 + 128 * QUARTER)
     assert second[10:] == (eighth, 128, 128, eighth)
+
+
+@pytest.mark.parametrize("arrays", [
+    {"rotations": [[0, 0, 0, 0], [0, 1, 0, 0]]}, {"means3D": [[np.nan, 2, 3], [4, 5, 6]]},
+    {"opacity_logits": [[np.inf], [np.log(3)]]}])
+def test_a_splat_file_leaves_out_what_no_viewer_can_show(arrays):
+    whole = splat_bytes(gaussians())
+    assert splat_bytes(gaussians(**arrays)) == whole[:32], "the second, which is first in the file"
 
 
 def test_a_page_holds_every_gaussian_to_the_bits_it_promises():

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -46,7 +47,10 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path, python):
 
 ENDS = {  # what a command does, and how `dsmoe run` ends then
     "made(None)": (0, ""), "pass": (1, "rendered nothing: what was trained or rendered was not smoe"),
-    "import os, signal; os.kill(os.getpid(), signal.SIGTERM)": (-15, ""), "sys.exit(3)": (3, "")}
+    "import os, signal; os.kill(os.getpid(), signal.SIGTERM)": (-15, ""),
+    "import os, signal; os.kill(os.getpid(), signal.SIGKILL)": (-9, ""), "sys.exit(3)": (3, ""),
+    "import contextlib, diff_gaussian_rasterization as d\nwith contextlib.suppress(TypeError): d.rasterize_gaussians()":
+        (0, "")}
 
 
 @pytest.mark.parametrize("code", ENDS)
@@ -58,15 +62,44 @@ def test_it_ends_as_the_command_unless_nothing_was_rendered(code, tmp_path, pyth
     assert result.status == status and said in result.err, result.err
 
 
-def test_a_signal_reaches_the_command(tmp_path):
-    make(tmp_path, {"x.py": "import signal, time\nsignal.signal(signal.SIGTERM, lambda *_: exit(5))\n"
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_reaches_the_command(number, tmp_path):
+    """In a session without a terminal, and sent to `dsmoe run` only."""
+    make(tmp_path, {"x.py": f"import signal, time\nsignal.signal({int(number)}, lambda *_: exit(5))\n"
                             "print('ready', flush=True)\ntime.sleep(60)\n"})
     process = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py"],
-                               cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+                               cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                               start_new_session=True)
     assert process.stdout.readline() == b"ready\n"
-    process.terminate()
-    assert process.wait() == 5
+    process.send_signal(number)
+    assert process.wait(30) == 5
     process.stdout.close()
+
+
+STARTING = """import os, signal, subprocess, sys
+from diff_smoe_rasterization.patches import run
+started = subprocess.Popen
+def start(*arguments, **keywords):
+    child = started(*arguments, **keywords)
+    os.kill(os.getpid(), signal.SIGTERM)  # the command runs, and its process is not known yet
+    return child
+subprocess.Popen = start
+print(run._status_of(["sleep", "60"], dict(os.environ)))
+"""
+
+
+def test_a_signal_while_the_command_starts_reaches_it(tmp_path, python):
+    result = python("-c", STARTING, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+    assert result.out == "-15\n", result.err
+
+
+def test_what_is_ignored_stays_so_for_the_command(tmp_path, python):
+    """As under nohup."""
+    code = ("import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); "
+            "from diff_smoe_rasterization.patches import run; "
+            "show = 'import signal; print(signal.getsignal(signal.SIGHUP) == signal.SIG_IGN)'; "
+            "run._status_of([sys.executable, '-c', show], dict(os.environ))")
+    assert python("-c", code, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT)).out == "True\n"
 
 
 def test_stand_ins_only_for_what_is_missing(tmp_path, python):

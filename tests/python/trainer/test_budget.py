@@ -213,6 +213,7 @@ def test_noise_shakes_the_faint_only(tiny_config):
     (dict(schedule="gate"), "--budget is 0; it must be at least 4 with --strategy gate"),
     (dict(schedule="mcmc"), "--budget is 0; it must be at least 4 with --strategy mcmc"),
     (dict(budget=-1), "--budget is -1; it must be at least 0"),
+    (dict(budget=100, densify_until_iter=1), "--densify-until-iter is 1; it must be at least 2 with --strategy gate"),
     (dict(budget=100, iterations=7000), "--iterations is 7000; it must be at least --densify-until-iter"),
 ])
 def test_what_cannot_be_is_said(options, words):
@@ -221,10 +222,59 @@ def test_what_cannot_be_is_said(options, words):
 
 
 @pytest.mark.parametrize("text, words", [
-    ("views=x", "views is 'x'; it must be a number"), ("speed=1", "'speed' is unknown"), ("views", "views is ''")])
-def test_settings_of_gate_are_checked(tiny_config, text, words):
+    ("views=x", "views is 'x'; it must be a number"), ("speed=1", "'speed' is unknown"), ("views", "views is ''"),
+    ("removals=0", "removals is 0; it must be at least 1"), ("views=0", "views is 0; it must be at least 1"),
+    ("moves=2", "moves is 2; it must be between 0 and 1"), ("moves=nan", "moves is nan; it must be between 0 and 1"),
+    ("overshoot=0.5", "overshoot is 0.5; it must be 0 or at least 1"), ("overshoot=inf", "overshoot is inf"),
+    ("worth=-1", "worth is -1; it must be at least 0"), ("anneal=0", "anneal is 0; it must be a positive number")])
+def test_settings_of_gate_are_checked(text, words):
     with pytest.raises(ConfigError, match="--strategy-options: " + words):
-        trainer_of(tiny_config, schedule="gate", budget=60, strategy_options=text)
+        TrainConfig(budget=60, strategy_options=text).validate()
+
+
+def test_settings_of_gate_are_of_gate_only():
+    assert TrainConfig(budget=60, strategy_options="overshoot=0,moves=0,worth=0,removals=1,views=1").validate()
+    with pytest.raises(ConfigError, match="--strategy-options is 'views=3'; it must be left out with --strategy mcmc"):
+        TrainConfig(budget=60, schedule="mcmc", strategy_options="views=3").validate()
+    config = TrainConfig(budget=60, strategy_options="views=3")
+    assert config.changed(seed=1).strategy_options == "views=3"
+    assert config.changed(schedule="mcmc").strategy_options == ""
+
+
+@pytest.mark.parametrize("iterations", [2, 3, 5, 6, 7, 8])
+def test_the_shortest_runs_of_gate_end_with_the_budget(tiny_config, iterations):
+    """All milestones lie within a few steps, of which the last changes nothing."""
+    config = tiny_config.changed(schedule="gate", budget=60, iterations=iterations, densify_until_iter=iterations)
+    assert counts_of(trainer_of(config))[-1] == 60
+
+
+def test_a_budget_that_growth_cannot_reach_is_refused(tiny_config):
+    """One densification lies between steps 4 and 16, none behind step 16."""
+    with pytest.raises(ConfigError, match="--budget is 1000; it must be at most .* --densify-from-iter 4 and step 16"):
+        trainer_of(tiny_config, schedule="gate", budget=1000)
+    with pytest.raises(ConfigError, match="--budget is 200"):
+        trainer_of(tiny_config, schedule="gate", budget=200, densify_from_iter=16)
+
+
+def test_children_of_an_opaque_one_can_be_trained(tiny_config):
+    """In float32 the sigmoid of 20 is 1, whose logit is infinite."""
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    trainer.step()
+    with torch.no_grad():
+        trainer.model.raw["opacities"][5] = 20.0
+        trainer.strategy.split(torch.tensor([5]), torch.tensor([9]))
+    assert trainer.model.raw["opacities"][[5, 9]].isfinite().all()
+
+
+def test_mcmc_grows_from_a_few(tiny_config):
+    """A twentieth of them is less than one."""
+    trainer = trainer_of(tiny_config, schedule="mcmc", budget=7, init_points=5)
+    counts = []
+    with torch.no_grad():
+        for _ in range(3):
+            trainer.strategy.grow()
+            counts.append(trainer.model.num_gaussians)
+    assert counts == [6, 7, 7]
 
 
 def test_a_budget_asks_for_gate():

@@ -1,0 +1,17 @@
+"""The Gaussians of a model that can be shown."""
+from __future__ import annotations
+
+from typing import List
+
+import numpy as np
+
+from ..io import Gaussians
+
+
+def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:
+    """Positions [M, 3], opacity logits [M, 1], log scales [M, 3], quaternions [M, 4], dc [M, 3] and the other harmonics
+    [M, 3 (K - 1)] of the M Gaussians all of whose numbers are finite."""
+    arrays = [gaussians.means3D, gaussians.opacity_logits, gaussians.log_scales, gaussians.rotations,
+              gaussians.dc[:, 0], gaussians.shs.reshape(len(gaussians.shs), -1)]
+    finite = np.isfinite(np.hstack(arrays)).all(axis=1)
+    return [array[finite] for array in arrays]

@@ -1,0 +1,52 @@
+"""What `--strategy-options` may set of the strategy `gate`, and in which ranges."""
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Callable
+
+from .errors import ConfigError
+
+
+def _setting(default: Any, holds: Callable[[Any], bool], requirement: str) -> Any:
+    return dataclasses.field(default=default, metadata={"holds": holds, "requirement": requirement})
+
+
+@dataclass(frozen=True)
+class GateOptions:
+    """Settings of the strategy `gate`."""
+
+    # Growth ends at so many times the budget; 0: wherever the threshold leads.
+    overshoot: float = _setting(10.0, lambda x: x == 0 or 1 <= x < math.inf, "0 or at least 1")
+    # Steps down to the budget.
+    removals: int = _setting(16, lambda x: x >= 1, "at least 1")
+    # Training views that a decision looks at.
+    views: int = _setting(96, lambda x: x >= 1, "at least 1")
+    # The most Gaussians that move at a time, as a part of all; 0: none.
+    moves: float = _setting(0.1, lambda x: 0 <= x <= 1, "between 0 and 1")
+    # A Gaussian moves where its cost is below this part of the error at its new place.
+    worth: float = _setting(0.2, lambda x: 0 <= x < math.inf, "at least 0")
+    # Behind the moves all learning rates but the positions' fall to this part of themselves.
+    anneal: float = _setting(0.1, lambda x: 0 < x < math.inf, "a positive number")
+
+
+def parse_gate_options(text: str) -> GateOptions:
+    """The settings from `NAME=X,...`; what is not named keeps its default.
+
+    Raises ConfigError with the name, the value and what it must be.
+    """
+    known = {option.name: option for option in dataclasses.fields(GateOptions)}
+    values = {}
+    for part in filter(None, text.split(",")):
+        name, _, value = part.partition("=")
+        if name not in known:
+            raise ConfigError(f"--strategy-options: {name!r} is unknown; it may name {', '.join(known)}")
+        try:
+            values[name] = type(known[name].default)(value)
+        except ValueError as error:
+            raise ConfigError(f"--strategy-options: {name} is {value!r}; it must be a number") from error
+        if not known[name].metadata["holds"](values[name]):
+            raise ConfigError(f"--strategy-options: {name} is {value}; it must be "
+                              f"{known[name].metadata['requirement']}")
+    return GateOptions(**values)
