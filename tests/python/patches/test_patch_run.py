@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -74,6 +75,35 @@ def test_a_signal_reaches_the_command(number, tmp_path):
     process.send_signal(number)
     assert process.wait(30) == 5
     process.stdout.close()
+
+
+COUNTING = """import signal, time
+came = []
+signal.signal(signal.SIGINT, lambda *_: came.append(1))
+print("ready", flush=True)
+while not came:
+    time.sleep(0.05)
+time.sleep(1)
+print("came", len(came), flush=True)
+"""
+
+
+def test_a_terminal_interrupts_the_command_once(tmp_path):
+    """The terminal sends SIGINT to the command too: it is not passed on a second time."""
+    make(tmp_path, {"x.py": COUNTING})
+    words = [sys.executable, "-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py"]
+    process, terminal = pty.fork()
+    if process == 0:
+        os.chdir(tmp_path)
+        os.execve(words[0], words, environment())
+    said = b""
+    while b"came" not in said:
+        said += os.read(terminal, 1000)
+        if said.endswith(b"ready\r\n"):
+            os.write(terminal, b"\x03")
+    os.waitpid(process, 0)
+    os.close(terminal)
+    assert b"came 1" in said
 
 
 STARTING = """import os, signal, subprocess, sys
