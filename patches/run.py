@@ -53,7 +53,7 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
 
 
 def _status_of(words: Sequence[str], environment: Dict[str, str]) -> int:
-    """Runs the command, to which signals of this process go, and returns its exit status; -N where signal N ended it."""
+    """Runs the command, to which signals of this process go. Returns its exit status; -N where signal N ended it."""
     child: Optional[subprocess.Popen] = None
     early: List[int] = []  # signals that came while the command was being started
 
@@ -67,8 +67,8 @@ def _status_of(words: Sequence[str], environment: Dict[str, str]) -> int:
         if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup: the command inherits that, but no handler
             signal.signal(number, forward)
     child = subprocess.Popen(list(words), env=environment)
-    for number in early:
-        child.send_signal(number)
+    for received in early:
+        child.send_signal(received)
     for number in FORWARDED:
         signal.signal(number, forward)
     return child.wait()

@@ -62,8 +62,8 @@ class GateStrategy(SteadyStrategy):
             0, self.growth_ends, config.densification_interval))
         most = self.start * 2**densifications
         if most < config.budget:
-            raise ConfigError(f"--budget is {config.budget}; it must be at most {most}: that is what {self.start} points "
-                              f"reach with one densification each --densification-interval "
+            raise ConfigError(f"--budget is {config.budget}; it must be at most {most}: that is what {self.start} "
+                              "points reach with one densification each --densification-interval "
                               f"{config.densification_interval} between --densify-from-iter "
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
 

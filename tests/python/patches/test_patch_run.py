@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -74,6 +75,26 @@ def test_a_signal_reaches_the_command(number, tmp_path):
     process.send_signal(number)
     assert process.wait(30) == 5
     process.stdout.close()
+
+
+IN_TERMINAL = """import os, signal, threading
+from diff_smoe_rasterization.patches import run
+threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+print("status", run._status_of(["sleep", "1.5"], dict(os.environ)), "seen", flush=True)
+"""
+
+
+def test_an_interrupt_in_the_terminals_foreground_is_not_passed_on():
+    """The terminal has sent it to the command too."""
+    process, terminal = pty.fork()
+    if process == 0:
+        os.execve(sys.executable, [sys.executable, "-c", IN_TERMINAL], environment())
+    said = b""
+    while b"seen" not in said:
+        said += os.read(terminal, 1000)  # raises OSError where the process ended without that
+    os.waitpid(process, 0)
+    os.close(terminal)
+    assert b"status 0 seen" in said
 
 
 STARTING = """import os, signal, subprocess, sys
