@@ -61,7 +61,7 @@ void backward(benchmark::State& state, BlendMode mode) {
   const ImageWeights<float> weights(scene, 2);
   SceneGradient<float> gradient(scene);
   const auto frame = frame_of(scene, rendering);
-  cpu::StageTimes times;
+  StageTimes times;
   for (auto _ : state) cpu::backward(frame, {weights.gradients(), gradient.gradients()}, &times);
   finish(state, rendering.instances.size());
   state.counters["blend_s"] = benchmark::Counter(times.blend_backward, benchmark::Counter::kAvgIterations);
