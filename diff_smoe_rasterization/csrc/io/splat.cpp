@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 #include "io/cursor.h"
 
@@ -42,8 +41,7 @@ GaussianModel parse_splat(std::string_view bytes, const std::string& file) {
   };
   for (std::size_t i = 0; i < model.count; ++i) {
     for (int k = 0; k < 3; ++k) model.means3D.push_back(read_finite("a position", -INFINITY));
-    for (int k = 0; k < 3; ++k)
-      model.log_scales.push_back(std::log(std::max(read_finite("a scale", 0), std::numeric_limits<float>::min())));
+    for (int k = 0; k < 3; ++k) model.log_scales.push_back(std::log(read_finite("a scale", 0)));
     for (int k = 0; k < 3; ++k) {
       const double color = cursor.read<std::uint8_t>("a colour") / kLevels;
       model.dc.push_back(static_cast<float>((color - 0.5) / kShC0));
