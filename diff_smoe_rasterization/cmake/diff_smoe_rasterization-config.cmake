@@ -44,10 +44,13 @@ ${dsmoe_found_version} (${DSMOE_LIBTORCH}). CMAKE_PREFIX_PATH=\"$(dsmoe info --c
     list(TRANSFORM dsmoe_names REPLACE "(.+)" "${DSMOE_LIBTORCH}/lib/lib\\1.so" OUTPUT_VARIABLE dsmoe_files)
     add_library(dsmoe::libtorch INTERFACE IMPORTED)
     # A program loads them itself, by its own path, even where it calls none: so libdsmoe.so gets these and no others.
+    # What they need in turn is their own affair. The linker would look for it beside the CUDA toolkit too, which may
+    # hold another release, of NCCL for example.
     set_target_properties(dsmoe::libtorch PROPERTIES
       INTERFACE_INCLUDE_DIRECTORIES "${DSMOE_LIBTORCH}/include;${DSMOE_LIBTORCH}/include/torch/csrc/api/include"
       INTERFACE_COMPILE_DEFINITIONS "_GLIBCXX_USE_CXX11_ABI=$<BOOL:${dsmoe_cxx11_abi}>"
       INTERFACE_COMPILE_FEATURES "$<IF:$<VERSION_LESS:${dsmoe_torch_version},2.13>,cxx_std_17,cxx_std_20>"
+      INTERFACE_LINK_OPTIONS -Wl,--allow-shlib-undefined
       INTERFACE_LINK_LIBRARIES "-Wl,--push-state,--no-as-needed;${dsmoe_files};-Wl,--pop-state")
   endif()
 endif()

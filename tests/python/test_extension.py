@@ -81,7 +81,7 @@ torch.ops.diff_smoe_rasterization.rasterize
 @pytest.mark.parametrize("program", [LAZY, EAGER])
 def test_torch_is_loaded_where_it_is_needed_and_its_ops_at_once_where_it_is_there(program):
     path = os.pathsep.join(filter(None, [str(WHERE_THE_PACKAGE_LIES), os.environ.get("PYTHONPATH", "")]))
-    subprocess.run([sys.executable, "-c", program], check=True, env={**os.environ, "PYTHONPATH": path})
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=os.sep, env={**os.environ, "PYTHONPATH": path})
 
 
 def test_the_command_says_in_one_line_that_nothing_was_built(copied_package, capsys):
