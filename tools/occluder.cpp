@@ -2,10 +2,11 @@
 
 #include <cmath>
 
+#include "dsmoe/sh.h"
+
 namespace dsmoe::tools {
 namespace {
 
-constexpr double kShC0 = 0.28209479177387814;  // the constant spherical harmonic
 constexpr float kOpaque = 0.99f;
 
 /// Adds round, flat Gaussians on a grid over a rectangle at depth z, so dense that two such sheets hide what is behind.
@@ -16,7 +17,7 @@ void add_sheet(Model& model, double x0, double x1, double y0, double y1, double 
       for (const double value : {x, y, z}) model.means3D.push_back(static_cast<float>(value));
       for (const double value : {radius, radius, 0.01}) model.scales.push_back(static_cast<float>(value));
       for (const float value : {1.0f, 0.0f, 0.0f, 0.0f}) model.rotations.push_back(value);
-      for (const float value : color) model.dc.push_back(static_cast<float>((value - 0.5) / kShC0));
+      for (const float value : color) model.dc.push_back(static_cast<float>((value - 0.5) / kSh0));
       model.opacities.push_back(kOpaque);
       ++model.count;
     }

@@ -3,14 +3,14 @@
 #include <algorithm>
 #include <cmath>
 
+#include "dsmoe/sh.h"
 #include "io/cursor.h"
 
 namespace dsmoe::io {
 
 namespace {
 
-constexpr std::size_t kRecordBytes = 32;       // 3 float32, 3 float32, 4 bytes, 4 bytes
-constexpr double kShC0 = 0.28209479177387814;  // the constant spherical harmonic, 1 / (2 sqrt(pi))
+constexpr std::size_t kRecordBytes = 32;  // 3 float32, 3 float32, 4 bytes, 4 bytes
 constexpr double kLevels = 255;
 
 double logit(double x) { return std::log(x / (1 - x)); }
@@ -44,7 +44,7 @@ GaussianModel parse_splat(std::string_view bytes, const std::string& file) {
     for (int k = 0; k < 3; ++k) model.log_scales.push_back(std::log(read_finite("a scale", 0)));
     for (int k = 0; k < 3; ++k) {
       const double color = cursor.read<std::uint8_t>("a colour") / kLevels;
-      model.dc.push_back(static_cast<float>((color - 0.5) / kShC0));
+      model.dc.push_back(static_cast<float>((color - 0.5) / kSh0));
     }
     const double opacity = cursor.read<std::uint8_t>("an opacity") / kLevels;
     model.opacity_logits.push_back(static_cast<float>(logit(std::clamp(opacity, 0.5 / kLevels, 1 - 0.5 / kLevels))));
