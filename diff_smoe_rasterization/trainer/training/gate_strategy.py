@@ -23,6 +23,10 @@ REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
 MOVES_END = 4 / 3
 MOVE_INTERVAL = 1 / 30
 
+# Growth beyond this many, or beyond twice the budget where that is more, would cost time and memory: no budget above
+# 200,000 was tried with more.
+MOST_OVERSHOOT = 2_000_000
+
 # A split along the longest axis: each child's offset and scale, in standard deviations of its parent, and the opacity
 # at which both together cover what the parent did.
 CHILD_OFFSET = 0.5
@@ -91,8 +95,13 @@ class GateStrategy(SteadyStrategy):
         least = -(-max(0, config.budget - now) // steps)
         if self.options.overshoot == 0:
             return least, None
-        goal = max(round(self.options.overshoot * config.budget), 2 * self.start)
-        return least, -(-max(0, goal - now) // steps)
+        return least, -(-max(0, self.overshoot() - now) // steps)
+
+    def overshoot(self) -> int:
+        """How many Gaussians growth leads to, where the gradients suffice."""
+        budget = self.context.config.budget
+        wanted = round(self.options.overshoot * budget)
+        return max(min(wanted, max(2 * budget, MOST_OVERSHOOT)), 2 * self.start)
 
     def remove(self, steps_left: int) -> None:
         """Removes the cheapest, down to the budget in steps of equal ratios. steps_left: with this one."""

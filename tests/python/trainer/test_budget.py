@@ -69,6 +69,15 @@ def test_without_a_budget_3dgs_is_as_it_was(tiny_config, tmp_path):
     assert ply_bytes(free) == ply_bytes(roomy)
 
 
+@pytest.mark.parametrize("budget, goal", [(100_000, 1_000_000), (500_000, 2_000_000), (1_500_000, 3_000_000)])
+def test_growth_ends_where_memory_does(tiny_config, budget, goal):
+    """Ten times the budget, but no more than two million or twice the budget, whichever is more."""
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    context = trainer.strategy.context
+    trainer.strategy.context = dataclasses.replace(context, config=dataclasses.replace(context.config, budget=budget))
+    assert trainer.strategy.overshoot() == goal
+
+
 @pytest.mark.parametrize("schedule, killed_at", [("gate", 14), ("gate", 24), ("gate", 39), ("mcmc", 24)])
 def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, schedule, killed_at):
     """Checkpoints at 10, 20, 30 lie in growth, between removals and among moves."""
