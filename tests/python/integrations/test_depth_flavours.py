@@ -57,8 +57,9 @@ def test_a_second_gradient_of_the_points_on_the_screen_and_a_confidence():
     expected = torch.autograd.grad(image.sum(), inputs["means2D"])[0]
     densify = torch.zeros_like(inputs["means2D"]).requires_grad_()
     _, _, image = depth.GaussianRasterizer(scene.settings)(**inputs, means2D_densify=densify)
-    for found in torch.autograd.grad(image.sum(), (inputs["means2D"], densify)):
-        assert torch.equal(found, expected) and expected.any()
+    found = torch.autograd.grad(image.sum(), (inputs["means2D"], densify))
+    assert torch.equal(*found) and expected.any()
+    assert_close(found[0], expected, TOLERANCE, "means2D")  # a GPU adds in another order each time
 
     names = ("means3D", "means2D", "shs", "opacities", "scales")
     leaves, confidence = [inputs[name] for name in names], torch.rand(30, 1, dtype=torch.float64)
