@@ -15,7 +15,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
               means2D: Optional[torch.Tensor] = None, dc: Optional[torch.Tensor] = None,
               shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
               scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
-              cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> Rendering:
+              cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = (),
+              means2D_abs: Optional[torch.Tensor] = None) -> Rendering:
     """Renders N Gaussians by the equation that `settings.blend_mode` names (see BLEND_MODES).
 
     Args:
@@ -31,6 +32,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         scales, rotations: [N, 3] standard deviations, world, and [N, 4] quaternions (w, x, y, z), used as given.
         cov3D_precomp: [N, 6] (xx, xy, xz, yy, yz, zz) instead of scales and rotations.
         outputs: names out of OUTPUTS, images to return beside the colour.
+        means2D_abs: [N, 2], of which only the gradient is of use: the sum over pixels of the absolute values of
+            dL/d(pixel), each axis apart, times (width / 2, height / 2). Without it nothing is summed.
     All tensors have one type, float32 or float64, and one device. Absent is None, or any tensor without elements.
 
     Returns: Rendering. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
@@ -46,7 +49,7 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     """
     inputs, options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
                                  colors_precomp=colors_precomp, scales=scales, rotations=rotations,
-                                 cov3D_precomp=cov3D_precomp)
+                                 cov3D_precomp=cov3D_precomp, means2D_abs=means2D_abs)
     return _rendering(rasterize_op(inputs, options)[:-1], outputs)
 
 
@@ -55,14 +58,15 @@ def rasterize_with_splats(means3D: torch.Tensor, opacities: torch.Tensor, settin
                           shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
                           scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
                           cov3D_precomp: Optional[torch.Tensor] = None,
-                          outputs: Sequence[str] = ()) -> Tuple[Rendering, Splats]:
+                          outputs: Sequence[str] = (),
+                          means2D_abs: Optional[torch.Tensor] = None) -> Tuple[Rendering, Splats]:
     """Renders as `rasterize`, and also returns where the Gaussians are on the image and can say what each gave to it.
 
     Arguments and errors are those of `rasterize`. Splats hold on to memory of the rendering as long as they live.
     """
     inputs, options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
                                  colors_precomp=colors_precomp, scales=scales, rotations=rotations,
-                                 cov3D_precomp=cov3D_precomp)
+                                 cov3D_precomp=cov3D_precomp, means2D_abs=means2D_abs)
     *images, saved = rasterize_op(inputs, options)
     return _rendering(images, outputs), Splats(images, saved, inputs, options)
 

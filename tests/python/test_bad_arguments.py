@@ -33,6 +33,7 @@ SHAPES = [
     ("means3D", {}, (COUNT * 3,), (3,)),
     ("means2D", {}, (COUNT, 2), (COUNT, 3)),
     ("means2D", {}, (COUNT - 1, 3), (COUNT, 3)),
+    ("means2D_abs", {}, (COUNT, 3), (COUNT, 2)),
     ("opacities", {}, (COUNT, 2), (COUNT, 1)),
     ("opacities", {}, (COUNT - 1, 1), (COUNT, 1)),
     ("opacities", {}, (COUNT + 1,), (COUNT, 1)),

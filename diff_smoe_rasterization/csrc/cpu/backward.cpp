@@ -35,7 +35,8 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& want
   const ImageOutputs<S>& images = frame.images;
   const ImageGradients<S>& image_gradients = wanted.images;
   const GaussianGradients<S>& gradients = wanted.inputs;
-  const int record = kNumGateMoments + config.num_features();
+  const bool absolute = gradients.means2D_abs != nullptr;
+  const int record = record_size(config.num_features(), absolute);
   const int64_t num_instances = saved.instance_offsets[inputs.num_gaussians];
   const std::unique_ptr<S[]> dL_dinstances(new S[num_instances * record]);
   {
@@ -45,7 +46,7 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& want
     const int background = config.num_channels + 1;  // numbers: its colour and its gate
     std::vector<S> dL_dbackground(gradients.background != nullptr ? tiles * background : 0);
     const TileGradients<S> tile_gradients = {images, image_gradients, dL_dinstances.get(),
-                                             dL_dbackground.empty() ? nullptr : dL_dbackground.data()};
+                                             dL_dbackground.empty() ? nullptr : dL_dbackground.data(), absolute};
     const int64_t pairs =
         for_each_tile(config, saved, camera.width, camera.height, config.num_features(),
                       [&](const Tile<S>& tile, S* scratch) { return kernels.backward(tile, tile_gradients, scratch); });
@@ -75,6 +76,7 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& want
       sums.features.values = saved.features + i * config.num_features();
       sums.features.dL_dvalues = sum.data() + kNumGateMoments;
       const auto to_camera = project_gaussian_backward({inputs, camera, config, i}, sums, gradients);
+      if (absolute) store_absolute(sum.data() + record - kNumAbsoluteSums, camera, gradients.means2D_abs, i);
       if (share != nullptr) share->add(to_camera);
     }
   });

@@ -13,14 +13,15 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   static constexpr BlendMode kMode = kBlendMode;
   static constexpr bool kBackToFront = true;
 
-  DSMOE_HD BackwardVisitor(int num_features, Scratch<S> scratch, S* dL_dinstances)
+  DSMOE_HD BackwardVisitor(int num_features, Scratch<S> scratch, const TileGradients<S>& gradients)
       : num_features_(num_features),
+        absolute_(kFeatures == kAnyFeatures && gradients.absolute),
         transmittance_(scratch.pixels()),
         suffix_(scratch.pixels()),
         base_(scratch.pixels()),
         last_(scratch.pixels()),
         scaled_{scratch.next},
-        dL_dinstances_(dL_dinstances) {
+        dL_dinstances_(gradients.dL_dinstances) {
     for (int i = 0; i < kTilePixels * (4 + num_features); ++i) transmittance_.values[i] = S(0);
     for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(1);
   }
@@ -61,6 +62,8 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
     features_ = gaussian.features;
     position_ = P(gaussian.position);
+    conic_ = gaussian.projected.conic;
+    absolute_x_ = absolute_y_ = P(S(0));
     one_ = x_ = y_ = xx_ = xy_ = yy_ = P(S(0));
     for (int f = 0; f < num_features_; ++f) dL_dfeatures()[f] = P(S(0));
   }
@@ -70,7 +73,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     return !Blend<kMode>::kStopsEarly || any(not_past_);
   }
 
-  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P, S dy) {
+  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P dx, S dy) {
     const auto contributes = gate.counts & not_past_;
     P value = S(0);
     for (int f = 0; f < num_features_; ++f) value = fma(scaled_of(f).load(strip, row), P(features_[f]), value);
@@ -85,6 +88,10 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     column_one_ = column_one_ + dL_dpower;
     column_y_ = fma(dL_dpower, P(dy), column_y_);
     column_yy_ = fma(dL_dpower, P(dy * dy), column_yy_);
+    if (!absolute_) return;
+    const auto by_mean = power_by_mean(conic_, dx, P(dy));
+    absolute_x_ = absolute_x_ + abs(dL_dpower * by_mean.x);
+    absolute_y_ = absolute_y_ + abs(dL_dpower * by_mean.y);
   }
 
   DSMOE_HD void end_strip(P dx) {
@@ -101,17 +108,20 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     *reinterpret_cast<GateMoments<S>*>(out) = {sum_lanes(one_), sum_lanes(x_),  sum_lanes(y_),
                                                sum_lanes(xx_),  sum_lanes(xy_), sum_lanes(yy_)};
     for (int f = 0; f < num_features_; ++f) out[kNumGateMoments + f] = sum_lanes(dL_dfeatures()[f]);
+    if (!absolute_) return;
+    out[kNumGateMoments + num_features_] = sum_lanes(absolute_x_);
+    out[kNumGateMoments + num_features_ + 1] = sum_lanes(absolute_y_);
   }
 
   DSMOE_HD void write_zeros(uint32_t slot) const {
     S* out = record(slot);
-    for (int k = 0; k < kNumGateMoments + num_features_; ++k) out[k] = S(0);
+    for (int k = 0; k < record_size(num_features_, absolute_); ++k) out[k] = S(0);
   }
 
  private:
   DSMOE_HD PixelArray<S> scaled_of(int f) const { return {scaled_.values + f * kTilePixels}; }
   DSMOE_HD S* record(uint32_t slot) const {
-    return dL_dinstances_ + slot * static_cast<int64_t>(kNumGateMoments + num_features_);
+    return dL_dinstances_ + slot * static_cast<int64_t>(record_size(num_features_, absolute_));
   }
   // dL/dfeature of the current Gaussian; in registers where their number is known.
   DSMOE_HD P* dL_dfeatures() {
@@ -120,12 +130,15 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   }
 
   const int num_features_;
+  const bool absolute_;  // false, when compiling, where the number of features is known
   const PixelArray<S> transmittance_, suffix_, base_, last_;
   const PixelArray<S> scaled_;  // g', one array a feature
   S* const dL_dinstances_;
   const S* features_ = nullptr;
   P position_;
   Mask<P> not_past_;
+  Sym2<S> conic_;                        // of the current Gaussian
+  P absolute_x_, absolute_y_;            // its sums of absolute gradients
   P one_, x_, y_, xx_, xy_, yy_;         // the moments of the current Gaussian
   P column_one_, column_y_, column_yy_;  // of the current strip: dx is the same down the column, it joins at the end
   P dL_dfeatures_in_registers_[kFeatures != kAnyFeatures ? kFeatures : 1];
@@ -134,7 +147,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
 template <class S, BlendMode kMode, int kFeatures>
 int64_t blend_tile_backward(const Tile<S>& tile, const TileGradients<S>& gradients, S* memory) {
   const int num_features = kFeatures != kAnyFeatures ? kFeatures : tile.config.num_features();
-  BackwardVisitor<S, kMode, kFeatures> visitor(num_features, {memory}, gradients.dL_dinstances);
+  BackwardVisitor<S, kMode, kFeatures> visitor(num_features, {memory}, gradients);
   const int64_t num_seen = visitor.read(tile, TileExtent(tile), gradients);
   const int64_t end = Blend<kMode>::kStopsEarly ? tile.begin + num_seen : tile.end;
   for (int64_t i = end; i < tile.end; ++i) visitor.write_zeros(tile.saved.instances[i].slot);
@@ -143,7 +156,8 @@ int64_t blend_tile_backward(const Tile<S>& tile, const TileGradients<S>& gradien
 
 template <class S> int64_t backward(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch) {
   int64_t pairs = 0;
-  dispatch_blend(tile.config.mode, tile.config.num_features(), [&](auto mode, auto features) {
+  const int num_features = gradients.absolute ? kAnyFeatures : tile.config.num_features();
+  dispatch_blend(tile.config.mode, num_features, [&](auto mode, auto features) {
     pairs = blend_tile_backward<S, decltype(mode)::value, decltype(features)::value>(tile, gradients, scratch);
   });
   return pairs;

@@ -27,8 +27,9 @@ template <class S> struct Tile {
 template <class S> struct TileGradients {
   const ImageOutputs<S>& images;
   const ImageGradients<S>& dL_dimages;
-  S* dL_dinstances;   // [I, kNumGateMoments + F] by slot; the tile's are written whole
-  S* dL_dbackground;  // [tiles, C + 1] the shares of all tiles, zero before; or null
+  S* dL_dinstances;       // [I, record_size(F, absolute)] by slot; the tile's are written whole
+  S* dL_dbackground;      // [tiles, C + 1] the shares of all tiles, zero before; or null
+  bool absolute = false;  // records end with sums of absolute gradients by the mean
 };
 
 // What is summed over a tile's pixels, from a map of the caller's.
@@ -42,6 +43,11 @@ template <class S> struct TileImportances {
   const ImportanceMap<S>& map;
   Importance<S>* instances;  // [I] by slot; the tile's are written whole
 };
+// Numbers that the backward pass of a tile writes for an instance.
+constexpr int record_size(int num_features, bool absolute) {
+  return kNumGateMoments + num_features + (absolute ? kNumAbsoluteSums : 0);
+}
+
 constexpr int kImportanceArrays = 7;  // numbers a pixel besides its channels
 
 // Numbers of scratch memory that one tile needs, for any of the kernels.

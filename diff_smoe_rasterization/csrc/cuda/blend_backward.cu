@@ -1,6 +1,8 @@
-// From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures.
+// From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures. Where
+// sums of absolute gradients by the mean are wanted, they follow in the record, and are split off at the end.
 #include "../dispatch.h"
 #include "capacity.h"
+#include "dsmoe/arrays.h"
 #include "dsmoe/params.h"
 #include "gradient_sinks.cuh"
 #include "reduce.cuh"
@@ -17,6 +19,7 @@ template <class S> struct BackwardArguments : BlendArguments<S> {
   S* scaled;                     // [F, H, W] g', where the number of features is not known
   int num_features;              // F
   int tiles;                     // of the image
+  bool absolute;                 // records end with the sums of absolute gradients
 };
 
 template <class S, class Sink> struct BackwardWithSink : BackwardArguments<S> {
@@ -41,8 +44,9 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Sums a batch by tensor cores, and gives the sums of its first `count` Gaussians to the sink.
-template <class Sink>
+// Sums a batch by tensor cores, and gives the sums of its first `count` Gaussians to the sink. kRecord: numbers of a
+// record.
+template <int kRecord, class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
                           const TensorBasis& basis, int count) {
   __syncwarp();
@@ -52,7 +56,7 @@ __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const T
   recentre(sums, {gaussian.x, gaussian.y}, tile.lane);
   __syncwarp();
   if (at.row >= count || at.column >= kFastFeatures) return;
-  sink.to_record(tile, __float_as_int(gaussian.z), __float_as_int(gaussian.w), kTensorRecord, [&](auto add) {
+  sink.to_record(tile, __float_as_int(gaussian.z), __float_as_int(gaussian.w), kRecord, [&](auto add) {
     add(2 * at.column, sums.moments[0]);
     add(2 * at.column + 1, sums.moments[1]);
     add(kNumGateMoments + at.column, sums.feature);
@@ -99,11 +103,16 @@ struct TensorShare {
 };
 
 // Walks back to front, and sums for each Gaussian the moments of dL/dpower and the gradients of its features.
-template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVisitor {
+// kAbsolute: also sums |dL/dmean|. Where the number of features is not known, the arguments say that instead.
+template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kReadsIndices = true;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
+  static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
 
+  __device__ __forceinline__ bool is_absolute() const {
+    return kFeatures != kAnyFeatures ? kAbsolute : arguments.absolute;
+  }
   __device__ __forceinline__ int num_features() const {
     return kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
   }
@@ -140,6 +149,7 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
       weight[k] = pair.weight;
       dL_dpower[k] = gate_backward(gate[k], pair.gamma);
     }
+    if (is_absolute()) add_absolute(dL_dpower, gaussian.conic, dx, dy, index, position);
     if constexpr (kTensor) {
       add_by_tensors(dL_dpower, weight, dx, dy, index, position);
     } else {
@@ -150,8 +160,20 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
   // Adds what still waits in the tensor stage.
   __device__ __forceinline__ void finish() {
     if constexpr (kTensor) {
-      if (batch > 0) add_batch(sink, tile, tensors.stage, tensors.moment_basis, batch);
+      if (batch > 0) add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, batch);
     }
+  }
+
+  __device__ __forceinline__ void add_absolute(const S (&dL_dpower)[kLanePixels], const Sym2<S>& conic, S dx, S dy,
+                                               int32_t index, int32_t position) {
+    S sums[kNumAbsoluteSums] = {};
+#pragma unroll
+    for (int k = 0; k < kLanePixels; ++k) {
+      const auto by_mean = power_by_mean(conic, dx, dy + S(k * kLaneStep));
+      sums[0] += abs(dL_dpower[k] * by_mean.x);
+      sums[1] += abs(dL_dpower[k] * by_mean.y);
+    }
+    add_values(sink, tile, sums, index, position, kNumGateMoments + num_features(), kNumAbsoluteSums);
   }
 
   __device__ __forceinline__ void add_by_tensors(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
@@ -164,7 +186,7 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
           make_float4(dx + kWarpTileCentre, dy + kWarpTileCentre, __int_as_float(index), __int_as_float(position));
     }
     if (++batch == kTensorBatch) {
-      add_batch(sink, tile, tensors.stage, tensors.moment_basis, batch);
+      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, batch);
       batch = 0;
     }
   }
@@ -288,11 +310,12 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
   return range;
 }
 
-template <class S, BlendMode kMode, int kFeatures, class Sink>
-__global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks
-                                                                                          : kGeneralBackwardBlocks)
+template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink>
+__global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures && !kAbsolute
+                                                  ? kBackwardBlocks
+                                                  : kGeneralBackwardBlocks)
     blend_backward_kernel(const __grid_constant__ BackwardWithSink<S, Sink> arguments) {
-  using Visitor = BackwardVisitor<S, kMode, kFeatures, Sink>;
+  using Visitor = BackwardVisitor<S, kMode, kFeatures, kAbsolute, Sink>;
   __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
   __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
   __shared__ TensorStage tensor_stages[Visitor::kTensor ? kWarpsPerTile : 1];
@@ -335,10 +358,10 @@ template <class S> S* allocate_scaled(const BackwardArguments<S>& arguments, Scr
   return allocate<S>(scratch, int64_t(arguments.width) * arguments.height * arguments.num_features);
 }
 
-template <class S, int kFeatures, class Sink>
+template <class S, int kFeatures, bool kAbsolute = false, class Sink>
 void launch_backward(const BackwardWithSink<S, Sink>& arguments, int64_t blocks, cudaStream_t stream) {
   dispatch_blend(arguments.config.mode, kFeatures, [&](auto mode, auto) {
-    blend_backward_kernel<S, decltype(mode)::value, kFeatures>
+    blend_backward_kernel<S, decltype(mode)::value, kFeatures, kAbsolute>
         <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("blend_backward");
   });
@@ -387,6 +410,31 @@ void backward_outgrown(const BackwardWithSink<S, RecordSink<S>>& arguments, Scra
   DSMOE_CHECK_LAUNCH("store_outgrown");
 }
 
+template <class S> struct SplitRecords {
+  int64_t num_gaussians;   // N
+  int length;              // numbers a record without its absolute sums
+  int width, height;       // of the image, pixels
+  const S* with_absolute;  // [N, length + kNumAbsoluteSums]
+  S* records;              // [N, length] written
+  S* means2D_abs;          // [N, kNumAbsoluteSums] written
+};
+
+template <class S> __global__ void split_records_kernel(const __grid_constant__ SplitRecords<S> arguments) {
+  const int length = arguments.length, both = length + kNumAbsoluteSums;
+  const int64_t at = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x, i = at / both;
+  const int number = static_cast<int>(at - i * both);
+  if (i >= arguments.num_gaussians) return;
+  if (number < length) arguments.records[i * length + number] = arguments.with_absolute[at];
+  if (number == length) store_absolute(arguments.with_absolute + at, arguments, arguments.means2D_abs, i);
+}
+
+// Records with absolute sums, zero.
+template <class S> S* absolute_records(int64_t size, const Work& work) {
+  S* records = allocate<S>(*work.scratch, size);
+  if (size > 0) check(cudaMemsetAsync(records, 0, size * sizeof(S), work.stream), "clearing gradients");
+  return records;
+}
+
 }  // namespace
 
 template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work) {
@@ -403,7 +451,14 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
   arguments.num_features = config.num_features();
   arguments.tiles = static_cast<int>(tiles);
   arguments.sink.records = pass.dL_dgaussians;
-  arguments.sink.length = kNumGateMoments + arguments.num_features;
+  const int length = kNumGateMoments + arguments.num_features;
+  arguments.sink.length = length;
+  S* means2D_abs = pass.gradients.inputs.means2D_abs;
+  arguments.absolute = means2D_abs != nullptr;
+  if (arguments.absolute) {
+    arguments.sink.length += kNumAbsoluteSums;
+    arguments.sink.records = absolute_records<S>(frame.inputs.num_gaussians * arguments.sink.length, work);
+  }
   if (saved.instance_width == 2) arguments.sink.slots = allocate_slots<S>(saved, arguments.sink.length, work);
   if (dL_dbackground != nullptr) {
     arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
@@ -412,7 +467,11 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
   if constexpr (sizeof(S) == sizeof(float)) {  // double is for checking: it has only the general kernel
     known = arguments.num_features == kFastFeatures;
     const int64_t segment_blocks = saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0;
-    if (known) launch_backward<S, kFastFeatures>(arguments, tiles + segment_blocks, stream);
+    if (known && arguments.absolute) {
+      launch_backward<S, kFastFeatures, true>(arguments, tiles + segment_blocks, stream);
+    } else if (known) {
+      launch_backward<S, kFastFeatures>(arguments, tiles + segment_blocks, stream);
+    }
   }
   if (!known) {
     arguments.scaled = allocate_scaled(arguments, scratch);
@@ -424,6 +483,12 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
                  stream);
     // Only in a captured graph may later contents have more instances than there is room for.
     if (is_capturing(stream)) backward_outgrown(arguments, scratch, stream);
+  }
+  if (arguments.absolute && frame.inputs.num_gaussians > 0) {
+    const int64_t count = frame.inputs.num_gaussians;
+    split_records_kernel<S><<<blocks_for(count * arguments.sink.length, kStoreBlock), kStoreBlock, 0, stream>>>(
+        {count, length, camera.width, camera.height, arguments.sink.records, pass.dL_dgaussians, means2D_abs});
+    DSMOE_CHECK_LAUNCH("split_records");
   }
   if (dL_dbackground != nullptr) {
     sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);

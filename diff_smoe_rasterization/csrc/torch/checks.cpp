@@ -50,6 +50,7 @@ void check_shapes(const Inputs& inputs) {
   TORCH_CHECK_VALUE(matches(opacities, {count}) || matches(opacities, {count, 1}), "rasterize: opacities has shape ",
                     opacities.sizes(), "; it must be [", count, ", 1] or [", count, "]");
   check_shape(kMeans2D, inputs, {count, 3});
+  check_shape(kMeans2DAbs, inputs, {count, 2});
   check_shape(kDc, inputs, {count, 1, 3});
   check_shape(kShs, inputs, {count, "K", 3});
   check_shape(kColorsPrecomp, inputs, {count, "C"});

@@ -18,7 +18,8 @@
   X(kViewMatrix, "Tensor", viewmatrix)           /* [4, 4] */                              \
   X(kProjMatrix, "Tensor", projmatrix)           /* [4, 4] */                              \
   X(kCampos, "Tensor", campos)                   /* [3] */                                 \
-  X(kBackgroundGate, "Tensor?", background_gate) /* one element; absent: a fixed number */
+  X(kBackgroundGate, "Tensor?", background_gate) /* one element; absent: a fixed number */ \
+  X(kMeans2DAbs, "Tensor?", means2D_abs)         /* [N, 2]; only its gradient is of use */
 
 // The others: X(type in C++, type in the schema, name). They mean what the field of that name means in settings.py.
 // for_backward stays the last one: callers in Python append it.

@@ -171,6 +171,7 @@ template <class S> GaussianGradients<S> gaussian_gradients(const Inputs& gradien
   GaussianGradients<S> out;
   out.means3D = mutable_data<S>(gradients[kMeans3D]);
   out.means2D = mutable_data<S>(gradients[kMeans2D]);
+  out.means2D_abs = mutable_data<S>(gradients[kMeans2DAbs]);
   out.opacities = mutable_data<S>(gradients[kOpacities]);
   out.scales = mutable_data<S>(gradients[kScales]);
   out.rotations = mutable_data<S>(gradients[kRotations]);

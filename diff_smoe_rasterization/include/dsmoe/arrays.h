@@ -162,6 +162,13 @@ DSMOE_HD void store_gradient(const GaussianGradient<S>& g, const GaussianGradien
   }
 }
 
+// Writes what Gaussian i gets of its sums over pixels of |dL/dmean|. They have the factors of means2D.
+template <class S, class AnyCamera>
+DSMOE_HD void store_absolute(const S* sums, const AnyCamera& camera, S* means2D_abs, int64_t i) {
+  means2D_abs[2 * i] = sums[0] * S(0.5) * S(camera.width);
+  means2D_abs[2 * i + 1] = sums[1] * S(0.5) * S(camera.height);
+}
+
 template <class S> DSMOE_HD void store_zeros(const ColorGradients<S>& out, int num_channels, int num_sh) {
   const auto clear = [](S* values, int size) {
     for (int k = 0; values != nullptr && k < size; ++k) values[k] = S(0);
@@ -172,6 +179,7 @@ template <class S> DSMOE_HD void store_zeros(const ColorGradients<S>& out, int n
 // Writes zeros to every gradient of Gaussian i.
 template <class S> DSMOE_HD void store_zeros(const GaussianGradients<S>& out, int num_channels, int num_sh, int64_t i) {
   store_gradient(GaussianGradient<S>{}, out, i);
+  if (out.means2D_abs != nullptr) out.means2D_abs[2 * i] = out.means2D_abs[2 * i + 1] = S(0);
   store_zeros(color_gradients_of(out, num_channels, num_sh, i), num_channels, num_sh);
 }
 

@@ -81,6 +81,14 @@ template <class S> DSMOE_HD GateMoments<S> shift_moments(const GateMoments<S>& m
   return {m.one, x, y, m.xx + shift.x * (m.x + x), m.xy + shift.x * m.y + shift.y * x, m.yy + shift.y * (m.y + y)};
 }
 
+// dpower/dmean of one pair, from the same derivative as moments_backward; d: pixel - mean.
+template <class Real, class S> DSMOE_HD Vec2<Real> power_by_mean(const Sym2<S>& conic, Real dx, Real dy) {
+  return {fma(Real(conic.xx), dx, Real(conic.xy) * dy), fma(Real(conic.xy), dx, Real(conic.yy) * dy)};
+}
+
+// Sums over pixels of |dL/dmean|, each axis apart: they do not cancel where pixels pull a centre to and fro.
+constexpr int kNumAbsoluteSums = 2;
+
 template <class S> struct GateGradient {
   Vec2<S> mean;   // by the pixel position of the centre
   Sym2<S> conic;  // by the three stored numbers

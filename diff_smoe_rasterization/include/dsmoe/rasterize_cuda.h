@@ -198,7 +198,7 @@ template <class S> struct BackwardPass {
   S* dL_dgaussians = nullptr;  // [N, kNumGateMoments + F] a Gaussian's record: the sums over its pixels; zero before
 };
 
-// From image gradients to the records, and to the gradient by the background.
+// From image gradients to the records, and to the gradients by the background and by means2D_abs.
 template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
 
 // From the records to the gradients of every other input.

@@ -64,6 +64,7 @@ struct RasterizeArguments {
   at::Tensor rotations;              // [N, 4] quaternions (w, x, y, z), used as given
   at::Tensor cov3D_precomp;          // [N, 6] (xx, xy, xz, yy, yz, zz) instead of scales and rotations
   std::vector<std::string> outputs;  // images to return beside the colour: "alpha", "depth", "inverse_depth"
+  at::Tensor means2D_abs;            // [N, 2]; its gradient: sum over pixels of |dL/d(pixel)| times (W/2, H/2)
 };
 
 /// What `rasterize` returns; an output that was not asked for is undefined. Until the backward pass has run, its images
