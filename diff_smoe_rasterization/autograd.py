@@ -147,6 +147,21 @@ def _fake_rasterize(*arguments):
     return (*images, saved)
 
 
+def _fake_project(*arguments):
+    given = dict(zip((*INPUTS, *OPTIONS), arguments))
+    means3D, colors = given["means3D"], given["colors_precomp"]
+    features = (3 if colors is None else colors.shape[1]) + given["depth"] + given["inverse_depth"]
+    stored = (features + 3) // 4 * 4 if means3D.device.type == "cuda" else features  # rows of vectors
+    return (means3D.new_empty((means3D.shape[0], 8)), means3D.new_empty((means3D.shape[0], stored))[:, :features],
+            _fake_radii(means3D))
+
+
+def _fake_project_backward(records, dL_ddepths, inputs, present, *others):
+    given = iter(inputs)
+    all_inputs = [next(given) if here else None for here in present]
+    return [tensor.new_empty(tensor.shape) for tensor, want in zip(all_inputs, others[-1]) if want]
+
+
 def _fake_radii(means3D, *others):
     return means3D.new_empty((means3D.shape[0],), dtype=torch.int32)
 
@@ -176,6 +191,8 @@ if _CAN_REGISTER:
     _NAME = "diff_smoe_rasterization::"
     torch.library.register_fake(_NAME + "rasterize", _fake_rasterize)
     torch.library.register_fake(_NAME + "rasterize_backward", _fake_rasterize_backward)
+    torch.library.register_fake(_NAME + "project", _fake_project)
+    torch.library.register_fake(_NAME + "project_backward", _fake_project_backward)
     torch.library.register_fake(_NAME + "radii", _fake_radii)
     torch.library.register_fake(_NAME + "mark_visible", _fake_mark_visible)
     torch.library.register_fake(_NAME + "contributions", _fake_contributions)

@@ -113,12 +113,17 @@ def _arguments(settings, outputs, means3D, opacities, **tensors):
     inputs["bg"] = required("bg", settings.bg)
     for name, dim in (("viewmatrix", 2), ("projmatrix", 2), ("campos", 1)):
         inputs[name] = _without_batch(required(name, getattr(settings, name)), dim)
+    return [inputs.get(name) for name in INPUTS], _options(settings, outputs, blend_mode, fixed_gate)
+
+
+def _options(settings, outputs, blend_mode, fixed_gate):
+    """Returns the options of a rendering in the order of the op, all but the last one."""
     options = [kind(getattr(settings, name)) for name, kind in _SETTING_OPTIONS]
     computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
                 "depth": "depth" in outputs, "inverse_depth": "inverse_depth" in outputs}
     for name, place in _COMPUTED_OPTIONS.items():
         options.insert(place, computed[name])
-    return [inputs.get(name) for name in INPUTS], options
+    return options
 
 
 _OUTPUTS = frozenset(OUTPUTS)

@@ -469,6 +469,37 @@ TYPED_TEST(RasterizeIn, ThePipelineDoesWhatItsStagesDo) {
   EXPECT_EQ(whole.radii, stages.radii);
 }
 
+TYPED_TEST(RasterizeIn, TheHalvesDoWhatTheWholeDoes) {
+  Scene<float> scene = in_mode(convert<float>(make_scene(39, 80, 37, 29)), TypeParam::value);
+  scene.config.depth = scene.config.inverse_depth = true;
+  Rendering<float> whole = render(scene), halves(scene);
+  cpu::Frame<float> projecting = frame_of(scene, halves);
+  projecting.saved.instance_offsets = nullptr;
+  EXPECT_EQ(cpu::project(projecting), 0);
+  EXPECT_EQ(halves.radii, whole.radii);
+
+  cpu::Frame<float> blending = frame_of(scene, halves);
+  blending.inputs = {};  // the blend knows no Gaussians
+  blending.inputs.num_gaussians = scene.count;
+  cpu::Heap heap;
+  cpu::blend_footprints(blending, heap);
+  EXPECT_EQ(halves.color, whole.color);
+  EXPECT_EQ(halves.gate_sum, whole.gate_sum);
+  EXPECT_EQ(halves.depth, whole.depth);
+  EXPECT_EQ(halves.inverse_depth, whole.inverse_depth);
+
+  const ImageWeights<float> weights(scene, 40);
+  SceneGradient<float> expected = render_backward(scene, whole, weights.gradients()), actual(scene);
+  std::vector<float> records(scene.count * (kNumGateGradients + scene.config.num_features()));
+  cpu::Gradients<float> gradients = {weights.gradients(), {}};
+  gradients.inputs.background = actual.gradients().background;
+  cpu::blend_footprints_backward(blending, gradients, {records.data(), nullptr});
+  GaussianGradients<float> wanted = actual.gradients();
+  wanted.background = nullptr;
+  cpu::project_backward(projecting, {records.data(), nullptr}, wanted);
+  EXPECT_EQ(actual.flat(), expected.flat());
+}
+
 TEST(MarkVisible, IsTheNearPlaneTest) {
   const Scene<double> scene = make_scene(34, 200, 37, 29);
   const std::unique_ptr<bool[]> visible(new bool[scene.count]);

@@ -15,6 +15,19 @@ template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* 
   blend(frame, times);
 }
 
+template <class S> void blend_footprints(Frame<S>& frame, Allocator& memory, StageTimes* times) {
+  SavedSizes sizes = saved_sizes(frame);
+  const SavedForward<S> given = frame.saved;
+  frame.saved = {};
+  frame.saved.projected = given.projected, frame.saved.features = given.features;
+  frame.saved.gate_sum = frame.images.gate_sum;
+  allocate_saved(frame.saved, sizes, memory);
+  sizes.num_instances = count_instances(frame, times);
+  allocate_saved(frame.saved, sizes, memory);
+  bin(frame, times);
+  blend(frame, times);
+}
+
 template <class S> void radii(const Frame<S>& frame, Scratch& scratch) {
   const int64_t count = frame.inputs.num_gaussians;
   Frame<S> projected = frame;
@@ -25,12 +38,13 @@ template <class S> void radii(const Frame<S>& frame, Scratch& scratch) {
   };
   allocate(projected.saved.projected, count);
   allocate(projected.saved.features, count * frame.config.num_features());
-  allocate(projected.saved.instance_offsets, count + 1);
+  projected.saved.instance_offsets = nullptr;
   project(projected);
 }
 
-#define DSMOE_INSTANTIATE(S)                                 \
-  template void forward(Frame<S>&, Allocator&, StageTimes*); \
+#define DSMOE_INSTANTIATE(S)                                          \
+  template void forward(Frame<S>&, Allocator&, StageTimes*);          \
+  template void blend_footprints(Frame<S>&, Allocator&, StageTimes*); \
   template void radii(const Frame<S>&, Scratch&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

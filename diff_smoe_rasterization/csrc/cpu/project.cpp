@@ -15,6 +15,28 @@ namespace {
 
 constexpr int64_t kChunk = 1024;  // Gaussians: enough to hide the hand-out, few enough to balance
 
+// How many tiles a footprint meets.
+template <class S>
+int64_t count_tiles(BlendMode mode, TileGrid grid, const ProjectedGaussian<S>& gaussian, int32_t radius) {
+  int64_t count = 0;
+  for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach,
+                    tile_bounds(mode, grid, gaussian.mean, S(radius)), [&](int x0, int x1, int) { count += x1 - x0; });
+  return count;
+}
+
+// Makes offsets of the counts that lie one place behind them. Returns how many instances there are.
+int64_t sum_counts(int64_t* instance_offsets, int64_t num_gaussians) {
+  instance_offsets[0] = 0;
+  for (int64_t i = 0; i < num_gaussians; ++i) instance_offsets[i + 1] += instance_offsets[i];
+  const int64_t num_instances = instance_offsets[num_gaussians];
+  if (num_instances > std::numeric_limits<int32_t>::max()) {
+    throw std::overflow_error("rasterize: " + std::to_string(num_instances) + " tile instances need " +
+                              std::to_string(num_instances * sizeof(TileInstance)) +
+                              " bytes; the CPU backend takes at most 2147483647 instances. Are the scales right?");
+  }
+  return num_instances;
+}
+
 }  // namespace
 
 template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
@@ -26,33 +48,37 @@ template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
   const Stopwatch stopwatch(times, &StageTimes::project);
   const int num_features = config.num_features();
   const TileGrid grid(camera.width, camera.height);
-  int64_t* counts = saved.instance_offsets + 1;
+  int64_t* counts = saved.instance_offsets == nullptr ? nullptr : saved.instance_offsets + 1;
   parallel_for(config.num_threads, inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       S* features = saved.features + i * num_features;
       const auto [radius, gaussian] = project_gaussian<S>({inputs, camera, config, i}, features);
       images.radii[i] = radius;
-      counts[i] = 0;
+      if (counts != nullptr) counts[i] = radius == 0 ? 0 : count_tiles(config.mode, grid, gaussian, radius);
       if (radius == 0) {
         saved.projected[i] = {};
         std::fill_n(features, num_features, S(0));
         continue;
       }
       saved.projected[i] = gaussian;
-      const TileRect bounds = tile_bounds(config.mode, grid, gaussian.mean, S(radius));
-      for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds,
-                        [&](int x0, int x1, int) { counts[i] += x1 - x0; });
     }
   });
-  saved.instance_offsets[0] = 0;
-  for (int64_t i = 0; i < inputs.num_gaussians; ++i) counts[i] += saved.instance_offsets[i];
-  const int64_t num_instances = saved.instance_offsets[inputs.num_gaussians];
-  if (num_instances > std::numeric_limits<int32_t>::max()) {
-    throw std::overflow_error("rasterize: " + std::to_string(num_instances) + " tile instances need " +
-                              std::to_string(num_instances * sizeof(TileInstance)) +
-                              " bytes; the CPU backend takes at most 2147483647 instances. Are the scales right?");
-  }
-  return num_instances;
+  return counts == nullptr ? 0 : sum_counts(saved.instance_offsets, inputs.num_gaussians);
+}
+
+template <class S> int64_t count_instances(const Frame<S>& frame, StageTimes* times) {
+  const SavedForward<S>& saved = frame.saved;
+  const Stopwatch stopwatch(times, &StageTimes::bin);
+  const TileGrid grid(frame.camera.width, frame.camera.height);
+  const int64_t count = frame.inputs.num_gaussians;
+  parallel_for(frame.config.num_threads, count, kChunk, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      const int32_t radius = frame.images.radii[i];
+      saved.instance_offsets[i + 1] =
+          radius == 0 ? 0 : count_tiles(frame.config.mode, grid, saved.projected[i], radius);
+    }
+  });
+  return sum_counts(saved.instance_offsets, count);
 }
 
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible) {
@@ -68,9 +94,10 @@ template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int
   return -1;
 }
 
-#define DSMOE_INSTANTIATE(S)                              \
-  template int64_t project(const Frame<S>&, StageTimes*); \
-  template void mark_visible(const Frame<S>&, bool*);     \
+#define DSMOE_INSTANTIATE(S)                                      \
+  template int64_t project(const Frame<S>&, StageTimes*);         \
+  template int64_t count_instances(const Frame<S>&, StageTimes*); \
+  template void mark_visible(const Frame<S>&, bool*);             \
   template int64_t first_non_finite(const GaussianInputs<S>&, int);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

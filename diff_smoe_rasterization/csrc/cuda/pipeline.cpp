@@ -83,21 +83,21 @@ void list_with_capacity(Frame<S>& frame, const SavedSizes& sizes, Allocator& mem
   memory.release();
 }
 
-}  // namespace
+// Allocates what frame.saved has not got yet, but what depends on the number of instances.
+template <class S> SavedSizes begin_saved(Frame<S>& frame, const Run& run, Allocator& memory) {
+  const SavedSizes sizes = saved_sizes(frame, run);
+  frame.saved.gate_sum = frame.images.gate_sum;
+  allocate_saved(frame.saved, sizes, memory);
+  complete(frame.saved, sizes);
+  return sizes;
+}
 
-template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory) {
+// From the footprints and the keys of their depths to the images.
+template <class S>
+void draw(Frame<S>& frame, SavedSizes sizes, const DepthKeys<S>& keys, const Run& run, Allocator& memory,
+          EventClock& clock) {
   auto& saved = frame.saved;
   Work work = {run.stream, &memory};
-  EventClock clock(run.times, run.stream);
-
-  SavedSizes sizes = saved_sizes(frame, run);
-  saved = {};
-  saved.gate_sum = frame.images.gate_sum;
-  allocate_saved(saved, sizes, memory);
-  complete(saved, sizes);
-  const DepthKeys<S> keys = depth_keys(frame, memory);
-  project(frame, keys, work);
-  clock.end(&StageTimes::project);
   if (keys.depths != nullptr) sort_by_depth(frame, keys, work);
   clock.end(&StageTimes::sort);
   memory.release();
@@ -125,22 +125,91 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
   memory.release();
 }
 
+// Memory for the records, zeros, or those of the caller.
+template <class S> S* begin_records(const Frame<S>& frame, S* given, const Run& run, Allocator& memory) {
+  const int64_t size = frame.inputs.num_gaussians * (kNumGateMoments + frame.config.num_features());
+  if (given == nullptr) return allocate_zeros<S>(memory, size, run.stream);
+  if (size > 0) check(cudaMemsetAsync(given, 0, size * sizeof(S), run.stream), "clearing gradients");
+  return given;
+}
+
+}  // namespace
+
+template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory) {
+  EventClock clock(run.times, run.stream);
+  frame.saved = {};
+  const SavedSizes sizes = begin_saved(frame, run, memory);
+  const DepthKeys<S> keys = depth_keys(frame, memory);
+  project(frame, keys, {run.stream, &memory});
+  clock.end(&StageTimes::project);
+  draw(frame, sizes, keys, run, memory, clock);
+}
+
+template <class S> void project_footprints(const Frame<S>& frame, const Run& run, Allocator& memory) {
+  EventClock clock(run.times, run.stream);
+  project(frame, DepthKeys<S>(), {run.stream, &memory});
+  clock.end(&StageTimes::project);
+  clock.finish();
+  memory.release();
+}
+
+template <class S> void blend_footprints(Frame<S>& frame, const Run& run, Allocator& memory) {
+  EventClock clock(run.times, run.stream);
+  const SavedForward<S> given = frame.saved;
+  frame.saved = {};
+  frame.saved.projected = given.projected, frame.saved.features = given.features;
+  const SavedSizes sizes = begin_saved(frame, run, memory);
+  const DepthKeys<S> keys = depth_keys(frame, memory);
+  key_footprints(frame, keys, {run.stream, &memory});
+  draw(frame, sizes, keys, run, memory, clock);
+}
+
 template <class S>
 void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory) {
-  const int64_t count = frame.inputs.num_gaussians;
-  const int64_t record = kNumGateMoments + frame.config.num_features();
   Work work = {run.stream, &memory};
   if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);
   EventClock clock(run.times, run.stream);
   BackwardPass<S> pass;
   pass.gradients = gradients;
-  pass.dL_dgaussians = allocate_zeros<S>(memory, count * record, run.stream);
+  pass.dL_dgaussians = begin_records<S>(frame, nullptr, run, memory);
   blend_backward(frame, pass, work);
   clock.end(&StageTimes::blend_backward);
   project_backward(frame, pass, work);
   clock.end(&StageTimes::project_backward);
   clock.finish();
   add_pairs(work, run.times != nullptr ? &run.times->backward_pairs : nullptr);
+  memory.release();
+}
+
+template <class S>
+void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradients,
+                               const FootprintGradients<S>& footprints, const Run& run, Allocator& memory) {
+  Work work = {run.stream, &memory};
+  if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);
+  EventClock clock(run.times, run.stream);
+  BackwardPass<S> pass;
+  pass.gradients = gradients;
+  pass.dL_dgaussians = begin_records(frame, footprints.records, run, memory);
+  blend_backward(frame, pass, work);
+  finish_records(frame, pass, work);
+  clock.end(&StageTimes::blend_backward);
+  clock.finish();
+  add_pairs(work, run.times != nullptr ? &run.times->backward_pairs : nullptr);
+  memory.release();
+}
+
+template <class S>
+void project_footprints_backward(const Frame<S>& frame, const FootprintGradients<S>& footprints,
+                                 const GaussianGradients<S>& gradients, const Run& run, Allocator& memory) {
+  EventClock clock(run.times, run.stream);
+  BackwardPass<S> pass;
+  pass.gradients.inputs = gradients;
+  pass.dL_dgaussians = footprints.records;
+  pass.by_footprints = true;
+  pass.dL_ddepths = footprints.depths;
+  project_backward(frame, pass, {run.stream, &memory});
+  clock.end(&StageTimes::project_backward);
+  clock.finish();
   memory.release();
 }
 
@@ -155,9 +224,15 @@ template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& 
   memory.release();
 }
 
-#define DSMOE_INSTANTIATE(S)                                                            \
-  template void forward(Frame<S>&, const Run&, Allocator&);                             \
-  template void backward(const Frame<S>&, const Gradients<S>&, const Run&, Allocator&); \
+#define DSMOE_INSTANTIATE(S)                                                                                  \
+  template void forward(Frame<S>&, const Run&, Allocator&);                                                   \
+  template void backward(const Frame<S>&, const Gradients<S>&, const Run&, Allocator&);                       \
+  template void project_footprints(const Frame<S>&, const Run&, Allocator&);                                  \
+  template void blend_footprints(Frame<S>&, const Run&, Allocator&);                                          \
+  template void blend_footprints_backward(const Frame<S>&, const Gradients<S>&, const FootprintGradients<S>&, \
+                                          const Run&, Allocator&);                                            \
+  template void project_footprints_backward(const Frame<S>&, const FootprintGradients<S>&,                    \
+                                            const GaussianGradients<S>&, const Run&, Allocator&);             \
   template void radii(const Frame<S>&, const Run&, Allocator&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

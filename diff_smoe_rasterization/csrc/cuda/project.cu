@@ -33,6 +33,12 @@ template <int kFeatures, class S> __device__ bool store_features(const ColorSour
   }
 }
 
+// What the depth sort sorts of Gaussian i. radius: 0 where it is culled.
+template <class S> __device__ void store_keys(const DepthKeys<S>& keys, int64_t i, int32_t radius, S depth) {
+  if (keys.gaussians != nullptr) keys.gaussians[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
+  if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);
+}
+
 template <class S, int kFeatures, class Rows>
 __global__ void __launch_bounds__(kRowsBlock) project_kernel(const __grid_constant__ ProjectArguments<S> arguments) {
   __shared__ Camera<S> camera;
@@ -75,9 +81,22 @@ __global__ void __launch_bounds__(kRowsBlock) project_kernel(const __grid_consta
     arguments.saved.projected[i] = projection.gaussian;
   }
   arguments.radii[i] = radius;
-  const DepthKeys<S>& keys = arguments.keys;
-  keys.gaussians[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
-  if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);
+  store_keys(arguments.keys, i, radius, depth);
+}
+
+template <class S> struct KeyArguments {
+  int64_t num_gaussians;                  // N
+  const ProjectedGaussian<S>* projected;  // [N]
+  const int32_t* radii;                   // [N] pixels
+  DepthKeys<S> keys;                      // written
+};
+
+template <class S>
+__global__ void __launch_bounds__(kStoreBlock)
+    key_footprints_kernel(const __grid_constant__ KeyArguments<S> arguments) {
+  const int64_t i = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
+  if (i >= arguments.num_gaussians) return;
+  store_keys(arguments.keys, i, arguments.radii[i], arguments.projected[i].depth);
 }
 
 template <class S> struct VisibleArguments {
@@ -121,6 +140,17 @@ template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys,
   });
 }
 
+template <class S> void key_footprints(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work) {
+  KeyArguments<S> arguments = {};
+  arguments.num_gaussians = frame.inputs.num_gaussians;
+  arguments.projected = frame.saved.projected;
+  arguments.radii = frame.images.radii;
+  arguments.keys = keys;
+  if (arguments.num_gaussians == 0) return;
+  key_footprints_kernel<<<blocks_for(arguments.num_gaussians, kStoreBlock), kStoreBlock, 0, work.stream>>>(arguments);
+  DSMOE_CHECK_LAUNCH("key_footprints");
+}
+
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work) {
   VisibleArguments<S> arguments = {};
   arguments.num_gaussians = frame.inputs.num_gaussians;
@@ -134,8 +164,9 @@ template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const
   DSMOE_CHECK_LAUNCH("mark_visible");
 }
 
-#define DSMOE_INSTANTIATE(S)                                                \
-  template void project(const Frame<S>&, const DepthKeys<S>&, const Work&); \
+#define DSMOE_INSTANTIATE(S)                                                       \
+  template void project(const Frame<S>&, const DepthKeys<S>&, const Work&);        \
+  template void key_footprints(const Frame<S>&, const DepthKeys<S>&, const Work&); \
   template void mark_visible(const Frame<S>&, bool*, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

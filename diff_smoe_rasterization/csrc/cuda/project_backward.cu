@@ -16,6 +16,8 @@ template <class S> struct ProjectBackwardArguments {
   SavedForward<S> saved;           // projected and features are read
   const int32_t* radii;            // [N] pixels; above 0 where a Gaussian was seen
   const S* dL_dgaussians;          // [N, kNumGateMoments + F] the records
+  bool by_footprints;              // which are gradients by the footprints, not sums over pixels
+  const S* dL_ddepths;             // [N] gradients by the view depths, besides what the features say; or null
   GaussianGradients<S> gradients;  // written
   S* camera_rows;                  // [warps, kCameraGradientSize] each warp's sums, written; or null
 };
@@ -35,8 +37,21 @@ __device__ void store_camera_row(const ProjectBackwardArguments<S>& arguments, i
   store_sums(dL_dcamera.view), store_sums(dL_dcamera.projection), store_sums(dL_dcamera.position);
 }
 
-template <class S> __device__ GateMoments<S> moments_of(const S* record) {
-  return {record[0], record[1], record[2], record[3], record[4], record[5]};
+template <class S> __device__ GateGradient<S> gate_of_moments(const ProjectedGaussian<S>& projected, const S* record) {
+  const GateMoments<S> moments = {record[0], record[1], record[2], record[3], record[4], record[5]};
+  return moments_backward(projected.conic, projected.opacity, moments);
+}
+
+// All that comes back to Gaussian i from the image. projected: only read where the record is of sums over pixels.
+template <class S>
+__device__ ProjectedGradient<S> image_gradient(const ProjectBackwardArguments<S>& arguments, int64_t i,
+                                               const ProjectedGaussian<S>& projected, const S* record,
+                                               Vec3<S> from_color, const RasterConfig<S>& config) {
+  GateGradient<S> gate = {{record[0], record[1]}, {record[2], record[3], record[4]}, record[5]};
+  if (!arguments.by_footprints) gate = gate_of_moments(projected, record);
+  auto out = projected_gradient(gate, record + kNumGateMoments, from_color, config);
+  if (arguments.dL_ddepths != nullptr) out.depth += arguments.dL_ddepths[i];
+  return out;
 }
 
 constexpr int kRecordLength = kNumGateMoments + kFastFeatures;  // of colours
@@ -111,7 +126,7 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : 
   if (seen) {
     own = Rows::gaussian(arguments.inputs, i);
     if constexpr (Rows::kDcApart) store3(dc, load3(arguments.inputs.dc + 3 * i));
-    projected = arguments.saved.projected[i];
+    if (!arguments.by_footprints) projected = arguments.saved.projected[i];
     features = *reinterpret_cast<const float4*>(arguments.saved.features + i * feature_stride(config.num_features()));
   }
   wait_for_copies();
@@ -133,9 +148,8 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : 
                                                          {color, record + kNumGateMoments},
                                                          {nullptr, Rows::kDcApart ? gradient.dc : nullptr, dL_dsh});
     rows.write(dL_dsh);  // the row's registers are free from here on
-    const auto gate = moments_backward(projected.conic, projected.opacity, moments_of(record));
     gradient.gaussian = project_backward(own, camera, config.projection_rules(),
-                                         projected_gradient(gate, record + kNumGateMoments, from_color, config));
+                                         image_gradient(arguments, i, projected, record, from_color, config));
     if constexpr (kCamera) dL_dcamera.add(gradient.gaussian.camera);
   } else {
     rows.write(dL_dsh);
@@ -173,7 +187,8 @@ __global__ void __launch_bounds__(kRowsBlock)
 
   Gaussian<S> own = {};
   ProjectedGaussian<S> projected = {};
-  if (seen) own = load_gaussian(inputs, i), projected = arguments.saved.projected[i];
+  if (seen) own = load_gaussian(inputs, i);
+  if (seen && !arguments.by_footprints) projected = arguments.saved.projected[i];
   const S* features = arguments.saved.features + i * feature_stride(num_features);
   const S* record = arguments.dL_dgaussians + i * (kNumGateMoments + num_features);
   const S* dL_dfeatures = record + kNumGateMoments;
@@ -190,9 +205,8 @@ __global__ void __launch_bounds__(kRowsBlock)
     }
     const auto from_color =
         write_color_gradients<S>({colors, own.mean, camera, config}, {features, dL_dfeatures}, to_colors);
-    const auto gate = moments_backward(projected.conic, projected.opacity, moments_of(record));
     const auto gradient = project_backward(own, camera, config.projection_rules(),
-                                           projected_gradient(gate, dL_dfeatures, from_color, config));
+                                           image_gradient(arguments, i, projected, record, from_color, config));
     store_gradient(gradient, arguments.gradients, i);
     if constexpr (kCamera) dL_dcamera.add(gradient.camera);
   } else if (exists) {
@@ -205,7 +219,36 @@ __global__ void __launch_bounds__(kRowsBlock)
   if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
 }
 
+template <class S> struct FinishArguments {
+  int64_t num_gaussians;  // N
+  int length;             // numbers a record
+  SavedForward<S> saved;  // projected is read
+  const int32_t* radii;   // [N] pixels; above 0 where a Gaussian was seen
+  S* records;             // [N, length] read and written
+};
+
+template <class S>
+__global__ void __launch_bounds__(kStoreBlock)
+    finish_records_kernel(const __grid_constant__ FinishArguments<S> arguments) {
+  const int64_t i = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
+  if (i >= arguments.num_gaussians || arguments.radii[i] == 0) return;
+  S* record = arguments.records + i * arguments.length;
+  store_gate_gradient(gate_of_moments(arguments.saved.projected[i], record), record);
+}
+
 }  // namespace
+
+template <class S> void finish_records(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work) {
+  FinishArguments<S> arguments = {};
+  arguments.num_gaussians = frame.inputs.num_gaussians;
+  arguments.length = kNumGateMoments + frame.config.num_features();
+  arguments.saved = frame.saved;
+  arguments.radii = frame.images.radii;
+  arguments.records = pass.dL_dgaussians;
+  if (arguments.num_gaussians == 0) return;
+  finish_records_kernel<<<blocks_for(arguments.num_gaussians, kStoreBlock), kStoreBlock, 0, work.stream>>>(arguments);
+  DSMOE_CHECK_LAUNCH("finish_records");
+}
 
 template <class S> void project_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work) {
   const GaussianInputs<S>& inputs = frame.inputs;
@@ -221,6 +264,8 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
   arguments.dL_dgaussians = dL_dgaussians;
+  arguments.by_footprints = pass.by_footprints;
+  arguments.dL_ddepths = pass.dL_ddepths;
   arguments.gradients = gradients;
   const bool with_camera = gradients.camera != nullptr;
   const int64_t blocks = blocks_for(inputs.num_gaussians, kRowsBlock), warps = blocks * (kRowsBlock / kWarp);
@@ -254,7 +299,9 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
   }
 }
 
-#define DSMOE_INSTANTIATE(S) template void project_backward(const Frame<S>&, const BackwardPass<S>&, const Work&);
+#define DSMOE_INSTANTIATE(S)                                                          \
+  template void finish_records(const Frame<S>&, const BackwardPass<S>&, const Work&); \
+  template void project_backward(const Frame<S>&, const BackwardPass<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

@@ -124,7 +124,7 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
   check_arguments(inputs, options);
   const at::Tensor& like = inputs[kMeans3D];
   for (int i = 0; i < kNumImages; ++i) {
-    const auto shape = image_shape(static_cast<Image>(i), inputs, options);
+    const auto shape = image_shape(static_cast<Image>(i), image_sizes(inputs), options);
     check_result(function, kImageNames[i], images[i], shape, i == kRadii ? at::kInt : like.scalar_type(),
                  like.device());
     if (!image_gradients[i].defined()) continue;
@@ -137,6 +137,58 @@ void check_backward_arguments(const Inputs& inputs, const Options& options, cons
     TORCH_CHECK_VALUE(!wanted[i] || inputs[i].defined(), function, ": the gradient of ", kInputNames[i],
                       " is wanted, but that input is absent");
   }
+}
+
+void check_footprints(const char* function, const Footprints& of, const Options& options) {
+  check_options(function, options);
+  check_real(function, "gates", of.gates);
+  check_shape(function, "gates", of.gates, {"N", kProjectedGaussianSize});
+  const int64_t count = of.gates.size(0), extra = options.depth + options.inverse_depth;
+  TORCH_CHECK_VALUE(count <= INT_MAX, function, ": gates has ", count, " footprints; the most is ", INT_MAX);
+  check_like(function, "bg", of.background, "gates", of.gates);
+  check_shape(function, "bg", of.background, {"C"});
+  TORCH_CHECK_VALUE(of.background.numel() > 0, function, ": bg has shape ", of.background.sizes(),
+                    "; a colour has one channel or more");
+  check_like(function, "features", of.features, "gates", of.gates);
+  check_shape(function, "features", of.features, {count, of.background.numel() + extra});
+  check_shape(function, "radii", of.radii, {count});
+  TORCH_CHECK_TYPE(of.radii.scalar_type() == at::kInt && of.radii.device() == of.gates.device(), function,
+                   ": radii is ", dtype_name(of.radii.scalar_type()), " on ", of.radii.device(), "; it must be ",
+                   dtype_name(at::kInt), " on ", of.gates.device());
+  if (of.background_gate.defined()) {
+    check_like(function, "background_gate", of.background_gate, "gates", of.gates);
+    check_background_gate(function, of.background_gate);
+  }
+  for (const at::Tensor& tensor : {of.gates, of.features, of.background}) refuse_tangent(function, tensor);
+}
+
+void check_blend_backward_arguments(const Images& images, const Images& image_gradients, const ImageSizes& sizes,
+                                    const at::Tensor& like, const Options& options) {
+  const char* function = "blend_backward";
+  for (Image image : kDifferentiable) {
+    const auto shape = image_shape(image, sizes, options);
+    check_result(function, kImageNames[image], images[image], shape, like.scalar_type(), like.device());
+    if (!image_gradients[image].defined()) continue;
+    const std::string name = std::string("dL_d") + kImageNames[image];
+    check_like(function, name.c_str(), image_gradients[image], "gates", like);
+    check_shape(function, name.c_str(), image_gradients[image], {shape.begin(), shape.end()});
+  }
+}
+
+void check_footprint_gradients(const at::Tensor& records, const at::Tensor& dL_ddepths, const at::Tensor& features,
+                               const at::Tensor& radii, const Inputs& inputs, const Options& options) {
+  const char* function = "project_backward";
+  const at::Tensor& like = inputs[kMeans3D];
+  const int64_t count = num_gaussians(inputs);
+  const int64_t num_features = num_channels(inputs) + options.depth + options.inverse_depth;
+  check_like(function, "records", records, "means3D", like);
+  check_shape(function, "records", records, {count, kNumGateGradients + num_features});
+  check_like(function, "features", features, "means3D", like);
+  check_shape(function, "features", features, {count, num_features});
+  check_result(function, "radii", radii, {count}, at::kInt, like.device());
+  if (!dL_ddepths.defined()) return;
+  check_like(function, "dL_ddepths", dL_ddepths, "means3D", like);
+  check_shape(function, "dL_ddepths", dL_ddepths, {count});
 }
 
 void check_contribution_arguments(const char* function, const at::Tensor& pixel_weights, const at::Tensor& radii,

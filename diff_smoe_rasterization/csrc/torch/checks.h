@@ -20,6 +20,19 @@ void check_arguments(const Inputs& inputs, const Options& options);
 void check_backward_arguments(const Inputs& inputs, const Options& options, const Images& images,
                               const Images& image_gradients, const InputMask& wanted);
 
+// What the op `blend` takes of the Gaussians, and the background.
+struct Footprints {
+  at::Tensor gates, features, radii;       // [N, 8], [N, F] and [N]
+  at::Tensor background, background_gate;  // [C], and one element or undefined
+};
+void check_footprints(const char* function, const Footprints& of, const Options& options);
+
+// The backward ops' own arguments.
+void check_blend_backward_arguments(const Images& images, const Images& image_gradients, const ImageSizes& sizes,
+                                    const at::Tensor& like, const Options& options);
+void check_footprint_gradients(const at::Tensor& records, const at::Tensor& dL_ddepths, const at::Tensor& features,
+                               const at::Tensor& radii, const Inputs& inputs, const Options& options);
+
 // Those of an op that goes over what a rendering saved.
 void check_contribution_arguments(const char* function, const at::Tensor& pixel_weights, const at::Tensor& radii,
                                   const Saved& saved, const at::Tensor& background_gate, const Options& options);

@@ -115,7 +115,7 @@ template <class Backend> void rasterize(const c10::OperatorHandle& op, torch::ji
   RenderingCall<Backend> call(op, *stack);
   const Inputs& inputs = call.inputs;
   const Options& options = call.options;
-  const Images images = allocate_images(inputs, options);
+  const Images images = allocate_images(inputs[kMeans3D], image_sizes(inputs), options);
   TensorMemory memory(inputs[kMeans3D]);
   dispatch(inputs[kMeans3D],
            [&](auto zero) { Backend::template forward<decltype(zero)>(inputs, options, images, memory); });
@@ -198,6 +198,128 @@ template <class Backend> void rasterize_backward(const c10::OperatorHandle& op, 
   arguments.give_back(std::move(results));
 }
 
+// Rows of `columns` numbers, dense and vector-aligned; those behind the tensor's own hold anything.
+inline at::Tensor padded(const at::Tensor& rows, int64_t columns) {
+  const bool fits = rows.size(1) == columns && rows.is_contiguous();
+  if (fits && reinterpret_cast<uintptr_t>(rows.data_ptr()) % 16 == 0) return rows;
+  const at::Tensor out = at::empty({rows.size(0), columns}, rows.options());
+  out.narrow(1, 0, rows.size(1)).copy_(rows);
+  return out;
+}
+
+template <class Backend> void project(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  RenderingCall<Backend> call(op, *stack);
+  const Inputs& inputs = call.inputs;
+  const at::TensorOptions like = inputs[kMeans3D].options();
+  const int64_t count = num_gaussians(inputs);
+  const int64_t num_features = num_channels(inputs) + call.options.depth + call.options.inverse_depth;
+  const at::Tensor gates = at::empty({count, kProjectedGaussianSize}, like);
+  const at::Tensor features = at::empty({count, Backend::feature_columns(num_features)}, like);
+  Images images;
+  images[kRadii] = at::empty({count}, like.dtype(at::kInt));
+  TensorMemory memory(gates);
+  dispatch(gates, [&](auto zero) {
+    Backend::template project<decltype(zero)>(inputs, call.options, images, gates, features, memory);
+  });
+  call.arguments.give_back(gates, features.narrow(1, 0, num_features), images[kRadii]);
+}
+
+template <class Backend> void blend(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  Arguments arguments(op, *stack);
+  Footprints of;
+  for (auto* tensor : {&of.gates, &of.features, &of.radii, &of.background, &of.background_gate}) {
+    arguments.read(*tensor);
+  }
+  const auto options = arguments.read<Options>();
+  check_footprints("blend", of, options);
+  const typename Backend::Guard guard(of.gates.device());
+  of.gates = padded(of.gates, kProjectedGaussianSize);
+  of.features = padded(of.features, Backend::feature_columns(of.features.size(1)));
+  of.radii = of.radii.contiguous(), of.background = of.background.contiguous();
+  const ImageSizes sizes = {of.gates.size(0), of.background.numel()};
+  Images images = allocate_images(of.gates, sizes, options);
+  images[kRadii] = of.radii;
+  TensorMemory memory(of.gates);
+  memory.give(0, of.gates), memory.give(1, of.features.view(-1));
+  dispatch(of.gates, [&](auto zero) { Backend::template blend<decltype(zero)>(of, options, images, memory); });
+  arguments.give_back(images[kColor], images[kGateSum], images[kDepth], images[kInverseDepth], memory.take_saved());
+}
+
+template <class Backend> void blend_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  Arguments arguments(op, *stack);
+  Images image_gradients, images;
+  for (Image image : kDifferentiable) {
+    arguments.read(image_gradients[image]);
+    if (image_gradients[image].defined()) image_gradients[image] = image_gradients[image].contiguous();
+  }
+  const auto image_list = arguments.read<std::vector<at::Tensor>>();
+  const auto saved = arguments.read<Saved>();
+  Footprints of;
+  for (auto* tensor : {&of.radii, &of.background, &of.background_gate}) arguments.read(*tensor);
+  const auto options = arguments.read<Options>();
+  const auto wants_background = arguments.read<bool>();
+  check_length("images", image_list.size(), kDifferentiable.size());
+  TORCH_CHECK_VALUE(saved.size() > 1, "blend_backward: saved has length ", saved.size(),
+                    "; it must be what blend returned");
+  const int64_t num_features = of.background.numel() + options.depth + options.inverse_depth;
+  const int64_t columns = Backend::feature_columns(num_features);
+  of.gates = saved[0], of.features = saved[1];
+  if (of.gates.dim() == 2 && of.features.numel() == of.gates.size(0) * columns) {
+    of.features = of.features.view({of.gates.size(0), columns}).narrow(1, 0, num_features);
+  }
+  check_footprints("blend_backward", of, options);
+  const ImageSizes sizes = {of.gates.size(0), of.background.numel()};
+  for (size_t i = 0; i < image_list.size(); ++i) images[kDifferentiable[i]] = image_list[i];
+  check_blend_backward_arguments(images, image_gradients, sizes, of.gates, options);
+  const typename Backend::Guard guard(of.gates.device());
+  images[kRadii] = of.radii = of.radii.contiguous();
+  of.background = of.background.contiguous();
+  const at::Tensor records = at::empty({sizes.num_gaussians, kNumGateGradients + num_features}, of.gates.options());
+  const at::Tensor background = at::empty({wants_background ? sizes.num_channels + 1 : 0}, of.gates.options());
+  dispatch(of.gates, [&](auto zero) {
+    Backend::template blend_backward<decltype(zero)>(of, options, images, saved, image_gradients, records, background);
+  });
+  const int64_t channels = wants_background ? sizes.num_channels : 0;
+  arguments.give_back(records, background.narrow(0, 0, channels).clone(),
+                      background.narrow(0, channels, wants_background ? 1 : 0).clone());
+}
+
+template <class Backend> void project_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  Arguments arguments(op, *stack);
+  const auto records = arguments.read<at::Tensor>().contiguous();
+  at::Tensor dL_ddepths = arguments.read<at::Tensor>();
+  const auto input_list = arguments.read<std::vector<at::Tensor>>();
+  const auto present = arguments.read<std::vector<bool>>();
+  at::Tensor features = arguments.read<at::Tensor>();
+  const auto radii = arguments.read<at::Tensor>();
+  const auto options = arguments.read<Options>();
+  const auto wanted_list = arguments.read<std::vector<bool>>();
+  const Inputs given = spread(input_list, present);
+  check_length("wanted", wanted_list.size(), kNumInputs);
+  InputMask wanted;
+  std::copy(wanted_list.begin(), wanted_list.end(), wanted.begin());
+  check_arguments(given, options);
+  check_footprint_gradients(records, dL_ddepths, features, radii, given, options);
+  for (int i = 0; i < kNumInputs; ++i) {
+    TORCH_CHECK_VALUE(!wanted[i] || (given[i].defined() && i != kBackground && i != kBackgroundGate),
+                      "project_backward: the gradient of ", kInputNames[i],
+                      " is wanted, but no footprint depends on it");
+  }
+  const typename Backend::Guard guard(given[kMeans3D].device());
+  features = padded(features, Backend::feature_columns(features.size(1)));
+  if (dL_ddepths.defined()) dL_ddepths = dL_ddepths.contiguous();
+  const Inputs inputs = contiguous(given), gradients = allocate_gradients(inputs, wanted);
+  dispatch(records, [&](auto zero) {
+    Backend::template project_backward<decltype(zero)>(inputs, options, features, radii, records, dL_ddepths,
+                                                       gradients);
+  });
+  std::vector<at::Tensor> results;
+  for (int i = 0; i < kNumInputs; ++i) {
+    if (wanted[i]) results.push_back(gradients[i]);
+  }
+  arguments.give_back(std::move(results));
+}
+
 template <class Backend> void contributions(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
   Arguments arguments(op, *stack);
   const auto pixel_weights = arguments.read<at::Tensor>();
@@ -270,6 +392,10 @@ at::Tensor mark_visible(const at::Tensor& positions, const at::Tensor& viewmatri
 template <class Backend> void register_ops(torch::Library& m) {
   m.impl("rasterize", torch::CppFunction::makeFromBoxedFunction<&rasterize<Backend>>());
   m.impl("rasterize_backward", torch::CppFunction::makeFromBoxedFunction<&rasterize_backward<Backend>>());
+  m.impl("project", torch::CppFunction::makeFromBoxedFunction<&project<Backend>>());
+  m.impl("project_backward", torch::CppFunction::makeFromBoxedFunction<&project_backward<Backend>>());
+  m.impl("blend", torch::CppFunction::makeFromBoxedFunction<&blend<Backend>>());
+  m.impl("blend_backward", torch::CppFunction::makeFromBoxedFunction<&blend_backward<Backend>>());
   m.impl("radii", torch::CppFunction::makeFromBoxedFunction<&radii<Backend>>());
   m.impl("contributions", torch::CppFunction::makeFromBoxedFunction<&contributions<Backend>>());
   m.impl("importance", torch::CppFunction::makeFromBoxedFunction<&importance<Backend>>());

@@ -36,6 +36,66 @@ struct Cpu {
     cpu::radii(frame<S>(inputs, options, images), memory);
   }
 
+  static int64_t feature_columns(int64_t num_features) { return num_features; }
+
+  template <class S>
+  static void project(const Inputs& inputs, const Options& options, const Images& images, const at::Tensor& gates,
+                      const at::Tensor& features, Allocator&) {
+    auto own = frame<S>(inputs, options, images);
+    own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(gates));
+    own.saved.features = mutable_data<S>(features);
+    StageRecorder recorder(Pass::kForward);
+    cpu::project(own, recorder.times());
+  }
+
+  // The frame of some footprints, nothing saved yet.
+  template <class S> static cpu::Frame<S> frame(const Footprints& of, const Options& options, const Images& images) {
+    cpu::Frame<S> frame;
+    frame.inputs.num_gaussians = of.gates.size(0);
+    frame.config = footprint_config<S>(of.background, of.background_gate, options);
+    frame.config.num_threads = at::get_num_threads();
+    set_image(frame.camera, options);
+    frame.images = image_outputs<S>(images);
+    return frame;
+  }
+
+  template <class S>
+  static void blend(const Footprints& of, const Options& options, const Images& images, Allocator& memory) {
+    auto own = frame<S>(of, options, images);
+    own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(of.gates.data_ptr<S>());
+    own.saved.features = of.features.data_ptr<S>();
+    StageRecorder recorder(Pass::kForward);
+    cpu::blend_footprints(own, memory, recorder.times());
+  }
+
+  template <class S>
+  static void blend_backward(const Footprints& of, const Options& options, const Images& images, const Saved& saved,
+                             const Images& image_gradient_tensors, const at::Tensor& records,
+                             const at::Tensor& background) {
+    auto own = frame<S>(of, options, images);
+    own.saved = unpack<S>("blend_backward", saved, cpu::saved_sizes(own), of.gates.device());
+    own.saved.gate_sum = own.images.gate_sum;
+    cpu::Gradients<S> gradients;
+    gradients.images = image_gradients<S>(image_gradient_tensors);
+    gradients.inputs.background = mutable_data<S>(background);
+    StageRecorder recorder(Pass::kBackward);
+    cpu::blend_footprints_backward(own, gradients, {mutable_data<S>(records), nullptr}, recorder.times());
+  }
+
+  template <class S>
+  static void project_backward(const Inputs& inputs, const Options& options, const at::Tensor& features,
+                               const at::Tensor& radii, const at::Tensor& records, const at::Tensor& dL_ddepths,
+                               const Inputs& gradient_tensors) {
+    auto own = frame<S>(inputs, options, Images());
+    own.saved.features = mutable_data<S>(features);
+    own.images.radii = mutable_data<int32_t>(radii);
+    cpu::Gradients<S> gradients;
+    with_input_gradients<S>(inputs, gradient_tensors, gradients, [&] {
+      StageRecorder recorder(Pass::kBackward);
+      cpu::project_backward(own, {mutable_data<S>(records), data<S>(dL_ddepths)}, gradients.inputs, recorder.times());
+    });
+  }
+
   // Checks what a rendering saved, and points to it.
   template <class S>
   static SavedForward<S> unpack(const char* function, const Saved& tensors, SavedSizes sizes, at::Device device) {

@@ -44,6 +44,70 @@ struct Cuda {
     cuda::radii(frame<S>(inputs, options, images), run(options, nullptr), memory);
   }
 
+  static int64_t feature_columns(int64_t num_features) { return cuda::feature_stride(static_cast<int>(num_features)); }
+
+  template <class S>
+  static void project(const Inputs& inputs, const Options& options, const Images& images, const at::Tensor& gates,
+                      const at::Tensor& features, Allocator& memory) {
+    auto own = frame<S>(inputs, options, images);
+    own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(gates));
+    own.saved.features = mutable_data<S>(features);
+    StageRecorder recorder(Pass::kForward);
+    cuda::project_footprints(own, run(options, recorder.times()), memory);
+  }
+
+  // The frame of some footprints, nothing saved yet.
+  template <class S> static cuda::Frame<S> frame(const Footprints& of, const Options& options, const Images& images) {
+    cuda::Frame<S> frame;
+    frame.inputs.num_gaussians = of.gates.size(0);
+    frame.config = footprint_config<S>(of.background, of.background_gate, options);
+    set_image(frame.camera, options);
+    frame.images = image_outputs<S>(images);
+    return frame;
+  }
+
+  template <class S>
+  static void blend(const Footprints& of, const Options& options, const Images& images, Allocator& memory) {
+    auto own = frame<S>(of, options, images);
+    own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(of.gates.data_ptr<S>());
+    own.saved.features = of.features.data_ptr<S>();
+    StageRecorder recorder(Pass::kForward);
+    cuda::blend_footprints(own, run(options, recorder.times()), memory);
+  }
+
+  template <class S>
+  static void blend_backward(const Footprints& of, const Options& options, const Images& images, const Saved& saved,
+                             const Images& image_gradient_tensors, const at::Tensor& records,
+                             const at::Tensor& background) {
+    auto own = frame<S>(of, options, images);
+    StageRecorder recorder(Pass::kBackward);
+    const cuda::Run how = run(options, recorder.times());
+    own.saved = unpack<S>("blend_backward", saved, cuda::saved_sizes(own, how), of.gates.device());
+    own.saved.gate_sum = own.images.gate_sum;
+    cuda::Gradients<S> gradients;
+    gradients.images = image_gradients<S>(image_gradient_tensors);
+    gradients.inputs.background = mutable_data<S>(background);
+    TensorMemory memory(of.gates);
+    cuda::blend_footprints_backward(own, gradients, {mutable_data<S>(records), nullptr}, how, memory);
+  }
+
+  template <class S>
+  static void project_backward(const Inputs& inputs, const Options& options, const at::Tensor& features,
+                               const at::Tensor& radii, const at::Tensor& records, const at::Tensor& dL_ddepths,
+                               const Inputs& gradient_tensors) {
+    auto own = frame<S>(inputs, options, Images());
+    own.saved.features = mutable_data<S>(features);
+    own.images.radii = mutable_data<int32_t>(radii);
+    StageRecorder recorder(Pass::kBackward);
+    const cuda::Run how = run(options, recorder.times());
+    cuda::Gradients<S> gradients;
+    TensorMemory memory(features);
+    with_input_gradients<S>(inputs, gradient_tensors, gradients, [&] {
+      cuda::project_footprints_backward(own, {mutable_data<S>(records), data<S>(dL_ddepths)}, gradients.inputs, how,
+                                        memory);
+    });
+  }
+
   // Checks what a rendering saved, and points to it. The capacity, and whether there are segments, is what it has.
   template <class S>
   static cuda::SavedForward<S> unpack(const char* function, const Saved& tensors, cuda::SavedSizes sizes,

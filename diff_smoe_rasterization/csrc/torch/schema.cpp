@@ -31,6 +31,27 @@ const std::string kRasterizeBackward =
 // The radii [N] that rasterize would return for the same arguments.
 const std::string kRadii = "radii(" + kInputs + without_comma(kOptions) + ") -> Tensor";
 
+// The two halves of rasterize, with the footprints of N Gaussians between them: what the blend reads of each. gates:
+// [N, 8], `projected` of params.h; features: [N, F], the colour's channels, then z and 1 / z where the options ask for
+// them; radii: [N]. Footprints of equal depth are blended in their order.
+const std::string kProject =
+    "project(" + kInputs + without_comma(kOptions) + ") -> (Tensor gates, Tensor features, Tensor radii)";
+const std::string kBlend = "blend(Tensor gates, Tensor features, Tensor radii, Tensor bg, Tensor? background_gate, " +
+                           without_comma(kOptions) +
+                           ") -> (Tensor color, Tensor gate_sum, Tensor depth, Tensor inverse_depth, Tensor[] saved)";
+
+// records: [N, 6 + F] gradients by a footprint's centre (2 numbers), conic (3), opacity and features.
+const std::string kBlendBackward =
+    "blend_backward(Tensor? dL_dcolor, Tensor? dL_dgate_sum, Tensor? dL_ddepth, Tensor? dL_dinverse_depth, "
+    "Tensor[] images, Tensor[] saved, Tensor radii, Tensor bg, Tensor? background_gate, " +
+    kOptions + "bool wants_background) -> (Tensor records, Tensor dL_dbg, Tensor dL_dbackground_gate)";
+
+// dL_ddepths: [N] by the view depths, besides what the features say. Returned is what rasterize_backward returns.
+const std::string kProjectBackward =
+    "project_backward(Tensor records, Tensor? dL_ddepths, Tensor[] inputs, bool[] present, Tensor features, "
+    "Tensor radii, " +
+    kOptions + "bool[] wanted) -> Tensor[]";
+
 // From a map [H, W] and what one rasterize saved: sums over the pixels of each Gaussian.
 const std::string kContributions =
     "contributions(Tensor pixel_weights, Tensor radii, Tensor[] saved, Tensor? background_gate, " +
@@ -48,6 +69,10 @@ TORCH_LIBRARY(diff_smoe_rasterization, m) {
   m.def(kRasterize.c_str());
   m.def(kRasterizeBackward.c_str());
   m.def(kRadii.c_str());
+  m.def(kProject.c_str());
+  m.def(kProjectBackward.c_str());
+  m.def(kBlend.c_str());
+  m.def(kBlendBackward.c_str());
   m.def(kContributions.c_str());
   m.def(kImportance.c_str());
   m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near) -> Tensor");

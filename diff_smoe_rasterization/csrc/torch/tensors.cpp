@@ -10,13 +10,13 @@ Inputs contiguous(Inputs inputs) {
   return inputs;
 }
 
-std::vector<int64_t> image_shape(Image image, const Inputs& inputs, const Options& options) {
+std::vector<int64_t> image_shape(Image image, const ImageSizes& sizes, const Options& options) {
   const int64_t height = options.image_height, width = options.image_width;
   switch (image) {
     case kColor:
-      return {num_channels(inputs), height, width};
+      return {sizes.num_channels, height, width};
     case kRadii:
-      return {num_gaussians(inputs)};
+      return {sizes.num_gaussians};
     case kDepth:
       if (!options.depth) return {0};
       break;
@@ -29,12 +29,12 @@ std::vector<int64_t> image_shape(Image image, const Inputs& inputs, const Option
   return {1, height, width};
 }
 
-Images allocate_images(const Inputs& inputs, const Options& options) {
-  const at::TensorOptions like = inputs[kMeans3D].options();
+Images allocate_images(const at::Tensor& like_tensor, const ImageSizes& sizes, const Options& options) {
+  const at::TensorOptions like = like_tensor.options();
   Images images;
   for (int i = 0; i < kNumImages; ++i) {
     const auto image = static_cast<Image>(i);
-    images[i] = at::empty(image_shape(image, inputs, options), image == kRadii ? like.dtype(at::kInt) : like);
+    images[i] = at::empty(image_shape(image, sizes, options), image == kRadii ? like.dtype(at::kInt) : like);
   }
   return images;
 }

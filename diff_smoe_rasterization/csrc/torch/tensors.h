@@ -54,11 +54,17 @@ inline int64_t num_channels(const Inputs& inputs) {
 // Dense copies of the tensors that are not dense already.
 Inputs contiguous(Inputs inputs);
 
-// The shape of an image; of the radii too.
-std::vector<int64_t> image_shape(Image image, const Inputs& inputs, const Options& options);
+// What the shapes of images depend on besides the options.
+struct ImageSizes {
+  int64_t num_gaussians, num_channels;
+};
+inline ImageSizes image_sizes(const Inputs& inputs) { return {num_gaussians(inputs), num_channels(inputs)}; }
 
-// All images, nothing filled.
-Images allocate_images(const Inputs& inputs, const Options& options);
+// The shape of an image; of the radii too.
+std::vector<int64_t> image_shape(Image image, const ImageSizes& sizes, const Options& options);
+
+// All images, nothing filled. like: a tensor of their type and device.
+Images allocate_images(const at::Tensor& like, const ImageSizes& sizes, const Options& options);
 
 // A gradient for each input that wants one, nothing filled; the others stay undefined.
 Inputs allocate_gradients(const Inputs& inputs, const InputMask& wanted);
@@ -86,6 +92,12 @@ class TensorMemory final : public Allocator {
   }
 
   void release() override { scratch_.clear(); }
+
+  // Puts a tensor that is there already among the saved ones.
+  void give(int index, const at::Tensor& tensor) {
+    if (saved_.size() <= static_cast<size_t>(index)) saved_.resize(index + 1);
+    saved_[index] = tensor;
+  }
 
   Saved take_saved() { return std::move(saved_); }
 
@@ -135,6 +147,18 @@ template <class S> RasterConfig<S> raster_config(const Inputs& inputs, const Opt
   out.depth = options.depth;
   out.inverse_depth = options.inverse_depth;
   out.clamp_color = options.clamp_color;
+  return out;
+}
+
+// The same, of a rendering of footprints.
+template <class S>
+RasterConfig<S> footprint_config(const at::Tensor& background, const at::Tensor& background_gate,
+                                 const Options& options) {
+  RasterConfig<S> out = blend_config<S>(background_gate, options);
+  out.num_channels = static_cast<int>(background.numel());
+  out.background = data<S>(background);
+  out.depth = options.depth;
+  out.inverse_depth = options.inverse_depth;
   return out;
 }
 

@@ -208,7 +208,25 @@ template <class S> DSMOE_HD Projection<S> project_gaussian(const RenderedGaussia
 template <class S> struct PixelSums {
   GateGradient<S> gate;         // by its shape and opacity on the image
   BlendedFeatures<S> features;  // and the gradients by them
+  S depth = 0;                  // by its view depth, where others than the pixels read that
 };
+
+// The gradient of Gaussian i that a record of FootprintGradients has. features: what the forward pass wrote of it.
+template <class S>
+DSMOE_HD PixelSums<S> pixel_sums(const FootprintGradients<S>& gradients, int64_t i, int num_features,
+                                 const S* features) {
+  const S* record = gradients.records + i * (kNumGateGradients + num_features);
+  return {{{record[0], record[1]}, {record[2], record[3], record[4]}, record[5]},
+          {features, record + kNumGateGradients},
+          gradients.depths != nullptr ? gradients.depths[i] : S(0)};
+}
+
+// Writes the gate's part of such a record.
+template <class S> DSMOE_HD void store_gate_gradient(const GateGradient<S>& gate, S* record) {
+  record[0] = gate.mean.x, record[1] = gate.mean.y;
+  record[2] = gate.conic.xx, record[3] = gate.conic.xy, record[4] = gate.conic.yy;
+  record[5] = gate.opacity;
+}
 
 // Writes the gradients of a Gaussian, but for coefficients above the active degree. Returns the Gaussian's share of the
 // camera's gradient.
@@ -219,8 +237,9 @@ DSMOE_HD CameraShare<S> project_gaussian_backward(const RenderedGaussian<S>& of,
   const Gaussian<S> gaussian = load_gaussian(of.inputs, of.index);
   const Vec3<S> color = write_color_gradients(of.color_source(gaussian.mean), sums.features,
                                               color_gradients_of(out, config.num_channels, of.inputs.num_sh, of.index));
-  const auto gradient = project_backward(gaussian, of.camera, config.projection_rules(),
-                                         projected_gradient(sums.gate, sums.features.dL_dvalues, color, config));
+  auto by_image = projected_gradient(sums.gate, sums.features.dL_dvalues, color, config);
+  by_image.depth += sums.depth;
+  const auto gradient = project_backward(gaussian, of.camera, config.projection_rules(), by_image);
   store_gradient(gradient, out, of.index);
   return gradient.camera;
 }

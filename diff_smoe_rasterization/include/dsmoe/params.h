@@ -47,7 +47,7 @@ template <class S> struct RasterConfig {
   }
   DSMOE_HD AlphaCut<S> alpha_cut() const { return {alpha_min, gate_of_background()}; }
   DSMOE_HD ProjectionRules<S> projection_rules() const {
-    return {mode, scale_modifier, alpha_cut(), antialiasing, depth, inverse_depth};
+    return {mode, scale_modifier, alpha_cut(), antialiasing, inverse_depth};
   }
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
 };
@@ -163,6 +163,14 @@ template <class S> struct GaussianGradients {
   S* shs = nullptr;             // [N, K, 3]
   S* background = nullptr;      // [C + 1] by the colour, then by its gate
   CameraGradient<S>* camera = nullptr;
+};
+
+// The gradients by the footprints of N Gaussians: what goes from the backward pass of the blend to that of the
+// projection. A footprint is what SavedForward has of a Gaussian in `projected` and `features`, and its radius.
+constexpr int kNumGateGradients = 6;  // by the centre's x and y, the conic's xx, xy and yy, and the opacity
+template <class S> struct FootprintGradients {
+  S* records = nullptr;       // [N, kNumGateGradients + F] those of the gate, then by the features
+  const S* depths = nullptr;  // [N] by the view depth, besides what the features say; or null. No blend writes it.
 };
 
 // One rendering, from its inputs to what it leaves for the backward pass. The backends differ in where the camera lies

@@ -26,7 +26,7 @@ template <class S> struct ProjectionRules {
   S scale_modifier;
   AlphaCut<S> cut;
   bool antialiasing;
-  bool depth, inverse_depth;  // z and 1 / z are blended too
+  bool inverse_depth;  // 1 / z is blended too
 };
 
 // One Gaussian on the image plane: all that the blend reads of it besides its features. Aligned to load as vectors.
@@ -123,7 +123,7 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
 // What comes back from a Gaussian's pixels.
 template <class S> struct ProjectedGradient {
   GateGradient<S> gate;
-  S depth, inverse_depth;  // by z and 1 / z, where they are blended
+  S depth, inverse_depth;  // by z and 1 / z; 0 where nothing asks for them
   Vec3<S> color;           // by the mean, on the way of the colour
 };
 
@@ -165,7 +165,7 @@ DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const
   const Mat3<S> view_axes = view_rotation(camera.view);
   const Mat23<S> dL_dJ = {view_axes * dL_daxes.r0, view_axes * dL_daxes.r1};
   Vec3<S> dL_dview = projection_jacobian_backward(made.jacobian, dL_dJ);
-  if (rules.depth) dL_dview.z += g.depth;
+  dL_dview.z += g.depth;
   if (rules.inverse_depth) dL_dview.z -= g.inverse_depth / (view.z * view.z);
   const auto by_pixel = project_to_pixel_backward(camera, gaussian.mean, g.gate.mean);
   out.mean = transform_point_backward(camera.view, dL_dview) + by_pixel.point + g.color;

@@ -5,7 +5,14 @@
 //     cpu::forward(frame, heap);                  // the images, and what the backward pass needs
 //     cpu::backward(frame, gradients);            // from gradients by the images to gradients by the inputs
 //
-// The stages that these two run are declared below in their order. They can be called one by one. Then the caller
+// Who projects in one place and blends in another has the same in two halves:
+//
+//     cpu::project(frame);                        // the footprints: saved.projected, saved.features and images.radii
+//     cpu::blend_footprints(other, heap);         // the images of some footprints, those of several frames maybe
+//     cpu::blend_footprints_backward(other, image_gradients, footprint_gradients);
+//     cpu::project_backward(frame, footprint_gradients, gradients);
+//
+// The stages that all these run are declared below in their order. They can be called one by one. Then the caller
 // allocates what `saved` points to.
 //
 // Results do not depend on config.num_threads, bit for bit.
@@ -31,6 +38,23 @@ template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* 
 
 // Writes gradients.inputs. `frame` is as `forward` left it.
 template <class S> void backward(const Frame<S>& frame, const Gradients<S>& gradients, StageTimes* times = nullptr);
+
+// Renders the footprints that the caller has put into frame.saved.projected, frame.saved.features and
+// frame.images.radii, and fills the rest of frame.saved and frame.images. Of frame.inputs it reads the number of
+// Gaussians, of the camera the image's size. Footprints of equal depth are blended in their order. Throws as `forward`.
+template <class S> void blend_footprints(Frame<S>& frame, Allocator& memory, StageTimes* times = nullptr);
+
+// Writes footprints.records, zeros where no pixel saw the footprint, and of gradients.inputs the background. `frame` is
+// as `blend_footprints` left it.
+template <class S>
+void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradients,
+                               const FootprintGradients<S>& footprints, StageTimes* times = nullptr);
+
+// Writes gradients, but for the background's, from those by the footprints that `project` filled; a footprint of
+// radius 0 hands back zeros. Of frame.saved it reads the features.
+template <class S>
+void project_backward(const Frame<S>& frame, const FootprintGradients<S>& footprints,
+                      const GaussianGradients<S>& gradients, StageTimes* times = nullptr);
 
 // Fills frame.images.radii as `forward` does, and nothing else.
 template <class S> void radii(const Frame<S>& frame, Scratch& scratch);
@@ -61,9 +85,13 @@ class Heap final : public Allocator {
   std::vector<void*> blocks_;
 };
 
-// Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are.
+// Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are; 0 where
+// saved.instance_offsets is null, because they are not counted then.
 // Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
 template <class S> int64_t project(const Frame<S>& frame, StageTimes* times = nullptr);
+
+// Fills saved.instance_offsets from the footprints. Returns and throws what `project` does.
+template <class S> int64_t count_instances(const Frame<S>& frame, StageTimes* times = nullptr);
 
 // Fills saved.tile_offsets and saved.instances: the tile lists, front to back.
 template <class S> void bin(const Frame<S>& frame, StageTimes* times = nullptr);

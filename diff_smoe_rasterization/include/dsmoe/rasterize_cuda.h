@@ -6,7 +6,10 @@
 //     cuda::forward(frame, {stream}, memory);     // the images, and what the backward pass needs
 //     cuda::backward(frame, gradients, {stream}, memory);
 //
-// The stages that these two run, in their order, are declared below and can be called one by one.
+// Who projects in one place and blends in another has the same in two halves, as in rasterize.h: `project_footprints`,
+// `blend_footprints`, `blend_footprints_backward`, `project_footprints_backward`.
+//
+// The stages that all these run, in their order, are declared below and can be called one by one.
 //
 // A capacity that turns out too small costs time, not correctness: where the instances do not fit, the blend reads the
 // depth order itself instead of the tile lists. So the host never has to wait, and a captured graph stays right when
@@ -128,6 +131,26 @@ void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& r
 // Fills frame.images.radii as `forward` does, and nothing else.
 template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory);
 
+// Fills frame.saved.projected, frame.saved.features and frame.images.radii: the footprints. The caller allocates them.
+template <class S> void project_footprints(const Frame<S>& frame, const Run& run, Allocator& memory);
+
+// Renders the footprints that the caller has put there, and fills the rest of frame.saved and frame.images. Of
+// frame.inputs it reads the number of Gaussians, of the camera the image's size. Footprints of equal depth are blended
+// in their order. It waits and throws as `forward` does.
+template <class S> void blend_footprints(Frame<S>& frame, const Run& run, Allocator& memory);
+
+// Writes footprints.records, zeros where no pixel saw the footprint, and of gradients.inputs the background. `frame` is
+// as `blend_footprints` left it.
+template <class S>
+void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradients,
+                               const FootprintGradients<S>& footprints, const Run& run, Allocator& memory);
+
+// Writes gradients, but for the background's, from those by the footprints that `project_footprints` filled; a
+// footprint of radius 0 hands back zeros. Of frame.saved it reads the features.
+template <class S>
+void project_footprints_backward(const Frame<S>& frame, const FootprintGradients<S>& footprints,
+                                 const GaussianGradients<S>& gradients, const Run& run, Allocator& memory);
+
 // The sizes of what `forward` keeps. The capacity is not known yet.
 template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run) {
   SavedSizes sizes;
@@ -158,7 +181,7 @@ class StreamMemory final : public Allocator {
   std::vector<void*> scratch_, kept_;
 };
 
-// What the depth sort sorts.
+// What the depth sort sorts. All null: only the footprints are wanted.
 template <class S> struct DepthKeys {
   DepthBits<S>* depths = nullptr;  // [N] the greatest number for culled Gaussians; null: no depth order is wanted
   int32_t* gaussians = nullptr;    // [N] 0, 1, 2, ...; ~i for a culled Gaussian i
@@ -178,6 +201,9 @@ struct Work {
 // Fills frame.saved.projected, frame.saved.features, frame.images.radii and keys.
 template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
 
+// Fills keys from the footprints, as `project` does.
+template <class S> void key_footprints(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
+
 // Fills frame.saved.order.
 template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
 
@@ -194,12 +220,18 @@ constexpr int kSlotsPerInstance = 4;  // one for each quarter of a tile
 
 // What goes through both stages of a backward pass.
 template <class S> struct BackwardPass {
-  Gradients<S> gradients;      // given by the images, wanted by the inputs
-  S* dL_dgaussians = nullptr;  // [N, kNumGateMoments + F] a Gaussian's record: the sums over its pixels; zero before
+  Gradients<S> gradients;         // given by the images, wanted by the inputs
+  S* dL_dgaussians = nullptr;     // [N, kNumGateMoments + F] a Gaussian's record: the sums over its pixels; zero before
+  bool by_footprints = false;     // the records are those of FootprintGradients: `finish_records` has been there
+  const S* dL_ddepths = nullptr;  // [N] as FootprintGradients has them, or null
 };
+static_assert(kNumGateGradients == kNumGateMoments, "records keep their length");
 
 // From image gradients to the records, and to the gradients by the background and by means2D_abs.
 template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
+
+// Makes gradients by the footprints of the records, in place.
+template <class S> void finish_records(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
 
 // From the records to the gradients of every other input.
 template <class S> void project_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);

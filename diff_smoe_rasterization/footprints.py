@@ -1,0 +1,168 @@
+"""A rendering in two halves: Gaussians to footprints on the image, and footprints to pixels.
+
+    footprints = project_gaussians(means3D, opacities, settings, shs=shs, scales=scales, rotations=rotations)
+    rendering = blend_footprints(footprints, settings)
+
+gives what `rasterize` gives, bit for bit. In between, footprints can be selected, joined with others, changed, or sent
+to where they are blended. Both halves are differentiable.
+"""
+from __future__ import annotations
+
+from typing import Any, List, NamedTuple, Optional, Sequence, Tuple
+
+import torch
+
+from .autograd import INPUTS, _below_autograd, refuse_forward_mode
+from .rasterizer import _arguments, _checks, _options, _rendering
+from .settings import OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
+
+_OPS = torch.ops.diff_smoe_rasterization
+_GATE_NUMBERS = 8  # centre (2), conic (3), opacity, squared reach, depth
+GATE_GRADIENTS = 6
+"""Numbers of a gate that have a gradient from the pixels: the first six."""
+
+
+class Footprints(NamedTuple):
+    """What the pixels of one image read of N Gaussians.
+
+    A footprint of radius 0 is on no pixel, and its other numbers mean nothing. Of two footprints of one depth the first
+    is blended first. An opacity that is changed needs the reach that belongs to it: project again.
+    """
+
+    gates: torch.Tensor  # [N, 8] centre x, y in pixels; conic xx, xy, yy; opacity; squared reach in sigmas; view depth
+    features: torch.Tensor  # [N, F] colour channels, then z and 1 / z for the outputs `depth` and `inverse_depth`
+    radii: torch.Tensor  # [N] int32 pixels
+
+    @property
+    def means2D(self) -> torch.Tensor:
+        """[N, 2] centres x, y in pixels; the centre of the first pixel is (0, 0)."""
+        return self.gates[:, :2]
+
+    @property
+    def conics(self) -> torch.Tensor:
+        """[N, 3] xx, xy, yy of the inverse covariance, 1 / pixel^2."""
+        return self.gates[:, 2:5]
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """[N] after antialiasing."""
+        return self.gates[:, 5]
+
+    @property
+    def depths(self) -> torch.Tensor:
+        """[N] distances from the camera along its axis, the view z. They order the footprints."""
+        return self.gates[:, 7]
+
+    def rows(self, index: torch.Tensor) -> Footprints:
+        """The footprints that an index or a mask [N] selects."""
+        return Footprints(self.gates[index], self.features[index], self.radii[index])
+
+    def visible(self) -> Footprints:
+        """Those of a radius above 0, in their order. The host waits for their number."""
+        return self.rows(self.radii.nonzero().squeeze(1))
+
+    @staticmethod
+    def joined(parts: Sequence[Footprints]) -> Footprints:
+        """All footprints of several parts, one part behind the other."""
+        gates, features, radii = zip(*parts)
+        return Footprints(torch.cat(gates), torch.cat(features), torch.cat(radii))
+
+
+def project_gaussians(means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
+                      means2D: Optional[torch.Tensor] = None, dc: Optional[torch.Tensor] = None,
+                      shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
+                      scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
+                      cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> Footprints:
+    """The first half of `rasterize`, whose arguments these are; it raises as `rasterize` does.
+
+    Gradients reach every tensor, but settings.bg and settings.background_gate, which belong to the second half.
+    """
+    inputs, options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
+                                 colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+                                 cov3D_precomp=cov3D_precomp)
+    refuse_forward_mode("project_gaussians", inputs)
+    if _wants_gradient(inputs):
+        return Footprints(*_Project.apply((*options, True), *inputs))
+    return Footprints(*_OPS.project(*inputs, *options, False))
+
+
+def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSettings,
+                     outputs: Sequence[str] = ()) -> Rendering:
+    """The second half of `rasterize`: the images of footprints, of one projection or of several.
+
+    Of the settings it takes the image's size, the background with its gate, the blend mode, alpha_min and
+    deterministic. outputs: those that the footprints were projected for, `alpha` apart.
+    Raises ValueError, TypeError or RuntimeError as `rasterize` does.
+    """
+    if not set(OUTPUTS).issuperset(outputs):
+        raise ValueError(f"blend_footprints: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
+    blend_mode, gate = resolve_blend(settings)
+    required, _ = _checks("blend_footprints", "gates", footprints.gates)
+    tensors: List[Optional[torch.Tensor]] = [
+        footprints.gates, required("features", footprints.features), required("radii", footprints.radii),
+        required("bg", settings.bg), required("background_gate", gate) if isinstance(gate, torch.Tensor) else None]
+    options = _options(settings, outputs, blend_mode, 0.0 if isinstance(gate, torch.Tensor) else gate)
+    refuse_forward_mode("blend_footprints", tensors)
+    if _wants_gradient(tensors):
+        images = _Blend.apply((*options, True), *tensors)
+    else:
+        images = _OPS.blend(*tensors, *options, False)[:-1]
+    color, gate_sum, depth, inverse_depth = images
+    return _rendering((color, footprints.radii, gate_sum, depth, inverse_depth), outputs)
+
+
+def _wants_gradient(tensors: Sequence[Optional[torch.Tensor]]) -> bool:
+    return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, options: Tuple[Any, ...], *inputs: Any) -> Tuple[torch.Tensor, ...]:
+        with _below_autograd():
+            gates, features, radii = _OPS.project(*inputs, *options)
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(radii)
+        ctx.options, ctx.present = options, [tensor is not None for tensor in inputs]
+        # The caller may edit the features, so they are copied.
+        ctx.save_for_backward(*(tensor for tensor in inputs if tensor is not None), features.clone(), radii)
+        return gates, features, radii
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, dL_dgates: Any, dL_dfeatures: Any, _: Any) -> Tuple[Any, ...]:  # type: ignore[override]
+        *inputs, features, radii = ctx.saved_tensors
+        wanted = list(ctx.needs_input_grad[1:])
+        belongs = [want and name not in ("bg", "background_gate") for want, name in zip(wanted, INPUTS)]
+        by_gates = features.new_zeros(len(features), _GATE_NUMBERS) if dL_dgates is None else dL_dgates
+        by_features = torch.zeros_like(features) if dL_dfeatures is None else dL_dfeatures
+        records = torch.cat([by_gates[:, :GATE_GRADIENTS], by_features], 1)
+        results = iter(_OPS.project_backward(records, None if dL_dgates is None else by_gates[:, -1].contiguous(),
+                                             inputs, ctx.present, features, radii, *ctx.options, belongs))
+        return (None, *(next(results) if want else None for want in belongs))
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, options: Tuple[Any, ...], gates: torch.Tensor, features: torch.Tensor, radii: torch.Tensor,
+                bg: torch.Tensor, background_gate: Optional[torch.Tensor]) -> Tuple[torch.Tensor, ...]:
+        with _below_autograd():
+            *images, saved = _OPS.blend(gates, features, radii, bg, background_gate, *options)
+        ctx.set_materialize_grads(False)
+        ctx.options, ctx.has_gate = options, background_gate is not None
+        ctx.images = [image.clone() for image in images]  # the caller may edit them
+        gate = () if background_gate is None else (background_gate,)
+        ctx.save_for_backward(gates, radii, bg, *gate, *saved)
+        return tuple(images)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *image_gradients: Any) -> Tuple[Any, ...]:  # type: ignore[override]
+        gates, radii, bg, *kept = ctx.saved_tensors
+        gate = kept.pop(0) if ctx.has_gate else None
+        wants_background = ctx.needs_input_grad[4] or ctx.needs_input_grad[5]
+        records, dL_dbg, dL_dgate = _OPS.blend_backward(*image_gradients, ctx.images, kept, radii, bg, gate,
+                                                        *ctx.options, wants_background)
+        dL_dgates = torch.zeros_like(gates)
+        dL_dgates[:, :GATE_GRADIENTS] = records[:, :GATE_GRADIENTS]
+        return (None, dL_dgates, records[:, GATE_GRADIENTS:], None, dL_dbg if ctx.needs_input_grad[4] else None,
+                dL_dgate.reshape(gate.shape) if gate is not None and ctx.needs_input_grad[5] else None)

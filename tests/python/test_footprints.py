@@ -1,0 +1,132 @@
+"""The two halves of a rendering: together they are `rasterize`, and in between footprints can be handled."""
+from __future__ import annotations
+
+import pytest
+import torch
+from scenes import assert_not_empty, gradients, random_scene, random_weights, with_gates
+
+from diff_smoe_rasterization import Footprints, blend_footprints, project_gaussians, rasterize
+
+pytestmark = pytest.mark.usefixtures("device")
+
+
+def in_halves(*, settings, outputs=(), **inputs):
+    return blend_footprints(project_gaussians(settings=settings, outputs=outputs, **inputs), settings, outputs)
+
+
+def assert_equal(actual, expected):
+    for name, value in expected.items():
+        assert torch.equal(actual[name], value), name
+
+
+@with_gates
+@pytest.mark.parametrize("case", [
+    dict(degree=3, split_dc=True), dict(degree=1, antialiasing=True, deterministic=True),
+    dict(channels=5, covariance="cov3D")])
+def test_the_halves_give_the_bits_of_the_whole(mode, case):
+    """float32: the type that trains. deterministic has no effect on the CPU, whose gradients always are."""
+    case = {**case, "deterministic": True}
+    scene = random_scene(mode, dtype=torch.float32, **case)
+    outputs = ("alpha", "depth", "inverse_depth")
+    expected, expected_gradients = gradients(rasterize, scene, outputs)
+    actual, actual_gradients = gradients(in_halves, scene, outputs)
+    assert_not_empty(expected, scene.settings)
+    assert_equal(actual._asdict(), expected._asdict())
+    assert_equal(actual_gradients, expected_gradients)
+
+
+def test_the_halves_of_no_gaussians_are_the_background():
+    scene = random_scene("smoe", 10).rows(slice(0, 0)).requiring_grad()
+    rendering = in_halves(settings=scene.settings, **scene.inputs)
+    rendering.color.sum().backward()
+    assert torch.equal(rendering.color, scene.settings.bg[:, None, None].expand_as(rendering.color))
+    assert scene.inputs["means3D"].grad.shape == (0, 3)
+
+
+def test_only_visible_footprints_count():
+    scene = random_scene("smoe").requiring_grad()
+    everything = project_gaussians(settings=scene.settings, **scene.inputs)
+    seen = everything.visible()
+    assert 5 < len(seen.radii) < len(everything.radii)
+    expected, actual = (blend_footprints(each, scene.settings) for each in (everything, seen))
+    assert torch.equal(actual.color, expected.color)
+    leaves = list(scene.leaves().values())
+    weights = random_weights(expected)[1]
+    for first, second in zip(*(torch.autograd.grad(each.color, leaves, weights, allow_unused=True, retain_graph=True)
+                               for each in (expected, actual))):
+        assert torch.equal(first, second)
+
+
+def test_footprints_of_shards_are_those_of_the_whole():
+    scene = random_scene("alpha")
+    parts = [project_gaussians(settings=scene.settings, **scene.rows(rows).inputs)
+             for rows in (slice(0, 50), slice(50, 51), slice(51, None))]
+    joined, expected = Footprints.joined(parts), rasterize(settings=scene.settings, **scene.inputs)
+    actual = blend_footprints(joined, scene.settings)
+    assert torch.equal(actual.color, expected.color) and torch.equal(actual.radii, expected.radii)
+
+
+def test_of_equal_depths_the_first_is_in_front():
+    scene = random_scene("alpha", 1, scale=0.5, opacity=(0.9, 0.9))
+    twice = scene.with_inputs(**{name: value.repeat(2, *[1] * (value.dim() - 1))
+                                 for name, value in scene.inputs.items()})
+    twice.inputs["means3D"][:] = 0
+    footprints = project_gaussians(settings=twice.settings, **twice.inputs)
+    red, blue = (footprints.features.new_tensor(color) for color in ([1, 0, 0], [0, 0, 1]))
+    colored = footprints._replace(features=torch.stack([red, blue]))
+    center = blend_footprints(colored, twice.settings).color[:, 18, 25]
+    assert center[0] > 0.8 and center[2] < 0.3  # 0.9, and what is left of 1
+
+
+def test_gradients_by_footprints_are_those_of_finite_differences(mode):
+    """In double, with steps of 1e-6: 1e-7 of rounding, and 1e-5 of the largest gradient for what curves."""
+    scene = random_scene(mode, 40)
+    footprints = project_gaussians(settings=scene.settings, outputs=("depth",), **scene.inputs).visible()
+    weights = random_weights(blend_footprints(footprints, scene.settings, ("depth",)), ("depth",))[1]
+
+    def loss(gates, features):
+        rendering = blend_footprints(Footprints(gates, features, footprints.radii), scene.settings, ("depth",))
+        return (rendering.color * weights[0]).sum() + (rendering.depth * weights[1]).sum()
+
+    leaves = [footprints.gates.clone().requires_grad_(), footprints.features.clone().requires_grad_()]
+    actual = torch.autograd.grad(loss(*leaves), leaves)
+    assert not actual[0][:, 6:].any()  # the reach and the depth only choose
+    for which, columns in ((0, 6), (1, footprints.features.shape[1])):
+        for column in range(columns):
+            row = actual[which][:, column].abs().argmax()
+            values = []
+            for step in (1e-6, -1e-6):
+                moved = [leaf.detach().clone() for leaf in leaves]
+                moved[which][row, column] += step
+                values.append(loss(*moved))
+            expected = (values[0] - values[1]) / 2e-6
+            assert abs(actual[which][row, column] - expected) < 1e-5 * actual[which].abs().max() + 1e-7, (which, column)
+
+
+def test_a_gradient_by_depths_reaches_the_means():
+    scene = random_scene("alpha").requiring_grad()
+    footprints = project_gaussians(settings=scene.settings, **scene.inputs)
+    seen = footprints.radii > 0
+    footprints.depths[seen].sum().backward()
+    expected = torch.where(seen[:, None], scene.settings.viewmatrix[:3, 2], torch.zeros(3).to(scene.settings.bg))
+    torch.testing.assert_close(scene.inputs["means3D"].grad, expected.detach())
+
+
+@pytest.mark.parametrize("change, error, text", [
+    (dict(features=slice(0, 2)), ValueError, r"features has shape \[120, 2\]; it must be \[120, 3\]"),
+    (dict(radii=torch.float32), TypeError, "radii is float32"),
+    (dict(gates=slice(0, 7)), ValueError, r"gates has shape \[120, 7\]; it must be \[N, 8\]")])
+def test_footprints_that_do_not_fit_are_refused(change, error, text):
+    scene = random_scene("alpha")
+    footprints = project_gaussians(settings=scene.settings, **scene.inputs)
+    (name, to), = change.items()
+    value = getattr(footprints, name)
+    footprints = footprints._replace(**{name: value.to(to) if isinstance(to, torch.dtype) else value[:, to]})
+    with pytest.raises(error, match=text):
+        blend_footprints(footprints, scene.settings)
+
+
+def test_depth_needs_footprints_that_have_it():
+    scene = random_scene("alpha")
+    with pytest.raises(ValueError, match=r"features has shape \[120, 3\]; it must be \[120, 4\]"):
+        blend_footprints(project_gaussians(settings=scene.settings, **scene.inputs), scene.settings, ("depth",))
