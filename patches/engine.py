@@ -188,8 +188,8 @@ def revert(path: PathLike) -> Dict[str, bool]:
     return {name: states[name] == "changed" for name in back}
 
 
-_WAY_OUT = (f"Undo your edit; or copy what lies in {FOLDER}/originals over the checkout, by which your edit is lost, and "
-            f"delete {FOLDER}")
+_WAY_OUT = (f"Undo your edit; or copy what lies in {FOLDER}/originals over the checkout, by which your edit is lost, "
+            f"and delete {FOLDER}")
 _SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
           "replaced": "was changed since, and is not patched any more; `revert` leaves it, and puts back the others",
           "original": "is not patched, or not any more: `apply` finishes the patch, `revert` takes it back"}
@@ -213,8 +213,8 @@ def _without_patch(recorded: Record, name: str) -> bytes:
         if done.returncode == 0:
             return file.read_bytes()
     mine = diff_of(name, recorded.after[name], edited, context=0).decode(errors="replace")
-    raise PatchError(f"{name}: you have edited what the patch wrote, or what needs it; nothing was touched. {_WAY_OUT}. "
-                     f"Your edit (- the patch's, + yours):\n{mine}{done.stderr.decode(errors='replace').strip()}")
+    raise PatchError(f"{name}: you have edited what the patch wrote, or what needs it; nothing was touched. {_WAY_OUT}."
+                     f" Your edit (- the patch's, + yours):\n{mine}{done.stderr.decode(errors='replace').strip()}")
 
 
 def _state_by_record(recorded: Record, is_current: bool) -> Tuple[str, List[str]]:

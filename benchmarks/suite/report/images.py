@@ -49,33 +49,31 @@ def _folders(results: str, groups: Sequence[Group]) -> Dict[str, str]:
 
 def _views(folders: Dict[str, str], output: str, folder: str) -> List[Dict[str, Any]]:
     """The views that every blend has images of."""
-    names = set.intersection(*(set(os.listdir(os.path.join(path, "render"))) for path in folders.values())) \
-        if folders else set()
-    views = []
-    for number, name in enumerate(sorted(names)):
-        os.makedirs(os.path.join(output, folder), exist_ok=True)
-        view, _ = os.path.splitext(name)
-        images: List[Dict[str, str]] = []
+    names = [set(os.listdir(os.path.join(path, "render"))) for path in folders.values()]
+    common = sorted(set.intersection(*names)) if names else []
+    if common:
+        os.makedirs(os.path.join(output, folder))
+    return [{"name": os.path.splitext(name)[0], "images": _images(folders, name, output, f"{folder}/{number:03d}")}
+            for number, name in enumerate(common)]
 
-        def add(label: str, pixels: np.ndarray) -> None:
-            path = f"{folder}/{number:03d}-{len(images)}-{safe_name(f'{view}-{label}')}.png"
-            Image.fromarray(pixels).save(os.path.join(output, path))
-            images.append({"label": label, "path": path})
 
-        truths = {blend: _pixels(os.path.join(path, "gt", name)) for blend, path in folders.items()}
-        truth = next(iter(truths.values()))
-        add("ground truth", truth)
-        for blend, path in folders.items():
-            image = _pixels(os.path.join(path, "render", name))
-            if not np.array_equal(truths[blend], truth) or image.shape != truth.shape:
-                raise ReportError(f"{path}: view {name}: its ground truth, or its rendering's size, is not that of "
-                                  f"{next(iter(folders.values()))}: these cells cannot be compared")
-            squares = np.square(image.astype(np.float64) - truth)
-            decibels = 10 * math.log10(255 ** 2 / squares.mean()) if squares.any() else math.inf
-            add(f"{blend}, {decibels:.2f} dB", image)
-            add(f"error of {blend}", error_image(truth, image))
-        views.append({"name": view, "images": images})
-    return views
+def _images(folders: Dict[str, str], name: str, output: str, prefix: str) -> List[Dict[str, str]]:
+    """Writes the images of one view."""
+    truths = {blend: _pixels(os.path.join(path, "gt", name)) for blend, path in folders.items()}
+    truth = next(iter(truths.values()))
+    found = {"ground truth": truth}
+    for blend, path in folders.items():
+        image = _pixels(os.path.join(path, "render", name))
+        if not np.array_equal(truths[blend], truth) or image.shape != truth.shape:
+            raise ReportError(f"{path}: view {name}: its ground truth, or its rendering's size, is not that of "
+                              f"{next(iter(folders.values()))}: these cells cannot be compared")
+        squares = np.square(image.astype(np.float64) - truth)
+        decibels = 10 * math.log10(255 ** 2 / squares.mean()) if squares.any() else math.inf
+        found.update({f"{blend}, {decibels:.2f} dB": image, f"error of {blend}": error_image(truth, image)})
+    paths = [f"{prefix}-{number}.png" for number in range(len(found))]
+    for path, pixels in zip(paths, found.values()):
+        Image.fromarray(pixels).save(os.path.join(output, path))
+    return [{"label": label, "path": path} for label, path in zip(found, paths)]
 
 
 def error_image(truth: np.ndarray, image: np.ndarray) -> np.ndarray:

@@ -170,7 +170,7 @@ def test_an_edit_is_neither_overwritten_nor_lost(tmp_path):
         "train.py: you have edited what the patch wrote", "\n-    pipe.blend = blend_of(dataset)",
         "\n+    pipe.blend = blend_of(other)", "copy what lies in .dsmoe_patch/originals over the checkout"]),
     ("    pipe.blend", "    if 1:\n        pipe.blend", ["train.py: you have edited"]),
-    ("    pipe.blend", "    if 1:\n      \\\n    pipe.blend", ["train.py: you have edited what the patch wrote, or what needs it"])])
+    ("    pipe.blend", "    if 1:\n      \\\n    pipe.blend", ["train.py: you have edited what the patch wrote, or"])])
 def test_an_edit_of_the_patchs_own_lines_is_shown(tmp_path, old, new, words):
     patches.apply(make(tmp_path))
     (tmp_path / "train.py").write_text((tmp_path / "train.py").read_text().replace(old, new))
