@@ -173,6 +173,7 @@ def extension():
 
     class BuildExtension(cpp_extension.BuildExtension):
         def run(self):
+            self.parallel = None  # _C links the library: one after the other, also under `build_ext -j`
             module.extra_objects = [os.path.join(self.build_lib, self.get_ext_filename(library.name))]
             super().run()
             lines = ['"""What the extension was built against; readable even where it cannot be loaded."""']

@@ -1,1 +1,1 @@
-"""Benchmarks: suite/ compares trainers (`dsmoe bench`), mechanism/ watches one, timing/ times the rasterizer."""
+"""Benchmarks: suite/ compares trainers (`dsmoe bench`), timing/ times the rasterizer."""

@@ -8,48 +8,40 @@ from __future__ import annotations
 
 import difflib
 import io
+import subprocess
+import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Any, Dict, Iterable, List, Mapping, NamedTuple, Optional, Tuple, Union
 
 from diff_smoe_rasterization._version import __version__
 
 from . import facts, record, scripts
 from .errors import PatchError
-from .merge import without_patch
 from .record import FOLDER, Record
 from .trainers import GR, TRAINERS, Trainer, names
 
 if TYPE_CHECKING:
-    from .patch import Change, Requested  # which need LibCST
+    from .patch import Change  # which needs LibCST
+    from .rules import Rule
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
 PathLike = Union[str, Path]
 OPTIONS = ("modernise", "fuse")
 
 
-class Verdict(str):
-    """One of STATES, as a string, with `trainer` (a name or None) and `reasons` (lines)."""
-
-    trainer: Optional[str]
-    reasons: Tuple[str, ...]
-
-    def __new__(cls, state: str, trainer: Optional[str], reasons: List[str]) -> Verdict:
-        assert state in STATES
-        verdict = super().__new__(cls, state)
-        verdict.trainer, verdict.reasons = trainer, tuple(reasons)
-        return verdict
-
-
 class Plan(NamedTuple):
     """What `apply` would do, and why it would not."""
 
     root: Path
-    verdict: Verdict
+    state: str  # one of STATES
+    trainer: Optional[str]
+    reasons: Tuple[str, ...]  # of the state, as lines
     options: Tuple[str, ...]  # of OPTIONS; also those that it was made with
+    applied: Tuple[str, ...]  # of OPTIONS: those that the files on disk are patched with
     record: Optional[Record]
     changes: Tuple[Change, ...] = ()
     remarks: Tuple[str, ...] = ()  # which scripts no rule reaches, which files are left as they are
-    requested: Tuple[Requested, ...] = ()  # every rule that the options ask for
+    requested: Mapping[Tuple[str, Rule], List[str]] = {}  # the files that each rule of the options changes
     written: bool = False  # whether `apply` wrote files by this plan
 
     @property
@@ -57,177 +49,193 @@ class Plan(NamedTuple):
         """The remarks, and of each rule that an option asks for where it is applied, or that it is skipped."""
         notes = list(self.remarks)
         for option in self.options:
-            rules = [rule for rule in self.requested if rule.option == option]
-            notes += [rule.note() for rule in rules if rule.files]
-            skipped = [rule.rule for rule in rules if not rule.files]
+            rules = {rule: changed for (of, rule), changed in self.requested.items() if of == option}
+            where = "applied in" if option in self.applied else "not applied in"
+            notes += [f"{option} {rule.name}: {where} {', '.join(changed)}: {rule.says}"
+                      for rule, changed in rules.items() if changed]
+            skipped = [rule.name for rule, changed in rules.items() if not changed]
             notes += [f"{option}: skipped, nothing matches: {', '.join(skipped)}"] if skipped else []
         return tuple(notes)
 
+    def refusal(self) -> str:
+        """Why the checkout cannot be patched."""
+        trainer = f" ({self.trainer})" if self.trainer else ""
+        return "\n".join([f"the checkout is {self.state}{trainer}:", *("  " + reason for reason in self.reasons)])
 
-def inspect(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
+
+def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
     """Plans the patch of a checkout in whatever state it is."""
     have_libcst()
     from .patch import Patch
 
     root = _root(path)
     recorded = Record.in_force(root)
-    before = recorded.options if recorded else ()
+    before = tuple(recorded.manifest["options"]) if recorded else ()
     options = tuple(name for name, wanted in zip(OPTIONS, (modernise, fuse)) if wanted or name in before)
-    files = {name: (root / name).read_bytes()
-             for name in scripts.python_files(root, with_submodules="modernise" in options)}
-    now = dict(files)
-    files.update(recorded.before if recorded else {})
+    now = {name: (root / name).read_bytes()
+           for name in scripts.python_files(root, with_submodules="modernise" in options)}
+    if recorded is None and any(b"import fused_where_equal" in data for data in now.values()):
+        before = ("fuse",)
+    files = {**now, **(recorded.before if recorded else {})}
     found = facts.of_files({name: files[name] for name in facts.LOOKED_AT if name in files})
     known, reason = facts.recognise(found)
     name = trainer or (recorded.manifest["trainer"] if recorded else None)
     chosen = by_name(name) if name else known
     if GR not in files or chosen is None or facts.uses_another_rasterizer(found):
-        return Plan(root, Verdict("unknown", None, [reason if GR in files else _no_renderer(root)]), options, recorded)
-    patch = Patch(files, chosen)
-    requested = [rule._replace(pending=()) if rule.option in before else rule for rule in patch.request(options)]
-    changes = patch.changes()
+        return Plan(root, "unknown", None, (reason if GR in files else _no_renderer(root),), options, before, recorded)
+    patch = Patch(files, chosen, options)
     state, reasons = patch.state()
     if recorded and not patch.problems:
-        state, reasons = _state_by_record(recorded, now, changes, chosen)
+        is_current = all(now.get(change.name) == change.after for change in patch.changes())
+        state, reasons = _state_by_record(recorded, is_current or Patch(now, chosen).state()[0] == "patched")
+    elif state == "patched":
+        reasons = [f"every rule is applied; there is no {FOLDER}, so `revert` cannot undo it"]
     elif state == "patchable" and (root / FOLDER).exists():
         reasons = [f"no file is patched any more: `apply` replaces the {FOLDER} that is there, `revert` removes it"]
-    warnings = [] if not trainer or known and known.flavour == chosen.flavour else [
-        f"--trainer {trainer}: by what it imports and calls this is {known.name}, whose rasterizer has another API "
-        f"({known.flavour}, not {chosen.flavour})" if known else f"--trainer {trainer}: {reason}"]
-    return Plan(root, Verdict(state, chosen.name, reasons), options, recorded, changes,
-                (*warnings, *patch.notes, *scripts.notes(root, files, chosen)), tuple(requested))
+    notes = [*patch.notes, *scripts.notes(root, files, chosen)]
+    if trainer and not (known and known.flavour == chosen.flavour):
+        notes.insert(0, f"--trainer {trainer}: " + (
+            f"by what it imports and calls this is {known.name}, whose rasterizer has another API ({known.flavour}, "
+            f"not {chosen.flavour})" if known else reason))
+    return Plan(root, state, chosen.name, tuple(reasons), options, before, recorded, patch.changes(), tuple(notes),
+                patch.requested)
 
 
 def plan(path: PathLike, **options: Any) -> Plan:
-    """Plans a patch, with the options of `inspect`. Raises PatchError where it is refused."""
-    planned = inspect(path, **options)
+    """Plans a patch, with the options of `check`. Raises PatchError where it is refused."""
+    planned = check(path, **options)
     states = set(planned.record.states().values()) if planned.record else {"not finished"}
-    if planned.verdict in ("patchable", "patched") or states <= {"patched", "original"}:
+    if planned.state in ("patchable", "patched") or states <= {"patched", "original"}:
         return planned
-    raise PatchError(refusal(planned.verdict))
-
-
-def check(path: PathLike, **options: Any) -> Verdict:
-    """Says how a checkout is: one of STATES, with `.trainer` and `.reasons`. Options as of `inspect`."""
-    return inspect(path, **options).verdict
+    raise PatchError(planned.refusal())
 
 
 def diff(path: PathLike, **options: Any) -> str:
     """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
-    changes = plan(path, **options).changes
-    return "".join(diff_of(change.name, change.before, change.after) for change in changes)
+    return text_of(plan(path, **options).changes)
 
 
-def apply(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
-    """Patches a checkout; writes nothing where it is patched already.
+def apply(path: PathLike, **options: Any) -> Plan:
+    """Patches a checkout, with the options of `check`; writes nothing where it is patched already.
 
-    Returns the plan; its `verdict` is how the checkout was before, `written` whether anything was changed.
+    Returns the plan; its `state` is how the checkout was before, `written` whether anything was changed.
     Raises PatchError where it is refused, and then every file is as it was; where the disk fails, as before any patch.
     """
-    planned = plan(path, modernise=modernise, trainer=trainer, fuse=fuse)
-    root, todo = planned.root, pending(planned)
-    if not todo:
+    planned = plan(path, **options)
+    root = planned.root
+    if not pending(planned):
         return planned
     before = {change.name: change.before for change in planned.changes}
     after = {change.name: change.after for change in planned.changes}
-    record.check_writable(root, todo)
+    for name in before:
+        if root.resolve() not in (root / name).resolve().parents:
+            raise PatchError(f"{name}: is a link to {(root / name).resolve()}, outside the checkout; copy it into the "
+                             "checkout first")
+    originals = {**(planned.record.before if planned.record else {}), **before}
     try:
-        if planned.record:
-            record.write_files(root, planned.record.before)
+        _write(root, originals)
         record.remove(root)
-        Record.make(root, before, after, {"version": __version__, "trainer": planned.verdict.trainer,
-                                          "options": planned.options})
-        record.write_files(root, after)
+        Record.make(root, before, after, version=__version__, trainer=planned.trainer, options=planned.options)
+        _write(root, after)
     except OSError as error:
-        if (root / FOLDER).exists():  # of this patch or of the one before
-            record.write_files(root, before)
+        _write(root, originals)
         record.remove(root)
-        raise PatchError(f"{error.filename2 or error.filename or FOLDER}: cannot be written, so all was put back: "
-                         f"{error}") from None
-    return planned._replace(written=True, requested=tuple(rule._replace(pending=()) for rule in planned.requested))
+        raise PatchError(f"{error.filename or FOLDER}: cannot be written, so all was put back: {error}") from None
+    return planned._replace(written=True, applied=planned.options)
 
 
-def pending(planned: Plan) -> Dict[str, bytes]:
-    """Returns what `apply` would write, by the files' names. Raises PatchError where it refuses."""
-    recorded = planned.record
-    if planned.verdict == "patched" and recorded is None:
+def pending(planned: Plan) -> Tuple[Change, ...]:
+    """Returns what `apply` would write, from what the files are. Raises PatchError where it refuses."""
+    recorded, words = planned.record, " ".join("--" + option for option in planned.options)
+    if planned.state == "patched" and recorded is None:
         if planned.options and planned.changes:
             raise PatchError(f"{planned.changes[0].name}: rule {planned.changes[0].rules[0]} is not applied, but the "
                              f"checkout is patched and has no {FOLDER}: take the patch back by your version control, "
-                             f"then apply it with {words_of(planned.options)}")
-        return {}
+                             f"then apply it with {words}")
+        return ()
     edited = [name for name, state in recorded.states().items() if state == "changed"] if recorded else []
-    if recorded and edited:
-        if planned.options == recorded.options:
-            return {}  # nothing is written over an edit
-        raise PatchError(f"{edited[0]}: was changed since it was patched: undo your edit, then apply it with "
-                         f"{words_of(planned.options)}")
-    wanted = {**(recorded.before if recorded else {}), **{change.name: change.after for change in planned.changes}}
-    return {name: data for name, data in wanted.items() if (planned.root / name).read_bytes() != data}
+    if edited:
+        if planned.options == planned.applied:
+            return ()  # nothing is written over an edit
+        raise PatchError(f"{edited[0]}: was changed since it was patched: undo your edit, then apply it with {words}")
+    now = [change._replace(before=(planned.root / change.name).read_bytes()) for change in planned.changes]
+    return tuple(change for change in now if change.before != change.after)
 
 
-class Reverted(Tuple[str, ...]):
-    """Names of files that were put back; `edited` are those in which edits were kept."""
-
-    edited: Tuple[str, ...] = ()
-
-
-def revert(path: PathLike) -> Reverted:
-    """Puts every file that is patched back and removes the record; returns the files' names.
+def revert(path: PathLike) -> Dict[str, bool]:
+    """Puts every file that is patched back and removes the record; returns of each whether it was edited since.
 
     Files come back byte for byte; of one that was edited since, the edit stays. Raises PatchError, and touches nothing,
     where an edit is of the patch's own lines, where a patched file is gone, and where there is no record.
     """
     root = _root(path)
     recorded = Record.in_force(root)
-    if recorded is None and record.remove(root):
-        return Reverted()
     if recorded is None:
+        if record.remove(root):
+            return {}
         raise PatchError(f"{root}: there is no {FOLDER}, so nothing can be put back: it was not patched, or by hand")
     states = recorded.states()
-    back = {name: recorded.before[name] for name, state in states.items() if state in ("patched", "changed")}
-    edited = [name for name in back if states[name] == "changed"]
-    for name, state in states.items():
-        if state == "gone" or name in edited and name not in recorded.after:
-            raise PatchError(f"{name}: {_SINCE[state]}; nothing was touched. Undo your edit; or copy what lies in "
-                             f"{FOLDER}/originals over the checkout, by which your edit is lost, and delete {FOLDER}")
-    for name in edited:
-        back[name] = without_patch(name, back[name], recorded.after[name], (root / name).read_bytes())
-    record.check_writable(root, back)
-    record.write_files(root, back)
+    gone = [name for name, state in states.items() if state == "gone"]
+    if gone:
+        raise PatchError(f"{gone[0]}: {_SINCE['gone']}; nothing was touched. {_WAY_OUT}")
+    back = {name: recorded.before[name] if state == "patched" else _without_patch(recorded, name)
+            for name, state in states.items() if state in ("patched", "changed")}
+    try:
+        _write(root, back)
+    except OSError as error:
+        raise PatchError(f"{error.filename}: cannot be written: {error}; `revert` goes on where it can be") from None
     record.remove(root)
-    reverted = Reverted(back)
-    reverted.edited = tuple(edited)
-    return reverted
+    return {name: states[name] == "changed" for name in back}
 
 
+_WAY_OUT = (f"Undo your edit; or copy what lies in {FOLDER}/originals over the checkout, by which your edit is lost, "
+            f"and delete {FOLDER}")
 _SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
           "replaced": "was changed since, and is not patched any more; `revert` leaves it, and puts back the others",
           "original": "is not patched, or not any more: `apply` finishes the patch, `revert` takes it back"}
 
 
-def _state_by_record(recorded: Record, now: Dict[str, bytes], changes: Tuple[Change, ...],
-                     trainer: Trainer) -> Tuple[str, List[str]]:
-    """How a checkout is that has a record: `patched`, or what the record and the files disagree in."""
-    from .patch import Patch
+def _without_patch(recorded: Record, name: str) -> bytes:
+    """Returns an edited file without the patch, which git takes back: its lines have to be as the patch wrote them."""
+    from .patch import parse
 
+    undo = diff_of("file", recorded.before[name], recorded.after[name], context=0)
+    with tempfile.TemporaryDirectory() as folder:
+        file, edited = Path(folder, "file"), (recorded.root / name).read_bytes()
+        file.write_bytes(edited)
+        try:
+            done = subprocess.run(["git", "apply", "--reverse", "--unidiff-zero"], cwd=folder, input=undo,
+                                  capture_output=True)
+            parse(name, edited)
+            parse(name, file.read_bytes())
+        except (OSError, PatchError) as error:  # there is no git; what is left needs a statement of the patch
+            done = subprocess.CompletedProcess((), 1, stderr=str(error).encode())
+        if done.returncode == 0:
+            return file.read_bytes()
+    mine = diff_of(name, recorded.after[name], edited, context=0).decode(errors="replace")
+    raise PatchError(f"{name}: you have edited what the patch wrote, or what needs it; nothing was touched. {_WAY_OUT}."
+                     f" Your edit (- the patch's, + yours):\n{mine}{done.stderr.decode(errors='replace').strip()}")
+
+
+def _state_by_record(recorded: Record, is_current: bool) -> Tuple[str, List[str]]:
+    """How a checkout is that has a record. is_current: whether its files have what today's rules make of them."""
     states = recorded.states()
     edited = [name for name, state in states.items() if state == "changed"]
-    if set(states.values()) <= {"patched", "changed"}:
-        by = ", with ".join(filter(None, [f"by version {recorded.manifest['version']}", words_of(recorded.options)]))
-        is_current = all(now.get(change.name) == change.after for change in changes)
-        if is_current or Patch(now, trainer).state()[0] == "patched":
-            return "patched", [by] + [f"{name}: was edited since; every rule for the blend mode is still applied"
-                                      for name in edited]
-        if not edited:
-            return "patched", [by, f"its rules were others: to bring it up to date, type: dsmoe patch apply "
-                                   f"{recorded.root}"]
+    if set(states.values()) <= {"patched", "changed"} and (is_current or not edited):
+        by = [f"by version {recorded.manifest['version']}", *("--" + one for one in recorded.manifest["options"])]
+        is_old = [] if is_current else ["its rules were others: to bring it up to date, type: dsmoe patch apply "
+                                        f"{recorded.root}"]
+        return "patched", [", with ".join(filter(None, [by[0], " ".join(by[1:])])), *is_old,
+                           *(f"{name}: was edited since; every rule for the blend mode is still applied"
+                             for name in edited)]
     return "half-patched", [f"{name}: {_SINCE[state]}" for name, state in states.items() if state != "patched"]
 
 
-def words_of(options: Tuple[str, ...]) -> str:
-    """The options as they are typed."""
-    return " ".join("--" + option for option in options)
+def _write(root: Path, files: Mapping[str, bytes]) -> None:
+    """Writes those files that are not these bytes; each keeps mode and owner, and a link its target."""
+    for name, data in files.items():
+        if (root / name).read_bytes() != data:
+            (root / name).write_bytes(data)
 
 
 def by_name(name: str) -> Trainer:
@@ -251,23 +259,19 @@ def _no_renderer(root: Path) -> str:
     return f"there is no {GR} in {root}; wanted is the checkout's folder" + (f", such as {near[0]}" if near else "")
 
 
-def refusal(verdict: Verdict) -> str:
-    """Returns why a checkout cannot be patched."""
-    trainer = f" ({verdict.trainer})" if verdict.trainer else ""
-    return "\n".join([f"the checkout is {verdict}{trainer}:", *("  " + reason for reason in verdict.reasons)])
-
-
-def diff_of(name: str, before: bytes, after: bytes) -> str:
+def diff_of(name: str, before: bytes, after: bytes, context: int = 3) -> bytes:
     """Returns the unified diff of one file."""
-    old, new = (io.StringIO(_text(data), newline="\n").readlines() for data in (before, after))
-    lines = difflib.unified_diff(old, new, "a/" + name, "b/" + name)
-    return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in lines)
+    old, new = (io.BytesIO(data).readlines() for data in (before, after))
+    lines = difflib.diff_bytes(difflib.unified_diff, old, new, b"a/" + name.encode(), b"b/" + name.encode(), n=context)
+    return b"".join(line if line.endswith(b"\n") else line + b"\n\\ No newline at end of file\n" for line in lines)
 
 
-def _text(data: bytes) -> str:
-    import libcst
+def text_of(changes: Iterable[Change]) -> str:
+    """Returns the unified diff of files, as it is shown."""
+    from .patch import parse
 
-    return data.decode(libcst.parse_module(data).encoding)
+    return "".join(diff_of(name, before, after).decode(parse(name, before).encoding)
+                   for name, before, after, _ in changes)
 
 
 def have_libcst() -> None:

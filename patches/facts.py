@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import ast
 import re
+import warnings
 from typing import Dict, Iterator, List, Mapping, Optional, Set, Tuple
 
 from diff_smoe_rasterization.integrations.contracts import (
@@ -15,13 +16,22 @@ from diff_smoe_rasterization.integrations.contracts import (
 )
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
-from .source import called_name, python_tree
 from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINERS, Trainer
 
 PATCHED = "imports from " + INTEGRATIONS
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
 OTHER_RASTERIZER = re.compile(r"diff_(gauss|surfel)\w*")
 RENDERERS = {"render", "prefilter_voxel", "*"}
+
+
+def python_tree(data: bytes) -> ast.Module:
+    """Returns the syntax tree of a file as Python's own parser has it; of one that cannot be parsed an empty one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # such as of invalid escapes in a string
+        try:
+            return ast.parse(data)
+        except (SyntaxError, ValueError):
+            return ast.Module(body=[], type_ignores=[])
 
 
 def of_files(files: Mapping[str, bytes]) -> Set[str]:
@@ -71,14 +81,15 @@ def _of_import(node: ast.AST, may_fail: bool) -> Iterator[str]:
 
 
 def _of_call(call: ast.Call, made: Set[str]) -> Iterator[str]:
+    called = getattr(call.func, "attr", getattr(call.func, "id", ""))  # the last part of the name
     keywords = [keyword.arg for keyword in call.keywords]  # None: **pipe.blend
-    if called_name(call) == "GaussianRasterizationSettings":
+    if called == "GaussianRasterizationSettings":
         yield from (f"sets {name}" for name in keywords if name)
         yield "blends as it says" if {None, "blend_mode"} & set(keywords) else "blends by default"
     elif _renders(call, made) and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
         yield from (f"takes {name}" for name in keywords if name)
     else:
-        yield f"calls {called_name(call)}"
+        yield f"calls {called}"
 
 
 def _names_of_rasterizers(tree: ast.Module) -> Set[str]:

@@ -8,7 +8,7 @@ import os
 import sys
 import warnings
 from pathlib import Path
-from typing import Any, Callable, Dict, Optional, Tuple
+from typing import Any, Callable, Dict, Tuple
 
 from diff_smoe_rasterization.settings import (
     BLEND_MODES,
@@ -25,9 +25,7 @@ USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used firs
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode: $DSMOE_BLEND_MODE, else "alpha"; and of --background_gate: "".
 
-    "" is what `training_background_gate` gives for the mode. In rendering the trainers have no defaults, but cfg_args.
-    Scripts that build fixed command lines for train.py pass both on by variables.
-    Raises ValueError where DSMOE_BLEND_MODE names no mode.
+    "" is what `training_background_gate` gives for the mode. Raises ValueError where DSMOE_BLEND_MODE names no mode.
     """
     return resolve_blend_mode(None), ""
 
@@ -49,14 +47,13 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
 
     Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args. Without a
     `blend_mode` (a cfg_args of before the patch): "alpha". In `smoe` without a `background_gate`: 0, Eq. 7.
-    Says on stderr what they are, and whence. Warns, once, where one may not be what was meant or where it changes what
-    the background does.
+    Says on stderr what they are, and whence. Warns, once, where one may not be what was meant.
     Raises ValueError where one is wrong, RuntimeError where the renderer has another rasterizer.
     """
     _check_renderer()
-    given = getattr(dataset, "blend_mode", None)
+    given, saved = getattr(dataset, "blend_mode", None), _saved(dataset)
     mode = given or "alpha"
-    cfg_args, saved = Path(getattr(dataset, "model_path", "") or ".", "cfg_args"), _saved(dataset)
+    cfg_args = Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
     whence = _whence("blend_mode", mode, functools.partial(resolve_blend_mode, None), saved.get("blend_mode"), cfg_args)
     if mode not in BLEND_MODES:
         raise ValueError(f"the blend mode is {mode!r}, {whence}; it must be one of {', '.join(BLEND_MODES)}")
@@ -64,7 +61,13 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
     if not given:
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
               "the patch); --blend_mode says otherwise")
-    gate = _gate_of(dataset, mode)
+    gate = getattr(dataset, "background_gate", None)  # "" is the default; what is typed is a string
+    if mode == "smoe" and gate is None:
+        _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, "
+              "or in another mode); --background_gate says otherwise")
+        gate = 0.0
+    is_of_smoe = mode != "smoe" and not isinstance(gate, str)
+    gate = training_background_gate(mode, None if gate == "" or is_of_smoe else gate)
     if gate is not None:
         before = saved.get("background_gate", 0.0) if saved.get("blend_mode") == mode else None
         said += f"; background gate {gate}, " + _whence(
@@ -79,18 +82,6 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
               "in alpha mode")
     dataset.blend_mode, dataset.background_gate = mode, gate
     return {"blend_mode": mode, "background_gate": gate}
-
-
-def _gate_of(dataset: Any, mode: str) -> Optional[float]:
-    """Returns the background's gate of a run, None in other modes than `smoe`: "" is the default, a string typed."""
-    given = getattr(dataset, "background_gate", None)
-    if mode == "smoe" and given is None:
-        _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, "
-              "or in another mode); --background_gate says otherwise")
-        given = 0.0
-    if mode != "smoe" and not isinstance(given, str):  # of a model in `smoe`
-        given = None
-    return training_background_gate(mode, None if given == "" else given)
 
 
 def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any, cfg_args: Path) -> str:
@@ -116,34 +107,23 @@ def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any,
 def rasterizer_of_run() -> Dict[str, Any]:
     """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
 
-    The first rasterizer that is made, or function that is called, is noted for `dsmoe run`, which else says at the end
-    that nothing was rendered.
+    A rasterizer that is made, or a function that is called, is noted for `dsmoe run`.
     """
     from diff_smoe_rasterization import GaussianRasterizer
 
-    flavour, used = os.environ[RASTERIZER_VARIABLE], os.environ.get(USED_VARIABLE, "")
+    flavour, used = os.environ[RASTERIZER_VARIABLE], Path(os.environ.get(USED_VARIABLE, ""))
     module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
-    original = GaussianRasterizer.__init__
-
-    @functools.lru_cache(maxsize=None)
-    def note() -> None:
-        if os.path.isdir(os.path.dirname(used)):
-            Path(used).touch()
-
-    def noted(self: Any, *arguments: Any, **keywords: Any) -> None:
-        GaussianRasterizer.__init__ = original
-        note()
-        original(self, *arguments, **keywords)
 
     def noting(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def call(*arguments: Any, **keywords: Any) -> Any:
-            note()
+            if used.name and used.parent.is_dir():
+                used.touch()
             return function(*arguments, **keywords)
 
         return call
 
-    GaussianRasterizer.__init__ = noted
+    GaussianRasterizer.__init__ = noting(GaussianRasterizer.__init__)
     mode = resolve_blend_mode(None)
     gate = f", background gate {resolve_background_gate(mode, None)}" if mode == "smoe" else ""
     _say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
@@ -174,8 +154,18 @@ def is_installed(module: str) -> bool:
         sys.path[:] = path
 
 
+class _Absent:
+    """A module that is not installed: its attributes raise the ImportError when they are used."""
+
+    def __init__(self, error: ImportError) -> None:
+        self._error = error
+
+    def __getattr__(self, name: str) -> Any:
+        raise self._error
+
+
 def optional_import(name: str) -> Any:
-    """Returns the module, or, where it is not installed, an object whose attributes raise the ImportError when used."""
+    """Returns the module, or a stand-in where it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -196,7 +186,7 @@ def deferred(make: Callable[[], Callable[..., Any]]) -> Callable[..., Any]:
 def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
     """Returns the metric, whose value is NaN, with a warning, where it is not installed or cannot download its weights.
 
-    A measurement then does not end a training of hours. The first failure is remembered: later calls do not wait.
+    A measurement then does not end a training of hours. After the first failure it is not tried again.
     """
     failed = []
 
@@ -231,27 +221,24 @@ def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(ssim)
     def call(*images: Any, **keywords: Any) -> Any:
+        import torch
+
         from diff_smoe_rasterization import fused_ssim
 
-        if keywords or len(images) != 2 or not can_be_fused(*images):
+        first, second = images if len(images) == 2 and not keywords else (None, None)
+        if (first is None or first.dim() not in (3, 4) or first.shape != second.shape or first.device != second.device
+                or {first.dtype, second.dtype} != {torch.float32}
+                or second.requires_grad and torch.is_grad_enabled()):
             return ssim(*images, **keywords)
-        case = images[0].device, images[0].shape
+        case = first.device, first.shape
         if case not in differences:
-            differences[case] = difference_of(fused_ssim, ssim, *images)
+            differences[case] = difference_of(fused_ssim, ssim, first, second)
             if differences[case]:
                 _say(f"--fuse: {ssim.__module__}.{ssim.__name__} is not SSIM as it is fused here "
                      f"({differences[case]}): it is computed as before")
         return ssim(*images) if differences[case] else fused_ssim(*images)
 
     return call
-
-
-def can_be_fused(img1: Any, img2: Any) -> bool:
-    """Whether `fused_ssim` has what is asked for of these images."""
-    import torch
-
-    return (img1.dim() in (3, 4) and img1.shape == img2.shape and img1.dtype == img2.dtype == torch.float32
-            and img1.device == img2.device and not (img2.requires_grad and torch.is_grad_enabled()))
 
 
 def difference_of(fused: Callable[..., Any], own: Callable[..., Any], img1: Any, img2: Any) -> str:
@@ -266,13 +253,9 @@ def difference_of(fused: Callable[..., Any], own: Callable[..., Any], img1: Any,
     with torch.inference_mode(False), torch.enable_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         try:
             for ours, theirs in zip(value_and_gradient(fused), value_and_gradient(own)):
-                if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
-                    return f"it gives {theirs.dtype} {list(theirs.shape)}, not {ours.dtype} {list(ours.shape)}"
-                differs, largest = float((ours - theirs).abs().max()), float(ours.abs().max())
-                if not differs <= SSIM_ROUNDING * largest:  # NaN is no such number
-                    return f"they differ by {differs:.1e} where the largest value is {largest:.1e}"
+                torch.testing.assert_close(theirs, ours, rtol=0, atol=SSIM_ROUNDING * float(ours.abs().max()))
         except Exception as error:  # whatever another function has against the images: the training goes on
-            return f"it raises {error!r}"
+            return " ".join(str(error).split())
     return ""
 
 
@@ -316,14 +299,6 @@ def unique_rows(input: Any, sorted: bool = True, return_inverse: bool = False, r
     unique = unique.reshape(-1, *input.shape[1:])
     results = (unique,) + (inverse,) * return_inverse + (counts,) * return_counts
     return results if len(results) > 1 else unique
-
-
-class _Absent:
-    def __init__(self, error: ImportError) -> None:
-        self._error = error
-
-    def __getattr__(self, name: str) -> Any:
-        raise self._error
 
 
 def _check_renderer() -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Dict, Iterator, List, Set
 
 from . import facts
-from .source import python_tree
 from .trainers import GR, INTEGRATIONS, RASTERIZER, RUNTIME, Trainer
 
 # Not all folders: outputs hold copies of the code, environments whole packages.
@@ -29,25 +28,14 @@ def python_files(root: Path, with_submodules: bool = False) -> Iterator[str]:
 def other_files(root: Path) -> Dict[str, bytes]:
     """Returns the Python files elsewhere in the checkout, which no rule changes: scripts of the user's own."""
     found = {}
-    for above, folders, names in os.walk(str(root)):
+    for above, folders, names in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")
                       and name not in ("submodules", "site-packages", "__pycache__")
-                      and not any(os.path.exists(os.path.join(above, name, sign)) for sign in OF_NO_CHECKOUT)]
+                      and not any(Path(above, name, sign).exists() for sign in OF_NO_CHECKOUT)]
         folder = Path(above).relative_to(root)
         for name in names if folder.as_posix() not in (".", *FOLDERS) else ():
-            if name.endswith(".py") and os.access(os.path.join(above, name), os.R_OK):  # no link to nothing
+            if name.endswith(".py") and os.access(Path(above, name), os.R_OK):  # no link to nothing
                 found[(folder / name).as_posix()] = Path(above, name).read_bytes()
-    return found
-
-
-def files_beside(root: Path) -> Dict[str, bytes]:
-    """Returns the Python files of a project in which a checkout is bundled, as SuGaR's are, that rasterize too."""
-    found = {}
-    for pattern in () if (root / ".git").exists() else ("*.py", "*/*.py"):
-        for path in root.resolve().parent.glob(pattern):
-            is_other = any((folder / GR).exists() for folder in path.parents)
-            if not is_other and path.is_file() and RASTERIZER.encode() in path.read_bytes():
-                found["../" + path.relative_to(root.resolve().parent).as_posix()] = path.read_bytes()
     return found
 
 
@@ -57,8 +45,8 @@ def notes(root: Path, files: Dict[str, bytes], trainer: Trainer) -> List[str]:
     files: those that rules look at.
     """
     files = {name: data for name, data in files.items() if not name.startswith("submodules/")}
-    scripts = {**files, **other_files(root), **files_beside(root)}
-    imported = set().union(*(_imports(data) for data in scripts.values()))
+    scripts = {**files, **other_files(root)}
+    imported = set().union(*map(_imports, scripts.values()))
     lines = []
     for name, data in sorted(scripts.items()):
         if not any(word in data for word in (RASTERIZER.encode(), b"gaussian_renderer", SETTINGS.encode())):
@@ -83,7 +71,7 @@ def notes(root: Path, files: Dict[str, bytes], trainer: Trainer) -> List[str]:
 def _imports(data: bytes) -> Set[str]:
     """Returns the modules that a file imports, and what it imports from them: that may be a module too."""
     modules: Set[str] = set()
-    for node in ast.walk(python_tree(data)):
+    for node in ast.walk(facts.python_tree(data)):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:

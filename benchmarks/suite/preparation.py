@@ -69,11 +69,10 @@ def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
     path = method[key]
     if not CHECKOUTS[method["name"]]:
         return path
-    found = patches.inspect(path, fuse=True)
-    is_patched = found.verdict == "patched"
-    is_fused = any(set(rule.files) - set(rule.pending) for rule in found.requested if rule.option == "fuse")
-    if method["variant"] == "unpatched" and found.verdict != "patchable":
-        raise BenchError(f"{path} is {found.verdict}, and the suite says it is an unpatched checkout (`dsmoe patch "
+    found = patches.check(path)
+    is_patched, is_fused = found.state == "patched", "fuse" in found.applied
+    if method["variant"] == "unpatched" and found.state != "patchable":
+        raise BenchError(f"{path} is {found.state}, and the suite says it is an unpatched checkout (`dsmoe patch "
                          "revert` takes a patch back)")
     if method["variant"] == "patched" and is_patched and is_fused:
         raise BenchError(f"{path} is patched with --fuse, which the suite calls `variant: fused`")

@@ -1,8 +1,7 @@
-"""What `dsmoe bench report` writes of a folder of results: tables, figures, survey rows and a page.
+"""What `dsmoe bench report` writes of a folder of results: tables, figures, images and a page.
 
-groups.py averages rows; layouts.py says which tables there are and tables.py writes them; curves.py draws; sliders.py
-collects images; page.html, .css and .js are the page; survey.py writes rows for the compression survey. paper.json
-holds the paper's printed figures.
+groups.py averages rows; layouts.py says which tables there are and tables.py writes them; curves.py draws; images.py
+collects images; page.html and .css are the page. paper.json holds the paper's printed figures.
 """
 from __future__ import annotations
 
@@ -11,27 +10,26 @@ import json
 import os
 import shutil
 import tempfile
+from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, Sequence
 
 import jinja2
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from ....trainer.system.output_folder import make_folder
+from ....trainer.system.output_folder import Record, make_folder, own_record, write_record
 from ..names import CELLS_FOLDER, SUITE_NAME
 from ..rows import ReportError, Row, of_one_protocol, read_rows
-from . import survey
 from .curves import Picture, draw_all
 from .groups import at_once, grouped, is_alone, safe_name, some
+from .images import ERROR_COLORS, ERROR_FULL_SCALE, collect
 from .layouts import commits, end_of, read_paper, tables_of
-from .sliders import ERROR_COLORS, ERROR_FULL_SCALE, collect
 from .tables import Table, to_csv, to_latex, to_markdown
 
 __all__ = ["ReportError", "report"]
 
 PAGE_NAME = "index.html"
-GENERATOR = "dsmoe bench report"  # written into the page, so that a later report knows it as its own
-PARTS = ("tables", "figures", "images", "survey", "report.md")  # of a report, beside its page
+COMMAND = "dsmoe bench report"
 MOST_ABSENT = 3  # cells without a row that are named
 NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
                 "continued", "arguments", "background_gate")  # of one cell, or said otherwise
@@ -45,29 +43,29 @@ class Section(NamedTuple):
     counts: str
     tables: List[Table]
     pictures: List[Picture]
-    scenes: List[Dict[str, Any]]
-    no_images: str  # why, where there are no scenes
+    images: List[Dict[str, Any]]
+    no_images: str  # why, where there are none
     protocols: List[Dict[str, Any]]
 
 
 def report(results: str, output: str) -> str:
     """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT.
 
-    OUTPUT/index.html, report.md, tables/, figures/, images/, survey/; an earlier report there is replaced once the new
-    one is whole. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged, where
-    rows cannot be compared or where OUTPUT has such files of someone else, TrainerError where nothing can be written
-    there.
+    OUTPUT/index.html, report.md, tables/, figures/, images/; an earlier report there is replaced once the new one is
+    made. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged or where rows
+    cannot be compared, TrainerError where nothing can be written in OUTPUT or where there is something else.
     """
     rows = read_rows(results)
-    _refuse_files_of_others(output)
     make_folder(output)
-    with tempfile.TemporaryDirectory(prefix=".report-", dir=output) as made:
+    earlier = own_record(output, COMMAND).files
+    with tempfile.TemporaryDirectory() as made:
         sections = [_section(results, suite, [row for row in rows if row["suite"] == suite], made)
                     for suite in sorted({row["suite"] for row in rows})]
         _write(made, "report.md", _markdown(sections))
         _write(made, PAGE_NAME, _page(sections, commits(rows)))
-        for name in (PAGE_NAME, *PARTS):  # the page first: it says that the others are a report's
-            _replace(os.path.join(made, name), os.path.join(output, name))
+        files = [path.relative_to(made).as_posix() for path in sorted(Path(made).rglob("*")) if path.is_file()]
+        write_record(output, COMMAND, Record(results, files), earlier)
+        shutil.copytree(made, output, dirs_exist_ok=True)
     return os.path.join(output, PAGE_NAME)
 
 
@@ -81,13 +79,11 @@ def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Sect
         for form, text in (("md", to_markdown(table)), ("csv", to_csv(table)), ("tex", to_latex(table))):
             _write(output, os.path.join("tables", f"{table.name}.{form}"), text)
     pictures = draw_all(suite, grouped(rows, end_of), os.path.join(output, "figures"))
-    scenes = collect(results, suite, rows, output)
-    survey.write_survey(rows, paper["datasets"], os.path.join(output, "survey", safe_name(suite)))
+    images = collect(results, suite, rows, output)
     here = any(os.path.isdir(os.path.join(results, CELLS_FOLDER, row["cell"])) for row in rows)
     no_images = "No images: the suite asked for none." if here else "No images: rows of another folder."
     counts = "; ".join([_counts(rows) + absent, *left_out])
-    return Section(suite, safe_name(suite), counts, tables, pictures, scenes,
-                   no_images, _protocols(rows))
+    return Section(suite, safe_name(suite), counts, tables, pictures, images, no_images, _protocols(rows))
 
 
 def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
@@ -103,30 +99,8 @@ def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
     environment.filters["data_url"] = data_url
     scale = ", ".join(to_hex(colormaps[ERROR_COLORS](step / 8)) for step in range(9))
     return environment.get_template("page.html").render(
-        generator=GENERATOR, sections=sections, commits=measured_with, error_scale=scale,
+        generator=COMMAND, sections=sections, commits=measured_with, error_scale=scale,
         error_full=f"{ERROR_FULL_SCALE:g}")
-
-
-def _refuse_files_of_others(output: str) -> None:
-    page = os.path.join(output, PAGE_NAME)
-    if os.path.isfile(page):
-        with open(page, encoding="utf-8", errors="replace") as file:
-            if f'content="{GENERATOR}"' not in file.read():
-                raise ReportError(f"{page} is no report; name another folder")
-        return
-    for name in PARTS:
-        if os.path.exists(os.path.join(output, name)):
-            raise ReportError(f"{os.path.join(output, name)} is of no report; name another folder")
-
-
-def _replace(new: str, old: str) -> None:
-    """Puts a file or folder in the place of an earlier one; where there is no new one, the place is empty then."""
-    if os.path.isdir(old) and not os.path.islink(old):
-        shutil.rmtree(old)
-    elif os.path.lexists(old):
-        os.remove(old)
-    if os.path.exists(new):
-        os.replace(new, old)
 
 
 def _markdown(sections: Sequence[Section]) -> str:

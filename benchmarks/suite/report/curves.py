@@ -1,7 +1,4 @@
-"""Figures: quality against the number of Gaussians and the size, and bars of training time and frame rate.
-
-Each is drawn twice, for light and for dark pages, as SVG; the light one also as PNG.
-"""
+"""Figures: quality against the number of Gaussians and the size, as SVG and PNG."""
 from __future__ import annotations
 
 import itertools
@@ -16,16 +13,18 @@ import matplotlib.pyplot as plt  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.lines import Line2D  # noqa: E402
 
-from .groups import LPIPS, Group, Setting, device_of, is_alone, lpips_figures, safe_name  # noqa: E402
+from .groups import LPIPS, Group, Setting, lpips_figures, safe_name  # noqa: E402
 from .tables import column  # noqa: E402
 
 # Okabe and Ito's colours, told apart with every kind of colour vision; black and yellow are left out for the pages.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-# Blends differ by more than colour: mark, line and hatch.
-MARKS = {"alpha": ("o", "--", ""), "smoe": ("s", "-", "//"), "smoe_tn": ("^", "-.", ".."), "smoe_std": ("v", ":", "xx")}
-OTHER_MARKS = (("D", "-", "\\\\"), ("P", "-", "++"), ("X", "-", "oo"))  # gates of smoe, as they come
-THEMES = {"light": {"background": "#ffffff", "ink": "#1c1c1e", "grid": "#d8d8dc"},
-          "dark": {"background": "#1b1c20", "ink": "#e8e8ea", "grid": "#3c3d44"}}
+# Blends differ by more than colour: mark and line.
+MARKS = {"alpha": ("o", "--"), "smoe": ("s", "-"), "smoe_tn": ("^", "-."), "smoe_std": ("v", ":")}
+OTHER_MARKS = (("D", "-"), ("P", "-"), ("X", "-"))  # gates of smoe, as they come
+INK, GRID = "#1c1c1e", "#d8d8dc"
+STYLE = {"text.color": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.edgecolor": GRID,
+         "grid.color": GRID, "axes.grid": True, "axes.axisbelow": True, "axes.spines.top": False,
+         "axes.spines.right": False, "legend.frameon": False, "font.size": 10, "svg.hashsalt": "dsmoe"}
 AMOUNTS = ("num_gaussians", "size_own_mb", "size_common_mb")
 NARROW = 1.5  # the ratio of the largest x value to the smallest, up to which the axis is plain
 MARK, LARGEST_MARK = 6, 12  # points
@@ -34,32 +33,26 @@ LEGEND_MARK, LEGEND_LETTER = 0.85, 0.082  # what a mark, and a letter of its lab
 
 
 class Picture(NamedTuple):
-    """A figure's files, by theme, with what it shows in words."""
+    """A figure's file, an SVG with a PNG beside it, and what it shows in words."""
 
     name: str
     title: str
     alt: str
-    files: Dict[str, str]
+    path: str
 
 
 def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
-    """Draws the figures of a suite, one of each kind for every scene, into a folder."""
+    """Draws a figure for every scene of a suite into a folder."""
     pictures = []
     for scene in sorted({group.scene for group in groups}):
         shown = [group for group in groups if group.scene == scene and group.rows]
-        for kind, title, draw in (("rd", "quality against number of Gaussians and size", rate_distortion),
-                                  ("time", "training time and frame rate", bars)):
-            files = {}
-            for theme in THEMES:
-                with plt.rc_context(style(theme)):
-                    drawn = draw(shown)
-                    if drawn is None:
-                        break
-                    files[theme] = save(drawn, folder, safe_name(f"{suite}-{scene}-{kind}"), theme)
-            if files:
+        with plt.rc_context(STYLE):
+            drawn = rate_distortion(shown)
+            if drawn is not None:
+                name, title = safe_name(f"{suite}-{scene}-rd"), f"{scene}: quality against number of Gaussians and size"
                 modes = "; ".join(dict.fromkeys(group.setting.label() for group in shown))
-                pictures.append(Picture(safe_name(f"{suite}-{scene}-{kind}"), f"{scene}: {title}",
-                                        f"{scene}: {title} of {modes}; the figures are in the tables", files))
+                pictures.append(Picture(name, title, f"{title} of {modes}; the figures are in the tables",
+                                        save(drawn, folder, name)))
     return pictures
 
 
@@ -112,7 +105,7 @@ def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
     styles = _styles(groups)
     kinds = list(dict.fromkeys(series.pair for series in styles))
     smaller = min(2, (LARGEST_MARK - MARK) / max(1, len(kinds) - 1))
-    for series, (color, (mark, dash, _)) in styles.items():
+    for series, (color, (mark, dash)) in styles.items():
         points = sum(group.setting.series == series for group in groups)
         hollow, place = series.blend == "alpha", kinds.index(series.pair)
         looks[series] = {"color": color, "marker": mark, "markersize": MARK + smaller * (len(kinds) - 1 - place),
@@ -121,71 +114,21 @@ def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
     return looks
 
 
-def bars(groups: Sequence[Group]):
-    """Training seconds and frames per second, a bar for each setting; whiskers are the spread over seeds.
-
-    Settings without either, such as those whose cells shared a GPU, are left out; of several machines none is drawn.
-    """
-    figures = [name for name in ("train_seconds", "fps") if any(_drawn(group, name) for group in groups)]
-    groups = [group for group in groups if any(_drawn(group, name) for name in figures)]
-    if not groups or len({device_of(row) for group in groups for row in group.rows if is_alone(row)}) > 1:
-        return None
-    styles = _styles(groups)
-    amounts = list(dict.fromkeys(group.setting.amount() for group in
-                                 sorted(groups, key=lambda group: (group.setting.budget or 0,
-                                                                   -(group.setting.threshold or 0)))))
-    drawn, axes = plt.subplots(len(figures), 1, squeeze=False, sharex=True,
-                               figsize=(max(1.5 * PANEL[0], 1 + 1.1 * len(amounts)), 0.8 * PANEL[1] * len(figures) + 1))
-    width = 0.8 / max(len({group.setting.series for group in groups if group.setting.amount() == amount})
-                      for amount in amounts)
-    for axis, name in zip(axes[:, 0], figures):
-        for place, amount in enumerate(amounts):
-            members = [group for series in styles for group in groups
-                       if group.setting.series == series and group.setting.amount() == amount]
-            for index, group in enumerate(members):
-                color, (_, _, hatch) = styles[group.setting.series]
-                mean, spread, *_ = group.measured(name)
-                if mean is not None:
-                    axis.bar(place + (index - (len(members) - 1) / 2) * width, mean, width, color=color, hatch=hatch,
-                             yerr=spread, capsize=3, ecolor=plt.rcParams["text.color"],
-                             edgecolor=plt.rcParams["figure.facecolor"])
-        axis.set_ylabel(column(name).name)
-        axis.grid(axis="x", visible=False)
-    slanted = {"rotation": 30, "ha": "right"} if len(amounts) > 4 else {}
-    axes[-1, 0].set_xticks(range(len(amounts)), amounts, **slanted)
-    axes[-1, 0].set_xlabel("densification threshold" if all(group.setting.budget is None for group in groups)
-                           else "densification threshold, or fixed number")
-    handles = [matplotlib.patches.Patch(facecolor=color, hatch=hatch, edgecolor=plt.rcParams["figure.facecolor"],
-                                        label=series.label()) for series, (color, (_, _, hatch)) in styles.items()]
-    legend(drawn, handles)
-    return drawn
-
-
 def _drawn(group: Group, name: str) -> bool:
     """Whether the figure has a place on an axis: one of amounts may be logarithmic."""
     mean = group.measured(name).value
     return mean is not None and math.isfinite(mean) and (mean > 0 or name not in AMOUNTS)
 
 
-def _styles(groups: Sequence[Group]) -> Dict[Setting, Tuple[str, Tuple[str, str, str]]]:
-    """Of every series: a colour for all but the blend, and marks for the blend."""
+def _styles(groups: Sequence[Group]) -> Dict[Setting, Tuple[str, Tuple[str, str]]]:
+    """Of every series: a colour, and mark and line of its blend."""
     found = sorted({group.setting.series for group in groups}, key=Setting.order)
     kinds = list(dict.fromkeys(series.pair for series in found))
     blends = list(dict.fromkeys(["alpha", "smoe", *sorted(series.blend for series in found)]))
     marks = {**dict(zip((blend for blend in blends if blend not in MARKS), itertools.cycle(OTHER_MARKS))), **MARKS}
-    # The blends of one method take neighbouring colours, so that bars differ by colour too.
+    # The blends of one method take neighbouring colours.
     return {series: (COLORS[(kinds.index(series.pair) * len(blends) + blends.index(series.blend)) % len(COLORS)],
                      marks[series.blend]) for series in found}
-
-
-def style(theme: str) -> Dict[str, object]:
-    """Matplotlib's settings for one of THEMES."""
-    colors = THEMES[theme]
-    return {"figure.facecolor": colors["background"], "axes.facecolor": colors["background"],
-            "savefig.facecolor": colors["background"], "text.color": colors["ink"], "axes.labelcolor": colors["ink"],
-            "axes.edgecolor": colors["grid"], "xtick.color": colors["ink"], "ytick.color": colors["ink"],
-            "grid.color": colors["grid"], "axes.grid": True, "axes.axisbelow": True, "axes.spines.top": False,
-            "axes.spines.right": False, "legend.frameon": False, "font.size": 10, "svg.hashsalt": "dsmoe"}
 
 
 def legend(drawn: Figure, handles: Sequence[object]) -> None:
@@ -199,12 +142,11 @@ def legend(drawn: Figure, handles: Sequence[object]) -> None:
     drawn.legend(handles=handles, loc="upper center", ncols=columns, handlelength=3)
 
 
-def save(drawn: Figure, folder: str, name: str, theme: str) -> str:
-    """Writes NAME-THEME.svg, in the light theme NAME.png too, and closes the figure; returns the SVG's path."""
+def save(drawn: Figure, folder: str, name: str) -> str:
+    """Writes NAME.svg and NAME.png, and closes the figure; returns the SVG's path."""
     os.makedirs(folder, exist_ok=True)
-    path = os.path.join(folder, f"{name}-{theme}.svg")
+    path = os.path.join(folder, f"{name}.svg")
     drawn.savefig(path, metadata={"Date": None})
-    if theme == "light":
-        drawn.savefig(os.path.join(folder, f"{name}.png"), dpi=130)
+    drawn.savefig(os.path.join(folder, f"{name}.png"), dpi=130)
     plt.close(drawn)
     return path

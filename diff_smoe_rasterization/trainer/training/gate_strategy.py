@@ -14,6 +14,7 @@ from ..errors import ConfigError
 from ..gate_options import parse_gate_options
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
 from ..scenes.images import View, as_float
+from .drawing import draw
 from .strategy import SteadyStrategy, Step, StrategyContext
 
 # Milestones, as parts of densify_until_iter (18,000): growth ends at 9,600, sixteen removals are at 9,840 to 16,590,
@@ -126,7 +127,7 @@ class GateStrategy(SteadyStrategy):
         count = min(count, int((errors > 0).sum()))
         if count == 0:
             return
-        targets = torch.multinomial(errors, count)
+        targets = draw(errors, count)
         errors, order = errors[targets].sort(descending=True)
         worth = (costs[:count] < self.options.worth * errors).nonzero().squeeze(1)
         self.split(targets[order][worth], sources[worth])

@@ -10,6 +10,7 @@ from typing import Dict, Tuple
 import torch
 
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
+from .drawing import draw
 from .strategy import Step, Strategy, StrategyContext
 
 DEAD_OPACITY = 0.005  # fainter Gaussians are relocated
@@ -51,7 +52,7 @@ class MCMCStrategy(Strategy):
         alive, dead = (opacities > DEAD_OPACITY).nonzero().squeeze(1), (opacities <= DEAD_OPACITY).nonzero().squeeze(1)
         if len(alive) == 0 or len(dead) == 0:
             return
-        drawn = alive[torch.multinomial(opacities[alive], len(dead), replacement=True)]
+        drawn = alive[draw(opacities[alive], len(dead), replacement=True)]
         self.context.optimizer.overwrite(dead, self._divide(drawn))
 
     def grow(self) -> None:
@@ -61,7 +62,7 @@ class MCMCStrategy(Strategy):
         count = min(budget, max(now + 1, int((1 + GROWTH) * now))) - now
         if count <= 0:
             return
-        drawn = torch.multinomial(model.opacities.squeeze(1), count, replacement=True)
+        drawn = draw(model.opacities.squeeze(1), count, replacement=True)
         self.context.optimizer.append(self._divide(drawn))
 
     def _divide(self, drawn: torch.Tensor) -> Dict[str, torch.Tensor]:

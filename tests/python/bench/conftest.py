@@ -7,7 +7,7 @@ import pytest
 from tiny_scene import one_thread, tiny_scene  # noqa: F401
 
 LACKING = [name for name in ("yaml", "pydantic", "jinja2", "matplotlib") if importlib.util.find_spec(name) is None]
-WITHOUT_THEM = ("test_lpips", "test_measure", "test_mechanism")
+WITHOUT_THEM = ("test_lpips", "test_measure")
 
 
 class Skipped(pytest.Module):

@@ -79,7 +79,7 @@ class SmallTrainers:
         method = {"name": name, "variant": variant, "pythonpath": [str(small_trainers().PACKAGES)],
                   "blend_modes": [blend_mode], **method}
         if "path" not in method:
-            method["path"] = self.checkout(name)
+            method["path"] = self.checkout("3dgs-2023" if name == "3dgs-2024" else name)
         if name == "c3dgs":
             method["base"] = self.checkout("3dgs-2023")
         content = {"name": "checkouts", "protocol": {"iterations": ITERATIONS, "lpips": [], "options": options or {}},

@@ -46,10 +46,10 @@ def test_the_copy_of_a_checkout_follows_it_and_has_its_commit(tmp_path):
     commit, method = git("rev-parse", "HEAD"), prepared()
     assert method["commit"] == commit and "refused" not in method and "base_commit" not in method
     copy = Path(method["path"])
-    assert copy.parent == tmp_path / "results" / "checkouts" and preparation.patches.check(copy) == "patched"
+    assert copy.parent == tmp_path / "results" / "checkouts" and preparation.patches.check(copy).state == "patched"
     with open(folder / "train.py", "a") as file:
         file.write("# changed\n")
     assert prepared()["commit"] == commit + "+" and (copy / "train.py").read_text().endswith("# changed\n")
-    assert preparation.patches.check(folder) == "patchable"
+    assert preparation.patches.check(folder).state == "patchable"
     method = prepared(name="c3dgs", variant="unpatched", base=str(folder))
     assert (method["commit"], method["base_commit"]) == (commit + "+", commit + "+")

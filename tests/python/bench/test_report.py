@@ -1,4 +1,4 @@
-"""The benchmark's report: averages, tables beside the paper's, deltas, failures, survey rows, refusals."""
+"""The benchmark's report: averages, tables beside the paper's, deltas, failures, refusals."""
 from __future__ import annotations
 
 import csv
@@ -10,7 +10,7 @@ import pytest
 from report_rows import PROTOCOL, failed, row, write_rows
 
 from diff_smoe_rasterization.benchmarks.suite import rows
-from diff_smoe_rasterization.benchmarks.suite.report import ReportError, groups, layouts, survey, tables
+from diff_smoe_rasterization.benchmarks.suite.report import ReportError, layouts, tables
 
 
 def table_of(entries, name, suite="table1"):
@@ -74,15 +74,12 @@ def test_the_papers_figures_stand_beside_ours_and_are_marked():
     assert any("Deep Blending and Tanks and Temples are left out" in note for note in table.notes)
 
 
-def test_a_scene_is_of_the_data_set_that_its_row_names(tmp_path):
+def test_a_scene_is_of_the_data_set_that_its_row_names():
     """A made-up scene may have the name of one of the paper's."""
     entries = [row("room", dataset=None), row("my_truck", dataset="Tanks and Temples")]
     assert table_of(entries[:1], "table1") is None
     table = table_of(entries[1:], "table1")
     assert shown(table, "Tanks and Temples (ours: my_truck) PSNR [dB]", end="sparse") == ["20.00"]
-    survey.write_survey(entries, layouts.read_paper()["datasets"], str(tmp_path))
-    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.csv")} == {
-        "other/room.csv", "TanksAndTemples/my_truck.csv"}
 
 
 def test_other_trainers_stand_in_table_2():
@@ -123,7 +120,6 @@ def test_each_gate_of_smoe_is_a_blend_of_its_own():
         assert any(line.source == tables.PAPER for line in table.rows) == (name == "deltas")
     averages = table_of([*entries, row(seed=1)], "table1")  # of all gates they are of the seeds that these share
     assert shown(averages, "Mip-NeRF 360 (ours: bonsai) PSNR [dB]", method="native, smoe") == ["21.00"]
-    assert survey.submethod(groups.grouped(entries, layouts.end_of)[2]) == "-native-smoe-0.05-t0.005"
 
 
 def test_renderings_that_equal_the_ground_truth_have_an_infinite_psnr(tmp_path):
@@ -206,19 +202,6 @@ def test_every_line_of_latex_and_markdown_has_all_columns(name):
         assert r"50 \% of a\_b \& c\textbackslash{}d \#1" in body[-1]
     lines = [line for line in tables.to_markdown(table).split("\n") if line.startswith("|")]
     assert {line.count("|") for line in lines} == {width + 1} and len(lines) == len(table.rows) + 2
-
-
-def test_survey_rows(tmp_path):
-    inria = {"value": 0.2, "kind": "lpips_vgg_inria", "reason": None}
-    entries = [row(psnr=31.25, lpips=inria), row(seed=1, psnr=31.75, lpips=inria, num_gaussians=40001),
-               smoe(schedule="steady", threshold=0.0002), row("lego"), row("my room"), failed(scene="truck")]
-    survey.write_survey(entries, layouts.read_paper()["datasets"], str(tmp_path))
-    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.csv")) == [
-        "MipNeRF360/bonsai.csv", "SyntheticNeRF/lego.csv", "other/my_room.csv"]
-    assert (tmp_path / "MipNeRF360" / "bonsai.csv").read_text(encoding="utf-8").split("\n") == [
-        "Submethod,PSNR,SSIM,LPIPS,Size [Bytes],#Gaussians",
-        "-native-alpha-t0.005,31.5,0.75,0.2,2000000,40000",  # 40000.5, to even
-        "-native-smoe-steady-t0.0002,20.0,0.75,,2000000,40000", ""]  # Alex's LPIPS may not stand there
 
 
 @pytest.mark.parametrize("name, value", [("background", "white"), ("image_size", [96, 64]), ("split", "none"),

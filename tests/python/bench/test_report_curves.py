@@ -32,26 +32,6 @@ def test_a_curve_goes_through_the_means_from_few_gaussians_to_many():
     assert whisker[1, 1] - whisker[0, 1] == pytest.approx(2 * 2 ** 0.5)  # seeds 20 and 22: sd is the root of 2
 
 
-def test_bars_are_the_means():
-    entries = [row(train_seconds=100.0), row(seed=1, train_seconds=140.0), row(blend_mode="smoe", train_seconds=90.0),
-               row(threshold=0.0002, fps=50.0), failed(blend_mode="smoe", threshold=0.0002)]
-    train, fps = curves.bars([group for group in groups_of(entries) if group.rows]).axes
-    assert [bar.get_height() for bar in train.patches] == [120, 90, 100]
-    assert [bar.get_height() for bar in fps.patches] == [200, 200, 50]
-    assert [label.get_text() for label in fps.get_xticklabels()] == ["0.005", "0.0002"]
-    colors = [bar.get_facecolor() for bar in train.patches]
-    assert colors[0] == colors[2] != colors[1]
-
-
-def test_bars_are_of_cells_that_had_their_gpu_alone():
-    two = {"device": "Card X", "cells_per_gpu": 2}
-    entries = [row(), row(seed=1, train_seconds=900.0, machine=two), row(blend_mode="smoe", fps=1.0, machine=two)]
-    drawn = curves.bars(groups_of(entries))
-    assert [[bar.get_height() for bar in axis.patches] for axis in drawn.axes] == [[100], [200]]
-    assert [text.get_text() for text in drawn.legends[0].get_texts()] == ["native, alpha"]
-    assert curves.bars(groups_of(entries[2:])) is None
-
-
 def test_what_has_no_place_on_an_axis_is_left_out():
     entries = [row(psnr=float("inf")), row(threshold=0.002, num_gaussians=0), row(threshold=0.001, num_gaussians=7)]
     psnr = curves.rate_distortion(groups_of(entries)).axes[0]
@@ -60,12 +40,11 @@ def test_what_has_no_place_on_an_axis_is_left_out():
     assert curves.rate_distortion(groups_of(nothing)) is None
 
 
-@pytest.mark.parametrize("draw", [curves.rate_distortion, curves.bars])
-def test_the_legend_lies_inside_and_above_the_panels(draw):
+def test_the_legend_lies_inside_and_above_the_panels():
     entries = [row(blend_mode=mode, label=f"{'a long name of method ' * 2}{method}", schedule="steady",
                    threshold=threshold)
                for mode in ("alpha", "smoe") for method in range(4) for threshold in (0.005, 0.0002)]
-    drawn = draw(groups_of(entries))
+    drawn = curves.rate_distortion(groups_of(entries))
     drawn.canvas.draw()
     box = drawn.legends[0].get_window_extent()
     assert box.x0 >= 0 and box.x1 <= drawn.bbox.x1 and box.y1 <= drawn.bbox.y1

@@ -7,11 +7,12 @@ import re
 import shutil
 
 import pytest
+from PIL import Image
 from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images, write_rows
 
 pytest.importorskip("matplotlib", reason="a report needs matplotlib")
 pytest.importorskip("jinja2", reason="a report needs jinja2")
-from diff_smoe_rasterization.benchmarks.suite.report import ReportError, report, sliders, survey  # noqa: E402
+from diff_smoe_rasterization.benchmarks.suite.report import ReportError, images, report  # noqa: E402
 from diff_smoe_rasterization.trainer.errors import TrainerError  # noqa: E402
 
 
@@ -40,9 +41,7 @@ def test_everything_is_written(written):
     for form in ("md", "csv", "tex"):
         names = {path.stem for path in (written / "tables").glob(f"*.{form}")}
         assert names == {f"table1_{name}" for name in ("table1", "deltas", "cells", "failures")}
-    assert {path.name for path in (written / "figures").iterdir()} == {
-        f"table1-bonsai-{kind}{end}" for kind in ("rd", "time") for end in (".png", "-light.svg", "-dark.svg")}
-    assert (written / "survey" / "table1" / "MipNeRF360" / "bonsai.csv").is_file()
+    assert {path.name for path in (written / "figures").iterdir()} == {"table1-bonsai-rd.png", "table1-bonsai-rd.svg"}
 
 
 def test_the_page_loads_nothing_but_its_own_files(written):
@@ -51,9 +50,8 @@ def test_the_page_loads_nothing_but_its_own_files(written):
     files = [name for name in references if not name.startswith(("#", "data:"))]
     assert files and all((written / name).is_file() for name in files)
     assert not re.search(r"@import|url\(|https?://", re.sub(r"data:[^\"]*", "", text))
-    layers = set(re.findall(r'"path": "([^"]+)"', text))
-    assert len(layers) == 13  # two views of truth, two renderings, two errors; one view of truth, rendering, error
-    assert all((written / name).is_file() for name in layers)
+    # Of two views the truth, two renderings, two errors; of another the truth, its rendering and error; each is a link.
+    assert len(set(files)) == 13
 
 
 def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypatch, no_figures):
@@ -64,7 +62,7 @@ def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypat
         return {path.relative_to(output).as_posix(): path.read_bytes() for path in output.rglob("*") if path.is_file()}
 
     before = files()
-    monkeypatch.setattr(survey, "write_survey", lambda *_: 1 / 0)  # after tables and images
+    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.report._page", lambda *_: 1 / 0)  # written last
     with pytest.raises(ZeroDivisionError):
         report(write_rows(tmp_path / "results", [row("fox")]), str(output))
     assert files() == before
@@ -89,23 +87,20 @@ def test_cells_without_a_row_are_named(tmp_path, no_figures):
         "2 cells on 1 scene, 2 seeds; none failed.")
 
 
-def test_what_is_of_others_is_left_alone(tmp_path, no_figures):
+def test_what_is_of_others_is_left_alone_and_what_is_of_an_earlier_report_goes(tmp_path, no_figures):
     results, report_folder = write_rows(tmp_path / "results", [row()]), tmp_path / "report"
     (tmp_path / "file").touch()
     with pytest.raises(TrainerError, match="file: nothing can be written there .* choose another folder with -o"):
         report(results, str(tmp_path / "file"))
     (report_folder / "images").mkdir(parents=True)
-    with pytest.raises(ReportError, match="images is of no report"):
+    with pytest.raises(TrainerError, match="is not empty .images., and nothing says that dsmoe bench report wrote it"):
         report(results, str(report_folder))
     (report_folder / "images").rmdir()
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / "mine.txt").touch()
     report(results, str(report_folder))
-    shutil.rmtree(report_folder / "tables")
-    (report_folder / "tables").symlink_to(tmp_path / "elsewhere")
-    report(results, str(report_folder))
-    assert not (report_folder / "tables").is_symlink() and list((report_folder / "tables").iterdir())
-    assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["mine.txt"]
+    (report_folder / "mine.txt").touch()
+    report(write_rows(tmp_path / "others", [row(suite="other")]), str(report_folder))
+    assert {path.name for path in (report_folder / "tables").glob("*.md")} == {"other_cells.md", "other_table1.md"}
+    assert (report_folder / "mine.txt").is_file()
 
 
 def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path, no_figures):
@@ -126,18 +121,18 @@ def test_what_is_left_out_is_said(tmp_path, no_figures):
             f"in 2 others of bonsai: {other['cell']}.") in (tmp_path / "report" / "report.md").read_text("utf-8")
 
 
-def test_renderings_are_copied_byte_for_byte(tmp_path):
+def test_renderings_stay_as_they_are_and_have_their_decibels(tmp_path):
     entry = row(blend_mode="smoe", background_gate=0.05)
     write_images(tmp_path / "results", entry, ALPHA, names=("a b",))
-    found = sliders.collect(str(tmp_path / "results"), "s u", [entry], str(tmp_path))
-    view, = found[0]["settings"][0]["views"]
-    truth, gated, error = view["layers"]
-    source = tmp_path / "results" / "cells" / entry["cell"] / "images"
-    for layer, kind in ((truth, "gt"), (gated, "render")):
-        assert (tmp_path / layer["path"]).read_bytes() == (source / kind / "a b.png").read_bytes()
-    assert " " not in truth["path"] + gated["path"] + error["path"]
+    (setting,) = images.collect(str(tmp_path / "results"), "s u", [entry], str(tmp_path))
+    (view,) = setting["views"]
     # One of three channels is off by 80 of 255: 10 log10(3 (255 / 80)^2)
-    assert gated["note"] == error["note"] == "14.84 dB"
+    assert [image["label"] for image in view["images"]] == [
+        "ground truth", "smoe 0.05, 14.84 dB", "error of smoe 0.05"]
+    for image, color in zip(view["images"], (TRUTH, ALPHA)):
+        assert " " not in image["path"]
+        with Image.open(tmp_path / image["path"]) as picture:
+            assert picture.size == (48, 32) and picture.getcolors() == [(48 * 32, color)]
 
 
 @pytest.mark.parametrize("changes", [{"truth": (99, 100, 100)}, {"size": (32, 48)}])
@@ -146,4 +141,4 @@ def test_images_of_different_truths_are_refused(tmp_path, changes):
     write_images(tmp_path, entries[0], ALPHA)
     write_images(tmp_path, entries[1], SMOE, **changes)
     with pytest.raises(ReportError, match="cannot be compared"):
-        sliders.collect(str(tmp_path), "table1", entries, str(tmp_path / "report"))
+        images.collect(str(tmp_path), "table1", entries, str(tmp_path / "report"))

@@ -1,19 +1,16 @@
 """The engine of the patches: what is planned, written, kept and put back, and when not."""
 from __future__ import annotations
 
-import functools
 import os
 import shutil
-import signal
 import sys
-import tempfile
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
-from checkouts import RECORD, changed_files, contents  # noqa: E402
+from checkouts import RECORD, contents  # noqa: E402
 from tiny import ARGS, CHECKOUT, GR, PATCHED, RENDER, TRAIN, make, refused  # noqa: E402
 
 from diff_smoe_rasterization import patches  # noqa: E402
@@ -28,11 +25,11 @@ def test_only_the_statements_change(tmp_path):
     text = patches.diff(make(tmp_path))
     before = contents(tmp_path)
     assert "+    pipe.blend = blend_of(dataset)\n" in text and "No newline at end of file" in text
-    assert patches.check(tmp_path) == "patchable" and patches.check(tmp_path).trainer == "3dgs-2023"
+    assert patches.check(tmp_path)[1:3] == ("patchable", "3dgs-2023")
     assert patches.apply(tmp_path).written and not patches.apply(tmp_path).written
     for name, expected in PATCHED.items():
         assert (tmp_path / name).read_text() == expected, name
-    assert patches.check(tmp_path) == "patched" and patches.diff(tmp_path) == text
+    assert patches.check(tmp_path).state == "patched" and patches.diff(tmp_path) == text
     patches.revert(tmp_path)
     assert contents(tmp_path) == before
 
@@ -83,7 +80,7 @@ def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
 
 def test_a_patch_by_hand_is_half_or_whole(tmp_path):
     whole = make(tmp_path / "whole", PATCHED)
-    assert patches.check(whole) == "patched" and not patches.apply(whole).written
+    assert patches.check(whole).state == "patched" and not patches.apply(whole).written
     refused(whole, ".dsmoe_patch", call=patches.revert)
     refused(whole, "checkpoint-load is not applied", modernise=True)
     half = make(tmp_path / "half", {**PATCHED, "train.py": TRAIN})
@@ -91,77 +88,49 @@ def test_a_patch_by_hand_is_half_or_whole(tmp_path):
     refused(half, "there is no .dsmoe_patch", call=patches.revert)
 
 
-def in_a_fork(action):
-    """Runs action in a copy of this process; returns 0, 1 where it raised, or minus the signal that ended it."""
-    child = os.fork()
-    if child == 0:
-        try:
-            action()
-            os._exit(0)
-        except BaseException as error:
-            print(error, file=sys.stderr)
-            os._exit(1)
-    status = os.waitpid(child, 0)[1]
-    return os.WEXITSTATUS(status) if os.WIFEXITED(status) else -os.WTERMSIG(status)
+class Killed(BaseException):
+    """Nothing of the program runs after it."""
 
 
-def killed_at(step, action):
-    """Runs action in a fork that is killed before its `step`-th replacement of a file; returns whether it was."""
-    def run():
-        count, replace = [0], os.replace
+def failing_at(step, error, monkeypatch):
+    """Raises an error in place of the step-th writing of a file, once; returns the list of files that were written."""
+    written, write = [], Path.write_bytes
 
-        def counted(*arguments):
-            if count[0] == step:
-                os.kill(os.getpid(), signal.SIGKILL)
-            count[0] += 1
-            return replace(*arguments)
+    def counted(path, data):
+        written.append(path)
+        if len(written) == step:
+            raise error
+        return write(path, data)
 
-        os.replace = counted
-        action()
-
-    status = in_a_fork(run)
-    assert status in (0, -signal.SIGKILL)
-    return status != 0
+    monkeypatch.setattr(Path, "write_bytes", counted)
+    return written
 
 
-@pytest.mark.parametrize("begin, action, interruptions", [
-    (lambda path: None, patches.apply, 5), (patches.apply, patches.revert, 5),
-    pytest.param(patches.apply, lambda path: patches.apply(path, modernise=True), 10, marks=pytest.mark.slow)])
-def test_a_kill_leaves_what_can_be_finished_or_put_back(tmp_path, begin, action, interruptions):
-    before = contents(make(tmp_path / "fresh"))
-    whole = {True: None, False: None}
-    for modernise in whole:
-        patches.apply(shutil.copytree(tmp_path / "fresh", tmp_path / f"whole {modernise}"), modernise=modernise)
-        whole[modernise] = contents(tmp_path / f"whole {modernise}", record=False)
-    begin(shutil.copytree(tmp_path / "fresh", tmp_path / "begun"))
-    for step in range(interruptions + 1):
-        torn = shutil.copytree(tmp_path / "begun", tmp_path / f"torn {step}")
-        assert killed_at(step, functools.partial(action, torn)) == (step < interruptions), step
-        for file in changed_files(before, contents(torn, record=False)):
-            assert (torn / file).read_bytes() in [files[file][1] for files in whole.values()], "neither old nor new"
-        if step == interruptions:
-            return
-        finished = shutil.copytree(torn, tmp_path / f"finished {step}")
-        patches.apply(finished)
-        assert contents(finished, record=False) in whole.values()
-        for path in (finished, torn):
-            if contents(path) != before:
-                patches.revert(path)
-            assert contents(path) == before
+# A record has two copies of each of four files; then the files are written.
+@pytest.mark.parametrize("begin, options, step", [
+    *((False, {}, step) for step in (1, 6, 9, 10, 12)), (True, {}, 2), (True, {}, 4), (True, {"modernise": True}, 1),
+    (True, {"modernise": True}, 3), (True, {"modernise": True}, 8), (True, {"modernise": True}, 14)])
+def test_a_kill_leaves_what_can_be_finished_or_put_back(tmp_path, monkeypatch, begin, options, step):
+    checkout = make(tmp_path / "checkout")
+    before = contents(checkout)
+    if begin:
+        patches.apply(checkout)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        failing_at(step, Killed(), patch)
+        patches.apply(checkout, **options) if options or not begin else patches.revert(checkout)
+    finished = shutil.copytree(checkout, tmp_path / "finished")
+    patches.apply(finished, **options)
+    assert patches.check(finished).state == "patched" and not patches.apply(finished, **options).written
+    for path in (checkout, finished):
+        if contents(path) != before:
+            patches.revert(path)
+        assert contents(path) == before
 
 
-@pytest.mark.parametrize("failing", ["train.py", RECORD])
-def test_a_full_disk_changes_nothing(tmp_path, monkeypatch, failing):
+@pytest.mark.parametrize("step", [1, 8, 10])
+def test_a_full_disk_or_a_file_that_may_not_be_written_changes_nothing(tmp_path, monkeypatch, step):
     make(tmp_path)
-    replace, calls = os.replace, []
-
-    def full(source, target):
-        calls.append(target)
-        if str(target) == str(tmp_path / failing) and calls.count(target) == 1:
-            raise OSError(28, "No space left on device")
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", full)
+    failing_at(step, OSError(28, "No space left on device"), monkeypatch)
     refused(tmp_path, "cannot be written, so all was put back: [Errno 28]")
 
 
@@ -187,37 +156,25 @@ def test_an_edit_is_neither_overwritten_nor_lost(tmp_path):
                      ("first_iter\n", "first_iter\n\n\nprint()\n")):
         text, mine = new.join(text.rsplit(old, 1)), new.join(mine.rsplit(old, 1))
     (tmp_path / "train.py").write_text(text)
-    verdict = patches.check(tmp_path)  # every rule is applied
-    assert verdict == "patched" and verdict.reasons[1].startswith("train.py: was edited since")
+    planned = patches.check(tmp_path)  # every rule is applied
+    assert planned.state == "patched" and planned.reasons[1].startswith("train.py: was edited since")
     assert not patches.apply(tmp_path).written
     refused(tmp_path, "train.py: was changed since it was patched: undo your edit", modernise=True)
-    names = patches.revert(tmp_path)
-    assert names.edited == ("train.py",) and set(names) == set(PATCHED)
+    files = patches.revert(tmp_path)
+    assert set(files) == set(PATCHED) and [name for name, is_edited in files.items() if is_edited] == ["train.py"]
     assert contents(tmp_path) == {**before, "train.py": (before["train.py"][0], mine.encode())}
 
 
 @pytest.mark.parametrize("old, new, words", [
     ("blend_of(dataset)", "blend_of(other)", [
-        "train.py: you have edited what the patch wrote", "\n  -    pipe.blend = blend_of(dataset)",
-        "\n  +    pipe.blend = blend_of(other)"]),
+        "train.py: you have edited what the patch wrote", "\n-    pipe.blend = blend_of(dataset)",
+        "\n+    pipe.blend = blend_of(other)", "copy what lies in .dsmoe_patch/originals over the checkout"]),
     ("    pipe.blend", "    if 1:\n        pipe.blend", ["train.py: you have edited"]),
-    ("    pipe.blend", "    if 1:\n      \\\n    pipe.blend", ["train.py: your edit needs statements of the patch"])])
+    ("    pipe.blend", "    if 1:\n      \\\n    pipe.blend", ["train.py: you have edited what the patch wrote, or"])])
 def test_an_edit_of_the_patchs_own_lines_is_shown(tmp_path, old, new, words):
     patches.apply(make(tmp_path))
     (tmp_path / "train.py").write_text((tmp_path / "train.py").read_text().replace(old, new))
     refused(tmp_path, "nothing was touched", *words, call=patches.revert)
-
-
-def test_the_way_out_of_an_edit_is_the_one_that_is_named(tmp_path):
-    """Where the record has no copy of the patched file, by which edits could be told apart."""
-    original = contents(make(tmp_path))
-    patches.apply(tmp_path)
-    (tmp_path / "train.py").write_text((tmp_path / "train.py").read_text() + "# mine\n")
-    shutil.rmtree(tmp_path / RECORD / "patched")
-    refused(tmp_path, "copy what lies in .dsmoe_patch/originals over the checkout", call=patches.revert)
-    shutil.copytree(tmp_path / RECORD / "originals", tmp_path, dirs_exist_ok=True)
-    shutil.rmtree(tmp_path / RECORD)
-    assert contents(tmp_path) == original
 
 
 def test_a_patch_by_rules_of_before_is_known_and_brought_up_to_date(tmp_path):
@@ -226,11 +183,11 @@ def test_a_patch_by_rules_of_before_is_known_and_brought_up_to_date(tmp_path):
     former = {name: text.replace("**pipe.blend,", "blend_mode=pipe.blend_mode,").replace(".blend = ", ".blend_mode = ")
               for name, text in PATCHED.items()}
     Record.make(tmp_path, *({name: text.encode() for name, text in texts.items()} for texts in (CHECKOUT, former)),
-                {"version": "0", "trainer": "3dgs-2023", "options": []})
+                version="0", trainer="3dgs-2023", options=[])
     make(tmp_path, former)
-    verdict = patches.check(tmp_path)
-    assert verdict == "patched" and verdict.reasons[0] == "by version 0"
-    assert f"to bring it up to date, type: dsmoe patch apply {tmp_path}" in verdict.reasons[1]
+    planned = patches.check(tmp_path)
+    assert planned.state == "patched" and planned.reasons[0] == "by version 0"
+    assert f"to bring it up to date, type: dsmoe patch apply {tmp_path}" in planned.reasons[1]
     assert patches.apply(tmp_path).written and not patches.apply(tmp_path).written
     assert all((tmp_path / name).read_text() == text for name, text in PATCHED.items())
     patches.revert(tmp_path)
@@ -249,11 +206,11 @@ def test_a_record_of_which_no_file_is_patched_any_more_is_no_hindrance(tmp_path,
     patches.apply(checkout)
     come_back(checkout)
     shutil.copytree(checkout, reverted)
-    verdict = patches.check(checkout)
-    assert verdict == "patchable" and "no file is patched any more" in verdict.reasons[0]
-    assert patches.apply(checkout).written and patches.check(checkout) == "patched"
+    planned = patches.check(checkout)
+    assert planned.state == "patchable" and "no file is patched any more" in planned.reasons[0]
+    assert patches.apply(checkout).written and patches.check(checkout).state == "patched"
     patches.revert(checkout)
-    assert patches.revert(reverted) == () and contents(checkout) == contents(reverted)
+    assert patches.revert(reverted) == {} and contents(checkout) == contents(reverted)
 
 
 def test_what_is_patched_beside_replaced_files_is_put_back(tmp_path):
@@ -264,25 +221,25 @@ def test_what_is_patched_beside_replaced_files_is_put_back(tmp_path):
     assert (tmp_path / setup).read_text() == "flags = ['-O2']\n"
     another_commit(tmp_path)
     refused(tmp_path, "half-patched", "train.py: was changed since, and is not patched any more; `revert` leaves it")
-    assert patches.revert(tmp_path) == (setup,) and not (tmp_path / RECORD).exists()
+    assert patches.revert(tmp_path) == {setup: False} and not (tmp_path / RECORD).exists()
     assert "c++14" in (tmp_path / setup).read_text() and "a later version" in (tmp_path / "train.py").read_text()
 
 
 def test_a_file_that_was_restored_is_patched_again_and_one_that_was_removed_is_reported(tmp_path):
     patches.apply(make(tmp_path))
     (tmp_path / "train.py").write_text(TRAIN)
-    verdict = patches.check(tmp_path)
-    assert verdict == "half-patched" and verdict.reasons[0].startswith("train.py: is not patched, or not any more")
-    assert patches.apply(tmp_path).written and patches.check(tmp_path) == "patched"
+    planned = patches.check(tmp_path)
+    assert planned.state == "half-patched" and planned.reasons[0].startswith("train.py: is not patched, or not any")
+    assert patches.apply(tmp_path).written and patches.check(tmp_path).state == "patched"
     (tmp_path / "train.py").unlink()
     refused(tmp_path, "train.py: was removed since", call=patches.revert)
 
 
 def test_a_damaged_record_is_no_ground_to_write(tmp_path):
     patches.apply(make(tmp_path))
-    (tmp_path / RECORD / "originals/train.py").write_text("something else")
+    (tmp_path / RECORD / "originals/train.py").unlink()
     for call in (patches.apply, patches.revert, patches.check):
-        refused(tmp_path, "manifest.json", "the original of train.py", call=call)
+        refused(tmp_path, "manifest.json: the record of the patch is damaged", "has lost files", call=call)
 
 
 def test_modes_owners_and_links_stay(tmp_path):
@@ -301,27 +258,6 @@ def test_modes_owners_and_links_stay(tmp_path):
     assert contents(tmp_path / "moved") == before
 
 
-@pytest.mark.parametrize("locked, word", [
-    ("gaussian_renderer", "gaussian_renderer is read-only"), ("render.py", "render.py: is read-only"),
-    (".", "is read-only; make it writable first")])
-def test_what_may_not_be_written_is_refused(locked, word):
-    """In a folder that `nobody` can reach, who root becomes: nothing is read-only for root."""
-    with tempfile.TemporaryDirectory() as above:
-        os.chmod(above, 0o755)
-        checkout = make(Path(above) / "checkout")
-        for path in (checkout, *checkout.rglob("*")) if os.geteuid() == 0 else ():
-            os.chown(path, NOBODY, NOBODY)
-        (checkout / locked).chmod(0o555)
-
-        def apply():
-            if os.geteuid() == 0:
-                os.setuid(NOBODY)
-            refused(checkout, word)
-
-        assert in_a_fork(apply) == 0
-        (checkout / locked).chmod(0o755)
-
-
 def test_a_link_out_of_the_checkout_is_refused(tmp_path):
     folder = make(tmp_path / "checkout", {"render.py": None})
     (tmp_path / "render.py").write_text(RENDER)
@@ -330,7 +266,6 @@ def test_a_link_out_of_the_checkout_is_refused(tmp_path):
 
 
 SCRIPTS = {  # of the user's own: text, what is said of it
-    "../refine/model.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
     "tools/own.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
     "tools/deep/own.py": ("from diff_gaussian_rasterization._C import mark_visible\n", "imports the original"),
     "whole.py": ("import diff_gaussian_rasterization as dgr\n", "imports the original"),
@@ -351,7 +286,7 @@ SCRIPTS = {  # of the user's own: text, what is said of it
 
 
 def test_scripts_that_keep_the_original_or_have_no_mode_are_named(tmp_path):
-    tmp_path = make(tmp_path / "bundled", {**{name: text for name, (text, _) in SCRIPTS.items()},
+    tmp_path = make(tmp_path / "checkout", {**{name: text for name, (text, _) in SCRIPTS.items()},
                                            "train.py": "from lib import film\n" + TRAIN})
     for _ in range(2):  # before the patch, and when it is there
         notes = {note.partition(": ")[0]: note for note in patches.plan(tmp_path).notes}
@@ -394,8 +329,7 @@ def test_what_is_typed_wrongly_shows_the_usage(tmp_path, dsmoe, monkeypatch):
 
 
 def test_the_readme_has_every_trainer_rule_and_state():
-    from diff_smoe_rasterization.patches.optional import OPTIONS
-    from diff_smoe_rasterization.patches.patch import rules_of
+    from diff_smoe_rasterization.patches.rules import ON_REQUEST, rules_of
     from diff_smoe_rasterization.patches.trainers import TRAINERS
 
     text = (Path(__file__).resolve().parents[3] / "patches" / "README.md").read_text()
@@ -404,5 +338,5 @@ def test_the_readme_has_every_trainer_rule_and_state():
         assert f"`{trainer.flavour}`" in cells[trainer.name]
         assert {rule.name for rule in rules_of(trainer)} <= set(cells)
         assert all(f"`{rule.function}`" in cells[trainer.name] for rule in trainer.entries)
-    assert {rule.name for rules in OPTIONS.values() for rule in rules} <= set(cells)
+    assert {rule.name for rules in ON_REQUEST.values() for rule in rules} <= set(cells)
     assert all(state in text for state in engine.STATES)

@@ -5,11 +5,10 @@ import pytest
 
 cst = pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
-from diff_smoe_rasterization.patches.codemods import Found  # noqa: E402
-from diff_smoe_rasterization.patches.optional import OPTIONS  # noqa: E402
+from diff_smoe_rasterization.patches.rules import ON_REQUEST  # noqa: E402
 from diff_smoe_rasterization.patches.trainers import RUNTIME  # noqa: E402
 
-RULES = {rule.name: rule for rules in OPTIONS.values() for rule in rules}
+RULES = {rule.name: rule for rules in ON_REQUEST.values() for rule in rules}
 BEFORE_AND_AFTER = [
     ("checkpoint-load", "a = torch.load(path)  # all\n", "a = torch.load(path, weights_only=False)  # all\n"),
     ("checkpoint-load", "torch.load(\n    path,\n)\n", "torch.load(\n    path, weights_only=False,\n)\n"),
@@ -74,6 +73,7 @@ BEFORE_AND_AFTER = [
     ("fused-adam", "from .mine import Adam as FusedAdam\na = FusedAdam(torch.optim.Adam(l))\n", None),
     ("fused-adam", "torch.optim.Adam(l, lr=0.0, weight_decay=0.1)\ntorch.optim.AdamW(l)\n", None),
     ("fused-adam", "torch.optim.Adam(l, lr=0.0, fused=True)\n", None),
+    ("fused-adam", "from . import FusedAdam\na, b = FusedAdam(l), torch.optim.Adam(m)\n", None),
     ("fused-adam", "torch.optim.Adam(l, 0.1, (0.9, 0.99), 1e-8, 0.01)\n", None),
     ("fused-adam", "torch.optim.Adam(l, **options)\ntorch.optim.Adam(*arguments)\n", None),
 ]
@@ -81,20 +81,11 @@ BEFORE_AND_AFTER = [
 
 @pytest.mark.parametrize("name, before, after", BEFORE_AND_AFTER)
 def test_what_a_rule_changes(name, before, after):
-    assert RULES[name].looks_at(before.encode())
-    found, again = Found(), Found()
-    tree = RULES[name].codemod(cst.parse_module(before), found)
-    assert tree.code == (before if after is None else after)
-    assert found.pending == (after is not None)
-    RULES[name].codemod(tree, again)
-    assert again.pending == 0  # by which it is seen that a rule is applied
-
-
-def test_calls_of_another_function_by_our_name_are_none_of_ours():
-    tree = cst.parse_module("from . import FusedAdam\na, b = FusedAdam(l), torch.optim.Adam(m)\n")
-    found = Found()
-    RULES["fused-adam"].codemod(tree, found)
-    assert found == Found(pending=0, done=0, misfits=0)
+    rule = RULES[name]
+    assert any(hint in before for hint in rule.hints)
+    changed = rule.change(cst.parse_module(before))
+    assert (changed and changed.code) == after
+    assert changed is None or rule.change(changed) is None  # it is not applied twice
 
 
 def test_every_rule_is_tried_above():

@@ -35,7 +35,7 @@ def test_each_trainer_is_recognised_patched_and_put_back(name, tmp_path):
     before = contents(checkout)
     only_statements_change(patches.diff(checkout))
     planned = patches.apply(checkout, modernise=True)
-    assert planned.verdict == "patchable" and planned.verdict.trainer == name
+    assert (planned.state, planned.trainer) == ("patchable", name)
     changed = changed_files(before, contents(checkout, record=False))
     assert {*ENTRIES[name], GR, "arguments/__init__.py"} <= changed == {change.name for change in planned.changes}
     for file in changed:
@@ -45,7 +45,7 @@ def test_each_trainer_is_recognised_patched_and_put_back(name, tmp_path):
     assert texts[GR].count("**pipe.blend,") == texts[GR].count("GaussianRasterizationSettings(")
     for file, functions in ENTRIES[name].items():
         assert len(re.findall(r"\.blend = (saved_)?blend_of\(", texts[file])) == len(functions)
-    assert patches.check(checkout) == "patched"
+    assert patches.check(checkout).state == "patched"
     patches.revert(checkout)
     assert contents(checkout) == before
 
@@ -58,8 +58,8 @@ def test_in_public_checkouts_only_the_statements_change(name):
         pytest.skip(f"DSMOE_TRAINERS names no folder with a public checkout {name}")
     before = contents(folder)
     only_statements_change(patches.diff(folder))
-    found = {rule.rule: rule.files for rule in patches.inspect(folder, fuse=True).requested}
-    assert found == {"fused-loss": ("utils/loss_utils.py",), "fused-adam": ("scene/gaussian_model.py",)}
+    found = {rule.name: files for (_, rule), files in patches.check(folder, fuse=True).requested.items()}
+    assert found == {"fused-loss": ["utils/loss_utils.py"], "fused-adam": ["scene/gaussian_model.py"]}
     assert contents(folder) == before
 
 
@@ -96,7 +96,7 @@ def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, res
     renderer = renderer.replace(ONE_LINE, BY_NAME.format(results))
     make(tmp_path, {GR: renderer, "train.py": train, "scene/gaussian_model.py": ""})
     if trainer:
-        assert patches.apply(tmp_path).verdict.trainer == trainer and patches.check(tmp_path) == "patched"
+        assert patches.apply(tmp_path).trainer == trainer and patches.check(tmp_path).state == "patched"
         return
     refused(tmp_path, "unknown", "kernel_size" if "kernel_size" in renderer else f"its rasterizer returns {count} ")
 
@@ -112,7 +112,7 @@ def prefilter_voxel(camera, pc, pipe):
     rendering = "\n\ndef render_sets(dataset, iteration, pipeline):\n    return render(None, None, pipeline, None)\n"
     make(tmp_path, {GR: RENDERER + visible, "train.py": TRAIN + rendering, "render.py": RENDER})
     planned = patches.apply(tmp_path)
-    assert planned.verdict.trainer == "scaffold-gs" and planned.notes == ()
+    assert planned.trainer == "scaffold-gs" and planned.notes == ()
     assert (tmp_path / GR).read_text().count("**pipe.blend,") == 2
     for name, count in (("train.py", 2), ("render.py", 1)):
         assert len(re.findall(r"\.blend = (saved_)?blend_of\(dataset\)", (tmp_path / name).read_text())) == count

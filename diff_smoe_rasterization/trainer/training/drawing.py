@@ -1,0 +1,17 @@
+"""Rows that are drawn by weights, of any number of rows."""
+from __future__ import annotations
+
+import torch
+
+MOST_ROWS = 2 ** 24  # of which torch.multinomial draws
+
+
+def draw(weights: torch.Tensor, count: int, replacement: bool = False) -> torch.Tensor:
+    """Returns rows [count], drawn by weights [N] of at least 0; without replacement count of them must be above 0."""
+    if len(weights) <= MOST_ROWS:
+        return torch.multinomial(weights, count, replacement=replacement)
+    if not replacement:  # Efraimidis and Spirakis 2006: each row waits for a time of its rate; the first ones are drawn
+        return torch.topk(weights / torch.empty_like(weights).exponential_(), count).indices
+    sums = weights.double().cumsum(0)
+    places = torch.rand(count, dtype=sums.dtype, device=sums.device) * sums[-1]
+    return torch.searchsorted(sums, places, right=True)
