@@ -13,13 +13,16 @@ from .settings import BLEND_MODES, OUTPUTS, Contributions, GaussianRasterization
 
 _HOMES = {"build_info": "extension", "set_profiling": "extension", "stage_times": "extension", "fused_ssim": "losses",
           "distCUDA2": "neighbors", "FusedAdam": "optimizers", "SparseGaussianAdam": "optimizers",
+          "LazyAdam": "lazy_adam", "DirectRendering": "direct",
           "GaussianRasterizer": "rasterizer", "rasterize": "rasterizer", "rasterize_gaussians": "rasterizer",
           "rasterize_with_splats": "rasterizer", "settings_from_camera": "camera", "Splats": "splats",
           "visible_radii": "rasterizer"}
 
 if TYPE_CHECKING:
     from .camera import settings_from_camera
+    from .direct import DirectRendering
     from .extension import build_info, set_profiling, stage_times
+    from .lazy_adam import LazyAdam
     from .losses import fused_ssim
     from .neighbors import distCUDA2
     from .optimizers import FusedAdam, SparseGaussianAdam
@@ -59,7 +62,7 @@ _beside = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
 if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",), ("build_support", "backend.py"))):
     __path__.append(_beside)
 
-__all__ = ["BLEND_MODES", "Contributions", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer",
-           "Importance", "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info",
+__all__ = ["BLEND_MODES", "Contributions", "DirectRendering", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer",
+           "Importance", "LazyAdam", "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info",
            "distCUDA2", "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
            "settings_from_camera", "stage_times", "visible_radii"]

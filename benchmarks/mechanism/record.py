@@ -141,6 +141,8 @@ def watched(strategy: ThreeDGSStrategy, recorder: Recorder) -> ThreeDGSStrategy:
     """The same strategy, not yet begun, that tells a recorder before and after each of its acts."""
 
     class Watched(type(strategy)):  # type: ignore[misc]
+        uses_gradients = True
+
         def after_backward(self, step: Step) -> None:
             recorder.before_change(step)
             super().after_backward(step)

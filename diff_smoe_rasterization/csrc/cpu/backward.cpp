@@ -64,6 +64,7 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& want
     std::vector<double> wide(record);
     CameraGradient<S>* share = camera_shares.empty() ? nullptr : &camera_shares[begin / kChunk];
     for (int64_t i = begin; i < end; ++i) {
+      if (gradients.seen_only && images.radii[i] <= 0) continue;
       store_zeros(gradients, config.num_channels, inputs.num_sh, i);
       const int64_t first = saved.instance_offsets[i], count = saved.instance_offsets[i + 1] - first;
       if (count == 0) continue;

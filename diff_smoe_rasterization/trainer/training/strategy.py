@@ -44,7 +44,7 @@ class Step:
     iteration: int  # counts from 1
     camera: Camera
     rendering: Rendering
-    means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H)
+    means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H) where radii > 0
     loss: torch.Tensor
 
 
@@ -54,6 +54,8 @@ class Strategy:
     Hooks run in this order in each step; rows may be added or removed in the last two (through the optimizer), which
     the last iteration of a run leaves out.
     """
+
+    uses_gradients = False  # whether after_backward reads or changes the .grad of parameters, which else have none
 
     def __init__(self, context: StrategyContext) -> None:
         """May change the first Gaussians; a resumed run replaces them and loads the state."""
