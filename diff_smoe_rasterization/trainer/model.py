@@ -164,9 +164,24 @@ class GaussianOptimizer:
 
     def keep(self, mask: torch.Tensor) -> None:
         """Removes the Gaussians where mask [N] (bool) is False."""
-        kept = mask.nonzero().squeeze(1)  # on a GPU the host waits here, once for all tensors
+        self.take(mask.nonzero().squeeze(1))  # on a GPU the host waits here, once for all tensors
+
+    def take(self, rows: torch.Tensor, new: Optional[Dict[str, torch.Tensor]] = None) -> None:
+        """Puts these rows of Gaussians in place of all, in one pass over memory.
+
+        new: raw parameters of the last ones, where they differ from those of their rows. As many of the last ones begin
+        without moments.
+        """
+        def edit(tensor: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+            taken = tensor.index_select(0, rows)
+            taken[len(taken) - len(last):] = last
+            return taken
+
+        new = new or {}
+        count = max((len(values) for values in new.values()), default=0)
         for name in PARAMETERS:
-            self._replace(name, lambda tensor, _: tensor.index_select(0, kept), self.model.raw[name].new_zeros(0))
+            like = self.model.raw[name]
+            self._replace(name, edit, new.get(name, like.new_zeros(0, *like.shape[1:])), like.new_zeros(count, *like.shape[1:]))
 
     def set_opacity_logits(self, logits: torch.Tensor) -> None:
         """Sets all opacity logits [N, 1] and forgets their moments."""
@@ -199,8 +214,10 @@ class GaussianOptimizer:
             self._replace(name, lambda _, new: new.clone(), raw[name])
 
     def _replace(self, name: str, edit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
-                 rows: torch.Tensor) -> None:
-        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros like rows) in place of its moments.
+                 rows: torch.Tensor, zeros: Optional[torch.Tensor] = None) -> None:
+        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros) in place of its moments.
+
+        zeros: by default like `rows`.
 
         The new leaf has no gradient, so the current step leaves it alone: as in 3DGS, where an iteration that
         densifies steps nothing and one that resets opacities steps all but them.
@@ -209,7 +226,7 @@ class GaussianOptimizer:
         new = edit(old.detach(), rows.detach()).contiguous().requires_grad_()
         state = self.adam.state.pop(old, None)
         if state is not None:
-            zeros = torch.zeros_like(rows)
+            zeros = torch.zeros_like(rows) if zeros is None else zeros
             for key in ("exp_avg", "exp_avg_sq"):
                 state[key] = edit(state[key], zeros).contiguous()
             self.adam.state[new] = state

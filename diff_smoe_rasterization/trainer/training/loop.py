@@ -103,7 +103,7 @@ class Trainer:
             passes = DirectPasses if self.direct and not self.strategy.uses_gradients else AutogradPasses
             self._passes = passes(model, self.optimizer, self.renderer)
         rendering, means2D = self._passes.render(view.camera, color, self.gate() if self.gate else None)
-        image = rendering.color
+        image = rendering.color.detach()
         target = view.image if view.opacity is None else view.image_over(color, self.renderer.background)
         if view.mask is None:
             loss, gradient = l1_ssim_loss_and_gradient(image, target, config.lambda_dssim)

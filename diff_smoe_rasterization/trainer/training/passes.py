@@ -39,7 +39,7 @@ class AutogradPasses:
         means2D = torch.zeros_like(self.model.raw["means3D"], requires_grad=True)
         rendering = self.renderer(camera, background=background, means2D=means2D, background_gate=background_gate)
         self._color = rendering.color
-        return rendering._replace(color=rendering.color.detach()), means2D
+        return rendering, means2D
 
     def backward(self, dL_dcolor: torch.Tensor) -> None:
         """From the gradient by the image [3, H, W] to those by all parameters."""
