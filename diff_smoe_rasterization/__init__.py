@@ -14,14 +14,17 @@ from .settings import BLEND_MODES, OUTPUTS, Contributions, GaussianRasterization
 _HOMES = {"build_info": "extension", "set_profiling": "extension", "stage_times": "extension", "fused_ssim": "losses",
           "distCUDA2": "neighbors", "Footprints": "footprints", "blend_footprints": "footprints",
           "project_gaussians": "footprints", "FusedAdam": "optimizers", "SparseGaussianAdam": "optimizers",
+          "LazyAdam": "lazy_adam", "DirectRendering": "direct",
           "GaussianRasterizer": "rasterizer", "rasterize": "rasterizer", "rasterize_gaussians": "rasterizer",
           "rasterize_with_splats": "rasterizer", "settings_from_camera": "camera", "Splats": "splats",
           "visible_radii": "rasterizer"}
 
 if TYPE_CHECKING:
     from .camera import settings_from_camera
+    from .direct import DirectRendering
     from .extension import build_info, set_profiling, stage_times
     from .footprints import Footprints, blend_footprints, project_gaussians
+    from .lazy_adam import LazyAdam
     from .losses import fused_ssim
     from .neighbors import distCUDA2
     from .optimizers import FusedAdam, SparseGaussianAdam
@@ -61,8 +64,8 @@ _beside = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
 if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",), ("build_support", "backend.py"))):
     __path__.append(_beside)
 
-__all__ = ["BLEND_MODES", "Contributions", "Footprints", "FusedAdam", "GaussianRasterizationSettings",
-           "GaussianRasterizer", "Importance", "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__",
-           "blend_footprints", "build_info", "distCUDA2", "fused_ssim", "project_gaussians", "rasterize",
-           "rasterize_gaussians", "rasterize_with_splats", "set_profiling", "settings_from_camera", "stage_times",
-           "visible_radii"]
+__all__ = ["BLEND_MODES", "Contributions", "DirectRendering", "Footprints", "FusedAdam",
+           "GaussianRasterizationSettings", "GaussianRasterizer", "Importance", "LazyAdam", "OUTPUTS", "Rendering",
+           "SparseGaussianAdam", "Splats", "__version__", "blend_footprints", "build_info", "distCUDA2", "fused_ssim",
+           "project_gaussians", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
+           "settings_from_camera", "stage_times", "visible_radii"]

@@ -2,11 +2,12 @@
 from __future__ import annotations
 
 import math
-from typing import Callable, Dict, Optional, Tuple
+from typing import Any, Callable, Dict, Optional, Tuple
 
 import torch
 
 from ..gaussians import activate
+from ..lazy_adam import LazyAdam
 from ..neighbors import distCUDA2
 from ..optimizers import FusedAdam
 from .config import TrainConfig
@@ -46,7 +47,9 @@ class GaussianModel:
         """raw: tensors named in PARAMETERS. sh_degree: highest degree that `shs` holds."""
         self.sh_degree = sh_degree
         self.active_sh_degree = 0
-        self.raw = {name: raw[name].detach().clone().contiguous().requires_grad_() for name in PARAMETERS}
+        self.stored = {name: raw[name].detach().clone().contiguous().requires_grad_() for name in PARAMETERS}
+        """The raw parameters, of which rows of spherical harmonics may wait for steps of `lazy`."""
+        self.lazy: Optional[LazyAdam] = None
 
     @classmethod
     def from_points(cls, points: PointCloud, sh_degree: int, device: str) -> GaussianModel:
@@ -66,12 +69,19 @@ class GaussianModel:
         }, sh_degree)
 
     @property
+    def raw(self) -> Dict[str, torch.Tensor]:
+        """The raw parameters by name, brought up to date."""
+        if self.lazy is not None:
+            self.lazy.catch_up()
+        return self.stored
+
+    @property
     def num_gaussians(self) -> int:
-        return self.raw["means3D"].shape[0]
+        return self.stored["means3D"].shape[0]
 
     def activated(self) -> Tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Opacities [N, 1] in (0, 1), scales [N, 3] in world units, and rotations [N, 4], unit quaternions."""
-        return activate(self.raw["opacities"], self.raw["scales"], self.raw["rotations"])
+        return activate(self.stored["opacities"], self.stored["scales"], self.stored["rotations"])
 
     @property
     def opacities(self) -> torch.Tensor:
@@ -90,9 +100,12 @@ class GaussianModel:
 
     def color_arguments(self) -> Dict[str, torch.Tensor]:
         """The colour arguments of `rasterize`; while degree 0 is active the higher bands are left out."""
-        if self.active_sh_degree == 0:
-            return {"shs": self.raw["dc"]}
-        return {"dc": self.raw["dc"], "shs": self.raw["shs"]}
+        raw = self.raw
+        return {name: raw[source] for name, source in self.color_sources().items()}
+
+    def color_sources(self) -> Dict[str, str]:
+        """The parameters that are the colour arguments of `rasterize`, by these."""
+        return {"shs": "dc"} if self.active_sh_degree == 0 else {"dc": "dc", "shs": "shs"}
 
     def raise_sh_degree(self) -> None:
         """Activates one more SH degree, up to the highest."""
@@ -124,23 +137,24 @@ class GaussianOptimizer:
         config = self.config
         rate = exponential_rate(iteration, config.position_lr_init, config.position_lr_final,
                                 config.position_lr_max_steps)
-        self._group("means3D")["lr"] = rate * self.extent
+        self.group("means3D")["lr"] = rate * self.extent
 
     @property
     def position_rate(self) -> float:
         """The learning rate of positions in this step, world units."""
-        return self._group("means3D")["lr"]
+        return self.group("means3D")["lr"]
 
     def scale_other_rates(self, factor: float) -> None:
         """Sets the learning rates of all but the positions to a part of what the options say."""
         for name in PARAMETERS[1:]:
-            self._group(name)["lr"] = factor * self.rates[name]
+            self.group(name)["lr"] = factor * self.rates[name]
 
     def step(self) -> None:
         """Steps every parameter that has a gradient, then drops the gradients."""
-        self._start_higher_bands()
+        if self.model.raw["shs"].grad is not None:
+            self.start_higher_bands()
         self.adam.step()
-        for tensor in self.model.raw.values():
+        for tensor in self.model.stored.values():
             tensor.grad = None
 
     def append(self, rows: Dict[str, torch.Tensor]) -> None:
@@ -150,9 +164,24 @@ class GaussianOptimizer:
 
     def keep(self, mask: torch.Tensor) -> None:
         """Removes the Gaussians where mask [N] (bool) is False."""
-        kept = mask.nonzero().squeeze(1)  # on a GPU the host waits here, once for all tensors
+        self.take(mask.nonzero().squeeze(1))  # on a GPU the host waits here, once for all tensors
+
+    def take(self, rows: torch.Tensor, new: Optional[Dict[str, torch.Tensor]] = None) -> None:
+        """Puts these rows of Gaussians in place of all, in one pass over memory.
+
+        new: raw parameters of the last ones, where they differ from those of their rows. As many of the last ones begin
+        without moments.
+        """
+        def edit(tensor: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+            taken = tensor.index_select(0, rows)
+            taken[len(taken) - len(last):] = last
+            return taken
+
+        new = new or {}
+        count = max((len(values) for values in new.values()), default=0)
         for name in PARAMETERS:
-            self._replace(name, lambda tensor, _: tensor.index_select(0, kept), self.model.raw[name].new_zeros(0))
+            like = self.model.raw[name]
+            self._replace(name, edit, new.get(name, like.new_zeros(0, *like.shape[1:])), like.new_zeros(count, *like.shape[1:]))
 
     def set_opacity_logits(self, logits: torch.Tensor) -> None:
         """Sets all opacity logits [N, 1] and forgets their moments."""
@@ -179,13 +208,16 @@ class GaussianOptimizer:
 
     def replace_all(self, raw: Dict[str, torch.Tensor]) -> None:
         """Sets every parameter, any number of rows, and forgets all moments."""
+        self.model.lazy = None
         self.adam.state.clear()
         for name in PARAMETERS:
             self._replace(name, lambda _, new: new.clone(), raw[name])
 
     def _replace(self, name: str, edit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
-                 rows: torch.Tensor) -> None:
-        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros like rows) in place of its moments.
+                 rows: torch.Tensor, zeros: Optional[torch.Tensor] = None) -> None:
+        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros) in place of its moments.
+
+        zeros: by default like `rows`.
 
         The new leaf has no gradient, so the current step leaves it alone: as in 3DGS, where an iteration that
         densifies steps nothing and one that resets opacities steps all but them.
@@ -194,24 +226,39 @@ class GaussianOptimizer:
         new = edit(old.detach(), rows.detach()).contiguous().requires_grad_()
         state = self.adam.state.pop(old, None)
         if state is not None:
-            zeros = torch.zeros_like(rows)
+            zeros = torch.zeros_like(rows) if zeros is None else zeros
             for key in ("exp_avg", "exp_avg_sq"):
                 state[key] = edit(state[key], zeros).contiguous()
             self.adam.state[new] = state
-        self._group(name)["params"][0] = new
-        self.model.raw[name] = new
+        self.group(name)["params"][0] = new
+        self.model.stored[name] = new
 
-    def _group(self, name: str) -> Dict:
+    def group(self, name: str) -> Dict[str, Any]:
+        """The parameter's group in Adam."""
         return self.adam.param_groups[PARAMETERS.index(name)]
 
-    def _start_higher_bands(self) -> None:
-        """Gives `shs` its Adam state when it first has a gradient, as old as that of `dc`.
+    def lazy_colors(self) -> LazyAdam:
+        """What steps the spherical harmonics whose rows are read now and then; the model is up to date by it."""
+        model = self.model
+        names = list(model.color_sources().values())
+        parameters = [model.stored[name] for name in names]
+        lazy = model.lazy
+        if lazy is None or [id(tensor) for tensor in lazy.parameters] != [id(tensor) for tensor in parameters]:
+            if lazy is not None:
+                lazy.catch_up()
+            if "shs" in names:
+                self.start_higher_bands()
+            lazy = model.lazy = LazyAdam(self.adam, parameters)
+        return lazy
+
+    def start_higher_bands(self) -> None:
+        """Gives `shs` its Adam state where it has none yet, as old as that of `dc`.
 
         While degree 0 is active its gradient would be zero: Adam would leave it where it is and only count the
         step. Skipping that, and taking over the count, gives the same numbers and saves most of the step's time.
         """
-        bands, base = self.model.raw["shs"], self.model.raw["dc"]
-        if bands.grad is None or bands in self.adam.state or base not in self.adam.state:
+        bands, base = self.model.stored["shs"], self.model.stored["dc"]
+        if bands in self.adam.state or base not in self.adam.state:
             return
         self.adam.state[bands] = {
             "step": self.adam.state[base]["step"],
@@ -226,6 +273,7 @@ class GaussianOptimizer:
 
     def load_state_dict(self, states: Dict[str, Dict]) -> None:
         """Takes what `state_dict` gave."""
+        self.model.lazy = None
         self.adam.state.clear()
         for name, state in states.items():
             self.adam.state[self.model.raw[name]] = dict(state)

@@ -11,7 +11,53 @@ namespace {
 template <class S> struct Tile {
   static constexpr int kWidth = kLossTileWidth<S>, kHeight = kLossTileHeight;
   static constexpr int kPaddedWidth = kWidth + 2 * kSsimRadius, kPaddedHeight = kHeight + 2 * kSsimRadius;
+  static constexpr int kStride = (kPaddedWidth + kLossRun - 1) / kLossRun * kLossRun;  // of a padded row, for vectors
+  using Padded = S[kPaddedHeight][kStride];
+  using Rows = S[kPaddedHeight][kWidth];  // after the window along rows
 };
+
+constexpr int kReach = kLossRun + kSsimTaps - 1;  // numbers that the windows of a run reach
+
+template <class S> struct alignas(kLossRun * sizeof(S)) Run { S numbers[kLossRun]; };
+
+// Reads what the windows of a run of columns reach.
+template <class S> __device__ void read_along_row(const S* row, S (&to)[kReach]) {
+#pragma unroll
+  for (int j = 0; j < kReach; j += kLossRun) {
+    const Run<S> run = *reinterpret_cast<const Run<S>*>(row + j);
+#pragma unroll
+    for (int k = 0; k < kLossRun && j + k < kReach; ++k) to[j + k] = run.numbers[k];
+  }
+}
+
+// The window along columns at a run of pixels, one below the other.
+template <class S>
+__device__ void blur_column(const typename Tile<S>::Rows& rows, const SsimWindow<S>& window, int row, int column,
+                            S (&means)[kLossRun]) {
+  S reached[kReach];
+#pragma unroll
+  for (int j = 0; j < kReach; ++j) reached[j] = rows[row + j][column];
+#pragma unroll
+  for (int r = 0; r < kLossRun; ++r) {
+    means[r] = 0;
+#pragma unroll
+    for (int k = 0; k < kSsimTaps; ++k) means[r] += window.taps[k] * reached[r + k];
+  }
+}
+
+// Calls visit(row, column) for the runs of the padded tile's rows, and for_each_column_run for those of the tile's
+// columns: the first pixel of each.
+template <class S, class Visit> __device__ void for_each_row_run(Visit visit) {
+  constexpr int kRuns = Tile<S>::kWidth / kLossRun;
+  for (int i = threadIdx.x; i < Tile<S>::kPaddedHeight * kRuns; i += kLossBlock) {
+    visit(i / kRuns, i % kRuns * kLossRun);
+  }
+}
+template <class S, class Visit> __device__ void for_each_column_run(Visit visit) {
+  for (int i = threadIdx.x; i < Tile<S>::kHeight / kLossRun * Tile<S>::kWidth; i += kLossBlock) {
+    visit(i / Tile<S>::kWidth * kLossRun, i % Tile<S>::kWidth);
+  }
+}
 
 template <class S> int64_t num_blocks(int64_t planes, int height, int width) {
   const int64_t across = (width + Tile<S>::kWidth - 1) / Tile<S>::kWidth;
@@ -70,8 +116,8 @@ template <class S>
 __global__ void __launch_bounds__(kLossBlock)
     value_kernel(const __grid_constant__ ImageLoss<S> loss, const __grid_constant__ LossWeights<S> weights) {
   using T = Tile<S>;
-  __shared__ S image[T::kPaddedHeight][T::kPaddedWidth], target[T::kPaddedHeight][T::kPaddedWidth];
-  __shared__ S rows[kNumSsimMoments][T::kPaddedHeight][T::kWidth];
+  alignas(16) __shared__ typename T::Padded image, target;
+  __shared__ typename T::Rows rows[kNumSsimMoments];
   const Place place = place_of_block(loss);
   for_each_padded(loss, place, [&](int row, int column, int64_t index) {
     image[row][column] = index < 0 ? S(0) : loss.image[index];
@@ -79,47 +125,53 @@ __global__ void __launch_bounds__(kLossBlock)
   });
   __syncthreads();
 
-  for (int i = threadIdx.x; i < T::kPaddedHeight * T::kWidth; i += kLossBlock) {
-    const int row = i / T::kWidth, column = i % T::kWidth;
-    S sums[kNumSsimMoments] = {};
+  for_each_row_run<S>([&](int row, int column) {
+    S x[kReach], y[kReach], sums[kNumSsimMoments][kLossRun] = {};
+    read_along_row(&image[row][column], x);
+    read_along_row(&target[row][column], y);
 #pragma unroll
-    for (int k = 0; k < kSsimTaps; ++k) {
-      const S x = image[row][column + k], y = target[row][column + k];
-      const S weighted_x = weights.window.taps[k] * x, weighted_y = weights.window.taps[k] * y;
-      sums[0] += weighted_x;
-      sums[1] += weighted_y;
-      sums[2] += weighted_x * x;
-      sums[3] += weighted_y * y;
-      sums[4] += weighted_x * y;
+    for (int r = 0; r < kLossRun; ++r) {
+#pragma unroll
+      for (int k = 0; k < kSsimTaps; ++k) {
+        const S weighted_x = weights.window.taps[k] * x[r + k], weighted_y = weights.window.taps[k] * y[r + k];
+        sums[0][r] += weighted_x;
+        sums[1][r] += weighted_y;
+        sums[2][r] += weighted_x * x[r + k];
+        sums[3][r] += weighted_y * y[r + k];
+        sums[4][r] += weighted_x * y[r + k];
+      }
     }
 #pragma unroll
-    for (int m = 0; m < kNumSsimMoments; ++m) rows[m][row][column] = sums[m];
-  }
+    for (int m = 0; m < kNumSsimMoments; ++m) {
+#pragma unroll
+      for (int r = 0; r < kLossRun; ++r) rows[m][row][column + r] = sums[m][r];
+    }
+  });
   __syncthreads();
 
   const int64_t map_size = loss.planes * loss.height * loss.width;
   double sum = 0;
-  for (int i = threadIdx.x; i < T::kHeight * T::kWidth; i += kLossBlock) {
-    const int row = i / T::kWidth, column = i % T::kWidth;
-    if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
-    S means[kNumSsimMoments] = {};
+  for_each_column_run<S>([&](int first_row, int column) {
+    S means[kNumSsimMoments][kLossRun];
 #pragma unroll
-    for (int k = 0; k < kSsimTaps; ++k) {
+    for (int m = 0; m < kNumSsimMoments; ++m) blur_column<S>(rows[m], weights.window, first_row, column, means[m]);
 #pragma unroll
-      for (int m = 0; m < kNumSsimMoments; ++m) means[m] += weights.window.taps[k] * rows[m][row + k][column];
+    for (int r = 0; r < kLossRun; ++r) {
+      const int row = first_row + r;
+      if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
+      const bool counts = in_margins(loss, place.row + row, place.column + column);
+      const Ssim<S> pixel = ssim(SsimMoments<S>{means[0][r], means[1][r], means[2][r], means[3][r], means[4][r]});
+      const S difference =
+          image[row + kSsimRadius][column + kSsimRadius] - target[row + kSsimRadius][column + kSsimRadius];
+      sum += weights.l1 * abs(difference) + (counts ? weights.ssim * pixel.value : S(0));
+      if (loss.derivatives != nullptr) {
+        const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
+        loss.derivatives[index] = counts ? pixel.d_mean : S(0);
+        loss.derivatives[map_size + index] = counts ? pixel.d_square : S(0);
+        loss.derivatives[2 * map_size + index] = counts ? pixel.d_product : S(0);
+      }
     }
-    const bool counts = in_margins(loss, place.row + row, place.column + column);
-    const Ssim<S> pixel = ssim(SsimMoments<S>{means[0], means[1], means[2], means[3], means[4]});
-    const S difference =
-        image[row + kSsimRadius][column + kSsimRadius] - target[row + kSsimRadius][column + kSsimRadius];
-    sum += weights.l1 * abs(difference) + (counts ? weights.ssim * pixel.value : S(0));
-    if (loss.derivatives != nullptr) {
-      const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
-      loss.derivatives[index] = counts ? pixel.d_mean : S(0);
-      loss.derivatives[map_size + index] = counts ? pixel.d_square : S(0);
-      loss.derivatives[2 * map_size + index] = counts ? pixel.d_product : S(0);
-    }
-  }
+  });
   sum = block_sum(sum);
   if (threadIdx.x == 0) loss.sums[blockIdx.x] = sum;
 }
@@ -128,8 +180,8 @@ template <class S>
 __global__ void __launch_bounds__(kLossBlock)
     gradient_kernel(const __grid_constant__ ImageLoss<S> loss, const __grid_constant__ LossWeights<S> weights) {
   using T = Tile<S>;
-  __shared__ S maps[kNumSsimDerivatives][T::kPaddedHeight][T::kPaddedWidth];
-  __shared__ S rows[kNumSsimDerivatives][T::kPaddedHeight][T::kWidth];
+  alignas(16) __shared__ typename T::Padded maps[kNumSsimDerivatives];
+  __shared__ typename T::Rows rows[kNumSsimDerivatives];
   const Place place = place_of_block(loss);
   const int64_t map_size = loss.planes * loss.height * loss.width;
   for_each_padded(loss, place, [&](int row, int column, int64_t index) {
@@ -140,31 +192,36 @@ __global__ void __launch_bounds__(kLossBlock)
   });
   __syncthreads();
 
-  for (int i = threadIdx.x; i < T::kPaddedHeight * T::kWidth; i += kLossBlock) {
-    const int row = i / T::kWidth, column = i % T::kWidth;
+  for_each_row_run<S>([&](int row, int column) {
 #pragma unroll
     for (int m = 0; m < kNumSsimDerivatives; ++m) {
-      S sum = 0;
+      S reached[kReach];
+      read_along_row(&maps[m][row][column], reached);
 #pragma unroll
-      for (int k = 0; k < kSsimTaps; ++k) sum += weights.window.taps[k] * maps[m][row][column + k];
-      rows[m][row][column] = sum;
+      for (int r = 0; r < kLossRun; ++r) {
+        S sum = 0;
+#pragma unroll
+        for (int k = 0; k < kSsimTaps; ++k) sum += weights.window.taps[k] * reached[r + k];
+        rows[m][row][column + r] = sum;
+      }
     }
-  }
+  });
   __syncthreads();
 
-  for (int i = threadIdx.x; i < T::kHeight * T::kWidth; i += kLossBlock) {
-    const int row = i / T::kWidth, column = i % T::kWidth;
-    if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
-    S means[kNumSsimDerivatives] = {};
+  for_each_column_run<S>([&](int first_row, int column) {
+    S means[kNumSsimDerivatives][kLossRun];
 #pragma unroll
-    for (int k = 0; k < kSsimTaps; ++k) {
+    for (int m = 0; m < kNumSsimDerivatives; ++m) blur_column<S>(rows[m], weights.window, first_row, column, means[m]);
 #pragma unroll
-      for (int m = 0; m < kNumSsimDerivatives; ++m) means[m] += weights.window.taps[k] * rows[m][row + k][column];
+    for (int r = 0; r < kLossRun; ++r) {
+      const int row = first_row + r;
+      if (place.row + row >= loss.height || place.column + column >= loss.width) continue;
+      const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
+      const S x = loss.image[index], y = target_value(loss, index);
+      loss.gradient[index] =
+          weights.l1 * sign(x - y) + weights.ssim * ssim_gradient(x, y, means[0][r], means[1][r], means[2][r]);
     }
-    const int64_t index = place.plane + static_cast<int64_t>(place.row + row) * loss.width + place.column + column;
-    const S x = loss.image[index], y = target_value(loss, index);
-    loss.gradient[index] = weights.l1 * sign(x - y) + weights.ssim * ssim_gradient(x, y, means[0], means[1], means[2]);
-  }
+  });
 }
 
 template <class S> struct SumArguments {

@@ -66,15 +66,16 @@ struct LaneGradient {
 
 // Stores the gradients of a warp's Gaussians, zeros included, as far as these exist. rows: the gradients of the SH
 // rows, in shared memory. That memory serves the other gradients too, so that the warp writes each array in one piece.
+// wanted: the lanes whose Gaussians have rows to write.
 template <class Rows>
 __device__ void store_gradients(const LaneGradient& gradient, const Rows& rows,
-                                const ProjectBackwardArguments<float>& arguments) {
+                                const ProjectBackwardArguments<float>& arguments, unsigned wanted) {
   const GaussianGradient<float>& own = gradient.gaussian;
   const GaussianGradients<float>& to = arguments.gradients;
   const int lane = rows.lane(), exist = rows.exist();
   const int64_t first = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x - lane;
-  if (to.shs != nullptr) rows.store(to.shs + first * Rows::kLength);
-  if (lane < exist) {
+  if (to.shs != nullptr) rows.store(to.shs + first * Rows::kLength, wanted);
+  if (wanted >> lane & 1) {
     if (to.opacities != nullptr) to.opacities[first + lane] = own.opacity;
     if (to.rotations != nullptr) {
       reinterpret_cast<float4*>(to.rotations)[first + lane] =
@@ -86,7 +87,7 @@ __device__ void store_gradients(const LaneGradient& gradient, const Rows& rows,
     if (array == nullptr) return;
     const WarpRows<3> threes(rows.memory() + place * 3 * kWarp, 3, exist, lane);
     threes.write({value.x, value.y, value.z});
-    threes.store(array + 3 * first);
+    threes.store(array + 3 * first, wanted);
   };
   store_threes(to.means3D, own.mean, 0);
   store_threes(to.means2D, {own.mean2D.x, own.mean2D.y, 0}, 1);
@@ -154,7 +155,7 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : 
   } else {
     rows.write(dL_dsh);
   }
-  store_gradients(gradient, rows, arguments);
+  store_gradients(gradient, rows, arguments, arguments.gradients.seen_only ? all_seen : rows.all());
   if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
 }
 
@@ -209,12 +210,13 @@ __global__ void __launch_bounds__(kRowsBlock)
                                            image_gradient(arguments, i, projected, record, from_color, config));
     store_gradient(gradient, arguments.gradients, i);
     if constexpr (kCamera) dL_dcamera.add(gradient.camera);
-  } else if (exists) {
+  } else if (exists && !arguments.gradients.seen_only) {
     store_gradient(GaussianGradient<S>{}, arguments.gradients, i);
     store_zeros(to_colors, config.num_channels, inputs.num_sh);
   }
   if constexpr (Rows::kStaged) {
-    if (arguments.gradients.shs != nullptr) rows.store(arguments.gradients.shs + first * length);
+    const unsigned wanted = arguments.gradients.seen_only ? __ballot_sync(kAllLanes, seen) : rows.all();
+    if (arguments.gradients.shs != nullptr) rows.store(arguments.gradients.shs + first * length, wanted);
   }
   if constexpr (kCamera) store_camera_row(arguments, i, dL_dcamera, lane);
 }

@@ -60,19 +60,21 @@ template <int kLength> class WarpRows {
 
   // Begins to copy the rows that `wanted` marks. They are there after wait_for_copies().
   __device__ void load(const float* from, unsigned wanted) const {
-    for_each_part(wanted, from, SharedAddress(shared_), [](auto part, const float* global, SharedAddress shared) {
+    for_each_part<false>(wanted, from, SharedAddress(shared_), [](auto part, const float* global, SharedAddress shared) {
       copy_async<decltype(part)>(shared, global);
     });
   }
 
-  // Writes all rows that exist.
-  __device__ void store(float* to) const {
+  // The lanes whose rows exist.
+  __device__ unsigned all() const { return exist_ < kWarp ? (1u << exist_) - 1 : kAllLanes; }
+
+  // Writes the rows that `wanted` marks, of those that exist, and touches no other.
+  __device__ void store(float* to, unsigned wanted) const {
     __syncwarp();
-    for_each_part(exist_ < kWarp ? (1u << exist_) - 1 : kAllLanes, to, shared_,
-                  [](auto part, float* global, const float* shared) {
-                    using Part = decltype(part);
-                    *reinterpret_cast<Part*>(global) = *reinterpret_cast<const Part*>(shared);
-                  });
+    for_each_part<true>(wanted, to, shared_, [](auto part, float* global, const float* shared) {
+      using Part = decltype(part);
+      *reinterpret_cast<Part*>(global) = *reinterpret_cast<const Part*>(shared);
+    });
   }
 
   // Copy the lane's row to registers, and back.
@@ -103,8 +105,8 @@ template <int kLength> class WarpRows {
  private:
   // Calls visit(value, global, shared) for all parts of the marked rows, in memory order. A part is a vector or a
   // single number. value: of the part's type. global, shared: where it lies. A part that reaches into the next row is
-  // visited where either row is marked.
-  template <class Global, class Shared, class Visit>
+  // visited where either row is marked or, with kExact, number by number where only one is.
+  template <bool kExact, class Global, class Shared, class Visit>
   __device__ void for_each_part(unsigned marked, Global global, Shared shared, Visit visit) const {
     if constexpr (kVectors) {
       // The lanes' places in their rows repeat after some steps.
@@ -128,9 +130,17 @@ template <int kLength> class WarpRows {
 #pragma unroll
       for (int step = 0; step < (kLength + 3) / 4; ++step) {
         const unsigned place = 4 * (lane_ + step * kWarp), row = place / kDivisor;
-        const unsigned reached = (place + 3) / kDivisor > row ? 3 : 1;
-        if (place < kWarp * kDivisor && (marked >> row & reached)) {
+        const unsigned reached = (place + 3) / kDivisor > row ? 3 : 1, hit = marked >> row & reached;
+        if (place >= kWarp * kDivisor || hit == 0) continue;
+        if (!kExact || hit == reached) {
           visit(float4(), from + 4 * kWarp * step, to + 4 * kWarp * step);
+        } else {
+#pragma unroll
+          for (int k = 0; k < 4; ++k) {
+            if (marked >> (place + k) / kDivisor & 1) {
+              visit(float(), from + (4 * kWarp * step + k), to + (4 * kWarp * step + k));
+            }
+          }
         }
       }
     } else {

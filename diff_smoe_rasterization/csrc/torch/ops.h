@@ -158,7 +158,25 @@ inline Inputs spread(const std::vector<at::Tensor>& list, const std::vector<bool
   return inputs;
 }
 
-template <class Backend> void rasterize_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+// The gradients that the caller has memory for, spread over the inputs that want one.
+inline Inputs given_gradients(const Inputs& inputs, const InputMask& wanted, const std::vector<at::Tensor>& list) {
+  const char* function = "rasterize_backward_seen";
+  check_length("gradients", list.size(), std::count(wanted.begin(), wanted.end(), true));
+  Inputs gradients;
+  auto next = list.begin();
+  for (int i = 0; i < kNumInputs; ++i) {
+    if (!wanted[i]) continue;
+    const std::string name = std::string("the gradient of ") + kInputNames[i];
+    check_same_shape(function, name.c_str(), *next, kInputNames[i], inputs[i]);
+    check_like(function, name.c_str(), *next, "means3D", inputs[kMeans3D]);
+    check_contiguous(function, name.c_str(), *next);
+    gradients[i] = *next++;
+  }
+  return gradients;
+}
+
+// kSeen: into the caller's memory, and only rows of Gaussians that were seen.
+template <class Backend, bool kSeen> void rasterize_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
   Arguments arguments(op, *stack);
   Images image_gradients, images;
   for (Image image : kDifferentiable) {
@@ -185,10 +203,22 @@ template <class Backend> void rasterize_backward(const c10::OperatorHandle& op, 
       refuse_nan(std::string("rasterize_backward: dL_d") + kImageNames[image], image_gradients[image]);
     }
   }
-  const Inputs inputs = contiguous(given), gradients = allocate_gradients(inputs, wanted);
+  const Inputs inputs = contiguous(given);
+  Inputs gradients;
+  if constexpr (kSeen) {
+    gradients = given_gradients(given, wanted, arguments.read<std::vector<at::Tensor>>());
+  } else {
+    gradients = allocate_gradients(inputs, wanted);
+  }
   dispatch(inputs[kMeans3D], [&](auto zero) {
-    Backend::template backward<decltype(zero)>(inputs, options, images, saved, image_gradients, gradients);
+    Backend::template backward<decltype(zero)>(inputs, options, images, saved, image_gradients, gradients, kSeen);
   });
+  if constexpr (kSeen) {
+    for (const at::Tensor& gradient : gradients) {
+      if (gradient.defined()) gradient.unsafeGetTensorImpl()->bump_version();
+    }
+    return arguments.give_back();
+  }
   std::vector<at::Tensor> results;
   for (int i = 0; i < kNumInputs; ++i) {
     if (!wanted[i]) continue;
@@ -391,7 +421,8 @@ at::Tensor mark_visible(const at::Tensor& positions, const at::Tensor& viewmatri
 
 template <class Backend> void register_ops(torch::Library& m) {
   m.impl("rasterize", torch::CppFunction::makeFromBoxedFunction<&rasterize<Backend>>());
-  m.impl("rasterize_backward", torch::CppFunction::makeFromBoxedFunction<&rasterize_backward<Backend>>());
+  m.impl("rasterize_backward", torch::CppFunction::makeFromBoxedFunction<&rasterize_backward<Backend, false>>());
+  m.impl("rasterize_backward_seen", torch::CppFunction::makeFromBoxedFunction<&rasterize_backward<Backend, true>>());
   m.impl("project", torch::CppFunction::makeFromBoxedFunction<&project<Backend>>());
   m.impl("project_backward", torch::CppFunction::makeFromBoxedFunction<&project_backward<Backend>>());
   m.impl("blend", torch::CppFunction::makeFromBoxedFunction<&blend<Backend>>());

@@ -108,13 +108,13 @@ struct Cpu {
 
   template <class S>
   static void backward(const Inputs& inputs, const Options& options, const Images& images, const Saved& saved,
-                       const Images& image_gradient_tensors, const Inputs& gradient_tensors) {
+                       const Images& image_gradient_tensors, const Inputs& gradient_tensors, bool seen_only) {
     auto own = frame<S>(inputs, options, images);
     own.saved = unpack<S>("rasterize_backward", saved, cpu::saved_sizes(own), inputs[kMeans3D].device());
     own.saved.gate_sum = own.images.gate_sum;
     cpu::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
-    with_input_gradients<S>(inputs, gradient_tensors, gradients, [&] {
+    with_input_gradients<S>(inputs, gradient_tensors, seen_only, gradients, [&] {
       StageRecorder recorder(Pass::kBackward);
       cpu::backward(own, gradients, recorder.times());
     });

@@ -122,7 +122,7 @@ struct Cuda {
 
   template <class S>
   static void backward(const Inputs& inputs, const Options& options, const Images& images, const Saved& saved,
-                       const Images& image_gradient_tensors, const Inputs& gradient_tensors) {
+                       const Images& image_gradient_tensors, const Inputs& gradient_tensors, bool seen_only) {
     auto own = frame<S>(inputs, options, images);
     StageRecorder recorder(Pass::kBackward);
     const cuda::Run how = run(options, recorder.times());
@@ -131,7 +131,8 @@ struct Cuda {
     cuda::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
     TensorMemory memory(inputs[kMeans3D]);
-    with_input_gradients<S>(inputs, gradient_tensors, gradients, [&] { cuda::backward(own, gradients, how, memory); });
+    with_input_gradients<S>(inputs, gradient_tensors, seen_only, gradients,
+                            [&] { cuda::backward(own, gradients, how, memory); });
   }
 
   template <class S>

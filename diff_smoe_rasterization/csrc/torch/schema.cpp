@@ -28,6 +28,13 @@ const std::string kRasterizeBackward =
     "Tensor[] inputs, bool[] present, Tensor[] images, Tensor[] saved, " +
     kOptions + "bool[] wanted) -> Tensor[]";
 
+// The same into the caller's memory, a tensor for each wanted input. Of the Gaussians only the rows are written whose
+// radius is above 0; the others stay as they are.
+const std::string kRasterizeBackwardSeen =
+    "rasterize_backward_seen(Tensor? dL_dcolor, Tensor? dL_dgate_sum, Tensor? dL_ddepth, Tensor? dL_dinverse_depth, "
+    "Tensor[] inputs, bool[] present, Tensor[] images, Tensor[] saved, " +
+    kOptions + "bool[] wanted, Tensor(a!)[] gradients) -> ()";
+
 // The radii [N] that rasterize would return for the same arguments.
 const std::string kRadii = "radii(" + kInputs + without_comma(kOptions) + ") -> Tensor";
 
@@ -68,6 +75,7 @@ const std::string kImportance =
 TORCH_LIBRARY(diff_smoe_rasterization, m) {
   m.def(kRasterize.c_str());
   m.def(kRasterizeBackward.c_str());
+  m.def(kRasterizeBackwardSeen.c_str());
   m.def(kRadii.c_str());
   m.def(kProject.c_str());
   m.def(kProjectBackward.c_str());

@@ -240,15 +240,17 @@ struct JointGradient {
   }
 };
 
-// Fills gradients.inputs, calls `backward`, and stores the gradients that it returned in one piece.
+// Fills out.inputs, calls `backward`, and stores the gradients that it returned in one piece. seen_only: as in params.h.
 template <class S, class Gradients, class Backward>
-void with_input_gradients(const Inputs& inputs, const Inputs& gradients, Gradients& out, Backward backward) {
+void with_input_gradients(const Inputs& inputs, const Inputs& gradients, bool seen_only, Gradients& out,
+                          Backward backward) {
   const at::Tensor& like = inputs[kMeans3D];
   const JointGradient camera({{kViewMatrix, 16}, {kProjMatrix, 16}, {kCampos, 3}}, gradients, like);
   const JointGradient background({{kBackground, num_channels(inputs)}, {kBackgroundGate, 1}}, gradients, like);
   out.inputs = gaussian_gradients<S>(gradients);
   out.inputs.camera = reinterpret_cast<CameraGradient<S>*>(mutable_data<S>(camera.whole));
   out.inputs.background = mutable_data<S>(background.whole);
+  out.inputs.seen_only = seen_only;
   backward();
   camera.store(gradients);
   background.store(gradients);

@@ -15,8 +15,10 @@
 
 #include "check_tensor.h"
 #include "dsmoe/adam_tensors.h"
+#include "dsmoe/gaussian_adam.h"
 #include "dsmoe/gaussians.h"
 #include "dsmoe/image_loss.h"
+#include "dsmoe/lazy_adam.h"
 
 namespace dsmoe {
 namespace binding {
@@ -24,6 +26,35 @@ namespace binding {
 // Autograd must notice where a tensor was changed in place after it was saved.
 inline void note_change(at::TensorList tensors) {
   for (const at::Tensor& tensor : tensors) tensor.unsafeGetTensorImpl()->bump_version();
+}
+
+template <class S> AdamConstants<S> adam_constants(double beta1, double beta2, double epsilon) {
+  return {static_cast<S>(beta1), static_cast<S>(beta2), static_cast<S>(1 - beta1), static_cast<S>(1 - beta2),
+          static_cast<S>(epsilon)};
+}
+
+inline std::string item_name(const char* list, size_t i) { return std::string(list) + "[" + std::to_string(i) + "]"; }
+
+// A list that must have a dense tensor for each parameter, of its shape, type and device.
+inline void check_like_parameters(const char* function, const char* list, at::TensorList tensors,
+                                  at::TensorList parameters) {
+  TORCH_CHECK_VALUE(tensors.size() == parameters.size(), function, ": ", list, " has length ", tensors.size(),
+                    "; it must be ", parameters.size());
+  for (size_t i = 0; i < tensors.size(); ++i) {
+    const std::string name = item_name(list, i);
+    check_same_shape(function, name.c_str(), tensors[i], item_name("parameters", i).c_str(), parameters[i]);
+    check_like(function, name.c_str(), tensors[i], "parameters[0]", parameters[0]);
+    check_contiguous(function, name.c_str(), tensors[i]);
+  }
+}
+
+// Radii [N], or another number of each row.
+inline void check_row_numbers(const char* function, const char* name, const at::Tensor& numbers,
+                              const at::Tensor& like) {
+  check_shape(function, name, numbers, {like.size(0)});
+  check_type(function, name, numbers, at::kInt);
+  check_device(function, name, numbers, "its parameters", like);
+  check_contiguous(function, name, numbers);
 }
 
 template <class Backend>
@@ -69,9 +100,7 @@ void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
   }
 
   AT_DISPATCH_FLOATING_TYPES(first.scalar_type(), "adam", [&] {
-    const AdamConstants<scalar_t> constants = {static_cast<scalar_t>(beta1), static_cast<scalar_t>(beta2),
-                                               static_cast<scalar_t>(1 - beta1), static_cast<scalar_t>(1 - beta2),
-                                               static_cast<scalar_t>(epsilon)};
+    const auto constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
     std::vector<AdamTensor<scalar_t>> tensors;
     for (size_t i = 0; i < count; ++i) {
       const int64_t size = parameters[i].numel();
@@ -87,6 +116,132 @@ void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
     Backend::adam(tensors, AdamStep<scalar_t>{constants, flags.defined() ? flags.data_ptr<bool>() : nullptr});
   });
   for (at::TensorList list : {parameters, moments, squares}) note_change(list);
+}
+
+template <class Backend>
+void lazy_adam_catch_up(at::TensorList parameters, at::TensorList moments, at::TensorList squares,
+                        at::TensorList gradients, const at::Tensor& marks, const at::Tensor& rates, int64_t steps,
+                        double beta1, double beta2, double epsilon, const OptionalTensor& radii) {
+  const char* function = "lazy_adam_catch_up";
+  const auto count = static_cast<int64_t>(parameters.size());
+  TORCH_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors, function, ": ", count,
+                    " parameters are given; it must be 1 to ", kLazyAdamMaxTensors);
+  const at::Tensor& first = parameters[0];
+  check_real(function, "parameters[0]", first);
+  check_like_parameters(function, "parameters", parameters, parameters);
+  check_like_parameters(function, "moments", moments, parameters);
+  check_like_parameters(function, "squares", squares, parameters);
+  check_like_parameters(function, "gradients", gradients, parameters);
+  for (const at::Tensor& parameter : parameters) {
+    TORCH_CHECK_VALUE(parameter.dim() > 0 && parameter.size(0) == first.size(0), function, ": a parameter has shape ",
+                      parameter.sizes(), "; all must have the rows of the first, ", first.sizes());
+  }
+  check_row_numbers(function, "marks", marks, first);
+  if (radii.has_value()) check_row_numbers(function, "radii", *radii, first);
+  check_shape(function, "rates", rates, {"capacity", count, 2});
+  check_like(function, "rates", rates, "parameters[0]", first);
+  check_contiguous(function, "rates", rates);
+  TORCH_CHECK_VALUE(0 <= steps && steps <= rates.size(0), function, ": steps is ", steps, "; rates has ",
+                    rates.size(0), " of them");
+  const c10::DeviceGuard guard(first.device());
+  AT_DISPATCH_FLOATING_TYPES(first.scalar_type(), "lazy_adam_catch_up", [&] {
+    LazyAdam<scalar_t> adam = {};
+    adam.num_tensors = static_cast<int>(count);
+    adam.num_rows = first.size(0);
+    for (int64_t i = 0; i < count; ++i) {
+      adam.tensors[i] = {parameters[i].data_ptr<scalar_t>(), moments[i].data_ptr<scalar_t>(),
+                         squares[i].data_ptr<scalar_t>(), gradients[i].data_ptr<scalar_t>(),
+                         static_cast<int>(parameters[i].numel() / std::max<int64_t>(1, adam.num_rows))};
+    }
+    adam.marks = marks.data_ptr<int32_t>();
+    adam.radii = radii.has_value() ? radii->data_ptr<int32_t>() : nullptr;
+    adam.rates = reinterpret_cast<const AdamRates<scalar_t>*>(rates.data_ptr<scalar_t>());
+    adam.steps = static_cast<int32_t>(steps);
+    adam.constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
+    Backend::catch_up(adam);
+  });
+  for (at::TensorList list : {parameters, moments, squares}) note_change(list);
+  note_change({marks});
+}
+
+template <class Backend>
+void lazy_adam_step(const at::Tensor& marks, const at::Tensor& rates, int64_t steps, at::ArrayRef<double> new_rates,
+                    at::ArrayRef<double> root_scales, const at::Tensor& radii) {
+  const char* function = "lazy_adam_step";
+  const auto count = static_cast<int64_t>(new_rates.size());
+  TORCH_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors && root_scales.size() == new_rates.size(), function,
+                    ": ", count, " new_rates and ", root_scales.size(), " root_scales are given; it must be as many, 1 "
+                    "to ", kLazyAdamMaxTensors);
+  check_real(function, "rates", rates);
+  check_shape(function, "rates", rates, {"capacity", count, 2});
+  check_contiguous(function, "rates", rates);
+  check_shape(function, "marks", marks, {"N"});
+  check_row_numbers(function, "marks", marks, marks);
+  check_row_numbers(function, "radii", radii, marks);
+  check_device(function, "rates", rates, "marks", marks);
+  TORCH_CHECK_VALUE(0 <= steps && steps < rates.size(0), function, ": steps is ", steps, "; rates has room for ",
+                    rates.size(0));
+  const c10::DeviceGuard guard(marks.device());
+  AT_DISPATCH_FLOATING_TYPES(rates.scalar_type(), "lazy_adam_step", [&] {
+    LazyAdamStep<scalar_t> step = {};
+    step.num_rows = marks.size(0);
+    step.marks = marks.data_ptr<int32_t>();
+    step.radii = radii.data_ptr<int32_t>();
+    step.rates = reinterpret_cast<AdamRates<scalar_t>*>(rates.data_ptr<scalar_t>()) + steps * count;
+    for (int64_t i = 0; i < count; ++i) {
+      step.new_rates[i] = {static_cast<scalar_t>(new_rates[i]), static_cast<scalar_t>(root_scales[i])};
+    }
+    step.num_tensors = static_cast<int>(count);
+    step.steps = static_cast<int32_t>(steps);
+    Backend::note_step(step);
+  });
+  note_change({marks, rates});
+}
+
+template <class Backend>
+void gaussian_adam(at::TensorList raw, at::TensorList values, at::TensorList dL_dvalues, at::TensorList moments,
+                   at::TensorList squares, const at::Tensor& radii, at::ArrayRef<double> rates,
+                   at::ArrayRef<double> root_scales, double beta1, double beta2, double epsilon) {
+  const char* function = "gaussian_adam";
+  constexpr Activation kActivations[] = {Activation::kNone, Activation::kSigmoid, Activation::kExp,
+                                         Activation::kUnitQuaternion};
+  constexpr int64_t kSizes[] = {3, 1, 3, 4};
+  TORCH_CHECK_VALUE(raw.size() == kGaussianAdamTensors && rates.size() == raw.size() &&
+                        root_scales.size() == raw.size(),
+                    function, ": raw, rates and root_scales must have ", kGaussianAdamTensors, " items each");
+  check_real(function, "raw[0]", raw[0]);
+  for (size_t i = 0; i < raw.size(); ++i) {
+    check_shape(function, item_name("raw", i).c_str(), raw[i], {raw[0].size(0), kSizes[i]});
+  }
+  check_like_parameters(function, "raw", raw, raw);
+  check_like_parameters(function, "values", values, raw.slice(1));
+  check_like_parameters(function, "dL_dvalues", dL_dvalues, raw);
+  check_like_parameters(function, "moments", moments, raw);
+  check_like_parameters(function, "squares", squares, raw);
+  check_row_numbers(function, "radii", radii, raw[0]);
+  const c10::DeviceGuard guard(raw[0].device());
+  AT_DISPATCH_FLOATING_TYPES(raw[0].scalar_type(), "gaussian_adam", [&] {
+    GaussianAdam<scalar_t> adam = {};
+    adam.num_gaussians = raw[0].size(0);
+    adam.radii = radii.data_ptr<int32_t>();
+    adam.constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
+    for (size_t i = 0; i < raw.size(); ++i) {
+      adam.tensors[i] = {raw[i].data_ptr<scalar_t>(),
+                         i > 0 ? values[i - 1].data_ptr<scalar_t>() : nullptr,
+                         dL_dvalues[i].data_ptr<scalar_t>(),
+                         moments[i].data_ptr<scalar_t>(),
+                         squares[i].data_ptr<scalar_t>(),
+                         static_cast<int>(kSizes[i]),
+                         kActivations[i],
+                         {static_cast<scalar_t>(rates[i]), static_cast<scalar_t>(root_scales[i])}};
+      for (const at::Tensor* tensor : {&raw[i], &dL_dvalues[i], &moments[i], &squares[i]}) {
+        TORCH_CHECK_VALUE(i < 3 || reinterpret_cast<uintptr_t>(tensor->data_ptr()) % (4 * sizeof(scalar_t)) == 0,
+                          function, ": rotations must begin at a multiple of a quaternion's size");
+      }
+    }
+    Backend::step_gaussians(adam);
+  });
+  for (at::TensorList list : {raw, values, moments, squares}) note_change(list);
 }
 
 // The loss and, if it is wanted, its gradient by the image; an empty tensor otherwise.

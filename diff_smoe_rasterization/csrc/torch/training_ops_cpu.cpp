@@ -17,6 +17,14 @@ struct Cpu {
     cpu::adam(tensors, step, at::get_num_threads());
   }
 
+  template <class S> static void catch_up(const LazyAdam<S>& adam) { cpu::catch_up(adam, at::get_num_threads()); }
+
+  template <class S> static void note_step(const LazyAdamStep<S>& step) { cpu::note_step(step); }
+
+  template <class S> static void step_gaussians(const GaussianAdam<S>& adam) {
+    cpu::step_gaussians(adam, at::get_num_threads());
+  }
+
   template <class S> static int64_t num_image_loss_sums(const ImageLoss<S>& loss) {
     return cpu::num_image_loss_sums(loss.planes, loss.height, loss.width);
   }
@@ -46,6 +54,9 @@ at::Tensor mean_squared_neighbour_distances(const at::Tensor& points) {
 
 TORCH_LIBRARY_IMPL(diff_smoe_rasterization, CPU, m) {
   m.impl("adam", &dsmoe::binding::adam<dsmoe::binding::Cpu>);
+  m.impl("lazy_adam_catch_up", &dsmoe::binding::lazy_adam_catch_up<dsmoe::binding::Cpu>);
+  m.impl("lazy_adam_step", &dsmoe::binding::lazy_adam_step<dsmoe::binding::Cpu>);
+  m.impl("gaussian_adam", &dsmoe::binding::gaussian_adam<dsmoe::binding::Cpu>);
   m.impl("image_loss", &dsmoe::binding::image_loss<dsmoe::binding::Cpu>);
   m.impl("activate", &dsmoe::binding::activate<dsmoe::binding::Cpu>);
   m.impl("activate_backward", &dsmoe::binding::activate_backward<dsmoe::binding::Cpu>);

@@ -16,6 +16,14 @@ struct Cuda {
     cuda::adam(tensors, step, current_stream());
   }
 
+  template <class S> static void catch_up(const LazyAdam<S>& adam) { cuda::catch_up(adam, current_stream()); }
+
+  template <class S> static void note_step(const LazyAdamStep<S>& step) { cuda::note_step(step, current_stream()); }
+
+  template <class S> static void step_gaussians(const GaussianAdam<S>& adam) {
+    cuda::step_gaussians(adam, current_stream());
+  }
+
   template <class S> static int64_t num_image_loss_sums(const ImageLoss<S>& loss) {
     return cuda::num_image_loss_sums<S>(loss.planes, loss.height, loss.width);
   }
@@ -63,6 +71,9 @@ at::Tensor mean_squared_neighbour_distances(const at::Tensor& points) {
 
 TORCH_LIBRARY_IMPL(diff_smoe_rasterization, CUDA, m) {
   m.impl("adam", &dsmoe::binding::adam<dsmoe::binding::Cuda>);
+  m.impl("lazy_adam_catch_up", &dsmoe::binding::lazy_adam_catch_up<dsmoe::binding::Cuda>);
+  m.impl("lazy_adam_step", &dsmoe::binding::lazy_adam_step<dsmoe::binding::Cuda>);
+  m.impl("gaussian_adam", &dsmoe::binding::gaussian_adam<dsmoe::binding::Cuda>);
   m.impl("image_loss", &dsmoe::binding::image_loss<dsmoe::binding::Cuda>);
   m.impl("activate", &dsmoe::binding::activate<dsmoe::binding::Cuda>);
   m.impl("activate_backward", &dsmoe::binding::activate_backward<dsmoe::binding::Cuda>);

@@ -7,6 +7,21 @@ TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m) {
   m.def(
       "adam(Tensor(a!)[] parameters, Tensor[] gradients, Tensor(b!)[] moments, Tensor(c!)[] squares, float[] rates, "
       "float[] root_scales, float beta1, float beta2, float epsilon, Tensor? visible) -> ()");
+  // Brings rows of parameters [N, ...] up to date: all, or those whose radii [N] are above 0. See dsmoe/lazy_adam.h.
+  // marks [N] int32; rates [capacity, tensors, 2], of which `steps` are written.
+  m.def(
+      "lazy_adam_catch_up(Tensor(a!)[] parameters, Tensor(b!)[] moments, Tensor(c!)[] squares, Tensor[] gradients, "
+      "Tensor(d!) marks, Tensor rates, int steps, float beta1, float beta2, float epsilon, Tensor? radii) -> ()");
+  // Writes rates[steps], and marks the rows whose radii are above 0.
+  m.def(
+      "lazy_adam_step(Tensor(a!) marks, Tensor(b!) rates, int steps, float[] new_rates, float[] root_scales, "
+      "Tensor radii) -> ()");
+  // One step of Adam, in place, on raw means, opacities, scales and rotations, from the gradients by what `activate`
+  // makes of them in the rows whose radii [N] are above 0. values: what it made of the last three; written anew.
+  m.def(
+      "gaussian_adam(Tensor(a!)[] raw, Tensor(b!)[] values, Tensor[] dL_dvalues, Tensor(c!)[] moments, "
+      "Tensor(d!)[] squares, Tensor radii, float[] rates, float[] root_scales, float beta1, float beta2, "
+      "float epsilon) -> ()");
   // offset + l1_weight mean |image - target| + ssim_weight mean SSIM, where the mean of SSIM leaves out `margin` pixels
   // at each side; gradient by image, or empty. image [..., H, W]; target alike, or bytes.
   m.def(

@@ -24,4 +24,13 @@ DSMOE_HD void adam_step(const AdamConstants<S>& constants, const AdamRates<S>& r
   parameter -= rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
 }
 
+// The same with a gradient of zero.
+template <class S>
+DSMOE_HD void adam_rest_step(const AdamConstants<S>& constants, const AdamRates<S>& rates, S& parameter, S& moment,
+                             S& square) {
+  moment = constants.beta1 * moment;
+  square = constants.beta2 * square;
+  parameter -= rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
+}
+
 }  // namespace dsmoe

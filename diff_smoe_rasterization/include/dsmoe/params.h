@@ -149,7 +149,8 @@ template <class S> struct ImageGradients {
   const S* inverse_depth = nullptr;  // [H, W]
 };
 
-// Any of these may be null. Then that gradient is not wanted. The others are written whole.
+// Any of these may be null. Then that gradient is not wanted. The others are written whole, or in the rows of Gaussians
+// whose radius is above 0.
 template <class S> struct GaussianGradients {
   S* means3D = nullptr;         // [N, 3]
   S* means2D = nullptr;         // [N, 3] dL/dpixel times (W/2, H/2), z = 0: what densification reads
@@ -163,6 +164,7 @@ template <class S> struct GaussianGradients {
   S* shs = nullptr;             // [N, K, 3]
   S* background = nullptr;      // [C + 1] by the colour, then by its gate
   CameraGradient<S>* camera = nullptr;
+  bool seen_only = false;  // whether the other rows stay as they are, in place of zeros
 };
 
 // The gradients by the footprints of N Gaussians: what goes from the backward pass of the blend to that of the

@@ -58,23 +58,27 @@ class Renderer:
     def _render(self, function: Callable[..., Any], camera: Camera, background: Optional[torch.Tensor] = None,
                 background_gate: Optional[torch.Tensor] = None, **arguments: Any) -> Any:
         model = self.model
-        settings = self.settings_of(camera)
-        if background is not None:
-            settings = settings._replace(bg=background)
-        if background_gate is not None and self.blend_mode == "smoe":
-            settings = settings._replace(background_gate=background_gate)
+        settings = self.settings_of(camera, background, background_gate)
         if "colors_precomp" not in arguments:
             arguments.update(model.color_arguments())
         opacities, scales, rotations = model.activated()
         return function(model.raw["means3D"], opacities, settings, scales=scales, rotations=rotations, **arguments)
 
-    def settings_of(self, camera: Camera) -> GaussianRasterizationSettings:
-        """The camera's settings; its matrices stay on the device, where sending them anew would hold up the step."""
+    def settings_of(self, camera: Camera, background: Optional[torch.Tensor] = None,
+                    background_gate: Optional[torch.Tensor] = None) -> GaussianRasterizationSettings:
+        """The camera's settings; its matrices stay on the device, where sending them anew would hold up the step.
+
+        background, background_gate: in place of the renderer's.
+        """
         if id(camera) not in self._settings:  # kept with its camera, so that no other one gets this id
             self._settings[id(camera)] = (camera, camera.settings(self.background, 0, self.blend_mode,
                                                                   self.antialiasing))
-        settings = self._settings[id(camera)][1]._replace(sh_degree=self.model.active_sh_degree)
-        return settings._replace(background_gate=self.background_gate) if self.blend_mode == "smoe" else settings
+        changes: Dict[str, Any] = {"sh_degree": self.model.active_sh_degree}
+        if background is not None:
+            changes["bg"] = background
+        if self.blend_mode == "smoe":
+            changes["background_gate"] = self.background_gate if background_gate is None else background_gate
+        return self._settings[id(camera)][1]._replace(**changes)
 
 
 def background_color(white: bool, device: str) -> torch.Tensor:

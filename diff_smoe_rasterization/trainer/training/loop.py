@@ -6,7 +6,7 @@ import dataclasses
 import math
 import os
 import re
-from typing import Any, Callable, Dict, List, Optional, Tuple
+from typing import Any, Callable, Dict, List, Optional, Tuple, Union
 
 import torch
 
@@ -32,6 +32,7 @@ from ..system.stopwatch import Stopwatch
 from .background_gate import LearnedGate
 from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
 from .order import ViewOrder
+from .passes import AutogradPasses, DirectPasses
 from .randomness import random_state, restore_random_state, seed_everything
 from .strategies import STRATEGIES
 from .strategy import Step, StrategyContext
@@ -78,6 +79,8 @@ class Trainer:
         self.order = ViewOrder(len(scene.train), config.seed)
         self.watch = Stopwatch(config.device)
         self.iteration = 0
+        self.direct = config.device != "cpu" and rasterize is None
+        self._passes: Union[AutogradPasses, DirectPasses, None] = None
 
     def step(self, before_change: Optional[Callable[[], None]] = None) -> Step:
         """One iteration, in the order of 3DGS: densification comes between the gradients and the optimizer's step.
@@ -95,10 +98,11 @@ class Trainer:
         if self.iteration % config.sh_degree_interval == 0:
             model.raise_sh_degree()
         view = self.scene.train[self.order.next()]
-        means2D = torch.zeros_like(model.raw["means3D"], requires_grad=True)
         color = torch.rand(3, device=config.device) if config.random_background else None
-        rendering = self.renderer(view.camera, background=color, means2D=means2D,
-                                  background_gate=self.gate() if self.gate else None)
+        if self._passes is None:
+            passes = DirectPasses if self.direct and not self.strategy.uses_gradients else AutogradPasses
+            self._passes = passes(model, self.optimizer, self.renderer)
+        rendering, means2D = self._passes.render(view.camera, color, self.gate() if self.gate else None)
         image = rendering.color.detach()
         target = view.image if view.opacity is None else view.image_over(color, self.renderer.background)
         if view.mask is None:
@@ -109,13 +113,13 @@ class Trainer:
             gradient = gradient * mask
         step = Step(self.iteration, view.camera, rendering, means2D, loss)
         self.strategy.before_backward(step)
-        rendering.color.backward(gradient)
+        self._passes.backward(gradient)
         if before_change:
             before_change()
         if self.iteration < config.iterations:
             with torch.no_grad():
                 self.strategy.after_backward(step)
-                self.optimizer.step()
+                self._passes.update()
                 if self.gate:
                     self.gate.step()
                 self.strategy.after_step(step)

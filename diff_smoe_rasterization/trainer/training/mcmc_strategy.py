@@ -26,6 +26,8 @@ MOST_COPIES = 50  # of a Gaussian in one relocation: beyond, the binomials lose 
 class MCMCStrategy(Strategy):
     """Relocates dead Gaussians to others in a way that keeps the image, grows to the budget, explores by noise."""
 
+    uses_gradients = True
+
     def __init__(self, context: StrategyContext) -> None:
         super().__init__(context)
         with torch.no_grad():

@@ -13,7 +13,7 @@ import torch
 from ...gaussians import add_view
 from ...settings import Rendering
 from ..config import TrainConfig
-from ..model import PARAMETERS, GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
+from ..model import GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
 from ..results.rendering import Renderer
 from ..scenes.cameras import Camera
 from ..scenes.images import View
@@ -44,7 +44,7 @@ class Step:
     iteration: int  # counts from 1
     camera: Camera
     rendering: Rendering
-    means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H)
+    means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H) where radii > 0
     loss: torch.Tensor
 
 
@@ -54,6 +54,8 @@ class Strategy:
     Hooks run in this order in each step; rows may be added or removed in the last two (through the optimizer), which
     the last iteration of a run leaves out.
     """
+
+    uses_gradients = False  # whether after_backward reads or changes the .grad of parameters, which else have none
 
     def __init__(self, context: StrategyContext) -> None:
         """May change the first Gaussians; a resumed run replaces them and loads the state."""
@@ -128,25 +130,25 @@ class ThreeDGSStrategy(Strategy):
             wanted[torch.topk(gradients, count).indices] = True
         large = model.scales.detach().max(dim=1).values > config.percent_dense * self.context.extent
         parents = wanted & large
-        clones = self._rows(wanted & ~large)
-        children = self._children(self._rows(parents))
-        kept = torch.cat([~parents, parents.new_ones(len(clones["means3D"]) + len(children["means3D"]))])
-        self.context.optimizer.append({name: torch.cat([clones[name], children[name]]) for name in PARAMETERS})
-        self.context.optimizer.keep(kept)
+        clones = (wanted & ~large).nonzero().squeeze(1)
+        children = parents.nonzero().squeeze(1).repeat(CHILDREN)
+        means, scales = self._children(children)
+        raw = model.raw
+        self.context.optimizer.take(torch.cat([(~parents).nonzero().squeeze(1), clones, children]), {
+            "means3D": torch.cat([raw["means3D"].detach().index_select(0, clones), means]),
+            "scales": torch.cat([raw["scales"].detach().index_select(0, clones), scales])})
 
-    def _rows(self, mask: torch.Tensor) -> Dict[str, torch.Tensor]:
-        """The raw parameters of the Gaussians where mask [N] (bool) is True."""
-        rows = mask.nonzero().squeeze(1)
-        return {name: self.context.model.raw[name].detach().index_select(0, rows) for name in PARAMETERS}
+    def _children(self, parents: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        """Means and raw scales of smaller Gaussians, at places drawn from their parents' own distribution.
 
-    def _children(self, parents: Dict[str, torch.Tensor]) -> Dict[str, torch.Tensor]:
-        """Smaller Gaussians at places drawn from each parent's own distribution. parents: raw parameters."""
-        raw = {name: rows.repeat(CHILDREN, *[1] * (rows.dim() - 1)) for name, rows in parents.items()}
-        offsets = torch.normal(torch.zeros_like(raw["scales"]), raw["scales"].exp())
+        parents: the row of each one's parent.
+        """
+        raw = {name: self.context.model.raw[name].detach().index_select(0, parents)
+               for name in ("means3D", "scales", "rotations")}
+        scales = raw["scales"].exp()
+        offsets = torch.normal(torch.zeros_like(scales), scales)
         turned = torch.bmm(quaternion_to_matrix(raw["rotations"]), offsets.unsqueeze(2)).squeeze(2)
-        raw["means3D"] = raw["means3D"] + turned
-        raw["scales"] = torch.log(raw["scales"].exp() / SPLIT_SHRINK)
-        return raw
+        return raw["means3D"] + turned, torch.log(scales / SPLIT_SHRINK)
 
     def prune(self, large_too: bool) -> None:
         """Removes faint Gaussians and, if asked, those larger than a tenth of the scene."""

@@ -1,0 +1,71 @@
+"""A rendering and its gradients without autograd, for a loop that knows what it wants of them."""
+from __future__ import annotations
+
+from typing import Dict, Optional, Sequence
+
+import torch
+
+from .autograd import IMAGES, INPUTS, refuse_forward_mode
+from .rasterizer import _arguments, _rendering
+from .settings import GaussianRasterizationSettings, Rendering
+
+_OPS = torch.ops.diff_smoe_rasterization
+_COLORS, _BACKGROUND, _OPACITIES = INPUTS.index("colors_precomp"), INPUTS.index("bg"), INPUTS.index("opacities")
+_ABSENT = [INPUTS.index(name) for name in ("means2D", "dc", "shs", "background_gate")]
+_GRADIENTS = {"color": "color", "alpha": "gate_sum", "depth": "depth", "inverse_depth": "inverse_depth"}
+
+
+class DirectRendering:
+    """One rendering in three calls: which Gaussians it will show, its images, and their gradients.
+
+    The arguments are those of `rasterize`, and so are the errors and all numbers. It is for loops that save what
+    autograd costs: Python's time, and a pass over memory for every gradient that is only passed on.
+    """
+
+    def __init__(self, means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,
+                 means2D: Optional[torch.Tensor] = None, dc: Optional[torch.Tensor] = None,
+                 shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
+                 scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
+                 cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> None:
+        self._inputs, self._options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc,
+                                                 shs=shs, colors_precomp=colors_precomp, scales=scales,
+                                                 rotations=rotations, cov3D_precomp=cov3D_precomp)
+        refuse_forward_mode("rasterize", self._inputs)
+        self._outputs = outputs
+
+    @torch.no_grad()
+    def visible_radii(self) -> torch.Tensor:
+        """The radii [N] int32 that `render` will return for Gaussians of finite colours; colours are not read."""
+        inputs = list(self._inputs)
+        for index in _ABSENT:
+            inputs[index] = None
+        # A radius does not depend on the colour. Any finite number does for one.
+        inputs[_COLORS] = inputs[_OPACITIES].reshape(-1, 1)
+        inputs[_BACKGROUND] = inputs[_BACKGROUND][:1]
+        return _OPS.radii(*inputs, *self._options, False)
+
+    @torch.no_grad()
+    def render(self) -> Rendering:
+        """The images, without gradient. They must not be changed before `backward`."""
+        *self._images, self._saved = _OPS.rasterize(*self._inputs, *self._options, True)
+        return _rendering(self._images, self._outputs)
+
+    @torch.no_grad()
+    def backward(self, dL_dimages: Dict[str, torch.Tensor], gradients: Dict[str, torch.Tensor]) -> None:
+        """Writes gradients, after `render`.
+
+        dL_dimages: by name, `color` and OUTPUTS. gradients: for the arguments whose gradients are wanted, by name, also
+        bg and background_gate; dense and of their shape. Of those with a row for each Gaussian only the rows are
+        written whose radius is above 0. The others stay as they are.
+        """
+        unknown = set(gradients) - {name for name, value in zip(INPUTS, self._inputs) if value is not None}
+        if unknown or not set(dL_dimages) <= set(_GRADIENTS):
+            raise ValueError(f"DirectRendering.backward: dL_dimages has {', '.join(dL_dimages)} and gradients has "
+                             f"{', '.join(gradients)}; they may have {', '.join(_GRADIENTS)} and arguments that "
+                             "are given")
+        by_image = {_GRADIENTS[name]: gradient for name, gradient in dL_dimages.items()}
+        _OPS.rasterize_backward_seen(
+            *(by_image.get(name) for name in IMAGES if name != "radii"),
+            [value for value in self._inputs if value is not None], [value is not None for value in self._inputs],
+            self._images, self._saved, *self._options, True, [name in gradients for name in INPUTS],
+            [gradients[name] for name in INPUTS if name in gradients])

@@ -1,0 +1,88 @@
+"""Adam that touches only the rows that a step reads, with the results of Adam over all rows.
+
+Dense Adam reads four numbers and writes three for every number of every Gaussian, in every step: in training that is
+more memory traffic than all else. A view shows a third of the Gaussians or less. The others have no gradient, but Adam
+moves them on by their momentum, so they cannot just be left out. They can wait, though: nobody reads the spherical
+harmonics of a Gaussian that is not seen. So a row's last gradient waits with it, and when the row is next read, that
+step and all that it has missed since are made at once, in registers.
+"""
+from __future__ import annotations
+
+import math
+from typing import Any, Dict, List, Optional, Sequence
+
+import torch
+
+from .extension import _C  # noqa: F401  (loading it registers the ops)
+from .optimizers import FusedAdam
+
+_OPS = torch.ops.diff_smoe_rasterization
+_CAPACITY = 4096  # steps whose rates are kept; then every row is brought up to date
+
+
+class LazyAdam:
+    """Steps parameters of a FusedAdam whose rows are read now and then: bit for bit as the FusedAdam would.
+
+    A step has three parts:
+
+        lazy.catch_up(radii)    # the rows that will be read are brought up to date
+        ...                     # their gradients are written into lazy.gradients, in rows of radii > 0
+        lazy.step(radii)        # the step is made on these rows when they are next caught up
+
+    The parameters, and their moments in the FusedAdam, are up to date after `catch_up()`. They may be changed then, in
+    place; where one gets another number of rows, make a new LazyAdam. Learning rates may change between steps.
+    """
+
+    def __init__(self, adam: FusedAdam, parameters: Sequence[torch.Tensor]) -> None:
+        """parameters: of `adam`, 1 to 4, [N, ...] dense, which the caller does not let it step. They have one age."""
+        groups = {id(parameter): group for group in adam.param_groups for parameter in group["params"]}
+        if any(id(parameter) not in groups for parameter in parameters):
+            raise ValueError("LazyAdam: a parameter is not among those of adam")
+        self.adam = adam
+        self.parameters = list(parameters)
+        self._groups: List[Dict[str, Any]] = [groups[id(parameter)] for parameter in parameters]
+        first = self._groups[0]
+        if any(group["betas"] != first["betas"] or group["eps"] != first["eps"] for group in self._groups):
+            raise ValueError("LazyAdam: the parameters' groups differ in betas or eps; they must be the same")
+        if any(group.get(option) for group in self._groups for option in ("weight_decay", "amsgrad", "maximize")):
+            raise ValueError("LazyAdam: a group asks for weight_decay, amsgrad or maximize, which it does not have")
+        for parameter in self.parameters:
+            if not adam.state[parameter]:
+                adam.state[parameter].update(step=0, exp_avg=torch.zeros_like(parameter),
+                                             exp_avg_sq=torch.zeros_like(parameter))
+        self._states = [adam.state[parameter] for parameter in self.parameters]
+        if len({int(state["step"]) for state in self._states}) != 1:
+            raise ValueError("LazyAdam: the parameters have made different numbers of steps; they must be the same")
+        self.gradients = [torch.empty_like(parameter, requires_grad=False) for parameter in self.parameters]
+        """Where the gradients of the rows that are seen go; a row keeps its gradient until it is caught up."""
+        rows = len(self.parameters[0])
+        self._marks = torch.zeros(rows, dtype=torch.int32, device=self.parameters[0].device)
+        self._rates = self.parameters[0].new_zeros(_CAPACITY, len(self.parameters), 2)
+        self._steps = 0  # since all rows were up to date
+
+    @torch.no_grad()
+    def catch_up(self, radii: Optional[torch.Tensor] = None) -> None:
+        """Brings rows up to date: all, or those where radii [N] (int32) is above 0."""
+        if self._steps == 0:
+            return
+        group = self._groups[0]
+        _OPS.lazy_adam_catch_up(self.parameters, [state["exp_avg"] for state in self._states],
+                                [state["exp_avg_sq"] for state in self._states], self.gradients, self._marks,
+                                self._rates, self._steps, *group["betas"], group["eps"], radii)
+        if radii is None:
+            self._marks.zero_()
+            self._steps = 0
+
+    @torch.no_grad()
+    def step(self, radii: torch.Tensor) -> None:
+        """Makes a step. Rows where radii [N] (int32) is above 0 are up to date, and `gradients` has theirs."""
+        if self._steps == len(self._rates):
+            self.catch_up()
+        rates, root_scales = [], []
+        for group, state in zip(self._groups, self._states):
+            beta1, beta2 = group["betas"]
+            age = state["step"] = int(state["step"]) + 1
+            rates.append(group["lr"] / (1 - beta1**age))
+            root_scales.append(1 / math.sqrt(1 - beta2**age))
+        _OPS.lazy_adam_step(self._marks, self._rates, self._steps, rates, root_scales, radii)
+        self._steps += 1

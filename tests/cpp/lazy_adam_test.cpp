@@ -1,0 +1,59 @@
+// Lazy Adam on the CPU against dense steps by hand.
+#include "dsmoe/lazy_adam.h"
+
+#include <gtest/gtest.h>
+
+#include <vector>
+
+namespace dsmoe {
+namespace {
+
+constexpr AdamConstants<double> kConstants = {0.9, 0.999, 1 - 0.9, 1 - 0.999, 1e-15};
+
+// Two tensors of three rows. Row 0 has a gradient in step 0, row 1 in step 2, row 2 never.
+struct Rows {
+  std::vector<double> parameter = {1, 2, 3, 4, 5, 6}, moment = {0, 0, 0.5, 0.5, 0.25, 0.25}, square = moment;
+  std::vector<double> gradient = {0.3, -0.4, 0.5, 0.6, 99, 99};
+};
+
+LazyAdamTensor<double> tensor_of(Rows& rows) {
+  return {rows.parameter.data(), rows.moment.data(), rows.square.data(), rows.gradient.data(), 2};
+}
+
+TEST(LazyAdam, RowsThatWaitMakeTheStepsOfDenseAdam) {
+  Rows rows[2], expected[2];
+  rows[1].gradient = {-1, 1, 0, 2, 99, 99};
+  const std::vector<AdamRates<double>> rates = {{0.1, 3}, {0.2, 4}, {0.3, 2}, {0.4, 1}, {0.5, 1}, {0.6, 2}};
+  const int32_t no_row[] = {0, 0, 0}, first[] = {5, 0, 0}, second[] = {0, 1, 0};
+  std::vector<int32_t> marks = {0, 0, 0};
+  std::vector<AdamRates<double>> noted(rates.size());
+  LazyAdam<double> adam = {{tensor_of(rows[0]), tensor_of(rows[1])}, 2, 3, marks.data(), nullptr, noted.data(), 0,
+                           kConstants};
+  const int32_t* const radii[] = {first, no_row, second};
+  for (int step = 0; step < 3; ++step) {
+    adam.steps = step, adam.radii = radii[step];
+    cpu::catch_up(adam, 1);
+    cpu::note_step<double>({3, marks.data(), radii[step], noted.data() + 2 * step, {rates[2 * step], rates[2 * step + 1]},
+                            2, step});
+  }
+  EXPECT_EQ(marks, (std::vector<int32_t>{~0, ~2, 0})) << "two gradients wait, and one row has missed all";
+  EXPECT_EQ(rows[0].parameter[0], 1) << "nothing has read it";
+  adam.steps = 3, adam.radii = nullptr;
+  cpu::catch_up(adam, 2);
+  EXPECT_EQ(marks, (std::vector<int32_t>{3, 3, 3}));
+  for (int t = 0; t < 2; ++t) {
+    for (int i = 0; i < 6; ++i) {
+      for (int step = 0; step < 3; ++step) {
+        const bool has_gradient = (i / 2 == 0 && step == 0) || (i / 2 == 1 && step == 2);
+        adam_step(kConstants, rates[2 * step + t], has_gradient ? rows[t].gradient[i] : 0.0, expected[t].parameter[i],
+                  expected[t].moment[i], expected[t].square[i]);
+      }
+    }
+    EXPECT_EQ(rows[t].parameter, expected[t].parameter);
+    EXPECT_EQ(rows[t].moment, expected[t].moment);
+    EXPECT_EQ(rows[t].square, expected[t].square);
+  }
+}
+
+}  // namespace
+}  // namespace dsmoe

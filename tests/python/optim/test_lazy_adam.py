@@ -1,0 +1,160 @@
+"""LazyAdam against FusedAdam, bit for bit: rows that are seen now and then, long after, or never."""
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from devices import random_normal
+
+from diff_smoe_rasterization import FusedAdam, LazyAdam, lazy_adam
+
+SHAPES = [(700, 1, 3), (700, 15, 3)]  # more rows than a block of a kernel has threads, in widths of its own
+EPSILON = 1e-15
+
+
+def parameters_of(dtype, shapes=SHAPES):
+    return [random_normal(shape, seed, dtype).requires_grad_() for seed, shape in enumerate(shapes)]
+
+
+def adam_of(parameters, betas=(0.9, 0.999)):
+    return FusedAdam([{"params": [parameter], "lr": 0.01 / (1 + i)} for i, parameter in enumerate(parameters)],
+                     betas=betas, eps=EPSILON)
+
+
+def radii_of(step, rows):
+    """Which rows a step sees: a third at random, the first always, the second first in step 9, the last never."""
+    radii = (random_normal((rows,), 100 + step) > 0.4).int()
+    radii[0], radii[1], radii[-1] = 7, int(step == 9), 0
+    return radii
+
+
+def gradients_of(step, radii, parameters):
+    """Zero where the row is not seen."""
+    seen = (radii > 0).to(parameters[0].dtype)
+    return [random_normal(parameter.shape, 1000 * step + i, parameter.dtype)
+            * seen.view(-1, *[1] * (parameter.dim() - 1)) for i, parameter in enumerate(parameters)]
+
+
+def dense_steps(adam, parameters, steps):
+    for step in steps:
+        gradients = gradients_of(step, radii_of(step, len(parameters[0])), parameters)
+        for parameter, gradient in zip(parameters, gradients):
+            parameter.grad = gradient
+        adam.step()
+
+
+def lazy_steps(lazy, steps):
+    """As a trainer does it: what a step does not see must not be read, and has gradients that mean nothing."""
+    for step in steps:
+        radii = radii_of(step, len(lazy.parameters[0]))
+        lazy.catch_up(radii)
+        gradients = gradients_of(step, radii, lazy.parameters)
+        for waiting, gradient in zip(lazy.gradients, gradients):
+            waiting[radii > 0] = gradient[radii > 0]
+        lazy.step(radii)
+
+
+def assert_equal(mine, others, parameters):
+    for parameter, other in zip(*parameters):
+        assert torch.equal(parameter, other)
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(mine.state[parameter][key], others.state[other][key])
+        assert mine.state[parameter]["step"] == others.state[other]["step"]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("capacity", [4096, 7])
+def test_lazy_is_dense_bit_for_bit(device, monkeypatch, dtype, capacity):
+    """capacity: of steps; beyond it every row is brought up to date on the way."""
+    monkeypatch.setattr(lazy_adam, "_CAPACITY", capacity)
+    lazy_parameters, dense_parameters = parameters_of(dtype), parameters_of(dtype)
+    lazily, densely = adam_of(lazy_parameters), adam_of(dense_parameters)
+    lazy = LazyAdam(lazily, lazy_parameters)
+    lazy_steps(lazy, range(20))
+    dense_steps(densely, dense_parameters, range(20))
+    assert not torch.equal(lazy_parameters[1], dense_parameters[1]), "rows must have waited"
+    lazy.catch_up()
+    assert_equal(lazily, densely, (lazy_parameters, dense_parameters))
+    assert torch.equal(lazy_parameters[0][-1], parameters_of(dtype)[0][-1]), "what is never seen stays"
+
+
+def test_rows_that_are_caught_up_are_those_of_dense_adam(device):
+    lazy_parameters, dense_parameters = parameters_of(torch.float32), parameters_of(torch.float32)
+    lazy = LazyAdam(adam_of(lazy_parameters), lazy_parameters)
+    lazy_steps(lazy, range(12))
+    dense_steps(adam_of(dense_parameters), dense_parameters, range(12))
+    before = lazy_parameters[1].detach().clone()
+    radii = radii_of(12, 700)
+    lazy.catch_up(radii)
+    seen = radii > 0
+    assert torch.equal(lazy_parameters[1][seen], dense_parameters[1][seen])
+    assert torch.equal(lazy_parameters[1][~seen], before[~seen]), "the others are not touched"
+
+
+def test_a_break_with_a_checkpoint_and_other_rates_on_the_way(device):
+    """State that is taken while rows wait is complete after catch_up(); learning rates and rows change between steps."""
+    lazy_parameters, dense_parameters = parameters_of(torch.float64), parameters_of(torch.float64)
+    lazily, densely = adam_of(lazy_parameters), adam_of(dense_parameters)
+    lazy = LazyAdam(lazily, lazy_parameters)
+    for first in (0, 3, 6):
+        for adam in (lazily, densely):
+            adam.param_groups[0]["lr"] = 0.1 / (1 + first)
+        lazy_steps(lazy, range(first, first + 3))
+        dense_steps(densely, dense_parameters, range(first, first + 3))
+    lazy.catch_up()
+    resumed_parameters = [parameter.detach().clone().requires_grad_() for parameter in lazy_parameters]
+    resumed = adam_of(resumed_parameters)
+    resumed.load_state_dict(copy.deepcopy(lazily.state_dict()))
+    with torch.no_grad():
+        for parameters in (resumed_parameters, dense_parameters, lazy_parameters):
+            parameters[1][5] = 2.0
+    for lazy in (lazy, LazyAdam(resumed, resumed_parameters)):
+        lazy_steps(lazy, range(9, 15))
+        lazy.catch_up()
+    dense_steps(densely, dense_parameters, range(9, 15))
+    assert_equal(lazily, densely, (lazy_parameters, dense_parameters))
+    assert_equal(resumed, densely, (resumed_parameters, dense_parameters))
+
+
+def test_a_long_wait(device):
+    """Momentum fades to nothing, and so does the second moment, in as many roundings as dense Adam makes."""
+    lazy_parameters, dense_parameters = parameters_of(torch.float32, [(3, 2)]), parameters_of(torch.float32, [(3, 2)])
+    lazily, densely = adam_of(lazy_parameters, (0.5, 0.9)), adam_of(dense_parameters, (0.5, 0.9))
+    lazy = LazyAdam(lazily, lazy_parameters)
+    for step in range(300):
+        radii = torch.full((3,), int(step == 0), dtype=torch.int32)
+        lazy.gradients[0].fill_(1e-3 if step == 0 else float("nan"))
+        if step == 0:
+            lazy.step(radii)
+            lazy.gradients[0][:] = 1e-3
+        else:
+            lazy.catch_up(radii)
+            lazy.gradients[0].fill_(1e-3)  # of rows that wait it stays as it was
+            lazy.step(radii)
+        dense_parameters[0].grad = torch.full_like(dense_parameters[0], 1e-3 if step == 0 else 0.0)
+        densely.step()
+    lazy.catch_up()
+    assert_equal(lazily, densely, (lazy_parameters, dense_parameters))
+
+
+def test_what_does_not_fit_is_refused(device):
+    first, second = parameters_of(torch.float32, [(4, 3), (4, 2)])
+    with pytest.raises(ValueError, match="not among those of adam"):
+        LazyAdam(adam_of([first]), [second])
+    with pytest.raises(ValueError, match="differ in betas or eps"):
+        LazyAdam(FusedAdam([{"params": [first]}, {"params": [second], "eps": 0.5}]), [first, second])
+    decaying = adam_of([first])
+    decaying.param_groups[0]["weight_decay"] = 0.1
+    with pytest.raises(ValueError, match="asks for weight_decay"):
+        LazyAdam(decaying, [first])
+    adam = adam_of([first, second])
+    first.grad = torch.ones_like(first)
+    adam.step()
+    with pytest.raises(ValueError, match="different numbers of steps"):
+        LazyAdam(adam, [first, second])
+    lazy = LazyAdam(adam_of([first]), [first])
+    with pytest.raises(ValueError, match="radii has shape"):
+        lazy.step(torch.ones(3, dtype=torch.int32))
+    with pytest.raises(TypeError, match="radii is bool"):
+        lazy.step(torch.ones(4, dtype=torch.bool))

@@ -1,0 +1,72 @@
+"""DirectRendering against `rasterize` under autograd: the same radii, images and gradients, and no row too many."""
+from __future__ import annotations
+
+import pytest
+import torch
+from scenes import random_scene, with_gate
+
+from diff_smoe_rasterization import DirectRendering, rasterize, visible_radii
+from diff_smoe_rasterization.settings import OUTPUTS
+
+OLD = 77.0  # what memory holds before a gradient is written to it
+
+
+@with_gate
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("layout", ["shs", "dc and shs", "all of degree 3", "colors", "covariances"])
+def test_direct_is_rasterize_bit_for_bit(device, mode, dtype, layout):
+    degree = 3 if layout == "all of degree 3" else 2
+    scene = random_scene(mode, 300, 61, 43, degree=degree, dtype=dtype, channels=4 if layout == "colors" else None,
+                         covariance="cov3D" if layout == "covariances" else "scales",
+                         split_dc=layout in ("dc and shs", "all of degree 3"))
+    scene = scene.with_settings(deterministic=True)
+    graph = scene.requiring_grad()
+    wanted = rasterize(settings=graph.settings, outputs=OUTPUTS, **graph.inputs)
+    images = {"color": wanted.color, **{name: getattr(wanted, name) for name in OUTPUTS}}
+    weights = {name: torch.linspace(-1, 1, image.numel(), dtype=dtype).view_as(image)
+               for name, image in images.items()}
+    torch.autograd.backward(list(images.values()), [weights[name] for name in images])
+
+    direct = DirectRendering(settings=scene.settings, outputs=OUTPUTS, **scene.inputs)
+    assert torch.equal(direct.visible_radii(), wanted.radii)
+    rendering = direct.render()
+    assert torch.equal(rendering.radii, wanted.radii) and not rendering.color.requires_grad
+    assert all(torch.equal(getattr(rendering, name), image) for name, image in images.items())
+    camera = scene.camera()
+    gradients = {name: torch.full_like(tensor, OLD) for name, tensor in {**scene.inputs, **camera}.items()}
+    direct.backward(weights, gradients)
+    seen = wanted.radii > 0
+    assert seen.any() and not seen.all()
+    for name, tensor in graph.inputs.items():
+        assert torch.equal(gradients[name][seen], tensor.grad[seen]), name
+        assert (gradients[name][~seen] == OLD).all(), name
+    for name, tensor in graph.camera().items():
+        assert torch.equal(gradients[name], tensor.grad), name
+
+
+def test_only_what_is_asked_for_is_computed(device):
+    scene = random_scene("alpha", 50)
+    direct = DirectRendering(settings=scene.settings, **scene.inputs)
+    color = direct.render().color
+    means, shs = torch.zeros_like(scene.inputs["means3D"]), torch.zeros_like(scene.inputs["shs"])
+    direct.backward({"color": torch.ones_like(color)}, {"means3D": means})
+    direct.backward({"color": torch.ones_like(color)}, {"shs": shs})
+    assert means.any() and shs.any()
+    assert torch.equal(direct.visible_radii(), visible_radii(scene.inputs["means3D"], scene.settings,
+                                                             scales=scene.inputs["scales"],
+                                                             rotations=scene.inputs["rotations"]))
+
+
+def test_what_does_not_fit_is_refused(device):
+    scene = random_scene("alpha", 20)
+    direct = DirectRendering(settings=scene.settings, **scene.inputs)
+    color = torch.ones_like(direct.render().color)
+    means = scene.inputs["means3D"]
+    with pytest.raises(ValueError, match="gradients has colors_precomp; they may have"):
+        direct.backward({"color": color}, {"colors_precomp": means})
+    with pytest.raises(ValueError, match="dL_dimages has colour"):
+        direct.backward({"colour": color}, {"means3D": means})
+    with pytest.raises(ValueError, match="the gradient of means3D has shape"):
+        direct.backward({"color": color}, {"means3D": means[1:].clone()})
+    with pytest.raises(ValueError, match="the gradient of means3D"):
+        direct.backward({"color": color}, {"means3D": torch.zeros(3, 20, dtype=means.dtype).t()})

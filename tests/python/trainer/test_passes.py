@@ -1,0 +1,91 @@
+"""The direct passes of a step against those of autograd: the same training, bit for bit, whatever happens in it."""
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from diff_smoe_rasterization.trainer.model import PARAMETERS
+from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.training.checkpoint import load_checkpoint, save_checkpoint
+from diff_smoe_rasterization.trainer.training.loop import Trainer
+from diff_smoe_rasterization.trainer.training.passes import AutogradPasses, DirectPasses
+
+
+@pytest.fixture
+def scene(tiny_config):
+    return load_scene(tiny_config, progress=False)
+
+
+def trained(config, scene, direct, steps=40):
+    trainer = Trainer(config, scene)
+    trainer.direct = direct  # on the CPU it is not by itself
+    for _ in range(steps):
+        trainer.step()
+    return trainer
+
+
+def assert_equal(one, other):
+    states = [trainer.state_dict() for trainer in (one, other)]
+    for name in PARAMETERS:
+        assert torch.equal(states[0]["raw"][name], states[1]["raw"][name]), name
+        of_one, of_other = (state["optimizer"].get(name, {}) for state in states)
+        assert set(of_one) == set(of_other)
+        for key, value in of_one.items():
+            assert torch.equal(torch.as_tensor(value), torch.as_tensor(of_other[key])), (name, key)
+    for key in ("gradient_sum", "view_count"):
+        if key in states[0]["strategy"]:
+            assert torch.equal(states[0]["strategy"][key], states[1]["strategy"][key])
+    assert one.background_gate == other.background_gate
+
+
+@pytest.mark.parametrize("options", [
+    dict(blend_mode="alpha"), dict(blend_mode="smoe", background_gate=0.0),
+    dict(blend_mode="smoe", background_gate="learned", random_background=True),
+    dict(blend_mode="alpha", antialiasing=True, white_background=True, sh_degree=1),
+    dict(blend_mode="alpha", schedule="steady", sh_degree=0),
+    dict(blend_mode="smoe", schedule="gate", budget=60)], ids=str)
+def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
+    """Densifications are at 8, 16, 24; an opacity reset alone, at 12, replaces one parameter of all."""
+    config = tiny_config.changed(**options)
+    trainers = [trained(config, scene, direct) for direct in (False, True)]
+    assert [type(trainer._passes) for trainer in trainers] == [AutogradPasses, DirectPasses]
+    assert trainers[1].model.num_gaussians != len(scene.points.positions), "something must have been densified"
+    assert_equal(*trainers)
+
+
+def test_who_reads_the_model_finds_it_up_to_date(tiny_config, scene):
+    """At any time, and reading changes nothing of what follows."""
+    quiet, disturbed = (Trainer(tiny_config, scene) for _ in range(2))
+    dense = Trainer(tiny_config, scene)
+    quiet.direct = disturbed.direct = True
+    waited = False
+    for step in range(30):
+        for trainer in (quiet, disturbed, dense):
+            trainer.step()
+        waited |= not torch.equal(quiet.model.stored["dc"], dense.model.stored["dc"])
+        if step % 4 == 0:
+            assert torch.equal(disturbed.model.raw["dc"], dense.model.raw["dc"])
+            assert disturbed.evaluate().metrics == dense.evaluate().metrics
+    assert waited, "no row has waited"
+    assert_equal(quiet, disturbed)
+
+
+def test_a_checkpoint_on_the_way(tiny_config, scene, tmp_path):
+    straight = trained(tiny_config, scene, True)
+    broken = trained(tiny_config, scene, True, 21)
+    path = str(tmp_path / "checkpoint.pt")
+    save_checkpoint(path, broken.state_dict())
+    resumed = Trainer(tiny_config, scene)
+    resumed.direct = True
+    resumed.load_state_dict(load_checkpoint(path, "cpu"))
+    for _ in range(19):
+        resumed.step()
+    assert_equal(straight, resumed)
+
+
+def test_a_strategy_that_uses_gradients_has_them(tiny_config, scene):
+    config = dataclasses.replace(tiny_config.changed(schedule="mcmc", budget=100))
+    trainer = trained(config, scene, True, 2)
+    assert isinstance(trainer._passes, AutogradPasses)
