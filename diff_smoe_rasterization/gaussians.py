@@ -48,3 +48,24 @@ class _Activate(torch.autograd.Function):
     def backward(ctx: Any, *dL_dvalues: Any) -> Tuple[torch.Tensor, ...]:  # type: ignore[override]
         saved = ctx.saved_tensors
         return _OPS.activate_backward(saved[:3], saved[3:], *dL_dvalues)
+
+
+MOST_COPIES = 50  # of a Gaussian in `divided`: beyond, the binomials lose their digits
+
+
+def divided(opacities: torch.Tensor, copies: torch.Tensor,
+            least_opacity: float = 0.0) -> Tuple[torch.Tensor, torch.Tensor]:
+    """Opacity and scale factor [M] of each of n equal Gaussians in one place that look as the one before.
+
+    That is Equation 9 of 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv:2404.09591).
+    opacities: [M] of the one; copies: [M] n, taken as 50 where it is more. least_opacity: the scale factor follows it.
+    """
+    old, n = opacities.double().unsqueeze(1), copies.double().clamp(1, MOST_COPIES).unsqueeze(1)
+    new = (1 - (1 - old) ** (1 / n)).clamp(min=least_opacity)
+    j = torch.arange(1.0, MOST_COPIES + 1, dtype=torch.float64, device=opacities.device)
+    # The paper's sum over i of the binomials (i - 1, k) is (n, k + 1).
+    log_binomials = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
+    signs = 2 * (j % 2) - 1
+    terms = signs * (log_binomials + j * new.log()).exp() / j.sqrt()
+    sums = terms.masked_fill(j > n, 0).sum(1)
+    return new.squeeze(1).to(opacities), (old.squeeze(1) / sums).to(opacities)

@@ -33,7 +33,6 @@ def _float32(value):
     return torch.tensor(value, dtype=torch.float32).item()
 
 
-LOW_PASS = 0.3  # px^2 on the diagonal of cov2D: a splat is never narrower than about a pixel (3DGS)
 COMPENSATION_MIN = _float32(2.5e-5)  # least square of the antialiasing factor (3DGS of 2024)
 FRUSTUM_MARGIN = 1.3  # the Jacobian is taken at most this many tan(fov) off axis, where it still fits (3DGS)
 W_EPSILON = 1e-7  # added to the clip w before dividing (3DGS)
@@ -256,7 +255,7 @@ def project(gaussians, settings):
     to_image = jacobian @ settings.viewmatrix[:3, :3].T
     raw = to_image @ covariance3D(gaussians, settings.scale_modifier) @ to_image.transpose(1, 2)
     raw_xx, xy, raw_yy = raw[:, 0, 0], raw[:, 0, 1], raw[:, 1, 1]
-    xx, yy = raw_xx + LOW_PASS, raw_yy + LOW_PASS
+    xx, yy = raw_xx + settings.low_pass, raw_yy + settings.low_pass
     det = xx * yy - xy * xy
     opacity = gaussians.opacities
     if settings.antialiasing:

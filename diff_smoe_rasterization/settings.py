@@ -61,7 +61,7 @@ class GaussianRasterizationSettings(NamedTuple):
     campos: torch.Tensor  # [3] camera centre, world
     prefiltered: bool = False  # the caller asserts that every point lies in front of the near plane
     debug: bool = False  # check inputs and results for NaN; slower
-    antialiasing: bool = False  # scale opacity by sqrt(det(cov2D) / det(cov2D + 0.3 I))
+    antialiasing: bool = False  # scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
     near: float = 0.2  # Gaussians with view depth <= near are culled
     alpha_min: float = 0.0  # SMoE modes: also skip alpha below this; 0 is the paper's rule
     strict: bool = False  # raise where an attribute is NaN or infinite, instead of culling that Gaussian
@@ -71,6 +71,7 @@ class GaussianRasterizationSettings(NamedTuple):
     clamp_color: bool = True  # colours from shs are at least 0; False: as the harmonics give them, with their gradient
     # `smoe`: how much the background weighs against the Gaussians, 0 or more; None: $DSMOE_BACKGROUND_GATE, else 0
     background_gate: Optional[BackgroundGate] = None
+    low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
 
 
 class Rendering(NamedTuple):

@@ -3,29 +3,32 @@ from __future__ import annotations
 
 from collections import namedtuple
 from inspect import Parameter, Signature
-from typing import Any, Dict, Sequence, Tuple
+from typing import Any, Callable, Dict, Optional, Sequence, Tuple
 
 import torch
+from torch.nn.functional import pad
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
-from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.settings import resolve_blend
 
 from .contracts import RESULTS, contract_of
 
-ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",)}
+ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",),
+              "opacity": ("alpha",)}
+COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums")  # results that need another walk
 
 
-def settings_with(name: str, module: str) -> type:
-    """Returns the package's settings as a class whose thirteenth field is `name`.
+def settings_with(names: Sequence[str], module: str) -> type:
+    """Returns the package's settings as a class that has the fields `names` behind `debug`.
 
     A field that the package has too moves there with its default; another one has the default None.
     module: the name of the module whose class it is, by which pickle finds it.
     """
-    fields = [field for field in Settings._fields if field != name]
-    fields.insert(fields.index("debug") + 1, name)
-    defaults = {name: None, **Settings._field_defaults}
+    fields = [field for field in Settings._fields if field not in names]
+    fields[fields.index("debug") + 1:fields.index("debug") + 1] = names
+    defaults = {**dict.fromkeys(names), **Settings._field_defaults}
     return namedtuple("GaussianRasterizationSettings", fields, module=module,
                       defaults=[defaults[field] for field in fields if field in defaults])
 
@@ -46,17 +49,55 @@ def share_of_gaussians(gate_sum: torch.Tensor, settings: Settings) -> torch.Tens
     return torch.where(total > 0, gate_sum / torch.where(total > 0, total, 1), torch.zeros_like(total))
 
 
-def results_of(contract: str, settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, ...]:
-    """Renders as `rasterize`, and returns the results of a contract in its order, as RESULTS explains them."""
-    names = contract_of(contract).results
+def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any],
+               **found: torch.Tensor) -> Tuple[torch.Tensor, ...]:
+    """Renders as `rasterize`, and returns results by their names, as RESULTS explains them; found: those at hand."""
     outputs = sorted({output for name in names for output in ON_REQUEST.get(name, ())})
-    rendering = rasterize(settings=settings, outputs=outputs, **inputs)
-    found = {"color": rendering.color, "radii": rendering.radii, "inverse_depth": rendering.inverse_depth}
+    if any(name in COUNTED and name not in found for name in names):
+        rendering, splats = rasterize_with_splats(settings=settings, outputs=outputs, **inputs)
+        sums = splats.contributions(torch.ones_like(rendering.color[0]))
+        found.update(pixels=sums.pixels.to(rendering.color.dtype), weights=sums.blend_weights, n_touched=sums.pixels,
+                     counts=sums.pixels, opacity_sums=sums.pixels * inputs["opacities"].detach().reshape(-1))
+    else:
+        rendering = rasterize(settings=settings, outputs=outputs, **inputs)
+    found = {"color": rendering.color, "radii": rendering.radii, "inverse_depth": rendering.inverse_depth,
+             "is_used": (rendering.radii > 0).to(torch.int32), **found}
     if "alpha" in outputs:
-        found["alpha"] = share_of_gaussians(rendering.alpha, settings)
+        found["alpha"] = found["opacity"] = share_of_gaussians(rendering.alpha, settings)
     if "depth" in outputs:
         found["depth"] = rendering.depth * found["alpha"]
     return tuple(found[name] for name in names)
+
+
+def results_with_features(names: Sequence[str], settings: Settings, inputs: Dict[str, Any], feature: str,
+                          features: torch.Tensor) -> Tuple[torch.Tensor, ...]:
+    """Returns `results_of`, in one rendering with features [N, F] or [N, 1, F], whose image is the result `feature`."""
+    features = features.reshape(len(features), -1)
+    inputs = dict(inputs)
+    shs, colors = inputs.pop("shs", None), inputs.pop("colors_precomp", None)
+    if colors is None or colors.numel() == 0:
+        colors = reference.color(reference.Gaussians(inputs["means3D"], None, None, shs, None, None, None, None),
+                                 settings)
+    inputs["colors_precomp"] = torch.cat([colors, features], 1)
+    results = list(results_of([name for name in names if name != feature],
+                              settings._replace(bg=pad(settings.bg, (0, features.shape[1]))), inputs))
+    place = [name for name in names if name != feature].index("color")
+    results[place], image = results[place].split([colors.shape[1], features.shape[1]])
+    results.insert(list(names).index(feature), image)
+    return tuple(results)
+
+
+def with_absolute(columns: int, inputs: Dict[str, Any]) -> Dict[str, Any]:
+    """Returns the inputs with means2D_abs, so that the columns of means2D behind x and y get absolute sums.
+
+    columns: 2 for x and y, or 1 for the sum of both. A means2D without those columns is passed on as it is.
+    """
+    points = inputs.get("means2D")
+    if not columns or points is None or points.shape[1] != 2 + columns:
+        return inputs
+    if not points.requires_grad:
+        return {**inputs, "means2D": None}
+    return {**inputs, "means2D": pad(points[:, :2], (0, 1)), "means2D_abs": points[:, 2:2 + columns].expand(-1, 2)}
 
 
 def scaled_gradients(confidence: torch.Tensor, tensors: Dict[str, Any]) -> Dict[str, Any]:
@@ -71,17 +112,21 @@ def scaled_gradients(confidence: torch.Tensor, tensors: Dict[str, Any]) -> Dict[
     return {name: tensor if name == "means2D" else scaled(tensor) for name, tensor in tensors.items()}
 
 
-def classes_of(contract: str, module: str) -> Tuple[type, type, Any]:
+Renderer = Callable[[Settings, Dict[str, Any]], Tuple[torch.Tensor, ...]]
+
+
+def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) -> Tuple[type, type, Any]:
     """Returns GaussianRasterizationSettings, GaussianRasterizer and rasterize_gaussians of a contract.
 
-    module: the name of the module whose they are.
+    module: the name of the module whose they are. renderer: from the settings and the arguments by name to the results,
+    where `results_of` does not do.
     """
     entry = contract_of(contract)
     own = [name for name in entry.settings if name not in Settings._fields]
-    settings_class = settings_with(own[0], module) if own else Settings
+    settings_class = settings_with(own, module) if own else Settings
     renamed = {"shs": "sh", "cov3D_precomp": "cov3Ds_precomp"}
     further = [name for name in entry.arguments if name not in ("means3D", "means2D", "opacities")]
-    place = further.index("colors_precomp") + 1
+    place = further.index("scales")
     positional = ["means3D", "means2D", *further[:place], "opacities", *further[place:]]
     of_function = _signature(*(renamed.get(name, name) for name in positional), "raster_settings")
     required = ("self", "means3D", "means2D", "opacities")
@@ -93,7 +138,9 @@ def classes_of(contract: str, module: str) -> Tuple[type, type, Any]:
         if densify is not None:  # one gradient of the image, which both receive
             inputs["means2D"] = densify if inputs["means2D"] is None else inputs["means2D"] + densify
         confidence = getattr(settings, "confidence", None)
-        return results_of(contract, settings, inputs if confidence is None else scaled_gradients(confidence, inputs))
+        inputs = with_absolute(entry.absolute, inputs)
+        inputs = inputs if confidence is None else scaled_gradients(confidence, inputs)
+        return renderer(settings, inputs) if renderer else results_of(entry.results, settings, inputs)
 
     def rasterize_gaussians(*values: Any, **named: Any) -> Tuple[torch.Tensor, ...]:
         given = of_function.bind(*values, **named).arguments

@@ -1,13 +1,14 @@
 """The Python APIs of public Gaussian rasterizers, as data: how a trainer is recognised by them, and what is returned.
 
 From this table come the modules here, what `dsmoe run` answers for, how `dsmoe patch` tells trainers apart, and the
-table in README.md. A new rasterizer of Inria's kind is one entry and a module of three lines, such as depth.py.
+table in README.md. A new rasterizer of Inria's kind is one entry and a module of three lines, such as depth.py. One that
+is imported by a name of its own also has a folder of that name in patches/shims.
 """
 from __future__ import annotations
 
 from typing import NamedTuple, Tuple
 
-RASTERIZER = "diff_gaussian_rasterization"  # the name that trainers import
+RASTERIZER = "diff_gaussian_rasterization"  # the name that most trainers import
 SETTINGS = ("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
             "sh_degree", "campos", "prefiltered", "debug")
 ARGUMENTS = ("means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
@@ -19,11 +20,23 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "inverse_depth": ("[1, H, W], 1 / z blended as a colour over 0", ""),
     "depth": ("[1, H, W], z blended as a colour over 0", "depth"),
     "alpha": ("[1, H, W], the share of the pixel that the background does not have", "alpha"),
+    "opacity": ("[1, H, W], the same as alpha", "opac"),
+    "is_used": ("[N] int32, 1 where the radius is positive", "used"),
+    "pixels": ("[N], how many pixels blended the Gaussian", "pixel"),
+    "weights": ("[N], sum over them of alpha T", "w"),
+    "n_touched": ("[N] int32, how many pixels blended the Gaussian", "touched"),
+    "counts": ("[N] int32, how many pixels blended the Gaussian", "count"),
+    "opacity_sums": ("[N], counts times the opacity", "score"),
+    "metric_counts": ("[N] int32, how many pixels of metric_map blended the Gaussian", "count"),
+    "kernel_times": ("[0], nothing is timed", "time"),
+    "objects": ("[F, H, W], sh_objs blended as a colour over 0", "object"),
+    "feature_map": ("[F, H, W], semantic_feature blended as a colour over 0", "feature"),
+    "language_feature": ("[F, H, W], language_feature_precomp blended as a colour over 0", "feature"),
 }
 
 
 class Contract(NamedTuple):
-    """What callers of a rasterizer rely on, beside SETTINGS, ARGUMENTS and NAMES, which all have."""
+    """What callers of a rasterizer rely on, beside SETTINGS, ARGUMENTS and NAMES, which all of Inria's kind have."""
 
     name: str  # of the module here, and for `dsmoe run --trainer`
     used_by: str
@@ -32,9 +45,18 @@ class Contract(NamedTuple):
     arguments: Tuple[str, ...] = ARGUMENTS  # of a call, in order
     names: Tuple[str, ...] = ()  # that can be imported
     signs: Tuple[str, ...] = ()  # a caller shows one of these (patches/facts.py); none: it needs to show nothing
+    module: str = RASTERIZER  # what callers import
+    other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings
+    absolute: int = 0  # columns of means2D behind x and y that get sums of absolute gradients: of both axes, or of each
 
 
-WITH_DC = ARGUMENTS[:3] + ("dc",) + ARGUMENTS[3:]
+def _behind(name: str, *further: str) -> Tuple[str, ...]:
+    """Returns ARGUMENTS with further ones behind one of them."""
+    place = ARGUMENTS.index(name) + 1
+    return (*ARGUMENTS[:place], *further, *ARGUMENTS[place:])
+
+
+WITH_DC = _behind("opacities", "dc")
 TAMING = ("color", "radii", "counts", "lists", "listsRender", "listsDistance", "centers", "depths", "my_radii",
           "accum_weights", "accum_count", "accum_blend", "accum_dist")
 
@@ -46,6 +68,24 @@ CONTRACTS = (
              signs=("sets clamp_color", "imports GaussianRasterizerIndexed")),
     Contract("taming", "Taming-3DGS", TAMING, ("pixel_weights",), WITH_DC, ("SparseGaussianAdam",),
              ("sets pixel_weights",)),
+    Contract("mip_splatting", "Mip-Splatting, TRELLIS", settings=("kernel_size", "subpixel_offset"),
+             signs=("sets kernel_size",), absolute=1),
+    Contract("mcmc", "3DGS-MCMC", ("color", "radii", "is_used"), names=("compute_relocation",)),
+    Contract("monogs", "MonoGS", ("color", "radii", "depth", "opacity", "n_touched"), ("projmatrix_raw",),
+             (*ARGUMENTS, "theta", "rho"), signs=("sets projmatrix_raw",),
+             other_results=(("color", "radii", "depth", "opacity"),)),
+    Contract("grouping", "gaussian-grouping", ("color", "radii", "objects"), arguments=_behind("shs", "sh_objs"),
+             signs=("takes sh_objs",)),
+    Contract("feature_3dgs", "feature-3dgs", ("color", "feature_map", "radii", "depth"),
+             arguments=_behind("colors_precomp", "semantic_feature"), signs=("takes semantic_feature",)),
+    Contract("langsplat", "LangSplat", ("color", "language_feature", "radii"), ("include_feature",),
+             _behind("colors_precomp", "language_feature_precomp"), signs=("sets include_feature",)),
+    Contract("speedy_splat", "Speedy-Splat", ("color", "radii", "kernel_times"),
+             arguments=_behind("opacities", "scores"), signs=("takes scores",)),
+    Contract("pixel_gs", "Pixel-GS", ("color", "radii", "pixels"), ("depth_threshold",),
+             signs=("sets depth_threshold",)),
+    Contract("light_gaussian", "LightGaussian", settings=("f_count",), signs=("sets f_count",),
+             other_results=(("counts", "opacity_sums", "color", "radii"),)),
     Contract("inria_2024", "3DGS of 2024 (`antialiasing`, sparse Adam)", ("color", "radii", "inverse_depth"),
              ("antialiasing",), WITH_DC, ("SparseGaussianAdam",),
              ("sets antialiasing", "takes dc", "imports SparseGaussianAdam", "reads invdepthmap")),
@@ -54,6 +94,10 @@ CONTRACTS = (
              arguments=(*ARGUMENTS, "means2D_densify")),
     Contract("depth_alpha", "dreamgaussian, LGM, DNGaussian, FSGS, SC-GS", ("color", "radii", "depth", "alpha"),
              settings=("confidence",)),
+    Contract("absgs", "AbsGS", ("color", "radii", "weights"), module=RASTERIZER + "_abs", absolute=2),
+    Contract("fastgs", "FastGS", ("color", "radii", "metric_counts"), ("mult", "get_flag", "metric_map"), WITH_DC,
+             ("SparseGaussianAdam",), module=RASTERIZER + "_fastgs", absolute=2),
+    Contract("gsplat", "gsplat, nerfstudio", ("renders", "alphas", "meta"), module="gsplat"),
 )
 
 

@@ -6,23 +6,29 @@ from typing import Any, Dict, Optional, Tuple
 import torch
 import torch.nn.functional as functional
 
-from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize
+from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, visible_radii
+from diff_smoe_rasterization.gaussians import divided
 from diff_smoe_rasterization.settings import BackgroundGate
 
 from ._rasterizer import share_of_gaussians
 
-__all__ = ["rasterization"]
+__all__ = ["compute_relocation", "rasterization"]
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
-# Arguments of later versions of gsplat. Callers spell them out with the values that switch them off.
-OF_LATER_VERSIONS = ("with_ut", "with_eval3d", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs",
-                     "ftheta_coeffs", "rolling_shutter", "viewmats_rs")
+EVERYTHING_NEARER = 1e10  # the far_plane that leaves nothing out
+# Arguments of later versions of gsplat, with the values that switch them off. Callers spell those out.
+OF_LATER_VERSIONS = {
+    "with_ut": False, "with_eval3d": False, "return_normals": False, "global_z_order": True, "rays": None,
+    "radial_coeffs": None, "tangential_coeffs": None, "thin_prism_coeffs": None, "ftheta_coeffs": None,
+    "lidar_coeffs": None, "external_distortion_coeffs": None, "rolling_shutter": None, "viewmats_rs": None,
+    "ut_params": None, "extra_signals": None, "extra_signals_sh_degree": None, "renderer_config": None}
+GLOBAL_SHUTTER = "GLOBAL"  # the name of the other value of rolling_shutter that switches it off
 
 
 def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Optional[torch.Tensor],
-                  opacities: torch.Tensor, colors: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor, width: int,
-                  height: int, near_plane: float = 0.01, far_plane: float = 1e10, radius_clip: float = 0.0,
+                  opacities: torch.Tensor, colors: Optional[torch.Tensor], viewmats: torch.Tensor, Ks: torch.Tensor, width: int,
+                  height: int, near_plane: float = 0.01, far_plane: float = EVERYTHING_NEARER, radius_clip: float = 0.0,
                   eps2d: float = 0.3, sh_degree: Optional[int] = None, packed: bool = False,
                   tile_size: Optional[int] = None, backgrounds: Optional[torch.Tensor] = None, render_mode: str = "RGB",
                   sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: str = "classic",
@@ -40,7 +46,12 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         viewmats: [C, 4, 4] world to camera, for column vectors; differentiable.
         Ks: [C, 3, 3] focal lengths and principal points in pixels, without skew; they get no gradient and are read by
             the host, which on a GPU waits for them.
-        near_plane: Gaussians with view depth <= near_plane are culled.
+            colors may be None where render_mode has no RGB.
+        near_plane, far_plane: Gaussians with view depth <= near_plane or > far_plane are culled.
+        eps2d: what is added to the variances on the image, square pixels.
+        radius_clip: Gaussians with a radius <= radius_clip, in pixels, are culled.
+        packed: meta is that of gsplat's packed mode. What is computed, and its memory, is the same.
+        absgrad: means2d also gets the attribute `absgrad`: the sum over pixels of its absolute gradients.
         backgrounds: [C, D]; None is black. The background of a depth is 0.
         render_mode: "RGB", and ED for the depth sum(w z) / sum(w) or D for that times alphas, alone or as the last
             channel.
@@ -57,17 +68,18 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
             sum(w) in `alpha`, and 1 wherever a gate is open where the background has no gate.
         meta: means2d [C, N, 2], pixels, which receives the gradient of the images by them (also in pixels) and passes
             none on; radii [C, N, 2] int32, 3 sigma of the longer axis twice, 0 where not seen; depths [C, N]; width,
-            height, n_cameras, n_batches; batch_ids, camera_ids and gaussian_ids are None, as always without `packed`.
+            height, n_cameras, n_batches; batch_ids, camera_ids and gaussian_ids are None. With `packed` means2d,
+            radii and depths have a row for each Gaussian that a camera sees, [M, 2], [M, 2] and [M], and the three
+            ids [M] say which.
 
     Raises:
-        NotImplementedError: what is asked for is not offered: far_plane, radius_clip or eps2d other than the defaults,
-            packed, sparse_grad, absgrad, distributed, other cameras, arguments of later versions of gsplat.
+        NotImplementedError: what is asked for is not offered: sparse_grad, distributed, other cameras, arguments of
+            later versions of gsplat but with the values that switch them off.
         ValueError, TypeError: arguments do not fit.
     """
     _refuse_what_is_not_offered(
-        others, packed=(packed, False), sparse_grad=(sparse_grad, False), absgrad=(absgrad, False),
-        distributed=(distributed, False), camera_model=(camera_model, "pinhole"), far_plane=(far_plane, 1e10),
-        radius_clip=(radius_clip, 0.0), eps2d=(eps2d, 0.3))
+        others, sparse_grad=(sparse_grad, False), distributed=(distributed, False),
+        camera_model=(camera_model, "pinhole"))
     _check_choice("render_mode", render_mode, RENDER_MODES)
     _check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
     _check_shape("means", means, (-1, 3))
@@ -79,7 +91,8 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
     _check_shape("opacities", opacities, (count,))
     with_color, with_depth = "RGB" in render_mode, "D" in render_mode
     color_name, color_shape = ("colors_precomp", (count, -1)) if sh_degree is None else ("shs", (count, -1, 3))
-    _check_shape("colors", colors, color_shape, (num_cameras,) + color_shape)
+    if with_color or colors is not None:
+        _check_shape("colors", colors, color_shape, (num_cameras,) + color_shape)
     if not with_color:  # a depth has no use for them
         color_name, color_shape, colors, backgrounds = "colors_precomp", (count, 1), means.new_zeros(count, 1), None
     channels = colors.shape[-1]
@@ -90,29 +103,42 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
 
     means2d, depths = _image_points(means, viewmats, Ks)
     differentiable = [means, opacities, colors, viewmats, backgrounds, *shape.values()]
-    means2d.requires_grad_(torch.is_grad_enabled() and any(tensor.requires_grad for tensor in differentiable))
+    with_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in differentiable)
     projections = viewmats.transpose(1, 2) @ _clip_matrices(Ks.detach(), width, height)
     centres = torch.inverse(viewmats)[:, :3, 3]
     focal_lengths = Ks[:, (0, 1), (0, 1)].tolist()
+    all_settings = [GaussianRasterizationSettings(
+        image_height=height, image_width=width, tanfovx=width / (2 * focal_x), tanfovy=height / (2 * focal_y),
+        bg=backgrounds[camera], scale_modifier=1.0, viewmatrix=viewmats[camera].T, projmatrix=projections[camera],
+        sh_degree=sh_degree or 0, campos=centres[camera], antialiasing=rasterize_mode == "antialiased",
+        near=near_plane, blend_mode=blend_mode, background_gate=background_gate, low_pass=eps2d)
+        for camera, (focal_x, focal_y) in enumerate(focal_lengths)]
+    clips = far_plane < EVERYTHING_NEARER or radius_clip > 0
+    if packed or clips:  # else the radii come with the images
+        seen = torch.stack([visible_radii(means, settings, **shape) for settings in all_settings])
+        seen = seen.masked_fill((depths > far_plane) | (seen <= radius_clip), 0) if clips else seen
+    ids = seen.nonzero(as_tuple=True) if packed else None
+    means2d = _Points(means2d if ids is None else means2d[ids], ids, depths.shape, (width, height),
+                      with_gradient, absgrad)
     renders, alphas, radii = [], [], []
-    for camera, (focal_x, focal_y) in enumerate(focal_lengths):
-        settings = GaussianRasterizationSettings(
-            image_height=height, image_width=width, tanfovx=width / (2 * focal_x), tanfovy=height / (2 * focal_y),
-            bg=backgrounds[camera], scale_modifier=1.0, viewmatrix=viewmats[camera].T, projmatrix=projections[camera],
-            sh_degree=sh_degree or 0, campos=centres[camera], antialiasing=rasterize_mode == "antialiased",
-            near=near_plane, blend_mode=blend_mode, background_gate=background_gate)
+    for camera, settings in enumerate(all_settings):
         color = colors[camera] if colors.dim() > len(color_shape) else colors
-        rendering = rasterize(means, opacities, settings, means2D=_in_ndc(means2d[camera], width, height),
-                              outputs=("alpha", "depth") if with_depth else ("alpha",), **{color_name: color}, **shape)
+        rendering = rasterize(means, opacities.where(seen[camera] > 0, opacities.new_zeros(())) if clips else opacities,
+                              settings, outputs=("alpha", "depth") if with_depth else ("alpha",),
+                              **means2d.of_camera(camera), **{color_name: color}, **shape)
         images, share = [rendering.color] if with_color else [], share_of_gaussians(rendering.alpha, settings)
         if with_depth:
             images.append(rendering.depth if "ED" in render_mode else rendering.depth * share)
         renders.append(torch.cat(images).permute(1, 2, 0))
         alphas.append(share.permute(1, 2, 0))
         radii.append(rendering.radii)
-    meta = {"means2d": means2d, "radii": torch.stack(radii)[..., None].repeat(1, 1, 2), "depths": depths,
-            "width": width, "height": height, "n_cameras": num_cameras, "n_batches": 1, "batch_ids": None,
-            "camera_ids": None, "gaussian_ids": None}
+    radii = seen if clips else torch.stack(radii)
+    meta = {"means2d": means2d.points, "radii": (radii if ids is None else radii[ids])[..., None].expand(
+                *radii.shape if ids is None else ids[0].shape, 2).contiguous(),
+            "depths": depths if ids is None else depths[ids], "width": width, "height": height,
+            "n_cameras": num_cameras, "n_batches": 1, "batch_ids": None, "camera_ids": None, "gaussian_ids": None}
+    if ids is not None:
+        meta.update(batch_ids=torch.zeros_like(ids[0]), camera_ids=ids[0], gaussian_ids=ids[1])
     return torch.stack(renders), torch.stack(alphas), meta
 
 
@@ -147,11 +173,45 @@ def _clip_matrices(Ks, width, height):
     return clip
 
 
-def _in_ndc(points, width, height):
-    """Returns the argument means2D of `rasterize` [N, 3], whose gradient reaches the points [N, 2] in pixels."""
-    if not points.requires_grad:
-        return None
-    return torch.stack([points[:, 0] * (2 / width), points[:, 1] * (2 / height), torch.zeros_like(points[:, 0])], 1)
+class _Points:
+    """meta["means2d"], and what of it goes into the rendering of each camera, so that the gradients come back to it.
+
+    points: [C, N, 2], or [M, 2] where ids, two tensors [M], say which cameras and Gaussians; pixels. shape: (C, N).
+    """
+
+    def __init__(self, points, ids, shape, size, with_gradient, absgrad):
+        self.points = points.requires_grad_(with_gradient)
+        self.ids, self.shape, self.to_ndc = ids, shape, points.new_tensor([2 / size[0], 2 / size[1]])
+        self.signed = self._of_all(self.points) if with_gradient else None
+        self.absolute = None
+        if with_gradient and absgrad:
+            leaf = torch.zeros_like(points).requires_grad_()
+            leaf.register_hook(lambda gradient: setattr(self.points, "absgrad", gradient))
+            self.absolute = self._of_all(leaf)
+
+    def of_camera(self, camera):
+        """Returns the arguments means2D and means2D_abs of `rasterize`."""
+        signed = None if self.signed is None else functional.pad(self.signed[camera], (0, 1))
+        return {"means2D": signed, "means2D_abs": None if self.absolute is None else self.absolute[camera]}
+
+    def _of_all(self, values):
+        """Returns them for all Gaussians, so scaled that a gradient by pixels comes back."""
+        values = values * self.to_ndc
+        if self.ids is None:
+            return values
+        return values.new_zeros(*self.shape, 2).index_put(self.ids, values)
+
+
+def compute_relocation(opacities: torch.Tensor, scales: torch.Tensor, ratios: torch.Tensor, binoms: torch.Tensor,
+                       min_opacity: float = 0.0) -> Tuple[torch.Tensor, torch.Tensor]:
+    """Opacities [N] and scales [N, 3] of Gaussians that n equal ones in one place take over, by Equation 9 of 3DGS-MCMC.
+
+    opacities: [N]. scales: [N, 3]. ratios: [N] n, which is clamped in place to [1, n_max], as gsplat does. binoms:
+    [n_max, n_max], of which only the size is read. min_opacity: what new opacities are at least.
+    """
+    ratios.clamp_(min=1, max=len(binoms))
+    new_opacities, factors = divided(opacities, ratios, min_opacity)
+    return new_opacities, factors[:, None] * scales
 
 
 def _refuse_what_is_not_offered(others, **arguments):
@@ -161,7 +221,9 @@ def _refuse_what_is_not_offered(others, **arguments):
     for name, value in others.items():
         if name not in OF_LATER_VERSIONS:
             raise TypeError(f"rasterization: there is no argument {name}")
-        if value is not None and value is not False:
+        off = OF_LATER_VERSIONS[name]
+        is_off = value is None or value is off or getattr(value, "name", None) == GLOBAL_SHUTTER
+        if not is_off:
             raise NotImplementedError(f"rasterization: {name} is {value!r}; this module does not offer it")
 
 

@@ -15,7 +15,7 @@ from ._rasterizer import settings_with
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "fused_ssim",
            "rasterize_gaussians"]
 
-GaussianRasterizationSettings = settings_with("pixel_weights", __name__)
+GaussianRasterizationSettings = settings_with(["pixel_weights"], __name__)
 GaussianRasterizationSettings.__doc__ = """The package's settings, with `pixel_weights` as the thirteenth.
 
 pixel_weights: [H, W], what to sum over the pixels of each Gaussian; None, or a tensor without elements, for no sums.

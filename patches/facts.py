@@ -10,17 +10,20 @@ from diff_smoe_rasterization.integrations.contracts import (
     ARGUMENTS,
     CONTRACTS,
     NAMES,
+    RASTERIZER,
     RESULTS,
     SETTINGS,
     Contract,
 )
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
-from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINERS, Trainer
+from .source import called_name, python_tree
+from .trainers import GR, INTEGRATIONS, TRAINERS, Trainer
 
 PATCHED = "imports from " + INTEGRATIONS
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
 OTHER_RASTERIZER = re.compile(r"diff_(gauss|surfel)\w*")
+MODULES = {contract.module: contract for contract in CONTRACTS if contract.module != RASTERIZER}
 RENDERERS = {"render", "prefilter_voxel", "*"}
 
 
@@ -65,18 +68,20 @@ def _of_import(node: ast.AST, may_fail: bool) -> Iterator[str]:
     for module in names if is_whole else [node.module or ""]:
         package, last = module.partition(".")[0], module.rpartition(".")[2]
         yield "imports " + last
-        if package != RASTERIZER and OTHER_RASTERIZER.fullmatch(package):
+        if package in MODULES:
+            yield "from " + package
+        elif package != RASTERIZER and OTHER_RASTERIZER.fullmatch(package):
             yield "uses " + package
-        if package == RASTERIZER:
+        if package == RASTERIZER or package in MODULES:
             yield "keeps the original" if is_whole else "keeps the original by name"
         if module == "gaussian_renderer" and (is_whole or RENDERERS & set(names)):
             yield "renders"
         if module.startswith(INTEGRATIONS + "."):
             yield PATCHED
-        if not is_whole and module.startswith((RASTERIZER, INTEGRATIONS + ".")):
+        if not is_whole and (package == RASTERIZER or package in MODULES or module.startswith(INTEGRATIONS + ".")):
             yield from (f"imports {name}" for name in names)
-        if not is_whole and package == RASTERIZER and not may_fail:
-            prefix = "" if module == RASTERIZER else module + "."
+        if not is_whole and (package == RASTERIZER or package in MODULES and package != "gsplat") and not may_fail:
+            prefix = "" if module == package else module + "."
             yield from (f"needs {prefix}{name}" for name in names if name != "*")
 
 
@@ -117,11 +122,19 @@ def uses_another_rasterizer(facts: Set[str]) -> bool:
     return bool(_those(facts, "uses "))
 
 
+def has_a_name_of_its_own(facts: Set[str]) -> bool:
+    """Whether one is imported that `dsmoe run` knows by another name than Inria's, which no patch rewrites."""
+    return bool(_those(facts, "from "))
+
+
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     """Returns the rasterizer whose API is called and "", or None and why it is none that is known."""
     foreign = sorted(_those(facts, "uses "))
     if foreign:
         return None, f"it imports {', '.join(foreign)}, another rasterizer, which would render in this one's place"
+    others = [contract for name, contract in MODULES.items() if "from " + name in facts]
+    if others and facts.isdisjoint({"imports " + name for name in NAMES}):
+        return others[0], ""
     if not facts & {f"imports {name}" for name in NAMES}:
         return None, f"nothing imports GaussianRasterizationSettings from {RASTERIZER} or {INTEGRATIONS}"
     known = {contract.name: _known(contract) for contract in CONTRACTS}
@@ -132,14 +145,15 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
         if names:
             return None, (text.format(", ".join(sorted(names))) + ", which no rasterizer has that is known here "
                           f"({', '.join(sorted(known))})")
-    shown = [contract for contract in CONTRACTS if not contract.signs or facts & set(contract.signs)]
+    shown = others or [contract for contract in CONTRACTS if contract.module == RASTERIZER
+                       and (not contract.signs or facts & set(contract.signs))]
     fitting = [contract for contract in shown
                if all(_those(facts, kind + " ") <= known[contract.name][kind] for kind in said)]
     for contract in fitting:
-        if all(_fits(found, contract.results) for found in _those(facts, "returns ")):
+        if all(_fits_one(found, contract) for found in _those(facts, "returns ")):
             return contract, ""
     nearest = (fitting or shown)[0]
-    found = next((found for found in sorted(_those(facts, "returns ")) if not _fits(found, nearest.results)), "")
+    found = next((found for found in sorted(_those(facts, "returns ")) if not _fits_one(found, nearest)), "")
     return None, (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which "
                   f"it resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
 
@@ -152,6 +166,10 @@ def _known(contract: Contract) -> Dict[str, Set[str]]:
     ours = set(GaussianRasterizationSettings._fields[len(SETTINGS) + 1:]) - {"clamp_color"}
     return {"sets": {*SETTINGS, *contract.settings} | ours, "takes": {*ARGUMENTS, *contract.arguments},
             "needs": {*NAMES, *contract.names}}
+
+
+def _fits_one(found: str, contract: Contract) -> bool:
+    return any(_fits(found, results) for results in (contract.results, *contract.other_results))
 
 
 def _fits(found: str, results: Tuple[str, ...]) -> bool:
@@ -167,5 +185,5 @@ def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
     contract, reason = contract_of(facts)
     if contract is None:
         return None, reason
-    return next(trainer for trainer in TRAINERS
-                if trainer.flavour == contract.name and facts.issuperset(trainer.signs)), ""
+    return next((trainer for trainer in TRAINERS if trainer.flavour == contract.name
+                 and facts.issuperset(trainer.signs)), Trainer(contract.name, contract.name, ())), ""

@@ -157,7 +157,7 @@ def _files(folder: Path, everywhere: bool) -> Dict[str, bytes]:
         for path in folder.glob(pattern):
             if not {"submodules", "site-packages"} & set(path.parts) and path.is_file():
                 data = path.read_bytes()
-                if re.search(rb"^\s*(from|import) diff_(gauss|surfel)", data, re.MULTILINE):
+                if re.search(rb"^\s*(from|import) (diff_(gauss|surfel)|gsplat\b)", data, re.MULTILINE):
                     found[str(path)] = data
     return found
 

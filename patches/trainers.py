@@ -30,7 +30,7 @@ class Trainer(NamedTuple):
 
     name: str  # as in --trainer
     flavour: str  # the rasterizer that it calls: an entry of contracts.py
-    entries: Tuple[Entry, ...]
+    entries: Tuple[Entry, ...]  # none: `dsmoe run` knows it, and no patch does
     signs: Tuple[str, ...] = ()  # it shows all of these
 
 

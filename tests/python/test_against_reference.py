@@ -16,7 +16,7 @@ from scenes import assert_not_empty, random_scene, with_gate
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import _C, reference
-from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
+from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -85,6 +85,8 @@ SCENES = {
     "channels_33": _scene(60, channels=33, covariance="cov3D", seed=7),
     "antialiasing": _scene(250, scale=0.05, antialiasing=True, seed=12),
     "antialiasing_cov3D": _scene(antialiasing=True, covariance="cov3D", seed=13),
+    "low_pass": _scene(700, scale=0.03, antialiasing=True, low_pass=0.1, seed=28),
+    "low_pass_cov3D": _scene(covariance="cov3D", low_pass=1.5, seed=29),
     "principal_point": _scene(principal_point=(7.3, -4.6), seed=14),
     "saturating": _scene(500, 24, 20, scale=0.3, opacity=(0.3, 1.3), seed=15),
     "large_splats": _scene(40, 70, 41, scale=1.2, opacity=(0.05, 0.5), seed=16),
@@ -218,7 +220,8 @@ def test_each_optional_output_has_its_own_gradient(mode):
 def test_the_core_has_the_constants_of_the_reference():
     expected = {"alpha_max": reference.ALPHA_MAX, "alpha_cut": reference.ALPHA_MIN, "gate_cut": reference.KERNEL_MIN,
                 "transmittance_cut": reference.TRANSMITTANCE_MIN, "gate_sum_cut": reference.GATE_SUM_MIN,
-                "radius_root_floor": reference.EIGENVALUE_SPREAD_MIN, "low_pass": reference.LOW_PASS,
+                "radius_root_floor": reference.EIGENVALUE_SPREAD_MIN,
+                "low_pass": GaussianRasterizationSettings._field_defaults["low_pass"],
                 "compensation_floor": reference.COMPENSATION_MIN, "frustum_margin": reference.FRUSTUM_MARGIN,
                 "homogeneous_epsilon": reference.W_EPSILON, "tile_size": reference.TILE,
                 "core_kernel": reference.KERNEL_KEPT}

@@ -99,6 +99,7 @@ void check_options(const char* function, const Options& options) {
   check_not_negative(function, "scale_modifier", options.scale_modifier);
   check_not_negative(function, "near", options.near);
   check_not_negative(function, "alpha_min", options.alpha_min);
+  check_not_negative(function, "low_pass", options.low_pass);
   check_not_negative(function, "background_gate", options.fixed_background_gate);
   check_blend_mode(function, options.blend_mode);
 }

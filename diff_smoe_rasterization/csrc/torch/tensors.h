@@ -143,6 +143,7 @@ template <class S> RasterConfig<S> raster_config(const Inputs& inputs, const Opt
   out.num_channels = static_cast<int>(num_channels(inputs));
   out.background = data<S>(inputs[kBackground]);
   out.scale_modifier = static_cast<S>(options.scale_modifier);
+  out.low_pass = static_cast<S>(options.low_pass);
   out.antialiasing = options.antialiasing;
   out.depth = options.depth;
   out.inverse_depth = options.inverse_depth;

@@ -156,22 +156,23 @@ template <class S> struct Conic {
 };
 
 // A Gaussian whose covariance on the image plane is cov2d. The determinants: before the low-pass filter, and after.
-template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& cov2d, S unfiltered, S determinant) {
-  const Sym2<S> c = {cov2d.xx + S(kLowPass), cov2d.xy, cov2d.yy + S(kLowPass)};
+// low_pass: px^2 that are added to both variances.
+template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& cov2d, S unfiltered, S determinant, S low_pass) {
+  const Sym2<S> c = {cov2d.xx + low_pass, cov2d.xy, cov2d.yy + low_pass};
   const S scale = S(1) / determinant;
   return {{c.yy * scale, -c.xy * scale, c.xx * scale}, c, determinant, unfiltered};
 }
 
-template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& c) {
+template <class S> DSMOE_HD Conic<S> make_conic(const Sym2<S>& c, S low_pass = S(kLowPass)) {
   return make_conic(c, difference_of_products(c.xx, c.yy, c.xy, c.xy),
-                    difference_of_products(c.xx + S(kLowPass), c.yy + S(kLowPass), c.xy, c.xy));
+                    difference_of_products(c.xx + low_pass, c.yy + low_pass, c.xy, c.xy), low_pass);
 }
 
-template <class S> DSMOE_HD Conic<S> conic_of(const ImageFactor<S>& factor) {
+template <class S> DSMOE_HD Conic<S> conic_of(const ImageFactor<S>& factor, S low_pass = S(kLowPass)) {
   const Vec3<S> minors = cross(factor.half.r0, factor.half.r1);
   const Sym2<S> c = covariance_2d(factor);
   const S unfiltered = dot(minors, minors);
-  return make_conic(c, unfiltered, unfiltered + S(kLowPass) * (c.xx + c.yy + S(kLowPass)));
+  return make_conic(c, unfiltered, unfiltered + low_pass * (c.xx + c.yy + low_pass), low_pass);
 }
 
 // Whether the filtered covariance is positive definite. That of a caller's cov3D_precomp may not be.

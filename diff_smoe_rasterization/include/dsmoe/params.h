@@ -33,6 +33,7 @@ template <class S> struct RasterConfig {
   int num_channels = 3;           // C
   const S* background = nullptr;  // [C]
   S scale_modifier = 1;
+  S low_pass = S(kLowPass);               // px^2 added to the projected variances
   S alpha_min = 0;                        // SMoE modes: also skip alpha below this
   S background_gate = 0;                  // lambda of kSmoe; 1 is kAlpha, but for rounding and the cuts
   const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
@@ -47,7 +48,7 @@ template <class S> struct RasterConfig {
   }
   DSMOE_HD AlphaCut<S> alpha_cut() const { return {alpha_min, gate_of_background()}; }
   DSMOE_HD ProjectionRules<S> projection_rules() const {
-    return {mode, scale_modifier, alpha_cut(), antialiasing, inverse_depth};
+    return {mode, scale_modifier, alpha_cut(), low_pass, antialiasing, inverse_depth};
   }
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
 };

@@ -25,6 +25,7 @@ template <class S> struct ProjectionRules {
   BlendMode mode;
   S scale_modifier;
   AlphaCut<S> cut;
+  S low_pass;  // px^2 added to the projected variances
   bool antialiasing;
   bool inverse_depth;  // 1 / z is blended too
 };
@@ -76,19 +77,19 @@ template <class S> struct Covariances {
 
 template <class S>
 DSMOE_HD Covariances<S> covariances(const Gaussian<S>& gaussian, const Camera<S>& camera, Vec3<S> view,
-                                    S scale_modifier) {
+                                    const ProjectionRules<S>& rules) {
   Covariances<S> out = {};
   out.jacobian = projection_jacobian(camera, view);
   out.axes = image_axes(out.jacobian.jacobian, view_rotation(camera.view));
   if (gaussian.has_covariance) {
     out.image = covariance_2d(out.axes, gaussian.covariance);
-    out.conic = make_conic(out.image);
+    out.conic = make_conic(out.image, rules.low_pass);
   } else {
-    out.scale = scale_modifier * gaussian.scale;
+    out.scale = rules.scale_modifier * gaussian.scale;
     out.rotation = quaternion_to_rotation(gaussian.rotation);
     out.factor = image_factor(out.axes, out.scale, out.rotation);
     out.image = covariance_2d(out.factor);
-    out.conic = conic_of(out.factor);
+    out.conic = conic_of(out.factor, rules.low_pass);
   }
   return out;
 }
@@ -99,7 +100,7 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
   out.radius = 0;
   const Vec3<S> view = transform_point(camera.view, gaussian.mean);
   if (!(view.z > camera.near) || !is_finite(gaussian.opacity)) return out;
-  const auto made = covariances(gaussian, camera, view, rules.scale_modifier);
+  const auto made = covariances(gaussian, camera, view, rules);
   const Conic<S>& conic = made.conic;
   const Vec2<S> pixel = project_to_pixel(camera, gaussian.mean);
   const S radius = screen_radius(conic);
@@ -142,7 +143,7 @@ DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const
                                               const ProjectionRules<S>& rules, const ProjectedGradient<S>& g) {
   GaussianGradient<S> out = {};
   const Vec3<S> view = transform_point(camera.view, gaussian.mean);
-  const auto made = covariances(gaussian, camera, view, rules.scale_modifier);
+  const auto made = covariances(gaussian, camera, view, rules);
   const Conic<S>& conic = made.conic;
 
   Sym2<S> dL_dcov2d = make_conic_backward(conic, g.gate.conic);

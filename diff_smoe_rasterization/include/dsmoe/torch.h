@@ -52,6 +52,7 @@ struct GaussianRasterizationSettings {
   bool deterministic = false;        // CUDA: gradients equal bit for bit from run to run; slower
   bool clamp_color = true;           // colours from shs are at least 0
   std::optional<BackgroundGate> background_gate;  // `smoe` only; absent: 0
+  double low_pass = 0.3;                          // px^2 added to the variances on the image
 };
 
 /// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.

@@ -5,10 +5,11 @@ given number.
 """
 from __future__ import annotations
 
-from typing import Dict, Tuple
+from typing import Dict
 
 import torch
 
+from ...gaussians import divided
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
 from .drawing import draw
 from .strategy import Step, Strategy, StrategyContext
@@ -20,7 +21,6 @@ NOISE_RATE = 5e5  # lambda_noise
 NOISE_STEEPNESS = 100.0  # k: Gaussians are moved by the noise where they are faint
 GROWTH = 0.05  # of the Gaussians, at each step of growth
 GROWTH_ENDS = 5 / 3  # of densify_until_iter: 25,000
-MOST_COPIES = 50  # of a Gaussian in one relocation: beyond, the binomials lose their digits
 
 
 class MCMCStrategy(Strategy):
@@ -72,7 +72,7 @@ class MCMCStrategy(Strategy):
         raw = self.context.model.raw
         opacities, scales, _ = self.context.model.activated()
         rows, times = drawn.unique(return_counts=True)
-        new_opacities, factors = divided(opacities[rows].squeeze(1), (times + 1).clamp(max=MOST_COPIES))
+        new_opacities, factors = divided(opacities[rows].squeeze(1), times + 1)
         changed = {name: raw[name].detach().index_select(0, rows) for name in PARAMETERS}
         changed["opacities"] = inverse_sigmoid(new_opacities.clamp(DEAD_OPACITY, 1 - 1e-6)).unsqueeze(1)
         changed["scales"] = (scales[rows] * factors.unsqueeze(1)).log()
@@ -87,18 +87,3 @@ class MCMCStrategy(Strategy):
         faint = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - opacities))
         noise = faint * (NOISE_RATE * self.context.optimizer.position_rate) * torch.randn_like(means)
         means += torch.bmm(axes, torch.bmm(axes.transpose(1, 2), noise.unsqueeze(2))).squeeze(2)
-
-
-def divided(opacities: torch.Tensor, copies: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-    """Opacity and scale factor of each of n equal Gaussians in one place that look as the one before (Eq. 9).
-
-    opacities: [M] of the one; copies: [M] n. The sum over i of the paper's binomials (i - 1, k) is (n, k + 1).
-    """
-    old, n = opacities.double().unsqueeze(1), copies.double().unsqueeze(1)
-    new = 1 - (1 - old) ** (1 / n)
-    j = torch.arange(1.0, MOST_COPIES + 1, dtype=torch.float64, device=opacities.device)
-    log_binomials = torch.lgamma(n + 1) - torch.lgamma(j + 1) - torch.lgamma((n - j).clamp(min=0) + 1)
-    signs = 2 * (j % 2) - 1
-    terms = signs * (log_binomials + j * new.log()).exp() / j.sqrt()
-    sums = terms.masked_fill(j > n, 0).sum(1)
-    return new.squeeze(1).to(opacities), (old.squeeze(1) / sums).to(opacities)

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from devices import on_the_cpu, random_normal
 from scenes import camera_settings, random_scene, with_gates
 
 from diff_smoe_rasterization import rasterize, reference
-from diff_smoe_rasterization.integrations.gsplat import rasterization
+from diff_smoe_rasterization.integrations.gsplat import compute_relocation, rasterization
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -314,9 +315,9 @@ def small():
 
 
 @pytest.mark.parametrize("name, value", [
-    ("packed", True), ("sparse_grad", True), ("absgrad", True), ("distributed", True), ("camera_model", "fisheye"),
-    ("far_plane", 100.0), ("radius_clip", 3.0), ("eps2d", 0.1), ("with_ut", True), ("rolling_shutter", 1),
-    ("radial_coeffs", torch.zeros(2, 6))])
+    ("sparse_grad", True), ("distributed", True), ("camera_model", "fisheye"), ("with_ut", True),
+    ("rolling_shutter", 1), ("radial_coeffs", torch.zeros(2, 6)), ("global_z_order", False),
+    ("extra_signals", torch.zeros(5, 1))])
 def test_what_is_not_offered_is_refused_by_name(small, name, value):
     with pytest.raises(NotImplementedError, match=name):
         rasterization(**small, **{name: value})
@@ -325,8 +326,103 @@ def test_what_is_not_offered_is_refused_by_name(small, name, value):
 def test_what_is_switched_off_or_changes_nothing_is_accepted(small):
     expected = rasterization(**small)[0]
     renders = rasterization(**small, packed=False, tile_size=8, channel_chunk=2, segmented=True, with_ut=False,
-                            with_eval3d=False, radial_coeffs=None, viewmats_rs=None)[0]
+                            with_eval3d=False, radial_coeffs=None, viewmats_rs=None, global_z_order=True,
+                            rolling_shutter=SimpleNamespace(name="GLOBAL"), extra_signals=None, renderer_config=None,
+                            far_plane=1e10, radius_clip=0.0, eps2d=0.3, absgrad=False)[0]
     assert torch.equal(renders, expected)
+
+
+@pytest.fixture
+def cloud(mode):
+    return random_scene(mode, 60, seed=45, channels=3, scale=0.05)
+
+
+@pytest.mark.parametrize("name, value", [("far_plane", 4.0), ("radius_clip", 4.0)])
+def test_what_is_far_or_small_is_not_there(mode, cloud, name, value):
+    cameras = make_cameras(mode, 3)
+    arguments = arguments_of(cloud, cameras)
+    everything = rasterization(**arguments, blend_mode=mode)[2]
+    measure = everything["depths"] if name == "far_plane" else -everything["radii"][..., 0]
+    limit = value if name == "far_plane" else -value - 0.5
+    for camera in range(2):  # a mask may differ from camera to camera
+        kept = measure[camera] <= limit
+        assert (kept & (everything["radii"][camera, :, 0] > 0)).sum() > 5 and not kept.all()
+        one = {**arguments, "viewmats": arguments["viewmats"][camera:camera + 1],
+               "Ks": arguments["Ks"][camera:camera + 1], "backgrounds": arguments["backgrounds"][camera:camera + 1]}
+        rows = {name: one[name][kept] for name in ("means", "quats", "scales", "opacities", "colors")}
+        renders, alphas, meta = rasterization(**one, blend_mode=mode, **{name: value})
+        expected = rasterization(**{**one, **rows}, blend_mode=mode)
+        # The rows that are left out take no part: what is added, and its order, are the same.
+        assert torch.equal(renders, expected[0]) and torch.equal(alphas, expected[1])
+        assert not meta["radii"][0, ~kept].any()
+        assert torch.equal(meta["radii"][0, kept], expected[2]["radii"][0])
+
+
+def test_eps2d_is_the_low_pass_filter(mode, cloud):
+    cameras = make_cameras(mode, 3)
+    renders = rasterization(**arguments_of(cloud, cameras), blend_mode=mode, eps2d=0.05)[0]
+    expected = reference_renderings(cloud.inputs, [camera._replace(low_pass=0.05) for camera in cameras])
+    assert_close(renders, channels_last([image.color for image in expected]), TOLERANCE, "renders")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_means2d_and_its_absgrad(mode, cloud, packed):
+    """As gsplat's strategies read them: in pixels, for all Gaussians or for those that a camera sees."""
+    cameras = make_cameras(mode, 3)
+    arguments = arguments_of(cloud, cameras)
+    arguments["means"].requires_grad_(True)
+    meta = {}
+    for name, asked in (("plain", {}), ("asked", {"packed": packed, "absgrad": True})):
+        renders, _, meta[name] = rasterization(**arguments, blend_mode=mode, **asked)
+        meta[name]["means2d"].retain_grad()
+        (renders * random_normal(renders.shape, 46)).sum().backward()
+    seen = meta["plain"]["radii"][..., 0] > 0
+    rows = (lambda values: values[seen]) if packed else (lambda values: values)
+    points, asked = meta["asked"]["means2d"], meta["asked"]
+    assert torch.equal(points.detach(), rows(meta["plain"]["means2d"].detach()))
+    assert torch.equal(asked["radii"], rows(meta["plain"]["radii"]))
+    assert torch.equal(asked["depths"], rows(meta["plain"]["depths"]))
+    # 1e-12: without absolute sums other code adds the same terms, in another order.
+    assert_close(points.grad, rows(meta["plain"]["means2d"].grad), 1e-12, "means2d")
+    for camera, settings in enumerate(cameras):
+        leaf = torch.zeros(60, 2, dtype=torch.float64, requires_grad=True)
+        rotations = torch.nn.functional.normalize(cloud.inputs["rotations"], dim=1)
+        color = rasterize(settings=settings, means2D_abs=leaf, **{**cloud.inputs, "rotations": rotations}).color
+        (color.permute(1, 2, 0) * random_normal((2, HEIGHT, WIDTH, 3), 46)[camera]).sum().backward()
+        expected = leaf.grad * leaf.new_tensor([2 / WIDTH, 2 / HEIGHT])
+        found = points.absgrad[asked["camera_ids"] == camera] if packed else points.absgrad[camera]
+        assert expected.any()
+        assert_close(found, expected[seen[camera]] if packed else expected, TOLERANCE, "absgrad")
+    if packed:
+        assert torch.equal(torch.stack([asked["camera_ids"], asked["gaussian_ids"]]), seen.nonzero().T)
+        assert not asked["batch_ids"].any()
+
+
+@pytest.mark.parametrize("copies", [1, 2, 7])
+def test_relocated_gaussians_look_as_the_one_before(copies):
+    """Together they have its opacity at the centre, and its integral along a line through it."""
+    opacities = torch.tensor([0.3, 0.9], dtype=torch.float64)
+    scales = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64).repeat(2, 1)
+    ratios = torch.tensor([copies, 99])
+    new, new_scales = compute_relocation(opacities, scales, ratios, torch.zeros(7, 7))
+    assert ratios.tolist() == [copies, 7]
+    assert 1 - (1 - new[0].item()) ** copies == pytest.approx(0.3, rel=1e-12)
+    assert 1 - (1 - new[1].item()) ** 7 == pytest.approx(0.9, rel=1e-12)
+    for old, opacity, scale, count in zip(opacities, new, new_scales[:, 0], ratios):
+        x = torch.linspace(-30, 30, 60001).double()
+        together = 1 - (1 - opacity * torch.exp(-0.5 * (x / scale) ** 2)) ** count
+        alone = old * torch.exp(-0.5 * x ** 2)
+        # The step, 1e-3, is small against the widths: the rule of trapezoids is exact to rounding for Gaussians.
+        assert together.sum().item() == pytest.approx(alone.sum().item(), rel=1e-9)
+    least, follows = compute_relocation(opacities, scales, ratios, torch.zeros(7, 7), min_opacity=0.5)
+    assert (least >= 0.5).all() and (follows[0] <= new_scales[0]).all()
+
+
+def test_colours_may_be_absent_where_none_are_rendered(small):
+    expected = rasterization(**small, render_mode="ED")[0]
+    assert torch.equal(rasterization(**{**small, "colors": None}, render_mode="ED")[0], expected)
+    with pytest.raises(TypeError, match="colors"):
+        rasterization(**{**small, "colors": None})
 
 
 def test_arguments_that_nobody_knows_are_refused(small):

@@ -1,0 +1,42 @@
+"""The API of Speedy-Splat's rasterizer: `scores` [N, 1], by whose gradient Gaussians are pruned.
+
+That gradient is here what the removal of a Gaussian changes, `Splats.importance().removal_costs`: exact in each blend
+mode, where the original has the squared derivative by the kernel. The trainer reads the order of the scores alone.
+`kernel_times` is empty.
+"""
+from __future__ import annotations
+
+import torch
+
+from diff_smoe_rasterization import rasterize_with_splats
+
+from ._rasterizer import classes_of, results_of
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
+
+
+class _Scored(torch.autograd.Function):
+    """Passes an image on; its scores get the removal costs."""
+
+    @staticmethod
+    def forward(ctx, color, scores, splats):
+        ctx.splats = splats
+        ctx.shape = scores.shape
+        return color.view_as(color)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return gradient, ctx.splats.importance().removal_costs.reshape(ctx.shape), None
+
+
+def _render(settings, inputs):
+    scores = inputs.pop("scores", None)
+    if scores is not None and scores.requires_grad and torch.is_grad_enabled():
+        rendering, splats = rasterize_with_splats(settings=settings, **inputs)
+        color, radii = _Scored.apply(rendering.color, scores, splats), rendering.radii
+    else:
+        color, radii = results_of(("color", "radii"), settings, inputs)
+    return color, radii, color.new_zeros(0)
+
+
+GaussianRasterizationSettings, GaussianRasterizer, rasterize_gaussians = classes_of("speedy_splat", __name__, _render)
