@@ -145,14 +145,15 @@ def watched(strategy: ThreeDGSStrategy, recorder: Recorder) -> ThreeDGSStrategy:
             recorder.before_change(step)
             super().after_backward(step)
 
-        def densify(self, gradients: torch.Tensor, *limits: Any) -> None:
+        def densify(self, gradients: torch.Tensor, *limits: Any) -> torch.Tensor:
             recorder.before_densification(gradients, self.view_count > 0)
-            super().densify(gradients, *limits)
+            return super().densify(gradients, *limits)
 
-        def prune(self, large_too: bool) -> None:
+        def prune(self, large_too: bool) -> torch.Tensor:
             recorder.before_prune(large_too)
-            super().prune(large_too)
+            kept = super().prune(large_too)
             recorder.after_prune()
+            return kept
 
         def reset_opacities(self) -> None:
             recorder.before_reset()
