@@ -17,11 +17,12 @@ from .trainer.config import (
     given_options,
     holds_run,
 )
-from .trainer.errors import TrainerError, in_one_line, printable
+from .trainer.errors import TrainerError, in_one_line, is_lost, printable
 from .trainer.system.files import is_folder
 from .trainer.system.interrupt import exit_status
 
 if TYPE_CHECKING:
+    from .trainer.distributed.group import Group
     from .trainer.results.evaluation import Measure
 
 
@@ -46,6 +47,9 @@ def build_parser() -> argparse.ArgumentParser:
                                   "--iterations extend it")
     earlier_run.add_argument("--overwrite", action="store_true",
                              help="replace the run in OUT, once this one can start")
+    train.add_argument("--gpus", type=int, metavar="N",
+                       help="train on so many GPUs of this machine: torchrun starts this command once for each; with "
+                            "--batch N or more")
     train.add_argument("--quiet", action="store_true", help="no progress bars")
     train.set_defaults(run=_train)
 
@@ -153,6 +157,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads sleep, where they would spin
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
+    arguments.command_words = list(sys.argv[1:] if argv is None else argv)
     if unknown:  # argparse would show the usage of `dsmoe` alone
         getattr(arguments, "command_parser", parser).error("unrecognized arguments: " + " ".join(unknown))
     try:
@@ -307,18 +312,54 @@ def _run(arguments: argparse.Namespace) -> None:
     run(words, arguments.blend_mode, arguments.trainer, arguments.background_gate)
 
 
-def _train(arguments: argparse.Namespace) -> None:
-    from .trainer.results.rows import blend_name, results_table, viewer_warning
+def _train(arguments: argparse.Namespace) -> Optional[int]:
+    from .trainer.distributed.group import join_group, launched_by_torchrun, leave_group
     from .trainer.system.process import set_up_process
+
+    gpus = arguments.gpus
+    if gpus is not None:
+        if launched_by_torchrun():
+            raise TrainerError("--gpus is given to a process that torchrun has started; leave out one of the two")
+        if not arguments.resume and not hasattr(arguments, "device"):
+            arguments.device = "cuda"
+            arguments.command_words += ["--device", "cuda"]
+    config = _train_config(arguments)
+    if gpus is not None:
+        from .trainer.distributed.launch import check_gpus, launch, without_gpus
+
+        check_gpus(gpus, config.device)
+        return launch(gpus, without_gpus(arguments.command_words))
+    set_up_process(config.device)
+    group = join_group(config.device)
+    try:
+        _train_in(group, config, arguments)
+    except Exception as error:
+        if group.leads or in_one_line(error) is None and not is_lost(error):
+            raise
+        text = "another process has ended" if is_lost(error) else in_one_line(error)
+        raise TrainerError(f"process {group.rank}: {text}") from error
+    finally:
+        leave_group(group)
+    return None
+
+
+def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) -> None:
+    from .trainer.results.rows import blend_name, results_table, viewer_warning
     from .trainer.training.loop import train
 
-    config = _train_config(arguments)
-    set_up_process(config.device)
+    if not group.leads:
+        train(config, arguments.resume, arguments.overwrite, progress=False, group=group)
+        return
     blend = blend_name(config.blend_mode, config.background_gate)
     budget = f" to {config.budget} Gaussians" if config.budget else ""
+    batch = f", {config.batch} views a step" if config.batch > 1 else ""
+    processes = f", in {group.size} processes" if group.size > 1 else ""
     print(f"{printable(config.scene)} -> {printable(config.output)}: blend mode {blend}, strategy "
-          f"{config.schedule}{budget}, {config.iterations} iterations, seed {config.seed}")
-    row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet)
+          f"{config.schedule}{budget}, {config.iterations} iterations{batch}{processes}, seed {config.seed}")
+    if group.size > config.batch:
+        print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
+              f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
+    row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group)
     print(results_table([row]))
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")

@@ -86,6 +86,25 @@ def project_gaussians(means3D: torch.Tensor, opacities: torch.Tensor, settings: 
     return Footprints(*_OPS.project(*inputs, *options, False))
 
 
+def projection_arguments(settings: GaussianRasterizationSettings, means3D: torch.Tensor, opacities: torch.Tensor,
+                         **tensors: Optional[torch.Tensor]) -> Tuple[List[Optional[torch.Tensor]], List[Any]]:
+    """The tensors and the options of the op `project`, all but the last option. The arguments of the function."""
+    return _arguments(settings, (), means3D, opacities, **tensors)
+
+
+def blend_op_arguments(footprints: Footprints, settings: GaussianRasterizationSettings,
+                       outputs: Sequence[str] = ()) -> Tuple[List[Optional[torch.Tensor]], List[Any]]:
+    """The tensors and the options of the op `blend`, all but the last option. Raises as `blend_footprints` does."""
+    if not set(OUTPUTS).issuperset(outputs):
+        raise ValueError(f"blend_footprints: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
+    blend_mode, gate = resolve_blend(settings)
+    required, _ = _checks("blend_footprints", "gates", footprints.gates)
+    learned = isinstance(gate, torch.Tensor)
+    tensors = [footprints.gates, required("features", footprints.features), required("radii", footprints.radii),
+               required("bg", settings.bg), required("background_gate", gate) if learned else None]
+    return tensors, _options(settings, outputs, blend_mode, 0.0 if learned else gate)
+
+
 def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSettings,
                      outputs: Sequence[str] = ()) -> Rendering:
     """The second half of `rasterize`: the images of footprints, of one projection or of several.
@@ -94,14 +113,7 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
     deterministic. outputs: those that the footprints were projected for, `alpha` apart.
     Raises ValueError, TypeError or RuntimeError as `rasterize` does.
     """
-    if not set(OUTPUTS).issuperset(outputs):
-        raise ValueError(f"blend_footprints: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
-    blend_mode, gate = resolve_blend(settings)
-    required, _ = _checks("blend_footprints", "gates", footprints.gates)
-    tensors: List[Optional[torch.Tensor]] = [
-        footprints.gates, required("features", footprints.features), required("radii", footprints.radii),
-        required("bg", settings.bg), required("background_gate", gate) if isinstance(gate, torch.Tensor) else None]
-    options = _options(settings, outputs, blend_mode, 0.0 if isinstance(gate, torch.Tensor) else gate)
+    tensors, options = blend_op_arguments(footprints, settings, outputs)
     refuse_forward_mode("blend_footprints", tensors)
     if _wants_gradient(tensors):
         images = _Blend.apply((*options, True), *tensors)

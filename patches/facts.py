@@ -17,7 +17,6 @@ from diff_smoe_rasterization.integrations.contracts import (
 )
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
-from .source import called_name, python_tree
 from .trainers import GR, INTEGRATIONS, TRAINERS, Trainer
 
 PATCHED = "imports from " + INTEGRATIONS

@@ -15,6 +15,7 @@ from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
 SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
+BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")
 LEARNED = "learned"  # the background gate that a training finds
 
@@ -45,7 +46,9 @@ class TrainConfig:
               f"`{LEARNED}` finds it with the scene (default: $DSMOE_BACKGROUND_GATE, else {LEARNED})",
         metavar=f"X|{LEARNED}")
     background_gate_bound: float = _option(0.03, "a learned background gate stays above this")
-    iterations: int = _option(30_000, "optimisation steps")
+    iterations: int = _option(30_000, "views to train on, a view each step; with --batch B, B each step")
+    batch: int = _option(
+        1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
     resolution: int = _option(
         -1, "1, 2, 4, 8: divide the image size by it; -1: cap the width at 1600; else the width in pixels")
     images: str = _option("images", "image folder inside a COLMAP scene")
@@ -70,6 +73,8 @@ class TrainConfig:
     sh_degree: int = _option(3, "highest spherical-harmonics degree, 0 to 3")
     sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
+    deterministic: bool = _option(
+        False, "cuda: gradients equal bit for bit from run to run, and for any number of GPUs; slower")
 
     lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
     position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
@@ -111,6 +116,11 @@ class TrainConfig:
             if choices and value not in choices:
                 raise ConfigError(f"{_flag(option)} is {value!r}; it must be one of {', '.join(choices)}")
         self._require("iterations", self.iterations >= 1, "at least 1")
+        self._require("batch", self.batch >= 1, "at least 1")
+        self._require("iterations", self.iterations % self.batch == 0, f"a multiple of --batch, {self.batch}")
+        if self.batch > 1 and self.schedule not in BATCHED:
+            raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.schedule}: only "
+                              f"{' and '.join(BATCHED)} know batches")
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
         self._require("budget", self.budget >= 0, "at least 0")

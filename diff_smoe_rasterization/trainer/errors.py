@@ -42,3 +42,9 @@ def out_of_memory(error: BaseException) -> Optional[str]:
     return (f"the {'GPU' if 'CUDA' in text else 'machine'} is out of memory"
             f"{f', {size.group(1)} more were asked for' if size else ''}; "
             "take smaller images (--resolution) or fewer Gaussians (a higher --densify-grad-threshold)")
+
+
+def is_lost(error: BaseException) -> bool:
+    """Whether a collective failed because another process of the training has ended."""
+    return isinstance(error, RuntimeError) and bool(re.search(
+        "Connection closed by peer|Connection reset|Broken pipe|NCCL|gloo", str(error)))

@@ -116,10 +116,13 @@ class GaussianOptimizer:
     """Adam over a GaussianModel, one group per parameter, with the exponential schedule of positions."""
 
     def __init__(self, model: GaussianModel, config: TrainConfig, extent: float) -> None:
-        """extent: the scene's scale, which multiplies the learning rate of positions."""
+        """extent: the scene's scale, which multiplies the learning rate of positions.
+
+        A batch of B views takes the learning rates of one view times sqrt(B), and its betas to the power of B.
+        """
         self.model = model
         self.config = config
-        self.extent = extent
+        self.position_scale = extent * math.sqrt(config.batch)
         rates = {
             "means3D": config.position_lr_init * extent,
             "dc": config.feature_lr,
@@ -128,16 +131,17 @@ class GaussianOptimizer:
             "scales": config.scaling_lr,
             "rotations": config.rotation_lr,
         }
+        rates = {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
         self.rates = rates
         self.adam = FusedAdam([{"params": [model.raw[name]], "lr": rates[name], "name": name} for name in PARAMETERS],
-                              eps=ADAM_EPSILON)
+                              eps=ADAM_EPSILON, betas=batch_betas(config.batch))
 
     def set_position_rate(self, iteration: int) -> None:
         """Sets the positions' learning rate for this step."""
         config = self.config
         rate = exponential_rate(iteration, config.position_lr_init, config.position_lr_final,
                                 config.position_lr_max_steps)
-        self.group("means3D")["lr"] = rate * self.extent
+        self.group("means3D")["lr"] = rate * self.position_scale
 
     @property
     def position_rate(self) -> float:
@@ -205,6 +209,12 @@ class GaussianOptimizer:
                 squares.index_fill_(0, rows, 0)
             else:
                 squares.index_copy_(0, rows, squares.index_select(0, like))
+
+    def rearrange(self, edit: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        """Puts edit(rows) in place of every parameter and every moment."""
+        for name in PARAMETERS:
+            tensor = self.model.raw[name]
+            self._replace(name, lambda rows, _: edit(rows), tensor.new_zeros(0))
 
     def replace_all(self, raw: Dict[str, torch.Tensor]) -> None:
         """Sets every parameter, any number of rows, and forgets all moments."""
@@ -277,6 +287,11 @@ class GaussianOptimizer:
         self.adam.state.clear()
         for name, state in states.items():
             self.adam.state[self.model.raw[name]] = dict(state)
+
+
+def batch_betas(batch: int) -> Tuple[float, float]:
+    """Adam's betas for the gradients of so many views at once."""
+    return 0.9**batch, 0.999**batch
 
 
 def exponential_rate(step: int, first: float, last: float, max_steps: int) -> float:

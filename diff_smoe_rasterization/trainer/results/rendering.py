@@ -27,7 +27,7 @@ class Renderer:
 
     def __init__(self, model: GaussianModel, blend_mode: str, background: torch.Tensor,
                  antialiasing: bool = False, rasterize: Optional[Rasterize] = None, *,
-                 background_gate: BackgroundGate) -> None:
+                 background_gate: BackgroundGate, deterministic: bool = False) -> None:
         """background: [3] on the model's device. rasterize: by default the package's.
 
         background_gate: of `smoe`; the other modes have their own. A tensor has no gradient, and may change.
@@ -37,6 +37,7 @@ class Renderer:
         self.background = background
         self.background_gate = background_gate
         self.antialiasing = antialiasing
+        self.deterministic = deterministic
         self.rasterize = rasterize or package_rasterizer()
         self._settings: Dict[int, Tuple[Camera, GaussianRasterizationSettings]] = {}
 
@@ -73,7 +74,7 @@ class Renderer:
         if id(camera) not in self._settings:  # kept with its camera, so that no other one gets this id
             self._settings[id(camera)] = (camera, camera.settings(self.background, 0, self.blend_mode,
                                                                   self.antialiasing))
-        changes: Dict[str, Any] = {"sh_degree": self.model.active_sh_degree}
+        changes: Dict[str, Any] = {"sh_degree": self.model.active_sh_degree, "deterministic": self.deterministic}
         if background is not None:
             changes["bg"] = background
         if self.blend_mode == "smoe":

@@ -28,6 +28,10 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     unusual: Dict[str, Any] = {}
     if config.background_gate == LEARNED:
         unusual.update(background_gate_learned=True, background_gate_bound=config.background_gate_bound)
+    if config.batch > 1:
+        unusual["batch"] = config.batch
+    if config.deterministic:
+        unusual["deterministic"] = True
     if config.budget:
         unusual["budget"] = config.budget
     if config.strategy_options:

@@ -17,10 +17,10 @@ def is_installed() -> bool:
 class Scalars:
     """What TensorBoard shows of a run; without tensorboard it does nothing, and `active` is False."""
 
-    def __init__(self, output: str, iteration: int) -> None:
+    def __init__(self, output: str, iteration: int, wanted: bool = True) -> None:
         """output: the run's folder. iteration: that the run goes on from; what was written later is not shown."""
         self._writer: Any = None
-        if not is_installed():
+        if not wanted or not is_installed():
             return
         try:
             from torch.utils.tensorboard import SummaryWriter

@@ -12,6 +12,7 @@ import torch
 
 from ...losses import l1_ssim_loss_and_gradient
 from ..config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
+from ..distributed.group import ALONE, Group
 from ..errors import TrainerError
 from ..model import GaussianModel, GaussianOptimizer
 from ..results.evaluation import Evaluation, evaluate
@@ -21,7 +22,7 @@ from ..results.pictures import loss_plot
 from ..results.rendering import Rasterize, Renderer, background_color
 from ..results.rows import RESULTS_NAME, result_row, write_results
 from ..results.scalars import Scalars, scalar_files
-from ..scenes.images import as_float
+from ..scenes.images import View, as_float
 from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
 from ..system.environment import extension_info
 from ..system.files import is_file, write_atomically, write_json_atomically
@@ -35,7 +36,8 @@ from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses
 from .randomness import random_state, restore_random_state, seed_everything
 from .strategies import STRATEGIES
-from .strategy import Step, StrategyContext
+from .shards import Shards
+from .strategy import AnyStep, Step, StrategyContext
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
 LOSS_NAME = "loss.png"
@@ -68,19 +70,46 @@ class Trainer:
         self.scene = scene.to(config.device)
         self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
         self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
+        self.shards = self._make_shards()
         background = background_color(config.white_background, config.device)
         learned = config.background_gate == LEARNED
-        self.gate = LearnedGate(config.background_gate_bound, config.device) if learned else None
+        self.gate = LearnedGate(config.background_gate_bound, config.device, config.batch) if learned else None
         self.renderer = Renderer(
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
-            background_gate=self.gate.value if self.gate else float(config.background_gate))
+            background_gate=self.gate.value if self.gate else float(config.background_gate),
+            deterministic=config.deterministic)
         self.strategy = STRATEGIES[str(config.schedule)](StrategyContext(
-            config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer))
+            config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer, self.shards))
         self.order = ViewOrder(len(scene.train), config.seed)
         self.watch = Stopwatch(config.device)
         self.iteration = 0
         self.direct = config.device != "cpu" and rasterize is None
         self._passes: Union[AutogradPasses, DirectPasses, None] = None
+        self.wants_stop: Callable[[], bool] = lambda: False  # whether this process was asked to stop
+
+    def _make_shards(self) -> Shards:
+        """Which of the Gaussians this process has; may take the others from the model."""
+        return Shards()
+
+    leads = True  # whether this process prints and writes
+
+    @property
+    def checkpoint_device(self) -> str:
+        """Where a checkpoint is read to."""
+        return self.config.device
+
+    @property
+    def num_gaussians(self) -> int:
+        """Of all processes."""
+        return self.model.num_gaussians
+
+    def whole_model(self) -> Optional[GaussianModel]:
+        """The model with the Gaussians of all processes, where this one leads."""
+        return self.model
+
+    def stops(self) -> bool:
+        """Whether the run is to end behind this step, before its last iteration."""
+        return self.wants_stop()
 
     def step(self, before_change: Optional[Callable[[], None]] = None) -> Step:
         """One iteration, in the order of 3DGS: densification comes between the gradients and the optimizer's step.
@@ -90,9 +119,7 @@ class Trainer:
         may have touched.
         """
         config, model = self.config, self.model
-        if model.num_gaussians == 0:
-            raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
-                               "try another --densify-grad-threshold or --strategy steady")
+        self._refuse_empty()
         self.iteration += 1
         self.optimizer.set_position_rate(self.iteration)
         if self.iteration % config.sh_degree_interval == 0:
@@ -103,14 +130,7 @@ class Trainer:
             passes = DirectPasses if self.direct and not self.strategy.uses_gradients else AutogradPasses
             self._passes = passes(model, self.optimizer, self.renderer)
         rendering, means2D = self._passes.render(view.camera, color, self.gate() if self.gate else None)
-        image = rendering.color.detach()
-        target = view.image if view.opacity is None else view.image_over(color, self.renderer.background)
-        if view.mask is None:
-            loss, gradient = l1_ssim_loss_and_gradient(image, target, config.lambda_dssim)
-        else:
-            mask = view.mask_float()
-            loss, gradient = l1_ssim_loss_and_gradient(image * mask, as_float(target) * mask, config.lambda_dssim)
-            gradient = gradient * mask
+        loss, gradient = self.loss_of(view, color, rendering.color.detach())
         step = Step(self.iteration, view.camera, rendering, means2D, loss)
         self.strategy.before_backward(step)
         self._passes.backward(gradient)
@@ -123,11 +143,28 @@ class Trainer:
                 if self.gate:
                     self.gate.step()
                 self.strategy.after_step(step)
-        self._report = (image, target, view)
         return step
 
+    def _refuse_empty(self) -> None:
+        if self.num_gaussians == 0:
+            raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
+                               "try another --densify-grad-threshold or --strategy steady")
+
+    def loss_of(self, view: View, color: Optional[torch.Tensor],
+                image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        """The loss of a rendering and its gradient. color: [3] the background, where it is of this step alone."""
+        config = self.config
+        target = view.image if color is None or view.opacity is None else view.image_over(
+            color, self.renderer.background)
+        self._report = (image, target, view)
+        if view.mask is None:
+            return l1_ssim_loss_and_gradient(image, target, config.lambda_dssim)
+        mask = view.mask_float()
+        loss, gradient = l1_ssim_loss_and_gradient(image * mask, as_float(target) * mask, config.lambda_dssim)
+        return loss, gradient * mask
+
     def training_psnr(self) -> float:
-        """PSNR of the last step's rendering against its training image."""
+        """PSNR of the last step's rendering, the last one of this process, against its training image."""
         image, target, view = self._report
         return psnr(image.clamp(0, 1), as_float(target), view.mask_float())
 
@@ -194,12 +231,12 @@ class Run:
         if not is_file(path):
             return False
         with damage_named(path):
-            state = load_checkpoint(path, self.trainer.config.device)
+            state = load_checkpoint(path, self.trainer.checkpoint_device)
             self.trainer.load_state_dict(state)
             self.history = list(state["history"])
             self.losses = [(int(iteration), float(loss)) for iteration, loss in state.get("losses", [])]
         before, config = state["config"]["iterations"], self.trainer.config
-        if before < config.iterations:
+        if before < config.iterations and self.trainer.leads:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
                   f"{config.densify_until_iter}, falling learning rate of positions until "
                   f"{config.position_lr_max_steps}")
@@ -208,34 +245,38 @@ class Run:
     def train(self) -> Dict[str, Any]:
         """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
         trainer, config = self.trainer, self.trainer.config
-        self.scalars = Scalars(config.output, trainer.iteration)
+        self.scalars = Scalars(config.output, trainer.iteration, wanted=trainer.leads)
         new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
                                disable=not self.progress, dynamic_ncols=True)
         with contextlib.closing(self.scalars), new_bar as bar, DelayedInterrupt() as interrupt:
+            trainer.wants_stop = lambda: interrupt.asked is not None
             trainer.watch.start()
             ends = trainer.iteration >= config.iterations
             while not ends:
-                evaluates = (trainer.iteration + 1 < config.iterations
-                             and _is_due(trainer.iteration + 1, config.eval_every))
+                following = trainer.iteration + config.batch
+                evaluates = following < config.iterations and _is_due(following, config.eval_every, config.batch)
                 step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
-                bar.update()
+                bar.update(config.batch)
                 last = trainer.iteration == config.iterations
-                if last or _is_due(trainer.iteration, PROGRESS_EVERY[config.device]):
+                if last or step.due(PROGRESS_EVERY[config.device]):
                     self.losses.append((trainer.iteration, _check_loss(step)))
                     self._show(bar, self.losses[-1][1])
-                ends = trainer.iteration >= config.iterations or interrupt.asked is not None
-                if ends or _is_due(trainer.iteration, config.checkpoint_every):
+                ends = trainer.iteration >= config.iterations or trainer.stops()
+                if ends or _is_due(trainer.iteration, config.checkpoint_every, config.batch):
                     trainer.watch.stop()
                     _check_loss(step)
                     self.save_checkpoint()
                     trainer.watch.start()
             trainer.watch.stop()
-        if interrupt.asked is not None:
-            raise interrupt.asked
-        gate = trainer.background_gate
-        save_model(model_path(config.output, trainer.iteration), trainer.model, str(config.blend_mode), gate)
+        if trainer.iteration < config.iterations or interrupt.asked is not None:
+            raise interrupt.asked or KeyboardInterrupt
+        gate, model = trainer.background_gate, trainer.whole_model()
+        if trainer.leads:
+            save_model(model_path(config.output, trainer.iteration), model, str(config.blend_mode), gate)
         evaluation = trainer.evaluate(self.progress)
-        row = result_row(config, trainer.scene, trainer.model.num_gaussians, trainer.watch.seconds, evaluation, gate)
+        row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation, gate)
+        if not trainer.leads:
+            return row
         write_results(config.output, [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
         if self.losses:
@@ -244,15 +285,16 @@ class Run:
 
     def save_checkpoint(self) -> None:
         """Writes the state of trainer, history and losses."""
-        save_checkpoint(self._path(CHECKPOINT_NAME), {**self.trainer.state_dict(), "history": self.history,
-                                                      "losses": self.losses})
+        state = self.trainer.state_dict()
+        if self.trainer.leads:
+            save_checkpoint(self._path(CHECKPOINT_NAME), {**state, "history": self.history, "losses": self.losses})
 
     def _show(self, bar: Any, loss: float) -> None:
         if not (self.progress or self.scalars.active):
             return
         trainer = self.trainer
         gate = {"gate": trainer.background_gate} if trainer.gate else {}
-        quality, count = trainer.training_psnr(), trainer.model.num_gaussians
+        quality, count = trainer.training_psnr(), trainer.num_gaussians
         self.scalars.add(trainer.iteration, loss=loss, psnr=quality, gaussians=count, **gate)
         if self.progress:
             shown = {name: f"{value:.4f}" for name, value in gate.items()}
@@ -263,20 +305,21 @@ class Run:
         trainer.watch.stop()
         evaluation = trainer.evaluate()
         self.history.append({"iteration": trainer.iteration, **evaluation.metrics,
-                             "num_gaussians": trainer.model.num_gaussians, "train_seconds": trainer.watch.seconds})
-        write_json_atomically(self._path(HISTORY_NAME), self.history)
+                             "num_gaussians": trainer.num_gaussians, "train_seconds": trainer.watch.seconds})
+        if trainer.leads:
+            write_json_atomically(self._path(HISTORY_NAME), self.history)
         self.scalars.add(trainer.iteration, **{f"test__{name}": value for name, value in evaluation.metrics.items()
                                                if value is not None})
         if self.progress and evaluation.metrics["psnr"] is not None:
             bar.write(f"iteration {trainer.iteration}: test PSNR {evaluation.metrics['psnr']:.2f} dB, "
-                      f"SSIM {evaluation.metrics['ssim']:.4f}, {trainer.model.num_gaussians} Gaussians")
+                      f"SSIM {evaluation.metrics['ssim']:.4f}, {trainer.num_gaussians} Gaussians")
         trainer.watch.start()
 
     def _path(self, name: str) -> str:
         return os.path.join(self.trainer.config.output, name)
 
 
-def _check_loss(step: Step) -> float:
+def _check_loss(step: AnyStep) -> float:
     """The step's loss. Raises TrainerError where it is not finite: nothing that follows would be worth keeping."""
     loss = float(step.loss.detach())
     if not math.isfinite(loss):
@@ -284,8 +327,9 @@ def _check_loss(step: Step) -> float:
     return loss
 
 
-def _is_due(iteration: int, interval: int) -> bool:
-    return interval > 0 and iteration % interval == 0
+def _is_due(iteration: int, interval: int, batch: int) -> bool:
+    """Whether a multiple of the interval is among the `batch` iterations up to this one."""
+    return interval > 0 and iteration // interval > (iteration - batch) // interval
 
 
 def _model_name(iterations: int) -> str:
@@ -323,20 +367,26 @@ def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = 
 
 
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
-          scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None) -> Dict[str, Any]:
+          scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None,
+          group: Optional[Group] = None) -> Dict[str, Any]:
     """Trains a scene into config.output; returns the row of results.json.
 
     resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
     of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
     is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
     run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
-    hand. Raises TrainerError before training starts where anything does not fit, as where another run is at work in
+    hand. group: the processes that train together, where there are several; all of them call this. Raises TrainerError before training starts where anything does not fit, as where another run is at work in
     the folder.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
     config.validate()
     check_device(config.device)
+    if group and not group.leads:  # the folder is the first process's
+        run = Run(_new_trainer(config, scene or load_scene(config, False), rasterize, group), progress=False)
+        if resume:
+            run.resume()
+        return run.train()
     earlier_models(config, resume, overwrite)
     layout = None if scene else read_layout(config)
     make_folder(config.output)  # a folder that cannot be made is told before images are read
@@ -346,7 +396,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         if config.random_background and config.background_gate == 0:
             print("warning: --random-background with a background gate of 0: the background is seen only where no "
                   "Gaussian is, so little is learned of transparency")
-        run = Run(Trainer(config, scene, rasterize), progress)
+        run = Run(_new_trainer(config, scene, rasterize, group), progress)
         if resume:
             resumed = run.resume()
             print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
@@ -357,3 +407,12 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
             remove_files(config.output, [*PRODUCTS, model, *scalar_files(config.output)])
         config.save(config.output)
         return run.train()
+
+
+def _new_trainer(config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize], group: Optional[Group]) -> Trainer:
+    """One view a step in one process has the usual trainer; what has more, the other one."""
+    if config.batch == 1 and (group is None or group.size == 1):
+        return Trainer(config, scene, rasterize)
+    from ..distributed.trainer import BatchTrainer
+
+    return BatchTrainer(config, scene, group or ALONE)

@@ -5,8 +5,8 @@ renderings of training views included, is in StrategyContext.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Dict, Optional, Sequence, Tuple
+from dataclasses import dataclass, field
+from typing import Any, Dict, Iterable, List, Optional, Sequence, Tuple, Union
 
 import torch
 
@@ -17,6 +17,7 @@ from ..model import GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternio
 from ..results.rendering import Renderer
 from ..scenes.cameras import Camera
 from ..scenes.images import View
+from .shards import Shards
 
 MIN_OPACITY = 0.005  # fainter Gaussians are pruned
 RESET_OPACITY = 0.01  # an opacity reset leaves no Gaussian above this
@@ -35,17 +36,66 @@ class StrategyContext:
     extent: float  # scene extent, world units
     views: Sequence[View]  # for training
     render: Renderer  # for passes of the strategy's own
+    shards: Shards = field(default_factory=Shards)  # which of the Gaussians the model has
+
+    @property
+    def num_gaussians(self) -> int:
+        """Of all processes."""
+        return self.shards.total(self.model.num_gaussians)
+
+
+Seen = Tuple[torch.Tensor, torch.Tensor]
+"""Of one view dL/dpixel times (0.5 W, 0.5 H), [N, 3], and the radii [N] int32."""
+
+
+class StepClock:
+    """When a step is. Iterations count views, from 1; a step has `batch` of them, of which `iteration` is the last."""
+
+    iteration: int
+    batch: int
+
+    def due(self, interval: int) -> bool:
+        """Whether a multiple of the interval is among the step's iterations."""
+        return self.iteration // interval > (self.iteration - self.batch) // interval
+
+    def reaches(self, iteration: int) -> bool:
+        """Whether that one is among the step's iterations."""
+        return self.iteration - self.batch < iteration <= self.iteration
 
 
 @dataclass
-class Step:
+class Step(StepClock):
     """One training step, as far as it has come when a hook is called."""
 
-    iteration: int  # counts from 1
+    iteration: int
     camera: Camera
     rendering: Rendering
     means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H) where radii > 0
     loss: torch.Tensor
+    batch: int = 1
+
+    def seen(self) -> Iterable[Seen]:
+        """What each view of the step says of the Gaussians; after backward."""
+        gradient = self.means2D.grad
+        assert gradient is not None
+        return [(gradient, self.rendering.radii)]
+
+
+@dataclass
+class BatchStep(StepClock):
+    """One training step over several views."""
+
+    iteration: int
+    batch: int
+    loss: torch.Tensor  # the mean over the views
+    views: List[Seen] = field(default_factory=list)
+
+    def seen(self) -> Iterable[Seen]:
+        """What each view of the step says of the Gaussians; after backward."""
+        return self.views
+
+
+AnyStep = Union[Step, BatchStep]
 
 
 class Strategy:
@@ -61,13 +111,13 @@ class Strategy:
         """May change the first Gaussians; a resumed run replaces them and loads the state."""
         self.context = context
 
-    def before_backward(self, step: Step) -> None:
+    def before_backward(self, step: AnyStep) -> None:
         """The loss is known, its gradients are not."""
 
-    def after_backward(self, step: Step) -> None:
+    def after_backward(self, step: AnyStep) -> None:
         """Gradients are known, the optimizer has not stepped. A parameter replaced here is not stepped."""
 
-    def after_step(self, step: Step) -> None:
+    def after_step(self, step: AnyStep) -> None:
         """The optimizer has stepped."""
 
     def state_dict(self) -> Dict[str, Any]:
@@ -92,18 +142,19 @@ class ThreeDGSStrategy(Strategy):
         super().__init__(context)
         self._forget_statistics()
 
-    def after_backward(self, step: Step) -> None:
+    def after_backward(self, step: AnyStep) -> None:
         config = self.context.config
         if step.iteration >= self.densify_until:
             return
         self._observe(step)
-        if step.iteration > config.densify_from_iter and step.iteration % config.densification_interval == 0:
-            self.densify(self._mean_gradients(), *self.growth(step.iteration))
-            self.prune(large_too=self.prunes_large and step.iteration > config.opacity_reset_interval)
+        if step.iteration > config.densify_from_iter and step.due(config.densification_interval):
+            kinds = self.densify(self._mean_gradients(), *self.growth(step.iteration))
+            kept = self.prune(large_too=self.prunes_large and step.iteration > config.opacity_reset_interval)
+            self.context.shards.settle(kinds[kept])
             self._forget_statistics()
         # On white, 3DGS resets once more where densification starts.
-        starts_on_white = config.white_background and step.iteration == config.densify_from_iter
-        if self.resets_opacity and (step.iteration % config.opacity_reset_interval == 0 or starts_on_white):
+        starts_on_white = config.white_background and step.reaches(config.densify_from_iter)
+        if self.resets_opacity and (step.due(config.opacity_reset_interval) or starts_on_white):
             self.reset_opacities()
 
     @property
@@ -114,29 +165,40 @@ class ThreeDGSStrategy(Strategy):
     def growth(self, iteration: int) -> Tuple[int, Optional[int]]:
         """How many Gaussians a densification adds at least and, but for None, at most."""
         budget = self.context.config.budget
-        return 0, max(0, budget - self.context.model.num_gaussians) if budget else None
+        return 0, max(0, budget - self.context.num_gaussians) if budget else None
 
-    def densify(self, gradients: torch.Tensor, least: int = 0, most: Optional[int] = None) -> None:
+    def densify(self, gradients: torch.Tensor, least: int = 0, most: Optional[int] = None) -> torch.Tensor:
         """Clones small and splits large Gaussians whose mean gradient [N] reaches the threshold.
 
-        Where those are fewer than `least` or more than `most`, so many of the largest gradients are taken.
+        Where those are fewer than `least` or more than `most`, so many of the largest gradients are taken. Returns the
+        kinds of all Gaussians now, [N] int64: 0 for the old ones, 1 for clones, from 2 on the children of splits.
         """
         config, model = self.context.config, self.context.model
         wanted = gradients >= config.densify_grad_threshold
         if least > 0 or most is not None:
-            count = max(int(wanted.sum()), least)
-            count = min(count, int((gradients > 0).sum()), count if most is None else most)
-            wanted = torch.zeros_like(wanted)
-            wanted[torch.topk(gradients, count).indices] = True
+            wanted = self.context.shards.over_all(lambda every: self._largest(every, least, most), gradients)
         large = model.scales.detach().max(dim=1).values > config.percent_dense * self.context.extent
         parents = wanted & large
-        clones = (wanted & ~large).nonzero().squeeze(1)
-        children = parents.nonzero().squeeze(1).repeat(CHILDREN)
+        kept, clones = (~parents).nonzero().squeeze(1), (wanted & ~large).nonzero().squeeze(1)
+        split = parents.nonzero().squeeze(1)
+        children = split.repeat(CHILDREN)
         means, scales = self._children(children)
         raw = model.raw
-        self.context.optimizer.take(torch.cat([(~parents).nonzero().squeeze(1), clones, children]), {
+        self.context.optimizer.take(torch.cat([kept, clones, children]), {
             "means3D": torch.cat([raw["means3D"].detach().index_select(0, clones), means]),
             "scales": torch.cat([raw["scales"].detach().index_select(0, clones), scales])})
+        counts = [len(kept), len(clones), *[len(split)] * CHILDREN]
+        kinds = torch.arange(len(counts), device=kept.device)
+        return kinds.repeat_interleave(torch.tensor(counts, device=kept.device), output_size=sum(counts))
+
+    def _largest(self, gradients: torch.Tensor, least: int, most: Optional[int]) -> torch.Tensor:
+        """Which Gaussians a densification takes that has bounds: a mask [N]. gradients: [N] of all Gaussians."""
+        wanted = gradients >= self.context.config.densify_grad_threshold
+        count = max(int(wanted.sum()), least)
+        count = min(count, int((gradients > 0).sum()), count if most is None else most)
+        mask = torch.zeros_like(wanted)
+        mask[torch.topk(gradients, count).indices] = True
+        return mask
 
     def _children(self, parents: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         """Means and raw scales of smaller Gaussians, at places drawn from their parents' own distribution.
@@ -146,25 +208,29 @@ class ThreeDGSStrategy(Strategy):
         raw = {name: self.context.model.raw[name].detach().index_select(0, parents)
                for name in ("means3D", "scales", "rotations")}
         scales = raw["scales"].exp()
-        offsets = torch.normal(torch.zeros_like(scales), scales)
+        normal = self.context.shards.draw(lambda count: torch.randn(CHILDREN, count, 3, device=scales.device),
+                                          len(parents) // CHILDREN)
+        offsets = normal.reshape(-1, 3) * scales
         turned = torch.bmm(quaternion_to_matrix(raw["rotations"]), offsets.unsqueeze(2)).squeeze(2)
         return raw["means3D"] + turned, torch.log(scales / SPLIT_SHRINK)
 
-    def prune(self, large_too: bool) -> None:
-        """Removes faint Gaussians and, if asked, those larger than a tenth of the scene."""
+    def prune(self, large_too: bool) -> torch.Tensor:
+        """Removes faint Gaussians and, if asked, those larger than a tenth of the scene. Returns which stay, [N]."""
         model = self.context.model
         doomed = model.opacities.detach().squeeze(1) < MIN_OPACITY
         if large_too:
             doomed |= model.scales.detach().max(dim=1).values > MAX_SCALE * self.context.extent
         self.context.optimizer.keep(~doomed)
+        return ~doomed
 
     def reset_opacities(self) -> None:
         """Lowers every opacity to at most RESET_OPACITY."""
         opacities = self.context.model.opacities.detach()
         self.context.optimizer.set_opacity_logits(inverse_sigmoid(opacities.clamp(max=RESET_OPACITY)))
 
-    def _observe(self, step: Step) -> None:
-        add_view(step.means2D.grad, step.rendering.radii, self.gradient_sum, self.view_count)
+    def _observe(self, step: AnyStep) -> None:
+        for gradients, radii in step.seen():
+            add_view(gradients, radii, self.gradient_sum, self.view_count)
 
     def _mean_gradients(self) -> torch.Tensor:
         """[N] over the views that saw each Gaussian since the last densification; 0 where none did."""

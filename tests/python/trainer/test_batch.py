@@ -1,0 +1,144 @@
+"""Batches of views on one process: gradients, the rule of the learning rates, milestones, resuming."""
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from diff_smoe_rasterization.trainer.distributed.group import ALONE
+from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
+from diff_smoe_rasterization.trainer.errors import ConfigError
+from diff_smoe_rasterization.trainer.results.modelfile import model_path
+from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.training.loop import Trainer, train
+
+
+@pytest.fixture
+def scene(tiny_config):
+    return load_scene(tiny_config, progress=False)
+
+
+def gradients_of(trainer):
+    """Steps a trainer, and returns the gradients that its step had."""
+    seen = {}
+
+    def keep():
+        seen.update({name: tensor.grad.clone() for name, tensor in trainer.model.raw.items() if tensor.grad is not None})
+        if trainer.gate:
+            seen["gate"] = trainer.gate.logarithm.grad.clone()
+
+    trainer.step(keep)
+    return seen
+
+
+@pytest.mark.parametrize("options", [
+    dict(), dict(background_gate=0.2), dict(blend_mode="alpha", random_background=True)])
+def test_gradients_of_a_batch_are_the_sums_of_those_of_its_views(tiny_config, scene, options):
+    config = tiny_config.changed(iterations=40, **options)
+    batched = BatchTrainer(config.changed(batch=4), scene, ALONE)
+    start = {name: tensor.detach().clone() for name, tensor in batched.model.raw.items()}
+    actual = gradients_of(batched)
+    single, sums = Trainer(config, scene), {}
+    gate = single.gate.state_dict() if single.gate else {}
+    gate = {name: value.clone() if isinstance(value, torch.Tensor) else dict(value) for name, value in gate.items()}
+    for _ in range(4):
+        single.optimizer.replace_all(start)
+        single.model.active_sh_degree = 0
+        if single.gate:
+            single.gate.load_state_dict(gate)
+        for name, gradient in gradients_of(single).items():
+            sums[name] = sums[name] + gradient if name in sums else gradient
+    assert set(actual) == set(sums) and actual["means3D"].any()
+    for name in sums:
+        # The same numbers in the same order, but that activations are differentiated once for the sum.
+        torch.testing.assert_close(actual[name], sums[name], rtol=1e-5, atol=1e-6 * float(sums[name].abs().max()))
+
+
+def test_a_batch_of_one_is_the_usual_training(tiny_config, scene):
+    results = []
+    for new in (Trainer, lambda *arguments: BatchTrainer(*arguments, ALONE)):
+        trainer = new(tiny_config, scene)
+        losses = [float(trainer.step().loss.detach()) for _ in range(tiny_config.iterations)]
+        results.append((losses, trainer.model.raw))
+    assert results[0][0] == results[1][0]
+    assert len(results[0][1]["means3D"]) != len(scene.points.positions)
+    for name, tensor in results[0][1].items():
+        assert torch.equal(tensor, results[1][1][name]), name
+
+
+def test_rates_and_betas_follow_the_square_root_rule(tiny_config, scene):
+    one, four = (BatchTrainer(tiny_config.changed(batch=batch), scene, ALONE) for batch in (1, 4))
+    four.step()
+    for _ in range(4):
+        one.step()
+    for group, batched in zip(one.optimizer.adam.param_groups, four.optimizer.adam.param_groups):
+        assert batched["lr"] == pytest.approx(2 * group["lr"], rel=1e-12)
+        assert batched["betas"] == pytest.approx((0.9**4, 0.999**4), rel=1e-12) != group["betas"]
+
+
+def test_milestones_count_views(tiny_config, scene):
+    """A batch of 3 passes most milestones between two steps; each comes once all the same."""
+    config = tiny_config.changed(iterations=39, batch=3, checkpoint_every=0)
+    trainer, happened = BatchTrainer(config, scene, ALONE), []
+    strategy = trainer.strategy
+    densify, reset = strategy.densify, strategy.reset_opacities
+    strategy.densify = lambda *arguments: happened.append(("densify", trainer.iteration)) or densify(*arguments)
+    strategy.reset_opacities = lambda: happened.append(("reset", trainer.iteration)) or reset()
+    degrees = []
+    for _ in range(13):
+        trainer.step()
+        degrees.append(trainer.model.active_sh_degree)
+    assert trainer.iteration == 39
+    # Multiples of 8 from 5 to 29, and of 12 below 30.
+    assert happened == [("densify", 9), ("reset", 12), ("densify", 18), ("densify", 24), ("reset", 24)]
+    assert degrees == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3]
+
+
+@pytest.mark.parametrize("gate", ["learned", 0.3])
+def test_a_batched_run_resumes_bit_for_bit(tiny_config, tmp_path, gate):
+    straight = tiny_config.changed(batch=4, background_gate=gate, output=str(tmp_path / "straight"))
+    row = train(straight, progress=False)
+    halted = dataclasses.replace(straight, output=str(tmp_path / "halted"))
+    steps, step = [], BatchTrainer.step
+
+    class Killed(Exception):
+        pass
+
+    def dying(self, *arguments):
+        steps.append(self.iteration)
+        if len(steps) == 8:
+            raise Killed
+        return step(self, *arguments)
+
+    BatchTrainer.step = dying
+    try:
+        with pytest.raises(Killed):
+            train(halted, progress=False)
+    finally:
+        BatchTrainer.step = step
+    torch.manual_seed(99)
+    resumed = train(halted, resume=True, progress=False)
+    contents = []
+    for config in (straight, halted):
+        with open(model_path(config.output, config.iterations), "rb") as file:
+            contents.append(file.read())
+    assert contents[0] == contents[1] and resumed["psnr"] == row["psnr"]
+    assert row["num_gaussians"] != row["protocol"]["init_points"] and row["protocol"]["batch"] == 4
+
+
+def test_training_lowers_the_loss(tiny_config, scene):
+    trainer = BatchTrainer(tiny_config.changed(batch=4, iterations=120, densify_until_iter=0), scene, ALONE)
+    losses = [float(trainer.step().loss) for _ in range(30)]
+    assert sum(losses[-5:]) < 0.9 * sum(losses[:5]) and all(map(math.isfinite, losses))
+
+
+@pytest.mark.parametrize("options, text", [
+    (dict(batch=0), "--batch is 0; it must be at least 1"),
+    (dict(batch=3), "--iterations is 40; it must be a multiple of --batch, 3"),
+    (dict(batch=4, schedule="gate", budget=50), "--batch is 4; it must be 1 with --strategy gate"),
+    (dict(batch=4, schedule="mcmc", budget=50), "--batch is 4; it must be 1 with --strategy mcmc")])
+def test_batches_that_do_not_fit_are_refused(tiny_config, options, text):
+    with pytest.raises(ConfigError, match=text):
+        tiny_config.changed(**options)
