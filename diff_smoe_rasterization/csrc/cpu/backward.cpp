@@ -104,7 +104,7 @@ void project_all_backward(const Frame<S>& frame, const GaussianGradients<S>& gra
     auto sums_of = new_sums();
     CameraGradient<S>* share = camera_shares.empty() ? nullptr : &camera_shares[begin / kChunk];
     for (int64_t i = begin; i < end; ++i) {
-      if (gradients.seen_only && images.radii[i] <= 0) continue;
+      if (gradients.seen_only && frame.images.radii[i] <= 0) continue;
       store_zeros(gradients, config.num_channels, inputs.num_sh, i);
       PixelSums<S> sums;
       if (!sums_of(i, sums)) continue;

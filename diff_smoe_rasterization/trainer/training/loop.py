@@ -35,8 +35,8 @@ from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_che
 from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses
 from .randomness import random_state, restore_random_state, seed_everything
-from .strategies import STRATEGIES
 from .shards import Shards
+from .strategies import STRATEGIES
 from .strategy import AnyStep, Step, StrategyContext
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
@@ -375,8 +375,8 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
     is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
     run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
-    hand. group: the processes that train together, where there are several; all of them call this. Raises TrainerError before training starts where anything does not fit, as where another run is at work in
-    the folder.
+    hand. group: the processes that train together, where there are several; all of them call this. Raises TrainerError
+    before training starts where anything does not fit, as where another run is at work in the folder.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
