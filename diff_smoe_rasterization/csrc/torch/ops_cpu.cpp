@@ -90,7 +90,7 @@ struct Cpu {
     own.saved.features = mutable_data<S>(features);
     own.images.radii = mutable_data<int32_t>(radii);
     cpu::Gradients<S> gradients;
-    with_input_gradients<S>(inputs, gradient_tensors, gradients, [&] {
+    with_input_gradients<S>(inputs, gradient_tensors, false, gradients, [&] {
       StageRecorder recorder(Pass::kBackward);
       cpu::project_backward(own, {mutable_data<S>(records), data<S>(dL_ddepths)}, gradients.inputs, recorder.times());
     });

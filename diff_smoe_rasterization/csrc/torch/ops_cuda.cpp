@@ -102,7 +102,7 @@ struct Cuda {
     const cuda::Run how = run(options, recorder.times());
     cuda::Gradients<S> gradients;
     TensorMemory memory(features);
-    with_input_gradients<S>(inputs, gradient_tensors, gradients, [&] {
+    with_input_gradients<S>(inputs, gradient_tensors, false, gradients, [&] {
       cuda::project_footprints_backward(own, {mutable_data<S>(records), data<S>(dL_ddepths)}, gradients.inputs, how,
                                         memory);
     });
