@@ -8,7 +8,7 @@ import os
 import sys
 import warnings
 from pathlib import Path
-from typing import Any, Callable, Dict, Tuple
+from typing import Any, Callable, Dict, Optional, Tuple
 
 from diff_smoe_rasterization.settings import (
     BLEND_MODES,
@@ -104,31 +104,52 @@ def _whence(option: str, value: Any, of_variable: Callable[[], Any], saved: Any,
     return whence
 
 
-def rasterizer_of_run() -> Dict[str, Any]:
-    """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
+@functools.lru_cache(maxsize=None)
+def _note_use() -> None:
+    """Tells `dsmoe run` that something was rendered."""
+    used = os.environ.get(USED_VARIABLE, "")
+    if os.path.isdir(os.path.dirname(used)):
+        Path(used).touch()
 
-    A rasterizer that is made, or a function that is called, is noted for `dsmoe run`.
-    """
-    from diff_smoe_rasterization import GaussianRasterizer
 
-    flavour, used = os.environ[RASTERIZER_VARIABLE], Path(os.environ.get(USED_VARIABLE, ""))
-    module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
+def _noting(function: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        _note_use()
+        return function(*arguments, **keywords)
 
-    def noting(function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(function)
-        def call(*arguments: Any, **keywords: Any) -> Any:
-            if used.name and used.parent.is_dir():
-                used.touch()
-            return function(*arguments, **keywords)
+    return call
 
-        return call
 
-    GaussianRasterizer.__init__ = noting(GaussianRasterizer.__init__)
+def _say_rasterizer(flavour: str) -> None:
     mode = resolve_blend_mode(None)
     gate = f", background gate {resolve_background_gate(mode, None)}" if mode == "smoe" else ""
     _say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
+
+
+def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
+    """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
+
+    flavour: the module of integrations, where the name that is imported says it; None: the one that the trainer needs.
+    The first rasterizer that is made, or function that is called, is noted for `dsmoe run`, which else says at the end
+    that nothing was rendered.
+    """
+    from diff_smoe_rasterization import GaussianRasterizer
+
+    flavour = flavour or os.environ[RASTERIZER_VARIABLE]
+    flavour = "inria" if flavour == "gsplat" else flavour  # gsplat's wrapper of Inria's rasterizer imports that
+    module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
+    original = GaussianRasterizer.__init__
+
+    def noted(self: Any, *arguments: Any, **keywords: Any) -> None:
+        GaussianRasterizer.__init__ = original
+        _note_use()
+        original(self, *arguments, **keywords)
+
+    GaussianRasterizer.__init__ = noted
+    _say_rasterizer(flavour)
     offered = {name: getattr(module, name) for name in module.__all__}
-    return {name: noting(value) if name.startswith("rasterize_") else value for name, value in offered.items()}
+    return {name: _noting(value) if name.startswith("rasterize_") else value for name, value in offered.items()}
 
 
 def is_installed(module: str) -> bool:
