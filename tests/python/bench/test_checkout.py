@@ -1,6 +1,6 @@
-"""Checkouts of public trainers as methods: small trainers of the same structure, patched, trained and measured.
+"""Checkouts of public trainers as methods: a small trainer of the same structure, patched, trained and measured.
 
-The small trainers are those of the patches' tests; they make up their scene, which is written here as images too.
+The small trainer is that of the patches' tests; it makes up its scene, which is written here as images too.
 """
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import random
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +19,7 @@ import pytest
 import torch
 from bench_commands import ABOVE, wait_for
 from PIL import Image
-from small_trainers import PATCHES, small_trainers, write_dbs
+from small_trainers import PATCHES, small_trainers
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.benchmarks.errors import BenchError
@@ -41,7 +42,7 @@ def scene(tmp_path_factory):
                "numpy.savez(sys.argv[2], **{view.image_name: view.image for view in made.hidden + made.shown})")
     stored = folder.parent / "views.npz"
     made = folder.parent / "checkout"
-    small_trainers().make_checkout("3dgs-2023", made)
+    small_trainers().make_checkout(made)
     subprocess.run([sys.executable, "-c", program, str(folder), str(stored)], check=True, cwd=str(made),
                    env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, [made, PATCHES / "packages", ABOVE]))})
     with np.load(stored) as views:
@@ -67,21 +68,17 @@ class SmallTrainers:
     """Cells of small trainers, each patched once."""
 
     def __init__(self, scene, folder):
-        self.scene, self.folder = scene, folder
-        self.prepared = {}
-
-    def checkout(self, name):
-        path = self.folder / f"checkout-{name}"
-        return str(path if path.is_dir() else small_trainers().make_checkout(name, path))
+        self.scene, self.folder, self.prepared = scene, folder, {}
+        self.checkout = small_trainers().make_checkout(folder / "checkout")
 
     def cell(self, name, variant="patched", scene=None, seed=0, blend_mode="smoe", options=None, **method):
         """A suite refuses checkouts on the CPU, as the public ones cannot train there: it is set afterwards."""
         method = {"name": name, "variant": variant, "pythonpath": [str(small_trainers().PACKAGES)],
                   "blend_modes": [blend_mode], **method}
         if "path" not in method:
-            method["path"] = self.checkout("3dgs-2023" if name == "3dgs-2024" else name)
+            method["path"] = str(self.checkout)
         if name == "c3dgs":
-            method["base"] = self.checkout("3dgs-2023")
+            method["base"] = str(self.checkout)
         content = {"name": "checkouts", "protocol": {"iterations": ITERATIONS, "lpips": [], "options": options or {}},
                    "scenes": [{"name": "made-up", "path": str(scene or self.scene)}], "methods": [method],
                    "seeds": [seed], "densify_grad_thresholds": [0.0001], "images": 1}
@@ -104,26 +101,22 @@ def small(scene, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", ABOVE)
         patch.setenv("OMP_NUM_THREADS", "1")
-        patch.setattr(shapes.ThreeDGS, "container", "point_cloud.npz")  # the small trainers write no .ply,
-        patch.setattr(shapes.HAC, "own_bytes", shapes.ThreeDGS.own_bytes)  # and no bitstreams
+        patch.setattr(shapes.ThreeDGS, "container", "point_cloud.npz")  # the small trainer writes no .ply
         yield SmallTrainers(scene, tmp_path_factory.mktemp("small"))
 
 
-@pytest.mark.parametrize("name", ["3dgs-2023", pytest.param("c3dgs", marks=pytest.mark.slow),
-                                  pytest.param("hac", marks=pytest.mark.slow)])
-def test_a_patched_checkout_gives_a_row(name, small, tmp_path):
+def test_a_patched_checkout_gives_a_row(small, tmp_path):
     output = tmp_path / "out"
-    row = row_of(small.cell(name), output)
+    row = row_of(small.cell("3dgs-2023"), output)
     assert row["ok"], row["reason"]
-    assert (row["method"], row["variant"], row["blend_mode"]) == (name, "patched", "smoe")
+    assert (row["method"], row["variant"], row["blend_mode"]) == ("3dgs-2023", "patched", "smoe")
     for figure in ("psnr", "psnr_float", "ssim", "fps", "num_gaussians"):
         assert row[figure] > 0, figure
-    protocol, is_hac = row["protocol"], name == "hac"
-    assert protocol["schedule"] == row["schedule"] == (None if is_hac else "3dgs") and protocol["recipe"] == {}
-    assert protocol["densify_grad_threshold"] == 0.0001 and protocol["sh_degree"] == (None if is_hac else 3)
-    assert row["size_bytes"]["common"] == (None if is_hac else 236 * row["num_gaussians"])
-    # The small c3dgs does not say how long compression took.
-    assert row["train_seconds"] is None if name == "c3dgs" else 0 < row["train_seconds"] < row["wall_seconds"]
+    protocol = row["protocol"]
+    assert protocol["schedule"] == row["schedule"] == "3dgs" and protocol["recipe"] == {}
+    assert protocol["densify_grad_threshold"] == 0.0001 and protocol["sh_degree"] == 3
+    assert row["size_bytes"]["common"] == 236 * row["num_gaussians"]
+    assert 0 < row["train_seconds"] < row["wall_seconds"]
     # The ground truth was rounded to 8 bits on its way here: a quarter of a grey level on average.
     assert 0 < row["protocol"]["ground_truth_difference"] < 0.5 / 255
     assert row["protocol"]["test_views"] == len(row["per_view"]) == 1
@@ -131,41 +124,94 @@ def test_a_patched_checkout_gives_a_row(name, small, tmp_path):
     assert not (output / "renders").exists() and not (output / "run").exists()
 
 
-@pytest.mark.slow
-def test_a_trainer_that_would_choose_on_the_test_views_is_kept_from_it(small, tmp_path):
-    """Of Deformable Beta Splatting's --eval the split alone is taken; the mean of the training views is its model."""
-    with np.load(small.scene.parent / "views.npz") as file:
-        views = {name: file[name] for name in file.files}
-    checkout = write_dbs(tmp_path / "dbs", views)
-    row = row_of(small.cell("dbs", variant="unpatched", blend_mode="alpha", path=str(checkout),
-                            arguments=["--cap_max", 12]), tmp_path / "out")
-    assert row["ok"], row["reason"]
-    rules = row["protocol"]
-    assert rules["schedule"] is rules["densify_grad_threshold"] is rules["sh_degree"] is None and rules["recipe"] == {}
-    assert row["size_bytes"]["common"] is None  # a Beta primitive is no Gaussian of 59 numbers
-    assert row["num_gaussians"] == 12 and row["train_seconds"] > 0 and row["fps"] > 0 and row["schedule"] is None
-    level = np.mean([views[name].mean() for name in sorted(views)[1:]])
-    truth = np.asarray(Image.open(small.scene / "images" / "view0.png"), np.float64) / 255
-    # float32 sums of some thousand values
-    assert row["psnr_float"] == pytest.approx(-10 * np.log10(((truth - level) ** 2).mean()), abs=1e-4)
+@pytest.fixture
+def started(monkeypatch):
+    """The words and the environment of each command that is started in place of running it."""
+    found = []
+
+    def call(line, env, **_):
+        found.append((line, env))
+        Path(line[2]).write_text(json.dumps({"loop_seconds": 5.0, "peak_gpu_mib": 10 * len(found)}))
+        return 0
+
+    monkeypatch.setattr(shapes.subprocess, "call", call)
+    return found
+
+
+def test_c3dgs_compresses_what_another_checkout_has_trained(small, started, tmp_path):
+    cell = small.cell("c3dgs", arguments=["--finetune_iterations", 3])
+    base, path = cell["method"]["base"], Path(cell["method"]["path"])
+    (path / "compress.py").touch()
+    shape = shapes.C3DGS(cell, shapes.config_of(cell), str(tmp_path))
+    trained = shape.train()
+    (train, _), (compress, _) = started
+    words = compress[compress.index("--") + 1:]
+    assert train[train.index("--") + 1] == f"{base}/train.py" and words[0] == f"{path}/compress.py"
+    assert train[train.index("-m") + 1] == words[words.index("--model_path") + 1]
+    assert words[-2:] == ["--finetune_iterations", "3"] and trained["peak_gpu_mib"] == 20
+    assert shape.train_seconds(trained) is None  # it does not say how long it took
+    Path(shape.model).mkdir(parents=True)
+    Path(shape.model, "times.json").write_text('{"total": 7}')
+    assert shape.train_seconds(trained) == 12
+
+
+@pytest.mark.parametrize("name, arguments, there, absent", [
+    ("hac", [], ["--eval", "--test_iterations", str(ITERATIONS)], ["--renders"]),
+    ("dbs", ["--cap_max", 12], ["--cap_max", "12", "--disable_viewer", "--no-compress"], ["--eval", "--blend_mode"])])
+def test_trainers_of_one_process_have_rules_of_their_own(name, arguments, there, absent, small, started, tmp_path):
+    """And no Gaussians of 59 numbers. Of Deformable Beta Splatting's --eval the observer takes the split alone."""
+    variant = {"variant": "unpatched", "blend_mode": "alpha"} if name == "dbs" else {}
+    cell = small.cell(name, arguments=arguments, **variant)
+    shape = shapes.SHAPES[name](cell, shapes.config_of(cell), str(tmp_path))
+    assert shape.train() == shape.render() and len(started) == 1
+    ours, words = " ".join(started[0][0]).split(" -- ")
+    assert " ".join(there[:3]) in words and not {*absent} & {*words.split()} and f"--renders {shape.renders}" in ours
+    assert ("--hold-out --model-renders beta_model" in ours) == (name == "dbs")
+    rules = shape.rules()
+    assert rules["schedule"] is rules["sh_degree"] is None and rules["recipe"] == {} and not shape.of_gaussians
+    assert ("densify_grad_threshold" in rules) == (name == "dbs")
+
+
+def test_views_are_held_out_and_rendered_by_the_model_itself(tmp_path, monkeypatch):
+    view = SimpleNamespace(image_name="a", original_image=torch.full((4, 2, 3), 0.5))
+
+    class Scene:
+        def __init__(self, args):
+            self.getTestCameras = lambda: [view] if was_held_out else []
+            was_held_out = args.eval
+            self.model = SimpleNamespace(get_xyz=torch.zeros(5, 3), render=lambda view: {"render": torch.ones(3, 2, 3)})
+
+    monkeypatch.setitem(sys.modules, "scene", SimpleNamespace(Scene=Scene))
+    made, args = observer.watch_scenes(hold_out=True), SimpleNamespace(eval=False)
+    sys.modules["scene"].Scene(args)
+    found = observer.renderings_of(made[-1], "model", str(tmp_path))
+    assert not args.eval and found["num_gaussians"] == 5 and found["a"]["milliseconds"] > 0
+    assert np.load(found["a"]["file"]).shape == np.load(found["a"]["truth"]).shape == (3, 2, 3)
+
+
+def test_what_comes_before_a_rendering_is_a_part_of_its_time(tmp_path, monkeypatch):
+    """HAC asks beforehand which anchors are visible. What is rendered for gradients is not kept."""
+    slow, view = [], SimpleNamespace(image_name="a", original_image=torch.zeros(3, 2, 3))
+    renderer = SimpleNamespace(render=lambda view, model: {"render": torch.ones(3, 2, 3)},
+                               prefilter_voxel=lambda view, model: slow.append(time.sleep(0.05)))
+    monkeypatch.setitem(sys.modules, "gaussian_renderer", renderer)
+    found, model = observer.watch_renderings(str(tmp_path)), SimpleNamespace(get_anchor=torch.zeros(7, 3))
+    renderer.render(view, model)
+    assert found == {}
+    with torch.no_grad():
+        renderer.prefilter_voxel(view, model)
+        renderer.render(view, model)
+    assert found["num_gaussians"] == 7 and found["a"]["milliseconds"] >= 50 and len(slow) == 2  # one warms up
 
 
 @pytest.mark.parametrize("other, blend", [
     ({"seed": 1}, ["--blend_mode", "smoe", "--background_gate", "0.0"]),
     ({"seed": 2, "background_gates": [0.3]}, ["--blend_mode", "smoe", "--background_gate", "0.3"]),
     ({"seed": 3, "blend_mode": "alpha"}, ["--blend_mode", "alpha"])])
-def test_blend_and_seed_reach_the_trainer_and_no_variable_does(other, blend, small, tmp_path, monkeypatch):
+def test_blend_and_seed_reach_the_trainer_and_no_variable_does(other, blend, small, started, tmp_path, monkeypatch):
     variables = {"DSMOE_BLEND_MODE": "smoe_tn", "DSMOE_BACKGROUND_GATE": "0.7"}
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    started = []
-
-    def call(line, env, **_):
-        started.append((line, env))
-        Path(line[2]).write_text("{}")
-        return 0
-
-    monkeypatch.setattr(shapes.subprocess, "call", call)
     cell = small.cell("3dgs-2023", **other)
     shapes.ThreeDGS(cell, shapes.config_of(cell), str(tmp_path)).train()
     (line, environment), = started

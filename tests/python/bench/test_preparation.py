@@ -29,7 +29,7 @@ def test_a_made_up_scene_is_made_anew_where_its_parameters_have_changed(tmp_path
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 def test_the_copy_of_a_checkout_follows_it_and_has_its_commit(tmp_path):
-    folder = small_trainers().make_checkout("3dgs-2023", tmp_path / "checkout")
+    folder = small_trainers().make_checkout(tmp_path / "checkout")
 
     def git(*words):
         who = ["-c", "user.name=Somebody", "-c", "user.email=somebody@example.org"]

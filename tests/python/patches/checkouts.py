@@ -1,4 +1,4 @@
-"""Copies of the small trainers, and what tests ask about a folder."""
+"""Copies of the small trainer, a 3DGS of 2023, and what tests ask about a folder."""
 from __future__ import annotations
 
 import json
@@ -11,45 +11,13 @@ import diff_smoe_rasterization
 
 HERE = Path(__file__).resolve().parent
 PACKAGE_PARENT = Path(diff_smoe_rasterization.__file__).resolve().parent.parent  # where it is installed, or the tree
-PACKAGES = HERE / "packages"  # what the trainers import beside the rasterizer
+PACKAGES = HERE / "packages"  # what trainers import beside the rasterizer
 RECORD = ".dsmoe_patch"
 
-# A trainer is the small 3DGS of 2023 with other files laid over it, without some, and with other lines in some.
-LAYERS = {"3dgs-2023": (), "c3dgs": ("c3dgs",), "hac": ("hac",)}
-REMOVED = {"c3dgs": ("train.py", "full_eval.py"), "hac": ("render.py", "full_eval.py")}
-EDITS = {
-    "c3dgs": {"scene/gaussian_model.py": {
-        "import Adam, build_covariance\n": "import Adam, build_covariance\n\nfrom scene.compressed import Compressed\n",
-        "class GaussianModel:": "class GaussianModel(Compressed):",
-        "        np.savez(path, **{":
-            "        np.savez(path, indices=torch.stack(self.indices).cpu().numpy(), **{",
-        "for name in self.FIELDS})\n": """for name in self.FIELDS})
-            self.indices = torch.tensor(saved["indices"], device=data_device).unbind() if "indices" in saved else None
-"""}},
-}
-TRAINERS = tuple(LAYERS)
 
-# Where the patch puts the mode into the pipeline: the functions behind the command lines.
-ENTRIES = {"3dgs-2023": {"train.py": ["training"], "render.py": ["render_sets"]},
-           "c3dgs": {"compress.py": ["run_vq"], "render.py": ["render_sets"]},
-           "hac": {"train.py": ["training", "render_sets"]}}
-
-
-def make_checkout(name, folder):
-    """Copies trainer `name` to `folder`; returns it."""
-    folder = Path(folder)
-    for layer in ("common", *LAYERS[name]):
-        shutil.copytree(HERE / "trainers" / layer, folder, dirs_exist_ok=True,
-                        ignore=shutil.ignore_patterns("__pycache__"))
-    for file in REMOVED.get(name, ()):
-        (folder / file).unlink()
-    for file, lines in EDITS.get(name, {}).items():
-        text = (folder / file).read_text()
-        for before, after in lines.items():
-            assert text.count(before) == 1, (file, before)
-            text = text.replace(before, after)
-        (folder / file).write_text(text)
-    return folder
+def make_checkout(folder):
+    """Copies the small trainer to `folder`; returns it."""
+    return shutil.copytree(HERE / "trainer", folder, ignore=shutil.ignore_patterns("__pycache__"))
 
 
 def make_scene(folder, seed=1):

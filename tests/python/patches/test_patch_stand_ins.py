@@ -11,7 +11,6 @@ import torch
 from torch.nn.functional import conv2d
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization import FusedAdam
 from diff_smoe_rasterization.patches import runtime
 
 
@@ -105,33 +104,6 @@ def test_another_ssim_stays_and_that_is_said_once(other, capsys):
     assert capsys.readouterr().err.count("is not SSIM as it is fused here") == 1
 
 
-@pytest.mark.slow
-def test_a_small_fit_goes_the_same_way():
-    """3DGS's loss, its epsilon, parameters that are replaced on the way as densification does."""
-    def fitted(similarity, adam):
-        torch.manual_seed(0)
-        target, start = torch.rand(3, 24, 24), torch.rand(3, 24, 24)
-        image = torch.nn.Parameter(start)
-        optimizer, losses = adam([{"params": [image], "lr": 0.01}], lr=0.0, eps=1e-15), []
-        for step in range(40):
-            loss = 0.8 * (image - target).abs().mean() + 0.2 * (1 - similarity(image, target))
-            loss.backward()
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-            losses.append(loss.item())
-            if step == 20:
-                state = optimizer.state.pop(image)
-                image = optimizer.param_groups[0]["params"][0] = torch.nn.Parameter(image.detach().clone())
-                optimizer.state[image] = {name: value.clone() if torch.is_tensor(value) else value
-                                          for name, value in state.items()}
-        return losses
-
-    before, after = fitted(ssim, torch.optim.Adam), fitted(runtime.fused_where_equal(ssim), FusedAdam)
-    # Adam divides by the gradient's size, so a pixel whose gradient is about 0 may step otherwise: 0.01 of 1728.
-    assert before[-1] < 0.5 * before[0]
-    assert after == pytest.approx(before, rel=1e-3)
-
-
 def test_a_module_that_is_absent_is_missed_when_it_is_used():
     assert runtime.optional_import("math").pi > 3
     absent = runtime.optional_import("there_is_no_such_module")
@@ -158,38 +130,33 @@ def test_eigenvectors_in_parts_are_those_of_all_at_once(monkeypatch, shape, at_o
     torch.testing.assert_close(gradient, expected_gradient)
 
 
-def same_unique(rows, **keywords):
-    """Asserts that unique_rows returns what torch.unique(dim=0) does."""
-    for inverse, counts in itertools.product((False, True), repeat=2):
-        found, expected = (unique(rows, return_inverse=inverse, return_counts=counts, dim=0, **keywords)
+INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+
+
+def integers(dtype, shape):
+    """All rows equal, many, few, and of the type's extremes."""
+    generator, ends = torch.Generator().manual_seed(0), torch.iinfo(dtype)
+    extremes = torch.tensor([ends.min, ends.min + 1, 0, 1, ends.max - 1, ends.max], dtype=dtype)
+    return [*(torch.randint(low, high, shape, generator=generator, dtype=dtype)
+              for low, high in ((0, 1), (0, 3), (max(-90, ends.min), 90))),
+            extremes[torch.randint(0, 6, shape, generator=generator)]]
+
+
+@pytest.mark.parametrize("rows", [
+    torch.tensor([[2.5, 1.0], [0.0, -0.0], [2.5, 1.0]]), torch.tensor([0.5, 0.5, -3]),
+    torch.arange(12).view(3, 4).t() % 2, torch.tensor([[True, False], [False, True], [True, False]]),
+    *(rows for dtype in INTEGERS for rows in integers(dtype, (500, 3))),
+    *(rows for shape in ((1, 3), (500, 1), (300,), (200, 2, 2), (0, 3), (0,))
+      for rows in integers(torch.int32, shape))])
+def test_unique_rows_are_those_of_torch(rows):
+    for inverse, counts, is_sorted in itertools.product((False, True), repeat=3):
+        found, expected = (unique(rows, is_sorted, inverse, counts, dim=0)
                            for unique in (runtime.unique_rows, torch.unique))
         assert isinstance(found, tuple) == isinstance(expected, tuple) == (inverse or counts)
         pairs = list(zip(found, expected)) if isinstance(found, tuple) else [(found, expected)]
         assert len(pairs) == 1 + inverse + counts
         for one, other in pairs:
             assert one.dtype == other.dtype and torch.equal(one, other)
-
-
-INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
-
-
-@pytest.mark.parametrize("dtype", INTEGERS)
-@pytest.mark.parametrize("shape", [(1, 3), (2000, 3), (500, 1), (500, 4), (300,), (200, 2, 2), (0, 3), (0,)])
-def test_unique_rows_are_those_of_torch(dtype, shape):
-    generator = torch.Generator().manual_seed(0)
-    ends = torch.iinfo(dtype)
-    for low, high in ((0, 1), (0, 3), (max(-90, ends.min), 90)):  # all rows equal, many, few
-        same_unique(torch.randint(low, high, shape, generator=generator, dtype=dtype))
-    extremes = torch.tensor([ends.min, ends.min + 1, 0, 1, ends.max - 1, ends.max], dtype=dtype)
-    same_unique(extremes[torch.randint(0, 6, shape, generator=generator)])
-
-
-@pytest.mark.parametrize("rows", [torch.tensor([[2.5, 1.0], [0.0, -0.0], [2.5, 1.0]]), torch.tensor([0.5, 0.5, -3]),
-                                  torch.tensor([[True, False], [False, True], [True, False]]),
-                                  torch.arange(12).reshape(3, 4).t() % 2])
-def test_unique_rows_of_other_tensors(rows):
-    same_unique(rows)
-    same_unique(rows, sorted=False)
 
 
 def test_rows_of_integers_are_not_given_to_the_unique_that_may_fail(monkeypatch):

@@ -1,4 +1,4 @@
-"""The patch on each small trainer: recognised as what it is, and nothing but the statements changes."""
+"""The patch on trainers of each structure: recognised as what they are, and nothing but the statements changes."""
 from __future__ import annotations
 
 import ast
@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 
-from checkouts import ENTRIES, TRAINERS, changed_files, contents, make_checkout  # noqa: E402
-from tiny import GR, RENDER, RENDERER, TRAIN, make, refused  # noqa: E402
+from checkouts import changed_files, contents, make_checkout  # noqa: E402
+from tiny import ARGS, GR, RENDERER, TRAIN, make, refused  # noqa: E402
 
 from diff_smoe_rasterization import patches  # noqa: E402
 from diff_smoe_rasterization.patches import facts  # noqa: E402
@@ -29,22 +29,16 @@ def only_statements_change(diff):
     assert all(not line or line.startswith(STATEMENTS) for line in added), added
 
 
-@pytest.mark.parametrize("name", TRAINERS)
-def test_each_trainer_is_recognised_patched_and_put_back(name, tmp_path):
-    checkout = make_checkout(name, tmp_path / "some folder")
+def test_the_small_trainer_is_recognised_patched_and_put_back(tmp_path):
+    checkout = make_checkout(tmp_path / "some folder")
     before = contents(checkout)
     only_statements_change(patches.diff(checkout))
     planned = patches.apply(checkout, modernise=True)
-    assert (planned.state, planned.trainer) == ("patchable", name)
+    assert (planned.state, planned.trainer) == ("patchable", "3dgs-2023")
     changed = changed_files(before, contents(checkout, record=False))
-    assert {*ENTRIES[name], GR, "arguments/__init__.py"} <= changed == {change.name for change in planned.changes}
+    assert {"train.py", "render.py", GR, ARGS} <= changed == {change.name for change in planned.changes}
     for file in changed:
         compile((checkout / file).read_bytes(), file, "exec")
-    texts = {file: (checkout / file).read_text() for file in changed}
-    assert not any("from diff_gaussian_rasterization import" in text for text in texts.values())
-    assert texts[GR].count("**pipe.blend,") == texts[GR].count("GaussianRasterizationSettings(")
-    for file, functions in ENTRIES[name].items():
-        assert len(re.findall(r"\.blend = (saved_)?blend_of\(", texts[file])) == len(functions)
     assert patches.check(checkout).state == "patched"
     patches.revert(checkout)
     assert contents(checkout) == before
@@ -101,21 +95,38 @@ def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, res
     refused(tmp_path, "unknown", "kernel_size" if "kernel_size" in renderer else f"its rasterizer returns {count} ")
 
 
-def test_scaffold_gs_renders_in_two_files(tmp_path):
-    """HAC's rasterizer without HAC's encodings, and with a render.py."""
-    visible = """
+VISIBLE = """
 
 def prefilter_voxel(camera, pc, pipe):
-    settings = GaussianRasterizationSettings(bg=None, debug=pipe.debug)
+    settings = GaussianRasterizationSettings(
+        bg=None, debug=pipe.debug)
     return GaussianRasterizer(raster_settings=settings).visible_filter(pc.get_xyz)
 """
-    rendering = "\n\ndef render_sets(dataset, iteration, pipeline):\n    return render(None, None, pipeline, None)\n"
-    make(tmp_path, {GR: RENDERER + visible, "train.py": TRAIN + rendering, "render.py": RENDER})
+RENDERING = "\n\ndef render_sets(dataset, iteration, pipeline):\n    return render(None, None, pipeline, None)\n"
+COMPRESS = TRAIN.replace("training(dataset, opt, pipe,", "run_vq(model_params, opt, pipeline_params,").replace(
+    "None, pipe,", "None, pipeline_params,")
+
+
+@pytest.mark.parametrize("name, files, entries", [
+    ("scaffold-gs", {GR: RENDERER + VISIBLE, "train.py": TRAIN + RENDERING}, {"train.py": 2, "render.py": 1}),
+    ("hac", {GR: RENDERER + VISIBLE, "train.py": "import utils.encodings\n" + TRAIN + RENDERING, "render.py": None},
+     {"train.py": 2}),
+    ("c3dgs", {GR: RENDERER.replace("prefiltered=False,", "clamp_color=True,"), "train.py": None,
+               "compress.py": COMPRESS}, {"compress.py": 1, "render.py": 1})])
+def test_trainers_of_other_files_get_the_mode_in_each_function(name, files, entries, tmp_path):
+    """Two renderers' settings, one file that trains and renders, and one whose parameters have other names."""
+    make(tmp_path, files)
+    before = contents(tmp_path)
+    only_statements_change(patches.diff(tmp_path))
     planned = patches.apply(tmp_path)
-    assert planned.trainer == "scaffold-gs" and planned.notes == ()
-    assert (tmp_path / GR).read_text().count("**pipe.blend,") == 2
-    for name, count in (("train.py", 2), ("render.py", 1)):
-        assert len(re.findall(r"\.blend = (saved_)?blend_of\(dataset\)", (tmp_path / name).read_text())) == count
+    assert planned.trainer == name and planned.notes == ()
+    assert (tmp_path / GR).read_text().count("**pipe.blend,") == files[GR].count("Settings(")
+    for file, count in entries.items():
+        text = (tmp_path / file).read_text()
+        compile(text, file, "exec")
+        assert len(re.findall(r"\.blend = (saved_)?blend_of\(", text)) == count
+    patches.revert(tmp_path)
+    assert contents(tmp_path) == before
 
 
 def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):

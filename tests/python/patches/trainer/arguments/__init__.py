@@ -23,7 +23,7 @@ class ModelParams(ParamGroup):
     def __init__(self, parser, sentinel=False):
         self.eval = self.train_test_exp = self._white_background = False
         self.data_device, self._images, self._model_path, self._source_path = "cpu", "images", "", ""
-        self.sh_degree, self.voxel_size, self.n_offsets, self.feat_dim = 1, 0.1, 4, 12
+        self.sh_degree = 1
         super().__init__(parser, "What is loaded", sentinel)
 
     def extract(self, args):
@@ -34,7 +34,7 @@ class ModelParams(ParamGroup):
 
 class PipelineParams(ParamGroup):
     def __init__(self, parser):
-        self.compute_cov3D_python = self.debug = self.antialiasing = self.separate_sh = False
+        self.compute_cov3D_python = self.debug = False
         super().__init__(parser, "How it is rendered")
 
 
@@ -43,20 +43,13 @@ class OptimizationParams(ParamGroup):
         self.iterations = 7
         self.position_lr_init, self.feature_lr, self.opacity_lr, self.scaling_lr = 0.002, 0.02, 0.05, 0.02
         self.lambda_dssim, self.densify_grad_threshold, self.densification_interval = 0.25, 0.0001, 2
-        self.optimizer_type, self.random_background = "default", False
+        self.random_background = False
         super().__init__(parser, "How it is trained")
-
-
-class CompressionParams(ParamGroup):
-    def __init__(self, parser):
-        self.finetune_iterations, self.load_iteration, self.output_vq = 4, -1, "eval_vq"
-        super().__init__(parser, "How it is compressed")
 
 
 def training_flags(parser: ArgumentParser):
     """Those of the script itself."""
-    for name, default in (("ip", "127.0.0.1"), ("port", 6009), ("debug_from", -1), ("start_checkpoint", ""),
-                          ("budget", 3.0), ("lmbda", 0.001)):
+    for name, default in (("ip", "127.0.0.1"), ("port", 6009), ("debug_from", -1), ("start_checkpoint", "")):
         parser.add_argument("--" + name, type=type(default), default=default)
     for name, default in (("test_iterations", [7]), ("save_iterations", []), ("checkpoint_iterations", [])):
         parser.add_argument("--" + name, type=int, nargs="+", default=default)

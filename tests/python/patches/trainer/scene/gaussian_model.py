@@ -11,8 +11,8 @@ class GaussianModel:
     FIELDS = {"xyz": "_xyz", "f_dc": "_features_dc", "f_rest": "_features_rest", "opacity": "_opacity",
               "scaling": "_scaling", "rotation": "_rotation"}
 
-    def __init__(self, degree, optimizer_type="default"):
-        self.active_sh_degree, self.max_sh_degree, self.kind = 0, degree, optimizer_type
+    def __init__(self, degree):
+        self.active_sh_degree, self.max_sh_degree = 0, degree
 
     get_xyz = property(lambda self: self._xyz)
     get_features = property(lambda self: torch.cat([self._features_dc, self._features_rest], dim=1))
@@ -52,11 +52,8 @@ class GaussianModel:
         self.opt = opt
         rates = {"xyz": opt.position_lr_init, "f_dc": opt.feature_lr, "f_rest": opt.feature_lr / 20,
                  "opacity": opt.opacity_lr, "scaling": opt.scaling_lr, "rotation": opt.scaling_lr}
-        self.optimizer = self.make_optimizer([{"params": [getattr(self, field)], "lr": rates[name]}
-                                              for name, field in self.FIELDS.items()])
-
-    def make_optimizer(self, groups):
-        return Adam(groups, lr=0.0, eps=1e-15)
+        self.optimizer = Adam([{"params": [getattr(self, field)], "lr": rates[name]}
+                               for name, field in self.FIELDS.items()], lr=0.0, eps=1e-15)
 
     def densify_and_prune(self, screen_points, threshold):
         """Moments of Adam begin anew."""

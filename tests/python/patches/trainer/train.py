@@ -13,7 +13,7 @@ from utils.loss_utils import l1_loss, ssim
 
 def training(dataset, opt, pipe, testing_iterations, saving_iterations, checkpoint_iterations, checkpoint, debug_from):
     write_cfg_args(dataset)
-    model = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+    model = GaussianModel(dataset.sh_degree)
     world = Scene(dataset, model)
     model.training_setup(opt)
     fixed = background_of(dataset)

@@ -64,4 +64,3 @@ class Camera:
         self.world_view_transform = to_view.T.contiguous().to(data_device)
         self.full_proj_transform = self.world_view_transform @ projection.T.to(data_device)
         self.camera_center = torch.tensor(-view.R @ view.T).to(data_device)
-        self.invdepthmap = torch.full((1, self.image_height, self.image_width), 1 / 3.0, device=data_device)
