@@ -56,7 +56,7 @@ def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any],
     if any(name in COUNTED and name not in found for name in names):
         rendering, splats = rasterize_with_splats(settings=settings, outputs=outputs, **inputs)
         sums = splats.contributions(torch.ones_like(rendering.color[0]))
-        found.update(pixels=sums.pixels.to(rendering.color.dtype), weights=sums.blend_weights, n_touched=sums.pixels,
+        found.update(pixels=sums.pixels.to(rendering.color.dtype)[:, None], weights=sums.blend_weights, n_touched=sums.pixels,
                      counts=sums.pixels, opacity_sums=sums.pixels * inputs["opacities"].detach().reshape(-1))
     else:
         rendering = rasterize(settings=settings, outputs=outputs, **inputs)

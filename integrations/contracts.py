@@ -22,7 +22,7 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "alpha": ("[1, H, W], the share of the pixel that the background does not have", "alpha"),
     "opacity": ("[1, H, W], the same as alpha", "opac"),
     "is_used": ("[N] int32, 1 where the radius is positive", "used"),
-    "pixels": ("[N], how many pixels blended the Gaussian", "pixel"),
+    "pixels": ("[N, 1], how many pixels blended the Gaussian", "pixel"),
     "weights": ("[N], sum over them of alpha T", "w"),
     "n_touched": ("[N] int32, how many pixels blended the Gaussian", "touched"),
     "counts": ("[N] int32, how many pixels blended the Gaussian", "count"),

@@ -6,13 +6,13 @@ from typing import Any, Dict, Optional, Tuple
 import torch
 import torch.nn.functional as functional
 
-from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, visible_radii
+from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, reference, visible_radii
 from diff_smoe_rasterization.gaussians import divided
 from diff_smoe_rasterization.settings import BackgroundGate
 
 from ._rasterizer import share_of_gaussians
 
-__all__ = ["compute_relocation", "rasterization"]
+__all__ = ["compute_relocation", "quat_scale_to_covar_preci", "rasterization"]
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -212,6 +212,23 @@ def compute_relocation(opacities: torch.Tensor, scales: torch.Tensor, ratios: to
     ratios.clamp_(min=1, max=len(binoms))
     new_opacities, factors = divided(opacities, ratios, min_opacity)
     return new_opacities, factors[:, None] * scales
+
+
+def quat_scale_to_covar_preci(quats: torch.Tensor, scales: torch.Tensor, compute_covar: bool = True,
+                              compute_preci: bool = True, triu: bool = False
+                              ) -> Tuple[Optional[torch.Tensor], Optional[torch.Tensor]]:
+    """Covariances R S^2 R^T and their inverses [N, 3, 3], as gsplat's strategies ask for them; None: not asked for.
+
+    quats: [N, 4] of any length. scales: [N, 3]. triu: as [N, 6], xx, xy, xz, yy, yz, zz.
+    """
+    rotations = functional.normalize(quats, dim=-1)
+
+    def product(lengths):
+        made = reference.covariance3D(
+            reference.Gaussians(lengths, None, None, None, None, lengths, rotations, None), 1.0)
+        return made[..., (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)] if triu else made
+
+    return product(scales) if compute_covar else None, product(1 / scales) if compute_preci else None
 
 
 def _refuse_what_is_not_offered(others, **arguments):

@@ -163,7 +163,7 @@ def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
 
 
 def gsplat_of_run() -> None:
-    """Puts this package's `rasterization` and `compute_relocation` into gsplat as it is installed.
+    """Puts this package's functions into gsplat as it is installed: the rasterizer, and what its strategies compute.
 
     The strategies and all else stay gsplat's own. A gsplat before 1.5 finds radii [C, N], without an axis of two.
     Where gsplat cannot be had, the package has `rasterization` and `rendering.rasterization` alone.
@@ -184,7 +184,9 @@ def gsplat_of_run() -> None:
             meta["radii"] = meta["radii"][..., 0]
         return renders, alphas, meta
 
-    for name, function in (("rasterization", _noting(rasterization)), ("compute_relocation", ours.compute_relocation)):
+    offered = {"rasterization": _noting(rasterization), "compute_relocation": ours.compute_relocation,
+               "quat_scale_to_covar_preci": ours.quat_scale_to_covar_preci}
+    for name, function in offered.items():
         for module in ("gsplat", "gsplat.rendering", "gsplat.relocation", "gsplat.strategy.ops"):
             if hasattr(sys.modules.get(module), name):
                 setattr(sys.modules[module], name, function)
