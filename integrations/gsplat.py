@@ -27,8 +27,9 @@ GLOBAL_SHUTTER = "GLOBAL"  # the name of the other value of rolling_shutter that
 
 
 def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Optional[torch.Tensor],
-                  opacities: torch.Tensor, colors: Optional[torch.Tensor], viewmats: torch.Tensor, Ks: torch.Tensor, width: int,
-                  height: int, near_plane: float = 0.01, far_plane: float = EVERYTHING_NEARER, radius_clip: float = 0.0,
+                  opacities: torch.Tensor, colors: Optional[torch.Tensor], viewmats: torch.Tensor, Ks: torch.Tensor,
+                  width: int, height: int, near_plane: float = 0.01, far_plane: float = EVERYTHING_NEARER,
+                  radius_clip: float = 0.0,
                   eps2d: float = 0.3, sh_degree: Optional[int] = None, packed: bool = False,
                   tile_size: Optional[int] = None, backgrounds: Optional[torch.Tensor] = None, render_mode: str = "RGB",
                   sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: str = "classic",
@@ -204,7 +205,7 @@ class _Points:
 
 def compute_relocation(opacities: torch.Tensor, scales: torch.Tensor, ratios: torch.Tensor, binoms: torch.Tensor,
                        min_opacity: float = 0.0) -> Tuple[torch.Tensor, torch.Tensor]:
-    """Opacities [N] and scales [N, 3] of Gaussians that n equal ones in one place take over, by Equation 9 of 3DGS-MCMC.
+    """Opacities [N] and scales [N, 3] of Gaussians that n equal ones in one place take over (Eq. 9 of 3DGS-MCMC).
 
     opacities: [N]. scales: [N, 3]. ratios: [N] n, which is clamped in place to [1, n_max], as gsplat does. binoms:
     [n_max, n_max], of which only the size is read. min_opacity: what new opacities are at least.

@@ -106,7 +106,8 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     environment["PYTHONPATH"] = os.pathsep.join([str(SHIMS), *filter(None, [environment.get("PYTHONPATH")])])
     _check_python(words, environment)
     said_gate = f", background gate {gate}" if gate is not None else ""
-    return environment, [f"{found}: {contract_of(flavour).module} will be {flavour} of this package, blend mode {blend_mode}{said_gate};"
+    module = contract_of(flavour).module
+    return environment, [f"{found}: {module} will be {flavour} of this package, blend mode {blend_mode}{said_gate};"
                          " each process that imports it says so", *(f"warning: {warning}" for warning in warnings)]
 
 

@@ -173,7 +173,7 @@ def gsplat_of_run() -> None:
     if not is_installed("gsplat"):
         sys.modules["gsplat.rendering"] = types.ModuleType("gsplat.rendering")
         for module in ("gsplat", "gsplat.rendering"):
-            setattr(sys.modules[module], "rasterization", None)
+            sys.modules[module].__dict__["rasterization"] = None
     theirs = sys.modules["gsplat"]
     major, minor = (int(number) for number in str(getattr(theirs, "__version__", "1.5")).split(".")[:2])
 
