@@ -49,19 +49,20 @@ def share_of_gaussians(gate_sum: torch.Tensor, settings: Settings) -> torch.Tens
     return torch.where(total > 0, gate_sum / torch.where(total > 0, total, 1), torch.zeros_like(total))
 
 
-def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any],
-               **found: torch.Tensor) -> Tuple[torch.Tensor, ...]:
-    """Renders as `rasterize`, and returns results by their names, as RESULTS explains them; found: those at hand."""
+def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, ...]:
+    """Renders as `rasterize`, and returns results by their names, as RESULTS explains them."""
+    found: Dict[str, Any] = {}
     outputs = sorted({output for name in names for output in ON_REQUEST.get(name, ())})
-    if any(name in COUNTED and name not in found for name in names):
+    if not set(COUNTED).isdisjoint(names):
         rendering, splats = rasterize_with_splats(settings=settings, outputs=outputs, **inputs)
         sums = splats.contributions(torch.ones_like(rendering.color[0]))
-        found.update(pixels=sums.pixels.to(rendering.color.dtype), weights=sums.blend_weights, n_touched=sums.pixels,
-                     counts=sums.pixels, opacity_sums=sums.pixels * inputs["opacities"].detach().reshape(-1))
+        found.update(pixels=sums.pixels.to(rendering.color.dtype)[:, None], weights=sums.blend_weights,
+                     n_touched=sums.pixels, counts=sums.pixels,
+                     opacity_sums=sums.pixels * inputs["opacities"].detach().reshape(-1))
     else:
         rendering = rasterize(settings=settings, outputs=outputs, **inputs)
-    found = {"color": rendering.color, "radii": rendering.radii, "inverse_depth": rendering.inverse_depth,
-             "is_used": (rendering.radii > 0).to(torch.int32), **found}
+    found.update(color=rendering.color, radii=rendering.radii, inverse_depth=rendering.inverse_depth,
+                 is_used=(rendering.radii > 0).to(torch.int32))
     if "alpha" in outputs:
         found["alpha"] = found["opacity"] = share_of_gaussians(rendering.alpha, settings)
     if "depth" in outputs:

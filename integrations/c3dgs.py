@@ -16,7 +16,7 @@ from ._rasterizer import settings_with
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "GaussianRasterizerIndexed", "rasterize_gaussians",
            "rasterize_gaussians_indexed"]
 
-GaussianRasterizationSettings = settings_with("clamp_color", __name__)
+GaussianRasterizationSettings = settings_with(["clamp_color"], __name__)
 GaussianRasterizationSettings.__doc__ = """The package's settings, with `clamp_color` as the thirteenth.
 
 clamp_color=False: colours from shs may be negative, and the gradient reaches their coefficients all the same.

@@ -1,8 +1,8 @@
 """The Python APIs of public Gaussian rasterizers, as data: how a trainer is recognised by them, and what is returned.
 
 From this table come the modules here, what `dsmoe run` answers for, how `dsmoe patch` tells trainers apart, and the
-table in README.md. A new rasterizer of Inria's kind is one entry and a module of three lines, such as depth.py. One that
-is imported by a name of its own also has a folder of that name in patches/shims.
+table in README.md. A new rasterizer of Inria's kind is one entry and a module of three lines, such as depth.py. One
+that is imported by a name of its own also has a folder of that name in patches/shims.
 """
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "alpha": ("[1, H, W], the share of the pixel that the background does not have", "alpha"),
     "opacity": ("[1, H, W], the same as alpha", "opac"),
     "is_used": ("[N] int32, 1 where the radius is positive", "used"),
-    "pixels": ("[N], how many pixels blended the Gaussian", "pixel"),
+    "pixels": ("[N, 1], how many pixels blended the Gaussian", "pixel"),
     "weights": ("[N], sum over them of alpha T", "w"),
     "n_touched": ("[N] int32, how many pixels blended the Gaussian", "touched"),
     "counts": ("[N] int32, how many pixels blended the Gaussian", "count"),

@@ -1,4 +1,4 @@
-"""The API of FastGS's rasterizer: means2D [N, 4] as in absgs, and the pixels of a map that each Gaussian was blended in.
+"""The API of FastGS's rasterizer: means2D [N, 4] as in absgs, and how many pixels of a map blended each Gaussian.
 
 `metric_map` has a 1 for each pixel that counts; `get_flag` says whether to count. `mult` shrinks the original's
 footprints; here they are exact.

@@ -6,13 +6,13 @@ from typing import Any, Dict, Optional, Tuple
 import torch
 import torch.nn.functional as functional
 
-from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, visible_radii
+from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, reference, visible_radii
 from diff_smoe_rasterization.gaussians import divided
 from diff_smoe_rasterization.settings import BackgroundGate
 
 from ._rasterizer import share_of_gaussians
 
-__all__ = ["compute_relocation", "rasterization"]
+__all__ = ["compute_relocation", "quat_scale_to_covar_preci", "rasterization"]
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -27,8 +27,9 @@ GLOBAL_SHUTTER = "GLOBAL"  # the name of the other value of rolling_shutter that
 
 
 def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Optional[torch.Tensor],
-                  opacities: torch.Tensor, colors: Optional[torch.Tensor], viewmats: torch.Tensor, Ks: torch.Tensor, width: int,
-                  height: int, near_plane: float = 0.01, far_plane: float = EVERYTHING_NEARER, radius_clip: float = 0.0,
+                  opacities: torch.Tensor, colors: Optional[torch.Tensor], viewmats: torch.Tensor, Ks: torch.Tensor,
+                  width: int, height: int, near_plane: float = 0.01, far_plane: float = EVERYTHING_NEARER,
+                  radius_clip: float = 0.0,
                   eps2d: float = 0.3, sh_degree: Optional[int] = None, packed: bool = False,
                   tile_size: Optional[int] = None, backgrounds: Optional[torch.Tensor] = None, render_mode: str = "RGB",
                   sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: str = "classic",
@@ -204,7 +205,7 @@ class _Points:
 
 def compute_relocation(opacities: torch.Tensor, scales: torch.Tensor, ratios: torch.Tensor, binoms: torch.Tensor,
                        min_opacity: float = 0.0) -> Tuple[torch.Tensor, torch.Tensor]:
-    """Opacities [N] and scales [N, 3] of Gaussians that n equal ones in one place take over, by Equation 9 of 3DGS-MCMC.
+    """Opacities [N] and scales [N, 3] of Gaussians that n equal ones in one place take over (Eq. 9 of 3DGS-MCMC).
 
     opacities: [N]. scales: [N, 3]. ratios: [N] n, which is clamped in place to [1, n_max], as gsplat does. binoms:
     [n_max, n_max], of which only the size is read. min_opacity: what new opacities are at least.
@@ -212,6 +213,23 @@ def compute_relocation(opacities: torch.Tensor, scales: torch.Tensor, ratios: to
     ratios.clamp_(min=1, max=len(binoms))
     new_opacities, factors = divided(opacities, ratios, min_opacity)
     return new_opacities, factors[:, None] * scales
+
+
+def quat_scale_to_covar_preci(quats: torch.Tensor, scales: torch.Tensor, compute_covar: bool = True,
+                              compute_preci: bool = True, triu: bool = False
+                              ) -> Tuple[Optional[torch.Tensor], Optional[torch.Tensor]]:
+    """Covariances R S^2 R^T and their inverses [N, 3, 3], as gsplat's strategies ask for them; None: not asked for.
+
+    quats: [N, 4] of any length. scales: [N, 3]. triu: as [N, 6], xx, xy, xz, yy, yz, zz.
+    """
+    rotations = functional.normalize(quats, dim=-1)
+
+    def product(lengths):
+        made = reference.covariance3D(
+            reference.Gaussians(lengths, None, None, None, None, lengths, rotations, None), 1.0)
+        return made[..., (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)] if triu else made
+
+    return product(scales) if compute_covar else None, product(1 / scales) if compute_preci else None
 
 
 def _refuse_what_is_not_offered(others, **arguments):

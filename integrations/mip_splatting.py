@@ -1,7 +1,7 @@
 """The API of Mip-Splatting's rasterizer, and of TRELLIS's: `kernel_size` in place of the low-pass filter's 0.3.
 
-Opacities are compensated as under `antialiasing`. The third column of means2D gets the sum of absolute gradients of both
-axes. `subpixel_offset` may be None or zeros: pixels that are sampled elsewhere than at their centres are refused.
+Opacities are compensated as under `antialiasing`. The third column of means2D gets the sum of absolute gradients of
+both axes. `subpixel_offset` may be None or zeros: pixels that are sampled elsewhere than at their centres are refused.
 """
 from ._rasterizer import classes_of, results_of
 
@@ -11,8 +11,8 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gau
 def _render(settings, inputs):
     offset = settings.subpixel_offset
     if offset is not None and offset.numel() > 0 and bool(offset.any()):
-        raise NotImplementedError("rasterize: subpixel_offset is not zero (Mip-Splatting's --sample_more_highres); this "
-                                  "package samples pixels at their centres alone")
+        raise NotImplementedError("rasterize: subpixel_offset is not zero (Mip-Splatting's --sample_more_highres); "
+                                  "this package samples pixels at their centres alone")
     if settings.kernel_size is not None:
         settings = settings._replace(low_pass=settings.kernel_size)
     return results_of(("color", "radii"), settings._replace(antialiasing=True), inputs)

@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
 
-from diff_smoe_rasterization.integrations.contracts import CONTRACTS
+from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_of
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
 
 from . import facts
@@ -106,7 +106,8 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     environment["PYTHONPATH"] = os.pathsep.join([str(SHIMS), *filter(None, [environment.get("PYTHONPATH")])])
     _check_python(words, environment)
     said_gate = f", background gate {gate}" if gate is not None else ""
-    return environment, [f"{found}: {RASTERIZER} will be {flavour} of this package, blend mode {blend_mode}{said_gate};"
+    module = contract_of(flavour).module
+    return environment, [f"{found}: {module} will be {flavour} of this package, blend mode {blend_mode}{said_gate};"
                          " each process that imports it says so", *(f"warning: {warning}" for warning in warnings)]
 
 

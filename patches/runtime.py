@@ -154,7 +154,7 @@ def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
 
 
 def gsplat_of_run() -> None:
-    """Puts this package's `rasterization` and `compute_relocation` into gsplat as it is installed.
+    """Puts this package's functions into gsplat as it is installed: the rasterizer, and what its strategies compute.
 
     The strategies and all else stay gsplat's own. A gsplat before 1.5 finds radii [C, N], without an axis of two.
     Where gsplat cannot be had, the package has `rasterization` and `rendering.rasterization` alone.
@@ -164,7 +164,7 @@ def gsplat_of_run() -> None:
     if not is_installed("gsplat"):
         sys.modules["gsplat.rendering"] = types.ModuleType("gsplat.rendering")
         for module in ("gsplat", "gsplat.rendering"):
-            sys.modules[module].rasterization = None
+            sys.modules[module].__dict__["rasterization"] = None
     theirs = sys.modules["gsplat"]
     major, minor = (int(number) for number in str(getattr(theirs, "__version__", "1.5")).split(".")[:2])
 
@@ -175,7 +175,9 @@ def gsplat_of_run() -> None:
             meta["radii"] = meta["radii"][..., 0]
         return renders, alphas, meta
 
-    for name, function in (("rasterization", _noting(rasterization)), ("compute_relocation", ours.compute_relocation)):
+    offered = {"rasterization": _noting(rasterization), "compute_relocation": ours.compute_relocation,
+               "quat_scale_to_covar_preci": ours.quat_scale_to_covar_preci}
+    for name, function in offered.items():
         for module in ("gsplat", "gsplat.rendering", "gsplat.relocation", "gsplat.strategy.ops"):
             if hasattr(sys.modules.get(module), name):
                 setattr(sys.modules[module], name, function)

@@ -12,7 +12,11 @@ from devices import on_the_cpu, random_normal
 from scenes import camera_settings, random_scene, with_gates
 
 from diff_smoe_rasterization import rasterize, reference
-from diff_smoe_rasterization.integrations.gsplat import compute_relocation, rasterization
+from diff_smoe_rasterization.integrations.gsplat import (
+    compute_relocation,
+    quat_scale_to_covar_preci,
+    rasterization,
+)
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -416,6 +420,17 @@ def test_relocated_gaussians_look_as_the_one_before(copies):
         assert together.sum().item() == pytest.approx(alone.sum().item(), rel=1e-9)
     least, follows = compute_relocation(opacities, scales, ratios, torch.zeros(7, 7), min_opacity=0.5)
     assert (least >= 0.5).all() and (follows[0] <= new_scales[0]).all()
+
+
+def test_covariances_and_their_inverses():
+    quats, scales = random_normal((5, 4), 47), random_normal((5, 3), 48).abs() + 0.1
+    covars, preci = quat_scale_to_covar_preci(quats, scales)
+    # 1e-12: the inverse of a matrix whose condition number is below 1e4, in float64.
+    assert_close(covars @ preci, torch.eye(3, dtype=torch.float64).expand(5, 3, 3), 1e-12, "their product")
+    assert_close(torch.linalg.eigvalsh(covars), scales.square().sort(1)[0], 1e-12, "the squared lengths")
+    x, y = torch.tensor([[1.0, 0.0, 0.0, 1.0]], dtype=torch.float64), torch.tensor([[1.0, 2.0, 3.0]]).double()
+    turned, none = quat_scale_to_covar_preci(x, y, compute_preci=False, triu=True)  # a quarter turn about z
+    assert none is None and turned.tolist() == [pytest.approx([4, 0, 0, 1, 0, 9], abs=1e-14)]
 
 
 def test_colours_may_be_absent_where_none_are_rendered(small):

@@ -1,0 +1,237 @@
+"""The rasterizers of contracts.py that ask for more than images: each against what it says, in float64."""
+from __future__ import annotations
+
+import importlib
+
+import pytest
+import torch
+from comparison import assert_close
+from devices import random_normal
+from scenes import random_scene
+
+from diff_smoe_rasterization import rasterize, rasterize_with_splats
+from diff_smoe_rasterization.integrations import (
+    absgs,
+    fastgs,
+    feature_3dgs,
+    grouping,
+    langsplat,
+    light_gaussian,
+    mcmc,
+    mip_splatting,
+    monogs,
+    pixel_gs,
+    speedy_splat,
+)
+from diff_smoe_rasterization.integrations.contracts import CONTRACTS, SETTINGS
+
+pytestmark = pytest.mark.usefixtures("device")
+
+# A sum of some thousand terms in float64, each with some hundred roundings of 1e-16.
+TOLERANCE = 1e-11
+N, WIDTH, HEIGHT = 30, 33, 21
+OFTEN_GIVEN = {"confidence": None, "subpixel_offset": None, "kernel_size": 0.3, "projmatrix_raw": None,
+               "depth_threshold": 1.0, "metric_map": None, "get_flag": False, "f_count": False}
+
+
+def scene_of(mode, **more):
+    return random_scene(mode, N, WIDTH, HEIGHT, seed=81, degree=1, scale=0.05, **more)
+
+
+def rendered(module, scene, settings=None, **inputs):
+    """A call of a module's rasterizer; settings: the fields of its own."""
+    made = module.GaussianRasterizationSettings(**{**scene.settings._asdict(), **(settings or {})})
+    return module.GaussianRasterizer(raster_settings=made)(**{**scene.inputs, **inputs})
+
+
+def own(scene, **more):
+    return rasterize(settings=scene.settings, **{**scene.inputs, **more})
+
+
+@pytest.mark.parametrize("contract", [one for one in CONTRACTS if one.name not in ("taming", "gsplat")])
+def test_each_module_returns_what_its_contract_says(contract):
+    module = importlib.import_module(f"diff_smoe_rasterization.integrations.{contract.name}")
+    scene = random_scene("alpha", 12, 20, 10)
+    fields = {name: getattr(scene.settings, name) for name in SETTINGS}
+    settings = module.GaussianRasterizationSettings(
+        **fields, **{name: OFTEN_GIVEN.get(name, True) for name in contract.settings})
+    features = {name: torch.rand(12, 1, 4).double() for name in contract.arguments if name.startswith("semantic")}
+    results = module.GaussianRasterizer(raster_settings=settings)(**scene.inputs, **features)
+    assert len(results) == len(contract.results)
+    found = dict(zip(contract.results, results))
+    assert found["color"].shape == (3, 10, 20) and found["radii"].shape == (12,)
+    for name in {"inverse_depth", "depth", "alpha", "opacity"} & set(found):
+        assert found[name].shape == (1, 10, 20)
+
+
+def sums_of_absolute_gradients(scene, weights, **settings):
+    points = torch.zeros(N, 2, dtype=torch.float64, requires_grad=True)
+    rendering = rasterize(settings=scene.settings._replace(**settings), means2D_abs=points, **scene.inputs)
+    (rendering.color * weights).sum().backward()
+    return rendering, points.grad
+
+
+def test_mip_splatting_has_a_low_pass_filter_of_its_own(mode):
+    scene, weights = scene_of(mode), random_normal((3, HEIGHT, WIDTH), 82)
+    points = torch.zeros(N, 3, dtype=torch.float64, requires_grad=True)
+    zeros = torch.zeros(HEIGHT, WIDTH, 2, dtype=torch.float64)
+    given = {"kernel_size": 0.1, "subpixel_offset": zeros}
+    color, radii = rendered(mip_splatting, scene, given, means2D=points)
+    expected, absolute = sums_of_absolute_gradients(scene, weights, low_pass=0.1, antialiasing=True)
+    assert torch.equal(radii, expected.radii) and not torch.equal(color, own(scene).color)
+    assert_close(color, expected.color, TOLERANCE, "color")
+    (color * weights).sum().backward()
+    assert_close(points.grad[:, 2], absolute.sum(1), TOLERANCE, "the third column")
+    with pytest.raises(NotImplementedError, match="subpixel_offset is not zero"):
+        rendered(mip_splatting, scene, {**given, "subpixel_offset": zeros + 0.25})
+
+
+@pytest.mark.parametrize("module, third", [(absgs, "blend_weights"), (fastgs, None)])
+def test_two_more_columns_of_means2d(mode, module, third):
+    scene, weights = scene_of(mode), random_normal((3, HEIGHT, WIDTH), 83)
+    points = torch.zeros(N, 4, dtype=torch.float64, requires_grad=True)
+    color, _, sums = rendered(module, scene, {"get_flag": False} if module is fastgs else {}, means2D=points)
+    (color * weights).sum().backward()
+    expected, absolute = sums_of_absolute_gradients(scene, weights)
+    assert_close(points.grad[:, 2:], absolute, TOLERANCE, "the last columns")
+    signed = torch.zeros(N, 3, dtype=torch.float64, requires_grad=True)
+    (own(scene, means2D=signed).color * weights).sum().backward()
+    assert_close(points.grad[:, :2], signed.grad[:, :2], TOLERANCE, "the first columns")
+    if third:
+        splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1]
+        assert_close(sums, getattr(splats.contributions(torch.ones_like(color[0]).detach()), third), 1e-15, third)
+    with torch.no_grad():  # as trainers render test views
+        assert_close(rendered(module, scene, means2D=points + 0)[0], color, TOLERANCE, "color")
+
+
+def test_mcmc_says_what_is_used_and_relocates():
+    scene = scene_of("smoe")
+    _, radii, used = rendered(mcmc, scene)
+    assert torch.equal(used, (radii > 0).int()) and 0 < used.sum() < N
+    old, copies = torch.tensor([[0.2], [0.95]], dtype=torch.float64), torch.tensor([[3], [80]])
+    new, scales = mcmc.compute_relocation(old, torch.ones(2, 3, dtype=torch.float64), copies, torch.zeros(51, 51), 51)
+    # The most copies are 50. 1e-12: a power of 50 times a rounding of 1e-16.
+    assert_close(1 - (1 - new) ** torch.tensor([[3], [50]]), old, 1e-12, "the opacity of all copies")
+    assert (scales < 1).all()
+
+
+def exponential(theta, rho):
+    """The matrix [4, 4] of a small motion."""
+    x, y, z = theta.tolist()
+    twist = torch.tensor([[0, -z, y, rho[0]], [z, 0, -x, rho[1]], [-y, x, 0, rho[2]], [0, 0, 0, 0]]).double()
+    return torch.matrix_exp(twist)
+
+
+def test_monogs_moves_the_camera_by_its_gradients():
+    """By finite differences along each axis: T becomes exp(rho, theta) T."""
+    scene = random_scene("smoe_gate", 8, WIDTH, HEIGHT, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)
+    view = scene.settings.viewmatrix
+    raw = torch.linalg.solve(view, scene.settings.projmatrix)
+    weights = random_normal((3, HEIGHT, WIDTH), 84)
+    theta, rho = (torch.full((3,), 0.7, dtype=torch.float64, requires_grad=True) for _ in range(2))  # not read
+    color, _, depth, opacity, touched = rendered(monogs, scene, {"projmatrix_raw": raw}, theta=theta, rho=rho)
+    # 1e-7: the projection is the product of two matrices here, and that of the scene is rounded to float32.
+    assert_close(color, own(scene).color, 1e-7, "color")
+    (color * weights).sum().backward()
+
+    def loss(motion):
+        moved = (motion @ view.T).T
+        centre = torch.linalg.inv(moved)[3, :3]
+        return (own(scene.with_settings(viewmatrix=moved, projmatrix=moved @ raw, campos=centre)).color * weights).sum()
+
+    step = 1e-6
+    for place, leaf in enumerate((theta, rho)):
+        for axis in range(3):
+            motion = torch.zeros(2, 3, dtype=torch.float64)
+            motion[place, axis] = step
+            numeric = ((loss(exponential(*motion)) - loss(exponential(*-motion))) / (2 * step)).item()
+            # The loss, up to 1e3, is rounded by 1e-13, and 2e-6 divides that; the step's own error is of order 1e-12.
+            assert leaf.grad[axis].item() == pytest.approx(numeric, rel=1e-5, abs=1e-5)
+    assert depth.shape == opacity.shape == (1, HEIGHT, WIDTH) and touched.dtype == torch.int32 and touched.any()
+    without = rendered(monogs, scene, {"projmatrix_raw": None}, theta=theta.detach())
+    assert_close(without[0], color, 1e-9, "color without projmatrix_raw")
+
+
+FEATURES = [(grouping, "sh_objs", (N, 1, 5), {}, 2), (feature_3dgs, "semantic_feature", (N, 1, 5), {}, 1),
+            (langsplat, "language_feature_precomp", (N, 3), {"include_feature": True}, 1)]
+
+
+@pytest.mark.parametrize("module, name, shape, settings, place", FEATURES)
+def test_features_are_blended_beside_the_colours(mode, module, name, shape, settings, place):
+    """As two renderings would; gradients too."""
+    values = random_normal(shape, 85)
+    weights = random_normal((3 + values.shape[-1], HEIGHT, WIDTH), 86)
+
+    def gradients(of):
+        scene, features = scene_of(mode).requiring_grad(camera=False), values.clone().requires_grad_()
+        color, image = of(scene, features)
+        assert image.shape == (shape[-1], HEIGHT, WIDTH)
+        (torch.cat([color, image]) * weights).sum().backward()
+        return [color, image, features.grad, *(leaf.grad for leaf in scene.leaves().values())]
+
+    def together(scene, features):
+        results = rendered(module, scene, settings, **{name: features})
+        return results[0], results[place]
+
+    def apart(scene, features):
+        inputs = {key: tensor for key, tensor in scene.inputs.items() if key != "shs"}
+        black = scene.settings._replace(bg=torch.zeros(shape[-1], dtype=torch.float64))
+        image = rasterize(settings=black, colors_precomp=features.reshape(N, -1), **inputs).color
+        return own(scene).color, image
+
+    for found, expected in zip(gradients(together), gradients(apart)):
+        assert expected.any()
+        assert_close(found, expected, TOLERANCE, "an image or a gradient")
+
+
+def test_features_that_are_not_wanted():
+    scene = scene_of("smoe")
+    assert not rendered(langsplat, scene, {"include_feature": False})[1].any()
+    color, _, objects = rendered(grouping, scene)
+    assert torch.equal(color, own(scene).color) and objects.numel() == 0
+
+
+def test_pixels_and_what_is_near_grows_less(mode):
+    scene = scene_of(mode)
+    points = torch.zeros(N, 3, dtype=torch.float64, requires_grad=True)
+    color, _, pixels = rendered(pixel_gs, scene, {"depth_threshold": 4.0}, means2D=points)
+    color.sum().backward()
+    plain = torch.zeros(N, 3, dtype=torch.float64, requires_grad=True)
+    rendering, splats = rasterize_with_splats(settings=scene.settings, **{**scene.inputs, "means2D": plain})
+    rendering.color.sum().backward()
+    factors = (splats.depths / 4.0).square().clamp(max=1)
+    seen = rendering.radii > 0
+    assert (factors[seen] < 1).any() and (factors[seen] == 1).any()
+    assert_close(points.grad, plain.grad * factors[:, None], TOLERANCE, "means2D")
+    assert torch.equal(pixels[:, 0], splats.contributions(torch.ones_like(color[0]).detach()).pixels.double())
+
+
+def test_counts_of_pixels(mode):
+    scene = scene_of(mode)
+    counts, scores, color, radii = rendered(light_gaussian, scene, {"f_count": True})
+    assert len(rendered(light_gaussian, scene)) == 2
+    seen = own(scene, opacities=scene.inputs["opacities"])
+    assert torch.equal(color, seen.color) and torch.equal(radii, seen.radii)
+    assert_close(scores, counts * scene.inputs["opacities"][:, 0], 1e-15, "scores")
+    chosen = torch.zeros(HEIGHT, WIDTH, dtype=torch.int32)
+    chosen[4:9, 6:20] = 1
+    inside = rendered(fastgs, scene, {"get_flag": True, "metric_map": chosen.reshape(-1)})[2]
+    outside = rendered(fastgs, scene, {"get_flag": True, "metric_map": 1 - chosen})[2]
+    assert inside.dtype == torch.int32 and inside.any() and torch.equal(inside + outside, counts)
+    assert not rendered(fastgs, scene, {"get_flag": False})[2].any()
+
+
+def test_scores_are_what_a_removal_changes(mode):
+    """Each Gaussian is left out in turn."""
+    scene = random_scene(mode, 6, WIDTH, HEIGHT, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)
+    scores = torch.zeros(6, 1, dtype=torch.float64, requires_grad=True)
+    color = rendered(speedy_splat, scene, scores=scores)[0]
+    color.sum().backward()
+    for i in range(6):
+        kept = torch.arange(6) != i
+        changed = own(scene.rows(kept)).color - own(scene).color
+        # 1e-9: squares of differences of colours that agree to 1e-15.
+        assert scores.grad[i].item() == pytest.approx(changed.square().sum().item(), rel=1e-9, abs=1e-12)
+    assert scores.grad.any()
+    with torch.no_grad():
+        assert torch.equal(rendered(speedy_splat, scene, scores=scores)[0], color)
