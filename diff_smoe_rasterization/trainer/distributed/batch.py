@@ -71,12 +71,15 @@ class Batch:
             gates, features, radii = _OPS.project(*inputs, *options, True)
             visible = radii.nonzero().squeeze(1)
             self.projected.append(Projected(inputs, (*options, True), visible, features, radii))
-            packed.append(torch.cat([gates.index_select(0, visible), features.index_select(0, visible),
-                                     radii.index_select(0, visible).view(gates.dtype).unsqueeze(1)], 1))
+            packed.append(_OPS.pack_footprints(gates, features, radii, visible))
         *rows, notes = zip(*group.gather_numbers([*map(len, packed), note], str(radii.device)))
         self.notes = list(notes)
         self._counts: List[Sequence[int]] = rows  # [view][process] how many footprints
-        self._arrived = self._split(group.exchange(torch.cat([packed[view] for view in self._order]), *self._lengths()))
+        if group.size == 1:
+            self._arrived = {view: [rows] for view, rows in enumerate(packed)}
+        else:
+            outgoing = joined([packed[view] for view in self._order])
+            self._arrived = self._split(group.exchange(outgoing, *self._lengths()))
 
     def _lengths(self) -> Tuple[List[int], List[int]]:
         """How many rows go to each process, and how many come from each."""
@@ -95,17 +98,19 @@ class Batch:
 
     def draw(self, view: int, settings: GaussianRasterizationSettings, for_backward: bool = True) -> DrawnImage:
         """Blends one of the own views, once."""
-        rows = torch.cat(self._arrived.pop(view))
+        rows = joined(self._arrived.pop(view))
         radii = rows[:, -1].contiguous().view(torch.int32)
         return DrawnImage(Footprints(rows[:, :_GATE], rows[:, _GATE:-1], radii), settings, for_backward)
 
     def give_back(self, records: Dict[int, torch.Tensor]) -> List[torch.Tensor]:
         """From the gradients by the footprints of each own view to those by the own footprints of each view."""
+        if self.group.size == 1:
+            return [records[view] for view in range(len(self.owners))]
         by_view = {view: rows.split(list(self._counts[view])) for view, rows in records.items()}
         parts = [by_view[view][rank] for rank in range(self.group.size) for view in self.own_views]
         sent, received = self._lengths()
         width = GATE_GRADIENTS + self.projected[0].features.shape[1]
-        outgoing = torch.cat(parts) if parts else self.projected[0].features.new_empty((0, width))
+        outgoing = joined(parts) if parts else self.projected[0].features.new_empty((0, width))
         returned = self.group.exchange(outgoing, received, sent)
         pieces = returned.split([self._counts[view][self.group.rank] for view in self._order])
         return [piece for _, piece in sorted(zip(self._order, pieces), key=lambda pair: pair[0])]
@@ -146,6 +151,11 @@ class Batch:
             by_name.update(dc=by_input["dc"], shs=by_input["shs"])
         for name in PARAMETERS:
             raw[name].grad = by_name.get(name)
+
+
+def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
+    """All rows of the parts, copied only where there are several parts."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 def gradient_places(present: Sequence[bool]) -> Tuple[List[str], List[bool]]:
