@@ -69,6 +69,7 @@ def test_processes_die_and_others_resume_bit_for_bit(tiny_config, tmp_path):
     assert model_of(alone) == model_of(straight)
 
 
+@pytest.mark.slow
 @needs_gloo
 def test_a_budget_holds_for_all_processes_together(tiny_config, tmp_path):
     """One view a step, two processes, of which one blends nothing: the model of the usual training."""
