@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Optional, Tuple
+from typing import Dict, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 import torch
@@ -72,12 +72,16 @@ def from_npz(path: str) -> Model:
     inputs = dict(means3D=tensor("xyz"), opacities=torch.sigmoid(tensor("opacity")), scales=torch.exp(tensor("scale")),
                   rotations=torch.nn.functional.normalize(tensor("quat")),
                   shs=torch.cat([tensor("f_dc"), tensor("f_rest")], 1))
+    return Model(path, inputs, from_npz_cameras(packed))
+
+
+def from_npz_cameras(packed: Mapping[str, np.ndarray]) -> List[Camera]:
+    """The cameras of a packed model."""
     width, height = int(packed["width"]), int(packed["height"])
     views = zip(packed["R"], packed["t"], *(np.broadcast_to(packed[name], len(packed["R"])) for name in ("fx", "fy")))
-    cameras = [Camera(str(view), rotation.astype(np.float64), translation.astype(np.float64), float(fx), float(fy),
-                      width / 2, height / 2, width, height)
-               for view, (rotation, translation, fx, fy) in enumerate(views)]
-    return Model(path, inputs, cameras)
+    return [Camera(str(view), rotation.astype(np.float64), translation.astype(np.float64), float(fx), float(fy),
+                   width / 2, height / 2, width, height)
+            for view, (rotation, translation, fx, fy) in enumerate(views)]
 
 
 def to_npz(model: Model, path: str) -> None:

@@ -44,7 +44,7 @@ def test_the_halves_of_no_gaussians_are_the_background():
 
 
 def test_only_visible_footprints_count():
-    scene = random_scene("smoe").requiring_grad()
+    scene = random_scene("smoe", deterministic=True).requiring_grad()
     everything = project_gaussians(settings=scene.settings, **scene.inputs)
     seen = everything.visible()
     assert 5 < len(seen.radii) < len(everything.radii)
@@ -64,6 +64,18 @@ def test_footprints_of_shards_are_those_of_the_whole():
     joined, expected = Footprints.joined(parts), rasterize(settings=scene.settings, **scene.inputs)
     actual = blend_footprints(joined, scene.settings)
     assert torch.equal(actual.color, expected.color) and torch.equal(actual.radii, expected.radii)
+
+
+def test_packed_footprints_are_rows_of_their_numbers():
+    scene = random_scene("smoe", dtype=torch.float32)
+    footprints = project_gaussians(settings=scene.settings, **scene.inputs)
+    visible = footprints.radii.nonzero().squeeze(1)
+    assert 5 < len(visible) < 120
+    rows = torch.ops.diff_smoe_rasterization.pack_footprints(*footprints, visible)
+    seen = footprints.rows(visible)
+    assert rows.shape == (len(visible), 12) and torch.equal(rows[:, :8], seen.gates)
+    assert torch.equal(rows[:, 8:11], seen.features)
+    assert torch.equal(rows[:, 11].contiguous().view(torch.int32), seen.radii)
 
 
 def test_of_equal_depths_the_first_is_in_front():

@@ -99,6 +99,24 @@ __global__ void __launch_bounds__(kStoreBlock)
   store_keys(arguments.keys, i, arguments.radii[i], arguments.projected[i].depth);
 }
 
+// A thread copies one number: neighbours read and write neighbouring ones.
+__global__ void __launch_bounds__(kStoreBlock) pack_footprints_kernel(const __grid_constant__ FootprintRows pack) {
+  const int width = kProjectedGaussianSize + pack.num_features + 1;
+  const int64_t at = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x, row = at / width;
+  const int column = static_cast<int>(at - row * width), feature = column - kProjectedGaussianSize;
+  if (row >= pack.count) return;
+  const int64_t i = pack.gaussians[row];
+  float number = 0;
+  if (feature < 0) {
+    number = pack.projected[i * kProjectedGaussianSize + column];
+  } else if (feature < pack.num_features) {
+    number = pack.features[i * feature_stride(pack.num_features) + feature];
+  } else {
+    number = __int_as_float(pack.radii[i]);
+  }
+  pack.rows[at] = number;
+}
+
 template <class S> struct VisibleArguments {
   int64_t num_gaussians;  // N
   const S* means3D;       // [N, 3] world
@@ -149,6 +167,13 @@ template <class S> void key_footprints(const Frame<S>& frame, const DepthKeys<S>
   if (arguments.num_gaussians == 0) return;
   key_footprints_kernel<<<blocks_for(arguments.num_gaussians, kStoreBlock), kStoreBlock, 0, work.stream>>>(arguments);
   DSMOE_CHECK_LAUNCH("key_footprints");
+}
+
+void pack_footprints(const FootprintRows& pack, const Work& work) {
+  const int64_t numbers = pack.count * (kProjectedGaussianSize + pack.num_features + 1);
+  if (numbers == 0) return;
+  pack_footprints_kernel<<<blocks_for(numbers, kStoreBlock), kStoreBlock, 0, work.stream>>>(pack);
+  DSMOE_CHECK_LAUNCH("pack_footprints");
 }
 
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work) {

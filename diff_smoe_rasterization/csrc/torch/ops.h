@@ -413,6 +413,21 @@ template <class Backend> void importance(const c10::OperatorHandle& op, torch::j
 }
 
 template <class Backend>
+at::Tensor pack_footprints(const at::Tensor& gates, const at::Tensor& features, const at::Tensor& radii,
+                           const at::Tensor& visible) {
+  const char* function = "pack_footprints";
+  TORCH_CHECK_TYPE(gates.scalar_type() == at::kFloat, function, ": gates is ", dtype_name(gates.scalar_type()),
+                   "; it must be float32");
+  check_shape(function, "gates", gates, {"N", kProjectedGaussianSize});
+  check_like(function, "features", features, "gates", gates);
+  check_shape(function, "features", features, {gates.size(0), "F"});
+  check_result(function, "radii", radii, {gates.size(0)}, at::kInt, gates.device());
+  check_result(function, "visible", visible, {visible.numel()}, at::kLong, gates.device());
+  const typename Backend::Guard guard(gates.device());
+  return Backend::pack_footprints(gates, features, radii, visible);
+}
+
+template <class Backend>
 at::Tensor mark_visible(const at::Tensor& positions, const at::Tensor& viewmatrix, double near) {
   const typename Backend::Guard guard(positions.device());
   check_positions(positions, viewmatrix);
@@ -430,6 +445,7 @@ template <class Backend> void register_ops(torch::Library& m) {
   m.impl("radii", torch::CppFunction::makeFromBoxedFunction<&radii<Backend>>());
   m.impl("contributions", torch::CppFunction::makeFromBoxedFunction<&contributions<Backend>>());
   m.impl("importance", torch::CppFunction::makeFromBoxedFunction<&importance<Backend>>());
+  m.impl("pack_footprints", &pack_footprints<Backend>);
   m.impl("mark_visible", &mark_visible<Backend>);
 }
 

@@ -147,6 +147,12 @@ struct Cpu {
     cpu::importance(own, map);
   }
 
+  static at::Tensor pack_footprints(const at::Tensor& gates, const at::Tensor& features, const at::Tensor& radii,
+                                    const at::Tensor& visible) {
+    const at::Tensor seen = radii.index_select(0, visible).view(at::kFloat).unsqueeze(1);
+    return at::cat({gates.index_select(0, visible), features.index_select(0, visible), seen}, 1);
+  }
+
   static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {
     const at::Tensor visible = at::empty({positions.size(0)}, at::kBool);
     dispatch(positions, [&](auto zero) {

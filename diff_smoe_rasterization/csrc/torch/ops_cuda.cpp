@@ -168,6 +168,25 @@ struct Cuda {
     cuda::importance(own, map, work);
   }
 
+  static at::Tensor pack_footprints(const at::Tensor& gates, const at::Tensor& features, const at::Tensor& radii,
+                                    const at::Tensor& visible) {
+    const int64_t num_features = features.size(1), columns = feature_columns(num_features);
+    // Features as `project` returns them need no copy.
+    const bool in_rows = features.stride(0) == columns && features.stride(1) == 1;
+    const at::Tensor rows = in_rows ? features : padded(features, columns), dense = gates.contiguous();
+    const at::Tensor out = at::empty({visible.numel(), kProjectedGaussianSize + num_features + 1}, gates.options());
+    cuda::FootprintRows pack;
+    pack.count = visible.numel();
+    pack.gaussians = visible.data_ptr<int64_t>();
+    pack.projected = dense.data_ptr<float>();
+    pack.features = rows.data_ptr<float>();
+    pack.num_features = static_cast<int>(num_features);
+    pack.radii = radii.data_ptr<int32_t>();
+    pack.rows = out.data_ptr<float>();
+    cuda::pack_footprints(pack, {at::cuda::getCurrentCUDAStream()});
+    return out;
+  }
+
   static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {
     const at::Tensor visible = at::empty({positions.size(0)}, positions.options().dtype(at::kBool));
     dispatch(positions, [&](auto zero) {

@@ -59,6 +59,11 @@ const std::string kProjectBackward =
     "Tensor radii, " +
     kOptions + "bool[] wanted) -> Tensor[]";
 
+// Some footprints, those of the Gaussians `visible` [M], as rows to be sent: [M, 8 + F + 1] float32, of which the last
+// number has the bits of the radius.
+const char* const kPackFootprints =
+    "pack_footprints(Tensor gates, Tensor features, Tensor radii, Tensor visible) -> Tensor";
+
 // From a map [H, W] and what one rasterize saved: sums over the pixels of each Gaussian.
 const std::string kContributions =
     "contributions(Tensor pixel_weights, Tensor radii, Tensor[] saved, Tensor? background_gate, " +
@@ -81,6 +86,7 @@ TORCH_LIBRARY(diff_smoe_rasterization, m) {
   m.def(kProjectBackward.c_str());
   m.def(kBlend.c_str());
   m.def(kBlendBackward.c_str());
+  m.def(kPackFootprints);
   m.def(kContributions.c_str());
   m.def(kImportance.c_str());
   m.def("mark_visible(Tensor positions, Tensor viewmatrix, float near) -> Tensor");

@@ -250,6 +250,18 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
 // what `contributions` does.
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work);
 
+// Some footprints as rows of numbers, to be sent.
+struct FootprintRows {
+  int64_t count = 0;                   // M
+  const int64_t* gaussians = nullptr;  // [M] which footprints
+  const float* projected = nullptr;    // [N, kProjectedGaussianSize]
+  const float* features = nullptr;     // [N, feature_stride(F)]
+  int num_features = 0;                // F
+  const int32_t* radii = nullptr;      // [N]
+  float* rows = nullptr;  // [M, kProjectedGaussianSize + F + 1] written; the last number is the radius' bits
+};
+void pack_footprints(const FootprintRows& pack, const Work& work);
+
 // Marks the Gaussians in front of the near plane. Of the frame it reads means3D, camera.view and camera.near.
 // visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work);

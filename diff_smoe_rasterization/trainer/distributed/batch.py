@@ -71,12 +71,15 @@ class Batch:
             gates, features, radii = _OPS.project(*inputs, *options, True)
             visible = radii.nonzero().squeeze(1)
             self.projected.append(Projected(inputs, (*options, True), visible, features, radii))
-            packed.append(torch.cat([gates.index_select(0, visible), features.index_select(0, visible),
-                                     radii.index_select(0, visible).view(gates.dtype).unsqueeze(1)], 1))
+            packed.append(_OPS.pack_footprints(gates, features, radii, visible))
         *rows, notes = zip(*group.gather_numbers([*map(len, packed), note], str(radii.device)))
         self.notes = list(notes)
         self._counts: List[Sequence[int]] = rows  # [view][process] how many footprints
-        self._arrived = self._split(group.exchange(torch.cat([packed[view] for view in self._order]), *self._lengths()))
+        if group.size == 1:
+            self._arrived = {view: [rows] for view, rows in enumerate(packed)}
+        else:
+            outgoing = joined([packed[view] for view in self._order])
+            self._arrived = self._split(group.exchange(outgoing, *self._lengths()))
 
     def _lengths(self) -> Tuple[List[int], List[int]]:
         """How many rows go to each process, and how many come from each."""
@@ -95,33 +98,40 @@ class Batch:
 
     def draw(self, view: int, settings: GaussianRasterizationSettings, for_backward: bool = True) -> DrawnImage:
         """Blends one of the own views, once."""
-        rows = torch.cat(self._arrived.pop(view))
+        rows = joined(self._arrived.pop(view))
         radii = rows[:, -1].contiguous().view(torch.int32)
         return DrawnImage(Footprints(rows[:, :_GATE], rows[:, _GATE:-1], radii), settings, for_backward)
 
     def give_back(self, records: Dict[int, torch.Tensor]) -> List[torch.Tensor]:
-        """From the gradients by the footprints of each own view to those by the own footprints of each view."""
-        by_view = {view: rows.split(list(self._counts[view])) for view, rows in records.items()}
+        """From the gradients by the footprints of each own view to those by the own footprints of each view.
+
+        The records are taken out of `records`.
+        """
+        if self.group.size == 1:
+            return [records.pop(view) for view in range(len(self.owners))]
+        by_view = {view: records.pop(view).split(list(self._counts[view])) for view in self.own_views}
         parts = [by_view[view][rank] for rank in range(self.group.size) for view in self.own_views]
         sent, received = self._lengths()
         width = GATE_GRADIENTS + self.projected[0].features.shape[1]
-        outgoing = torch.cat(parts) if parts else self.projected[0].features.new_empty((0, width))
+        outgoing = joined(parts) if parts else self.projected[0].features.new_empty((0, width))
+        del by_view, parts
         returned = self.group.exchange(outgoing, received, sent)
         pieces = returned.split([self._counts[view][self.group.rank] for view in self._order])
         return [piece for _, piece in sorted(zip(self._order, pieces), key=lambda pair: pair[0])]
 
-    def backward(self, records: Sequence[torch.Tensor]) -> List[torch.Tensor]:
+    def backward(self, records: List[torch.Tensor]) -> List[torch.Tensor]:
         """Sets the gradients of the model's parameters, sums over the views in their order.
 
-        records: what `give_back` returned. Returns for each view dL/dpixel times (W / 2, H / 2), [N, 3].
+        records: what `give_back` returned; it is emptied. Returns for each view dL/dpixel times (W / 2, H / 2), [N, 3].
         """
         present = [tensor is not None for tensor in self.projected[0].inputs]
         names, wanted = gradient_places(present)
         sums: Optional[List[torch.Tensor]] = None
         means2D: List[torch.Tensor] = []
         for view, projected in enumerate(self.projected):
-            dense = records[view].new_zeros((len(projected.radii), records[view].shape[1]))
-            dense.index_copy_(0, projected.visible, records[view])
+            rows = records.pop(0)
+            dense = rows.new_zeros((len(projected.radii), rows.shape[1]))
+            dense.index_copy_(0, projected.visible, rows)
             given = [tensor for tensor in projected.inputs if tensor is not None]
             gradients = _OPS.project_backward(dense, None, given, present, projected.features, projected.radii,
                                               *projected.options, wanted)
@@ -130,6 +140,7 @@ class Batch:
                 sums = gradients
             else:
                 torch._foreach_add_(sums, gradients)
+            del rows, dense, gradients  # they are as large as the parameters
         names.remove("means2D")
         self._set_gradients(dict(zip(names, sums or ())))
         return means2D
@@ -146,6 +157,11 @@ class Batch:
             by_name.update(dc=by_input["dc"], shs=by_input["shs"])
         for name in PARAMETERS:
             raw[name].grad = by_name.get(name)
+
+
+def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
+    """All rows of the parts, copied only where there are several parts."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 def gradient_places(present: Sequence[bool]) -> Tuple[List[str], List[bool]]:

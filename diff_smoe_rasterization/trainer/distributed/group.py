@@ -81,17 +81,15 @@ class DistributedGroup(Group):
         return out
 
     def rows_on_first(self, rows: torch.Tensor, counts: Sequence[int]) -> Optional[torch.Tensor]:
-        if not self.leads:
-            if len(rows) > 0:
-                torch.distributed.send(rows.contiguous(), 0)
-            return None
-        out = torch.empty((sum(counts), *rows.shape[1:]), dtype=rows.dtype)
-        for rank, part in enumerate(out.split(list(counts))):
-            received = rows if rank == 0 else rows.new_empty(part.shape)
-            if rank > 0 and len(part) > 0:
-                torch.distributed.recv(received, rank)
-            part.copy_(received)
-        return out
+        out = torch.empty((sum(counts) if self.leads else 0, *rows.shape[1:]), dtype=rows.dtype)
+        parts = out.split(list(counts)) if self.leads else []
+        for rank, count in enumerate(counts):  # one by one, so that the first process's device has one part at a time
+            sent = [count if self.rank == rank and to == 0 else 0 for to in range(self.size)]
+            received = [count if self.leads and of == rank else 0 for of in range(self.size)]
+            arrived = self.exchange(rows if self.rank == rank else rows[:0], sent, received)
+            if self.leads:
+                parts[rank].copy_(arrived)
+        return out if self.leads else None
 
     def add_up(self, numbers: torch.Tensor) -> None:
         torch.distributed.all_reduce(numbers)

@@ -78,13 +78,17 @@ class BatchTrainer(Trainer):
         self._asked = any(batch.notes)
         numbers = torch.zeros(2, len(views), device=device)  # losses, and gradients by the background's gate
         records: Dict[int, torch.Tensor] = {}
-        for view in batch.own_views:
+
+        def blend(view: int) -> None:  # what one view has saved is gone before the next one is blended
             drawn = batch.draw(view, settings[view])
             loss, gradient = self.loss_of(views[view], colors[view], drawn.color)
             records[view], dL_dgate = drawn.backward(gradient, self.gate is not None)
             numbers[0, view] = loss
             if self.gate:
                 numbers[1, view] = dL_dgate[0]
+
+        for view in batch.own_views:
+            blend(view)
         self.group.add_up(numbers)
         step.loss = numbers[0].mean()
         self.strategy.before_backward(step)

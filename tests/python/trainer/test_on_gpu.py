@@ -10,7 +10,11 @@ import pytest
 import torch
 from devices import without_cuda_because
 
+from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.distributed.group import ALONE
+from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
 from diff_smoe_rasterization.trainer.model import PARAMETERS
+from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
 
@@ -111,3 +115,31 @@ def test_a_resumed_run_goes_on_where_it_stopped(config, scene):
 def test_targets_lie_on_the_device_as_bytes(config, scene):
     trainer = Trainer(config, scene)
     assert all(view.image.device.type == "cuda" and view.image.dtype == torch.uint8 for view in trainer.scene.train)
+
+
+def test_a_deterministic_training_over_batches_repeats_bit_for_bit(config, scene):
+    results = []
+    for _ in range(2):
+        trainer = BatchTrainer(config.changed(batch=4, deterministic=True), scene, ALONE)
+        for _ in range(config.iterations // 4):
+            trainer.step()
+        results.append({name: tensor.detach().clone() for name, tensor in trainer.model.raw.items()})
+    assert len(results[0]["means3D"]) != len(scene.points.positions)
+    for name in PARAMETERS:
+        assert torch.equal(results[0][name], results[1][name]), name
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_two_gpus_train_the_bits_of_one(config, tmp_path):
+    config = config.changed(batch=4, deterministic=True, output=str(tmp_path / "one"))
+    train(config, progress=False)
+    words = ["train", config.scene, "-o", str(tmp_path / "two"), "--gpus", "2", "--quiet", "--deterministic", *(
+        word for name in ("batch", "iterations", "blend_mode", "sh_degree_interval", "densify_from_iter",
+                          "densify_until_iter", "densification_interval", "opacity_reset_interval",
+                          "densify_grad_threshold") for word in ("--" + name.replace("_", "-"), str(getattr(config, name))))]
+    assert main(words) == 0
+    models = []
+    for folder in ("one", "two"):
+        with open(model_path(str(tmp_path / folder), config.iterations), "rb") as file:
+            models.append(file.read())
+    assert models[0] == models[1]

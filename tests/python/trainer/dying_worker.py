@@ -1,0 +1,21 @@
+"""`dsmoe` as one of torchrun's processes, of which the second dies in a step: DYING_AT says in which iteration."""
+from __future__ import annotations
+
+import os
+import sys
+
+from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
+from diff_smoe_rasterization.trainer.errors import TrainerError
+
+step = BatchTrainer.step
+
+
+def dying_step(self, *arguments):
+    if self.group.rank == 1 and self.iteration + self.config.batch >= int(os.environ["DYING_AT"]):
+        raise TrainerError("this process dies")
+    return step(self, *arguments)
+
+
+BatchTrainer.step = dying_step
+sys.exit(main())

@@ -1,0 +1,120 @@
+"""One scene trained by several processes, over gloo: the bits of one process, whatever dies on the way."""
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+import torch.distributed
+
+from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.distributed import launch
+from diff_smoe_rasterization.trainer.distributed.shards import run_of
+from diff_smoe_rasterization.trainer.errors import TrainerError
+from diff_smoe_rasterization.trainer.results.modelfile import model_path
+from diff_smoe_rasterization.trainer.training.loop import train
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+ROOT = os.path.dirname(os.path.dirname(os.path.dirname(HERE)))
+
+needs_gloo = pytest.mark.skipif(not torch.distributed.is_available() or not torch.distributed.is_gloo_available(),
+                                reason="this torch has no gloo")
+
+
+def torchrun(processes, *words, **environment):
+    """Runs a program in so many processes. Returns its exit status, output and errors."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), *words]
+    path = os.pathsep.join([ROOT, os.environ.get("PYTHONPATH", "")])
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300,
+                            env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", **environment})
+    return result.returncode, result.stdout, result.stderr
+
+
+def model_of(config):
+    with open(model_path(config.output, config.iterations), "rb") as file:
+        return file.read()
+
+
+@needs_gloo
+def test_processes_die_and_others_resume_bit_for_bit(tiny_config, tmp_path):
+    """Two processes train until one dies; from what they saved, three go on, and one does. 40 views in steps of 4."""
+    straight = tiny_config.changed(batch=4, output=str(tmp_path / "straight"))
+    row = train(straight, progress=False)
+    config = dataclasses.replace(straight, output=str(tmp_path / "several"))
+    words = [config.scene, "-o", config.output, "--quiet", *(
+        word for name in ("batch", "iterations", "blend_mode", "sh_degree_interval", "densify_from_iter",
+                          "densify_until_iter", "densification_interval", "opacity_reset_interval",
+                          "densify_grad_threshold", "checkpoint_every")
+        for word in ("--" + name.replace("_", "-"), str(getattr(config, name))))]
+    status, out, errors = torchrun(2, os.path.join(HERE, "dying_worker.py"), "train", *words, DYING_AT="32")
+    assert status != 0 and "process 1: this process dies" in errors, errors
+    assert out.count("in 2 processes") == 1
+    assert not os.path.exists(model_path(config.output, 40)) and os.path.isfile(config.output + "/checkpoint.pt")
+    alone = dataclasses.replace(config, output=str(tmp_path / "alone"))
+    shutil.copytree(config.output, alone.output)
+
+    status, out, errors = torchrun(3, "-m", "diff_smoe_rasterization", "train", "--resume", "-o", config.output)
+    assert status == 0, errors
+    # The last checkpoint before 32: densifications were at 8 and 16, and one at 24 follows.
+    assert "resumed at iteration 20" in out or "resumed at iteration 28" in out
+    assert model_of(config) == model_of(straight)
+    assert row["num_gaussians"] != row["protocol"]["init_points"]
+
+    torch.manual_seed(77)
+    assert train(alone, resume=True, progress=False)["psnr"] == row["psnr"]
+    assert model_of(alone) == model_of(straight)
+
+
+@pytest.mark.slow
+@needs_gloo
+def test_a_budget_holds_for_all_processes_together(tiny_config, tmp_path):
+    """One view a step, two processes, of which one blends nothing: the model of the usual training."""
+    config = tiny_config.changed(schedule="steady", budget=170, iterations=20, output=str(tmp_path / "one"))
+    row = train(config, progress=False)
+    assert 165 < row["num_gaussians"] <= 170 and row["num_gaussians"] != row["protocol"]["init_points"]
+    other = dataclasses.replace(config, output=str(tmp_path / "two"))
+    status, out, errors = torchrun(
+        2, "-m", "diff_smoe_rasterization", "train", config.scene, "-o", other.output, "--quiet", "--strategy", "steady",
+        "--budget", "170", "--iterations", "20", "--blend-mode", "smoe", "--sh-degree-interval", "10",
+        "--densify-from-iter", "4", "--densify-until-iter", "30", "--densification-interval", "8",
+        "--densify-grad-threshold", "0.002")
+    assert status == 0, errors
+    assert "1 blend nothing; --batch 2 keeps all busy" in out
+    assert model_of(other) == model_of(config)
+
+
+@pytest.mark.parametrize("total, size", [(10, 3), (2, 4), (0, 2), (1000, 7)])
+def test_runs_are_all_gaussians_and_equally_long(total, size):
+    runs = [run_of(rank, size, total) for rank in range(size)]
+    assert runs[0][0] == 0 and runs[-1][1] == total
+    assert all(first[1] == second[0] for first, second in zip(runs, runs[1:]))
+    lengths = [end - begin for begin, end in runs]
+    assert max(lengths) - min(lengths) <= 1
+
+
+def test_gpus_is_refused_on_the_cpu(tiny_config, capsys):
+    assert main(["train", tiny_config.scene, "-o", tiny_config.output, "--gpus", "2", "--device", "cpu"]) == 1
+    assert "--gpus is 2 with --device cpu; it needs --device cuda" in capsys.readouterr().err
+
+
+def test_gpus_starts_torchrun_with_the_same_command(tiny_config, monkeypatch):
+    """Without --device it is cuda."""
+    seen = []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(launch, "launch", lambda gpus, words: seen.append((gpus, words)) or 3)
+    words = ["train", tiny_config.scene, "-o", tiny_config.output, "--batch", "4"]
+    assert main([*words, "--gpus", "2"]) == 3 and main([*words[:2], "--gpus=2", *words[2:], "--device", "cuda"]) == 3
+    assert seen == [(2, [*words, "--device", "cuda"])] * 2
+    command = launch.torchrun_command(2, words)
+    assert command[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    assert command[6:] == ["-m", "diff_smoe_rasterization", *words]
+
+
+def test_more_gpus_than_there_are_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(TrainerError, match="--gpus is 3; it must be at least 1 and at most 2"):
+        launch.check_gpus(3, "cuda")
