@@ -36,6 +36,7 @@ template <class S, BlendMode kBlendMode> class ContributionVisitor {
     return num_seen;
   }
 
+  DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(out_.instances + slot, 1); }
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
     position_ = P(gaussian.position);
     sum_ = no_contribution<P>();

@@ -27,6 +27,7 @@ template <class S, BlendMode kBlendMode> class GateMapVisitor {
     }
   }
 
+  DSMOE_HD void expect(uint32_t) const {}
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) { position_ = P(gaussian.position); }
   DSMOE_HD bool wants(int) const { return true; }
 

@@ -48,6 +48,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
     return num_seen;
   }
 
+  DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(out_.instances + slot, 1); }
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
     features_ = gaussian.features;
     position_ = P(gaussian.position);

@@ -90,7 +90,8 @@ template <class S> struct PixelCenters {
     using P = Pack<S>;
     for (int at = 0; at < kTilePixels; at += P::kLanes) {
       const int cell = at / kCellPixels, first = at % kCellPixels;
-      const P left = S(extent.x0 + cell % kCellColumns * kCellSize), top = S(extent.y0 + cell / kCellColumns * kCellSize);
+      const P left = S(extent.x0 + cell % kCellColumns * kCellSize),
+              top = S(extent.y0 + cell / kCellColumns * kCellSize);
       (P::load(kSquareOfFour<S>.columns + first) + left).store(x + at);
       (P::load(kSquareOfFour<S>.rows + first) + top).store(y + at);
     }
@@ -104,9 +105,9 @@ template <class S> struct ListedGaussian {
   S opacity, least_alpha;
   S position;  // in the list, from 0
   uint32_t slot;
-  CellBits met;        // the cells that the footprint meets, or some more
-  CellBits smooth;     // those of them over which the Gaussian is smooth
-  const S* features;   // [F]
+  CellBits met;       // the cells that the footprint meets, or some more
+  CellBits smooth;    // those of them over which the Gaussian is smooth
+  const S* features;  // [F]
 
   // Of smooth cells: alpha at the centre, the exponent's slopes there, and the exponent's quadratic part about it,
   // which is the same in all cells.
@@ -167,7 +168,8 @@ template <class S> class GaussianList {
       const P slope_y = fma(P(S(2) * factors.yy), dy, P(factors.xy) * dx);
       const P power = P(S(0.5)) * fma(slope_x, dx, slope_y * dy);
       const P spread = fma(P(kReach), abs(slope_x) + abs(slope_y), P(bend));
-      listed.smooth |= bits_of((spread <= P(::dsmoe::DSMOE_SIMD::kNearZero<S>)) & (power - spread >= P(least_power))) << first;
+      listed.smooth |= bits_of((spread <= P(::dsmoe::DSMOE_SIMD::kNearZero<S>)) & (power - spread >= P(least_power)))
+                       << first;
       (P(gaussian.opacity) * exp(power)).store(listed.alpha + first);
       slope_x.store(listed.slope_x + first);
       slope_y.store(listed.slope_y + first);
@@ -204,7 +206,8 @@ template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
       const int cell = at / kCellPixels, first = at % kCellPixels;
       const P u = P::load(kSquareOfFour<S>.columns + first) - P(kReach);
       const P v = P::load(kSquareOfFour<S>.rows + first) - P(kReach);
-      const P change = fma(P(gaussian.slope_x[cell]), u, fma(P(gaussian.slope_y[cell]), v, P::load(gaussian.bend + first)));
+      const P change =
+          fma(P(gaussian.slope_x[cell]), u, fma(P(gaussian.slope_y[cell]), v, P::load(gaussian.bend + first)));
       gate.logit = gate.alpha = P(gaussian.alpha[cell]) * exp_near_zero(change);
       gate.counts = Mask<P>::all();
     } else {
@@ -216,6 +219,7 @@ template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
 
 // Visits the pairs of the list entries [begin, end), and returns how many pairs it visited. A visitor has:
 //   kMode, kBackToFront   how pairs are cut, and the direction
+//   expect(slot)          the slot of a Gaussian that will soon come
 //   begin(gaussian)       then, for each pack of pixels that the footprint may meet:
 //     wants(at)           whether pairs of these pixels are wanted; at: of the first in a PixelArray
 //     take(at, pairs)     a pack of pairs
@@ -243,6 +247,7 @@ DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int 
     const int64_t next =
         Visitor::kBackToFront ? max(i - kPrefetchDistance, begin) : min(i + kPrefetchDistance, end - 1);
     list.load(i, next, gaussian);
+    visitor.expect(tile.saved.instances[next].slot);
     visitor.begin(gaussian);
     visit(gaussian.met & on_image & ~gaussian.smooth, std::false_type{});
     visit(gaussian.smooth & on_image, std::true_type{});
