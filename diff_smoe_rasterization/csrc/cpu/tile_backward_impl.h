@@ -58,7 +58,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     return num_seen;
   }
 
-  DSMOE_HD bool done() const { return false; }
+  DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(record(slot), 1); }
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
     features_ = gaussian.features;
     position_ = P(gaussian.position);
@@ -67,47 +67,48 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     one_ = x_ = y_ = xx_ = xy_ = yy_ = P(S(0));
     for (int f = 0; f < num_features_; ++f) dL_dfeatures()[f] = P(S(0));
   }
-  DSMOE_HD void begin_strip() { column_one_ = column_y_ = column_yy_ = P(S(0)); }
-  DSMOE_HD bool wants(int strip, int row) {
-    not_past_ = position_ < last_.load(strip, row);
+  DSMOE_HD bool wants(int at) {
+    not_past_ = position_ < last_.load(at);
     return !Blend<kMode>::kStopsEarly || any(not_past_);
   }
 
-  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P dx, S dy) {
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs) {
+    const Gate<P>& gate = pairs.gate;
     const auto contributes = gate.counts & not_past_;
     P value = S(0);
-    for (int f = 0; f < num_features_; ++f) value = fma(scaled_of(f).load(strip, row), P(features_[f]), value);
-    PixelBackward<P> pixel = {transmittance_.load(strip, row), suffix_.load(strip, row), base_.load(strip, row)};
+    for (int f = 0; f < num_features_; ++f) value = fma(scaled_of(f).load(at), P(features_[f]), value);
+    PixelBackward<P> pixel = {transmittance_.load(at), suffix_.load(at), base_.load(at)};
     const auto pair = Blend<kMode>::backward(pixel, gate, value, contributes);
-    transmittance_.store(strip, row, pixel.transmittance);
-    suffix_.store(strip, row, pixel.suffix);
+    transmittance_.store(at, pixel.transmittance);
+    suffix_.store(at, pixel.suffix);
     for (int f = 0; f < num_features_; ++f) {
-      dL_dfeatures()[f] = fma(pair.weight, scaled_of(f).load(strip, row), dL_dfeatures()[f]);
+      dL_dfeatures()[f] = fma(pair.weight, scaled_of(f).load(at), dL_dfeatures()[f]);
     }
-    const P dL_dpower = gate_backward(gate, pair.gamma);
-    column_one_ = column_one_ + dL_dpower;
-    column_y_ = fma(dL_dpower, P(dy), column_y_);
-    column_yy_ = fma(dL_dpower, P(dy * dy), column_yy_);
+    const P dL_dpower = Pairs::kSmooth ? pair.gamma : gate_backward(gate, pair.gamma);
+    const P by_x = dL_dpower * pairs.dx, by_y = dL_dpower * pairs.dy;
+    one_ = one_ + dL_dpower;
+    x_ = x_ + by_x;
+    y_ = y_ + by_y;
+    xx_ = fma(by_x, pairs.dx, xx_);
+    xy_ = fma(by_x, pairs.dy, xy_);
+    yy_ = fma(by_y, pairs.dy, yy_);
     if (!absolute_) return;
-    const auto by_mean = power_by_mean(conic_, dx, P(dy));
+    const auto by_mean = power_by_mean(conic_, pairs.dx, pairs.dy);
     absolute_x_ = absolute_x_ + abs(dL_dpower * by_mean.x);
     absolute_y_ = absolute_y_ + abs(dL_dpower * by_mean.y);
   }
 
-  DSMOE_HD void end_strip(P dx) {
-    one_ = one_ + column_one_;
-    y_ = y_ + column_y_;
-    yy_ = yy_ + column_yy_;
-    x_ = fma(column_one_, dx, x_);
-    xx_ = fma(column_one_ * dx, dx, xx_);
-    xy_ = fma(column_y_, dx, xy_);
-  }
-
   DSMOE_HD void end(const ListedGaussian<S>& gaussian) {
     S* out = record(gaussian.slot);
-    *reinterpret_cast<GateMoments<S>*>(out) = {sum_lanes(one_), sum_lanes(x_),  sum_lanes(y_),
-                                               sum_lanes(xx_),  sum_lanes(xy_), sum_lanes(yy_)};
-    for (int f = 0; f < num_features_; ++f) out[kNumGateMoments + f] = sum_lanes(dL_dfeatures()[f]);
+    sum_lanes(one_, x_, y_, xx_, out);
+    if (kFeatures == 3) {
+      sum_lanes(xy_, yy_, dL_dfeatures()[0], dL_dfeatures()[1], out + 4);
+      out[8] = sum_lanes(dL_dfeatures()[2]);
+    } else {
+      out[4] = sum_lanes(xy_);
+      out[5] = sum_lanes(yy_);
+      for (int f = 0; f < num_features_; ++f) out[kNumGateMoments + f] = sum_lanes(dL_dfeatures()[f]);
+    }
     if (!absolute_) return;
     out[kNumGateMoments + num_features_] = sum_lanes(absolute_x_);
     out[kNumGateMoments + num_features_ + 1] = sum_lanes(absolute_y_);
@@ -137,10 +138,9 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   const S* features_ = nullptr;
   P position_;
   Mask<P> not_past_;
-  Sym2<S> conic_;                        // of the current Gaussian
-  P absolute_x_, absolute_y_;            // its sums of absolute gradients
-  P one_, x_, y_, xx_, xy_, yy_;         // the moments of the current Gaussian
-  P column_one_, column_y_, column_yy_;  // of the current strip: dx is the same down the column, it joins at the end
+  Sym2<S> conic_;                 // of the current Gaussian
+  P absolute_x_, absolute_y_;     // its sums of absolute gradients
+  P one_, x_, y_, xx_, xy_, yy_;  // the moments of the current Gaussian
   P dL_dfeatures_in_registers_[kFeatures != kAnyFeatures ? kFeatures : 1];
 };
 

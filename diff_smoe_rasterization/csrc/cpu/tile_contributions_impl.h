@@ -36,26 +36,24 @@ template <class S, BlendMode kBlendMode> class ContributionVisitor {
     return num_seen;
   }
 
-  DSMOE_HD bool done() const { return false; }
+  DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(out_.instances + slot, 1); }
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
     position_ = P(gaussian.position);
     sum_ = no_contribution<P>();
   }
-  DSMOE_HD void begin_strip() {}
-  DSMOE_HD bool wants(int strip, int row) {
-    not_past_ = position_ < last_.load(strip, row);
+  DSMOE_HD bool wants(int at) {
+    not_past_ = position_ < last_.load(at);
     return any(not_past_);
   }
 
-  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P dx, S dy) {
-    PixelState<P> state = {transmittance_.load(strip, row), gate_sum_.load(strip, row)};
-    const auto pair = Blend<kMode>::accumulate(state, gate);
-    transmittance_.store(strip, row, state.transmittance);
-    gate_sum_.store(strip, row, state.gate_sum);
-    add_pair(sum_, pair.contributes & not_past_, pixel_weight_.load(strip, row), pair.weight, dx, P(dy));
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs) {
+    PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
+    const auto pair = Blend<kMode>::accumulate(state, pairs.gate);
+    transmittance_.store(at, state.transmittance);
+    gate_sum_.store(at, state.gate_sum);
+    add_pair(sum_, pair.contributes & not_past_, pixel_weight_.load(at), pair.weight, pairs.dx, pairs.dy);
   }
 
-  DSMOE_HD void end_strip(P) {}
   DSMOE_HD void end(const ListedGaussian<S>& gaussian) const {
     out_.instances[gaussian.slot] = {sum_lanes(sum_.pixel_weight), sum_lanes(sum_.pixels), sum_lanes(sum_.blend_weight),
                                      sum_lanes(sum_.distance)};

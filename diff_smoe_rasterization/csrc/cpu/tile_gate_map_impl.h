@@ -27,24 +27,22 @@ template <class S, BlendMode kBlendMode> class GateMapVisitor {
     }
   }
 
-  DSMOE_HD bool done() const { return false; }
+  DSMOE_HD void expect(uint32_t) const {}
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) { position_ = P(gaussian.position); }
-  DSMOE_HD void begin_strip() {}
-  DSMOE_HD bool wants(int, int) const { return true; }
+  DSMOE_HD bool wants(int) const { return true; }
 
-  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P, S) {
-    PixelState<P> state = {transmittance_.load(strip, row), gate_sum_.load(strip, row)};
-    const auto pair = Blend<kMode>::accumulate(state, gate);
-    transmittance_.store(strip, row, state.transmittance);
-    gate_sum_.store(strip, row, state.gate_sum);
-    count_.store(strip, row, count_.load(strip, row) + select(pair.contributes, P(S(1)), P(S(0))));
-    const P greatest = greatest_weight_.load(strip, row);
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs) {
+    PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
+    const auto pair = Blend<kMode>::accumulate(state, pairs.gate);
+    transmittance_.store(at, state.transmittance);
+    gate_sum_.store(at, state.gate_sum);
+    count_.store(at, count_.load(at) + select(pair.contributes, P(S(1)), P(S(0))));
+    const P greatest = greatest_weight_.load(at);
     const Mask<P> greater = pair.contributes & (pair.weight > greatest);
-    greatest_weight_.store(strip, row, select(greater, pair.weight, greatest));
-    greatest_position_.store(strip, row, select(greater, position_, greatest_position_.load(strip, row)));
+    greatest_weight_.store(at, select(greater, pair.weight, greatest));
+    greatest_position_.store(at, select(greater, position_, greatest_position_.load(at)));
   }
 
-  DSMOE_HD void end_strip(P) {}
   DSMOE_HD void end(const ListedGaussian<S>&) {}
 
   DSMOE_HD void write(const Tile<S>& tile, const GateMap& map) const {

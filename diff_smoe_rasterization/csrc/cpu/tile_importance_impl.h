@@ -48,36 +48,34 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
     return num_seen;
   }
 
-  DSMOE_HD bool done() const { return false; }
+  DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(out_.instances + slot, 1); }
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
     features_ = gaussian.features;
     position_ = P(gaussian.position);
     sum_ = no_importance<P>();
   }
-  DSMOE_HD void begin_strip() {}
-  DSMOE_HD bool wants(int strip, int row) {
-    not_past_ = position_ < last_.load(strip, row);
+  DSMOE_HD bool wants(int at) {
+    not_past_ = position_ < last_.load(at);
     return !Blend<kMode>::kStopsEarly || any(not_past_);
   }
 
-  DSMOE_HD void take(int strip, int row, const Gate<P>& gate, P, S) {
-    PixelState<P> state = {transmittance_.load(strip, row), gate_sum_.load(strip, row)};
-    const PixelEnd<P> end = {end_transmittance_.load(strip, row), end_gate_sum_.load(strip, row), background_gate_};
-    const auto removal = remove_pair<kMode>(state, end, gate, not_past_);
-    transmittance_.store(strip, row, state.transmittance);
-    gate_sum_.store(strip, row, state.gate_sum);
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs) {
+    PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
+    const PixelEnd<P> end = {end_transmittance_.load(at), end_gate_sum_.load(at), background_gate_};
+    const auto removal = remove_pair<kMode>(state, end, pairs.gate, not_past_);
+    transmittance_.store(at, state.transmittance);
+    gate_sum_.store(at, state.gate_sum);
     P squared = S(0);
     for (int c = 0; c < num_channels_; ++c) {
-      const P value = value_of(c).load(strip, row), distance = P(features_[c]) - value;
-      const P front = front_of(c).load(strip, row);
+      const P value = value_of(c).load(at), distance = P(features_[c]) - value;
+      const P front = front_of(c).load(at);
       const P change = channel_change<kMode>(removal, distance, front, value, P(background_[c]));
       squared = fma(change, change, squared);
-      front_of(c).store(strip, row, fma(removal.weight, distance, front));
+      front_of(c).store(at, fma(removal.weight, distance, front));
     }
-    add_pair(sum_, removal, squared, share_weight_.load(strip, row), weight_.load(strip, row));
+    add_pair(sum_, removal, squared, share_weight_.load(at), weight_.load(at));
   }
 
-  DSMOE_HD void end_strip(P) {}
   DSMOE_HD void end(const ListedGaussian<S>& gaussian) const {
     out_.instances[gaussian.slot] = {sum_lanes(sum_.share), sum_lanes(sum_.squared_share),
                                      sum_lanes(sum_.removal_cost)};

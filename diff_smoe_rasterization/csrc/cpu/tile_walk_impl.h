@@ -1,5 +1,6 @@
-// The walk over a tile: Gaussians in list order, then strips of pixels (one SIMD pack wide) and the rows of each strip.
-// Forward, backward and contributions are visitors of it. Included once per instruction set, after pack.h.
+// The walk over a tile: Gaussians in list order, and the cells of the tile that each of them meets. Backward,
+// contributions, importance and gate map are visitors of it. The forward pass walks cell by cell (tile_forward_impl.h),
+// with the same parts. Included once per instruction set, after pack.h.
 #pragma once
 
 #include "../dispatch.h"
@@ -14,20 +15,33 @@ namespace DSMOE_SIMD {
 
 template <class S> using Pack = ::dsmoe::DSMOE_SIMD::Pack<S>;
 
-// One number per pixel of the tile, strip by strip, each strip's rows one below the other.
+// A tile is made of square cells, row by row. A cell is the largest pack's pixels, row by row; smaller packs take a
+// part of it each. A square is met by fewer Gaussians than a row of as many pixels.
+constexpr int kCellSize = 4;  // pixels
+constexpr int kCellPixels = kCellSize * kCellSize;
+constexpr int kCellColumns = kTileSize / kCellSize;
+constexpr int kCells = kCellColumns * kCellColumns;
+using CellBits = uint32_t;  // one bit a cell, the first cell's the lowest
+
+// 0, 1, 2, 3, 0, 1, ... and 0, 0, 0, 0, 1, 1, ...: columns and rows of a cell's pixels, and of a tile's cells.
+template <class S> struct SquareOfFour {
+  alignas(64) S columns[16] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
+  alignas(64) S rows[16] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+};
+template <class S> constexpr SquareOfFour<S> kSquareOfFour = {};
+static_assert(kCellSize == 4 && kCellColumns == 4, "kSquareOfFour");
+
+// One number per pixel of the tile, cell by cell.
 template <class S> struct PixelArray {
   S* values;
 
-  DSMOE_HD S* at(int strip, int row) const { return values + (strip * kTileSize + row) * Pack<S>::kLanes; }
-  DSMOE_HD Pack<S> load(int strip, int row) const { return Pack<S>::load(at(strip, row)); }
-  DSMOE_HD void store(int strip, int row, Pack<S> value) const { value.store(at(strip, row)); }
-  DSMOE_HD S& pixel(int x, int y) const { return at(x / Pack<S>::kLanes, y)[x % Pack<S>::kLanes]; }
+  DSMOE_HD Pack<S> load(int at) const { return Pack<S>::load(values + at); }
+  DSMOE_HD void store(int at, Pack<S> value) const { value.store(values + at); }
+  DSMOE_HD S& pixel(int x, int y) const {
+    const int cell = y / kCellSize * kCellColumns + x / kCellSize;
+    return values[cell * kCellPixels + y % kCellSize * kCellSize + x % kCellSize];
+  }
 };
-
-template <class S> constexpr int kStrips = kTileSize / Pack<S>::kLanes;
-
-// A Gaussian's rows are found for the tile's whole width: where that is one strip, each of them holds pixels.
-template <class S> constexpr bool kRowsAreExact = kStrips<S> == 1;
 
 // Hands out PixelArrays one after the other.
 template <class S> struct Scratch {
@@ -55,89 +69,191 @@ struct TileExtent {
       for (int x = 0; x < columns; ++x) body(x, y, static_cast<int64_t>(y0 + y) * width + x0 + x);
     }
   }
+
+  // The cells with pixels on the image.
+  DSMOE_HD CellBits cells() const {
+    CellBits out = 0;
+    for (int cell = 0; cell < kCells; ++cell) {
+      const bool on_image = cell % kCellColumns * kCellSize < columns && cell / kCellColumns * kCellSize < rows;
+      out |= CellBits(on_image) << cell;
+    }
+    return out;
+  }
 };
 
-// The rows of the tile that a Gaussian's footprint meets.
-struct RowRange {
-  int begin, end;
+// Where the pixels of a tile lie in the image.
+template <class S> struct PixelCenters {
+  alignas(64) S x[kTilePixels];
+  alignas(64) S y[kTilePixels];
+
+  DSMOE_HD explicit PixelCenters(const TileExtent& extent) {
+    using P = Pack<S>;
+    for (int at = 0; at < kTilePixels; at += P::kLanes) {
+      const int cell = at / kCellPixels, first = at % kCellPixels;
+      const P left = S(extent.x0 + cell % kCellColumns * kCellSize),
+              top = S(extent.y0 + cell / kCellColumns * kCellSize);
+      (P::load(kSquareOfFour<S>.columns + first) + left).store(x + at);
+      (P::load(kSquareOfFour<S>.rows + first) + top).store(y + at);
+    }
+  }
 };
 
-template <class S> DSMOE_HD RowRange rows_of(const ProjectedGaussian<S>& gaussian, const TileExtent& extent) {
-  // EllipseBand gives u over a band of v; with x and y exchanged, y over the tile's columns.
-  const Sym2<S> exchanged = {gaussian.conic.yy, gaussian.conic.xy, gaussian.conic.xx};
-  const S left = S(extent.x0) - gaussian.mean.x, top = gaussian.mean.y - S(extent.y0);
-  const auto y = EllipseBand<S>(exchanged, gaussian.squared_reach).over({left, left + S(extent.columns - 1)});
-  if (y.empty()) return {0, 0};
-  return {ceil_to_int(top + y.low, 0, extent.rows), floor_to_int(top + y.high + S(1), 0, extent.rows)};
-}
-
-// No pair of the Gaussian has an exponent below this.
-template <class S> DSMOE_HD S least_power(const ProjectedGaussian<S>& gaussian) {
-  return S(-0.5) * (gaussian.squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack));
-}
-
-constexpr int64_t kPrefetchDistance = 8;  // instances; the Gaussians of a list lie anywhere in memory
-
-template <class S>
-DSMOE_HD void prefetch_gaussian(const SavedForward<S>& saved, const TileInstance& instance, int num_features) {
-  __builtin_prefetch(saved.projected + instance.gaussian);
-  __builtin_prefetch(saved.features + static_cast<int64_t>(instance.gaussian) * num_features);
-}
-
-// A Gaussian of the list.
+// A Gaussian of the list: all that its pairs need.
 template <class S> struct ListedGaussian {
-  const ProjectedGaussian<S>& projected;
-  const S* features;  // [F]
-  uint32_t slot;
+  Vec2<S> mean;
+  ExponentFactors<S> exponent;
+  S opacity, least_alpha;
   S position;  // in the list, from 0
+  uint32_t slot;
+  CellBits met;       // the cells that the footprint meets, or some more
+  CellBits smooth;    // those of them over which the Gaussian is smooth
+  const S* features;  // [F]
+
+  // Of smooth cells: alpha at the centre, the exponent's slopes there, and the exponent's quadratic part about it,
+  // which is the same in all cells.
+  alignas(64) S alpha[kCells];
+  alignas(64) S slope_x[kCells];
+  alignas(64) S slope_y[kCells];
+  alignas(64) S bend[kCellPixels];
 };
 
-// Visits the pairs of the instances [begin, end), and returns how many pairs had their exponent evaluated. A visitor
-// has:
+// The Gaussians of a tile's list, one after the other.
+template <class S> class GaussianList {
+ public:
+  DSMOE_HD GaussianList(const Tile<S>& tile, const TileExtent& extent, int num_features)
+      : tile_(tile), extent_(extent), num_features_(num_features), cut_(tile.config.alpha_cut()) {}
+
+  // Fills `listed` with entry i of all lists. next: an entry that will soon be wanted; the Gaussians of a list lie
+  // anywhere in memory.
+  DSMOE_HD void load(int64_t i, int64_t next, ListedGaussian<S>& listed) const {
+    const SavedForward<S>& saved = tile_.saved;
+    const int64_t soon = saved.instances[next].gaussian;
+    __builtin_prefetch(saved.projected + soon);
+    __builtin_prefetch(saved.features + soon * num_features_);
+    const TileInstance& instance = saved.instances[i];
+    const ProjectedGaussian<S>& gaussian = saved.projected[instance.gaussian];
+    listed.mean = gaussian.mean;
+    listed.exponent = ExponentFactors<S>(gaussian.conic);
+    listed.opacity = gaussian.opacity;
+    listed.least_alpha = cut_.of(gaussian.opacity);
+    listed.position = S(i - tile_.begin);
+    listed.slot = instance.slot;
+    listed.features = saved.features + static_cast<int64_t>(instance.gaussian) * num_features_;
+    find_cells(gaussian, listed);
+  }
+
+ private:
+  // The exponent changes by at most `spread` between a cell's centre and its pixels. Smooth cells have a spread that
+  // exp_near_zero takes, and lie inside the footprint: each of their pairs counts.
+  DSMOE_HD void find_cells(const ProjectedGaussian<S>& gaussian, ListedGaussian<S>& listed) const {
+    using P = Pack<S>;
+    constexpr S kReach = S(kCellSize - 1) / 2;  // from a cell's centre to its outermost pixels
+    const Sym2<S>& conic = gaussian.conic;
+    const ExponentFactors<S>& factors = listed.exponent;
+    const S bend = kReach * kReach * (abs(factors.xy) - factors.xx - factors.yy);
+    // Where the determinant is all but lost, the exponent may be above 0. The clamp of alpha has a gradient of its own.
+    const bool may_be_smooth = bend < S(0.5) * ::dsmoe::DSMOE_SIMD::kNearZero<S> && gaussian.opacity <= S(kAlphaMax) &&
+                               conic.xy * conic.xy < S(0.9999) * conic.xx * conic.yy;
+    // As in may_meet, on the other side of the border.
+    const S least_power = S(-0.5) * (gaussian.squared_reach * S(1 - kFootprintSlack) - S(kFootprintSlack));
+    listed.met = listed.smooth = 0;
+    for (int first = 0; first < kCells; first += P::kLanes) {
+      const P x = fma(P::load(kSquareOfFour<S>.columns + first), P(S(kCellSize)), P(S(extent_.x0)));
+      const P y = fma(P::load(kSquareOfFour<S>.rows + first), P(S(kCellSize)), P(S(extent_.y0)));
+      const PixelRect<P> rects = {x, y, x + P(S(kCellSize - 1)), y + P(S(kCellSize - 1))};
+      listed.met |= bits_of(may_meet(conic, gaussian.mean, gaussian.squared_reach, rects)) << first;
+      if (!may_be_smooth) continue;
+      const P dx = x + P(kReach) - P(gaussian.mean.x), dy = y + P(kReach) - P(gaussian.mean.y);
+      const P slope_x = fma(P(S(2) * factors.xx), dx, P(factors.xy) * dy);
+      const P slope_y = fma(P(S(2) * factors.yy), dy, P(factors.xy) * dx);
+      const P power = P(S(0.5)) * fma(slope_x, dx, slope_y * dy);
+      const P spread = fma(P(kReach), abs(slope_x) + abs(slope_y), P(bend));
+      listed.smooth |= bits_of((spread <= P(::dsmoe::DSMOE_SIMD::kNearZero<S>)) & (power - spread >= P(least_power)))
+                       << first;
+      (P(gaussian.opacity) * exp(power)).store(listed.alpha + first);
+      slope_x.store(listed.slope_x + first);
+      slope_y.store(listed.slope_y + first);
+    }
+    listed.smooth &= listed.met;
+    if (listed.smooth == 0) return;
+    for (int first = 0; first < kCellPixels; first += P::kLanes) {
+      const P u = P::load(kSquareOfFour<S>.columns + first) - P(kReach);
+      const P v = P::load(kSquareOfFour<S>.rows + first) - P(kReach);
+      ColumnExponent<P, S>(factors, u).at(v).store(listed.bend + first);
+    }
+  }
+
+  const Tile<S>& tile_;
+  const TileExtent& extent_;
+  const int num_features_;
+  const AlphaCut<S> cut_;
+};
+
+constexpr int64_t kPrefetchDistance = 8;  // list entries
+
+// A pack of pairs of one Gaussian. at: of the first pixel in a PixelArray.
+template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
+  using P = Pack<S>;
+  static constexpr bool kSmooth = kIsSmooth;  // alpha is not clamped
+
+  P dx, dy;  // pixel - mean
+  Gate<P> gate;
+
+  DSMOE_HD PackPairs(const ListedGaussian<S>& gaussian, const PixelCenters<S>& pixels, int at)
+      : dx(P::load(pixels.x + at) - P(gaussian.mean.x)), dy(P::load(pixels.y + at) - P(gaussian.mean.y)) {
+    if constexpr (kSmooth) {
+      constexpr S kReach = S(kCellSize - 1) / 2;
+      const int cell = at / kCellPixels, first = at % kCellPixels;
+      const P u = P::load(kSquareOfFour<S>.columns + first) - P(kReach);
+      const P v = P::load(kSquareOfFour<S>.rows + first) - P(kReach);
+      const P change =
+          fma(P(gaussian.slope_x[cell]), u, fma(P(gaussian.slope_y[cell]), v, P::load(gaussian.bend + first)));
+      gate.logit = gate.alpha = P(gaussian.alpha[cell]) * exp_near_zero(change);
+      gate.counts = Mask<P>::all();
+    } else {
+      const P power = ColumnExponent<P, S>(gaussian.exponent, dx).at(dy);
+      gate = evaluate_gate<kMode>(power, gaussian.opacity, gaussian.least_alpha);
+    }
+  }
+};
+
+// Visits the pairs of the list entries [begin, end), and returns how many pairs it visited. A visitor has:
 //   kMode, kBackToFront   how pairs are cut, and the direction
-//   done()                whether no more Gaussians are wanted
-//   begin(gaussian)       then, for each strip and the rows of it that the footprint meets:
-//     begin_strip()
-//     wants(strip, row)   whether pairs of these pixels are wanted
-//     take(strip, row, gate, dx, dy)   a pack of pairs; (dx, dy): pixel - mean
-//     end_strip(dx)
+//   expect(slot)          the slot of a Gaussian that will soon come
+//   begin(gaussian)       then, for each pack of pixels that the footprint may meet:
+//     wants(at)           whether pairs of these pixels are wanted; at: of the first in a PixelArray
+//     take(at, pairs)     a pack of pairs
 //   end(gaussian)
 template <class S, class Visitor>
 DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int num_features, Visitor& visitor) {
-  using P = Pack<S>;
   const TileExtent extent(tile);
-  const AlphaCut<S> cut = tile.config.alpha_cut();
-  int64_t pairs = 0;
-  for (int64_t k = 0; k < end - begin && !visitor.done(); ++k) {
-    const int64_t i = Visitor::kBackToFront ? end - 1 - k : begin + k;
-    const int64_t ahead =
-        Visitor::kBackToFront ? max(i - kPrefetchDistance, begin) : min(i + kPrefetchDistance, end - 1);
-    prefetch_gaussian(tile.saved, tile.saved.instances[ahead], num_features);
-    const TileInstance& instance = tile.saved.instances[i];
-    const ListedGaussian<S> listed = {tile.saved.projected[instance.gaussian],
-                                      tile.saved.features + static_cast<int64_t>(instance.gaussian) * num_features,
-                                      instance.slot, S(i - tile.begin)};
-    const ProjectedGaussian<S>& gaussian = listed.projected;
-    const RowRange rows = rows_of(gaussian, extent);
-    const S faintest = least_power(gaussian), least_alpha = cut.of(gaussian.opacity);
-    visitor.begin(listed);
-    for (int strip = 0; strip < kStrips<S>; ++strip) {
-      const P dx = P::iota() + P(S(extent.x0 + strip * P::kLanes) - gaussian.mean.x);
-      const ColumnExponent<P, S> exponent(gaussian.conic, dx);
-      visitor.begin_strip();
-      for (int row = rows.begin; row < rows.end; ++row) {
-        if (!visitor.wants(strip, row)) continue;
-        pairs += P::kLanes;
-        const S dy = S(extent.y0 + row) - gaussian.mean.y;
-        const P power = exponent.at(dy);
-        if (!kRowsAreExact<S> && !any(power >= P(faintest))) continue;
-        visitor.take(strip, row, evaluate_gate<Visitor::kMode>(power, gaussian.opacity, least_alpha), dx, dy);
+  const PixelCenters<S> pixels(extent);
+  const GaussianList<S> list(tile, extent, num_features);
+  const CellBits on_image = extent.cells();
+  ListedGaussian<S> gaussian;
+  int64_t num_pairs = 0;
+  const auto visit = [&](CellBits cells, auto smooth) {
+    for (; cells != 0; cells &= cells - 1) {
+      const int cell_begin = __builtin_ctz(cells) * kCellPixels;
+      for (int at = cell_begin; at < cell_begin + kCellPixels; at += Pack<S>::kLanes) {
+        if (!visitor.wants(at)) continue;
+        num_pairs += Pack<S>::kLanes;
+        visitor.take(at, PackPairs<Visitor::kMode, S, decltype(smooth)::value>(gaussian, pixels, at));
       }
-      visitor.end_strip(dx);
     }
-    visitor.end(listed);
+  };
+  for (int64_t k = 0; k < end - begin; ++k) {
+    const int64_t i = Visitor::kBackToFront ? end - 1 - k : begin + k;
+    const int64_t next =
+        Visitor::kBackToFront ? max(i - kPrefetchDistance, begin) : min(i + kPrefetchDistance, end - 1);
+    list.load(i, next, gaussian);
+    visitor.expect(tile.saved.instances[next].slot);
+    visitor.begin(gaussian);
+    visit(gaussian.met & on_image & ~gaussian.smooth, std::false_type{});
+    visit(gaussian.smooth & on_image, std::true_type{});
+    visitor.end(gaussian);
   }
-  return pairs;
+  return num_pairs;
 }
 
 }  // namespace DSMOE_SIMD

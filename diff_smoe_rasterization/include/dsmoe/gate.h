@@ -13,15 +13,25 @@ enum class Cut {
   kKernel,  // the paper: those of G >= 1e-5, and of the least alpha below
 };
 
-// The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels. d = pixel - mean; d.x is the same for all of them.
+// The factors of d.x^2, d.x d.y and d.y^2 in the exponent -1/2 d^T Sigma2D^-1 d, where d = pixel - mean.
+template <class S> struct ExponentFactors {
+  S xx, xy, yy;
+
+  ExponentFactors() = default;
+  DSMOE_HD explicit ExponentFactors(const Sym2<S>& conic)
+      : xx(S(-0.5) * conic.xx), xy(-conic.xy), yy(S(-0.5) * conic.yy) {}
+};
+
+// The exponent along one column of pixels: d.x is the same for all of them.
 template <class Real, class S> struct ColumnExponent {
   Real constant, linear;
   S quadratic;
 
-  DSMOE_HD ColumnExponent(const Sym2<S>& conic, Real dx)
-      : constant(S(-0.5) * conic.xx * dx * dx), linear(-conic.xy * dx), quadratic(S(-0.5) * conic.yy) {}
+  DSMOE_HD ColumnExponent(const ExponentFactors<S>& factors, Real dx)
+      : constant(Real(factors.xx) * dx * dx), linear(Real(factors.xy) * dx), quadratic(factors.yy) {}
+  DSMOE_HD ColumnExponent(const Sym2<S>& conic, Real dx) : ColumnExponent(ExponentFactors<S>(conic), dx) {}
 
-  DSMOE_HD Real at(S dy) const { return fma(fma(Real(quadratic), Real(dy), linear), Real(dy), constant); }
+  DSMOE_HD Real at(Real dy) const { return fma(fma(Real(quadratic), dy, linear), dy, constant); }
 };
 
 // The least alpha that counts where pairs are cut by G.

@@ -134,25 +134,31 @@ template <class S> struct PixelRect {
 
 // The least value of d^T conic d over a rectangle. The form grows along every ray from the mean, so the least value
 // lies where a ray enters: on the column or the row that is nearest to the mean.
-template <class S> DSMOE_HD S least_squared_distance(const Sym2<S>& conic, Vec2<S> mean, PixelRect<S> rect) {
-  const S x0 = rect.x0 - mean.x, x1 = rect.x1 - mean.x, y0 = rect.y0 - mean.y, y1 = rect.y1 - mean.y;
-  auto value = [&](S x, S y) { return (conic.xx * x + S(2) * conic.xy * y) * x + conic.yy * y * y; };
-  const S x = clamp(S(0), x0, x1), y = clamp(S(0), y0, y1);
-  const S on_column = value(x, clamp(-conic.xy * x * rough_reciprocal(conic.yy), y0, y1));
-  const S on_row = value(clamp(-conic.xy * y * rough_reciprocal(conic.xx), x0, x1), y);
+template <class Real, class S>
+DSMOE_HD Real least_squared_distance(const Sym2<S>& conic, Vec2<S> mean, const PixelRect<Real>& rect) {
+  const Real x0 = rect.x0 - Real(mean.x), x1 = rect.x1 - Real(mean.x);
+  const Real y0 = rect.y0 - Real(mean.y), y1 = rect.y1 - Real(mean.y);
+  auto value = [&](Real x, Real y) {
+    return (Real(conic.xx) * x + Real(S(2) * conic.xy) * y) * x + Real(conic.yy) * y * y;
+  };
+  const Real x = clamp(Real(S(0)), x0, x1), y = clamp(Real(S(0)), y0, y1);
+  const Real on_column = value(x, clamp(Real(-conic.xy) * x * Real(rough_reciprocal(conic.yy)), y0, y1));
+  const Real on_row = value(clamp(Real(-conic.xy) * y * Real(rough_reciprocal(conic.xx)), x0, x1), y);
   return min(on_column, on_row);
 }
 
-// Whether a pair of the Gaussian may count inside the rectangle; a bound.
-template <class S> DSMOE_HD bool may_meet(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, PixelRect<S> rect) {
-  return squared_reach >= S(0) &&
-         least_squared_distance(conic, mean, rect) <= squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack);
+// Whether a pair of the Gaussian may count inside the rectangle, or in each of a pack of rectangles; a bound.
+template <class Real, class S>
+DSMOE_HD Mask<Real> may_meet(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, const PixelRect<Real>& rect) {
+  const S bound = squared_reach >= S(0) ? squared_reach * S(1 + kFootprintSlack) + S(kFootprintSlack) : S(-INFINITY);
+  return least_squared_distance(conic, mean, rect) <= Real(bound);
 }
 
 // Whether the ellipse meets the image: the gated modes' rule for radius > 0. Exact, without the bounds' slack.
 template <class S>
 DSMOE_HD bool meets_image(const Sym2<S>& conic, Vec2<S> mean, S squared_reach, int width, int height) {
-  return least_squared_distance(conic, mean, {S(0), S(0), S(width - 1), S(height - 1)}) <= squared_reach;
+  const PixelRect<S> image = {S(0), S(0), S(width - 1), S(height - 1)};
+  return least_squared_distance(conic, mean, image) <= squared_reach;
 }
 
 }  // namespace dsmoe
