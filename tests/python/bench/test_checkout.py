@@ -34,7 +34,7 @@ ITERATIONS = 7
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Written by a process of its own: the small trainers' modules have everyday names."""
+    """Written by a process of its own: the small trainer's modules have everyday names."""
     folder = tmp_path_factory.mktemp("bench") / "scene"
     small_trainers().make_scene(folder)
     program = ("import numpy, sys; from scene.dataset_readers import read_made_up_scene; "
@@ -65,7 +65,7 @@ def write_views(folder, views):
 
 
 class SmallTrainers:
-    """Cells of small trainers, each patched once."""
+    """Cells of the small trainer, patched once of each kind."""
 
     def __init__(self, scene, folder):
         self.scene, self.folder, self.prepared = scene, folder, {}

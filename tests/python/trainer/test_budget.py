@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from test_resume import Killed, kill_at, ply_bytes
+from test_resume import killed_and_resumed, ply_bytes
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.trainer.config import TrainConfig
@@ -79,19 +79,11 @@ def test_growth_ends_where_memory_does(tiny_config, budget, goal):
 
 
 @pytest.mark.parametrize("schedule, killed_at", [("gate", 14), ("gate", 24), ("gate", 39), ("mcmc", 24)])
-def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, schedule, killed_at):
+def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, killed_at):
     """Checkpoints at 10, 20, 30 lie in growth, between removals and among moves."""
-    straight = tiny_config.changed(schedule=schedule, budget=120, output=str(tmp_path / "straight"),
-                                   densification_interval=4)
-    row = train(straight, progress=False)
-    broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
-    with monkeypatch.context() as patch:
-        kill_at(patch, killed_at)
-        with pytest.raises(Killed):
-            train(broken, progress=False)
-    torch.manual_seed(12345)
-    assert train(broken, resume=True, progress=False)["num_gaussians"] == row["num_gaussians"] == 120
-    assert ply_bytes(broken) == ply_bytes(straight)
+    (_, row), _ = killed_and_resumed(tiny_config, tmp_path, killed_at, schedule=schedule, budget=120,
+                                     densification_interval=4)
+    assert row["num_gaussians"] == 120
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])

@@ -42,20 +42,24 @@ def kill_at(monkeypatch, iteration):
     monkeypatch.setattr(Trainer, "step", dying_step)
 
 
-@pytest.mark.parametrize("blend_mode, killed_at", [("alpha", 26), ("smoe", 26), ("smoe", 11), ("smoe", 39)])
-def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, blend_mode, killed_at):
-    """Checkpoints are at 10, 20, 30; densifications at 8, 16, 24 and resets at 12, 24 lie on both sides."""
-    straight = tiny_config.changed(blend_mode=blend_mode, output=str(tmp_path / "straight"))
+def killed_and_resumed(config, folder, killed_at, **options):
+    """Trains undisturbed, and killed and resumed; asserts that the models are equal. Returns of both config and row."""
+    straight = config.changed(output=str(folder / "straight"), **options)
+    broken = dataclasses.replace(straight, output=str(folder / "broken"))
     row = train(straight, progress=False)
-    broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         kill_at(patch, killed_at)
-        with pytest.raises(Killed):
-            train(broken, progress=False)
-    # Whatever happens to the generators in between must not matter.
-    torch.manual_seed(12345)
+        train(broken, progress=False)
+    torch.manual_seed(12345)  # whatever happens to the generators in between must not matter
     resumed = train(broken, resume=True, progress=False)
     assert ply_bytes(broken) == ply_bytes(straight)
+    return (straight, row), (broken, resumed)
+
+
+@pytest.mark.parametrize("blend_mode, killed_at", [("alpha", 26), ("smoe", 26), ("smoe", 11), ("smoe", 39)])
+def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, blend_mode, killed_at):
+    """Checkpoints are at 10, 20, 30; densifications at 8, 16, 24 and resets at 12, 24 lie on both sides."""
+    (straight, row), (broken, resumed) = killed_and_resumed(tiny_config, tmp_path, killed_at, blend_mode=blend_mode)
     assert (resumed["psnr"], resumed["num_gaussians"]) == (row["psnr"], row["num_gaussians"])
     # The tiny scene must really have been densified, else nothing was shown.
     assert row["num_gaussians"] != row["protocol"]["init_points"]
@@ -67,17 +71,8 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, monkeypatch, bl
 
 @pytest.mark.parametrize("options", [
     dict(blend_mode="smoe", background_gate="learned"), dict(blend_mode="alpha", random_background=True)])
-def test_a_learned_gate_and_random_backgrounds_resume_bit_for_bit(tiny_config, tmp_path, monkeypatch, options):
-    straight = tiny_config.changed(output=str(tmp_path / "straight"), **options)
-    row = train(straight, progress=False)
-    broken = dataclasses.replace(straight, output=str(tmp_path / "broken"))
-    with monkeypatch.context() as patch:
-        kill_at(patch, 26)
-        with pytest.raises(Killed):
-            train(broken, progress=False)
-    torch.manual_seed(12345)
-    resumed = train(broken, resume=True, progress=False)
-    assert ply_bytes(broken) == ply_bytes(straight)
+def test_a_learned_gate_and_random_backgrounds_resume_bit_for_bit(tiny_config, tmp_path, options):
+    (_, row), (_, resumed) = killed_and_resumed(tiny_config, tmp_path, 26, **options)
     assert (resumed["psnr"], resumed["background_gate"]) == (row["psnr"], row["background_gate"])
 
 
