@@ -12,7 +12,6 @@ import torch
 
 from ...losses import l1_ssim_loss_and_gradient
 from ..config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
-from ..distributed.group import ALONE, Group
 from ..errors import TrainerError
 from ..model import GaussianModel, GaussianOptimizer
 from ..results.evaluation import Evaluation, evaluate
@@ -26,6 +25,7 @@ from ..scenes.images import View, as_float
 from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
 from ..system.environment import extension_info
 from ..system.files import is_file, write_atomically, write_json_atomically
+from ..system.group import ALONE, Group
 from ..system.interrupt import DelayedInterrupt
 from ..system.output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
 from ..system.progress import progress_bar
@@ -34,8 +34,8 @@ from .background_gate import LearnedGate
 from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
 from .order import ViewOrder
 from .randomness import random_state, restore_random_state, seed_everything
-from .strategies import STRATEGIES
 from .shards import Shards
+from .strategies import STRATEGIES
 from .strategy import AnyStep, Step, StrategyContext
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
@@ -371,8 +371,8 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
     is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
     run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
-    hand. group: the processes that train together, where there are several; all of them call this. Raises TrainerError before training starts where anything does not fit, as where another run is at work in
-    the folder.
+    hand. group: the processes that train together, where there are several; all of them call this. Raises TrainerError
+    before training starts where anything does not fit, as where another run is at work in the folder.
     """
     if resume and overwrite:
         raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
