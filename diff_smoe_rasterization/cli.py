@@ -22,8 +22,8 @@ from .trainer.system.files import is_folder
 from .trainer.system.interrupt import exit_status
 
 if TYPE_CHECKING:
-    from .trainer.distributed.group import Group
     from .trainer.results.evaluation import Measure
+    from .trainer.system.group import Group
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -313,7 +313,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> Optional[int]:
-    from .trainer.distributed.group import join_group, launched_by_torchrun, leave_group
+    from .trainer.system.group import join_group, launched_by_torchrun, leave_group
     from .trainer.system.process import set_up_process
 
     gpus = arguments.gpus
@@ -325,7 +325,7 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
             arguments.command_words += ["--device", "cuda"]
     config = _train_config(arguments)
     if gpus is not None:
-        from .trainer.distributed.launch import check_gpus, launch, without_gpus
+        from .trainer.system.torchrun import check_gpus, launch, without_gpus
 
         check_gpus(gpus, config.device)
         return launch(gpus, without_gpus(arguments.command_words))

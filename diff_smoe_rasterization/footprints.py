@@ -12,7 +12,7 @@ from typing import Any, List, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 
-from .autograd import INPUTS, _below_autograd, refuse_forward_mode
+from .autograd import INPUTS, refuse_forward_mode
 from .rasterizer import _arguments, _checks, _options, _rendering
 from .settings import OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 
@@ -130,8 +130,7 @@ def _wants_gradient(tensors: Sequence[Optional[torch.Tensor]]) -> bool:
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, options: Tuple[Any, ...], *inputs: Any) -> Tuple[torch.Tensor, ...]:
-        with _below_autograd():
-            gates, features, radii = _OPS.project(*inputs, *options)
+        gates, features, radii = _OPS.project(*inputs, *options)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         ctx.options, ctx.present = options, [tensor is not None for tensor in inputs]
@@ -157,8 +156,7 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, options: Tuple[Any, ...], gates: torch.Tensor, features: torch.Tensor, radii: torch.Tensor,
                 bg: torch.Tensor, background_gate: Optional[torch.Tensor]) -> Tuple[torch.Tensor, ...]:
-        with _below_autograd():
-            *images, saved = _OPS.blend(gates, features, radii, bg, background_gate, *options)
+        *images, saved = _OPS.blend(gates, features, radii, bg, background_gate, *options)
         ctx.set_materialize_grads(False)
         ctx.options, ctx.has_gate = options, background_gate is not None
         ctx.images = [image.clone() for image in images]  # the caller may edit them

@@ -2,10 +2,10 @@
 
     torchrun --nproc-per-node 2 benchmarks/timing/distributed.py --npz PACKED.npz --batch 4 --json ROWS.jsonl
 
-One process without torchrun does the same alone. The model is one that `models.from_npz` reads, or --copies of it, each
-moved by noise and made smaller, so that all together cover what one did. Targets are renderings of the model, lightened.
-The first process prints and writes a row: images a second, peak memory of each process, and with --digest a sum of the
-gradients' bits, which with --deterministic is the same for any number of processes.
+One process without torchrun does the same alone. The model is one that `models.from_npz` reads, or --copies of it,
+each moved by noise and made smaller, so that all together cover what one did. Targets are renderings of the model, but
+lighter. The first process prints and writes a row: images a second and peak memory of each process. With --digest it
+has checksums of the gradients, which with --deterministic are the same for any number of processes.
 """
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ import torch
 
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.distributed.batch import Batch
-from diff_smoe_rasterization.trainer.distributed.group import join_group, leave_group
 from diff_smoe_rasterization.trainer.distributed.shards import run_of
 from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
 from diff_smoe_rasterization.trainer.scenes.images import View
 from diff_smoe_rasterization.trainer.scenes.pointcloud import PointCloud
 from diff_smoe_rasterization.trainer.scenes.scene import Scene
 from diff_smoe_rasterization.trainer.system.environment import machine, versions
+from diff_smoe_rasterization.trainer.system.group import join_group, leave_group
 
 
 def rows_of(packed: Dict[str, torch.Tensor], copies: int, begin: int, end: int) -> Dict[str, torch.Tensor]:
@@ -48,15 +48,15 @@ def rows_of(packed: Dict[str, torch.Tensor], copies: int, begin: int, end: int) 
 
 
 def new_trainer(options: argparse.Namespace, group: Any) -> BatchTrainer:
-    """A trainer of the model, as it is after its first densifications: all SH degrees active, and Adam's state there."""
+    """A trainer of the model with all SH degrees active, whose Gaussians stay as many as they are."""
     packed = np.load(options.npz)
     cameras = models.from_npz_cameras(packed)
     cameras = [camera.resized(options.width or camera.width, options.height or camera.height) for camera in cameras]
     blank = torch.zeros(3, cameras[0].height, cameras[0].width, dtype=torch.uint8)
     points = PointCloud(np.random.RandomState(0).rand(max(4, group.size), 3), np.zeros((max(4, group.size), 3)))
     scene = Scene("synthetic", [View(camera, blank) for camera in cameras], [], points, 1.0, "all train")
-    config = TrainConfig(scene="-", output="-", device=options.device, batch=options.batch, blend_mode=options.blend_mode,
-                         iterations=10**6 * options.batch, densify_until_iter=0, sh_degree=options.sh_degree,
+    config = TrainConfig(scene="-", output="-", device=options.device, batch=options.batch,
+                         blend_mode=options.blend_mode, iterations=10**6 * options.batch, densify_until_iter=0, sh_degree=options.sh_degree,
                          deterministic=options.deterministic, background_gate=None).validate()
     trainer = BatchTrainer(config, scene, group)
     tensors = {name: torch.tensor(packed[key], device=options.device) for name, key in (

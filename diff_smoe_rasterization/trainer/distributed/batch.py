@@ -14,7 +14,7 @@ from ...autograd import INPUTS
 from ...footprints import GATE_GRADIENTS, Footprints, blend_op_arguments, projection_arguments
 from ...settings import GaussianRasterizationSettings
 from ..model import PARAMETERS, GaussianModel
-from .group import Group
+from ..system.group import Group
 
 _OPS = torch.ops.diff_smoe_rasterization
 _GATE = 8  # numbers of a footprint before its features
@@ -128,7 +128,7 @@ class Batch:
         names, wanted = gradient_places(present)
         sums: Optional[List[torch.Tensor]] = None
         means2D: List[torch.Tensor] = []
-        for view, projected in enumerate(self.projected):
+        for projected in self.projected:
             rows = records.pop(0)
             dense = rows.new_zeros((len(projected.radii), rows.shape[1]))
             dense.index_copy_(0, projected.visible, rows)

@@ -10,8 +10,8 @@ from typing import Any, Callable, Dict, List, Tuple
 import torch
 
 from ..model import GaussianModel, GaussianOptimizer
+from ..system.group import Group
 from ..training.shards import Shards
-from .group import Group
 
 KINDS = 4  # of Gaussians, at most, that a densification leaves
 

@@ -12,12 +12,12 @@ from ..results.evaluation import Evaluation, summary
 from ..results.metrics import image_metrics
 from ..scenes.images import View
 from ..scenes.scene import Scene
+from ..system.group import Group
 from ..system.progress import progress_bar
 from ..system.stopwatch import synchronised_time
 from ..training.loop import Trainer
 from ..training.strategy import BatchStep
 from .batch import Batch
-from .group import Group
 from .shards import DividedShards
 
 
@@ -26,7 +26,7 @@ class BatchTrainer(Trainer):
 
     def __init__(self, config: TrainConfig, scene: Scene, group: Group) -> None:
         if config.schedule not in BATCHED:
-            raise ConfigError(f"--strategy is {config.schedule}; on several GPUs it must be one of {', '.join(BATCHED)}")
+            raise ConfigError(f"--strategy is {config.schedule}; on several GPUs it must be {' or '.join(BATCHED)}")
         self.group = group
         self._asked = False
         super().__init__(config, scene)

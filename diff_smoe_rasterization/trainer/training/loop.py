@@ -12,7 +12,6 @@ import torch
 
 from ...losses import l1_ssim_loss_and_gradient
 from ..config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
-from ..distributed.group import ALONE, Group
 from ..errors import TrainerError
 from ..model import GaussianModel, GaussianOptimizer
 from ..results.evaluation import Evaluation, evaluate
@@ -26,6 +25,7 @@ from ..scenes.images import View, as_float
 from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
 from ..system.environment import extension_info
 from ..system.files import is_file, write_atomically, write_json_atomically
+from ..system.group import ALONE, Group
 from ..system.interrupt import DelayedInterrupt
 from ..system.output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
 from ..system.progress import progress_bar

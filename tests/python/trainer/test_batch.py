@@ -7,11 +7,11 @@ import math
 import pytest
 import torch
 
-from diff_smoe_rasterization.trainer.distributed.group import ALONE
 from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
 from diff_smoe_rasterization.trainer.errors import ConfigError
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.system.group import ALONE
 from diff_smoe_rasterization.trainer.training.loop import Trainer, train
 
 
@@ -25,7 +25,8 @@ def gradients_of(trainer):
     seen = {}
 
     def keep():
-        seen.update({name: tensor.grad.clone() for name, tensor in trainer.model.raw.items() if tensor.grad is not None})
+        seen.update({name: tensor.grad.clone() for name, tensor in trainer.model.raw.items()
+                     if tensor.grad is not None})
         if trainer.gate:
             seen["gate"] = trainer.gate.logarithm.grad.clone()
 

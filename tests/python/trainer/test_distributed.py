@@ -12,10 +12,10 @@ import torch
 import torch.distributed
 
 from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.distributed import launch
 from diff_smoe_rasterization.trainer.distributed.shards import run_of
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
+from diff_smoe_rasterization.trainer.system import torchrun as torchrun_module
 from diff_smoe_rasterization.trainer.training.loop import train
 
 HERE = os.path.dirname(os.path.abspath(__file__))
@@ -27,7 +27,8 @@ needs_gloo = pytest.mark.skipif(not torch.distributed.is_available() or not torc
 
 def torchrun(processes, *words, **environment):
     """Runs a program in so many processes. Returns its exit status, output and errors."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), *words]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes),
+               *words]
     path = os.pathsep.join([ROOT, os.environ.get("PYTHONPATH", "")])
     result = subprocess.run(command, capture_output=True, text=True, timeout=300,
                             env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", **environment})
@@ -78,8 +79,8 @@ def test_a_budget_holds_for_all_processes_together(tiny_config, tmp_path):
     assert 165 < row["num_gaussians"] <= 170 and row["num_gaussians"] != row["protocol"]["init_points"]
     other = dataclasses.replace(config, output=str(tmp_path / "two"))
     status, out, errors = torchrun(
-        2, "-m", "diff_smoe_rasterization", "train", config.scene, "-o", other.output, "--quiet", "--strategy", "steady",
-        "--budget", "170", "--iterations", "20", "--blend-mode", "smoe", "--sh-degree-interval", "10",
+        2, "-m", "diff_smoe_rasterization", "train", config.scene, "-o", other.output, "--quiet",
+        "--strategy", "steady", "--budget", "170", "--iterations", "20", "--blend-mode", "smoe", "--sh-degree-interval", "10",
         "--densify-from-iter", "4", "--densify-until-iter", "30", "--densification-interval", "8",
         "--densify-grad-threshold", "0.002")
     assert status == 0, errors
@@ -105,11 +106,11 @@ def test_gpus_starts_torchrun_with_the_same_command(tiny_config, monkeypatch):
     """Without --device it is cuda."""
     seen = []
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(launch, "launch", lambda gpus, words: seen.append((gpus, words)) or 3)
+    monkeypatch.setattr(torchrun_module, "launch", lambda gpus, words: seen.append((gpus, words)) or 3)
     words = ["train", tiny_config.scene, "-o", tiny_config.output, "--batch", "4"]
     assert main([*words, "--gpus", "2"]) == 3 and main([*words[:2], "--gpus=2", *words[2:], "--device", "cuda"]) == 3
     assert seen == [(2, [*words, "--device", "cuda"])] * 2
-    command = launch.torchrun_command(2, words)
+    command = torchrun_module.torchrun_command(2, words)
     assert command[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     assert command[6:] == ["-m", "diff_smoe_rasterization", *words]
 
@@ -117,4 +118,4 @@ def test_gpus_starts_torchrun_with_the_same_command(tiny_config, monkeypatch):
 def test_more_gpus_than_there_are_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     with pytest.raises(TrainerError, match="--gpus is 3; it must be at least 1 and at most 2"):
-        launch.check_gpus(3, "cuda")
+        torchrun_module.check_gpus(3, "cuda")

@@ -11,11 +11,11 @@ import torch
 from devices import without_cuda_because
 
 from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.distributed.group import ALONE
 from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
 from diff_smoe_rasterization.trainer.model import PARAMETERS
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.system.group import ALONE
 from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
 
 pytestmark = pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
@@ -133,10 +133,10 @@ def test_a_deterministic_training_over_batches_repeats_bit_for_bit(config, scene
 def test_two_gpus_train_the_bits_of_one(config, tmp_path):
     config = config.changed(batch=4, deterministic=True, output=str(tmp_path / "one"))
     train(config, progress=False)
-    words = ["train", config.scene, "-o", str(tmp_path / "two"), "--gpus", "2", "--quiet", "--deterministic", *(
-        word for name in ("batch", "iterations", "blend_mode", "sh_degree_interval", "densify_from_iter",
-                          "densify_until_iter", "densification_interval", "opacity_reset_interval",
-                          "densify_grad_threshold") for word in ("--" + name.replace("_", "-"), str(getattr(config, name))))]
+    words = ["train", config.scene, "-o", str(tmp_path / "two"), "--gpus", "2", "--quiet", "--deterministic"]
+    for name in ("batch", "iterations", "blend_mode", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
+                 "densification_interval", "opacity_reset_interval", "densify_grad_threshold"):
+        words += ["--" + name.replace("_", "-"), str(getattr(config, name))]
     assert main(words) == 0
     models = []
     for folder in ("one", "two"):

@@ -19,7 +19,7 @@ def check_gpus(gpus: int, device: str) -> None:
         raise ConfigError(f"{GPUS} is {gpus} with --device {device}; it needs --device cuda")
     there = torch.cuda.device_count()
     if not 1 <= gpus <= there:
-        raise ConfigError(f"{GPUS} is {gpus}; it must be at least 1 and at most {there}, the GPUs that torch finds here")
+        raise ConfigError(f"{GPUS} is {gpus}; it must be at least 1 and at most {there}: so many GPUs torch finds here")
 
 
 def without_gpus(words: Sequence[str]) -> List[str]:
