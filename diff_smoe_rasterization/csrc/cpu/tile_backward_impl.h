@@ -62,7 +62,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
     features_ = gaussian.features;
     position_ = P(gaussian.position);
-    conic_ = gaussian.projected.conic;
+    exponent_ = gaussian.exponent;
     absolute_x_ = absolute_y_ = P(S(0));
     one_ = x_ = y_ = xx_ = xy_ = yy_ = P(S(0));
     for (int f = 0; f < num_features_; ++f) dL_dfeatures()[f] = P(S(0));
@@ -93,7 +93,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     xy_ = fma(by_x, pairs.dy, xy_);
     yy_ = fma(by_y, pairs.dy, yy_);
     if (!absolute_) return;
-    const auto by_mean = power_by_mean(conic_, pairs.dx, pairs.dy);
+    const auto by_mean = power_by_mean(exponent_, pairs.dx, pairs.dy);
     absolute_x_ = absolute_x_ + abs(dL_dpower * by_mean.x);
     absolute_y_ = absolute_y_ + abs(dL_dpower * by_mean.y);
   }
@@ -138,7 +138,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   const S* features_ = nullptr;
   P position_;
   Mask<P> not_past_;
-  Sym2<S> conic_;                 // of the current Gaussian
+  ExponentFactors<S> exponent_;   // of the current Gaussian
   P absolute_x_, absolute_y_;     // its sums of absolute gradients
   P one_, x_, y_, xx_, xy_, yy_;  // the moments of the current Gaussian
   P dL_dfeatures_in_registers_[kFeatures != kAnyFeatures ? kFeatures : 1];

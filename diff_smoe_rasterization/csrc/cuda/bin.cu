@@ -1,6 +1,6 @@
-// Stage 2: the depth order, and the tile lists front to back. First the Gaussians are sorted by depth. Then a stable
-// sort by tile sorts their instances. So the keys of the second sort are short. (Faster-GS, arXiv:2602.09999, does the
-// same.)
+// Stage 2, the tile lists, front to back. macro_lists.cu has the usual way. Here is the one for instances with slots:
+// they are listed in depth order, Gaussian by Gaussian, so that a Gaussian's slots lie side by side. A stable sort by
+// tile sorts them. (Faster-GS, arXiv:2602.09999, sorts so.)
 #include <cub/device/device_radix_sort.cuh>
 #include <limits>
 
@@ -9,6 +9,7 @@
 #include "dsmoe/blend.h"
 #include "dsmoe/params.h"
 #include "look_back.cuh"
+#include "macro_lists.h"
 #include "reduce.cuh"
 #include "tile_rows.cuh"
 #include "tuning.cuh"
@@ -34,15 +35,15 @@ template <class S, class Key> struct ListArguments {
   LookBack look_back;      // zero before
   // These are null where the instances are only counted:
   Key* keys;             // [capacity] tile
-  int32_t* values;       // [capacity] sorted with the keys: the Gaussian, or its slot where gradients go to slots
-  int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
+  int32_t* values;       // [capacity] sorted with the keys: the slot
+  int32_t* slot_owners;  // [capacity] Gaussian of each slot
 };
 
 // The rows of tiles that the warp's Gaussians meet. position: of the lane's Gaussian in the depth order.
 template <class S, class Key>
 __device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t position,
                                    typename WarpTileRows<S>::Shared* shared, int lane) {
-  const bool exists = lane < list.gaussians_per_warp && position < list.num_gaussians;
+  const bool exists = lane < list.gaussians_per_warp && position < *list.saved.num_ordered;
   const int32_t gaussian = exists ? list.saved.order[position] : -1;
   FootprintTiles<S> tiles;
   if (gaussian >= 0) {
@@ -75,8 +76,8 @@ __device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row,
     const int32_t gaussian = from_lane(row.gaussian, owner);
     if (k >= fit) continue;
     keys[k] = static_cast<Key>(tile);
-    values[k] = list.slot_owners != nullptr ? static_cast<int32_t>(slot + k) : gaussian;
-    if (list.slot_owners != nullptr) list.slot_owners[slot + k] = gaussian;
+    values[k] = static_cast<int32_t>(slot + k);
+    list.slot_owners[slot + k] = gaussian;
   }
   slot += instances.total;
 }
@@ -180,17 +181,9 @@ __global__ void pair_with_slots_kernel(const __grid_constant__ SlotArguments arg
   arguments.instances[2 * i + 1] = arguments.slots[i];
 }
 
-// How many warps are enough to keep the current device busy.
-int64_t enough_warps() {
-  int device = 0, multiprocessors = 0;
-  check(cudaGetDevice(&device), "asking for the device");
-  check(cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount, device), "asking for its size");
-  return int64_t(kEnoughWarpsPerMultiprocessor) * multiprocessors;
-}
-
 // Lists the instances into the memory that `list` has, or only counts them.
 template <class Key, class S> void list_instances(ListArguments<S, Key> list, Scratch& scratch, cudaStream_t stream) {
-  const int64_t enough = enough_warps();
+  const int64_t enough = int64_t(kEnoughWarpsPerMultiprocessor) * num_multiprocessors();  // to keep the device busy
   list.gaussians_per_warp = kWarp;
   while (list.gaussians_per_warp > 1 && list.num_gaussians < enough * list.gaussians_per_warp) {
     list.gaussians_per_warp /= 2;
@@ -224,16 +217,15 @@ template <class Key, class S> ListArguments<S, Key> list_arguments(const Frame<S
   return list;
 }
 
-template <class Key, class S> void bin_by(const Frame<S>& frame, Scratch& scratch, cudaStream_t stream) {
+template <class Key, class S> void bin_with_slots(const Frame<S>& frame, Scratch& scratch, cudaStream_t stream) {
   const SavedForward<S>& saved = frame.saved;
   const int64_t tiles = num_tiles(frame.camera.width, frame.camera.height), capacity = saved.capacity;
-  const bool slots = saved.instance_width == 2;
   auto list = list_arguments<Key>(frame);
   list.keys = allocate<Key>(scratch, capacity);
   list.values = allocate<int32_t>(scratch, capacity);
-  list.slot_owners = slots ? allocate<int32_t>(scratch, capacity) : nullptr;
+  list.slot_owners = allocate<int32_t>(scratch, capacity);
   Key* sorted_keys = allocate<Key>(scratch, capacity);
-  int32_t* sorted_values = slots ? allocate<int32_t>(scratch, capacity) : saved.instances;
+  int32_t* sorted_values = allocate<int32_t>(scratch, capacity);
   // Keys behind the last instance are above every tile.
   check(cudaMemsetAsync(list.keys, 0xff, capacity * sizeof(Key), stream), "listing instances");
   list_instances(list, scratch, stream);
@@ -244,16 +236,14 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, Scratch& scratc
       return cub::DeviceRadixSort::SortPairs(memory, bytes, list.keys, sorted_keys, list.values, sorted_values,
                                              capacity, 0, bits, stream);
     });
-    if (slots) {
-      SlotArguments pairs = {};
-      pairs.capacity = capacity;
-      pairs.num_instances = saved.num_instances;
-      pairs.slots = sorted_values;
-      pairs.owners = list.slot_owners;
-      pairs.instances = saved.instances;
-      pair_with_slots_kernel<<<blocks_for(capacity, kListBlock), kListBlock, 0, stream>>>(pairs);
-      DSMOE_CHECK_LAUNCH("pair_with_slots");
-    }
+    SlotArguments pairs = {};
+    pairs.capacity = capacity;
+    pairs.num_instances = saved.num_instances;
+    pairs.slots = sorted_values;
+    pairs.owners = list.slot_owners;
+    pairs.instances = saved.instances;
+    pair_with_slots_kernel<<<blocks_for(capacity, kListBlock), kListBlock, 0, stream>>>(pairs);
+    DSMOE_CHECK_LAUNCH("pair_with_slots");
   }
   OffsetArguments<Key> offsets = {};
   offsets.tiles = tiles;
@@ -274,16 +264,6 @@ bool needs_depth_order(BlendMode mode) {
   return needed;
 }
 
-template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work) {
-  const int64_t num_gaussians = frame.inputs.num_gaussians;
-  if (num_gaussians == 0) return;
-  auto* sorted_keys = allocate<DepthBits<S>>(*work.scratch, num_gaussians);
-  with_temporary(*work.scratch, "sorting by depth", [&](void* memory, size_t& bytes) {
-    return cub::DeviceRadixSort::SortPairs(memory, bytes, keys.depths, sorted_keys, keys.gaussians, frame.saved.order,
-                                           num_gaussians, 0, 8 * int(sizeof(S)), work.stream);
-  });
-}
-
 template <class S> void count_instances(const Frame<S>& frame, const Work& work) {
   Frame<S> counted = frame;
   counted.saved.slot_ranges = nullptr;
@@ -292,13 +272,13 @@ template <class S> void count_instances(const Frame<S>& frame, const Work& work)
 }
 
 template <class S> void bin(const Frame<S>& frame, const Work& work) {
+  if (frame.saved.instance_width == 1) return bin_by_macro_tiles(frame, work);
   dispatch_keys(num_tiles(frame.camera.width, frame.camera.height),
-                [&](auto key) { bin_by<decltype(key)>(frame, *work.scratch, work.stream); });
+                [&](auto key) { bin_with_slots<decltype(key)>(frame, *work.scratch, work.stream); });
 }
 
-#define DSMOE_INSTANTIATE(S)                                                      \
-  template void sort_by_depth(const Frame<S>&, const DepthKeys<S>&, const Work&); \
-  template void count_instances(const Frame<S>&, const Work&);                    \
+#define DSMOE_INSTANTIATE(S)                                   \
+  template void count_instances(const Frame<S>&, const Work&); \
   template void bin(const Frame<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

@@ -106,7 +106,8 @@ struct TensorShare {
 // kAbsolute: also sums |dL/dmean|. Where the number of features is not known, the arguments say that instead.
 template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
-  static constexpr bool kReadsFeatures = true, kReadsIndices = true;
+  static constexpr bool kReadsFeatures = true, kInSegments = false;
+  static constexpr int kUnroll = 1;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
   static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
 
@@ -117,11 +118,10 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
     return kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
   }
 
-  __device__ __forceinline__ void begin_chunk(int32_t) {}
+  __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const WarpStage<S, BackwardVisitor>& stage, int j, int32_t position) {
-    const auto current = stage.gaussians[j];
-    const ProjectedGaussian<S>& gaussian = current.gaussian;
+  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged) {
+    const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
     const ColumnExponent<S, S> exponent(gaussian.conic, dx);
     const S least_alpha = cut.of(gaussian.opacity);
@@ -129,15 +129,15 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
     bool contributes[kLanePixels], any = false;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      gate[k] = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
-      contributes[k] = gate[k].counts && position < pixels.last[k];
+      gate[k] = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
+      contributes[k] = gate[k].counts && gaussian.position < pixels.last[k];
       any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
     }
     if (!__any_sync(kAllLanes, any)) return;
 
-    const int32_t index = stage.indices[j];
+    const int32_t index = gaussian.gaussian, position = gaussian.position;
     const S* features = arguments.saved.features + int64_t(index) * feature_stride(num_features());
-    const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? current.features[f] : features[f]; };
+    const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? gaussian.features[f] : features[f]; };
     S weight[kLanePixels], dL_dpower[kLanePixels];
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
@@ -164,12 +164,12 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
     }
   }
 
-  __device__ __forceinline__ void add_absolute(const S (&dL_dpower)[kLanePixels], const Sym2<S>& conic, S dx, S dy,
-                                               int32_t index, int32_t position) {
+  __device__ __forceinline__ void add_absolute(const S (&dL_dpower)[kLanePixels], const ExponentFactors<S>& conic, S dx,
+                                               S dy, int32_t index, int32_t position) {
     S sums[kNumAbsoluteSums] = {};
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto by_mean = power_by_mean(conic, dx, dy + S(k * kLaneStep));
+      const auto by_mean = power_by_mean(conic, dx, below(dy, k));
       sums[0] += abs(dL_dpower[k] * by_mean.x);
       sums[1] += abs(dL_dpower[k] * by_mean.y);
     }
@@ -178,9 +178,8 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
 
   __device__ __forceinline__ void add_by_tensors(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
                                                  S dx, S dy, int32_t index, int32_t position) {
-    *reinterpret_cast<float2*>(&tensors.stage.values[batch][2 * tile.lane]) = make_float2(dL_dpower[0], dL_dpower[1]);
-    *reinterpret_cast<float2*>(&tensors.stage.values[kTensorBatch + batch][2 * tile.lane]) =
-        make_float2(weight[0], weight[1]);
+    *reinterpret_cast<float4*>(&tensors.stage.values[batch][4 * tile.lane]) =
+        make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
     if (tile.lane == 0) {
       tensors.stage.gaussians[batch] =
           make_float4(dx + kWarpTileCentre, dy + kWarpTileCentre, __int_as_float(index), __int_as_float(position));
@@ -313,11 +312,10 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
 template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink>
 __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures && !kAbsolute
                                                   ? kBackwardBlocks
-                                                  : kGeneralBackwardBlocks)
+                                                  : kGeneralWalkBlocks)
     blend_backward_kernel(const __grid_constant__ BackwardWithSink<S, Sink> arguments) {
   using Visitor = BackwardVisitor<S, kMode, kFeatures, kAbsolute, Sink>;
-  __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
-  __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
+  __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
   __shared__ TensorStage tensor_stages[Visitor::kTensor ? kWarpsPerTile : 1];
   __shared__ TensorBasis moment_basis;
   if (Sink::kOnlyOutgrown && !overflows(arguments.saved)) return;
@@ -341,8 +339,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
   Visitor visitor = {
       arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(), 0};
-  const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
-  const unsigned met = walk_tile<S>(stage, range, visitor);
+  const unsigned met = walk_tile<S>(stages[warp], range, visitor);
   visitor.finish();
   count_pairs(arguments, tile.lane, met);
 }

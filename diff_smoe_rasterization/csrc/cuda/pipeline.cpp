@@ -30,14 +30,10 @@ void check_slots(int64_t instances) {
                             " tile instances; with deterministic=True the most is " + std::to_string(kMostSlots));
 }
 
-// Memory for what the depth sort sorts. In a mode without a depth order, `project` fills saved.order itself.
-template <class S> DepthKeys<S> depth_keys(const Frame<S>& frame, Scratch& scratch) {
-  const int64_t count = frame.inputs.num_gaussians;
-  if (!needs_depth_order(frame.config.mode)) return {nullptr, frame.saved.order};
-  DepthKeys<S> keys;
-  keys.depths = allocate<DepthBits<S>>(scratch, count);
-  keys.gaussians = allocate<int32_t>(scratch, count);
-  return keys;
+// Memory for what the depth sort sorts; null in a mode without a depth order.
+template <class S> DepthBits<S>* allocate_depths(const Frame<S>& frame, Scratch& scratch) {
+  if (!needs_depth_order(frame.config.mode)) return nullptr;
+  return allocate<DepthBits<S>>(scratch, frame.inputs.num_gaussians);
 }
 
 // Waits for a number of the device.
@@ -92,13 +88,13 @@ template <class S> SavedSizes begin_saved(Frame<S>& frame, const Run& run, Alloc
   return sizes;
 }
 
-// From the footprints and the keys of their depths to the images.
+// From the footprints and their depths to the images.
 template <class S>
-void draw(Frame<S>& frame, SavedSizes sizes, const DepthKeys<S>& keys, const Run& run, Allocator& memory,
+void draw(Frame<S>& frame, SavedSizes sizes, const DepthBits<S>* depths, const Run& run, Allocator& memory,
           EventClock& clock) {
   auto& saved = frame.saved;
   Work work = {run.stream, &memory};
-  if (keys.depths != nullptr) sort_by_depth(frame, keys, work);
+  if (depths != nullptr) sort_by_depth(frame, depths, work);
   clock.end(&StageTimes::sort);
   memory.release();
 
@@ -139,15 +135,15 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
   EventClock clock(run.times, run.stream);
   frame.saved = {};
   const SavedSizes sizes = begin_saved(frame, run, memory);
-  const DepthKeys<S> keys = depth_keys(frame, memory);
-  project(frame, keys, {run.stream, &memory});
+  DepthBits<S>* depths = allocate_depths(frame, memory);
+  project(frame, depths, {run.stream, &memory});
   clock.end(&StageTimes::project);
-  draw(frame, sizes, keys, run, memory, clock);
+  draw(frame, sizes, depths, run, memory, clock);
 }
 
 template <class S> void project_footprints(const Frame<S>& frame, const Run& run, Allocator& memory) {
   EventClock clock(run.times, run.stream);
-  project(frame, DepthKeys<S>(), {run.stream, &memory});
+  project<S>(frame, nullptr, {run.stream, &memory});
   clock.end(&StageTimes::project);
   clock.finish();
   memory.release();
@@ -159,9 +155,9 @@ template <class S> void blend_footprints(Frame<S>& frame, const Run& run, Alloca
   frame.saved = {};
   frame.saved.projected = given.projected, frame.saved.features = given.features;
   const SavedSizes sizes = begin_saved(frame, run, memory);
-  const DepthKeys<S> keys = depth_keys(frame, memory);
-  key_footprints(frame, keys, {run.stream, &memory});
-  draw(frame, sizes, keys, run, memory, clock);
+  DepthBits<S>* depths = allocate_depths(frame, memory);
+  key_footprints(frame, depths, {run.stream, &memory});
+  draw(frame, sizes, depths, run, memory, clock);
 }
 
 template <class S>
@@ -218,9 +214,8 @@ template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& 
   Frame<S> projected = frame;
   projected.saved.projected = allocate<ProjectedGaussian<S>>(memory, count);
   projected.saved.features = allocate<S>(memory, count * feature_stride(frame.config.num_features()));
-  DepthKeys<S> keys;
-  keys.gaussians = allocate<int32_t>(memory, count);
-  project(projected, keys, {run.stream, &memory});
+  projected.saved.order = nullptr;
+  project<S>(projected, nullptr, {run.stream, &memory});
   memory.release();
 }
 

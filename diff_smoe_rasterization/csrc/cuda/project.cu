@@ -7,13 +7,25 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
+// Where the order of the Gaussians begins: with what the depth sort sorts or, without a depth order, with the order.
+template <class S> struct OrderTargets {
+  DepthBits<S>* depths;   // [N] the greatest number for culled Gaussians; null: the order is written
+  int32_t* order;         // [N] 0, 1, 2, ...; ~i for a culled Gaussian i; or null
+  int64_t* num_ordered;   // N is written
+  int64_t num_gaussians;  // N
+};
+
+template <class S> OrderTargets<S> order_targets(const Frame<S>& frame, DepthBits<S>* depths) {
+  return {depths, frame.saved.order, frame.saved.num_ordered, frame.inputs.num_gaussians};
+}
+
 template <class S> struct ProjectArguments {
   GaussianInputs<S> inputs;  // read
   DeviceCamera<S> camera;    // read
   RasterConfig<S> config;    // read
   SavedForward<S> saved;     // projected and features are written
   int32_t* radii;            // [N] pixels, written
-  DepthKeys<S> keys;         // written
+  OrderTargets<S> order;     // written
 };
 
 // Writes the features of a Gaussian, one row of saved.features. Where their number is known they stay in registers
@@ -33,10 +45,20 @@ template <int kFeatures, class S> __device__ bool store_features(const ColorSour
   }
 }
 
-// What the depth sort sorts of Gaussian i. radius: 0 where it is culled.
-template <class S> __device__ void store_keys(const DepthKeys<S>& keys, int64_t i, int32_t radius, S depth) {
-  if (keys.gaussians != nullptr) keys.gaussians[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
-  if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);
+// radius: 0 where Gaussian i is culled.
+template <class S> __device__ void store_order(const OrderTargets<S>& to, int64_t i, int32_t radius, S depth) {
+  if (to.depths != nullptr) {
+    to.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);
+  } else if (to.order != nullptr) {
+    to.order[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
+    if (i == 0) *to.num_ordered = to.num_gaussians;
+  }
+}
+
+// Of no Gaussians there is no thread to say so.
+template <class S> void order_nothing(const Frame<S>& frame, cudaStream_t stream) {
+  if (frame.saved.num_ordered == nullptr) return;
+  check(cudaMemsetAsync(frame.saved.num_ordered, 0, sizeof(int64_t), stream), "projecting Gaussians");
 }
 
 template <class S, int kFeatures, class Rows>
@@ -81,14 +103,14 @@ __global__ void __launch_bounds__(kRowsBlock) project_kernel(const __grid_consta
     arguments.saved.projected[i] = projection.gaussian;
   }
   arguments.radii[i] = radius;
-  store_keys(arguments.keys, i, radius, depth);
+  store_order(arguments.order, i, radius, depth);
 }
 
 template <class S> struct KeyArguments {
   int64_t num_gaussians;                  // N
   const ProjectedGaussian<S>* projected;  // [N]
   const int32_t* radii;                   // [N] pixels
-  DepthKeys<S> keys;                      // written
+  OrderTargets<S> order;                  // written
 };
 
 template <class S>
@@ -96,7 +118,7 @@ __global__ void __launch_bounds__(kStoreBlock)
     key_footprints_kernel(const __grid_constant__ KeyArguments<S> arguments) {
   const int64_t i = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
   if (i >= arguments.num_gaussians) return;
-  store_keys(arguments.keys, i, arguments.radii[i], arguments.projected[i].depth);
+  store_order(arguments.order, i, arguments.radii[i], arguments.projected[i].depth);
 }
 
 // A thread copies one number: neighbours read and write neighbouring ones.
@@ -135,16 +157,16 @@ __global__ void __launch_bounds__(kStoreBlock)
 
 }  // namespace
 
-template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work) {
+template <class S> void project(const Frame<S>& frame, DepthBits<S>* depths, const Work& work) {
   const GaussianInputs<S>& inputs = frame.inputs;
-  if (inputs.num_gaussians == 0) return;
+  if (inputs.num_gaussians == 0) return order_nothing(frame, work.stream);
   ProjectArguments<S> arguments = {};
   arguments.inputs = inputs;
   arguments.camera = frame.camera;
   arguments.config = frame.config;
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
-  arguments.keys = keys;
+  arguments.order = order_targets(frame, depths);
   dispatch_sh_rows(inputs, true, [&](auto type, size_t shared) {
     using Rows = typename decltype(type)::type;
     const auto launch = [&](auto kernel) {
@@ -158,13 +180,13 @@ template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys,
   });
 }
 
-template <class S> void key_footprints(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work) {
+template <class S> void key_footprints(const Frame<S>& frame, DepthBits<S>* depths, const Work& work) {
+  if (frame.inputs.num_gaussians == 0) return order_nothing(frame, work.stream);
   KeyArguments<S> arguments = {};
   arguments.num_gaussians = frame.inputs.num_gaussians;
   arguments.projected = frame.saved.projected;
   arguments.radii = frame.images.radii;
-  arguments.keys = keys;
-  if (arguments.num_gaussians == 0) return;
+  arguments.order = order_targets(frame, depths);
   key_footprints_kernel<<<blocks_for(arguments.num_gaussians, kStoreBlock), kStoreBlock, 0, work.stream>>>(arguments);
   DSMOE_CHECK_LAUNCH("key_footprints");
 }
@@ -189,9 +211,9 @@ template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const
   DSMOE_CHECK_LAUNCH("mark_visible");
 }
 
-#define DSMOE_INSTANTIATE(S)                                                       \
-  template void project(const Frame<S>&, const DepthKeys<S>&, const Work&);        \
-  template void key_footprints(const Frame<S>&, const DepthKeys<S>&, const Work&); \
+#define DSMOE_INSTANTIATE(S)                                                 \
+  template void project(const Frame<S>&, DepthBits<S>*, const Work&);        \
+  template void key_footprints(const Frame<S>&, DepthBits<S>*, const Work&); \
   template void mark_visible(const Frame<S>&, bool*, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

@@ -92,8 +92,10 @@ template <class S> DSMOE_HD GateMoments<S> shift_moments(const GateMoments<S>& m
 }
 
 // dpower/dmean of one pair, from the same derivative as moments_backward; d: pixel - mean.
-template <class Real, class S> DSMOE_HD Vec2<Real> power_by_mean(const Sym2<S>& conic, Real dx, Real dy) {
-  return {fma(Real(conic.xx), dx, Real(conic.xy) * dy), fma(Real(conic.xy), dx, Real(conic.yy) * dy)};
+template <class Real, class S> DSMOE_HD Vec2<Real> power_by_mean(const ExponentFactors<S>& factors, Real dx, Real dy) {
+  const Real by_x = fma(Real(S(2) * factors.xx), dx, Real(factors.xy) * dy);
+  const Real by_y = fma(Real(factors.xy), dx, Real(S(2) * factors.yy) * dy);
+  return {-by_x, -by_y};
 }
 
 // Sums over pixels of |dL/dmean|, each axis apart: they do not cancel where pixels pull a centre to and fro.
