@@ -62,7 +62,7 @@ _beside = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
 if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",), ("build_support", "backend.py"))):
     __path__.append(_beside)
 
-__all__ = ["BLEND_MODES", "Contributions", "DirectRendering", "FusedAdam", "GaussianRasterizationSettings", "GaussianRasterizer",
-           "Importance", "LazyAdam", "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats", "__version__", "build_info",
-           "distCUDA2", "fused_ssim", "rasterize", "rasterize_gaussians", "rasterize_with_splats", "set_profiling",
-           "settings_from_camera", "stage_times", "visible_radii"]
+__all__ = ["BLEND_MODES", "Contributions", "DirectRendering", "FusedAdam", "GaussianRasterizationSettings",
+           "GaussianRasterizer", "Importance", "LazyAdam", "OUTPUTS", "Rendering", "SparseGaussianAdam", "Splats",
+           "__version__", "build_info", "distCUDA2", "fused_ssim", "rasterize", "rasterize_gaussians",
+           "rasterize_with_splats", "set_profiling", "settings_from_camera", "stage_times", "visible_radii"]

@@ -178,6 +178,10 @@ struct Work {
 // Fills frame.saved.projected, frame.saved.features, frame.images.radii and keys.
 template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
 
+// Fills frame.images.radii alone, where there are at most kMostHeldFeatures features.
+constexpr int kMostHeldFeatures = 8;
+template <class S> void project_radii(const Frame<S>& frame, const Work& work);
+
 // Fills frame.saved.order.
 template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
 
