@@ -174,16 +174,17 @@ class GaussianOptimizer:
         """
         new = new or {}
         fresh = max((len(values) for values in new.values()), default=0)
-        old = [(name, key, tensor) for name in PARAMETERS for key, tensor in self._tensors(name).items()]
-        taken = torch.ops.diff_smoe_rasterization.gather_rows([tensor.detach() for *_, tensor in old], rows)
-        for (name, key, _), tensor in zip(old, taken):
-            last = tensor[len(tensor) - fresh:]
-            if key != "raw":
-                last.zero_()
-            elif name in new:
-                last.copy_(new[name])
-        for name in PARAMETERS:
-            self._put(name, {key: tensor for (of, key, _), tensor in zip(old, taken) if of == name})
+        for name in PARAMETERS:  # one after the other: then only one is in memory twice
+            old = self._tensors(name)
+            taken = torch.ops.diff_smoe_rasterization.gather_rows([tensor.detach() for tensor in old.values()], rows)
+            tensors = dict(zip(old, taken))
+            for key, tensor in tensors.items():
+                if key != "raw":
+                    tensor[len(tensor) - fresh:] = 0
+                elif name in new:
+                    tensor[len(tensor) - fresh:] = new[name]
+            del old
+            self._put(name, tensors)
 
     def set_opacity_logits(self, logits: torch.Tensor) -> None:
         """Sets all opacity logits [N, 1] and forgets their moments."""
@@ -233,6 +234,8 @@ class GaussianOptimizer:
         The new leaf has no gradient, so the current step leaves it alone: as in 3DGS, where an iteration that
         densifies steps nothing and one that resets opacities steps all but them.
         """
+        if name in self.model.color_sources().values():
+            self.model.lazy = None  # `_tensors` has brought it up to date
         moments = {key: tensor.contiguous() for key, tensor in tensors.items()}
         new = moments.pop("raw").requires_grad_()
         state = self.adam.state.pop(self.model.stored[name], None)
