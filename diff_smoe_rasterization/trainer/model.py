@@ -171,21 +171,24 @@ class GaussianOptimizer:
         self.take(mask.nonzero().squeeze(1))  # on a GPU the host waits here, once for all tensors
 
     def take(self, rows: torch.Tensor, new: Optional[Dict[str, torch.Tensor]] = None) -> None:
-        """Puts these rows of Gaussians in place of all, in one pass over memory.
+        """Puts these rows [M] of Gaussians in place of all, in one pass over memory.
 
         new: raw parameters of the last ones, where they differ from those of their rows. As many of the last ones begin
         without moments.
         """
-        def edit(tensor: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
-            taken = tensor.index_select(0, rows)
-            taken[len(taken) - len(last):] = last
-            return taken
-
         new = new or {}
-        count = max((len(values) for values in new.values()), default=0)
-        for name in PARAMETERS:
-            like = self.model.raw[name]
-            self._replace(name, edit, new.get(name, like.new_zeros(0, *like.shape[1:])), like.new_zeros(count, *like.shape[1:]))
+        fresh = max((len(values) for values in new.values()), default=0)
+        for name in PARAMETERS:  # one after the other: then only one is in memory twice
+            old = self._tensors(name)
+            taken = torch.ops.diff_smoe_rasterization.gather_rows([tensor.detach() for tensor in old.values()], rows)
+            tensors = dict(zip(old, taken))
+            for key, tensor in tensors.items():
+                if key != "raw":
+                    tensor[len(tensor) - fresh:] = 0
+                elif name in new:
+                    tensor[len(tensor) - fresh:] = new[name]
+            del old
+            self._put(name, tensors)
 
     def set_opacity_logits(self, logits: torch.Tensor) -> None:
         """Sets all opacity logits [N, 1] and forgets their moments."""
@@ -224,21 +227,30 @@ class GaussianOptimizer:
             self._replace(name, lambda _, new: new.clone(), raw[name])
 
     def _replace(self, name: str, edit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
-                 rows: torch.Tensor, zeros: Optional[torch.Tensor] = None) -> None:
-        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros) in place of its moments.
+                 rows: torch.Tensor) -> None:
+        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros like rows) in place of its moments."""
+        self._put(name, {key: edit(tensor.detach(), rows.detach() if key == "raw" else torch.zeros_like(rows))
+                         for key, tensor in self._tensors(name).items()})
 
-        zeros: by default like `rows`.
+    def _tensors(self, name: str) -> Dict[str, torch.Tensor]:
+        """The parameter, `raw`, and its moments, where it has some, by their names in Adam's state."""
+        parameter = self.model.raw[name]
+        state = self.adam.state.get(parameter, {})
+        return {"raw": parameter, **{key: state[key] for key in ("exp_avg", "exp_avg_sq") if key in state}}
+
+    def _put(self, name: str, tensors: Dict[str, torch.Tensor]) -> None:
+        """Puts others in place of what `_tensors` gives.
 
         The new leaf has no gradient, so the current step leaves it alone: as in 3DGS, where an iteration that
         densifies steps nothing and one that resets opacities steps all but them.
         """
-        old = self.model.raw[name]
-        new = edit(old.detach(), rows.detach()).contiguous().requires_grad_()
-        state = self.adam.state.pop(old, None)
+        if name in self.model.color_sources().values():
+            self.model.lazy = None  # `_tensors` has brought it up to date
+        moments = {key: tensor.contiguous() for key, tensor in tensors.items()}
+        new = moments.pop("raw").requires_grad_()
+        state = self.adam.state.pop(self.model.stored[name], None)
         if state is not None:
-            zeros = torch.zeros_like(rows) if zeros is None else zeros
-            for key in ("exp_avg", "exp_avg_sq"):
-                state[key] = edit(state[key], zeros).contiguous()
+            state.update(moments)
             self.adam.state[new] = state
         self.group(name)["params"][0] = new
         self.model.stored[name] = new

@@ -51,9 +51,10 @@ TEST(GaussianAdam, IsActivateBackwardAdamAndActivate) {
     for (int i = 0; i < kSizes[t] * kCount; ++i) {
       if (radii[i / kSizes[t]] == 0) unread[t][i] = 1e9;  // what was not seen has no gradient, whatever lies there
     }
-    adam.tensors[t] = {stepped[t].data(), t > 0 ? stepped_value[t].data() : nullptr, unread[t].data(),
-                       stepped_moment[t].data(), stepped_square[t].data(), kSizes[t], activations[t],
-                       {0.1 + t, 2.0 - 0.1 * t}};
+    adam.tensors[t] = {stepped[t].data(),        t > 0 ? stepped_value[t].data() : nullptr,
+                       unread[t].data(),         stepped_moment[t].data(),
+                       stepped_square[t].data(), kSizes[t],
+                       activations[t],           {0.1 + t, 2.0 - 0.1 * t}};
   }
   cpu::step_gaussians(adam, 2);
 

@@ -27,14 +27,14 @@ TEST(LazyAdam, RowsThatWaitMakeTheStepsOfDenseAdam) {
   const int32_t no_row[] = {0, 0, 0}, first[] = {5, 0, 0}, second[] = {0, 1, 0};
   std::vector<int32_t> marks = {0, 0, 0};
   std::vector<AdamRates<double>> noted(rates.size());
-  LazyAdam<double> adam = {{tensor_of(rows[0]), tensor_of(rows[1])}, 2, 3, marks.data(), nullptr, noted.data(), 0,
-                           kConstants};
+  LazyAdam<double> adam = {
+      {tensor_of(rows[0]), tensor_of(rows[1])}, 2, 3, marks.data(), nullptr, noted.data(), 0, kConstants};
   const int32_t* const radii[] = {first, no_row, second};
   for (int step = 0; step < 3; ++step) {
     adam.steps = step, adam.radii = radii[step];
     cpu::catch_up(adam, 1);
-    cpu::note_step<double>({3, marks.data(), radii[step], noted.data() + 2 * step, {rates[2 * step], rates[2 * step + 1]},
-                            2, step});
+    cpu::note_step<double>(
+        {3, marks.data(), radii[step], noted.data() + 2 * step, {rates[2 * step], rates[2 * step + 1]}, 2, step});
   }
   EXPECT_EQ(marks, (std::vector<int32_t>{~0, ~2, 0})) << "two gradients wait, and one row has missed all";
   EXPECT_EQ(rows[0].parameter[0], 1) << "nothing has read it";

@@ -15,8 +15,15 @@ template <class S> void catch_up_row(const LazyAdam<S>& adam, int64_t row) {
     const LazyAdamTensor<S>& tensor = adam.tensors[t];
     const int64_t first = row * tensor.row_size;
     for (int64_t i = first; i < first + tensor.row_size; ++i) {
-      const S gradient = mark.waiting ? tensor.gradient[i] : S(0);
-      catch_up(adam, mark, adam.rates + t, gradient, tensor.parameter[i], tensor.moment[i], tensor.square[i]);
+      int32_t step = mark.steps;
+      const auto rates = [&] { return adam.rates[step * adam.num_tensors + t]; };
+      if (mark.waiting) {
+        adam_step(adam.constants, rates(), tensor.gradient[i], tensor.parameter[i], tensor.moment[i], tensor.square[i]);
+        ++step;
+      }
+      for (; step < adam.steps; ++step) {
+        adam_rest_step(adam.constants, rates(), tensor.parameter[i], tensor.moment[i], tensor.square[i]);
+      }
     }
   }
   adam.marks[row] = adam.steps;
@@ -40,8 +47,8 @@ template <class S> void note_step(const LazyAdamStep<S>& step) {
   }
 }
 
-#define DSMOE_INSTANTIATE(S)                          \
-  template void catch_up(const LazyAdam<S>&, int);    \
+#define DSMOE_INSTANTIATE(S)                       \
+  template void catch_up(const LazyAdam<S>&, int); \
   template void note_step(const LazyAdamStep<S>&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

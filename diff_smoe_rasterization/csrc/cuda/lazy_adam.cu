@@ -1,4 +1,4 @@
-// Lazy Adam: a warp finds the rows to bring up to date among 32, and shares out their numbers to its lanes.
+// Lazy Adam: a warp finds the rows to bring up to date among 32, and each half of it takes every other one of them.
 #include "dsmoe/lazy_adam.h"
 #include "tuning.cuh"
 
@@ -8,8 +8,74 @@ namespace {
 
 constexpr int kWarps = kAdamBlock / kWarp;
 
+// The lanes that take a row together, and how many numbers each holds at a time. All of a row miss the same steps, so
+// that lanes wait for each other only where the rows of a warp differ; and 48 numbers are a row of spherical harmonics.
+constexpr int kRowLanes = 16;
+constexpr int kRowNumbers = 3;
+
+// Blocks that one multiprocessor holds at once: of floats, so many that enough loads are in flight.
+template <class S> constexpr int kBlocks = sizeof(S) == 4 ? 4 : 1;
+
+// Where a number of each row lies: one column of one tensor.
+template <class S> struct Column {
+  LazyAdamTensor<S> tensor;  // that begins at the column
+  const AdamRates<S>* rates;
+  bool exists;
+
+  // column: counted over all tensors.
+  __device__ Column(const LazyAdam<S>& adam, int column) {
+    int t = 0;
+    while (t < adam.num_tensors && column >= adam.tensors[t].row_size) column -= adam.tensors[t++].row_size;
+    exists = t < adam.num_tensors;
+    if (!exists) return;
+    tensor = adam.tensors[t];
+    tensor.parameter += column, tensor.moment += column, tensor.square += column, tensor.gradient += column;
+    rates = adam.rates + t;
+  }
+};
+
+// Makes the steps that a row has missed on the columns of a lane. Those that do not exist compute with zeros.
 template <class S>
-__global__ void __launch_bounds__(kAdamBlock) catch_up_kernel(const __grid_constant__ LazyAdam<S> adam) {
+__device__ void catch_up_row(const LazyAdam<S>& adam, const Column<S> (&columns)[kRowNumbers], int64_t row,
+                             LazyAdamMark mark) {
+  S gradient[kRowNumbers], parameter[kRowNumbers] = {}, moment[kRowNumbers] = {}, square[kRowNumbers] = {};
+#pragma unroll
+  for (int k = 0; k < kRowNumbers; ++k) {
+    if (!columns[k].exists) continue;
+    const LazyAdamTensor<S>& tensor = columns[k].tensor;
+    const int64_t i = row * tensor.row_size;
+    gradient[k] = mark.waiting ? tensor.gradient[i] : S(0);
+    parameter[k] = tensor.parameter[i], moment[k] = tensor.moment[i], square[k] = tensor.square[i];
+  }
+  int32_t step = mark.steps;
+  if (mark.waiting) {
+#pragma unroll
+    for (int k = 0; k < kRowNumbers; ++k) {
+      if (!columns[k].exists) continue;
+      adam_step(adam.constants, columns[k].rates[step * adam.num_tensors], gradient[k], parameter[k], moment[k],
+                square[k]);
+    }
+    ++step;
+  }
+#pragma unroll 1
+  for (; step < adam.steps; ++step) {
+#pragma unroll
+    for (int k = 0; k < kRowNumbers; ++k) {
+      if (!columns[k].exists) continue;
+      adam_rest_step(adam.constants, columns[k].rates[step * adam.num_tensors], parameter[k], moment[k], square[k]);
+    }
+  }
+#pragma unroll
+  for (int k = 0; k < kRowNumbers; ++k) {
+    if (!columns[k].exists) continue;
+    const LazyAdamTensor<S>& tensor = columns[k].tensor;
+    const int64_t i = row * tensor.row_size;
+    tensor.parameter[i] = parameter[k], tensor.moment[i] = moment[k], tensor.square[i] = square[k];
+  }
+}
+
+template <class S>
+__global__ void __launch_bounds__(kAdamBlock, kBlocks<S>) catch_up_kernel(const __grid_constant__ LazyAdam<S> adam) {
   __shared__ int32_t shared_rows[kWarps][kWarp], shared_marks[kWarps][kWarp];
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const int64_t row = int64_t(blockIdx.x) * kAdamBlock + threadIdx.x;
@@ -24,36 +90,13 @@ __global__ void __launch_bounds__(kAdamBlock) catch_up_kernel(const __grid_const
     adam.marks[row] = adam.steps;
   }
   __syncwarp();
-  const int count = __popc(stale);
-  for (int t = 0; t < adam.num_tensors; ++t) {
-    const LazyAdamTensor<S>& tensor = adam.tensors[t];
-    const AdamRates<S>* rates = adam.rates + t;
-    const int size = tensor.row_size, total = count * size;
-    const int64_t first = (row - lane) * size;
-    for (int begin = lane; begin < total; begin += kWarp * kAdamPerThread) {
-      S gradient[kAdamPerThread], parameter[kAdamPerThread], moment[kAdamPerThread], square[kAdamPerThread];
-      int32_t marks[kAdamPerThread];
-      int64_t place[kAdamPerThread];
-#pragma unroll
-      for (int k = 0; k < kAdamPerThread; ++k) {
-        const int i = begin + k * kWarp;
-        if (i >= total) continue;
-        const int n = i / size;
-        place[k] = first + (shared_rows[warp][n] - n) * size + i;
-        marks[k] = shared_marks[warp][n];
-        gradient[k] = marks[k] < 0 ? tensor.gradient[place[k]] : S(0);
-        parameter[k] = tensor.parameter[place[k]];
-        moment[k] = tensor.moment[place[k]];
-        square[k] = tensor.square[place[k]];
-      }
-#pragma unroll
-      for (int k = 0; k < kAdamPerThread; ++k) {
-        if (begin + k * kWarp >= total) continue;
-        catch_up(adam, LazyAdamMark(marks[k]), rates, gradient[k], parameter[k], moment[k], square[k]);
-        tensor.parameter[place[k]] = parameter[k];
-        tensor.moment[place[k]] = moment[k];
-        tensor.square[place[k]] = square[k];
-      }
+  int numbers = 0;
+  for (int t = 0; t < adam.num_tensors; ++t) numbers += adam.tensors[t].row_size;
+  for (int begin = lane % kRowLanes; begin < numbers; begin += kRowLanes * kRowNumbers) {
+    const Column<S> columns[kRowNumbers] = {Column<S>(adam, begin), Column<S>(adam, begin + kRowLanes),
+                                            Column<S>(adam, begin + 2 * kRowLanes)};
+    for (int n = lane / kRowLanes; n < __popc(stale); n += kWarp / kRowLanes) {
+      catch_up_row(adam, columns, row - lane + shared_rows[warp][n], LazyAdamMark(shared_marks[warp][n]));
     }
   }
 }

@@ -210,6 +210,7 @@ void project_footprints_backward(const Frame<S>& frame, const FootprintGradients
 }
 
 template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory) {
+  if (frame.config.num_features() <= kMostHeldFeatures) return project_radii(frame, {run.stream});
   const int64_t count = frame.inputs.num_gaussians;
   Frame<S> projected = frame;
   projected.saved.projected = allocate<ProjectedGaussian<S>>(memory, count);

@@ -139,6 +139,24 @@ __global__ void __launch_bounds__(kStoreBlock) pack_footprints_kernel(const __gr
   pack.rows[at] = number;
 }
 
+template <class S> struct RadiiArguments {
+  GaussianInputs<S> inputs;  // read
+  DeviceCamera<S> camera;    // read
+  RasterConfig<S> config;    // read
+  int32_t* radii;            // [N] pixels, written
+};
+
+template <class S>
+__global__ void __launch_bounds__(kRowsBlock) radii_kernel(const __grid_constant__ RadiiArguments<S> arguments) {
+  __shared__ Camera<S> camera;
+  load_camera(arguments.camera, camera);
+  __syncthreads();
+  const int64_t i = int64_t(blockIdx.x) * kRowsBlock + threadIdx.x;
+  if (i >= arguments.inputs.num_gaussians) return;
+  S features[kMostHeldFeatures];
+  arguments.radii[i] = project_gaussian<S>({arguments.inputs, camera, arguments.config, i}, features).radius;
+}
+
 template <class S> struct VisibleArguments {
   int64_t num_gaussians;  // N
   const S* means3D;       // [N, 3] world
@@ -198,6 +216,14 @@ void pack_footprints(const FootprintRows& pack, const Work& work) {
   DSMOE_CHECK_LAUNCH("pack_footprints");
 }
 
+template <class S> void project_radii(const Frame<S>& frame, const Work& work) {
+  const int64_t count = frame.inputs.num_gaussians;
+  if (count == 0) return;
+  const RadiiArguments<S> arguments = {frame.inputs, frame.camera, frame.config, frame.images.radii};
+  radii_kernel<<<blocks_for(count, kRowsBlock), kRowsBlock, 0, work.stream>>>(arguments);
+  DSMOE_CHECK_LAUNCH("radii");
+}
+
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work) {
   VisibleArguments<S> arguments = {};
   arguments.num_gaussians = frame.inputs.num_gaussians;
@@ -214,6 +240,7 @@ template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const
 #define DSMOE_INSTANTIATE(S)                                                 \
   template void project(const Frame<S>&, DepthBits<S>*, const Work&);        \
   template void key_footprints(const Frame<S>&, DepthBits<S>*, const Work&); \
+  template void project_radii(const Frame<S>&, const Work&);                 \
   template void mark_visible(const Frame<S>&, bool*, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

@@ -60,9 +60,9 @@ template <int kLength> class WarpRows {
 
   // Begins to copy the rows that `wanted` marks. They are there after wait_for_copies().
   __device__ void load(const float* from, unsigned wanted) const {
-    for_each_part<false>(wanted, from, SharedAddress(shared_), [](auto part, const float* global, SharedAddress shared) {
-      copy_async<decltype(part)>(shared, global);
-    });
+    for_each_part<false>(
+        wanted, from, SharedAddress(shared_),
+        [](auto part, const float* global, SharedAddress shared) { copy_async<decltype(part)>(shared, global); });
   }
 
   // The lanes whose rows exist.

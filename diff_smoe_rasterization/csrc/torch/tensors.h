@@ -241,7 +241,8 @@ struct JointGradient {
   }
 };
 
-// Fills out.inputs, calls `backward`, and stores the gradients that it returned in one piece. seen_only: as in params.h.
+// Fills out.inputs, calls `backward`, and stores the gradients that it returned in one piece. seen_only: as in
+// params.h.
 template <class S, class Gradients, class Backward>
 void with_input_gradients(const Inputs& inputs, const Inputs& gradients, bool seen_only, Gradients& out,
                           Backward backward) {

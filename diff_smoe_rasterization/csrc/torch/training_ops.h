@@ -15,6 +15,7 @@
 
 #include "check_tensor.h"
 #include "dsmoe/adam_tensors.h"
+#include "dsmoe/gather.h"
 #include "dsmoe/gaussian_adam.h"
 #include "dsmoe/gaussians.h"
 #include "dsmoe/image_loss.h"
@@ -141,8 +142,8 @@ void lazy_adam_catch_up(at::TensorList parameters, at::TensorList moments, at::T
   check_shape(function, "rates", rates, {"capacity", count, 2});
   check_like(function, "rates", rates, "parameters[0]", first);
   check_contiguous(function, "rates", rates);
-  TORCH_CHECK_VALUE(0 <= steps && steps <= rates.size(0), function, ": steps is ", steps, "; rates has ",
-                    rates.size(0), " of them");
+  TORCH_CHECK_VALUE(0 <= steps && steps <= rates.size(0), function, ": steps is ", steps, "; rates has ", rates.size(0),
+                    " of them");
   const c10::DeviceGuard guard(first.device());
   AT_DISPATCH_FLOATING_TYPES(first.scalar_type(), "lazy_adam_catch_up", [&] {
     LazyAdam<scalar_t> adam = {};
@@ -169,9 +170,11 @@ void lazy_adam_step(const at::Tensor& marks, const at::Tensor& rates, int64_t st
                     at::ArrayRef<double> root_scales, const at::Tensor& radii) {
   const char* function = "lazy_adam_step";
   const auto count = static_cast<int64_t>(new_rates.size());
-  TORCH_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors && root_scales.size() == new_rates.size(), function,
-                    ": ", count, " new_rates and ", root_scales.size(), " root_scales are given; it must be as many, 1 "
-                    "to ", kLazyAdamMaxTensors);
+  TORCH_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors && root_scales.size() == new_rates.size(), function, ": ",
+                    count, " new_rates and ", root_scales.size(),
+                    " root_scales are given; it must be as many, 1 "
+                    "to ",
+                    kLazyAdamMaxTensors);
   check_real(function, "rates", rates);
   check_shape(function, "rates", rates, {"capacity", count, 2});
   check_contiguous(function, "rates", rates);
@@ -206,9 +209,9 @@ void gaussian_adam(at::TensorList raw, at::TensorList values, at::TensorList dL_
   constexpr Activation kActivations[] = {Activation::kNone, Activation::kSigmoid, Activation::kExp,
                                          Activation::kUnitQuaternion};
   constexpr int64_t kSizes[] = {3, 1, 3, 4};
-  TORCH_CHECK_VALUE(raw.size() == kGaussianAdamTensors && rates.size() == raw.size() &&
-                        root_scales.size() == raw.size(),
-                    function, ": raw, rates and root_scales must have ", kGaussianAdamTensors, " items each");
+  TORCH_CHECK_VALUE(
+      raw.size() == kGaussianAdamTensors && rates.size() == raw.size() && root_scales.size() == raw.size(), function,
+      ": raw, rates and root_scales must have ", kGaussianAdamTensors, " items each");
   check_real(function, "raw[0]", raw[0]);
   for (size_t i = 0; i < raw.size(); ++i) {
     check_shape(function, item_name("raw", i).c_str(), raw[i], {raw[0].size(0), kSizes[i]});
@@ -242,6 +245,36 @@ void gaussian_adam(at::TensorList raw, at::TensorList values, at::TensorList dL_
     Backend::step_gaussians(adam);
   });
   for (at::TensorList list : {raw, values, moments, squares}) note_change(list);
+}
+
+template <class Backend> std::vector<at::Tensor> gather_rows(at::TensorList tensors, const at::Tensor& rows) {
+  const char* function = "gather_rows";
+  if (tensors.empty()) return {};
+  check_real(function, "tensors[0]", tensors[0]);
+  check_shape(function, "rows", rows, {"M"});
+  check_type(function, "rows", rows, at::kLong);
+  check_device(function, "rows", rows, "tensors[0]", tensors[0]);
+  const c10::DeviceGuard guard(rows.device());
+  const at::Tensor list = rows.contiguous();
+  std::vector<at::Tensor> dense, results;
+  for (size_t i = 0; i < tensors.size(); ++i) {
+    const std::string name = item_name("tensors", i);
+    check_like(function, name.c_str(), tensors[i], "tensors[0]", tensors[0]);
+    TORCH_CHECK_VALUE(tensors[i].dim() > 0, function, ": ", name, " has no rows");
+    std::vector<int64_t> shape = tensors[i].sizes().vec();
+    shape[0] = list.size(0);
+    dense.push_back(tensors[i].contiguous());
+    results.push_back(at::empty(shape, tensors[i].options()));
+  }
+  AT_DISPATCH_FLOATING_TYPES(tensors[0].scalar_type(), "gather_rows", [&] {
+    std::vector<GatherTensor<scalar_t>> all;
+    for (size_t i = 0; i < dense.size(); ++i) {
+      const int64_t size = list.size(0) > 0 ? results[i].numel() / list.size(0) : 0;
+      all.push_back({dense[i].data_ptr<scalar_t>(), results[i].data_ptr<scalar_t>(), static_cast<int>(size)});
+    }
+    Backend::gather_rows(all, GatherRows{list.data_ptr<int64_t>(), list.size(0)});
+  });
+  return results;
 }
 
 // The loss and, if it is wanted, its gradient by the image; an empty tensor otherwise.

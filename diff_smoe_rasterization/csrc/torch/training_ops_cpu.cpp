@@ -25,6 +25,10 @@ struct Cpu {
     cpu::step_gaussians(adam, at::get_num_threads());
   }
 
+  template <class S> static void gather_rows(const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows) {
+    cpu::gather_rows(tensors, rows, at::get_num_threads());
+  }
+
   template <class S> static int64_t num_image_loss_sums(const ImageLoss<S>& loss) {
     return cpu::num_image_loss_sums(loss.planes, loss.height, loss.width);
   }
@@ -57,6 +61,7 @@ TORCH_LIBRARY_IMPL(diff_smoe_rasterization, CPU, m) {
   m.impl("lazy_adam_catch_up", &dsmoe::binding::lazy_adam_catch_up<dsmoe::binding::Cpu>);
   m.impl("lazy_adam_step", &dsmoe::binding::lazy_adam_step<dsmoe::binding::Cpu>);
   m.impl("gaussian_adam", &dsmoe::binding::gaussian_adam<dsmoe::binding::Cpu>);
+  m.impl("gather_rows", &dsmoe::binding::gather_rows<dsmoe::binding::Cpu>);
   m.impl("image_loss", &dsmoe::binding::image_loss<dsmoe::binding::Cpu>);
   m.impl("activate", &dsmoe::binding::activate<dsmoe::binding::Cpu>);
   m.impl("activate_backward", &dsmoe::binding::activate_backward<dsmoe::binding::Cpu>);

@@ -24,6 +24,10 @@ struct Cuda {
     cuda::step_gaussians(adam, current_stream());
   }
 
+  template <class S> static void gather_rows(const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows) {
+    cuda::gather_rows(tensors, rows, current_stream());
+  }
+
   template <class S> static int64_t num_image_loss_sums(const ImageLoss<S>& loss) {
     return cuda::num_image_loss_sums<S>(loss.planes, loss.height, loss.width);
   }
@@ -74,6 +78,7 @@ TORCH_LIBRARY_IMPL(diff_smoe_rasterization, CUDA, m) {
   m.impl("lazy_adam_catch_up", &dsmoe::binding::lazy_adam_catch_up<dsmoe::binding::Cuda>);
   m.impl("lazy_adam_step", &dsmoe::binding::lazy_adam_step<dsmoe::binding::Cuda>);
   m.impl("gaussian_adam", &dsmoe::binding::gaussian_adam<dsmoe::binding::Cuda>);
+  m.impl("gather_rows", &dsmoe::binding::gather_rows<dsmoe::binding::Cuda>);
   m.impl("image_loss", &dsmoe::binding::image_loss<dsmoe::binding::Cuda>);
   m.impl("activate", &dsmoe::binding::activate<dsmoe::binding::Cuda>);
   m.impl("activate_backward", &dsmoe::binding::activate_backward<dsmoe::binding::Cuda>);

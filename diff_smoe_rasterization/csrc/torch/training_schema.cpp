@@ -22,6 +22,8 @@ TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m) {
       "gaussian_adam(Tensor(a!)[] raw, Tensor(b!)[] values, Tensor[] dL_dvalues, Tensor(c!)[] moments, "
       "Tensor(d!)[] squares, Tensor radii, float[] rates, float[] root_scales, float beta1, float beta2, "
       "float epsilon) -> ()");
+  // rows [M] of each tensor [N, ...], which have one type.
+  m.def("gather_rows(Tensor[] tensors, Tensor rows) -> Tensor[]");
   // offset + l1_weight mean |image - target| + ssim_weight mean SSIM, where the mean of SSIM leaves out `margin` pixels
   // at each side; gradient by image, or empty. image [..., H, W]; target alike, or bytes.
   m.def(

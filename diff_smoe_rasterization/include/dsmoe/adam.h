@@ -16,12 +16,40 @@ template <class S> struct AdamConstants {
 // root_scale = 1 / sqrt(1 - beta2^t). Without: rate = lr and root_scale = 1.
 template <class S> struct AdamRates { S rate, root_scale; };
 
+// a b + c. In kernels it is always one fused operation, so that all kernels come to the same bits.
+template <class S> DSMOE_HD S multiply_add(S a, S b, S c) {
+#if defined(__CUDA_ARCH__)
+  return fma(a, b, c);
+#else
+  return a * b + c;
+#endif
+}
+
+// parameter - rate * moment / (sqrt(square) * root_scale + epsilon). In kernels root and reciprocal of floats are the
+// hardware's own: lazy Adam (lazy_adam.h) makes this move for every step that a row has missed, and exact ones would
+// take most of its time. The relative error is below 2^-20, of the move and not of the parameter.
+DSMOE_HD double adam_move(const AdamConstants<double>& constants, const AdamRates<double>& rates, double parameter,
+                          double moment, double square) {
+  return parameter - rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
+}
+DSMOE_HD float adam_move(const AdamConstants<float>& constants, const AdamRates<float>& rates, float parameter,
+                         float moment, float square) {
+#if defined(__CUDA_ARCH__)
+  float root, inverse;
+  asm("sqrt.approx.f32 %0, %1;" : "=f"(root) : "f"(square));
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(fma(root, rates.root_scale, constants.epsilon)));
+  return fma(-(rates.rate * moment), inverse, parameter);
+#else
+  return parameter - rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
+#endif
+}
+
 template <class S>
 DSMOE_HD void adam_step(const AdamConstants<S>& constants, const AdamRates<S>& rates, S gradient, S& parameter,
                         S& moment, S& square) {
-  moment = constants.beta1 * moment + constants.one_minus_beta1 * gradient;
-  square = constants.beta2 * square + constants.one_minus_beta2 * (gradient * gradient);
-  parameter -= rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
+  moment = multiply_add(constants.beta1, moment, constants.one_minus_beta1 * gradient);
+  square = multiply_add(constants.beta2, square, constants.one_minus_beta2 * (gradient * gradient));
+  parameter = adam_move(constants, rates, parameter, moment, square);
 }
 
 // The same with a gradient of zero.
@@ -30,7 +58,7 @@ DSMOE_HD void adam_rest_step(const AdamConstants<S>& constants, const AdamRates<
                              S& square) {
   moment = constants.beta1 * moment;
   square = constants.beta2 * square;
-  parameter -= rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
+  parameter = adam_move(constants, rates, parameter, moment, square);
 }
 
 }  // namespace dsmoe

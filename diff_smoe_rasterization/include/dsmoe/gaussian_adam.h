@@ -15,11 +15,11 @@ enum class Activation { kNone, kSigmoid, kExp, kUnitQuaternion };
 // One parameter tensor [N, row_size] with its moments, all dense.
 template <class S> struct ActivatedTensor {
   S* raw;
-  S* value;             // activated; where there is an activation: read, and written anew
-  const S* dL_dvalue;   // read in rows of Gaussians that were seen
-  S* moment;            // mean gradient
-  S* square;            // mean squared gradient
-  int row_size;         // numbers per row
+  S* value;            // activated; where there is an activation: read, and written anew
+  const S* dL_dvalue;  // read in rows of Gaussians that were seen
+  S* moment;           // mean gradient
+  S* square;           // mean squared gradient
+  int row_size;        // numbers per row
   Activation activation;
   AdamRates<S> rates;
 

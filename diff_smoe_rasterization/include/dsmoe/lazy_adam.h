@@ -27,8 +27,8 @@ template <class S> struct LazyAdamTensor {
 template <class S> struct LazyAdam {
   LazyAdamTensor<S> tensors[kLazyAdamMaxTensors];
   int num_tensors;
-  int64_t num_rows;  // N
-  int32_t* marks;    // [N] read, and written: `steps`
+  int64_t num_rows;           // N
+  int32_t* marks;             // [N] read, and written: `steps`
   const int32_t* radii;       // [N] above 0 in rows that are brought up to date; or null: all are
   const AdamRates<S>* rates;  // [steps, num_tensors] of each step
   int32_t steps;              // how many there have been
@@ -41,17 +41,6 @@ struct LazyAdamMark {
   int32_t steps;  // made
   DSMOE_HD explicit LazyAdamMark(int32_t mark) : waiting(mark < 0), steps(mark < 0 ? ~mark : mark) {}
 };
-
-// Makes the missed steps on one number. rates: of its tensor in step 0; stride: from one step to the next.
-template <class S>
-DSMOE_HD void catch_up(const LazyAdam<S>& adam, const LazyAdamMark& mark, const AdamRates<S>* rates, S gradient,
-                       S& parameter, S& moment, S& square) {
-  int32_t step = mark.steps;
-  if (mark.waiting) adam_step(adam.constants, rates[step++ * adam.num_tensors], gradient, parameter, moment, square);
-  for (; step < adam.steps; ++step) {
-    adam_rest_step(adam.constants, rates[step * adam.num_tensors], parameter, moment, square);
-  }
-}
 
 // What a step leaves behind: its rates, and marks on the rows whose gradients now wait.
 template <class S> struct LazyAdamStep {

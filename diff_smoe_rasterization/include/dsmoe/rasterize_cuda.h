@@ -198,6 +198,10 @@ struct Work {
 // sorts, the greatest number for culled Gaussians; null where no depth order is wanted.
 template <class S> void project(const Frame<S>& frame, DepthBits<S>* depths, const Work& work);
 
+// Fills frame.images.radii alone, where there are at most kMostHeldFeatures features.
+constexpr int kMostHeldFeatures = 8;
+template <class S> void project_radii(const Frame<S>& frame, const Work& work);
+
 // Fills depths from the footprints, as `project` does.
 template <class S> void key_footprints(const Frame<S>& frame, DepthBits<S>* depths, const Work& work);
 

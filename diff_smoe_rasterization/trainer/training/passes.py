@@ -7,7 +7,8 @@ spherical harmonics lazily, makes one pass of activations and Adam, and writes n
 from __future__ import annotations
 
 import math
-from typing import Dict, List, Optional, Tuple
+import weakref
+from typing import Dict, List, Optional, Set, Tuple
 
 import torch
 
@@ -63,8 +64,10 @@ class DirectPasses:
                background_gate: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
         """As of AutogradPasses, but that .grad has rows only of Gaussians with radii above 0."""
         model = self.model
-        self._lazy = self.optimizer.lazy_colors()
-        self._parameters = parameters = dict(model.stored)
+        lazy = self.optimizer.lazy_colors()
+        parameters = model.stored
+        # Weak, so that what a densification replaces does not stay in memory.
+        self._rendered = {name: weakref.ref(tensor) for name, tensor in parameters.items()}
         self._gate = background_gate if self.renderer.blend_mode == "smoe" else None
         gate = None if self._gate is None else self._gate.detach()
         settings = self.renderer.settings_of(camera, background, gate)
@@ -72,22 +75,25 @@ class DirectPasses:
         self._means2D.grad = None
         self._activate()
         colors = {argument: parameters[name] for argument, name in model.color_sources().items()}
-        self._direct = DirectRendering(parameters["means3D"], self._values[0], settings, means2D=self._means2D,
-                                       scales=self._values[1], rotations=self._values[2], **colors)
-        self._lazy.catch_up(self._direct.visible_radii())
+        self._direct: Optional[DirectRendering] = DirectRendering(
+            parameters["means3D"], self._values[0], settings, means2D=self._means2D, scales=self._values[1],
+            rotations=self._values[2], **colors)
+        lazy.catch_up(self._direct.visible_radii())
         rendering = self._direct.render()
         self._radii = rendering.radii
         return rendering, self._means2D
 
     @torch.no_grad()
     def backward(self, dL_dcolor: torch.Tensor) -> None:
-        parameters = self._parameters
+        parameters, lazy = self.model.stored, self.model.lazy
+        assert self._direct is not None and lazy is not None, "render comes first"
         self._gradients = {name: self._buffer("d" + name, parameters[name]) for name in GEOMETRY}
-        gradients = {**self._gradients, **dict(zip(self.model.color_sources(), self._lazy.gradients)),
+        gradients = {**self._gradients, **dict(zip(self.model.color_sources(), lazy.gradients)),
                      "means2D": self._buffer("dmeans2D", parameters["means3D"])}
         if self._gate is not None:
             gradients["background_gate"] = torch.empty_like(self._gate)
         self._direct.backward({"color": dL_dcolor}, gradients)
+        self._direct = None  # which holds on to memory
         self._means2D.grad = gradients["means2D"]
         if self._gate is not None:
             with torch.enable_grad():
@@ -95,17 +101,17 @@ class DirectPasses:
 
     @torch.no_grad()
     def update(self) -> None:
-        stored = self.model.stored
-        same = {name for name in PARAMETERS if stored[name] is self._parameters[name]}
+        stored, lazy = self.model.stored, self.model.lazy
+        same = {name for name in PARAMETERS if stored[name] is self._rendered[name]()}
         if same.issuperset(GEOMETRY):
             self._step_geometry()
         elif same.intersection(GEOMETRY):
             self._step_some(same)
-        if all(any(parameter is tensor for tensor in stored.values()) for parameter in self._lazy.parameters):
-            self._lazy.step(self._radii)
+        if lazy is not None and same.issuperset(self.model.color_sources().values()):
+            lazy.step(self._radii)
 
     def _step_geometry(self) -> None:
-        raw = [self._parameters[name] for name in GEOMETRY]
+        raw = [self.model.stored[name] for name in GEOMETRY]
         states, rates, root_scales = [], [], []
         for name, tensor in zip(GEOMETRY, raw):
             state, group = self.optimizer.adam.state[tensor], self.optimizer.group(name)
@@ -121,20 +127,20 @@ class DirectPasses:
                            self._radii, rates, root_scales, beta1, beta2, group["eps"])
         self._made_of = [(tensor, tensor._version) for tensor in raw[1:]]
 
-    def _step_some(self, same: set) -> None:
+    def _step_some(self, same: Set[str]) -> None:
         """Where an opacity reset has replaced a parameter: the others are stepped by the dense optimizer."""
         unseen = (self._radii <= 0).unsqueeze(1)
         gradients = {name: gradient.masked_fill(unseen, 0) for name, gradient in self._gradients.items()}
-        raw = _OPS.activate_backward([self._parameters[name] for name in ACTIVATED], self._values,
+        raw = _OPS.activate_backward([self.model.stored[name] for name in ACTIVATED], self._values,
                                      *(gradients[name] for name in ACTIVATED))
         gradients.update(zip(ACTIVATED, raw))
         for name in same.intersection(GEOMETRY):
-            self._parameters[name].grad = gradients[name]
+            self.model.stored[name].grad = gradients[name]
         self.optimizer.step()
 
     def _activate(self) -> None:
         """Makes the values anew where something else than `update` has changed what they are made of."""
-        raw = [self._parameters[name] for name in ACTIVATED]
+        raw = [self.model.stored[name] for name in ACTIVATED]
         if len(self._made_of) != len(raw) or any(tensor is not made_of or tensor._version != version
                                                  for tensor, (made_of, version) in zip(raw, self._made_of)):
             with torch.no_grad():

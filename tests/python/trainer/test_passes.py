@@ -63,7 +63,7 @@ def test_who_reads_the_model_finds_it_up_to_date(tiny_config, scene):
     waited = False
     for step in range(30):
         for trainer in (quiet, disturbed, dense):
-            torch.manual_seed(step)  # they draw from one generator
+            torch.manual_seed(step)  # splits draw from the one generator of the process
             trainer.step()
         waited |= not torch.equal(quiet.model.stored["dc"], dense.model.stored["dc"])
         if step % 4 == 0:
