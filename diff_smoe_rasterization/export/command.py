@@ -26,7 +26,10 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
     form: one of FORMATS; None: by the ending of `path`, else html. path: None: model.FORM. sh_degree: the highest
     degree of view-dependent colour that is kept. The rest is as in `open_trained`. Raises TrainerError.
     """
-    form = form or (os.path.splitext(path)[1][1:].lower() if path else FORMATS[0])
+    ending = os.path.splitext(path)[1][1:].lower() if path else FORMATS[0]
+    if form and path and ending in FORMATS and ending != form:
+        raise TrainerError(f"{path}: its ending says {ending}, and --format says {form}; they must agree")
+    form = form or ending
     if form not in FORMATS:
         raise TrainerError(f"{path}: its ending is none of {', '.join(FORMATS)}; say which --format it is")
     path = path or f"model.{form}"

@@ -120,6 +120,7 @@ def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
 
 @pytest.mark.parametrize("arguments, text", [
     (["-o", "model.obj"], "model.obj: its ending is none of html, ply, splat"),
+    (["-o", "model.PLY", "--format", "splat"], "model.PLY: its ending says ply, and --format says splat"),
     (["-o", "trained.ply"], "is the model itself"),
     (["-o", "a.html", "--blend-mode", "alpha"], "trained with the blend mode smoe, not alpha"),
     (["-o", "a.html", "--background-gate", "0.5"], "trained with the background gate 0.25, not 0.5"),
