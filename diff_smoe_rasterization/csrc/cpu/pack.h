@@ -99,7 +99,6 @@ template <class T> struct Pack {
   friend DSMOE_HD Pack operator*(Pack a, Pack b) { return a.v * b.v; }
   friend DSMOE_HD Pack operator/(Pack a, Pack b) { return a.v / b.v; }
   friend DSMOE_HD Pack operator-(Pack a) { return -a.v; }
-  friend DSMOE_HD Pack reciprocal(Pack a) { return T(1) / a.v; }
   // The sums over the lanes of a, b, c and d, to out[0 ... 3].
   friend DSMOE_HD void sum_lanes(Pack a, Pack b, Pack c, Pack d, T* out) {
 #if DSMOE_SIMD_BYTES >= 32
@@ -123,10 +122,17 @@ template <class T> struct Pack {
   friend DSMOE_HD T sum_lanes(Pack a) { return sum(a.v); }
   friend DSMOE_HD Pack sqrt(Pack a) { return root(a.v); }
   friend DSMOE_HD Pack abs(Pack a) { return magnitude(a.v); }
+  friend DSMOE_HD Pack reciprocal(Pack a) { return inverse(a.v); }
 
  private:
   static DSMOE_HD __m512 magnitude(__m512 a) { return _mm512_abs_ps(a); }
   static DSMOE_HD __m512d magnitude(__m512d a) { return _mm512_abs_pd(a); }
+  // 14 bits and a Newton step: within an ulp, in half the time of a division.
+  static DSMOE_HD __m512 inverse(__m512 a) {
+    const __m512 rough = _mm512_rcp14_ps(a);
+    return _mm512_fmadd_ps(rough, _mm512_fnmadd_ps(a, rough, _mm512_set1_ps(1.0f)), rough);
+  }
+  static DSMOE_HD __m512d inverse(__m512d a) { return 1.0 / a; }
   static DSMOE_HD __mmask16 compare_less(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
   static DSMOE_HD __mmask8 compare_less(__m512d a, __m512d b) { return _mm512_cmp_pd_mask(a, b, _CMP_LT_OQ); }
   static DSMOE_HD __mmask16 compare_less_equal(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
@@ -157,6 +163,7 @@ template <class T> struct Pack {
   friend DSMOE_HD Pack min(Pack a, Pack b) { return a.v < b.v ? a.v : b.v; }
   friend DSMOE_HD Pack max(Pack a, Pack b) { return a.v > b.v ? a.v : b.v; }
   friend DSMOE_HD Pack abs(Pack a) { return max(a, -a); }
+  friend DSMOE_HD Pack reciprocal(Pack a) { return T(1) / a.v; }
   friend DSMOE_HD T sum_lanes(Pack a) {
     T total = a.v[0];
     for (int i = 1; i < kLanes; ++i) total += a.v[i];

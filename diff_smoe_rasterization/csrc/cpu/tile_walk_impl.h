@@ -151,8 +151,8 @@ template <class S> class GaussianList {
     const Sym2<S>& conic = gaussian.conic;
     const ExponentFactors<S>& factors = listed.exponent;
     const S bend = kReach * kReach * (abs(factors.xy) - factors.xx - factors.yy);
-    // Where the determinant is all but lost, the exponent may be above 0. The clamp of alpha has a gradient of its own.
-    const bool may_be_smooth = bend < S(0.5) * ::dsmoe::DSMOE_SIMD::kNearZero<S> && gaussian.opacity <= S(kAlphaMax) &&
+    // Where the determinant is all but lost, the exponent may be above 0. The clamp of alpha, at 0.99, is left out.
+    const bool may_be_smooth = bend < S(0.5) * ::dsmoe::DSMOE_SIMD::kNearZero<S> && gaussian.opacity < S(0.98) &&
                                conic.xy * conic.xy < S(0.9999) * conic.xx * conic.yy;
     // As in may_meet, on the other side of the border.
     const S least_power = S(-0.5) * (gaussian.squared_reach * S(1 - kFootprintSlack) - S(kFootprintSlack));
@@ -220,10 +220,12 @@ template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
 // Visits the pairs of the list entries [begin, end), and returns how many pairs it visited. A visitor has:
 //   kMode, kBackToFront   how pairs are cut, and the direction
 //   expect(slot)          the slot of a Gaussian that will soon come
-//   begin(gaussian)       then, for each pack of pixels that the footprint may meet:
-//     wants(at)           whether pairs of these pixels are wanted; at: of the first in a PixelArray
-//     take(at, pairs)     a pack of pairs
-//   end(gaussian)
+//   begin(gaussian)       returns the sums of a Gaussian, in registers; then, for each pack of pixels that the
+//   footprint
+//                         may meet:
+//     wanted(at, pixels)  whether pairs of the pack are wanted, and of which pixels; at: of the first in a PixelArray
+//     take(at, pairs, pixels, sums)   a pack of pairs
+//   end(gaussian, sums)
 template <class S, class Visitor>
 DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int num_features, Visitor& visitor) {
   const TileExtent extent(tile);
@@ -232,13 +234,14 @@ DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int 
   const CellBits on_image = extent.cells();
   ListedGaussian<S> gaussian;
   int64_t num_pairs = 0;
-  const auto visit = [&](CellBits cells, auto smooth) {
+  const auto visit = [&](CellBits cells, auto& sums, auto smooth) {
     for (; cells != 0; cells &= cells - 1) {
       const int cell_begin = __builtin_ctz(cells) * kCellPixels;
       for (int at = cell_begin; at < cell_begin + kCellPixels; at += Pack<S>::kLanes) {
-        if (!visitor.wants(at)) continue;
+        Mask<Pack<S>> wanted;
+        if (!visitor.wanted(at, wanted)) continue;
         num_pairs += Pack<S>::kLanes;
-        visitor.take(at, PackPairs<Visitor::kMode, S, decltype(smooth)::value>(gaussian, pixels, at));
+        visitor.take(at, PackPairs<Visitor::kMode, S, decltype(smooth)::value>(gaussian, pixels, at), wanted, sums);
       }
     }
   };
@@ -248,10 +251,10 @@ DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int 
         Visitor::kBackToFront ? max(i - kPrefetchDistance, begin) : min(i + kPrefetchDistance, end - 1);
     list.load(i, next, gaussian);
     visitor.expect(tile.saved.instances[next].slot);
-    visitor.begin(gaussian);
-    visit(gaussian.met & on_image & ~gaussian.smooth, std::false_type{});
-    visit(gaussian.smooth & on_image, std::true_type{});
-    visitor.end(gaussian);
+    auto sums = visitor.begin(gaussian);
+    visit(gaussian.met & on_image & ~gaussian.smooth, sums, std::false_type{});
+    visit(gaussian.smooth & on_image, sums, std::true_type{});
+    visitor.end(gaussian, sums);
   }
   return num_pairs;
 }
