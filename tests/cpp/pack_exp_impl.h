@@ -7,13 +7,13 @@
 namespace dsmoe {
 namespace DSMOE_SIMD {
 
-template <class T, bool kNearZeroOnly> void exp_each(const T* x, T* result, int count) {
+template <class T, bool kSquared> void exp_each(const T* x, T* result, int count) {
   using P = Pack<T>;
   alignas(DSMOE_SIMD_BYTES) T lanes[P::kLanes];
   for (int i = 0; i < count; i += P::kLanes) {
     for (int k = 0; k < P::kLanes; ++k) lanes[k] = x[i + k];
     const P in = P::load(lanes);
-    (kNearZeroOnly ? exp_near_zero(in) : exp(in)).store(lanes);
+    (kSquared ? squared_exp(in) : exp(in)).store(lanes);
     for (int k = 0; k < P::kLanes; ++k) result[i + k] = lanes[k];
   }
 }

@@ -59,7 +59,7 @@ template <class S> double worst_ulps(const PackExp& level, double low) {
   return static_cast<double>(worst);
 }
 
-template <class S> double worst_ulps_near_zero(void (*near_zero)(const S*, S*, int), S most) {
+template <class S> double worst_ulps_of_square(void (*near_zero)(const S*, S*, int), S most) {
   std::vector<S> x;
   for (int i = 0; i < 64000; ++i) x.push_back(S(most * (i / 31999.5 - 1)));
   x[0] = -most, x.back() = most;
@@ -67,7 +67,7 @@ template <class S> double worst_ulps_near_zero(void (*near_zero)(const S*, S*, i
   near_zero(x.data(), y.data(), static_cast<int>(x.size()));
   long double worst = 0;
   for (size_t i = 0; i < x.size(); ++i) {
-    const long double exact = std::exp(static_cast<long double>(x[i]));
+    const long double exact = std::exp(2 * static_cast<long double>(x[i]));
     const S nearest = S(exact);
     const long double ulp = std::nextafter(nearest, std::numeric_limits<S>::infinity()) - nearest;
     worst = std::max(worst, std::abs(y[i] - exact) / ulp);
@@ -86,11 +86,15 @@ TEST(PackExp, IsAccurateToTwoUlpsAtEveryLevel) {
   }
 }
 
-// As above: |p r| is at most 1, and errors of p weigh at most 0.69.
-TEST(PackExp, NearZeroIsAccurateToTwoUlpsAtEveryLevel) {
+// The square doubles the relative error of exp(h), and its ulp may be half as large beside it.
+constexpr double kWorstUlpsOfSquare = 2 * 2 * kWorstUlps + 0.5;
+
+TEST(PackExp, TheSquareIsAccurateToSomeUlpsAtEveryLevel) {
   for (const PackExp* level : available_levels()) {
-    EXPECT_LT(worst_ulps_near_zero(level->near_zero_in_float, level->near_zero_float), kWorstUlps) << level->name;
-    EXPECT_LT(worst_ulps_near_zero(level->near_zero_in_double, level->near_zero_double), kWorstUlps) << level->name;
+    EXPECT_LT(worst_ulps_of_square(level->near_zero_in_float, level->near_zero_float), kWorstUlpsOfSquare)
+        << level->name;
+    EXPECT_LT(worst_ulps_of_square(level->near_zero_in_double, level->near_zero_double), kWorstUlpsOfSquare)
+        << level->name;
   }
 }
 

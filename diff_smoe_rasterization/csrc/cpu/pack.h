@@ -122,17 +122,11 @@ template <class T> struct Pack {
   friend DSMOE_HD T sum_lanes(Pack a) { return sum(a.v); }
   friend DSMOE_HD Pack sqrt(Pack a) { return root(a.v); }
   friend DSMOE_HD Pack abs(Pack a) { return magnitude(a.v); }
-  friend DSMOE_HD Pack reciprocal(Pack a) { return inverse(a.v); }
+  friend DSMOE_HD Pack reciprocal(Pack a) { return T(1) / a.v; }
 
  private:
   static DSMOE_HD __m512 magnitude(__m512 a) { return _mm512_abs_ps(a); }
   static DSMOE_HD __m512d magnitude(__m512d a) { return _mm512_abs_pd(a); }
-  // 14 bits and a Newton step: within an ulp, in half the time of a division.
-  static DSMOE_HD __m512 inverse(__m512 a) {
-    const __m512 rough = _mm512_rcp14_ps(a);
-    return _mm512_fmadd_ps(rough, _mm512_fnmadd_ps(a, rough, _mm512_set1_ps(1.0f)), rough);
-  }
-  static DSMOE_HD __m512d inverse(__m512d a) { return 1.0 / a; }
   static DSMOE_HD __mmask16 compare_less(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
   static DSMOE_HD __mmask8 compare_less(__m512d a, __m512d b) { return _mm512_cmp_pd_mask(a, b, _CMP_LT_OQ); }
   static DSMOE_HD __mmask16 compare_less_equal(__m512 a, __m512 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
@@ -215,22 +209,24 @@ DSMOE_HD Pack<float> exp(Pack<float> x) {
   return p * P(reinterpret_cast<P::Values>(power));
 }
 
-// exp(x) for |x| <= kNearZero. Minimax polynomial of degree 7, relative error 2e-8 before rounding.
+// exp(2 h) for |h| <= kNearZero, as the square of exp(h). float: minimax polynomial of degree 7, relative error 2e-8
+// before rounding, doubled by the square.
 template <class T> constexpr T kNearZero = T(0.34);
 template <> constexpr float kNearZero<float> = 0.69f;
-DSMOE_HD Pack<float> exp_near_zero(Pack<float> x) {
+DSMOE_HD Pack<float> squared_exp(Pack<float> h) {
   using P = Pack<float>;
-  P p = fma(P(1.9606798e-4f), x, P(1.4108368e-3f));
-  p = fma(p, x, P(8.3362116e-3f));
-  p = fma(p, x, P(4.1661076e-2f));
-  p = fma(p, x, P(1.6666611e-1f));
-  p = fma(p, x, P(5.0000036e-1f));
-  p = fma(p, x, P(1.0f));
-  return fma(p, x, P(1.0f));
+  P p = fma(P(1.9606798e-4f), h, P(1.4108368e-3f));
+  p = fma(p, h, P(8.3362116e-3f));
+  p = fma(p, h, P(4.1661076e-2f));
+  p = fma(p, h, P(1.6666611e-1f));
+  p = fma(p, h, P(5.0000036e-1f));
+  p = fma(p, h, P(1.0f));
+  p = fma(p, h, P(1.0f));
+  return p * p;
 }
 
 // double: Taylor to degree 13, whose remainder is below 5e-18 for |r| <= ln 2 / 2.
-DSMOE_HD Pack<double> exp_near_zero(Pack<double> r) {
+DSMOE_HD Pack<double> exp_of_remainder(Pack<double> r) {
   using P = Pack<double>;
   P p = P(1.0 / 6227020800.0);
   constexpr double kInverseFactorials[] = {1.0 / 479001600.0,
@@ -250,6 +246,11 @@ DSMOE_HD Pack<double> exp_near_zero(Pack<double> r) {
   return p;
 }
 
+DSMOE_HD Pack<double> squared_exp(Pack<double> h) {
+  const Pack<double> p = exp_of_remainder(h);
+  return p * p;
+}
+
 DSMOE_HD Pack<double> exp(Pack<double> x) {
   using P = Pack<double>;
   const P kRound = 6755399441055744.0;  // 1.5 * 2^52
@@ -259,7 +260,7 @@ DSMOE_HD Pack<double> exp(Pack<double> x) {
   P r = fma(n, P(-0.693147180369123816490), clamped);
   r = fma(n, P(-1.90821492927058770002e-10), r);
   const P::Bits power = (reinterpret_cast<P::Bits>(shifted.v) << 52) + 0x3ff0000000000000;
-  return exp_near_zero(r) * P(reinterpret_cast<P::Values>(power));
+  return exp_of_remainder(r) * P(reinterpret_cast<P::Values>(power));
 }
 
 }  // namespace DSMOE_SIMD
