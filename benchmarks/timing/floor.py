@@ -6,7 +6,8 @@ floor = walked pairs x instructions per pair / (lanes x issue rate x clock)
 - Instructions per pair are the floating-point operations, comparisons and selections of the formulas in gate.h and
   blend.h for three colour channels, a multiply-add counted once. Loads, stores, mask logic, what a Gaussian, a row or
   a column needs once, and the reduction over lanes count nothing. That most registers of a footprint's edge are left
-  after the exponent is ignored too: every walked pair counts in full.
+  after the exponent is ignored too: every walked pair counts in full. Pairs of smooth cells need fewer
+  (tile_walk_impl.h).
 - The denominator is measured as one number: the multiply-adds a second of torch's matrix product. A core that adds
   and compares beside its multiply-add units can stay below this floor.
 """

@@ -16,7 +16,7 @@
 #include "pack_exp_impl.h"
 
 namespace dsmoe {
-const PackExp kAvx2PackExp = {"avx2", avx2::exp_each<float>, avx2::exp_each<double>};
+const PackExp kAvx2PackExp = avx2::pack_exp("avx2");
 }  // namespace dsmoe
 
 #if defined(__clang__)

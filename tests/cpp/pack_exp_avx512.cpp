@@ -18,7 +18,7 @@
 #include "pack_exp_impl.h"
 
 namespace dsmoe {
-const PackExp kAvx512PackExp = {"avx512", avx512::exp_each<float>, avx512::exp_each<double>};
+const PackExp kAvx512PackExp = avx512::pack_exp("avx512");
 }  // namespace dsmoe
 
 #if defined(__clang__)

@@ -4,5 +4,5 @@
 #include "pack_exp_impl.h"
 
 namespace dsmoe {
-const PackExp kBaselinePackExp = {"baseline", baseline::exp_each<float>, baseline::exp_each<double>};
+const PackExp kBaselinePackExp = baseline::pack_exp("baseline");
 }  // namespace dsmoe

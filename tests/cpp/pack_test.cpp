@@ -59,6 +59,22 @@ template <class S> double worst_ulps(const PackExp& level, double low) {
   return static_cast<double>(worst);
 }
 
+template <class S> double worst_ulps_of_square(void (*near_zero)(const S*, S*, int), S most) {
+  std::vector<S> x;
+  for (int i = 0; i < 64000; ++i) x.push_back(S(most * (i / 31999.5 - 1)));
+  x[0] = -most, x.back() = most;
+  std::vector<S> y(x.size());
+  near_zero(x.data(), y.data(), static_cast<int>(x.size()));
+  long double worst = 0;
+  for (size_t i = 0; i < x.size(); ++i) {
+    const long double exact = std::exp(2 * static_cast<long double>(x[i]));
+    const S nearest = S(exact);
+    const long double ulp = std::nextafter(nearest, std::numeric_limits<S>::infinity()) - nearest;
+    worst = std::max(worst, std::abs(y[i] - exact) / ulp);
+  }
+  return static_cast<double>(worst);
+}
+
 // The last step, 1 + p r, rounds at half an ulp of 1, which below 1 is a whole ulp; the products before it and r itself
 // add up to as much again, weighed by r <= 0.35.
 constexpr double kWorstUlps = 2;
@@ -67,6 +83,18 @@ TEST(PackExp, IsAccurateToTwoUlpsAtEveryLevel) {
   for (const PackExp* level : available_levels()) {
     EXPECT_LT(worst_ulps<float>(*level, -80), kWorstUlps) << level->name;
     EXPECT_LT(worst_ulps<double>(*level, -700), kWorstUlps) << level->name;
+  }
+}
+
+// The square doubles the relative error of exp(h), and its ulp may be half as large beside it.
+constexpr double kWorstUlpsOfSquare = 2 * 2 * kWorstUlps + 0.5;
+
+TEST(PackExp, TheSquareIsAccurateToSomeUlpsAtEveryLevel) {
+  for (const PackExp* level : available_levels()) {
+    EXPECT_LT(worst_ulps_of_square(level->near_zero_in_float, level->near_zero_float), kWorstUlpsOfSquare)
+        << level->name;
+    EXPECT_LT(worst_ulps_of_square(level->near_zero_in_double, level->near_zero_double), kWorstUlpsOfSquare)
+        << level->name;
   }
 }
 

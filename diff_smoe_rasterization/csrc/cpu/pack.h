@@ -99,7 +99,6 @@ template <class T> struct Pack {
   friend DSMOE_HD Pack operator*(Pack a, Pack b) { return a.v * b.v; }
   friend DSMOE_HD Pack operator/(Pack a, Pack b) { return a.v / b.v; }
   friend DSMOE_HD Pack operator-(Pack a) { return -a.v; }
-  friend DSMOE_HD Pack reciprocal(Pack a) { return T(1) / a.v; }
   // The sums over the lanes of a, b, c and d, to out[0 ... 3].
   friend DSMOE_HD void sum_lanes(Pack a, Pack b, Pack c, Pack d, T* out) {
 #if DSMOE_SIMD_BYTES >= 32
@@ -123,6 +122,7 @@ template <class T> struct Pack {
   friend DSMOE_HD T sum_lanes(Pack a) { return sum(a.v); }
   friend DSMOE_HD Pack sqrt(Pack a) { return root(a.v); }
   friend DSMOE_HD Pack abs(Pack a) { return magnitude(a.v); }
+  friend DSMOE_HD Pack reciprocal(Pack a) { return T(1) / a.v; }
 
  private:
   static DSMOE_HD __m512 magnitude(__m512 a) { return _mm512_abs_ps(a); }
@@ -157,6 +157,7 @@ template <class T> struct Pack {
   friend DSMOE_HD Pack min(Pack a, Pack b) { return a.v < b.v ? a.v : b.v; }
   friend DSMOE_HD Pack max(Pack a, Pack b) { return a.v > b.v ? a.v : b.v; }
   friend DSMOE_HD Pack abs(Pack a) { return max(a, -a); }
+  friend DSMOE_HD Pack reciprocal(Pack a) { return T(1) / a.v; }
   friend DSMOE_HD T sum_lanes(Pack a) {
     T total = a.v[0];
     for (int i = 1; i < kLanes; ++i) total += a.v[i];
@@ -208,22 +209,24 @@ DSMOE_HD Pack<float> exp(Pack<float> x) {
   return p * P(reinterpret_cast<P::Values>(power));
 }
 
-// exp(x) for |x| <= kNearZero. Minimax polynomial of degree 7, relative error 2e-8 before rounding.
+// exp(2 h) for |h| <= kNearZero, as the square of exp(h). float: minimax polynomial of degree 7, relative error 2e-8
+// before rounding, doubled by the square.
 template <class T> constexpr T kNearZero = T(0.34);
 template <> constexpr float kNearZero<float> = 0.69f;
-DSMOE_HD Pack<float> exp_near_zero(Pack<float> x) {
+DSMOE_HD Pack<float> squared_exp(Pack<float> h) {
   using P = Pack<float>;
-  P p = fma(P(1.9606798e-4f), x, P(1.4108368e-3f));
-  p = fma(p, x, P(8.3362116e-3f));
-  p = fma(p, x, P(4.1661076e-2f));
-  p = fma(p, x, P(1.6666611e-1f));
-  p = fma(p, x, P(5.0000036e-1f));
-  p = fma(p, x, P(1.0f));
-  return fma(p, x, P(1.0f));
+  P p = fma(P(1.9606798e-4f), h, P(1.4108368e-3f));
+  p = fma(p, h, P(8.3362116e-3f));
+  p = fma(p, h, P(4.1661076e-2f));
+  p = fma(p, h, P(1.6666611e-1f));
+  p = fma(p, h, P(5.0000036e-1f));
+  p = fma(p, h, P(1.0f));
+  p = fma(p, h, P(1.0f));
+  return p * p;
 }
 
 // double: Taylor to degree 13, whose remainder is below 5e-18 for |r| <= ln 2 / 2.
-DSMOE_HD Pack<double> exp_near_zero(Pack<double> r) {
+DSMOE_HD Pack<double> exp_of_remainder(Pack<double> r) {
   using P = Pack<double>;
   P p = P(1.0 / 6227020800.0);
   constexpr double kInverseFactorials[] = {1.0 / 479001600.0,
@@ -243,6 +246,11 @@ DSMOE_HD Pack<double> exp_near_zero(Pack<double> r) {
   return p;
 }
 
+DSMOE_HD Pack<double> squared_exp(Pack<double> h) {
+  const Pack<double> p = exp_of_remainder(h);
+  return p * p;
+}
+
 DSMOE_HD Pack<double> exp(Pack<double> x) {
   using P = Pack<double>;
   const P kRound = 6755399441055744.0;  // 1.5 * 2^52
@@ -252,7 +260,7 @@ DSMOE_HD Pack<double> exp(Pack<double> x) {
   P r = fma(n, P(-0.693147180369123816490), clamped);
   r = fma(n, P(-1.90821492927058770002e-10), r);
   const P::Bits power = (reinterpret_cast<P::Bits>(shifted.v) << 52) + 0x3ff0000000000000;
-  return exp_near_zero(r) * P(reinterpret_cast<P::Values>(power));
+  return exp_of_remainder(r) * P(reinterpret_cast<P::Values>(power));
 }
 
 }  // namespace DSMOE_SIMD

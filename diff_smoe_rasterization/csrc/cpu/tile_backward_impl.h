@@ -59,22 +59,31 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   }
 
   DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(record(slot), 1); }
-  DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
+  // Of one Gaussian. Its features' gradients lie here where their number is known, else in scratch memory.
+  struct Sums {
+    GateMoments<P> moments;
+    Vec2<P> absolute;  // of absolute gradients by the mean
+    P dL_dfeatures[kFeatures != kAnyFeatures ? kFeatures : 1];
+  };
+  DSMOE_HD Sums begin(const ListedGaussian<S>& gaussian) {
     features_ = gaussian.features;
     position_ = P(gaussian.position);
     exponent_ = gaussian.exponent;
-    absolute_x_ = absolute_y_ = P(S(0));
-    one_ = x_ = y_ = xx_ = xy_ = yy_ = P(S(0));
-    for (int f = 0; f < num_features_; ++f) dL_dfeatures()[f] = P(S(0));
+    const P zero = S(0);
+    Sums sums;
+    sums.moments = {zero, zero, zero, zero, zero, zero};
+    sums.absolute = {zero, zero};
+    for (int f = 0; f < num_features_; ++f) dL_dfeature(sums, f) = zero;
+    return sums;
   }
-  DSMOE_HD bool wants(int at) {
-    not_past_ = position_ < last_.load(at);
-    return !Blend<kMode>::kStopsEarly || any(not_past_);
+  DSMOE_HD bool wanted(int at, Mask<P>& not_past) const {
+    not_past = position_ < last_.load(at);
+    return !Blend<kMode>::kStopsEarly || any(not_past);
   }
 
-  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs) {
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P> not_past, Sums& sums) const {
     const Gate<P>& gate = pairs.gate;
-    const auto contributes = gate.counts & not_past_;
+    const auto contributes = gate.counts & not_past;
     P value = S(0);
     for (int f = 0; f < num_features_; ++f) value = fma(scaled_of(f).load(at), P(features_[f]), value);
     PixelBackward<P> pixel = {transmittance_.load(at), suffix_.load(at), base_.load(at)};
@@ -82,36 +91,38 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     transmittance_.store(at, pixel.transmittance);
     suffix_.store(at, pixel.suffix);
     for (int f = 0; f < num_features_; ++f) {
-      dL_dfeatures()[f] = fma(pair.weight, scaled_of(f).load(at), dL_dfeatures()[f]);
+      dL_dfeature(sums, f) = fma(pair.weight, scaled_of(f).load(at), dL_dfeature(sums, f));
     }
     const P dL_dpower = Pairs::kSmooth ? pair.gamma : gate_backward(gate, pair.gamma);
     const P by_x = dL_dpower * pairs.dx, by_y = dL_dpower * pairs.dy;
-    one_ = one_ + dL_dpower;
-    x_ = x_ + by_x;
-    y_ = y_ + by_y;
-    xx_ = fma(by_x, pairs.dx, xx_);
-    xy_ = fma(by_x, pairs.dy, xy_);
-    yy_ = fma(by_y, pairs.dy, yy_);
+    GateMoments<P>& m = sums.moments;
+    m.one = m.one + dL_dpower;
+    m.x = m.x + by_x;
+    m.y = m.y + by_y;
+    m.xx = fma(by_x, pairs.dx, m.xx);
+    m.xy = fma(by_x, pairs.dy, m.xy);
+    m.yy = fma(by_y, pairs.dy, m.yy);
     if (!absolute_) return;
     const auto by_mean = power_by_mean(exponent_, pairs.dx, pairs.dy);
-    absolute_x_ = absolute_x_ + abs(dL_dpower * by_mean.x);
-    absolute_y_ = absolute_y_ + abs(dL_dpower * by_mean.y);
+    sums.absolute.x = sums.absolute.x + abs(dL_dpower * by_mean.x);
+    sums.absolute.y = sums.absolute.y + abs(dL_dpower * by_mean.y);
   }
 
-  DSMOE_HD void end(const ListedGaussian<S>& gaussian) {
+  DSMOE_HD void end(const ListedGaussian<S>& gaussian, Sums& sums) const {
+    const GateMoments<P>& m = sums.moments;
     S* out = record(gaussian.slot);
-    sum_lanes(one_, x_, y_, xx_, out);
-    if (kFeatures == 3) {
-      sum_lanes(xy_, yy_, dL_dfeatures()[0], dL_dfeatures()[1], out + 4);
-      out[8] = sum_lanes(dL_dfeatures()[2]);
+    sum_lanes(m.one, m.x, m.y, m.xx, out);
+    if constexpr (kFeatures == 3) {
+      sum_lanes(m.xy, m.yy, sums.dL_dfeatures[0], sums.dL_dfeatures[1], out + 4);
+      out[8] = sum_lanes(sums.dL_dfeatures[2]);
     } else {
-      out[4] = sum_lanes(xy_);
-      out[5] = sum_lanes(yy_);
-      for (int f = 0; f < num_features_; ++f) out[kNumGateMoments + f] = sum_lanes(dL_dfeatures()[f]);
+      out[4] = sum_lanes(m.xy);
+      out[5] = sum_lanes(m.yy);
+      for (int f = 0; f < num_features_; ++f) out[kNumGateMoments + f] = sum_lanes(dL_dfeature(sums, f));
     }
     if (!absolute_) return;
-    out[kNumGateMoments + num_features_] = sum_lanes(absolute_x_);
-    out[kNumGateMoments + num_features_ + 1] = sum_lanes(absolute_y_);
+    out[kNumGateMoments + num_features_] = sum_lanes(sums.absolute.x);
+    out[kNumGateMoments + num_features_ + 1] = sum_lanes(sums.absolute.y);
   }
 
   DSMOE_HD void write_zeros(uint32_t slot) const {
@@ -124,10 +135,9 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   DSMOE_HD S* record(uint32_t slot) const {
     return dL_dinstances_ + slot * static_cast<int64_t>(record_size(num_features_, absolute_));
   }
-  // dL/dfeature of the current Gaussian; in registers where their number is known.
-  DSMOE_HD P* dL_dfeatures() {
-    if (kFeatures != kAnyFeatures) return dL_dfeatures_in_registers_;
-    return reinterpret_cast<P*>(scaled_.values + num_features_ * kTilePixels);
+  DSMOE_HD P& dL_dfeature(Sums& sums, int f) const {
+    if (kFeatures != kAnyFeatures) return sums.dL_dfeatures[f];
+    return reinterpret_cast<P*>(scaled_.values + num_features_ * kTilePixels)[f];
   }
 
   const int num_features_;
@@ -137,11 +147,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   S* const dL_dinstances_;
   const S* features_ = nullptr;
   P position_;
-  Mask<P> not_past_;
-  ExponentFactors<S> exponent_;   // of the current Gaussian
-  P absolute_x_, absolute_y_;     // its sums of absolute gradients
-  P one_, x_, y_, xx_, xy_, yy_;  // the moments of the current Gaussian
-  P dL_dfeatures_in_registers_[kFeatures != kAnyFeatures ? kFeatures : 1];
+  ExponentFactors<S> exponent_;
 };
 
 template <class S, BlendMode kMode, int kFeatures>

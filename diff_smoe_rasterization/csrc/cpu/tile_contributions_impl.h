@@ -37,34 +37,32 @@ template <class S, BlendMode kBlendMode> class ContributionVisitor {
   }
 
   DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(out_.instances + slot, 1); }
-  DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
+  DSMOE_HD Contribution<P> begin(const ListedGaussian<S>& gaussian) {
     position_ = P(gaussian.position);
-    sum_ = no_contribution<P>();
+    return no_contribution<P>();
   }
-  DSMOE_HD bool wants(int at) {
-    not_past_ = position_ < last_.load(at);
-    return any(not_past_);
+  DSMOE_HD bool wanted(int at, Mask<P>& not_past) const {
+    not_past = position_ < last_.load(at);
+    return any(not_past);
   }
 
-  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs) {
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P> not_past, Contribution<P>& sum) const {
     PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
     const auto pair = Blend<kMode>::accumulate(state, pairs.gate);
     transmittance_.store(at, state.transmittance);
     gate_sum_.store(at, state.gate_sum);
-    add_pair(sum_, pair.contributes & not_past_, pixel_weight_.load(at), pair.weight, pairs.dx, pairs.dy);
+    add_pair(sum, pair.contributes & not_past, pixel_weight_.load(at), pair.weight, pairs.dx, pairs.dy);
   }
 
-  DSMOE_HD void end(const ListedGaussian<S>& gaussian) const {
-    out_.instances[gaussian.slot] = {sum_lanes(sum_.pixel_weight), sum_lanes(sum_.pixels), sum_lanes(sum_.blend_weight),
-                                     sum_lanes(sum_.distance)};
+  DSMOE_HD void end(const ListedGaussian<S>& gaussian, const Contribution<P>& sum) const {
+    out_.instances[gaussian.slot] = {sum_lanes(sum.pixel_weight), sum_lanes(sum.pixels), sum_lanes(sum.blend_weight),
+                                     sum_lanes(sum.distance)};
   }
 
  private:
   const PixelArray<S> transmittance_, gate_sum_, last_, pixel_weight_;
   const TileContributions<S>& out_;
   P position_;
-  Mask<P> not_past_;
-  Contribution<P> sum_;
 };
 
 template <class S, BlendMode kMode> int64_t sum_tile(const Tile<S>& tile, const TileContributions<S>& out, S* memory) {

@@ -28,10 +28,14 @@ template <class S, BlendMode kBlendMode> class GateMapVisitor {
   }
 
   DSMOE_HD void expect(uint32_t) const {}
-  DSMOE_HD void begin(const ListedGaussian<S>& gaussian) { position_ = P(gaussian.position); }
-  DSMOE_HD bool wants(int) const { return true; }
+  struct NoSums {};
+  DSMOE_HD NoSums begin(const ListedGaussian<S>& gaussian) {
+    position_ = P(gaussian.position);
+    return {};
+  }
+  DSMOE_HD bool wanted(int, Mask<P>&) const { return true; }
 
-  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs) {
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P>, NoSums) const {
     PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
     const auto pair = Blend<kMode>::accumulate(state, pairs.gate);
     transmittance_.store(at, state.transmittance);
@@ -43,7 +47,7 @@ template <class S, BlendMode kBlendMode> class GateMapVisitor {
     greatest_position_.store(at, select(greater, position_, greatest_position_.load(at)));
   }
 
-  DSMOE_HD void end(const ListedGaussian<S>&) {}
+  DSMOE_HD void end(const ListedGaussian<S>&, NoSums) const {}
 
   DSMOE_HD void write(const Tile<S>& tile, const GateMap& map) const {
     TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {

@@ -49,20 +49,20 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
   }
 
   DSMOE_HD void expect(uint32_t slot) const { __builtin_prefetch(out_.instances + slot, 1); }
-  DSMOE_HD void begin(const ListedGaussian<S>& gaussian) {
+  DSMOE_HD Importance<P> begin(const ListedGaussian<S>& gaussian) {
     features_ = gaussian.features;
     position_ = P(gaussian.position);
-    sum_ = no_importance<P>();
+    return no_importance<P>();
   }
-  DSMOE_HD bool wants(int at) {
-    not_past_ = position_ < last_.load(at);
-    return !Blend<kMode>::kStopsEarly || any(not_past_);
+  DSMOE_HD bool wanted(int at, Mask<P>& not_past) const {
+    not_past = position_ < last_.load(at);
+    return !Blend<kMode>::kStopsEarly || any(not_past);
   }
 
-  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs) {
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P> not_past, Importance<P>& sum) const {
     PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
     const PixelEnd<P> end = {end_transmittance_.load(at), end_gate_sum_.load(at), background_gate_};
-    const auto removal = remove_pair<kMode>(state, end, pairs.gate, not_past_);
+    const auto removal = remove_pair<kMode>(state, end, pairs.gate, not_past);
     transmittance_.store(at, state.transmittance);
     gate_sum_.store(at, state.gate_sum);
     P squared = S(0);
@@ -73,12 +73,11 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
       squared = fma(change, change, squared);
       front_of(c).store(at, fma(removal.weight, distance, front));
     }
-    add_pair(sum_, removal, squared, share_weight_.load(at), weight_.load(at));
+    add_pair(sum, removal, squared, share_weight_.load(at), weight_.load(at));
   }
 
-  DSMOE_HD void end(const ListedGaussian<S>& gaussian) const {
-    out_.instances[gaussian.slot] = {sum_lanes(sum_.share), sum_lanes(sum_.squared_share),
-                                     sum_lanes(sum_.removal_cost)};
+  DSMOE_HD void end(const ListedGaussian<S>& gaussian, const Importance<P>& sum) const {
+    out_.instances[gaussian.slot] = {sum_lanes(sum.share), sum_lanes(sum.squared_share), sum_lanes(sum.removal_cost)};
   }
 
  private:
@@ -93,8 +92,6 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
   const TileImportances<S>& out_;
   const S* features_ = nullptr;
   P position_;
-  Mask<P> not_past_;
-  Importance<P> sum_;
 };
 
 template <class S, BlendMode kMode, int kFeatures>

@@ -109,12 +109,12 @@ template <class S> struct ListedGaussian {
   CellBits smooth;    // those of them over which the Gaussian is smooth
   const S* features;  // [F]
 
-  // Of smooth cells: alpha at the centre, the exponent's slopes there, and the exponent's quadratic part about it,
-  // which is the same in all cells.
+  // Of smooth cells: alpha at the centre, half of the exponent's slopes there, and half of the exponent's quadratic
+  // part about it, which is the same in all cells.
   alignas(64) S alpha[kCells];
-  alignas(64) S slope_x[kCells];
-  alignas(64) S slope_y[kCells];
-  alignas(64) S bend[kCellPixels];
+  alignas(64) S half_slope_x[kCells];
+  alignas(64) S half_slope_y[kCells];
+  alignas(64) S half_bend[kCellPixels];
 };
 
 // The Gaussians of a tile's list, one after the other.
@@ -144,15 +144,16 @@ template <class S> class GaussianList {
 
  private:
   // The exponent changes by at most `spread` between a cell's centre and its pixels. Smooth cells have a spread that
-  // exp_near_zero takes, and lie inside the footprint: each of their pairs counts.
+  // squared_exp takes, and lie inside the footprint: each of their pairs counts.
   DSMOE_HD void find_cells(const ProjectedGaussian<S>& gaussian, ListedGaussian<S>& listed) const {
     using P = Pack<S>;
     constexpr S kReach = S(kCellSize - 1) / 2;  // from a cell's centre to its outermost pixels
+    constexpr S kLargestSpread = 2 * ::dsmoe::DSMOE_SIMD::kNearZero<S>;
     const Sym2<S>& conic = gaussian.conic;
     const ExponentFactors<S>& factors = listed.exponent;
     const S bend = kReach * kReach * (abs(factors.xy) - factors.xx - factors.yy);
-    // Where the determinant is all but lost, the exponent may be above 0. The clamp of alpha has a gradient of its own.
-    const bool may_be_smooth = bend < S(0.5) * ::dsmoe::DSMOE_SIMD::kNearZero<S> && gaussian.opacity <= S(kAlphaMax) &&
+    // Where the determinant is all but lost, the exponent may be above 0. The clamp of alpha, at 0.99, is left out.
+    const bool may_be_smooth = bend < S(0.25) * kLargestSpread && gaussian.opacity < S(0.98) &&
                                conic.xy * conic.xy < S(0.9999) * conic.xx * conic.yy;
     // As in may_meet, on the other side of the border.
     const S least_power = S(-0.5) * (gaussian.squared_reach * S(1 - kFootprintSlack) - S(kFootprintSlack));
@@ -168,18 +169,17 @@ template <class S> class GaussianList {
       const P slope_y = fma(P(S(2) * factors.yy), dy, P(factors.xy) * dx);
       const P power = P(S(0.5)) * fma(slope_x, dx, slope_y * dy);
       const P spread = fma(P(kReach), abs(slope_x) + abs(slope_y), P(bend));
-      listed.smooth |= bits_of((spread <= P(::dsmoe::DSMOE_SIMD::kNearZero<S>)) & (power - spread >= P(least_power)))
-                       << first;
+      listed.smooth |= bits_of((spread <= P(kLargestSpread)) & (power - spread >= P(least_power))) << first;
       (P(gaussian.opacity) * exp(power)).store(listed.alpha + first);
-      slope_x.store(listed.slope_x + first);
-      slope_y.store(listed.slope_y + first);
+      (P(S(0.5)) * slope_x).store(listed.half_slope_x + first);
+      (P(S(0.5)) * slope_y).store(listed.half_slope_y + first);
     }
     listed.smooth &= listed.met;
     if (listed.smooth == 0) return;
     for (int first = 0; first < kCellPixels; first += P::kLanes) {
       const P u = P::load(kSquareOfFour<S>.columns + first) - P(kReach);
       const P v = P::load(kSquareOfFour<S>.rows + first) - P(kReach);
-      ColumnExponent<P, S>(factors, u).at(v).store(listed.bend + first);
+      (P(S(0.5)) * ColumnExponent<P, S>(factors, u).at(v)).store(listed.half_bend + first);
     }
   }
 
@@ -206,9 +206,9 @@ template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
       const int cell = at / kCellPixels, first = at % kCellPixels;
       const P u = P::load(kSquareOfFour<S>.columns + first) - P(kReach);
       const P v = P::load(kSquareOfFour<S>.rows + first) - P(kReach);
-      const P change =
-          fma(P(gaussian.slope_x[cell]), u, fma(P(gaussian.slope_y[cell]), v, P::load(gaussian.bend + first)));
-      gate.logit = gate.alpha = P(gaussian.alpha[cell]) * exp_near_zero(change);
+      const P half_change = fma(P(gaussian.half_slope_x[cell]), u,
+                                fma(P(gaussian.half_slope_y[cell]), v, P::load(gaussian.half_bend + first)));
+      gate.logit = gate.alpha = P(gaussian.alpha[cell]) * squared_exp(half_change);
       gate.counts = Mask<P>::all();
     } else {
       const P power = ColumnExponent<P, S>(gaussian.exponent, dx).at(dy);
@@ -220,10 +220,12 @@ template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
 // Visits the pairs of the list entries [begin, end), and returns how many pairs it visited. A visitor has:
 //   kMode, kBackToFront   how pairs are cut, and the direction
 //   expect(slot)          the slot of a Gaussian that will soon come
-//   begin(gaussian)       then, for each pack of pixels that the footprint may meet:
-//     wants(at)           whether pairs of these pixels are wanted; at: of the first in a PixelArray
-//     take(at, pairs)     a pack of pairs
-//   end(gaussian)
+//   begin(gaussian)       returns the sums of a Gaussian, in registers; then, for each pack of pixels that the
+//   footprint
+//                         may meet:
+//     wanted(at, pixels)  whether pairs of the pack are wanted, and of which pixels; at: of the first in a PixelArray
+//     take(at, pairs, pixels, sums)   a pack of pairs
+//   end(gaussian, sums)
 template <class S, class Visitor>
 DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int num_features, Visitor& visitor) {
   const TileExtent extent(tile);
@@ -232,13 +234,14 @@ DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int 
   const CellBits on_image = extent.cells();
   ListedGaussian<S> gaussian;
   int64_t num_pairs = 0;
-  const auto visit = [&](CellBits cells, auto smooth) {
+  const auto visit = [&](CellBits cells, auto& sums, auto smooth) {
     for (; cells != 0; cells &= cells - 1) {
       const int cell_begin = __builtin_ctz(cells) * kCellPixels;
       for (int at = cell_begin; at < cell_begin + kCellPixels; at += Pack<S>::kLanes) {
-        if (!visitor.wants(at)) continue;
+        Mask<Pack<S>> wanted;
+        if (!visitor.wanted(at, wanted)) continue;
         num_pairs += Pack<S>::kLanes;
-        visitor.take(at, PackPairs<Visitor::kMode, S, decltype(smooth)::value>(gaussian, pixels, at));
+        visitor.take(at, PackPairs<Visitor::kMode, S, decltype(smooth)::value>(gaussian, pixels, at), wanted, sums);
       }
     }
   };
@@ -248,10 +251,10 @@ DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int 
         Visitor::kBackToFront ? max(i - kPrefetchDistance, begin) : min(i + kPrefetchDistance, end - 1);
     list.load(i, next, gaussian);
     visitor.expect(tile.saved.instances[next].slot);
-    visitor.begin(gaussian);
-    visit(gaussian.met & on_image & ~gaussian.smooth, std::false_type{});
-    visit(gaussian.smooth & on_image, std::true_type{});
-    visitor.end(gaussian);
+    auto sums = visitor.begin(gaussian);
+    visit(gaussian.met & on_image & ~gaussian.smooth, sums, std::false_type{});
+    visit(gaussian.smooth & on_image, sums, std::true_type{});
+    visitor.end(gaussian, sums);
   }
   return num_pairs;
 }
