@@ -28,7 +28,7 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "counts": ("[N] int32, how many pixels blended the Gaussian", "count"),
     "opacity_sums": ("[N], counts times the opacity", "score"),
     "metric_counts": ("[N] int32, how many pixels of metric_map blended the Gaussian", "count"),
-    "kernel_times": ("[0], nothing is timed", "time"),
+    "kernel_times": ("[1], zero: nothing is timed", "time"),
     "objects": ("[F, H, W], sh_objs blended as a colour over 0", "object"),
     "feature_map": ("[F, H, W], semantic_feature blended as a colour over 0", "feature"),
     "language_feature": ("[F, H, W], language_feature_precomp blended as a colour over 0", "feature"),
