@@ -183,7 +183,8 @@ def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_pa
 
 CALLS = {  # what a checkout sets, calls with and names the results of, and the rasterizer that it needs
     "mip_splatting": ("kernel_size=1, subpixel_offset=2", "", "image, radii"),
-    "mcmc": ("", "", "image, radii, is_used"), "monogs": ("projmatrix_raw=1", "theta=1", "image, radii, depth, opacity"),
+    "mcmc": ("", "", "image, radii, is_used"),
+    "monogs": ("projmatrix_raw=1", "theta=1", "image, radii, depth, opacity"),
     "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
     "feature_3dgs": ("", "semantic_feature=1", "image, feature_map, radii, depth"),
     "langsplat": ("include_feature=1", "language_feature_precomp=1", "image, feature_image, radii"),
@@ -196,7 +197,7 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
 
 @pytest.mark.parametrize("flavour", CALLS)
 def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(flavour, tmp_path, monkeypatch):
-    module = next((contract.module for contract in CONTRACTS if contract.name == flavour), "diff_gaussian_rasterization")
+    module = {contract.name: contract.module for contract in CONTRACTS}.get(flavour, "diff_gaussian_rasterization")
     settings, keywords, results = CALLS[flavour]
     renderer = (f"from {module} import GaussianRasterizationSettings, GaussianRasterizer\n"
                 f"draw = GaussianRasterizer(raster_settings=GaussianRasterizationSettings(bg=1, {settings}))\n"
@@ -227,7 +228,8 @@ GSPLAT = {  # a gsplat of some lines: its version, and a strategy that has taken
                           "from .cuda import quat_scale_to_covar_preci\nfrom . import strategy\n"
                           "__version__ = '{version}'\n",
     "gsplat/rendering.py": "def rasterization(*a, **k): raise SystemExit('theirs')\n",
-    "gsplat/relocation.py": "compute_relocation = 'theirs'\n", "gsplat/cuda.py": "quat_scale_to_covar_preci = 'theirs'\n",
+    "gsplat/relocation.py": "compute_relocation = 'theirs'\n",
+    "gsplat/cuda.py": "quat_scale_to_covar_preci = 'theirs'\n",
     "gsplat/strategy/__init__.py": "from . import ops\n",
     "gsplat/strategy/ops.py": "from gsplat import quat_scale_to_covar_preci\n"
                               "from gsplat.relocation import compute_relocation\n"}
