@@ -2,7 +2,7 @@
 
 That gradient is here what the removal of a Gaussian changes, `Splats.importance().removal_costs`: exact in each blend
 mode, where the original has the squared derivative by the kernel. The trainer reads the order of the scores alone.
-`kernel_times` is empty.
+`kernel_times` is one zero.
 """
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _render(settings, inputs):
         color, radii = _Scored.apply(rendering.color, scores, splats), rendering.radii
     else:
         color, radii = results_of(("color", "radii"), settings, inputs)
-    return color, radii, color.new_zeros(0)
+    return color, radii, color.new_zeros(1)
 
 
 GaussianRasterizationSettings, GaussianRasterizer, rasterize_gaussians = classes_of("speedy_splat", __name__, _render)

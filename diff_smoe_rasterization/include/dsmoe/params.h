@@ -155,7 +155,6 @@ template <class S> struct ImageGradients {
 template <class S> struct GaussianGradients {
   S* means3D = nullptr;         // [N, 3]
   S* means2D = nullptr;         // [N, 3] dL/dpixel times (W/2, H/2), z = 0: what densification reads
-  S* means2D_abs = nullptr;     // [N, 2] sum over pixels of |dL/dpixel| times (W/2, H/2)
   S* opacities = nullptr;       // [N]
   S* scales = nullptr;          // [N, 3]
   S* rotations = nullptr;       // [N, 4]
@@ -165,6 +164,7 @@ template <class S> struct GaussianGradients {
   S* shs = nullptr;             // [N, K, 3]
   S* background = nullptr;      // [C + 1] by the colour, then by its gate
   CameraGradient<S>* camera = nullptr;
+  S* means2D_abs = nullptr;  // [N, 2] sum over pixels of |dL/dpixel| times (W/2, H/2)
   bool seen_only = false;  // whether the other rows stay as they are, in place of zeros
 };
 

@@ -15,8 +15,8 @@ def test_the_examples_run():
     text = README.read_text(encoding="utf-8")
     preamble, *flavours = re.split(r"^## ([\w, ]+)$", text, flags=re.MULTILINE)
     names, sections = flavours[::2], flavours[1::2]
-    assert names == ["inria", "inria_2024", "depth, depth_alpha", "taming", "c3dgs", "scaffold", "gsplat",
-                     "Which projects"]
+    assert names == ["inria", "inria_2024", "depth, depth_alpha", "More than images", "taming", "c3dgs", "scaffold",
+                     "gsplat", "Which projects"]
     torch.manual_seed(0)
     variables = {}
     example = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -35,6 +35,9 @@ def test_the_examples_run():
         if name == "taming":
             assert len(variables["accum_weights"]) == 500 and variables["accum_blend"].sum() > 1
             assert ((variables["accum_count"] > 0) <= (variables["radii"] > 0)).all()
+        if name == "More than images":  # 1e-3: float32 sums of some hundred terms
+            signed, absolute = variables["signed"].abs(), variables["absolute"]
+            assert (absolute > 0.999 * signed - 1e-3).all() and signed.any()
         if name == "inria":
             variables["from_inria"] = variables["color"]
         if name == "depth, depth_alpha":

@@ -156,7 +156,7 @@ def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
 
 
 OURS = RENDERER.replace("diff_gaussian_rasterization import", "diff_smoe_rasterization.integrations.inria import")
-ABS = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
+MS = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
 PYTHON = [*RUN, "--", sys.executable, "train.py"]
 AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
 
@@ -166,20 +166,101 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({}, [*RUN, "--"], "there is no command"), ({}, ["run", "--blend_mode", "smoe", "--"], "there is no command"),
     ({}, [*RUN, "--", "no-such-command"], "no-such-command: there is no such command"),
     ({"tool.py": ""}, [*RUN, "--", "./tool.py"], "./tool.py: is not executable; type: python ./tool.py"),
-    ({GR: None}, PYTHON, "name it with --trainer, or the rasterizer whose API it calls (c3dgs, depth"),
+    ({GR: None}, PYTHON, "name it with --trainer, or the rasterizer whose API it calls (absgs, c3dgs, depth"),
     ({}, [*RUN, "--trainer", "nerf", "--", sys.executable], "there is no trainer 'nerf'; it must be one of 3dgs-2023"),
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
     ({GR: OURS}, PYTHON, "is patched already: run the command itself, with --blend_mode"),
-    # Under --trainer too: AbsGS, Mini-Splatting, and a renderer of no rasterizer at all.
-    ({GR: ABS}, PYTHON, "it imports diff_gaussian_rasterization_abs, another rasterizer"),
-    ({GR: ABS}, AS_INRIA, "it imports diff_gaussian_rasterization_abs, another rasterizer"),
-    ({GR: RENDERER + ABS.replace("_abs", "_ms")}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
-    ({GR: "from gsplat import rasterization\n"}, AS_INRIA, "nothing imports GaussianRasterizationSettings from")])
+    # Under --trainer too: Mini-Splatting, and a renderer of no rasterizer at all.
+    ({GR: MS}, PYTHON, "it imports diff_gaussian_rasterization_ms, another rasterizer"),
+    ({GR: RENDERER + MS}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
+    ({GR: "from nvdiffrast import rasterize\n"}, AS_INRIA, "nothing imports GaussianRasterizationSettings from")])
 def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_path, dsmoe, monkeypatch):
     monkeypatch.chdir(make(tmp_path, files))
     result = dsmoe(*words)
     assert result.status in (1, 2) and said in result.err and "Traceback" not in result.err
+
+
+CALLS = {  # what a checkout sets, calls with and names the results of, and the rasterizer that it needs
+    "mip_splatting": ("kernel_size=1, subpixel_offset=2", "", "image, radii"),
+    "mcmc": ("", "", "image, radii, is_used"),
+    "monogs": ("projmatrix_raw=1", "theta=1", "image, radii, depth, opacity"),
+    "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
+    "feature_3dgs": ("", "semantic_feature=1", "image, feature_map, radii, depth"),
+    "langsplat": ("include_feature=1", "language_feature_precomp=1", "image, feature_image, radii"),
+    "speedy_splat": ("", "scores=1", "image, radii, kernel_times"),
+    "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
+    "light_gaussian": ("f_count=1", "", "counts, score, image, radii"), "depth": ("", "", "image, radii, depth"),
+    "absgs": ("", "", "image, radii, gs_w"), "fastgs": ("mult=1, get_flag=1", "dc=1", "image, radii, metric_counts"),
+    None: ("", "", "image, radii, normals"), "inria": ("", "", "image, radii")}
+
+
+@pytest.mark.parametrize("flavour", CALLS)
+def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(flavour, tmp_path, monkeypatch):
+    module = {contract.name: contract.module for contract in CONTRACTS}.get(flavour, "diff_gaussian_rasterization")
+    settings, keywords, results = CALLS[flavour]
+    renderer = (f"from {module} import GaussianRasterizationSettings, GaussianRasterizer\n"
+                f"draw = GaussianRasterizer(raster_settings=GaussianRasterizationSettings(bg=1, {settings}))\n"
+                f"{results} = draw(means3D=1, {keywords})\n")
+    monkeypatch.chdir(make(tmp_path, {GR: renderer}))
+    words = [sys.executable, "train.py"], "smoe", None, environment()
+    if flavour is None:
+        with pytest.raises(patches.PatchError, match="returns 3 results"):
+            run.prepare(*words)
+        return
+    made, lines = run.prepare(*words)
+    assert made["DSMOE_RASTERIZER"] == flavour and f"{module} will be {flavour} of this package" in lines[0]
+
+
+@pytest.mark.parametrize("flavour", ["absgs", "fastgs"])
+def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(flavour, tmp_path, python):
+    contract = next(contract for contract in CONTRACTS if contract.name == flavour)
+    script = (f"from {contract.module} import GaussianRasterizer, GaussianRasterizationSettings\n"
+              "print(GaussianRasterizer.__module__)\nGaussianRasterizer(None)\n")
+    make(tmp_path, {"x.py": script})
+    result = python("-m", "diff_smoe_rasterization", *RUN, "--trainer", flavour, "--", sys.executable, "x.py",
+                    cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+    assert (result.status, result.out) == (0, f"diff_smoe_rasterization.integrations.{flavour}\n"), result.err
+
+
+GSPLAT = {  # a gsplat of some lines: its version, and a strategy that has taken its functions by name
+    "gsplat/__init__.py": "from .rendering import rasterization\nfrom .relocation import compute_relocation\n"
+                          "from .cuda import quat_scale_to_covar_preci\nfrom . import strategy\n"
+                          "__version__ = '{version}'\n",
+    "gsplat/rendering.py": "def rasterization(*a, **k): raise SystemExit('theirs')\n",
+    "gsplat/relocation.py": "compute_relocation = 'theirs'\n",
+    "gsplat/cuda.py": "quat_scale_to_covar_preci = 'theirs'\n",
+    "gsplat/strategy/__init__.py": "from . import ops\n",
+    "gsplat/strategy/ops.py": "from gsplat import quat_scale_to_covar_preci\n"
+                              "from gsplat.relocation import compute_relocation\n"}
+CALL_GSPLAT = """import torch
+from gsplat.rendering import rasterization
+view, K = torch.eye(4)[None], torch.tensor([[[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]])
+means = torch.tensor([[0.0, 0, 2]])
+image, alphas, meta = rasterization(means, torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.3), torch.ones(1),
+                                    torch.ones(1, 3), view, K, 8, 8, packed=False)
+print(image.max().item() > 0.5, list(meta["radii"].shape))
+"""
+CALL_STRATEGY = """from gsplat.strategy import ops
+print(ops.compute_relocation.__module__, ops.quat_scale_to_covar_preci.__module__)
+"""
+
+
+@pytest.mark.parametrize("version, radii", [("1.4.0", [1, 1]), ("1.5.3", [1, 1, 2]), ("1.6.0+cu13", [1, 1, 2]),
+                                            (None, [1, 1, 2])])
+def test_gsplat_gets_this_rasterizer_and_keeps_its_strategies(version, radii, tmp_path, python):
+    """version None: where gsplat is not installed, there is the rasterizer alone."""
+    make(tmp_path, {GR: None, "x.py": CALL_GSPLAT + (CALL_STRATEGY if version else "")})
+    installed = tmp_path / "installed"
+    for name, text in GSPLAT.items() if version else ():
+        (installed / name).parent.mkdir(parents=True, exist_ok=True)
+        (installed / name).write_text(text.replace("{version}", version))
+    result = python("-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py", cwd=tmp_path,
+                    PYTHONPATH=os.pathsep.join([str(PACKAGE_PARENT), str(installed)]))
+    assert result.status == 0, result.err
+    ours = "diff_smoe_rasterization.integrations.gsplat"
+    assert result.out.splitlines() == [f"True {radii}", *([f"{ours} {ours}"] if version else [])]
+    assert "gsplat will be gsplat of this package, blend mode smoe" in result.err
 
 
 def test_what_speaks_against_a_trainer_that_is_named_is_said(tmp_path, dsmoe, monkeypatch):
@@ -241,4 +322,5 @@ def test_the_package_brings_the_shims_and_nothing_beside_itself():
     assert brought == set((root / "patches/shims").rglob("*.py")) != set()
     for contract in CONTRACTS:
         module = importlib.import_module(f"diff_smoe_rasterization.integrations.{contract.name}")
-        assert {*NAMES, *contract.names} <= set(module.__all__)
+        names = NAMES if contract.module != "gsplat" else ("rasterization",)
+        assert {*names, *contract.names} <= set(module.__all__)
