@@ -122,8 +122,8 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device
               held: Optional[IO[str]] = None) -> Dict[str, Any]:
     """Runs `work` in a process of its own, which ends with this one, and returns the row that is in OUT then.
 
-    gpu: those that the process is given, "0" or "0,1"; None: as the machine has them. per_device: how many cells may have that GPU,
-    or on the CPU this machine, at once; None where nobody counts. held: a lock that the process has too.
+    gpu: those that the process is given, "0" or "0,1"; None: as the machine has them. per_device: how many cells may
+    have that GPU, or on the CPU this machine, at once; None where nobody counts. held: a lock that the process has too.
     """
     with open(cell_path, encoding="utf-8") as file:
         cell = json.load(file)
@@ -196,7 +196,8 @@ def main(argv: Optional[List[str]] = None) -> int:
                                      description="Trains and measures one cell of a suite.")
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
     parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
-    parser.add_argument("--gpus", metavar="N,N", default="", help="take of these GPUs as many as the cell says, one if nothing")
+    parser.add_argument("--gpus", metavar="N,N", default="",
+                        help="take of these GPUs as many as the cell says, one if nothing")
     parser.add_argument("--per-device", metavar="K", type=int,
                         help="cells that may have one GPU, or on the CPU this machine, at once; the row says it "
                              "(default: 1 with --gpus, else nothing is said)")
