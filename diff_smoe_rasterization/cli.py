@@ -333,10 +333,14 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
     group = join_group(config.device)
     try:
         _train_in(group, config, arguments)
-    except Exception as error:
-        if group.leads or in_one_line(error) is None and not is_lost(error):
+    except KeyboardInterrupt as stop:
+        if group.leads:
             raise
-        text = "another process has ended" if is_lost(error) else in_one_line(error)
+        return exit_status(stop)  # the first process says it
+    except Exception as error:
+        text = "another process has ended" if group.size > 1 and is_lost(error) else in_one_line(error)
+        if text is None or group.size == 1:
+            raise
         raise TrainerError(f"process {group.rank}: {text}") from error
     finally:
         leave_group(group)

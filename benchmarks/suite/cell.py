@@ -122,8 +122,8 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device
               held: Optional[IO[str]] = None) -> Dict[str, Any]:
     """Runs `work` in a process of its own, which ends with this one, and returns the row that is in OUT then.
 
-    gpu: the one that the process is given; None: as the machine has it. per_device: how many cells may have that GPU,
-    or on the CPU this machine, at once; None where nobody counts. held: a lock that the process has too.
+    gpu: those that the process is given, "0" or "0,1"; None: as the machine has them. per_device: how many cells may
+    have that GPU, or on the CPU this machine, at once; None where nobody counts. held: a lock that the process has too.
     """
     with open(cell_path, encoding="utf-8") as file:
         cell = json.load(file)
@@ -150,6 +150,12 @@ def how_it_ended(status: int, log_path: str) -> str:
     how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
     memory = "; the system may have been out of memory" if status == -signal.SIGKILL else ""
     return f"the process {how}{memory}" + (f"; its last line: {words}" if words else "")
+
+
+def gpus_of(cell_path: str) -> int:
+    """How many GPUs the cell takes."""
+    with open(cell_path, encoding="utf-8") as file:
+        return json.load(file)["protocol"].get("gpus", 1)
 
 
 def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Tuple[str, IO[str]]:
@@ -190,7 +196,8 @@ def main(argv: Optional[List[str]] = None) -> int:
                                      description="Trains and measures one cell of a suite.")
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
     parser.add_argument("output", metavar="OUT", help="folder of row.json, log.txt and images")
-    parser.add_argument("--gpus", metavar="N,N", default="", help="take one of these GPUs")
+    parser.add_argument("--gpus", metavar="N,N", default="",
+                        help="take of these GPUs as many as the cell says, one if nothing")
     parser.add_argument("--per-device", metavar="K", type=int,
                         help="cells that may have one GPU, or on the CPU this machine, at once; the row says it "
                              "(default: 1 with --gpus, else nothing is said)")
@@ -203,14 +210,16 @@ def main(argv: Optional[List[str]] = None) -> int:
         with open(arguments.cell, encoding="utf-8") as file:
             work(json.load(file), arguments.output, time.time(), arguments.per_device)
         return 0
-    gpu, lock, held, per_device = None, None, None, arguments.per_device
+    gpu, locks, held, per_device = None, [], None, arguments.per_device
     try:
         if arguments.hold:
             die_with_parent()
             held = locked(arguments.hold, shared=True)
         if arguments.gpus:
             per_device = per_device or 1
-            gpu, lock = claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_device)
+            claims = [claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_device)
+                      for _ in range(gpus_of(arguments.cell))]
+            gpu, locks = ",".join(name for name, _ in claims), [lock for _, lock in claims]
         row = supervise(arguments.cell, arguments.output, gpu, per_device, held)
     except TrainerError as error:
         print(f"{arguments.cell}: {error}", file=sys.stderr)
@@ -218,7 +227,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     except KeyboardInterrupt:
         return 130
     finally:
-        for file in filter(None, (lock, held)):
+        for file in filter(None, (*locks, held)):
             file.close()
     tell(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {shown(row['psnr'], '.2f')} dB" if row["ok"]
                                else f"failed: {row['reason']}"))

@@ -183,6 +183,8 @@ def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[st
             raise BenchError(f"--slurm {word}: must be KEY=VALUE, such as slurm_partition=gpu; the suite comes first")
     if per_gpu > 1 and (suite.protocol["device"] != "cuda" or slurm is not None):
         raise BenchError(f"--per-gpu is {per_gpu}; it is for protocol.device cuda, without --slurm")
+    if per_gpu > 1 and suite.protocol.get("gpus", 1) > 1:
+        raise BenchError(f"--per-gpu is {per_gpu}; it must be 1 with protocol.gpus {suite.protocol['gpus']}")
 
 
 def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optional[int],
@@ -194,12 +196,15 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
     if on_gpu and slurm is None and not gpus:
         raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine; for the "
                          "CPU set protocol.device: cpu")
-    at_once = min(jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus))), len(cells))
+    each = suite.protocol.get("gpus", 1)
+    if gpus and each > len(gpus):
+        raise BenchError(f"protocol.gpus is {each}, and torch finds {len(gpus)} on this machine")
+    at_once = min(jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus) // each)), len(cells))
     # Spread over the GPUs first: no more cells share one than must. In a queue nobody counts: 0.
     per_device = 0 if slurm is not None else min(per_gpu, -(-at_once // len(gpus))) if gpus else at_once
     threads = threads_of_each(at_once) if slurm is None else threads_asked_for(slurm)
     said = {"cells": json.dumps([cell["id"] for cell in cells]), "python": sys.executable, "threads": threads,
-            "device": suite.protocol["device"], "per_device": per_device,
+            "gpus_each": each if on_gpu else 0, "per_device": per_device,
             "gpus": json.dumps(gpus)}  # a list: Snakemake takes a bare 0 for a number
     words = [sys.executable, "-m", "snakemake", "all", "--snakefile", SNAKEFILE, "--directory", results, "--nolock",
              "--quiet", "host", "reason", "rules", "--keep-going", "--rerun-incomplete",

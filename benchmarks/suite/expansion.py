@@ -17,7 +17,7 @@ from typing import Any, Dict, List, Sequence, Tuple
 import yaml
 
 from ...settings import resolve_background_gate
-from ...trainer.config import LEARNED
+from ...trainer.config import BATCHED, LEARNED
 from ...trainer.errors import ConfigError
 from ..errors import BenchError
 from . import schema
@@ -68,6 +68,7 @@ def expand(content: Any, folder: str) -> Suite:
     schema.check(content)
     content = {**schema.defaults(schema.Axes), **schema.defaults(schema.SuiteFile), **content}
     protocol = {**schema.defaults(schema.Protocol), **(content["protocol"] or {})}
+    protocol = {name: value for name, value in protocol.items() if value is not None}
     scenes = [_scene({**schema.defaults(schema.Scene), "background": protocol["background"], **scene}, scene,
                      f"scenes[{index}]", folder) for index, scene in enumerate(content["scenes"])]
     methods = [_method(method, f"methods[{index}]", protocol, folder)
@@ -82,6 +83,7 @@ def expand(content: Any, folder: str) -> Suite:
     for scene, method in itertools.product(scenes, methods):
         if method["name"] != NATIVE:
             _can_train(content, scene, method)
+        _can_divide(content, protocol, scene, method)
         cells += _cells(content, protocol, scene, method)
     for cell in cells:
         try:
@@ -242,6 +244,22 @@ def _can_train(content: Dict[str, Any], scene: Dict[str, Any], method: Dict[str,
 def _values(axis: str, content: Dict[str, Any], scene: Dict[str, Any], method: Dict[str, Any]) -> List[Any]:
     """The values of an axis: the method's own, else the scene's, else the suite's."""
     return {**content, **scene["axes"], **method["axes"]}[axis]
+
+
+def _can_divide(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, Any],
+                method: Dict[str, Any]) -> None:
+    """Raises BenchError where the method cannot train on batches of views or on several GPUs, as the protocol says."""
+    for field in ("batch", "gpus"):
+        if protocol.get(field, 1) == 1:
+            continue
+        what = f"protocol.{field} is {protocol[field]}"
+        if method["name"] != NATIVE:
+            raise BenchError(f"{what}, but method {method['label']} knows none; only {NATIVE} does")
+        for schedule in _values("schedules", content, scene, method):
+            if schedule not in BATCHED:
+                raise BenchError(f"{what}, but schedule {schedule} knows none; only {' and '.join(BATCHED)} do")
+    if protocol.get("gpus", 1) > 1 and protocol["device"] != "cuda":
+        raise BenchError(f"protocol.gpus is {protocol['gpus']}; it needs protocol.device: cuda")
 
 
 def _cells(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, Any],

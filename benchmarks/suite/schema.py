@@ -84,6 +84,8 @@ class Protocol(Part):
     """What is the same for all cells."""
 
     iterations: Positive = 30_000
+    batch: Positive = None  # views a step; this and gpus stand only where they are given, as in earlier rows
+    gpus: Positive = None  # of each cell
     device: Literal["cpu", "cuda"] = "cuda"
     background: Background = "black"
     principal_point: one_of(PRINCIPAL_POINTS) = "centre"

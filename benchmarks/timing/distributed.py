@@ -56,8 +56,8 @@ def new_trainer(options: argparse.Namespace, group: Any) -> BatchTrainer:
     points = PointCloud(np.random.RandomState(0).rand(max(4, group.size), 3), np.zeros((max(4, group.size), 3)))
     scene = Scene("synthetic", [View(camera, blank) for camera in cameras], [], points, 1.0, "all train")
     config = TrainConfig(scene="-", output="-", device=options.device, batch=options.batch,
-                         blend_mode=options.blend_mode, iterations=10**6 * options.batch, densify_until_iter=0, sh_degree=options.sh_degree,
-                         deterministic=options.deterministic, background_gate=None).validate()
+                         blend_mode=options.blend_mode, iterations=10**6 * options.batch, densify_until_iter=0,
+                         sh_degree=options.sh_degree, deterministic=options.deterministic).validate()
     trainer = BatchTrainer(config, scene, group)
     tensors = {name: torch.tensor(packed[key], device=options.device) for name, key in (
         ("means3D", "xyz"), ("dc", "f_dc"), ("shs", "f_rest"), ("opacities", "opacity"), ("scales", "scale"),

@@ -72,6 +72,16 @@ def test_opcheck_of_rasterize(mode, case):
     opcheck_rasterize(scene)
 
 
+@pytest.mark.parametrize("case", [dict(degree=1), dict(channels=5, covariance="cov3D")])
+def test_opcheck_of_project(case):
+    """Nobody has written the rows of culled Gaussians on a GPU, so there results are not compared."""
+    scene = random_scene("smoe", 20, 20, 18, dtype=torch.float32, **case)
+    op, arguments = torch.ops.diff_smoe_rasterization.project.default, op_arguments(scene, "project")
+    on_gpu = scene.inputs["means3D"].device.type == "cuda"
+    torch.library.opcheck(op, arguments, test_utils=("test_schema", "test_faketensor", *(
+        () if on_gpu else ("test_aot_dispatch_dynamic",))))
+
+
 @SHAPES
 def test_opcheck_of_rasterize_on_no_gaussians(mode):
     scene = random_scene(mode, 20, 20, 18, dtype=torch.float32).rows(slice(0, 0)).requiring_grad()

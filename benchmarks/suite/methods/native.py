@@ -7,11 +7,15 @@ from typing import Any, Dict, List
 
 import torch
 
+from ....trainer.config import TrainConfig, holds_run
+from ....trainer.errors import TrainerError
 from ....trainer.inspection import open_renderer
 from ....trainer.results.evaluation import evaluate
 from ....trainer.results.modelfile import model_path
 from ....trainer.results.pictures import evenly_spaced
+from ....trainer.results.rows import read_results
 from ....trainer.scenes.scene import load_scene
+from ....trainer.system import torchrun
 from ....trainer.system.process import set_up_process
 from ....trainer.training.checkpoint import CHECKPOINT_NAME
 from ....trainer.training.loop import HISTORY_NAME, train
@@ -30,9 +34,10 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
         torch.cuda.reset_peak_memory_stats()
     continued = os.path.isfile(os.path.join(folder, CHECKPOINT_NAME))
     scene = require_test_views(load_scene(config, progress=False), config).to(config.device)
-    row = train(config, resume=True, progress=False, scene=scene)
+    gpus = cell["protocol"].get("gpus", 1)
+    row = train_on(gpus, config) if gpus > 1 else train(config, resume=True, progress=False, scene=scene)
     # The peak of a part of the training would be taken for that of the whole.
-    peak = torch.cuda.max_memory_allocated() / 2**20 if on_gpu and not continued else None
+    peak = torch.cuda.max_memory_allocated() / 2**20 if on_gpu and gpus == 1 and not continued else None
     measures = Measures(config.device, cell["protocol"]["lpips"])  # after the peak, of which its networks are no part
     ply = model_path(folder, config.iterations)
     renderer = open_renderer(config, ply, config.blend_mode, config.device)
@@ -46,7 +51,21 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
                    num_gaussians=row["num_gaussians"], own_bytes=os.path.getsize(ply),
                    train_seconds=row["train_seconds"], peak_gpu_mib=peak, history=_history(folder), renders=renders,
                    notes={"continued": continued, "scale_recipe": cell["protocol"]["scale_recipe"],
-                          "background_gate": row["background_gate"]})
+                          "background_gate": row["background_gate"], **({"gpus": gpus} if gpus > 1 else {})})
+
+
+def train_on(gpus: int, config: TrainConfig) -> Dict[str, Any]:
+    """Trains in as many processes, continuing where an earlier attempt stopped; returns the run's row.
+
+    Raises TrainerError where one of them fails; what they printed says why.
+    """
+    os.makedirs(config.output, exist_ok=True)
+    if not holds_run(config.output):
+        config.save(config.output)
+    status = torchrun.launch(gpus, ["train", "--resume", "-o", config.output, "--quiet"])
+    if status != 0:
+        raise TrainerError(f"the training on {gpus} GPUs ended with status {status}; log.txt says why")
+    return read_results(config.output)[0]
 
 
 def _history(folder: str) -> List[Dict[str, Any]]:

@@ -83,7 +83,7 @@ class DividedShards(Shards):
         self.counts = self._even_counts(int(of_rank.sum()))
         ends = torch.tensor(self.counts, device=kinds.device).cumsum(0)
         owners = torch.bucketize(places, ends, right=True)
-        order = owners.argsort(stable=True)
+        order = owners.sort(stable=True).indices
         sent = torch.bincount(owners, minlength=self.group.size).tolist()
         sent_by = self.group.gather_numbers(sent, str(kinds.device))
         received = [numbers[self.group.rank] for numbers in sent_by]

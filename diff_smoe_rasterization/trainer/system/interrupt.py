@@ -22,7 +22,11 @@ class DelayedInterrupt:
     somebody else's.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, patient: bool = False) -> None:
+        """patient: a second signal does nothing. Who ends a job may signal torchrun and its processes, to which
+        torchrun passes the signal on; it kills them after half a minute.
+        """
+        self.patient = patient
         self.asked: Optional[KeyboardInterrupt] = None  # what is to be raised once all is saved
         self._usual: Dict[int, Any] = {}
 
@@ -40,4 +44,5 @@ class DelayedInterrupt:
 
     def _ask(self, number: int, frame: Any) -> None:
         self.asked = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
-        self.__exit__()
+        if not self.patient:
+            self.__exit__()

@@ -92,6 +92,10 @@ class Trainer:
         return Shards()
 
     leads = True  # whether this process prints and writes
+    is_divided = False  # whether several processes train together
+
+    def meet(self) -> None:
+        """Waits for the other processes."""
 
     @property
     def checkpoint_device(self) -> str:
@@ -248,7 +252,7 @@ class Run:
         self.scalars = Scalars(config.output, trainer.iteration, wanted=trainer.leads)
         new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
                                disable=not self.progress, dynamic_ncols=True)
-        with contextlib.closing(self.scalars), new_bar as bar, DelayedInterrupt() as interrupt:
+        with contextlib.closing(self.scalars), new_bar as bar, DelayedInterrupt(patient=trainer.is_divided) as interrupt:
             trainer.wants_stop = lambda: interrupt.asked is not None
             trainer.watch.start()
             ends = trainer.iteration >= config.iterations
@@ -288,6 +292,7 @@ class Run:
         state = self.trainer.state_dict()
         if self.trainer.leads:
             save_checkpoint(self._path(CHECKPOINT_NAME), {**state, "history": self.history, "losses": self.losses})
+        self.trainer.meet()  # where one process ends before the file is whole, torchrun ends the others
 
     def _show(self, bar: Any, loss: float) -> None:
         if not (self.progress or self.scalars.active):

@@ -12,6 +12,9 @@ from bench_commands import environment
 
 from diff_smoe_rasterization.benchmarks.suite import cell as cells
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
+from diff_smoe_rasterization.benchmarks.suite.methods import native
+from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.results.rendering import Renderer
 
 
@@ -71,6 +74,34 @@ def test_cells_that_share_gpus_are_spread_over_them_first(tmp_path):
     assert claims[-1][0] == "5"
     for _, lock in claims:
         lock.close()
+
+
+def test_a_cell_takes_as_many_gpus_as_it_says(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(cells, "supervise", lambda path, output, gpu, *rest: seen.append(gpu) or {
+        "cell": "c", "ok": False, "reason": "none"})
+    for number, gpus in enumerate(({}, {"gpus": 2})):
+        path = tmp_path / f"{number}.json"
+        path.write_text(json.dumps({"protocol": gpus}))
+        assert cells.main([str(path), str(tmp_path), "--gpus", "3,5,7", "--locks", str(tmp_path / "locks")]) == 0
+    assert seen == ["3", "3,5"]
+
+
+def test_a_cell_of_two_gpus_is_trained_by_torchrun(content, tmp_path, monkeypatch):
+    """Its processes are replaced by one on the CPU, which goes on with what it finds in the folder."""
+    content["protocol"].update(batch=4)
+    cell = {**expand(content, "").cells[0], "blend_mode": "alpha", "background_gate": 1.0}
+    cell["protocol"] = {**cell["protocol"], "gpus": 2}
+    launched = []
+    monkeypatch.setattr(native.torchrun, "launch", lambda gpus, words: launched.append((gpus, words)) or main(words))
+    (tmp_path / "cell").mkdir()
+    outcome = native.run_native(cell, str(tmp_path / "cell"))
+    folder = str(tmp_path / "cell" / "run")
+    assert launched == [(2, ["train", "--resume", "-o", folder, "--quiet"])]
+    assert outcome.notes["gpus"] == 2 and outcome.num_gaussians > 0 and outcome.evaluation.metrics["psnr"] > 5
+    monkeypatch.setattr(native.torchrun, "launch", lambda gpus, words: 1)
+    with pytest.raises(TrainerError, match="the training on 2 GPUs ended with status 1"):
+        native.train_on(2, native.config_of(cell, folder))
 
 
 @pytest.fixture

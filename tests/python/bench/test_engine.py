@@ -386,6 +386,39 @@ def on_gpus(content, monkeypatch):
     return expand({**content, "headline": {"blend_modes": ["alpha"]}, "seeds": list(range(8))}, "")
 
 
+def test_cells_of_two_gpus_take_two_of_three(on_gpus, monkeypatch):
+    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: object())  # of Slurm's plugin
+    on_gpus.protocol["gpus"] = 2
+    words = words_of(on_gpus, None, None)
+    assert (words["gpus_each"], words["gpu"], words["--cores"]) == ("2", "3", "24")  # one cell at once
+    assert words_of(on_gpus, None, ["runtime=10"])["gpus_each"] == "2"
+    with pytest.raises(BenchError, match="--per-gpu is 2; it must be 1 with protocol.gpus 2"):
+        engine.check_sharing(on_gpus, None, None, 2)
+    on_gpus.protocol["gpus"] = 4
+    with pytest.raises(BenchError, match="protocol.gpus is 4, and torch finds 3 on this machine"):
+        words_of(on_gpus, None, None)
+
+
+@pytest.mark.parametrize("protocol, more, text", [
+    (dict(gpus=2, device="cpu"), {}, "protocol.gpus is 2; it needs protocol.device: cuda"),
+    (dict(gpus=2, device="cuda", principal_point="centre"), {"methods": [{"name": "3dgs-2023", "path": "x"}]},
+     "but method 3dgs-2023 knows none; only native does"),
+    (dict(batch=2), {"schedules": ["mcmc"]}, "protocol.batch is 2, but schedule mcmc knows none"),
+    (dict(batch=5), {}, "--iterations is 12; it must be a multiple of --batch, 5")])
+def test_batches_and_gpus_that_cannot_be_are_refused(content, protocol, more, text):
+    content["protocol"].update(protocol)
+    with pytest.raises(BenchError, match=text):
+        expand({**content, **more}, "")
+
+
+def test_a_cells_name_is_as_it_was_without_batches(content):
+    def names(**protocol):
+        return {cell["id"] for cell in expand({**content, "protocol": {**content["protocol"], **protocol}}, "").cells}
+
+    assert not names() & names(batch=2)
+    assert all("batch" not in cell["protocol"] and "gpus" not in cell["protocol"] for cell in expand(content, "").cells)
+
+
 def test_queues_are_snakemakes_business(on_gpus, monkeypatch):
     monkeypatch.setattr(engine, "visible_gpus", list)
     with pytest.raises(BenchError, match="no CUDA device"):

@@ -80,9 +80,9 @@ def test_a_budget_holds_for_all_processes_together(tiny_config, tmp_path):
     other = dataclasses.replace(config, output=str(tmp_path / "two"))
     status, out, errors = torchrun(
         2, "-m", "diff_smoe_rasterization", "train", config.scene, "-o", other.output, "--quiet",
-        "--strategy", "steady", "--budget", "170", "--iterations", "20", "--blend-mode", "smoe", "--sh-degree-interval", "10",
-        "--densify-from-iter", "4", "--densify-until-iter", "30", "--densification-interval", "8",
-        "--densify-grad-threshold", "0.002")
+        "--strategy", "steady", "--budget", "170", "--iterations", "20", "--blend-mode", "smoe",
+        "--sh-degree-interval", "10", "--densify-from-iter", "4", "--densify-until-iter", "30",
+        "--densification-interval", "8", "--densify-grad-threshold", "0.002")
     assert status == 0, errors
     assert "1 blend nothing; --batch 2 keeps all busy" in out
     assert model_of(other) == model_of(config)
