@@ -288,8 +288,8 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
 }
 
 template <class S, BlendMode kMode, int kFeatures, class Sink>
-__global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks
-                                                                                          : kGeneralWalkBlocks)
+__global__ void __launch_bounds__(kWalkBlock,
+                                  sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks : kGeneralWalkBlocks)
     blend_backward_kernel(const __grid_constant__ BackwardWithSink<S, Sink> arguments) {
   using Visitor = BackwardVisitor<S, kMode, kFeatures, Sink>;
   __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
