@@ -7,13 +7,12 @@
 //
 // (HiGS, arXiv:2606.00352, sorts by macro tiles too, and has masks of small tiles.) An instance carries the bits of its
 // tile's four squares, so that the warps of the walk do not test footprints again.
-#include "macro_lists.h"
-
 #include <limits>
 
 #include "device.cuh"
 #include "dsmoe/params.h"
 #include "look_back.cuh"
+#include "macro_lists.h"
 #include "radix_sort.cuh"
 #include "tile_rows.cuh"
 
@@ -21,10 +20,10 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-constexpr int kMacroSize = 64;                            // pixels, each way
-constexpr int kMacroTiles = kMacroSize / kTileSize;       // tiles, each way
+constexpr int kMacroSize = 64;                       // pixels, each way
+constexpr int kMacroTiles = kMacroSize / kTileSize;  // tiles, each way
 constexpr int kTilesPerMacro = kMacroTiles * kMacroTiles;
-constexpr int kSquares = kMacroSize / kWarpTile;          // squares of warps, each way
+constexpr int kSquares = kMacroSize / kWarpTile;  // squares of warps, each way
 static_assert(kSquares == 8 && kTileSize == 2 * kWarpTile, "a macro tile's squares are 64 bits, a tile's are four");
 template <class Key> constexpr int kMacroDigit = sizeof(Key) == 2 ? kShortMacroDigit : kLongMacroDigit;
 template <class Key> constexpr int kMacroBins = 1 << kMacroDigit<Key>;
@@ -147,7 +146,7 @@ __global__ void __launch_bounds__(kListBlock)
       const unsigned row = in_rect / width, column = in_rect - row * width;
       const uint32_t key = ((corner >> 16) + row) * list.grid.columns + (corner & 0xffff) + column;
       for (int p = 0; p < list.passes; ++p) {
-        atomicAdd(&counts[p][key >> (p * kMacroDigit<Key>) & (kMacroBins<Key> - 1)], 1u);
+        atomicAdd(&counts[p][key >> (p * kMacroDigit<Key>)&(kMacroBins<Key> - 1)], 1u);
       }
       if (slot + k >= list.capacity) continue;
       list.keys[slot + k] = static_cast<Key>(key);
@@ -213,15 +212,36 @@ struct Chunks {
   }
 };
 
-// A chunk's entries.
-struct Chunk {
-  int macro;
-  int64_t begin, end;
-  __device__ Chunk(const Chunks& chunks, int64_t number, int lane) {
-    macro = chunks.macro_of(number, lane);
-    begin = chunks.offsets[macro] + (number - chunks.first_chunk(macro)) * kChunk;
-    end = min(begin + kChunk, chunks.offsets[macro + 1]);
+// A block's share of the chunks: neighbouring ones, so that it seldom searches for their macro tile.
+class ChunkWalk {
+ public:
+  __device__ ChunkWalk(const Chunks& chunks, int lane) : chunks_(chunks) {
+    const int64_t all = chunks.end(), share = (all + gridDim.x - 1) / gridDim.x;
+    number = share * blockIdx.x;
+    last_ = min(number + share, all);
+    if (number < last_) begin_chunk(chunks.macro_of(number, lane));
   }
+
+  __device__ bool is_done() const { return number >= last_; }
+  __device__ void next() {
+    if (++number >= last_) return;
+    // Each macro tile has a number at least, so that the next one is at most one macro tile ahead.
+    begin_chunk(macro + (macro + 1 < chunks_.macros && chunks_.first_chunk(macro + 1) <= number));
+  }
+
+  int64_t number;      // of the chunk
+  int macro;           // tile
+  int64_t begin, end;  // its entries; none where the number has no chunk
+
+ private:
+  __device__ void begin_chunk(int of_macro) {
+    macro = of_macro;
+    begin = chunks_.offsets[macro] + (number - chunks_.first_chunk(macro)) * kChunk;
+    end = min(begin + kChunk, chunks_.offsets[macro + 1]);
+  }
+
+  const Chunks& chunks_;
+  int64_t last_;  // behind the block's last number
 };
 
 // Bits of the tiles that have squares, each at its tile's first square.
@@ -277,8 +297,7 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
   __shared__ uint32_t counts[kChunk / kWarp][kTilesPerMacro];
   const Chunks& chunks = arguments.chunks;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  for (int64_t number = blockIdx.x; number < chunks.end(); number += gridDim.x) {
-    const Chunk chunk(chunks, number, lane);
+  for (ChunkWalk chunk(chunks, lane); !chunk.is_done(); chunk.next()) {
     if (chunk.begin >= chunk.end) continue;
     const int macro_x = chunk.macro % arguments.macro_columns, macro_y = chunk.macro / arguments.macro_columns;
     const int64_t entry = chunk.begin + threadIdx.x;
@@ -304,7 +323,7 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
     if (threadIdx.x < kTilesPerMacro) {
       uint32_t sum = 0;
       for (int w = 0; w < kChunk / kWarp; ++w) sum += counts[w][threadIdx.x];
-      chunks.counts[number * kTilesPerMacro + threadIdx.x] = sum;
+      chunks.counts[chunk.number * kTilesPerMacro + threadIdx.x] = sum;
       if (sum > 0) {
         const int x = macro_x * kMacroTiles + threadIdx.x % kMacroTiles;
         const int y = macro_y * kMacroTiles + threadIdx.x / kMacroTiles;
@@ -315,13 +334,13 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
 }
 
 struct TileOffsetArguments {
-  int64_t tiles;            // of the image
-  const uint32_t* counts;   // [tiles] instances of each tile
-  LookBack look_back;       // zero before
-  EntryCount entries;       // of macro tiles
-  int64_t* offsets;         // [tiles + 1] written
-  int64_t* num_instances;   // [1] written; where the entries did not fit, it is their number
-  int32_t* segment_queue;   // its counter is set to 0; or null
+  int64_t tiles;           // of the image
+  const uint32_t* counts;  // [tiles] instances of each tile
+  LookBack look_back;      // zero before
+  EntryCount entries;      // of macro tiles
+  int64_t* offsets;        // [tiles + 1] written
+  int64_t* num_instances;  // [1] written; where the entries did not fit, it is their number
+  int32_t* segment_queue;  // its counter is set to 0; or null
 };
 
 // Adds up the tiles before each tile.
@@ -353,8 +372,8 @@ __global__ void __launch_bounds__(kSortBlock)
 
 struct GiveArguments {
   Chunks chunks;
-  const int32_t* gaussians;      // [entries] of each entry
-  const uint64_t* squares;       // [entries] that the footprint meets
+  const int32_t* gaussians;  // [entries] of each entry
+  const uint64_t* squares;   // [entries] that the footprint meets
   TileGrid tiles;
   int macro_columns;
   const int64_t* tile_offsets;   // [tiles + 1]
@@ -371,8 +390,7 @@ __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_cons
   if (*arguments.num_instances > arguments.capacity) return;
   const Chunks& chunks = arguments.chunks;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  for (int64_t number = blockIdx.x; number < chunks.end(); number += gridDim.x) {
-    const Chunk chunk(chunks, number, lane);
+  for (ChunkWalk chunk(chunks, lane); !chunk.is_done(); chunk.next()) {
     if (chunk.begin >= chunk.end) continue;
     const int64_t entry = chunk.begin + threadIdx.x;
     const bool exists = entry < chunk.end;
@@ -396,7 +414,7 @@ __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_cons
     if (lane < kTilesPerMacro) counts[warp][lane] = own;
     __syncthreads();
     unsigned long long earlier = 0;
-    for (int64_t c = chunks.first_chunk(chunk.macro) + threadIdx.x / kTilesPerMacro; c < number;
+    for (int64_t c = chunks.first_chunk(chunk.macro) + threadIdx.x / kTilesPerMacro; c < chunk.number;
          c += kChunk / kTilesPerMacro) {
       earlier += chunks.counts[c * kTilesPerMacro + threadIdx.x % kTilesPerMacro];
     }
@@ -436,8 +454,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   const int64_t num_tiles = int64_t(tiles.columns) * tiles.rows, macros = grid.count();
   // Where a list of macro tiles is longer than all lists of tiles, it does not fit; num_instances then says so.
   const int64_t capacity = max<int64_t>(1, min<int64_t>(saved.capacity, kCountMask));
-  const int64_t list_blocks = max<int64_t>(1, blocks_for(frame.inputs.num_gaussians,
-                                                         kListBlock * kListedPerLane));
+  const int64_t list_blocks = max<int64_t>(1, blocks_for(frame.inputs.num_gaussians, kListBlock * kListedPerLane));
   const int64_t offset_blocks = blocks_for(num_tiles + 1, kSortBlock);
   int passes = 1;
   while (int64_t(1) << (passes * kMacroDigit<Key>) < macros) ++passes;
@@ -497,8 +514,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   DSMOE_CHECK_LAUNCH("macro_offsets");
 
   const int64_t most_chunks = capacity / kChunk + macros;
-  const Chunks chunks = {offsets.offsets, grid.count(),
-                         allocate<uint32_t>(scratch, most_chunks * kTilesPerMacro)};
+  const Chunks chunks = {offsets.offsets, grid.count(), allocate<uint32_t>(scratch, most_chunks * kTilesPerMacro)};
   TestArguments<S> test = {};
   test.chunks = chunks;
   test.gaussians = pass.values;

@@ -66,7 +66,8 @@ int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& ke
   count_instances(frame, work);
   const auto count = read(frame.saved.num_instances, "projecting Gaussians", run.stream);
   if (run.deterministic) check_slots(count);
-  return count;
+  // The lists of macro tiles must fit too. Seldom are they longer, by macro tiles that long Gaussians only pass by.
+  return run.deterministic ? count : count + count / 8;
 }
 
 // Lists the instances, with room for `sizes.capacity`. What depends on the capacity is allocated anew.

@@ -37,9 +37,9 @@ struct TensorBasis {
 
 // What one warp keeps in shared memory.
 struct TensorStage {
-  float values[kTensorBatch][kTensorRow];      // dL/dpower and weight of pixel k of lane l, at 4 l + 2 k
-  TensorBasis gradients;                       // g', each number in two parts side by side
-  float4 gaussians[kTensorBatch];  // shift to the Gaussian's mean; its index and its place in the list, as bits
+  float values[kTensorBatch][kTensorRow];  // dL/dpower and weight of pixel k of lane l, at 4 l + 2 k
+  TensorBasis gradients;                   // g', each number in two parts side by side
+  float4 gaussians[kTensorBatch];          // shift to the Gaussian's mean; its index and its place in the list, as bits
 };
 
 // What TF32 keeps of a number.
