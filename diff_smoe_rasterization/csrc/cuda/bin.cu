@@ -29,13 +29,12 @@ template <class S, class Key> struct ListArguments {
   int gaussians_per_warp;  // 1 to 32
   BlendMode mode;          // decides the bounds of footprints
   TileGrid grid;           // of the image
-  SavedForward<S> saved;   // projected and order are read; num_instances and slot_ranges are written
+  SavedForward<S> saved;   // projected and order are read; num_instances is written
   const int32_t* radii;    // [N] pixels
   LookBack look_back;      // zero before
   // These are null where the instances are only counted:
-  Key* keys;             // [capacity] tile
-  int32_t* values;       // [capacity] sorted with the keys: the Gaussian, or its slot where gradients go to slots
-  int32_t* slot_owners;  // [capacity] Gaussian of each slot, or null
+  Key* keys;        // [capacity] tile
+  int32_t* values;  // [capacity] Gaussian; sorted with the keys
 };
 
 // The rows of tiles that the warp's Gaussians meet. position: of the lane's Gaussian in the depth order.
@@ -51,34 +50,26 @@ __device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t po
         tile_bounds(list.mode, list.grid, projected.mean, bounding_radius<S>(list.mode, list.radii, gaussian));
     tiles = {projected.conic, projected.mean, projected.squared_reach, bounds};
   }
-  if (list.saved.slot_ranges != nullptr && gaussian >= 0 && tiles.end() <= tiles.begin()) {
-    list.saved.slot_ranges[2 * int64_t(gaussian)] = list.saved.slot_ranges[2 * int64_t(gaussian) + 1] = 0;
-  }
   return {gaussian, tiles, list.grid.columns, shared, lane};
 }
 
-// Lists the tiles of one row a lane, from `slot` on and not beyond `end`. Neighbouring lanes write neighbouring places.
+// Lists the tiles of one row a lane, from `place` on and not beyond `end`. Neighbouring lanes write neighbouring places.
 template <class S, class Key>
-__device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row, int64_t& slot, int64_t end, int lane) {
+__device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row, int64_t& place, int64_t end,
+                          int lane) {
   const WarpLine instances(row.width, lane);
-  if (list.saved.slot_ranges != nullptr) {
-    int64_t* range = list.saved.slot_ranges + 2 * int64_t(row.gaussian);
-    if (row.ends & kFirstRow) range[0] = slot + instances.begin;
-    if (row.ends & kLastRow) range[1] = slot + instances.begin + row.width;
-  }
-  const unsigned fit = static_cast<unsigned>(max<int64_t>(0, min<int64_t>(end - slot, instances.total)));
-  Key* keys = list.keys + slot;
-  int32_t* values = list.values + slot;
+  const unsigned fit = static_cast<unsigned>(max<int64_t>(0, min<int64_t>(end - place, instances.total)));
+  Key* keys = list.keys + place;
+  int32_t* values = list.values + place;
   for (unsigned k = lane; k - lane < fit; k += kWarp) {
     const int owner = instances.owner(k);
     const uint32_t tile = from_lane(row.tile - instances.begin, owner) + k;
     const int32_t gaussian = from_lane(row.gaussian, owner);
     if (k >= fit) continue;
     keys[k] = static_cast<Key>(tile);
-    values[k] = list.slot_owners != nullptr ? static_cast<int32_t>(slot + k) : gaussian;
-    if (list.slot_owners != nullptr) list.slot_owners[slot + k] = gaussian;
+    values[k] = gaussian;
   }
-  slot += instances.total;
+  place += instances.total;
 }
 
 template <class S, class Key>
@@ -97,7 +88,7 @@ __global__ void __launch_bounds__(kListBlock)
 
   // The loop runs twice over the rows: it counts their tiles, then lists them. It is one loop, so that both times it
   // finds the same rows.
-  int64_t slot = 0, end = 0;
+  int64_t place = 0, end = 0;
 #pragma unroll 1
   for (bool listing = false;; listing = true) {
     unsigned long long count = 0;
@@ -107,7 +98,7 @@ __global__ void __launch_bounds__(kListBlock)
       TileRow& kept = kept_rows[keep ? first / kWarp : 0][threadIdx.x];
       const TileRow row = listing && keep ? kept : rows.at(first + lane);
       if (listing) {
-        list_rows(list, row, slot, end, lane);
+        list_rows(list, row, place, end, lane);
       } else {
         if (keep) kept = row;
         count += row.width;
@@ -132,8 +123,8 @@ __global__ void __launch_bounds__(kListBlock)
     }
     __syncthreads();
     if (list.keys == nullptr) return;
-    slot = static_cast<int64_t>(shared_before + before);
-    end = min(slot + static_cast<int64_t>(count), list.saved.capacity);
+    place = static_cast<int64_t>(shared_before + before);
+    end = min(place + static_cast<int64_t>(count), list.saved.capacity);
   }
 }
 
@@ -162,22 +153,6 @@ template <class Key> __global__ void tile_offsets_kernel(const __grid_constant__
     high = min(low + part - 1, high);
   }
   if (lane == 0) arguments.offsets[tile] = low;
-}
-
-struct SlotArguments {
-  int64_t capacity;              // instances there is room for
-  const int64_t* num_instances;  // [1]
-  const int32_t* slots;          // [capacity] by tile, front to back
-  const int32_t* owners;         // [capacity] Gaussian of each slot
-  int32_t* instances;            // [capacity, 2] written: Gaussian, slot
-};
-
-// Where the instances do not fit, nothing is written, because nobody reads the lists then.
-__global__ void pair_with_slots_kernel(const __grid_constant__ SlotArguments arguments) {
-  const int64_t i = int64_t(blockIdx.x) * kListBlock + threadIdx.x, count = *arguments.num_instances;
-  if (i >= count || count > arguments.capacity) return;
-  arguments.instances[2 * i] = arguments.owners[static_cast<uint32_t>(arguments.slots[i])];
-  arguments.instances[2 * i + 1] = arguments.slots[i];
 }
 
 // How many warps are enough to keep the current device busy.
@@ -227,13 +202,10 @@ template <class Key, class S> ListArguments<S, Key> list_arguments(const Frame<S
 template <class Key, class S> void bin_by(const Frame<S>& frame, Scratch& scratch, cudaStream_t stream) {
   const SavedForward<S>& saved = frame.saved;
   const int64_t tiles = num_tiles(frame.camera.width, frame.camera.height), capacity = saved.capacity;
-  const bool slots = saved.instance_width == 2;
   auto list = list_arguments<Key>(frame);
   list.keys = allocate<Key>(scratch, capacity);
   list.values = allocate<int32_t>(scratch, capacity);
-  list.slot_owners = slots ? allocate<int32_t>(scratch, capacity) : nullptr;
   Key* sorted_keys = allocate<Key>(scratch, capacity);
-  int32_t* sorted_values = slots ? allocate<int32_t>(scratch, capacity) : saved.instances;
   // Keys behind the last instance are above every tile.
   check(cudaMemsetAsync(list.keys, 0xff, capacity * sizeof(Key), stream), "listing instances");
   list_instances(list, scratch, stream);
@@ -241,19 +213,9 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, Scratch& scratc
     int bits = 1;  // of the greatest tile, and of the key above all tiles
     while (int64_t(1) << bits <= tiles) ++bits;
     with_temporary(scratch, "sorting instances", [&](void* memory, size_t& bytes) {
-      return cub::DeviceRadixSort::SortPairs(memory, bytes, list.keys, sorted_keys, list.values, sorted_values,
+      return cub::DeviceRadixSort::SortPairs(memory, bytes, list.keys, sorted_keys, list.values, saved.instances,
                                              capacity, 0, bits, stream);
     });
-    if (slots) {
-      SlotArguments pairs = {};
-      pairs.capacity = capacity;
-      pairs.num_instances = saved.num_instances;
-      pairs.slots = sorted_values;
-      pairs.owners = list.slot_owners;
-      pairs.instances = saved.instances;
-      pair_with_slots_kernel<<<blocks_for(capacity, kListBlock), kListBlock, 0, stream>>>(pairs);
-      DSMOE_CHECK_LAUNCH("pair_with_slots");
-    }
   }
   OffsetArguments<Key> offsets = {};
   offsets.tiles = tiles;
@@ -285,10 +247,8 @@ template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>&
 }
 
 template <class S> void count_instances(const Frame<S>& frame, const Work& work) {
-  Frame<S> counted = frame;
-  counted.saved.slot_ranges = nullptr;
   dispatch_keys(num_tiles(frame.camera.width, frame.camera.height),
-                [&](auto key) { list_instances(list_arguments<decltype(key)>(counted), *work.scratch, work.stream); });
+                [&](auto key) { list_instances(list_arguments<decltype(key)>(frame), *work.scratch, work.stream); });
 }
 
 template <class S> void bin(const Frame<S>& frame, const Work& work) {

@@ -1,11 +1,5 @@
 // The order of the stages, and the memory between them. A capacity that turns out too small costs time, not
-// correctness (rasterize_cuda.h). So only the first call of a kind waits for the number of instances, and every one
-// whose gradients are reproducible, because each instance must have its slot then.
-#include <algorithm>
-#include <limits>
-#include <stdexcept>
-#include <string>
-
+// correctness (rasterize_cuda.h). So only the first call of a kind waits for the number of instances.
 #include "capacity.h"
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
@@ -20,14 +14,6 @@ template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream
   T* memory = allocate<T>(scratch, count);
   if (count > 0) check(cudaMemsetAsync(memory, 0, count * sizeof(T), stream), "clearing scratch memory");
   return memory;
-}
-
-constexpr int64_t kMostSlots = std::numeric_limits<uint32_t>::max();  // their numbers have 32 bits
-
-void check_slots(int64_t instances) {
-  if (instances <= kMostSlots) return;
-  throw std::overflow_error("rasterize: " + std::to_string(instances) +
-                            " tile instances; with deterministic=True the most is " + std::to_string(kMostSlots));
 }
 
 // Memory for what the depth sort sorts. In a mode without a depth order, `project` fills saved.order itself.
@@ -63,24 +49,11 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
 // Returns for how many instances there will be room.
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
-  const bool capturing = is_capturing(run.stream), mendable = run.deterministic && !capturing;
-  int64_t capacity = InstanceCapacities::shared().likely(key, mendable);
-  if (capacity < 0 && capturing) capacity = 8 * frame.inputs.num_gaussians + 1024;
-  if (capacity >= 0) return run.deterministic ? std::min(capacity, kMostSlots) : capacity;
+  const int64_t capacity = InstanceCapacities::shared().likely(key);
+  if (capacity >= 0) return capacity;
+  if (is_capturing(run.stream)) return 8 * frame.inputs.num_gaussians + 1024;
   count_instances(frame, work);
-  const auto count = read(frame.saved.num_instances, "projecting Gaussians", run.stream);
-  if (run.deterministic) check_slots(count);
-  return count;
-}
-
-// Lists the instances, with room for `sizes.capacity`. What depends on the capacity is allocated anew.
-template <class S>
-void list_with_capacity(Frame<S>& frame, const SavedSizes& sizes, Allocator& memory, const Work& work) {
-  frame.saved.instances = nullptr, frame.saved.segments = nullptr, frame.saved.segment_queue = nullptr;
-  allocate_saved(frame.saved, sizes, memory);
-  complete(frame.saved, sizes);
-  bin(frame, work);
-  memory.release();
+  return read(frame.saved.num_instances, "projecting Gaussians", run.stream);
 }
 
 }  // namespace
@@ -105,15 +78,10 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
   const auto key = capacity_key(frame);
   sizes.capacity = choose_capacity(frame, key, run, work);
   memory.release();
-  list_with_capacity(frame, sizes, memory, work);
-  if (run.deterministic && !is_capturing(run.stream)) {  // each instance must have its slot
-    const int64_t count = read(saved.num_instances, "listing instances", run.stream);
-    check_slots(count);
-    if (count > sizes.capacity) {
-      sizes.capacity = count;
-      list_with_capacity(frame, sizes, memory, work);
-    }
-  }
+  allocate_saved(saved, sizes, memory);
+  complete(saved, sizes);
+  bin(frame, work);
+  memory.release();
   InstanceCapacities::shared().learn(key, saved.num_instances, run.stream);
   clock.end(&StageTimes::bin);
 
@@ -134,6 +102,7 @@ void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& r
   EventClock clock(run.times, run.stream);
   BackwardPass<S> pass;
   pass.gradients = gradients;
+  pass.deterministic = run.deterministic;
   pass.dL_dgaussians = allocate_zeros<S>(memory, count * record, run.stream);
   blend_backward(frame, pass, work);
   clock.end(&StageTimes::blend_backward);

@@ -52,9 +52,7 @@ struct alignas(16) TileRow {
   uint32_t tile;  // the first
   int32_t width;  // how many
   int32_t gaussian;
-  int32_t ends;  // whether it is the first or the last of the Gaussian's rows: kFirstRow, kLastRow, both or 0
 };
-constexpr int32_t kFirstRow = 1, kLastRow = 2;
 
 template <class S> class WarpTileRows {
  public:
@@ -82,8 +80,7 @@ template <class S> class WarpTileRows {
     memcpy(&tiles, shared_[owner].tiles, sizeof(tiles));
     const int y = tiles.begin() + static_cast<int>(row);
     const auto span = tiles.row(y);
-    const int32_t ends = (row == 0 ? kFirstRow : 0) | (y + 1 == tiles.end() ? kLastRow : 0);
-    return {static_cast<uint32_t>(y) * columns_ + span.x0, max(0, span.x1 - span.x0), gaussian, ends};
+    return {static_cast<uint32_t>(y) * columns_ + span.x0, max(0, span.x1 - span.x0), gaussian};
   }
 
  private:

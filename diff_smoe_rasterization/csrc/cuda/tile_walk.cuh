@@ -54,25 +54,18 @@ template <class S> class EntrySource {
     listed = !overflows(saved);
     begin = listed ? saved.tile_offsets[tile] : 0;
     length = static_cast<int32_t>(listed ? saved.tile_offsets[tile + 1] - begin : arguments.num_gaussians);
-    entries_ = listed ? saved.instances + begin * saved.instance_width : saved.order;
-    stride_ = listed ? saved.instance_width : 1;
+    entries_ = listed ? saved.instances + begin : saved.order;
   }
 
   // The Gaussian of an entry. Below 0 for a culled one, which only the depth order has.
-  __device__ int32_t gaussian(int32_t position) const { return entries_[int64_t(position) * stride_]; }
-
-  // Where the gradient of a listed entry goes, if it has slots.
-  __device__ uint32_t slot(int32_t position) const {
-    return static_cast<uint32_t>(entries_[2 * int64_t(position) + 1]);
-  }
+  __device__ int32_t gaussian(int32_t position) const { return entries_[position]; }
 
   bool listed;     // the entries are the tile's list; else the depth order, which knows nothing of tiles
   int64_t begin;   // the list's first instance
   int32_t length;  // entries
 
  private:
-  const int32_t* entries_;  // [length, stride]
-  int stride_;              // numbers an entry
+  const int32_t* entries_;  // [length]
 };
 
 // The pixels of a warp, and the entries that may meet them.

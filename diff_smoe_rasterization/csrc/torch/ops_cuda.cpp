@@ -50,7 +50,7 @@ struct Cuda {
                                       at::Device device) {
     cuda::SavedForward<S> saved;
     sizes.segments = saved_length(tensors, saved, "segments") > 0;
-    sizes.capacity = saved_length(tensors, saved, "instances") / (sizes.slots ? 2 : 1);
+    sizes.capacity = saved_length(tensors, saved, "instances");
     unpack_saved(function, tensors, saved, sizes, device);
     complete(saved, sizes);
     return saved;
