@@ -9,9 +9,11 @@ template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* 
   frame.saved = {};
   frame.saved.gate_sum = frame.images.gate_sum;
   allocate_saved(frame.saved, sizes, memory);
-  sizes.num_instances = project(frame, times);
+  const int64_t num_instances = project(frame, times);
+  const bool fit = num_instances <= frame.config.most_instances;
+  sizes.num_instances = fit ? num_instances : 0;
   allocate_saved(frame.saved, sizes, memory);
-  bin(frame, times);
+  fit ? bin(frame, times) : void(frame.saved.instances = nullptr);
   blend(frame, times);
 }
 

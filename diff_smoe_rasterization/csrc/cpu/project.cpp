@@ -1,9 +1,7 @@
 // Stage 1: every Gaussian to the image plane, and how many tiles each meets.
 #include <algorithm>
-#include <limits>
-#include <stdexcept>
-#include <string>
 
+#include "bands.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
 #include "parallel.h"
@@ -25,7 +23,6 @@ template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
   const ImageOutputs<S>& images = frame.images;
   const Stopwatch stopwatch(times, &StageTimes::project);
   const int num_features = config.num_features();
-  const TileGrid grid(camera.width, camera.height);
   int64_t* counts = saved.instance_offsets + 1;
   parallel_for(config.num_threads, inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
@@ -39,20 +36,12 @@ template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
         continue;
       }
       saved.projected[i] = gaussian;
-      const TileRect bounds = tile_bounds(config.mode, grid, gaussian.mean, S(radius));
-      for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds,
-                        [&](int x0, int x1, int) { counts[i] += x1 - x0; });
+      for_each_tile_row(gaussian, bounds_in(frame, i), [&](int x0, int x1, int) { counts[i] += x1 - x0; });
     }
   });
   saved.instance_offsets[0] = 0;
   for (int64_t i = 0; i < inputs.num_gaussians; ++i) counts[i] += saved.instance_offsets[i];
-  const int64_t num_instances = saved.instance_offsets[inputs.num_gaussians];
-  if (num_instances > std::numeric_limits<int32_t>::max()) {
-    throw std::overflow_error("rasterize: " + std::to_string(num_instances) + " tile instances need " +
-                              std::to_string(num_instances * sizeof(TileInstance)) +
-                              " bytes; the CPU backend takes at most 2147483647 instances. Are the scales right?");
-  }
-  return num_instances;
+  return saved.instance_offsets[inputs.num_gaussians];
 }
 
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible) {

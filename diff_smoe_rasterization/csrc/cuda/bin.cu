@@ -5,6 +5,7 @@
 #include <limits>
 
 #include "../dispatch.h"
+#include "bands.h"
 #include "device.cuh"
 #include "dsmoe/blend.h"
 #include "dsmoe/params.h"
@@ -46,14 +47,15 @@ __device__ WarpTileRows<S> rows_at(const ListArguments<S, Key>& list, int64_t po
   FootprintTiles<S> tiles;
   if (gaussian >= 0) {
     const ProjectedGaussian<S> projected = list.saved.projected[gaussian];
-    const TileRect bounds =
+    TileRect bounds =
         tile_bounds(list.mode, list.grid, projected.mean, bounding_radius<S>(list.mode, list.radii, gaussian));
+    bounds.y0 = max(bounds.y0, list.saved.band.begin), bounds.y1 = min(bounds.y1, list.saved.band.end);
     tiles = {projected.conic, projected.mean, projected.squared_reach, bounds};
   }
-  return {gaussian, tiles, list.grid.columns, shared, lane};
+  return {gaussian, tiles, list.grid.columns, list.saved.band.begin, shared, lane};
 }
 
-// Lists the tiles of one row a lane, from `place` on and not beyond `end`. Neighbouring lanes write neighbouring places.
+// Lists the tiles of one row a lane, from `place` on and not beyond `end`. Neighbouring lanes write side by side.
 template <class S, class Key>
 __device__ void list_rows(const ListArguments<S, Key>& list, const TileRow& row, int64_t& place, int64_t end,
                           int lane) {
@@ -129,7 +131,7 @@ __global__ void __launch_bounds__(kListBlock)
 }
 
 template <class Key> struct OffsetArguments {
-  int64_t tiles;           // of the image
+  int64_t tiles;           // of the band
   int64_t capacity;        // keys
   const Key* keys;         // [capacity] sorted
   int64_t* offsets;        // [tiles + 1] written
@@ -201,7 +203,7 @@ template <class Key, class S> ListArguments<S, Key> list_arguments(const Frame<S
 
 template <class Key, class S> void bin_by(const Frame<S>& frame, Scratch& scratch, cudaStream_t stream) {
   const SavedForward<S>& saved = frame.saved;
-  const int64_t tiles = num_tiles(frame.camera.width, frame.camera.height), capacity = saved.capacity;
+  const int64_t tiles = num_band_tiles(frame), capacity = saved.capacity;
   auto list = list_arguments<Key>(frame);
   list.keys = allocate<Key>(scratch, capacity);
   list.values = allocate<int32_t>(scratch, capacity);
@@ -247,13 +249,12 @@ template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>&
 }
 
 template <class S> void count_instances(const Frame<S>& frame, const Work& work) {
-  dispatch_keys(num_tiles(frame.camera.width, frame.camera.height),
+  dispatch_keys(num_band_tiles(frame),
                 [&](auto key) { list_instances(list_arguments<decltype(key)>(frame), *work.scratch, work.stream); });
 }
 
 template <class S> void bin(const Frame<S>& frame, const Work& work) {
-  dispatch_keys(num_tiles(frame.camera.width, frame.camera.height),
-                [&](auto key) { bin_by<decltype(key)>(frame, *work.scratch, work.stream); });
+  dispatch_keys(num_band_tiles(frame), [&](auto key) { bin_by<decltype(key)>(frame, *work.scratch, work.stream); });
 }
 
 #define DSMOE_INSTANTIATE(S)                                                      \

@@ -1,5 +1,6 @@
 // From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures.
 #include "../dispatch.h"
+#include "bands.h"
 #include "dsmoe/params.h"
 #include "gradient_sinks.cuh"
 #include "reduce.cuh"
@@ -12,10 +13,10 @@ namespace {
 
 template <class S> struct BackwardArguments : BlendArguments<S> {
   ImageGradients<S> dL_dimages;  // [features, H, W], and of the gate sum [H, W]; any may be null
-  S* dL_dbackground_rows;        // [tiles * kWarpsPerTile, C + 1] of each warp, or null
+  S* dL_dbackground_rows;        // [tiles * kWarpsPerTile, C + 1] of each warp of the band, or null
   S* scaled;                     // [F, H, W] g', where the number of features is not known
   int num_features;              // F
-  int tiles;                     // of the image
+  int tiles;                     // of the band
 };
 
 template <class S, class Sink> struct BackwardWithSink : BackwardArguments<S> {
@@ -352,30 +353,35 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
   S* dL_dbackground = pass.gradients.inputs.background;
   Scratch& scratch = *work.scratch;
   const cudaStream_t stream = work.stream;
-  const int64_t tiles = num_tiles(camera.width, camera.height), warps = tiles * kWarpsPerTile;
-  BackwardArguments<S> arguments = {};
-  static_cast<BlendArguments<S>&>(arguments) = blend_arguments(frame, work);
-  arguments.dL_dimages = pass.gradients.images;
-  arguments.num_features = config.num_features();
-  arguments.tiles = static_cast<int>(tiles);
-  if (dL_dbackground != nullptr) {
-    arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+  const int64_t warps = num_tiles(camera.width, camera.height) * kWarpsPerTile;
+  const int num_features = config.num_features(), length = kNumGateMoments + num_features;
+  S *rows = nullptr, *scaled = nullptr;
+  if (dL_dbackground != nullptr) rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+  if (sizeof(S) == sizeof(double) || num_features != kFastFeatures) {
+    scaled = allocate<S>(scratch, int64_t(camera.width) * camera.height * num_features);
   }
-  if (sizeof(S) == sizeof(double) || arguments.num_features != kFastFeatures) {
-    arguments.scaled =
-        allocate<S>(scratch, int64_t(arguments.width) * arguments.height * arguments.num_features);
-  }
-  const int length = kNumGateMoments + arguments.num_features;
+  const auto walk = [&](const auto& sink) {
+    S* band_rows = rows;
+    for_each_band(frame, work, [&](const Frame<S>& band) {
+      BackwardArguments<S> arguments = {};
+      static_cast<BlendArguments<S>&>(arguments) = blend_arguments(band, work);
+      arguments.dL_dimages = pass.gradients.images;
+      arguments.dL_dbackground_rows = band_rows;
+      arguments.scaled = scaled;
+      arguments.num_features = num_features;
+      arguments.tiles = static_cast<int>(num_band_tiles(band));
+      walk_backward(arguments, sink, stream);
+      if (rows != nullptr) band_rows += num_band_tiles(band) * kWarpsPerTile * (config.num_channels + 1);
+    });
+  };
   if (pass.deterministic) {
     const auto sums = begin_integer_sums(frame, pass.gradients.images, work);
-    walk_backward(arguments, IntegerSink<S>{sums, length}, stream);
+    walk(IntegerSink<S>{sums, length});
     store_integer_sums(frame, sums, pass.dL_dgaussians, work);
   } else {
-    walk_backward(arguments, RecordSink<S>{pass.dL_dgaussians, length}, stream);
+    walk(RecordSink<S>{pass.dL_dgaussians, length});
   }
-  if (dL_dbackground != nullptr) {
-    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
-  }
+  if (rows != nullptr) sum_columns(rows, warps, config.num_channels + 1, dL_dbackground, stream);
 }
 
 #define DSMOE_INSTANTIATE(S) template void blend_backward(const Frame<S>&, const BackwardPass<S>&, const Work&);

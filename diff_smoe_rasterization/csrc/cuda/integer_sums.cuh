@@ -4,8 +4,8 @@
 // to a second integer, so that a Gaussian of which little is seen keeps its digits.
 //
 // The most that a sum can be, with the names of blend.h. A weight w is at most D, the pixel's denominator, so
-// |w g'| <= |dL/df|. The pairs behind a pair weigh at most T (1 - alpha) together, so alpha / (1 - alpha) |R| is at most
-// w max |u|, and
+// |w g'| <= |dL/df|. The pairs behind a pair weigh at most T (1 - alpha) together, so alpha / (1 - alpha) |R| is at
+// most w max |u|, and
 //
 //   |gamma| <= 2 max(1, lambda) (sum_f 2 |dL/df| max |c_f| + |dL/dW|)
 //
@@ -88,7 +88,8 @@ template <class S> struct IntegerSums {
     const int64_t at = gaussian * length + number;
     if (refused[at]) return S(NAN);
     const auto value = [](unsigned long long number) { return static_cast<double>(static_cast<long long>(number)); };
-    return static_cast<S>(ldexp(value(sums[at]) + ldexp(value(rests[at]), -kRestBits), unit(extents[gaussian], number)));
+    return static_cast<S>(
+        ldexp(value(sums[at]) + ldexp(value(rests[at]), -kRestBits), unit(extents[gaussian], number)));
   }
 
  private:

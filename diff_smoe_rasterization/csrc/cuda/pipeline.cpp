@@ -1,5 +1,7 @@
 // The order of the stages, and the memory between them. A capacity that turns out too small costs time, not
 // correctness (rasterize_cuda.h). So only the first call of a kind waits for the number of instances.
+#include <algorithm>
+
 #include "capacity.h"
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
@@ -26,14 +28,6 @@ template <class S> DepthKeys<S> depth_keys(const Frame<S>& frame, Scratch& scrat
   return keys;
 }
 
-// Waits for a number of the device.
-template <class T> T read(const T* number, const char* what, cudaStream_t stream) {
-  T value = 0;
-  check(cudaMemcpyAsync(&value, number, sizeof(value), cudaMemcpyDeviceToHost, stream), what);
-  check(cudaStreamSynchronize(stream), what);
-  return value;
-}
-
 // Adds the pairs that were counted. Waits for them.
 void add_pairs(const Work& work, int64_t* sum) {
   if (sum != nullptr) *sum += static_cast<int64_t>(read(work.pairs, "counting pairs", work.stream));
@@ -46,14 +40,19 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
                                  frame.inputs.num_gaussians);
 }
 
-// Returns for how many instances there will be room.
+// Returns for how many instances there will be room, 1 or more; 0 where there are more than are listed at once.
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
-  const int64_t capacity = InstanceCapacities::shared().likely(key);
-  if (capacity >= 0) return capacity;
-  if (is_capturing(run.stream)) return 8 * frame.inputs.num_gaussians + 1024;
+  const int64_t most = frame.config.most_instances;
+  int64_t capacity = InstanceCapacities::shared().likely(key);
+  if (is_capturing(run.stream)) {  // nothing can be counted then
+    if (capacity < 0) capacity = 8 * frame.inputs.num_gaussians + 1024;
+    return std::min(capacity, most);
+  }
+  if (capacity > 0 && capacity <= most) return capacity;
   count_instances(frame, work);
-  return read(frame.saved.num_instances, "projecting Gaussians", run.stream);
+  capacity = read(frame.saved.num_instances, "projecting Gaussians", run.stream);
+  return capacity > most ? 0 : std::max<int64_t>(capacity, 1);
 }
 
 }  // namespace
@@ -78,9 +77,10 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
   const auto key = capacity_key(frame);
   sizes.capacity = choose_capacity(frame, key, run, work);
   memory.release();
+  sizes.segments = sizes.segments && sizes.capacity > 0;
   allocate_saved(saved, sizes, memory);
   complete(saved, sizes);
-  bin(frame, work);
+  if (sizes.capacity > 0) bin(frame, work);
   memory.release();
   InstanceCapacities::shared().learn(key, saved.num_instances, run.stream);
   clock.end(&StageTimes::bin);

@@ -61,9 +61,15 @@ template <class S> class WarpTileRows {
     unsigned char tiles[sizeof(FootprintTiles<S>) + 16];
   };
 
-  // gaussian, tiles: of the lane. shared: [32] of the warp.
-  __device__ WarpTileRows(int32_t gaussian, const FootprintTiles<S>& tiles, int columns, Shared* shared, int lane)
-      : gaussian_(gaussian), columns_(columns), shared_(shared), line_(max(0, tiles.end() - tiles.begin()), lane) {
+  // gaussian, tiles: of the lane. columns: tiles of a row. first: the row in which the numbers of tiles begin.
+  // shared: [32] of the warp.
+  __device__ WarpTileRows(int32_t gaussian, const FootprintTiles<S>& tiles, int columns, int first, Shared* shared,
+                          int lane)
+      : gaussian_(gaussian),
+        columns_(columns),
+        first_(first),
+        shared_(shared),
+        line_(max(0, tiles.end() - tiles.begin()), lane) {
     memcpy(shared[lane].tiles, &tiles, sizeof(tiles));
     __syncwarp();
   }
@@ -80,12 +86,12 @@ template <class S> class WarpTileRows {
     memcpy(&tiles, shared_[owner].tiles, sizeof(tiles));
     const int y = tiles.begin() + static_cast<int>(row);
     const auto span = tiles.row(y);
-    return {static_cast<uint32_t>(y) * columns_ + span.x0, max(0, span.x1 - span.x0), gaussian};
+    return {static_cast<uint32_t>(y - first_) * columns_ + span.x0, max(0, span.x1 - span.x0), gaussian};
   }
 
  private:
   int32_t gaussian_;
-  int columns_;
+  int columns_, first_;
   const Shared* shared_;
   WarpLine line_;
 };

@@ -76,7 +76,8 @@ template <class S> class WarpTile {
 
   __device__ WarpTile(const BlendArguments<S>& arguments, int tile, int quarter) : quarter(quarter) {
     lane = threadIdx.x % kWarp;
-    tile_x = tile % arguments.tile_columns, tile_y = tile / arguments.tile_columns;
+    index = tile;
+    tile_x = tile % arguments.tile_columns, tile_y = arguments.saved.band.begin + tile / arguments.tile_columns;
     constexpr int kAcross = kTileSize / kWarpTile;
     const int x0 = tile_x * kTileSize + quarter % kAcross * kWarpTile;
     const int y0 = tile_y * kTileSize + quarter / kAcross * kWarpTile;
@@ -95,6 +96,7 @@ template <class S> class WarpTile {
 
   int quarter;  // of the tile, row by row
   int lane;
+  int index;           // of the tile in the band
   int tile_x, tile_y;  // of the tile, in tiles
   int x, y;            // of the lane's first pixel
   bool empty;          // no pixel of the warp lies in the image

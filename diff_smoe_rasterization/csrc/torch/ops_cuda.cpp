@@ -82,7 +82,8 @@ struct Cuda {
     auto sizes = cuda::saved_sizes(own, how);
     sizes.num_features = -1;
     own.saved = unpack<S>("contributions", saved, sizes, radii.device());
-    cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream});
+    TensorMemory memory(pixel_weights);
+    cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream, &memory});
   }
 
   template <class S>
@@ -97,10 +98,7 @@ struct Cuda {
     own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
     own.saved.gate_sum = mutable_data<S>(gate_sum);
     TensorMemory memory(gate_sum);
-    cuda::Work work;
-    work.stream = how.stream;
-    work.scratch = &memory;
-    cuda::importance(own, map, work);
+    cuda::importance(own, map, {how.stream, &memory});
   }
 
   static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {

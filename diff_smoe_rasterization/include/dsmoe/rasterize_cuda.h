@@ -57,7 +57,8 @@ template <class S> struct SavedForward {
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
   int64_t* num_instances = nullptr;           // [1] how many there are; those beyond the capacity are not listed
   int32_t* instances = nullptr;               // [capacity] Gaussians by tile, front to back
-  int64_t capacity = 0;
+  int64_t capacity = 0;              // 0: no lists are kept. Each pass makes them, for some rows of tiles at a time
+  TileBand band;                     // the rows of tiles that tile_offsets and instances are of
   S* segments = nullptr;             // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
   int32_t* segment_queue = nullptr;  // [num_queue_entries(capacity), 2] which segments some pixel has reached, or null
   S* final_transmittance = nullptr;  // [H, W] T_{N+1}
@@ -112,7 +113,8 @@ struct Run {
 };
 
 // Renders frame.inputs to frame.images and fills frame.saved. The first call of a size, mode and order of N waits for
-// the number of instances. So does every call with `times`.
+// the number of instances. So does every call with `times`,
+// and every pass over a rendering that has more than config.most_instances.
 template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory);
 
 // Writes gradients.inputs. `frame` is as `forward` left it.
@@ -180,7 +182,8 @@ template <class S> void count_instances(const Frame<S>& frame, const Work& work)
 // Fills saved.num_instances, instances and tile_offsets of the frame, and empties segment_queue.
 template <class S> void bin(const Frame<S>& frame, const Work& work);
 
-// Fills frame.images but the radii, and what saved has for each pixel.
+// Fills frame.images but the radii, and what saved has for each pixel. This pass and those below make the lists, band
+// by band, where frame.saved.capacity is 0.
 template <class S> void blend(const Frame<S>& frame, const Work& work);
 
 // What goes through both stages of a backward pass.
