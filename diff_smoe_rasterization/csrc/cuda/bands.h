@@ -13,7 +13,12 @@
 namespace dsmoe {
 namespace cuda {
 
-// Tiles of the rows that the frame's lists are of.
+// The tiles of the rows that the frame's lists are of.
+template <class S> TileGrid band_grid(const Frame<S>& frame) {
+  TileGrid grid(frame.camera.width, frame.camera.height);
+  grid.rows = std::min(frame.saved.band.end, grid.rows) - frame.saved.band.begin;
+  return grid;
+}
 template <class S> int64_t num_band_tiles(const Frame<S>& frame) {
   return band_tiles(TileGrid(frame.camera.width, frame.camera.height), frame.saved.band);
 }
@@ -44,17 +49,12 @@ class ReusedScratch final : public Scratch {
   size_t next_ = 0;
 };
 
-struct CountedBand {
-  TileBand rows;
-  int64_t num_instances;
-};
-
 // Cuts the image into bands of at most config.most_instances; a single row may have more. Waits for the counts.
 template <class S>
-std::vector<CountedBand> cut_into_bands(const Frame<S>& frame, ReusedScratch& scratch, const Work& work) {
+std::vector<TileBand> cut_into_bands(const Frame<S>& frame, ReusedScratch& scratch, const Work& work) {
   const int64_t most = frame.config.most_instances;
   Frame<S> part = frame;
-  std::vector<CountedBand> bands;
+  std::vector<TileBand> bands;
   std::vector<TileBand> left = {{0, TileGrid(frame.camera.width, frame.camera.height).rows}};  // the next one last
   while (!left.empty()) {
     part.saved.band = left.back();
@@ -69,7 +69,7 @@ std::vector<CountedBand> cut_into_bands(const Frame<S>& frame, ReusedScratch& sc
     const int64_t wanted = (count + most - 1) / most, height = rows.end - rows.begin;
     const int parts = static_cast<int>(std::min(wanted, height));
     if (parts <= 1) {
-      bands.push_back({rows, count});
+      bands.push_back(rows);
       continue;
     }
     for (int i = parts - 1; i >= 0; --i) {
@@ -89,15 +89,13 @@ template <class S, class Visit> void for_each_band(const Frame<S>& frame, const 
   const auto bands = cut_into_bands(frame, scratch, work);
   Frame<S> part = frame;
   part.saved.segments = nullptr, part.saved.segment_queue = nullptr;
-  part.saved.capacity = 1;  // the same for all bands, so that all want the same memory
-  for (const auto& band : bands) {
-    part.saved.capacity = std::max(part.saved.capacity, std::min(band.num_instances, frame.config.most_instances));
-  }
+  // The same for all bands, so that all want the same memory. It serves the lists of macro tiles too.
+  part.saved.capacity = frame.config.most_instances;
   Work listing = work;
   listing.scratch = &scratch;
-  for (const auto& band : bands) {
+  for (const TileBand& band : bands) {
     scratch.rewind();
-    part.saved.band = band.rows;
+    part.saved.band = band;
     const int64_t tiles = num_band_tiles(part);
     part.saved.tile_offsets = allocate<int64_t>(scratch, tiles + 2);
     part.saved.num_instances = part.saved.tile_offsets + tiles + 1;

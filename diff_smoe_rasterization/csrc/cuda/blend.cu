@@ -48,28 +48,30 @@ template <class S, int kSums> struct BlendedPixels {
 // Blends kSums features, front to back.
 template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = Blend<kMode>::kStopsEarly;
-  static constexpr bool kReadsFeatures = true, kReadsIndices = false;
-  static constexpr bool kSegments = kWalksSegments<S, kSums>;
+  static constexpr bool kReadsFeatures = true, kInSegments = kWalksSegments<S, kSums>;
+  static constexpr int kUnroll = kBlendUnroll;
 
-  __device__ __forceinline__ void begin_chunk(int32_t position) {
-    if constexpr (kSegments) {
-      if (position != next_segment) return;
-      begin_segment(arguments, tile, position / kSegmentLength, pixels.state, pixels.sums);
-      next_segment += kSegmentLength;
+  __device__ __forceinline__ void begin_batch(int32_t position) {
+    if constexpr (kInSegments) begin_segments(position);
+  }
+
+  // Begins the segments up to that of the entry at `position`.
+  __device__ __forceinline__ void begin_segments(int32_t position) {
+    for (; next_segment <= position; next_segment += kSegmentLength) {
+      begin_segment(arguments, tile, next_segment / kSegmentLength, pixels.state, pixels.sums);
     }
   }
 
-  __device__ __forceinline__ void visit(const WarpStage<S, BlendVisitor>& stage, int j, int32_t position) {
-    const auto current = stage.gaussians[j];
-    const ProjectedGaussian<S>& gaussian = current.gaussian;
+  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged) {
+    const auto gaussian = staged;
     const ColumnExponent<S, S> exponent(gaussian.conic, S(tile.x) - gaussian.mean.x);
     const S dy = S(tile.y) - gaussian.mean.y, least_alpha = cut.of(gaussian.opacity);
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
+      const auto gate = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
-      for (int f = 0; f < kSums; ++f) pixels.sums[k][f] = fma(pair.weight, current.features[f], pixels.sums[k][f]);
-      pixels.last[k] = pair.contributes ? position + 1 : pixels.last[k];
+      for (int f = 0; f < kSums; ++f) pixels.sums[k][f] = fma(pair.weight, gaussian.features[f], pixels.sums[k][f]);
+      pixels.last[k] = pair.contributes ? gaussian.position + 1 : pixels.last[k];
     }
   }
 
@@ -83,13 +85,13 @@ template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
   const WarpTile<S>& tile;
   BlendedPixels<S, kSums>& pixels;
   AlphaCut<S> cut;
-  int32_t next_segment;  // where the next segment begins, or -1 where the list is not noted in segments
+  int32_t next_segment;  // where the next segment begins; beyond the list where it is not noted in segments
 };
 
 // Blends kSums features from `first_feature` on, and writes them.
 template <class S, BlendMode kMode, int kSums>
 __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTile<S>& tile,
-                               const WarpStage<S, BlendVisitor<S, kMode, kSums>>& stage, int first_feature) {
+                               WarpStage<S, BlendVisitor<S, kMode, kSums>>& stage, int first_feature) {
   const RasterConfig<S>& config = arguments.config;
   BlendedPixels<S, kSums> blended;
   for (int k = 0; k < kLanePixels; ++k) {
@@ -99,10 +101,12 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     blended.last[k] = 0;
   }
   using Visitor = BlendVisitor<S, kMode, kSums>;
-  const bool segments = Visitor::kSegments && has_segments(arguments.saved, tile);
-  Visitor visitor = {arguments, tile, blended, config.alpha_cut(), segments ? kSegmentLength : -1};
+  const bool segments = Visitor::kInSegments && has_segments(arguments.saved, tile);
+  Visitor visitor = {arguments, tile, blended, config.alpha_cut(), segments ? kSegmentLength : INT32_MAX};
   const unsigned met = walk_tile(stage, {0, tile.source.length, first_feature}, visitor);
-  if constexpr (Visitor::kSegments) {
+  if (Visitor::kInSegments && segments) {
+    // Where pixels do not stop, the backward pass walks the whole list.
+    if (!Visitor::kStopsEarly) visitor.begin_segments(tile.source.length - 1);
     end_segments(arguments, tile, visitor.next_segment / kSegmentLength - 1, blended.sums);
   }
 
@@ -127,12 +131,14 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
 }
 
 template <class S, BlendMode kMode, int kFeatures>
-__global__ void __launch_bounds__(kWalkBlock) blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
+__global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBlendBlocks
+                                                                                          : kGeneralWalkBlocks)
+    blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
   constexpr int kSums = kFeatures != kAnyFeatures ? kFeatures : kFeatureChunk;
-  __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
+  __shared__ WarpStage<S, BlendVisitor<S, kMode, kSums>> stages[kWarpsPerTile];
   const WarpTile<S> tile(arguments);
   if (tile.empty) return;
-  const WarpStage<S, BlendVisitor<S, kMode, kSums>> stage = {staged[threadIdx.x / kWarp], nullptr};
+  auto& stage = stages[threadIdx.x / kWarp];
   if constexpr (kFeatures != kAnyFeatures) {
     blend_features<S, kMode, kSums>(arguments, tile, stage, 0);
   } else {

@@ -101,18 +101,18 @@ struct TensorShare {
 // Walks back to front, and sums for each Gaussian the moments of dL/dpower and the gradients of its features.
 template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
-  static constexpr bool kReadsFeatures = true, kReadsIndices = true;
+  static constexpr bool kReadsFeatures = true, kInSegments = false;
+  static constexpr int kUnroll = 1;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
 
   __device__ __forceinline__ int num_features() const {
     return kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
   }
 
-  __device__ __forceinline__ void begin_chunk(int32_t) {}
+  __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const WarpStage<S, BackwardVisitor>& stage, int j, int32_t position) {
-    const auto current = stage.gaussians[j];
-    const ProjectedGaussian<S>& gaussian = current.gaussian;
+  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged) {
+    const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
     const ColumnExponent<S, S> exponent(gaussian.conic, dx);
     const S least_alpha = cut.of(gaussian.opacity);
@@ -120,15 +120,15 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
     bool contributes[kLanePixels], any = false;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      gate[k] = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
-      contributes[k] = gate[k].counts && position < pixels.last[k];
+      gate[k] = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
+      contributes[k] = gate[k].counts && gaussian.position < pixels.last[k];
       any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
     }
     if (!__any_sync(kAllLanes, any)) return;
 
-    const int32_t index = stage.indices[j];
+    const int32_t index = gaussian.gaussian, position = gaussian.position;
     const S* features = arguments.saved.features + int64_t(index) * feature_stride(num_features());
-    const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? current.features[f] : features[f]; };
+    const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? gaussian.features[f] : features[f]; };
     S weight[kLanePixels], dL_dpower[kLanePixels];
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
@@ -156,9 +156,8 @@ template <class S, BlendMode kMode, int kFeatures, class Sink> struct BackwardVi
 
   __device__ __forceinline__ void add_by_tensors(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
                                                  S dx, S dy, int32_t index) {
-    *reinterpret_cast<float2*>(&tensors.stage.values[batch][2 * tile.lane]) = make_float2(dL_dpower[0], dL_dpower[1]);
-    *reinterpret_cast<float2*>(&tensors.stage.values[kTensorBatch + batch][2 * tile.lane]) =
-        make_float2(weight[0], weight[1]);
+    *reinterpret_cast<float4*>(&tensors.stage.values[batch][4 * tile.lane]) =
+        make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
     if (tile.lane == 0) tensors.stage.gaussians[batch] = {{dx + kWarpTileCentre, dy + kWarpTileCentre}, index};
     if (++batch == kTensorBatch) {
       add_batch(sink, tile, tensors.stage, tensors.moment_basis, batch);
@@ -286,12 +285,11 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
 }
 
 template <class S, BlendMode kMode, int kFeatures, class Sink>
-__global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks
-                                                                                          : kGeneralBackwardBlocks)
+__global__ void __launch_bounds__(kWalkBlock,
+                                  sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBackwardBlocks : kGeneralWalkBlocks)
     blend_backward_kernel(const __grid_constant__ BackwardWithSink<S, Sink> arguments) {
   using Visitor = BackwardVisitor<S, kMode, kFeatures, Sink>;
-  __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
-  __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
+  __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
   __shared__ TensorStage tensor_stages[Visitor::kTensor ? kWarpsPerTile : 1];
   __shared__ TensorBasis moment_basis;
   if (is_idle_block(arguments.saved, arguments.tiles)) return;
@@ -314,8 +312,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
   Visitor visitor = {
       arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(), 0};
-  const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
-  const unsigned met = walk_tile<S>(stage, range, visitor);
+  const unsigned met = walk_tile<S>(stages[warp], range, visitor);
   visitor.finish();
   count_pairs(arguments, tile.lane, met);
 }

@@ -35,12 +35,13 @@ template <class S> struct ScoredPixels {
 // Walks front to back, as the blend does, up to the last pair that the blend took.
 template <class S, BlendMode kMode> struct ContributionVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
-  static constexpr bool kReadsFeatures = false, kReadsIndices = true;
+  static constexpr bool kReadsFeatures = false, kInSegments = false;
+  static constexpr int kUnroll = 1;
 
-  __device__ __forceinline__ void begin_chunk(int32_t) {}
+  __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const WarpStage<S, ContributionVisitor>& stage, int j, int32_t position) {
-    const ProjectedGaussian<S> gaussian = stage.gaussians[j].gaussian;
+  __device__ __forceinline__ void visit(const StagedGaussian<S, false>& staged) {
+    const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
     const ColumnExponent<S, S> exponent(gaussian.conic, dx);
     const S least_alpha = cut.of(gaussian.opacity);
@@ -48,17 +49,17 @@ template <class S, BlendMode kMode> struct ContributionVisitor {
     bool any = false;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const S below = dy + S(k * kLaneStep);
-      const auto gate = evaluate_gate<kMode>(exponent.at(below), gaussian.opacity, least_alpha);
+      const S pixel_dy = below(dy, k);
+      const auto gate = evaluate_gate<kMode>(exponent.at(pixel_dy), gaussian.opacity, least_alpha);
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
-      const bool contributes = pair.contributes && position < pixels.last[k];
+      const bool contributes = pair.contributes && gaussian.position < pixels.last[k];
       any |= contributes;
-      add_pair(sum, contributes, pixels.weight[k], pair.weight, dx, below);
+      add_pair(sum, contributes, pixels.weight[k], pair.weight, dx, pixel_dy);
     }
     if (!__any_sync(kAllLanes, any)) return;
     S numbers[kNumContributions] = {sum.pixel_weight, sum.pixels, sum.blend_weight, sum.distance};
     sum_pixels(numbers);
-    if (sum_pixels.holds) add_number(arguments.sums, stage.indices[j], sum_pixels.number, numbers[0]);
+    if (sum_pixels.holds) add_number(arguments.sums, gaussian.gaussian, sum_pixels.number, numbers[0]);
   }
 
   const ContributionArguments<S>& arguments;
@@ -71,8 +72,7 @@ template <class S, BlendMode kMode> struct ContributionVisitor {
 template <class S, BlendMode kMode>
 __global__ void __launch_bounds__(kWalkBlock)
     contributions_kernel(const __grid_constant__ ContributionArguments<S> arguments) {
-  __shared__ StagedGaussian<S, false> staged[kWarpsPerTile][kWarp];
-  __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
+  __shared__ WarpStage<S, ContributionVisitor<S, kMode>> stages[kWarpsPerTile];
   const WarpTile<S> tile(arguments);
   if (tile.empty) return;
 
@@ -89,9 +89,7 @@ __global__ void __launch_bounds__(kWalkBlock)
   using Visitor = ContributionVisitor<S, kMode>;
   Visitor visitor = {arguments, tile, pixels, arguments.config.alpha_cut(),
                      TransposedSum<kNumContributions>(tile.lane)};
-  const int warp = threadIdx.x / kWarp;
-  const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
-  walk_tile(stage, {0, max_over_lanes(seen)}, visitor);
+  walk_tile(stages[threadIdx.x / kWarp], {0, max_over_lanes(seen)}, visitor);
 }
 
 }  // namespace

@@ -26,6 +26,21 @@ template <class S> __device__ void load_camera(const DeviceCamera<S>& from, Came
   }
 }
 
+// Multiprocessors of the current device.
+inline int num_multiprocessors() {
+  int device = 0, multiprocessors = 0;
+  check(cudaGetDevice(&device), "asking for the device");
+  check(cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount, device), "asking for its size");
+  return multiprocessors;
+}
+
+// Whether each instance says in its upper four bits which quarters of its tile the footprint may meet, quarter 0 in
+// the lowest of them. The Gaussian is in the bits below.
+constexpr int kMarkShift = 28;
+inline bool marks_quarters(int64_t num_gaussians) {
+  return num_gaussians <= int64_t(1) << kMarkShift;
+}
+
 // Whether the instances did not fit their memory. Then no tile list is read; the depth order is the list of every tile.
 template <class S> __device__ bool overflows(const SavedForward<S>& saved) {
   return *saved.num_instances > saved.capacity;

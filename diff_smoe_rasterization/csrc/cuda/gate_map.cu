@@ -21,23 +21,24 @@ template <class S> struct MappedPixels {
 // All gates of a pixel have one denominator, so the greatest weight is the greatest gate.
 template <class S, BlendMode kMode> struct GateMapVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
-  static constexpr bool kReadsFeatures = false, kReadsIndices = true;
+  static constexpr bool kReadsFeatures = false, kInSegments = false;
+  static constexpr int kUnroll = 1;
 
-  __device__ __forceinline__ void begin_chunk(int32_t) {}
+  __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const WarpStage<S, GateMapVisitor>& stage, int j, int32_t) {
-    const ProjectedGaussian<S> gaussian = stage.gaussians[j].gaussian;
+  __device__ __forceinline__ void visit(const StagedGaussian<S, false>& staged) {
+    const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
     const ColumnExponent<S, S> exponent(gaussian.conic, dx);
     const S least_alpha = cut.of(gaussian.opacity);
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto gate = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
+      const auto gate = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
       pixels.count[k] += pair.contributes;
       if (!pair.contributes || !(pair.weight > pixels.greatest_weight[k])) continue;
       pixels.greatest_weight[k] = pair.weight;
-      pixels.greatest[k] = stage.indices[j];
+      pixels.greatest[k] = gaussian.gaussian;
     }
   }
 
@@ -50,8 +51,7 @@ template <class S, BlendMode kMode> struct GateMapVisitor {
 template <class S, BlendMode kMode>
 __global__ void __launch_bounds__(kWalkBlock)
     gate_map_kernel(const __grid_constant__ BlendArguments<S> arguments, GateMap map) {
-  __shared__ StagedGaussian<S, false> staged[kWarpsPerTile][kWarp];
-  __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
+  __shared__ WarpStage<S, GateMapVisitor<S, kMode>> stages[kWarpsPerTile];
   const WarpTile<S> tile(arguments);
   if (tile.empty) return;
 
@@ -68,9 +68,7 @@ __global__ void __launch_bounds__(kWalkBlock)
   }
   using Visitor = GateMapVisitor<S, kMode>;
   Visitor visitor = {arguments, tile, pixels, arguments.config.alpha_cut()};
-  const int warp = threadIdx.x / kWarp;
-  const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
-  walk_tile(stage, {0, max_over_lanes(seen)}, visitor);
+  walk_tile(stages[threadIdx.x / kWarp], {0, max_over_lanes(seen)}, visitor);
   for (int k = 0; k < kLanePixels; ++k) {
     if (!tile.inside(arguments, k)) continue;
     const int64_t index = tile.pixel_index(arguments, k);

@@ -65,17 +65,17 @@ template <class S, int kChannels> struct WeighedPixels {
 // Walks front to back, as the blend does.
 template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
-  static constexpr bool kReadsFeatures = true, kReadsIndices = true;
+  static constexpr bool kReadsFeatures = true, kInSegments = false;
+  static constexpr int kUnroll = 1;
 
   __device__ __forceinline__ int num_channels() const {
     return kChannels != kAnyFeatures ? kChannels : arguments.config.num_channels;
   }
 
-  __device__ __forceinline__ void begin_chunk(int32_t) {}
+  __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const WarpStage<S, ImportanceVisitor>& stage, int j, int32_t position) {
-    const auto current = stage.gaussians[j];
-    const ProjectedGaussian<S>& gaussian = current.gaussian;
+  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged) {
+    const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
     const ColumnExponent<S, S> exponent(gaussian.conic, dx);
     const S least_alpha = cut.of(gaussian.opacity);
@@ -83,20 +83,20 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
     bool any = false;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      gate[k] = evaluate_gate<kMode>(exponent.at(dy + S(k * kLaneStep)), gaussian.opacity, least_alpha);
-      any |= gate[k].counts && (!Blend<kMode>::kStopsEarly || position < pixels.last[k]);
+      gate[k] = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
+      any |= gate[k].counts && (!Blend<kMode>::kStopsEarly || gaussian.position < pixels.last[k]);
     }
     if (!__any_sync(kAllLanes, any)) return;
 
-    const int32_t index = stage.indices[j];
+    const int32_t index = gaussian.gaussian;
     const S* features = arguments.saved.features + int64_t(index) * feature_stride(arguments.config.num_features());
     auto sum = no_importance<S>();
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto removal = remove_pair<kMode>(pixels.state[k], pixels.end[k], gate[k], position < pixels.last[k]);
+      const auto removal = remove_pair<kMode>(pixels.state[k], pixels.end[k], gate[k], gaussian.position < pixels.last[k]);
       S squared = S(0);
       for (int c = 0; c < num_channels(); ++c) {
-        const S feature = kChannels != kAnyFeatures ? current.features[c] : features[c];
+        const S feature = kChannels != kAnyFeatures ? gaussian.features[c] : features[c];
         const S value = pixels.channels.value(arguments, tile, k, c), distance = feature - value;
         const S front = pixels.channels.front(arguments, tile, k, c);
         const S change = channel_change<kMode>(removal, distance, front, value, arguments.config.background[c]);
@@ -126,8 +126,7 @@ template <class S, BlendMode kMode, int kChannels>
 __global__ void __launch_bounds__(kWalkBlock)
     importance_kernel(const __grid_constant__ ImportanceArguments<S> arguments) {
   using Visitor = ImportanceVisitor<S, kMode, kChannels>;
-  __shared__ StagedGaussian<S, true> staged[kWarpsPerTile][kWarp];
-  __shared__ int32_t staged_indices[kWarpsPerTile][kWarp];
+  __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
   const WarpTile<S> tile(arguments);
   if (tile.empty) return;
 
@@ -147,10 +146,8 @@ __global__ void __launch_bounds__(kWalkBlock)
     seen = seen > pixels.last[k] ? seen : pixels.last[k];
   }
   Visitor visitor = {arguments, tile, pixels, arguments.config.alpha_cut(), TransposedSum<kNumImportances>(tile.lane)};
-  const int warp = threadIdx.x / kWarp;
-  const WarpStage<S, Visitor> stage = {staged[warp], staged_indices[warp]};
   const int32_t end = Blend<kMode>::kStopsEarly ? max_over_lanes(seen) : tile.source.length;
-  walk_tile(stage, {0, end}, visitor);
+  walk_tile(stages[threadIdx.x / kWarp], {0, end}, visitor);
 }
 
 }  // namespace

@@ -18,14 +18,10 @@ template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream
   return memory;
 }
 
-// Memory for what the depth sort sorts. In a mode without a depth order, `project` fills saved.order itself.
-template <class S> DepthKeys<S> depth_keys(const Frame<S>& frame, Scratch& scratch) {
-  const int64_t count = frame.inputs.num_gaussians;
-  if (!needs_depth_order(frame.config.mode)) return {nullptr, frame.saved.order};
-  DepthKeys<S> keys;
-  keys.depths = allocate<DepthBits<S>>(scratch, count);
-  keys.gaussians = allocate<int32_t>(scratch, count);
-  return keys;
+// Memory for what the depth sort sorts; null in a mode without a depth order.
+template <class S> DepthBits<S>* allocate_depths(const Frame<S>& frame, Scratch& scratch) {
+  if (!needs_depth_order(frame.config.mode)) return nullptr;
+  return allocate<DepthBits<S>>(scratch, frame.inputs.num_gaussians);
 }
 
 // Adds the pairs that were counted. Waits for them.
@@ -67,10 +63,10 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
   saved.gate_sum = frame.images.gate_sum;
   allocate_saved(saved, sizes, memory);
   complete(saved, sizes);
-  const DepthKeys<S> keys = depth_keys(frame, memory);
-  project(frame, keys, work);
+  DepthBits<S>* depths = allocate_depths(frame, memory);
+  project(frame, depths, work);
   clock.end(&StageTimes::project);
-  if (keys.depths != nullptr) sort_by_depth(frame, keys, work);
+  if (depths != nullptr) sort_by_depth(frame, depths, work);
   clock.end(&StageTimes::sort);
   memory.release();
 
@@ -118,9 +114,8 @@ template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& 
   Frame<S> projected = frame;
   projected.saved.projected = allocate<ProjectedGaussian<S>>(memory, count);
   projected.saved.features = allocate<S>(memory, count * feature_stride(frame.config.num_features()));
-  DepthKeys<S> keys;
-  keys.gaussians = allocate<int32_t>(memory, count);
-  project(projected, keys, {run.stream, &memory});
+  projected.saved.order = nullptr;
+  project<S>(projected, nullptr, {run.stream, &memory});
   memory.release();
 }
 

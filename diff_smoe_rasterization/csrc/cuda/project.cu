@@ -11,9 +11,9 @@ template <class S> struct ProjectArguments {
   GaussianInputs<S> inputs;  // read
   DeviceCamera<S> camera;    // read
   RasterConfig<S> config;    // read
-  SavedForward<S> saved;     // projected and features are written
+  SavedForward<S> saved;     // projected and features are written, and where depths is null order and num_ordered
   int32_t* radii;            // [N] pixels, written
-  DepthKeys<S> keys;         // written
+  DepthBits<S>* depths;      // [N] written, or null
 };
 
 // Writes the features of a Gaussian, one row of saved.features. Where their number is known they stay in registers
@@ -75,9 +75,12 @@ __global__ void __launch_bounds__(kRowsBlock) project_kernel(const __grid_consta
     arguments.saved.projected[i] = projection.gaussian;
   }
   arguments.radii[i] = radius;
-  const DepthKeys<S>& keys = arguments.keys;
-  keys.gaussians[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
-  if (keys.depths != nullptr) keys.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);
+  if (arguments.depths != nullptr) {
+    arguments.depths[i] = radius > 0 ? depth_bits(depth) : ~DepthBits<S>(0);
+  } else if (arguments.saved.order != nullptr) {
+    arguments.saved.order[i] = static_cast<int32_t>(radius > 0 ? i : ~i);
+    if (i == 0) *arguments.saved.num_ordered = inputs.num_gaussians;
+  }
 }
 
 template <class S> struct VisibleArguments {
@@ -98,16 +101,21 @@ __global__ void __launch_bounds__(kStoreBlock)
 
 }  // namespace
 
-template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work) {
+template <class S> void project(const Frame<S>& frame, DepthBits<S>* depths, const Work& work) {
   const GaussianInputs<S>& inputs = frame.inputs;
-  if (inputs.num_gaussians == 0) return;
+  if (inputs.num_gaussians == 0) {
+    if (frame.saved.num_ordered != nullptr) {
+      check(cudaMemsetAsync(frame.saved.num_ordered, 0, sizeof(int64_t), work.stream), "projecting Gaussians");
+    }
+    return;
+  }
   ProjectArguments<S> arguments = {};
   arguments.inputs = inputs;
   arguments.camera = frame.camera;
   arguments.config = frame.config;
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
-  arguments.keys = keys;
+  arguments.depths = depths;
   dispatch_sh_rows(inputs, true, [&](auto type, size_t shared) {
     using Rows = typename decltype(type)::type;
     const auto launch = [&](auto kernel) {
@@ -134,8 +142,8 @@ template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const
   DSMOE_CHECK_LAUNCH("mark_visible");
 }
 
-#define DSMOE_INSTANTIATE(S)                                                \
-  template void project(const Frame<S>&, const DepthKeys<S>&, const Work&); \
+#define DSMOE_INSTANTIATE(S)                                          \
+  template void project(const Frame<S>&, DepthBits<S>*, const Work&); \
   template void mark_visible(const Frame<S>&, bool*, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)

@@ -25,7 +25,7 @@ template <class S, int kFeatures>
 constexpr bool kSumsByTensors = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kFastFeatures;
 constexpr int kTensorSteps = 8;  // of 8 pixels each
 // Numbers between rows: the quads of a warp that read two rows at once meet different banks.
-constexpr int kTensorRow = kWarpTile * kWarpTile + 16;
+constexpr int kTensorRow = 2 * kWarpTile * kWarpTile + 4;
 constexpr int kTensorRecord = kNumGateMoments + kFastFeatures;
 constexpr float kWarpTileCentre = (kWarpTile - 1) / 2.0f;
 static_assert(kWarpTile == 8 && kLanePixels == 2, "the places of pixels in the operands");
@@ -43,7 +43,7 @@ struct alignas(16) TensorGaussian {
 
 // What one warp keeps in shared memory.
 struct TensorStage {
-  float values[2 * kTensorBatch][kTensorRow];  // dL/dpower, then weights; pixel k of lane l at 2 l + k
+  float values[kTensorBatch][kTensorRow];      // dL/dpower and weight of pixel k of lane l, at 4 l + 2 k
   TensorBasis gradients;                       // g', each number in two parts side by side
   TensorGaussian gaussians[kTensorBatch];
 };
@@ -87,7 +87,7 @@ inline __device__ void fill_moment_basis(TensorBasis& basis) {
 inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&scaled)[kLanePixels][kFastFeatures],
                                            int lane) {
   for (int k = 0; k < kLanePixels; ++k) {
-    for (int f = 0; f < kFastFeatures; ++f) stage.values[f][2 * lane + k] = scaled[k][f];
+    for (int f = 0; f < kFastFeatures; ++f) stage.values[f][4 * lane + 2 * k] = scaled[k][f];
   }
   __syncwarp();
   const TensorLane at(lane);
@@ -96,7 +96,7 @@ inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&sca
     const auto number = [&](int k) {
       if (feature >= kFastFeatures) return 0.0f;
       const int owner = 8 * (step / 2) + 2 * at.column + step % 2;
-      const float value = stage.values[feature][2 * owner + k];
+      const float value = stage.values[feature][4 * owner + 2 * k];
       return at.row % 2 == 0 ? tf32_part(value) : value - tf32_part(value);
     };
     stage.gradients.of[step][lane] = make_float2(number(0), number(1));
@@ -117,13 +117,11 @@ inline __device__ TensorSums sum_pixels(const TensorStage& stage, const TensorBa
   float moments[2][4] = {}, features[2][4] = {};
 #pragma unroll
   for (int m = 0; m < kTensorSteps / 2; ++m) {
-    const int first = 4 * (at.column + 4 * m);
-    const float4 upper = *reinterpret_cast<const float4*>(&stage.values[at.row][first]);
-    const float4 lower = *reinterpret_cast<const float4*>(&stage.values[kTensorBatch + at.row][first]);
 #pragma unroll
     for (int h = 0; h < 2; ++h) {
-      const float all[4] = {h == 0 ? upper.x : upper.z, h == 0 ? lower.x : lower.z, h == 0 ? upper.y : upper.w,
-                            h == 0 ? lower.y : lower.w};
+      const int owner = 8 * m + 2 * at.column + h;
+      const float4 both = *reinterpret_cast<const float4*>(&stage.values[at.row][4 * owner]);
+      const float all[4] = {both.x, both.y, both.z, both.w};
       float rest[4];
       for (int i = 0; i < 4; ++i) rest[i] = all[i] - tf32_part(all[i]);
       const float2 moment_basis = basis.of[2 * m + h][lane], gradient_basis = stage.gradients.of[2 * m + h][lane];

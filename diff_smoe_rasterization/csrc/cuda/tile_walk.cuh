@@ -2,12 +2,13 @@
 //
 // A warp owns a square of pixels, a quarter of a tile; each lane owns two of them, one below the other, so that they
 // share a Gaussian's terms in x. (HiGS, arXiv:2606.00352, also has small squares for warps inside larger tiles.)
-// The warp takes 32 entries of the list at a time, one a lane:
 //
-//   prefetch  each lane loads its entry of the next chunk, while the current one is visited
-//   ballot    each lane tests the footprint of its entry against the warp's pixels
-//   stage     the entries that meet them go to shared memory
-//   visit     all lanes read the staged entries one after the other, and the visitor does the work of its pass
+//   find    the warp looks ahead in the list for entries that may meet its pixels. In most lists entries are marked
+//           with the quarters that they may meet
+//   load    32 of those that it has found, one a lane, while the 32 before them are visited. Where entries are not
+//           marked, each lane tests the footprint of its entry against the warp's pixels
+//   stage   those that meet them go to shared memory
+//   visit   all lanes read the staged entries one after the other, and the visitor does the work of its pass
 //
 // Warps do not wait for each other.
 #pragma once
@@ -28,6 +29,7 @@ template <class S> struct BlendArguments {
   RasterConfig<S> config;     // mode, features, background
   SavedForward<S> saved;      // what the forward pass leaves, and reads itself
   ImageOutputs<S> images;     // [features, H, W], and the radii [N]
+  bool marked;                // entries of lists are marked with quarters
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
@@ -40,6 +42,7 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   arguments.config = frame.config;
   arguments.saved = frame.saved;
   arguments.images = frame.images;
+  arguments.marked = marks_quarters(frame.inputs.num_gaussians);
   arguments.pairs = work.pairs;
   return arguments;
 }
@@ -49,23 +52,37 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
 template <class S> class EntrySource {
  public:
   EntrySource() = default;
-  __device__ EntrySource(const BlendArguments<S>& arguments, int tile) {
+  __device__ EntrySource(const BlendArguments<S>& arguments, int tile, int quarter) {
     const SavedForward<S>& saved = arguments.saved;
     listed = !overflows(saved);
+    marked = listed && arguments.marked;
     begin = listed ? saved.tile_offsets[tile] : 0;
-    length = static_cast<int32_t>(listed ? saved.tile_offsets[tile + 1] - begin : arguments.num_gaussians);
+    length = static_cast<int32_t>(listed ? saved.tile_offsets[tile + 1] - begin : *saved.num_ordered);
     entries_ = listed ? saved.instances + begin : saved.order;
+    wanted_ = marked ? 1u << (kMarkShift + quarter) : kSign;
   }
 
-  // The Gaussian of an entry. Below 0 for a culled one, which only the depth order has.
-  __device__ int32_t gaussian(int32_t position) const { return entries_[position]; }
+  __device__ uint32_t entry(int32_t position) const { return static_cast<uint32_t>(entries_[position]); }
+
+  // Stands for an entry, and meets no pixels.
+  __device__ uint32_t no_entry() const { return marked ? 0 : kSign; }
+
+  // Whether an entry may meet the quarter's pixels. Never for a culled Gaussian, which only the depth order has.
+  __device__ bool may_meet(uint32_t entry) const { return ((marked ? entry : ~entry) & wanted_) != 0; }
+  __device__ int32_t gaussian(uint32_t entry) const {
+    return static_cast<int32_t>(marked ? entry & ((1u << kMarkShift) - 1) : entry);
+  }
 
   bool listed;     // the entries are the tile's list; else the depth order, which knows nothing of tiles
+  bool marked;     // an entry says which quarters it may meet
   int64_t begin;   // the list's first instance
   int32_t length;  // entries
 
  private:
+  static constexpr uint32_t kSign = 1u << 31;
+
   const int32_t* entries_;  // [length]
+  uint32_t wanted_;         // the bit of an entry that tells
 };
 
 // The pixels of a warp, and the entries that may meet them.
@@ -84,7 +101,7 @@ template <class S> class WarpTile {
     x = x0 + lane % kWarpTile, y = y0 + lane / kWarpTile;
     empty = x0 >= arguments.width || y0 >= arguments.height;
     rect = {S(x0), S(y0), S(min(x0 + kWarpTile, arguments.width) - 1), S(min(y0 + kWarpTile, arguments.height) - 1)};
-    source = EntrySource<S>(arguments, tile);
+    source = EntrySource<S>(arguments, tile, quarter);
   }
 
   __device__ bool inside(const BlendArguments<S>& arguments, int k) const {
@@ -104,18 +121,32 @@ template <class S> class WarpTile {
   EntrySource<S> source;
 };
 
-// A Gaussian that meets the warp's pixels.
-template <class S, bool kWithFeatures> struct alignas(16) StagedGaussian {
-  ProjectedGaussian<S> gaussian;
+// A Gaussian that meets the warp's pixels, as the visitors read it.
+template <class S> struct alignas(16) StagedShape {
+  Vec2<S> mean;            // pixels
+  ExponentForm<S> conic;   // per px^2
+  S opacity;
+  int32_t gaussian;        // its number
+  int32_t position;        // of the entry in the list
+};
+template <class S, bool kWithFeatures> struct alignas(16) StagedGaussian : StagedShape<S> {
   S features[kFeatureChunk];
 };
-template <class S> struct alignas(16) StagedGaussian<S, false> { ProjectedGaussian<S> gaussian; };
+template <class S> struct alignas(16) StagedGaussian<S, false> : StagedShape<S> {};
 
-// Where a warp stages what it visits, in shared memory.
-template <class S, class Visitor> struct WarpStage {
-  StagedGaussian<S, Visitor::kReadsFeatures>* gaussians;  // [32]
-  int32_t* indices;                                       // [32] of the Gaussians; null where the visitor reads none
+// An entry that has been found.
+struct FoundEntry {
+  int32_t gaussian, position;
 };
+
+// Where a warp keeps what it has found and what it visits, in shared memory.
+template <class S, class Visitor> struct WarpStage {
+  FoundEntry found[kFoundEntries];  // a ring
+  StagedGaussian<S, Visitor::kReadsFeatures> gaussians[kWarp];
+};
+
+// The vertical distance of the lane's pixel k, from that of its first one.
+template <class S> __device__ __forceinline__ S below(S dy, int k) { return k == 0 ? dy : dy + S(k * kLaneStep); }
 
 // The part of a list that a warp walks.
 struct WalkRange {
@@ -123,84 +154,141 @@ struct WalkRange {
   int first_feature = 0;  // the kFeatureChunk features from here on come along, where the visitor reads features
 };
 
-// One entry of a list, as its lane loads it.
-template <class S, bool kWithFeatures> struct ListEntry {
-  StagedGaussian<S, kWithFeatures> staged;
-  int32_t gaussian;
-  bool valid;
+// Looks ahead in a list.
+template <class S, bool kBackToFront> class EntryFinder {
+ public:
+  __device__ EntryFinder(const WarpTile<S>& tile, const WalkRange& range, FoundEntry* ring)
+      : tile_(tile), range_(range), ring_(ring), cursor_(kBackToFront ? range.end - 1 : range.begin) {
+    read();
+  }
+
+  // Takes the next 32 entries, or as many as are left; with kInSegments only those in the segment of the first of them.
+  // Returns how many. The lane gets entry `lane`, if there is one.
+  template <bool kInSegments> __device__ int take(FoundEntry& own) {
+    while (found_ - taken_ < kWarp && (kBackToFront ? cursor_ >= range_.begin : cursor_ < range_.end)) find();
+    __syncwarp();
+    own = ring_[(taken_ + tile_.lane) % kFoundEntries];
+    int count = min(kWarp, found_ - taken_);
+    if constexpr (kInSegments) {
+      const int32_t segment = own.position / kSegmentLength, first = __shfl_sync(kAllLanes, segment, 0);
+      count = __popc(__ballot_sync(kAllLanes, tile_.lane < count && segment == first));
+    }
+    taken_ += count;
+    __syncwarp();
+    return count;
+  }
+
+ private:
+  __device__ int32_t position(int i) const {
+    const int32_t step = i * kWarp + tile_.lane;
+    return kBackToFront ? cursor_ - step : cursor_ + step;
+  }
+
+  // Reads the entries that will be looked at next.
+  __device__ void read() {
+#pragma unroll
+    for (int i = 0; i < kReadAhead; ++i) {
+      const int32_t at = position(i);
+      const bool exists = kBackToFront ? at >= range_.begin : at < range_.end;
+      entries_[i] = exists ? tile_.source.entry(at) : tile_.source.no_entry();
+    }
+  }
+
+  __device__ void find() {
+#pragma unroll
+    for (int i = 0; i < kReadAhead; ++i) {
+      const bool meets = tile_.source.may_meet(entries_[i]);
+      const unsigned meet = __ballot_sync(kAllLanes, meets);
+      if (meets) {
+        ring_[(found_ + __popc(meet & ((1u << tile_.lane) - 1))) % kFoundEntries] = {
+            tile_.source.gaussian(entries_[i]), position(i)};
+      }
+      found_ += __popc(meet);
+    }
+    cursor_ += kBackToFront ? -kReadAhead * kWarp : kReadAhead * kWarp;
+    read();
+  }
+
+  const WarpTile<S>& tile_;
+  const WalkRange& range_;
+  FoundEntry* ring_;             // [kFoundEntries]
+  int32_t cursor_;               // position of the first entry that was read
+  uint32_t entries_[kReadAhead];
+  int found_ = 0, taken_ = 0;    // entries so far
 };
 
-// Positions behind the end of the walk give an entry that is not valid.
+// What a lane has loaded of an entry.
+template <class S, bool kWithFeatures> struct LoadedEntry {
+  StagedGaussian<S, kWithFeatures> staged;
+  bool meets;  // the warp's pixels
+};
+
 template <class Visitor, class S>
-__device__ auto load_entry(const Visitor& visitor, int32_t position, const WalkRange& range) {
+__device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEntry& entry, bool exists,
+                                           const WalkRange& range) {
   const BlendArguments<S>& arguments = visitor.arguments;
   const WarpTile<S>& tile = visitor.tile;
-  const SavedForward<S>& saved = arguments.saved;
-  ListEntry<S, Visitor::kReadsFeatures> entry;
-  entry.valid = Visitor::kBackToFront ? position >= range.begin : position < range.end;
-  if (!entry.valid) return entry;
-  entry.gaussian = tile.source.gaussian(position);
-  entry.valid = entry.gaussian >= 0;
-  if (!entry.valid) return entry;
-  entry.staged.gaussian = saved.projected[entry.gaussian];
+  LoadedEntry<S, Visitor::kReadsFeatures> loaded;
+  loaded.meets = exists;
+  if (!exists) return loaded;
+  const ProjectedGaussian<S> gaussian = arguments.saved.projected[entry.gaussian];
   if constexpr (Visitor::kReadsFeatures) {
-    const S* features = saved.features + int64_t(entry.gaussian) * feature_stride(arguments.config.num_features());
+    const S* features =
+        arguments.saved.features + int64_t(entry.gaussian) * feature_stride(arguments.config.num_features());
     struct alignas(16) Chunk {
       S values[kFeatureChunk];
     };
-    *reinterpret_cast<Chunk*>(entry.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
+    *reinterpret_cast<Chunk*>(loaded.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
   }
+  StagedShape<S>& shape = loaded.staged;
+  shape = {gaussian.mean, ExponentForm<S>(gaussian.conic), gaussian.opacity, entry.gaussian, entry.position};
+  if (tile.source.marked) return loaded;
+  loaded.meets = may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
   if (!tile.source.listed) {
     const BlendMode mode = arguments.config.mode;
-    const TileRect bounds = tile_bounds(mode, TileGrid(arguments.width, arguments.height), entry.staged.gaussian.mean,
+    const TileRect bounds = tile_bounds(mode, TileGrid(arguments.width, arguments.height), gaussian.mean,
                                         bounding_radius<S>(mode, arguments.images.radii, entry.gaussian));
-    entry.valid =
+    loaded.meets &=
         bounds.x0 <= tile.tile_x && tile.tile_x < bounds.x1 && bounds.y0 <= tile.tile_y && tile.tile_y < bounds.y1;
   }
-  return entry;
-}
-
-template <class S, bool kWithFeatures>
-__device__ bool meets_pixels(const ListEntry<S, kWithFeatures>& entry, const WarpTile<S>& tile) {
-  const auto& gaussian = entry.staged.gaussian;
-  return entry.valid && may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
+  return loaded;
 }
 
 // The walk itself. Returns how many entries met the warp's pixels. A visitor has
 //
-//   kBackToFront, kStopsEarly, kReadsFeatures, kReadsIndices   what it wants of the walk, static
-//   arguments, tile                                   the rendering, and the warp's place in it
-//   begin_chunk(position)                             called before the chunk whose first entry is at `position`
-//   visit(stage, j, position)                         entry j of the stage, at `position` of the list, for all lanes
-//   is_done()                                         the walk may end; called behind each chunk
+//   kBackToFront, kStopsEarly, kReadsFeatures   what it wants of the walk, static
+//   kInSegments                   entries of two segments are never staged together, static
+//   kUnroll                       visits that the compiler may interleave, static
+//   arguments, tile               the rendering, and the warp's place in it
+//   begin_batch(position)         called before the staged entries are visited, whose first one was at `position`
+//   visit(staged)                 one staged entry, for all lanes
+//   is_done()                     the walk may end; called now and then
 template <class S, class Visitor>
-__device__ __forceinline__ unsigned walk_tile(const WarpStage<S, Visitor>& stage, const WalkRange& range,
-                                              Visitor& visitor) {
-  const auto at = [](int32_t chunk, int j) { return Visitor::kBackToFront ? chunk - j : chunk + j; };
-  const auto load = [&](int32_t position) { return load_entry<Visitor, S>(visitor, position, range); };
+__device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, const WalkRange& range, Visitor& visitor) {
   const int lane = visitor.tile.lane;
+  EntryFinder<S, Visitor::kBackToFront> finder(visitor.tile, range, stage.found);
   unsigned met = 0;
-  int32_t chunk = Visitor::kBackToFront ? range.end - 1 : range.begin;
-  auto next = load(at(chunk, lane));
-  for (; Visitor::kBackToFront ? chunk >= range.begin : chunk < range.end; chunk = at(chunk, kWarp)) {
-    visitor.begin_chunk(chunk);
-    const bool meets = meets_pixels(next, visitor.tile);
-    if (meets) {
-      stage.gaussians[lane] = next.staged;
-      if constexpr (Visitor::kReadsIndices) stage.indices[lane] = next.gaussian;
+  FoundEntry entry;
+  int count = finder.template take<Visitor::kInSegments>(entry);
+  auto next = load_entry<Visitor, S>(visitor, entry, lane < count, range);
+  while (count > 0) {
+    const unsigned meet = __ballot_sync(kAllLanes, next.meets);
+    if (next.meets) stage.gaussians[__popc(meet & ((1u << lane) - 1))] = next.staged;
+    const int32_t first = __shfl_sync(kAllLanes, entry.position, 0);
+    const int staged = __popc(meet);
+    count = finder.template take<Visitor::kInSegments>(entry);  // waits for the stage too
+    next = load_entry<Visitor, S>(visitor, entry, lane < count, range);
+    visitor.begin_batch(first);
+    met += staged;
+    for (int j = 0; j < staged; j += kVisitsPerCheck) {
+      const int end = min(j + kVisitsPerCheck, staged);
+#pragma unroll(Visitor::kUnroll)
+      for (int i = j; i < end; ++i) visitor.visit(stage.gaussians[i]);
+      if constexpr (Visitor::kStopsEarly) {
+        if (visitor.is_done()) return met - staged + end;
+      }
     }
-    unsigned left = __ballot_sync(kAllLanes, meets);
     __syncwarp();
-    next = load(at(at(chunk, kWarp), lane));
-    met += __popc(left);
-    for (; left != 0; left &= left - 1) {
-      const int j = __ffs(left) - 1;
-      visitor.visit(stage, j, at(chunk, j));
-    }
-    __syncwarp();
-    if constexpr (Visitor::kStopsEarly) {
-      if (visitor.is_done()) break;
-    }
   }
   return met;
 }

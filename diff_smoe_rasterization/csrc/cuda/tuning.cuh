@@ -21,10 +21,25 @@ constexpr int kLaneStep = kWarpTile / kLanePixels;          // rows between them
 // Features that come along with an entry: as many floats as one vector load takes.
 constexpr int kFeatureChunk = 4;
 
+// Entries of a list that a lane reads ahead. Together the lanes find enough in 96 of them for about one batch of 32.
+constexpr int kReadAhead = 3;
+// Entries that a warp has found and not taken: up to 31, and all that it finds next.
+constexpr int kFoundEntries = 128;
+static_assert(kFoundEntries >= kWarp - 1 + kReadAhead * kWarp, "the ring holds what was found");
+// Visits between two questions whether all pixels are full.
+constexpr int kVisitsPerCheck = 8;
+
+// Visits of the forward walk that are interleaved: what one waits for, the next one hides. And blocks of it that one
+// multiprocessor holds at once, where the number of features is known: 6 x 128 threads leave each thread 80 registers,
+// all that two visits ask for. Four visits at 96 registers take as long, one at 72 takes 1.06 times that.
+constexpr int kBlendUnroll = 2;
+constexpr int kBlendBlocks = 6;
+
 // Blocks of the backward walk that one multiprocessor holds at once, where the number of features is known: 5 x 128
-// threads leave each thread 96 registers, nearly all that the kernel asks for. The general kernel takes what it needs.
+// threads leave each thread 96 registers, nearly all that the kernel asks for.
 constexpr int kBackwardBlocks = 5;
-constexpr int kGeneralBackwardBlocks = 1;
+// Of the general kernels: they take what they need.
+constexpr int kGeneralWalkBlocks = 1;
 
 // Sums by tensor cores: how many Gaussians one warp sums together. They fill the 16 rows of an operand, eight rows for
 // dL/dpower and eight for the weights.
@@ -35,12 +50,29 @@ constexpr int kTensorBatch = 8;
 // Threads a block. Large blocks, because the look-back goes from block to block.
 constexpr int kListBlock = 256;
 constexpr int kListWarps = kListBlock / kWarp;
-// Rows of tiles of a warp that are kept in shared memory between counting and listing: three for each of 32 Gaussians.
-// Rows beyond them are found again.
-constexpr int kKeptRows = 96;
 // A warp takes up to 32 Gaussians, and fewer where a multiprocessor would get less than this many warps: half of the 64
 // that it can hold, enough to hide the latency of loads.
 constexpr int kEnoughWarpsPerMultiprocessor = 32;
+
+// Sorts by radix, and the lists of macro tiles.
+//
+// Threads a block: one for each digit of 8 bits.
+constexpr int kSortBlock = 256;
+// Pairs a thread: enough that few blocks look back, and that keys and values of a block fit 48 KiB.
+constexpr int kSortItemsOfFloats = 16;
+// Bits of a depth that one pass sorts, and of a macro tile with 16 or 32 bits. With 9 bits one pass serves images up to
+// 2048x1024; more bits, or longer keys with as many, would not fit 48 KiB.
+constexpr int kDepthDigit = 8;
+constexpr int kShortMacroDigit = 9, kLongMacroDigit = 8;
+// Copies of the histogram of depths in a block's shared memory. Depths share their upper digits, so that many lanes
+// would count at one place.
+template <class S> constexpr int kHistogramCopies = sizeof(S) == 4 ? 8 : 4;
+// Gaussians that a lane lists in macro tiles: blocks of 1,024 Gaussians look back seldom.
+constexpr int kListedPerLane = 4;
+// Entries of a macro tile that one block gives to its tiles.
+constexpr int kChunk = 256;
+// Blocks a multiprocessor of kernels whose blocks take piece after piece: more of them fit none.
+constexpr int kResidentBlocks = 8;
 
 // The projection and its backward pass.
 //

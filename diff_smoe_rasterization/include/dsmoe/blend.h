@@ -94,10 +94,9 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
   using S = Scalar<Real>;
   const Real before = state.transmittance;
   const Real after = before * (Real(S(1)) - gate.alpha);
-  const Mask<Real> takes = gate.counts & state.is_open();
-  const Mask<Real> full = takes & (after < Real(S(kTransmittanceCut)));
-  const Mask<Real> contributes = takes & (after >= Real(S(kTransmittanceCut)));
-  state.transmittance = select(contributes, after, select(full, -before, before));
+  // Of a full pixel T is negative, and so is what would be left.
+  const Mask<Real> contributes = gate.counts & (after >= Real(S(kTransmittanceCut)));
+  state.transmittance = select(contributes, after, select(gate.counts, -abs(before), before));
   return {select(contributes, gate.alpha * before, Real(S(0))), contributes};
 }
 

@@ -13,13 +13,21 @@ enum class Cut {
   kKernel,  // the paper: those of G >= 1e-5, and of the least alpha below
 };
 
+// A conic by the coefficients of the exponent: xx dx^2 + xy dx dy + yy dy^2.
+template <class S> struct ExponentForm {
+  S xx, xy, yy;
+  ExponentForm() = default;
+  DSMOE_HD explicit ExponentForm(const Sym2<S>& conic) : xx(S(-0.5) * conic.xx), xy(-conic.xy), yy(S(-0.5) * conic.yy) {}
+};
+
 // The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels. d = pixel - mean; d.x is the same for all of them.
 template <class Real, class S> struct ColumnExponent {
   Real constant, linear;
   S quadratic;
 
-  DSMOE_HD ColumnExponent(const Sym2<S>& conic, Real dx)
-      : constant(S(-0.5) * conic.xx * dx * dx), linear(-conic.xy * dx), quadratic(S(-0.5) * conic.yy) {}
+  DSMOE_HD ColumnExponent(const ExponentForm<S>& form, Real dx)
+      : constant(form.xx * dx * dx), linear(form.xy * dx), quadratic(form.yy) {}
+  DSMOE_HD ColumnExponent(const Sym2<S>& conic, Real dx) : ColumnExponent(ExponentForm<S>(conic), dx) {}
 
   DSMOE_HD Real at(S dy) const { return fma(fma(Real(quadratic), Real(dy), linear), Real(dy), constant); }
 };

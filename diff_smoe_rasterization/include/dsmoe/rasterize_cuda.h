@@ -53,9 +53,10 @@ DSMOE_HD constexpr int64_t num_queue_entries(int64_t capacity) { return 1 + 4 * 
 template <class S> struct SavedForward {
   ProjectedGaussian<S>* projected = nullptr;  // [N]
   S* features = nullptr;                      // [N, feature_stride(F)]
-  int32_t* order = nullptr;                   // [N] Gaussians, nearest first; culled ones last, Gaussian i as ~i
+  int32_t* order = nullptr;                   // [N] Gaussians, nearest first; ~i is for a culled Gaussian i
+  int64_t* num_ordered = nullptr;             // [1] entries of order; culled Gaussians have none in a depth order
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
-  int64_t* num_instances = nullptr;           // [1] how many there are; those beyond the capacity are not listed
+  int64_t* num_instances = nullptr;           // [1] room that the lists need; where they have less, none is listed
   int32_t* instances = nullptr;               // [capacity] Gaussians by tile, front to back
   int64_t capacity = 0;              // 0: no lists are kept. Each pass makes them, for some rows of tiles at a time
   TileBand band;                     // the rows of tiles that tile_offsets and instances are of
@@ -77,15 +78,15 @@ struct SavedSizes {
 };
 
 // Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. All code
-// that allocates, checks or passes on these arrays uses this list and its order. tile_offsets has num_instances behind
-// it.
+// that allocates, checks or passes on these arrays uses this list and its order. tile_offsets has num_ordered and
+// num_instances behind it.
 template <class S, class Visit> void for_each_array(SavedForward<S>& saved, const SavedSizes& sizes, Visit visit) {
   const bool known = sizes.capacity >= 0;
   const int64_t stride = sizes.num_features < 0 ? -1 : feature_stride(static_cast<int>(sizes.num_features));
   visit("projected", saved.projected, sizes.num_gaussians);
   visit("features", saved.features, stride < 0 ? -1 : sizes.num_gaussians * stride);
   visit("order", saved.order, sizes.num_gaussians);
-  visit("tile_offsets", saved.tile_offsets, sizes.tiles + 2);
+  visit("tile_offsets", saved.tile_offsets, sizes.tiles + 3);
   visit("final_transmittance", saved.final_transmittance, sizes.pixels);
   visit("last_contributor", saved.last_contributor, sizes.pixels);
   visit("instances", saved.instances, sizes.capacity);
@@ -95,7 +96,8 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
 
 // Sets the fields that are no arrays of their own. Call it when the arrays have their memory.
 template <class S> void complete(SavedForward<S>& saved, const SavedSizes& sizes) {
-  saved.num_instances = saved.tile_offsets + sizes.tiles + 1;
+  saved.num_ordered = saved.tile_offsets + sizes.tiles + 1;
+  saved.num_instances = saved.num_ordered + 1;
   saved.capacity = sizes.capacity;
 }
 
@@ -153,14 +155,8 @@ class StreamMemory final : public Allocator {
   std::vector<void*> scratch_, kept_;
 };
 
-// What the depth sort sorts.
-template <class S> struct DepthKeys {
-  DepthBits<S>* depths = nullptr;  // [N] the greatest number for culled Gaussians; null: no depth order is wanted
-  int32_t* gaussians = nullptr;    // [N] 0, 1, 2, ...; ~i for a culled Gaussian i
-};
-
-// Whether the mode needs saved.order to be the depth order. Where it does not, the caller gives `project` saved.order
-// itself as keys.gaussians, and culled Gaussians keep their places.
+// Whether the mode needs saved.order to be the depth order. Where it does not, `project` fills saved.order, if there is
+// any, with 0, 1, 2, ..., and culled Gaussians keep their places.
 bool needs_depth_order(BlendMode mode);
 
 // How a stage runs.
@@ -170,11 +166,12 @@ struct Work {
   unsigned long long* pairs = nullptr;  // in device memory; (Gaussian, pixel) pairs evaluated are added to it; or null
 };
 
-// Fills frame.saved.projected, frame.saved.features, frame.images.radii and keys.
-template <class S> void project(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
+// Fills frame.saved.projected, frame.saved.features, frame.images.radii and depths. depths: [N] what the depth sort
+// sorts, the greatest number for culled Gaussians; null where no depth order is wanted.
+template <class S> void project(const Frame<S>& frame, DepthBits<S>* depths, const Work& work);
 
-// Fills frame.saved.order.
-template <class S> void sort_by_depth(const Frame<S>& frame, const DepthKeys<S>& keys, const Work& work);
+// Fills frame.saved.order and frame.saved.num_ordered.
+template <class S> void sort_by_depth(const Frame<S>& frame, const DepthBits<S>* depths, const Work& work);
 
 // Fills only frame.saved.num_instances, for a caller that wants exactly as much memory as is needed.
 template <class S> void count_instances(const Frame<S>& frame, const Work& work);
