@@ -131,8 +131,8 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
 }
 
 template <class S, BlendMode kMode, int kFeatures>
-__global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBlendBlocks
-                                                                                          : kGeneralWalkBlocks)
+__global__ void __launch_bounds__(kWalkBlock,
+                                  sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBlendBlocks : kGeneralWalkBlocks)
     blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
   constexpr int kSums = kFeatures != kAnyFeatures ? kFeatures : kFeatureChunk;
   __shared__ WarpStage<S, BlendVisitor<S, kMode, kSums>> stages[kWarpsPerTile];

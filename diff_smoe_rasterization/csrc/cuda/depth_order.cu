@@ -23,14 +23,23 @@ __global__ void __launch_bounds__(kSortBlock)
   for (int i = threadIdx.x; i < kSize * kCopies; i += kSortBlock) counts[i] = 0;
   __syncthreads();
   const int copy = threadIdx.x % kCopies;
-  for (int64_t i = int64_t(blockIdx.x) * kSortBlock + threadIdx.x; i < arguments.count;
-       i += int64_t(gridDim.x) * kSortBlock) {
-    const DepthBits<S> depth = arguments.depths[i];
-    if (depth == ~DepthBits<S>(0)) continue;
+  const int64_t step = int64_t(gridDim.x) * kSortBlock;
+  for (int64_t first = int64_t(blockIdx.x) * kSortBlock + threadIdx.x; first < arguments.count;
+       first += kDepthsAtOnce * step) {
+    constexpr DepthBits<S> kCulled = ~DepthBits<S>(0);
+    DepthBits<S> depths[kDepthsAtOnce];  // read together, so that the loads do not wait for each other
 #pragma unroll
-    for (int pass = 0; pass < kPasses<S>; ++pass) {
-      const int digit = static_cast<int>(depth >> (pass * kDepthDigit)) & (kBins - 1);
-      atomicAdd(&counts[(pass * kBins + digit) * kCopies + copy], 1u);
+    for (int i = 0; i < kDepthsAtOnce; ++i) {
+      depths[i] = first + i * step < arguments.count ? arguments.depths[first + i * step] : kCulled;
+    }
+#pragma unroll
+    for (int i = 0; i < kDepthsAtOnce; ++i) {
+      if (depths[i] == kCulled) continue;
+#pragma unroll
+      for (int pass = 0; pass < kPasses<S>; ++pass) {
+        const int digit = static_cast<int>(depths[i] >> (pass * kDepthDigit)) & (kBins - 1);
+        atomicAdd(&counts[(pass * kBins + digit) * kCopies + copy], 1u);
+      }
     }
   }
   __syncthreads();
@@ -57,7 +66,8 @@ template <class S> void sort_by_depth(const Frame<S>& frame, const DepthBits<S>*
   histogram.count = count;
   histogram.depths = depths;
   histogram.histograms = zeros;
-  const unsigned blocks = min(blocks_for(count, kSortBlock), 2u * static_cast<unsigned>(num_multiprocessors()));
+  const unsigned blocks =
+      min(blocks_for(count, kSortBlock), kHistogramBlocks * static_cast<unsigned>(num_multiprocessors()));
   depth_histogram_kernel<S><<<blocks, kSortBlock, 0, stream>>>(histogram);
   DSMOE_CHECK_LAUNCH("depth_histogram");
 

@@ -93,7 +93,8 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
     auto sum = no_importance<S>();
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto removal = remove_pair<kMode>(pixels.state[k], pixels.end[k], gate[k], gaussian.position < pixels.last[k]);
+      const auto removal =
+          remove_pair<kMode>(pixels.state[k], pixels.end[k], gate[k], gaussian.position < pixels.last[k]);
       S squared = S(0);
       for (int c = 0; c < num_channels(); ++c) {
         const S feature = kChannels != kAnyFeatures ? gaussian.features[c] : features[c];

@@ -220,15 +220,36 @@ struct Chunks {
   }
 };
 
-// A chunk's entries.
-struct Chunk {
-  int macro;
-  int64_t begin, end;
-  __device__ Chunk(const Chunks& chunks, int64_t number, int lane) {
-    macro = chunks.macro_of(number, lane);
-    begin = chunks.offsets[macro] + (number - chunks.first_chunk(macro)) * kChunk;
-    end = min(begin + kChunk, chunks.offsets[macro + 1]);
+// A block's share of the chunks: neighbouring ones, so that it seldom searches for their macro tile.
+class ChunkWalk {
+ public:
+  __device__ ChunkWalk(const Chunks& chunks, int lane) : chunks_(chunks) {
+    const int64_t all = chunks.end(), share = (all + gridDim.x - 1) / gridDim.x;
+    number = share * blockIdx.x;
+    last_ = min(number + share, all);
+    if (number < last_) begin_chunk(chunks.macro_of(number, lane));
   }
+
+  __device__ bool is_done() const { return number >= last_; }
+  __device__ void next() {
+    if (++number >= last_) return;
+    // Each macro tile has a number at least, so that the next one is at most one macro tile ahead.
+    begin_chunk(macro + (macro + 1 < chunks_.macros && chunks_.first_chunk(macro + 1) <= number));
+  }
+
+  int64_t number;      // of the chunk
+  int macro;           // tile
+  int64_t begin, end;  // its entries; none where the number has no chunk
+
+ private:
+  __device__ void begin_chunk(int of_macro) {
+    macro = of_macro;
+    begin = chunks_.offsets[macro] + (number - chunks_.first_chunk(macro)) * kChunk;
+    end = min(begin + kChunk, chunks_.offsets[macro + 1]);
+  }
+
+  const Chunks& chunks_;
+  int64_t last_;  // behind the block's last number
 };
 
 // Bits of the tiles that have squares, each at its tile's first square.
@@ -284,8 +305,7 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
   __shared__ uint32_t counts[kChunk / kWarp][kTilesPerMacro];
   const Chunks& chunks = arguments.chunks;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  for (int64_t number = blockIdx.x; number < chunks.end(); number += gridDim.x) {
-    const Chunk chunk(chunks, number, lane);
+  for (ChunkWalk chunk(chunks, lane); !chunk.is_done(); chunk.next()) {
     if (chunk.begin >= chunk.end) continue;
     const int macro_x = chunk.macro % arguments.macro_columns, macro_y = chunk.macro / arguments.macro_columns;
     const int64_t entry = chunk.begin + threadIdx.x;
@@ -313,7 +333,7 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
     if (threadIdx.x < kTilesPerMacro) {
       uint32_t sum = 0;
       for (int w = 0; w < kChunk / kWarp; ++w) sum += counts[w][threadIdx.x];
-      chunks.counts[number * kTilesPerMacro + threadIdx.x] = sum;
+      chunks.counts[chunk.number * kTilesPerMacro + threadIdx.x] = sum;
       if (sum > 0) {
         const int x = macro_x * kMacroTiles + threadIdx.x % kMacroTiles;
         const int y = macro_y * kMacroTiles + threadIdx.x / kMacroTiles;
@@ -380,8 +400,7 @@ __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_cons
   if (*arguments.num_instances > arguments.capacity) return;
   const Chunks& chunks = arguments.chunks;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  for (int64_t number = blockIdx.x; number < chunks.end(); number += gridDim.x) {
-    const Chunk chunk(chunks, number, lane);
+  for (ChunkWalk chunk(chunks, lane); !chunk.is_done(); chunk.next()) {
     if (chunk.begin >= chunk.end) continue;
     const int64_t entry = chunk.begin + threadIdx.x;
     const bool exists = entry < chunk.end;
@@ -405,7 +424,7 @@ __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_cons
     if (lane < kTilesPerMacro) counts[warp][lane] = own;
     __syncthreads();
     unsigned long long earlier = 0;
-    for (int64_t c = chunks.first_chunk(chunk.macro) + threadIdx.x / kTilesPerMacro; c < number;
+    for (int64_t c = chunks.first_chunk(chunk.macro) + threadIdx.x / kTilesPerMacro; c < chunk.number;
          c += kChunk / kTilesPerMacro) {
       earlier += chunks.counts[c * kTilesPerMacro + threadIdx.x % kTilesPerMacro];
     }

@@ -47,8 +47,10 @@ int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& ke
   }
   if (capacity > 0 && capacity <= most) return capacity;
   count_instances(frame, work);
-  capacity = read(frame.saved.num_instances, "projecting Gaussians", run.stream);
-  return capacity > most ? 0 : std::max<int64_t>(capacity, 1);
+  const auto count = read(frame.saved.num_instances, "projecting Gaussians", run.stream);
+  if (count > most) return 0;
+  // The lists of macro tiles must fit too. Seldom are they longer, by macro tiles that long Gaussians only pass by.
+  return std::min(most, count + count / 8 + 1);
 }
 
 }  // namespace

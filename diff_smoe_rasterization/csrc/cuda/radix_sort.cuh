@@ -13,7 +13,7 @@ namespace dsmoe {
 namespace cuda {
 
 template <class Key> constexpr int kSortItems = sizeof(Key) == 8 ? kSortItemsOfFloats / 2 : kSortItemsOfFloats;
-template <class Key> constexpr int kSortTile = kSortBlock * kSortItems<Key>;  // pairs a block
+template <class Key> constexpr int kSortTile = kSortBlock* kSortItems<Key>;  // pairs a block
 
 template <class Key> struct RadixPass {
   int64_t capacity;           // pairs there are at most; where there are more, nothing is sorted
@@ -78,10 +78,11 @@ template <int kBins> __device__ uint32_t look_back(const volatile uint32_t* stat
 }
 
 template <class Key, int kBits>
-__global__ void __launch_bounds__(kSortBlock) radix_pass_kernel(const __grid_constant__ RadixPass<Key> pass) {
+__global__ void __launch_bounds__(kSortBlock, kSortBlocks)
+    radix_pass_kernel(const __grid_constant__ RadixPass<Key> pass) {
   constexpr int kBins = 1 << kBits, kOwn = kBins / kSortBlock, kItems = kSortItems<Key>, kWarps = kSortBlock / kWarp;
   static_assert(kBins % kSortBlock == 0, "each thread has the same number of digits");
-  __shared__ uint32_t warp_counts[kWarps][kBins];  // pairs of each digit, then those in the warps before
+  __shared__ uint32_t warp_counts[kWarps][kBins];    // pairs of each digit, then those in the warps before
   __shared__ uint32_t starts[kBins], places[kBins];  // of each digit: in the block's order; what leads from there out
   __shared__ Key block_keys[kSortTile<Key>];
   __shared__ int32_t block_values[kSortTile<Key>];
@@ -89,7 +90,7 @@ __global__ void __launch_bounds__(kSortBlock) radix_pass_kernel(const __grid_con
   __shared__ unsigned shared_block;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   if (threadIdx.x == 0) shared_block = atomicAdd(pass.next_block, 1u);
-  for (int i = threadIdx.x; i < kWarps * kBins; i += kSortBlock) warp_counts[0][i] = 0;
+  for (int i = threadIdx.x; i < kWarps * kBins; i += kSortBlock) warp_counts[i / kBins][i % kBins] = 0;
 
   // Where each digit begins in the result. A thread has kOwn neighbouring digits.
   uint32_t own[kOwn], base[kOwn], sum = 0, total;

@@ -43,8 +43,8 @@ struct alignas(16) TensorGaussian {
 
 // What one warp keeps in shared memory.
 struct TensorStage {
-  float values[kTensorBatch][kTensorRow];      // dL/dpower and weight of pixel k of lane l, at 4 l + 2 k
-  TensorBasis gradients;                       // g', each number in two parts side by side
+  float values[kTensorBatch][kTensorRow];  // dL/dpower and weight of pixel k of lane l, at 4 l + 2 k
+  TensorBasis gradients;                   // g', each number in two parts side by side
   TensorGaussian gaussians[kTensorBatch];
 };
 

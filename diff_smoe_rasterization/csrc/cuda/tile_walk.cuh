@@ -123,11 +123,11 @@ template <class S> class WarpTile {
 
 // A Gaussian that meets the warp's pixels, as the visitors read it.
 template <class S> struct alignas(16) StagedShape {
-  Vec2<S> mean;            // pixels
-  ExponentForm<S> conic;   // per px^2
+  Vec2<S> mean;           // pixels
+  ExponentForm<S> conic;  // per px^2
   S opacity;
-  int32_t gaussian;        // its number
-  int32_t position;        // of the entry in the list
+  int32_t gaussian;  // its number
+  int32_t position;  // of the entry in the list
 };
 template <class S, bool kWithFeatures> struct alignas(16) StagedGaussian : StagedShape<S> {
   S features[kFeatureChunk];
@@ -200,8 +200,8 @@ template <class S, bool kBackToFront> class EntryFinder {
       const bool meets = tile_.source.may_meet(entries_[i]);
       const unsigned meet = __ballot_sync(kAllLanes, meets);
       if (meets) {
-        ring_[(found_ + __popc(meet & ((1u << tile_.lane) - 1))) % kFoundEntries] = {
-            tile_.source.gaussian(entries_[i]), position(i)};
+        ring_[(found_ + __popc(meet & ((1u << tile_.lane) - 1))) % kFoundEntries] = {tile_.source.gaussian(entries_[i]),
+                                                                                     position(i)};
       }
       found_ += __popc(meet);
     }
@@ -211,10 +211,10 @@ template <class S, bool kBackToFront> class EntryFinder {
 
   const WarpTile<S>& tile_;
   const WalkRange& range_;
-  FoundEntry* ring_;             // [kFoundEntries]
-  int32_t cursor_;               // position of the first entry that was read
+  FoundEntry* ring_;  // [kFoundEntries]
+  int32_t cursor_;    // position of the first entry that was read
   uint32_t entries_[kReadAhead];
-  int found_ = 0, taken_ = 0;    // entries so far
+  int found_ = 0, taken_ = 0;  // entries so far
 };
 
 // What a lane has loaded of an entry.

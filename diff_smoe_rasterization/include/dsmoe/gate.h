@@ -17,7 +17,8 @@ enum class Cut {
 template <class S> struct ExponentForm {
   S xx, xy, yy;
   ExponentForm() = default;
-  DSMOE_HD explicit ExponentForm(const Sym2<S>& conic) : xx(S(-0.5) * conic.xx), xy(-conic.xy), yy(S(-0.5) * conic.yy) {}
+  DSMOE_HD explicit ExponentForm(const Sym2<S>& conic)
+      : xx(S(-0.5) * conic.xx), xy(-conic.xy), yy(S(-0.5) * conic.yy) {}
 };
 
 // The exponent -1/2 d^T Sigma2D^-1 d along one column of pixels. d = pixel - mean; d.x is the same for all of them.

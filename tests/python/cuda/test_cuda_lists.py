@@ -1,0 +1,35 @@
+"""Tile lists by macro tiles: where they need more than one pass, and where they do not fit."""
+from __future__ import annotations
+
+import pytest
+import torch
+from against_cpu import FLOAT32, compare
+from scenes import op_results, random_scene
+
+MACRO_TILE = 64  # pixels
+ONE_PASS = 512  # macro tiles that one pass of the sort tells apart
+
+
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_more_macro_tiles_than_one_pass_sorts(mode, gpu):
+    width, height = 2305, 1217
+    assert (width // MACRO_TILE) * (height // MACRO_TILE) > ONE_PASS
+    scene = random_scene(mode, 400, width, height, scale=0.03, degree=0, dtype=torch.float32)
+    compare(scene, gpu, torch.float32, (), FLOAT32, camera=False)
+
+
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_needles_that_pass_by_more_macro_tiles_than_they_meet_tiles(mode, gpu):
+    """Their boxes outgrow the room that the count of their tiles suggests. Then the lists are not used, and the next
+    rendering has more room. A pixel sums the same pairs in the same order both times."""
+    scene = random_scene(mode, 300, 2391, 2377, scale=0.01, degree=0, dtype=torch.float32)
+    needle = torch.tensor([6.0, 0.001, 0.001])
+    scene = scene.with_inputs(scales=needle.expand_as(scene.inputs["scales"]).contiguous()).to(gpu)
+    images = []
+    for fits in (False, True):
+        outputs, saved = op_results(scene)
+        torch.cuda.synchronize()  # the count is there for the next call
+        assert (len(saved["instances"]) >= int(saved["tile_offsets"][-1])) is fits
+        images.append(outputs["color"])
+    assert images[0].std() > 0.01, "nothing is seen"
+    assert torch.equal(*images)
