@@ -1,4 +1,5 @@
 // Views in json files; without nlohmann's library (Debian, Ubuntu: nlohmann-json3-dev) an error that says so.
+#include "io/cursor.h"
 #include "views.h"
 
 #if DSMOE_WITH_JSON
@@ -6,8 +7,6 @@
 #include <cmath>
 #include <nlohmann/json.hpp>
 #include <utility>
-
-#include "io/cursor.h"
 
 namespace dsmoe::tools {
 namespace {

@@ -4,6 +4,7 @@
 #include <memory>
 #include <vector>
 
+#include "bands.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
 #include "parallel.h"
@@ -17,81 +18,102 @@ namespace {
 
 constexpr int64_t kChunk = 512;  // Gaussians; also fixes the order in which the camera's gradient is summed
 
-// Sums the records of one Gaussian in double: a large Gaussian has thousands.
-template <class S> void sum_records(const S* records, int64_t count, int size, double* wide, S* sum) {
-  for (int k = 0; k < size; ++k) wide[k] = 0;
+// Adds the records of one Gaussian to its sum, in double: a large Gaussian has thousands.
+template <class S> void add_records(const S* records, int64_t count, int size, double* sum) {
   for (int64_t n = 0; n < count; ++n) {
-    for (int k = 0; k < size; ++k) wide[k] += records[n * size + k];
+    for (int k = 0; k < size; ++k) sum[k] += records[n * size + k];
   }
-  for (int k = 0; k < size; ++k) sum[k] = static_cast<S>(wide[k]);
 }
 
-// One record for each instance, as the tiles write them; where means2D_abs is wanted, it ends with those sums. Also
-// writes the gradient by the background.
-template <class S>
-std::unique_ptr<S[]> instance_records(const Frame<S>& frame, const Gradients<S>& wanted, StageTimes* times) {
-  const Stopwatch stopwatch(times, &StageTimes::blend_backward);
+// What the tiles say of each Gaussian. Where means2D_abs is wanted, records end with its sums.
+template <class S> struct Records {
+  int size;                           // numbers a record
+  std::unique_ptr<S[]> of_instances;  // one for each instance, a Gaussian's side by side
+  std::vector<double> of_gaussians;   // their sums, where the tile lists were made band by band; else empty
+};
+
+// Also writes the gradient by the background.
+template <class S> Records<S> walk_tiles(const Frame<S>& frame, const Gradients<S>& wanted, StageTimes* times) {
   const Camera<S>& camera = frame.camera;
   const RasterConfig<S>& config = frame.config;
+  const int64_t num_gaussians = frame.inputs.num_gaussians;
   S* dL_dbackground = wanted.inputs.background;
-  const bool absolute = wanted.inputs.means2D_abs != nullptr;
-  const int record = record_size(config.num_features(), absolute);
-  std::unique_ptr<S[]> dL_dinstances(new S[frame.saved.instance_offsets[frame.inputs.num_gaussians] * record]);
-  const auto& kernels = tile_kernels<S>();
+  const bool absolute = wanted.inputs.means2D_abs != nullptr, banded = is_banded(frame);
+  Records<S> records;
+  records.size = record_size(config.num_features(), absolute);
+  const int size = records.size;
+  if (banded) records.of_gaussians.resize(num_gaussians * size);
   const int64_t tiles = num_tiles(camera.width, camera.height);
   const int background = config.num_channels + 1;  // numbers: its colour and its gate
   std::vector<S> dL_dbackgrounds(dL_dbackground != nullptr ? tiles * background : 0);
-  const TileGradients<S> tile_gradients = {frame.images, wanted.images, dL_dinstances.get(),
-                                           dL_dbackgrounds.empty() ? nullptr : dL_dbackgrounds.data(), absolute};
-  const int64_t pairs =
-      for_each_tile(config, frame.saved, camera.width, camera.height, config.num_features(),
-                    [&](const Tile<S>& tile, S* scratch) { return kernels.backward(tile, tile_gradients, scratch); });
-  if (times != nullptr) times->backward_pairs += pairs;
+  for_each_band(frame, times, [&](const Frame<S>& band) {
+    const Stopwatch stopwatch(times, &StageTimes::blend_backward);
+    const auto& kernels = tile_kernels<S>();
+    const int64_t* offsets = band.saved.instance_offsets;
+    records.of_instances.reset(new S[offsets[num_gaussians] * size]);
+    const TileGradients<S> tile_gradients = {frame.images, wanted.images, records.of_instances.get(),
+                                             dL_dbackgrounds.empty() ? nullptr : dL_dbackgrounds.data(), absolute};
+    const int64_t pairs =
+        for_each_tile(config, band.saved, camera.width, camera.height, config.num_features(),
+                      [&](const Tile<S>& tile, S* scratch) { return kernels.backward(tile, tile_gradients, scratch); });
+    if (times != nullptr) times->backward_pairs += pairs;
+    if (!banded) return;
+    parallel_for(config.num_threads, num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        add_records(records.of_instances.get() + offsets[i] * size, offsets[i + 1] - offsets[i], size,
+                    &records.of_gaussians[i * size]);
+      }
+    });
+  });
   if (dL_dbackground != nullptr) {
     std::vector<double> wide(background);
-    sum_records(dL_dbackgrounds.data(), tiles, background, wide.data(), dL_dbackground);
+    add_records(dL_dbackgrounds.data(), tiles, background, wide.data());
+    for (int k = 0; k < background; ++k) dL_dbackground[k] = static_cast<S>(wide[k]);
   }
-  return dL_dinstances;
+  return records;
 }
 
-// Sums what the instances of a Gaussian say, one Gaussian at a time.
-template <class S> class InstanceSums {
+// Sums the records of a Gaussian, one Gaussian at a time.
+template <class S> class RecordSums {
  public:
-  InstanceSums(const Frame<S>& frame, const S* dL_dinstances, S* means2D_abs)
-      : frame_(frame),
-        dL_dinstances_(dL_dinstances),
-        means2D_abs_(means2D_abs),
-        sum_(record_size(frame.config.num_features(), means2D_abs != nullptr)),
-        wide_(sum_.size()) {}
+  RecordSums(const Frame<S>& frame, const Records<S>& records, S* means2D_abs)
+      : frame_(frame), records_(records), means2D_abs_(means2D_abs), sum_(records.size), wide_(records.size) {}
 
   // Fills `sums`, which last until the next call, with those of Gaussian i, and stores its absolute ones where they are
   // wanted. Returns false where it has no instances.
   bool operator()(int64_t i, PixelSums<S>& sums) {
     const SavedForward<S>& saved = frame_.saved;
-    const int record = static_cast<int>(sum_.size());
+    const int size = records_.size;
     const int64_t first = saved.instance_offsets[i], count = saved.instance_offsets[i + 1] - first;
     if (count == 0) return false;
-    sum_records(dL_dinstances_ + first * record, count, record, wide_.data(), sum_.data());
+    const double* total = wide_.data();
+    if (!records_.of_gaussians.empty()) {
+      total = &records_.of_gaussians[i * size];
+    } else {
+      std::fill(wide_.begin(), wide_.end(), 0);
+      add_records(records_.of_instances.get() + first * size, count, size, wide_.data());
+    }
+    for (int k = 0; k < size; ++k) sum_[k] = static_cast<S>(total[k]);
     const ProjectedGaussian<S>& gaussian = saved.projected[i];
     const GateMoments<S> moments = {sum_[0], sum_[1], sum_[2], sum_[3], sum_[4], sum_[5]};
     sums.gate = moments_backward(gaussian.conic, gaussian.opacity, moments);
     sums.features.values = saved.features + i * frame_.config.num_features();
     sums.features.dL_dvalues = sum_.data() + kNumGateMoments;
     if (means2D_abs_ != nullptr) {
-      store_absolute(sum_.data() + record - kNumAbsoluteSums, frame_.camera, means2D_abs_, i);
+      store_absolute(sum_.data() + size - kNumAbsoluteSums, frame_.camera, means2D_abs_, i);
     }
     return true;
   }
 
  private:
   const Frame<S>& frame_;
-  const S* dL_dinstances_;
+  const Records<S>& records_;
   S* means2D_abs_;  // null where it is not wanted
   std::vector<S> sum_;
   std::vector<double> wide_;
 };
 
-// Writes the gradients of every input but the background. new_sums() returns what InstanceSums is.
+// Writes the gradients of every input but the background. new_sums() returns what RecordSums is.
 template <class S, class NewSums>
 void project_all_backward(const Frame<S>& frame, const GaussianGradients<S>& gradients, StageTimes* times,
                           NewSums new_sums) {
@@ -120,19 +142,19 @@ void project_all_backward(const Frame<S>& frame, const GaussianGradients<S>& gra
 }  // namespace
 
 template <class S> void backward(const Frame<S>& frame, const Gradients<S>& wanted, StageTimes* times) {
-  const auto records = instance_records(frame, wanted, times);
+  const auto records = walk_tiles(frame, wanted, times);
   project_all_backward(frame, wanted.inputs, times,
-                       [&] { return InstanceSums<S>(frame, records.get(), wanted.inputs.means2D_abs); });
+                       [&] { return RecordSums<S>(frame, records, wanted.inputs.means2D_abs); });
 }
 
 template <class S>
 void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradients,
                                const FootprintGradients<S>& footprints, StageTimes* times) {
-  const auto records = instance_records(frame, gradients, times);
+  const auto records = walk_tiles(frame, gradients, times);
   const Stopwatch stopwatch(times, &StageTimes::blend_backward);
   const int num_features = frame.config.num_features(), size = kNumGateGradients + num_features;
   parallel_for(frame.config.num_threads, frame.inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
-    InstanceSums<S> sums_of(frame, records.get(), gradients.inputs.means2D_abs);
+    RecordSums<S> sums_of(frame, records, gradients.inputs.means2D_abs);
     for (int64_t i = begin; i < end; ++i) {
       S* record = footprints.records + i * size;
       PixelSums<S> sums;

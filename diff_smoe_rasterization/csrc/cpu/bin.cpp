@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "../dispatch.h"
+#include "bands.h"
 #include "dsmoe/blend.h"
 #include "dsmoe/depth_bits.h"
 #include "dsmoe/project.h"
@@ -42,7 +43,11 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
   const Camera<S>& camera = frame.camera;
   const RasterConfig<S>& config = frame.config;
   const SavedForward<S>& saved = frame.saved;
-  const int32_t* radii = frame.images.radii;
+  if (saved.instance_offsets[num_gaussians] > std::numeric_limits<uint32_t>::max()) {
+    throw std::overflow_error("rasterize: " + std::to_string(saved.instance_offsets[num_gaussians]) +
+                              " tile instances are to be listed at once; the CPU backend lists at most 4294967295, and "
+                              "no less than a row of tiles. Are the scales right?");
+  }
   std::vector<KeyedIndex<DepthBits<S>>> order;
   {
     const Stopwatch stopwatch(times, &StageTimes::sort);
@@ -50,7 +55,8 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
   }
   const Stopwatch stopwatch(times, &StageTimes::bin);
   const TileGrid grid(camera.width, camera.height);
-  const int64_t tiles = num_tiles(camera.width, camera.height);
+  const TileBand& band = saved.band;
+  const int64_t tiles = band_tiles(grid, band);
   const int64_t num_visible = static_cast<int64_t>(order.size());
 
   // A counting sort by tile. Each thread has a run of the depth order and counters of its own. So the lists are in
@@ -65,10 +71,9 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
     for_each_gaussian(run, [&](int32_t i) {
       uint32_t* next = &tile_of_slot[saved.instance_offsets[i]];
       const ProjectedGaussian<S>& gaussian = saved.projected[i];
-      const TileRect bounds = tile_bounds(config.mode, grid, gaussian.mean, S(radii[i]));
-      for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds, [&](int x0, int x1, int y) {
+      for_each_tile_row(gaussian, bounds_in(frame, i), [&](int x0, int x1, int y) {
         for (int x = x0; x < x1; ++x) {
-          const uint32_t tile = static_cast<uint32_t>(y) * grid.columns + x;
+          const uint32_t tile = static_cast<uint32_t>(y - band.begin) * grid.columns + x;
           ++cursors[run][tile];
           *next++ = tile;
         }

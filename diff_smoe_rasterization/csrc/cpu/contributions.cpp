@@ -1,7 +1,9 @@
 // Sums over the pixels of each Gaussian. Each tile writes one record per instance. Then each Gaussian sums its own
 // records, which lie side by side. There are no atomics, so the result does not depend on the threads.
 #include <memory>
+#include <vector>
 
+#include "bands.h"
 #include "dsmoe/contribution.h"
 #include "dsmoe/rasterize.h"
 #include "parallel.h"
@@ -20,26 +22,33 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
   const int64_t num_gaussians = frame.inputs.num_gaussians;
   const int width = frame.camera.width, height = frame.camera.height;
   const RasterConfig<S>& config = frame.config;
-  const SavedForward<S>& saved = frame.saved;
   const S* pixel_weights = map.pixel_weights;
   const ContributionSums<S>& sums = map.sums;
-  const std::unique_ptr<Contribution<S>[]> instances(new Contribution<S>[saved.instance_offsets[num_gaussians]]);
   const auto& kernels = tile_kernels<S>();
-  const TileContributions<S> out = {pixel_weights, instances.get()};
-  for_each_tile(config, saved, width, height, 0,
-                [&](const Tile<S>& tile, S* scratch) { return kernels.contributions(tile, out, scratch); });
-  parallel_for(config.num_threads, num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      auto sum = no_contribution<double>();  // a large Gaussian has thousands of instances
-      for (int64_t slot = saved.instance_offsets[i]; slot < saved.instance_offsets[i + 1]; ++slot) {
-        const Contribution<S>& part = instances[slot];
-        sum.pixel_weight += part.pixel_weight, sum.pixels += part.pixels;
-        sum.blend_weight += part.blend_weight, sum.distance += part.distance;
+  // In double: a large Gaussian has thousands of instances.
+  std::vector<Contribution<double>> totals(num_gaussians, no_contribution<double>());
+  for_each_band(frame, nullptr, [&](const Frame<S>& band) {
+    const SavedForward<S>& saved = band.saved;
+    const std::unique_ptr<Contribution<S>[]> instances(new Contribution<S>[saved.instance_offsets[num_gaussians]]);
+    const TileContributions<S> out = {pixel_weights, instances.get()};
+    for_each_tile(config, saved, width, height, 0,
+                  [&](const Tile<S>& tile, S* scratch) { return kernels.contributions(tile, out, scratch); });
+    parallel_for(config.num_threads, num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        Contribution<double>& sum = totals[i];
+        for (int64_t slot = saved.instance_offsets[i]; slot < saved.instance_offsets[i + 1]; ++slot) {
+          const Contribution<S>& part = instances[slot];
+          sum.pixel_weight += part.pixel_weight, sum.pixels += part.pixels;
+          sum.blend_weight += part.blend_weight, sum.distance += part.distance;
+        }
       }
-      sums.pixel_weights[i] = static_cast<S>(sum.pixel_weight), sums.pixels[i] = static_cast<int32_t>(sum.pixels);
-      sums.blend_weights[i] = static_cast<S>(sum.blend_weight), sums.distances[i] = static_cast<S>(sum.distance);
-    }
+    });
   });
+  for (int64_t i = 0; i < num_gaussians; ++i) {
+    const Contribution<double>& sum = totals[i];
+    sums.pixel_weights[i] = static_cast<S>(sum.pixel_weight), sums.pixels[i] = static_cast<int32_t>(sum.pixels);
+    sums.blend_weights[i] = static_cast<S>(sum.blend_weight), sums.distances[i] = static_cast<S>(sum.distance);
+  }
 }
 
 #define DSMOE_INSTANTIATE(S) template void contributions(const Frame<S>&, const ContributionMap<S>&);

@@ -3,16 +3,26 @@
 
 namespace dsmoe {
 namespace cpu {
+namespace {
+
+// From the footprints to the images. Lists are kept where they fit.
+template <class S>
+void draw(Frame<S>& frame, SavedSizes sizes, int64_t num_instances, Allocator& memory, StageTimes* times) {
+  const bool fit = num_instances <= frame.config.most_instances;
+  sizes.num_instances = fit ? num_instances : 0;
+  allocate_saved(frame.saved, sizes, memory);
+  fit ? bin(frame, times) : void(frame.saved.instances = nullptr);
+  blend(frame, times);
+}
+
+}  // namespace
 
 template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* times) {
   SavedSizes sizes = saved_sizes(frame);
   frame.saved = {};
   frame.saved.gate_sum = frame.images.gate_sum;
   allocate_saved(frame.saved, sizes, memory);
-  sizes.num_instances = project(frame, times);
-  allocate_saved(frame.saved, sizes, memory);
-  bin(frame, times);
-  blend(frame, times);
+  draw(frame, sizes, project(frame, times), memory, times);
 }
 
 template <class S> void blend_footprints(Frame<S>& frame, Allocator& memory, StageTimes* times) {
@@ -22,10 +32,7 @@ template <class S> void blend_footprints(Frame<S>& frame, Allocator& memory, Sta
   frame.saved.projected = given.projected, frame.saved.features = given.features;
   frame.saved.gate_sum = frame.images.gate_sum;
   allocate_saved(frame.saved, sizes, memory);
-  sizes.num_instances = count_instances(frame, times);
-  allocate_saved(frame.saved, sizes, memory);
-  bin(frame, times);
-  blend(frame, times);
+  draw(frame, sizes, count_instances(frame, times), memory, times);
 }
 
 template <class S> void radii(const Frame<S>& frame, Scratch& scratch) {

@@ -1,9 +1,7 @@
 // Stage 1: every Gaussian to the image plane, and how many tiles each meets.
 #include <algorithm>
-#include <limits>
-#include <stdexcept>
-#include <string>
 
+#include "bands.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
 #include "parallel.h"
@@ -15,12 +13,10 @@ namespace {
 
 constexpr int64_t kChunk = 1024;  // Gaussians: enough to hide the hand-out, few enough to balance
 
-// How many tiles a footprint meets.
-template <class S>
-int64_t count_tiles(BlendMode mode, TileGrid grid, const ProjectedGaussian<S>& gaussian, int32_t radius) {
+// How many tiles the footprint of Gaussian i meets.
+template <class S> int64_t count_tiles(const Frame<S>& frame, int64_t i) {
   int64_t count = 0;
-  for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach,
-                    tile_bounds(mode, grid, gaussian.mean, S(radius)), [&](int x0, int x1, int) { count += x1 - x0; });
+  for_each_tile_row(frame.saved.projected[i], bounds_in(frame, i), [&](int x0, int x1, int) { count += x1 - x0; });
   return count;
 }
 
@@ -28,13 +24,7 @@ int64_t count_tiles(BlendMode mode, TileGrid grid, const ProjectedGaussian<S>& g
 int64_t sum_counts(int64_t* instance_offsets, int64_t num_gaussians) {
   instance_offsets[0] = 0;
   for (int64_t i = 0; i < num_gaussians; ++i) instance_offsets[i + 1] += instance_offsets[i];
-  const int64_t num_instances = instance_offsets[num_gaussians];
-  if (num_instances > std::numeric_limits<int32_t>::max()) {
-    throw std::overflow_error("rasterize: " + std::to_string(num_instances) + " tile instances need " +
-                              std::to_string(num_instances * sizeof(TileInstance)) +
-                              " bytes; the CPU backend takes at most 2147483647 instances. Are the scales right?");
-  }
-  return num_instances;
+  return instance_offsets[num_gaussians];
 }
 
 }  // namespace
@@ -47,20 +37,20 @@ template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
   const ImageOutputs<S>& images = frame.images;
   const Stopwatch stopwatch(times, &StageTimes::project);
   const int num_features = config.num_features();
-  const TileGrid grid(camera.width, camera.height);
   int64_t* counts = saved.instance_offsets == nullptr ? nullptr : saved.instance_offsets + 1;
   parallel_for(config.num_threads, inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       S* features = saved.features + i * num_features;
       const auto [radius, gaussian] = project_gaussian<S>({inputs, camera, config, i}, features);
       images.radii[i] = radius;
-      if (counts != nullptr) counts[i] = radius == 0 ? 0 : count_tiles(config.mode, grid, gaussian, radius);
+      if (counts != nullptr) counts[i] = 0;
       if (radius == 0) {
         saved.projected[i] = {};
         std::fill_n(features, num_features, S(0));
         continue;
       }
       saved.projected[i] = gaussian;
+      if (counts != nullptr) counts[i] = count_tiles(frame, i);
     }
   });
   return counts == nullptr ? 0 : sum_counts(saved.instance_offsets, inputs.num_gaussians);
@@ -69,13 +59,10 @@ template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
 template <class S> int64_t count_instances(const Frame<S>& frame, StageTimes* times) {
   const SavedForward<S>& saved = frame.saved;
   const Stopwatch stopwatch(times, &StageTimes::bin);
-  const TileGrid grid(frame.camera.width, frame.camera.height);
   const int64_t count = frame.inputs.num_gaussians;
   parallel_for(frame.config.num_threads, count, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
-      const int32_t radius = frame.images.radii[i];
-      saved.instance_offsets[i + 1] =
-          radius == 0 ? 0 : count_tiles(frame.config.mode, grid, saved.projected[i], radius);
+      saved.instance_offsets[i + 1] = frame.images.radii[i] == 0 ? 0 : count_tiles(frame, i);
     }
   });
   return sum_counts(saved.instance_offsets, count);

@@ -19,7 +19,7 @@ template <class S> struct Tile {
   const SavedForward<S>& saved;
   int width, height;   // of the image, pixels
   int x, y;            // of the tile, tiles
-  int64_t index;       // of the tile
+  int64_t index;       // of the tile in the image
   int64_t begin, end;  // its instances
 };
 

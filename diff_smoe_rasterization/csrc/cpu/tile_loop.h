@@ -13,14 +13,14 @@
 namespace dsmoe {
 namespace cpu {
 
-// Calls body(tile, scratch) for every tile of an image. Returns the sum of what body returns. num_features: how many
-// features `scratch` has room for.
+// Calls body(tile, scratch) for every tile of the band that has its lists in `saved`. Returns the sum of what body
+// returns. num_features: how many features `scratch` has room for.
 template <class S, class Body>
 int64_t for_each_tile(const RasterConfig<S>& config, const SavedForward<S>& saved, int width, int height,
                       int num_features, Body body) {
   constexpr size_t kAlignment = 64;
   const TileGrid grid(width, height);
-  const int64_t tiles = static_cast<int64_t>(grid.columns) * grid.rows;
+  const int64_t first = static_cast<int64_t>(grid.columns) * saved.band.begin, tiles = band_tiles(grid, saved.band);
   std::atomic<int64_t> next{0}, total{0};
   run_threads(static_cast<int>(std::min<int64_t>(config.num_threads, tiles)), [&](int) {
     size_t bytes = tile_scratch_size(num_features) * sizeof(S) + kAlignment;
@@ -34,8 +34,8 @@ int64_t for_each_tile(const RasterConfig<S>& config, const SavedForward<S>& save
                             width,
                             height,
                             static_cast<int>(i % grid.columns),
-                            static_cast<int>(i / grid.columns),
-                            i,
+                            static_cast<int>(i / grid.columns) + saved.band.begin,
+                            first + i,
                             saved.tile_offsets[i],
                             saved.tile_offsets[i + 1]};
       sum += body(tile, static_cast<S*>(aligned));

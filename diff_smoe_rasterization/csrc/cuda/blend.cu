@@ -1,5 +1,6 @@
 // Stage 3: the images.
 #include "../dispatch.h"
+#include "bands.h"
 #include "dsmoe/params.h"
 #include "segments.cuh"
 
@@ -18,7 +19,7 @@ __device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile
     segment_pixel(arguments.saved, tile, segment, k) = begin;
   }
   if (tile.lane == 0) {
-    segment_queue(arguments.saved).push(tile.tile_y * arguments.tile_columns + tile.tile_x, tile.quarter, segment);
+    segment_queue(arguments.saved).push(tile.index, tile.quarter, segment);
   }
 }
 
@@ -150,16 +151,16 @@ __global__ void __launch_bounds__(kWalkBlock,
 }  // namespace
 
 template <class S> void blend(const Frame<S>& frame, const Work& work) {
-  const DeviceCamera<S>& camera = frame.camera;
   const RasterConfig<S>& config = frame.config;
-  const cudaStream_t stream = work.stream;
-  const auto arguments = blend_arguments(frame, work);
-  const unsigned tiles = static_cast<unsigned>(num_tiles(camera.width, camera.height));
-  // Double is for checking: it has only the general kernel.
-  dispatch_blend(config.mode, sizeof(S) == 4 ? config.num_features() : kAnyFeatures, [&](auto mode, auto features) {
-    constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
-    blend_kernel<S, decltype(mode)::value, kFeatures><<<tiles, kWalkBlock, 0, stream>>>(arguments);
-    DSMOE_CHECK_LAUNCH("blend");
+  for_each_band(frame, work, [&](const Frame<S>& band) {
+    const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
+    // Double is for checking: it has only the general kernel.
+    dispatch_blend(config.mode, sizeof(S) == 4 ? config.num_features() : kAnyFeatures, [&](auto mode, auto features) {
+      constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
+      blend_kernel<S, decltype(mode)::value, kFeatures>
+          <<<tiles, kWalkBlock, 0, work.stream>>>(blend_arguments(band, work));
+      DSMOE_CHECK_LAUNCH("blend");
+    });
   });
 }
 

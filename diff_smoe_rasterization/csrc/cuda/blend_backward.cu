@@ -1,7 +1,7 @@
 // From image gradients to one record per Gaussian: the moments of dL/dpower over its pixels, and dL/dfeatures. Where
 // sums of absolute gradients by the mean are wanted, they follow in the record, and are split off at the end.
 #include "../dispatch.h"
-#include "capacity.h"
+#include "bands.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/params.h"
 #include "gradient_sinks.cuh"
@@ -15,10 +15,10 @@ namespace {
 
 template <class S> struct BackwardArguments : BlendArguments<S> {
   ImageGradients<S> dL_dimages;  // [features, H, W], and of the gate sum [H, W]; any may be null
-  S* dL_dbackground_rows;        // [tiles * kWarpsPerTile, C + 1] of each warp, or null
+  S* dL_dbackground_rows;        // [tiles * kWarpsPerTile, C + 1] of each warp of the band, or null
   S* scaled;                     // [F, H, W] g', where the number of features is not known
   int num_features;              // F
-  int tiles;                     // of the image
+  int tiles;                     // of the band
   bool absolute;                 // records end with the sums of absolute gradients
 };
 
@@ -52,11 +52,11 @@ __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const T
   __syncwarp();
   TensorSums sums = sum_pixels(stage, basis, tile.lane);
   const TensorLane at(tile.lane);
-  const float4 gaussian = stage.gaussians[at.row];
-  recentre(sums, {gaussian.x, gaussian.y}, tile.lane);
+  const TensorGaussian gaussian = stage.gaussians[at.row];
+  recentre(sums, gaussian.shift, tile.lane);
   __syncwarp();
   if (at.row >= count || at.column >= kFastFeatures) return;
-  sink.to_record(tile, __float_as_int(gaussian.z), __float_as_int(gaussian.w), kRecord, [&](auto add) {
+  sink.to_record(gaussian.index, kRecord, [&](auto add) {
     add(2 * at.column, sums.moments[0]);
     add(2 * at.column + 1, sums.moments[1]);
     add(kNumGateMoments + at.column, sums.feature);
@@ -66,12 +66,12 @@ __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const T
 // Sums `values` over the warp, and gives the first `wanted` sums to the sink: numbers `first`, first + 1, ... of the
 // Gaussian's record.
 template <class S, int kCount, class Sink>
-__device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values)[kCount], int32_t gaussian,
-                           int32_t position, int first, int wanted) {
+__device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values)[kCount], int32_t gaussian, int first,
+                           int wanted) {
   const TransposedSum<kCount> sum(tile.lane);
   sum(values);
   if (!sum.holds || sum.number >= wanted) return;
-  sink.to_record(tile, gaussian, position, sink.length, [&](auto add) { add(first + sum.number, values[0]); });
+  sink.to_record(gaussian, sink.length, [&](auto add) { add(first + sum.number, values[0]); });
 }
 
 // Sums the six moments over a lane's pixels, which lie one below the other.
@@ -149,11 +149,11 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       weight[k] = pair.weight;
       dL_dpower[k] = gate_backward(gate[k], pair.gamma);
     }
-    if (is_absolute()) add_absolute(dL_dpower, gaussian.conic, dx, dy, index, position);
+    if (is_absolute()) add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
     if constexpr (kTensor) {
-      add_by_tensors(dL_dpower, weight, dx, dy, index, position);
+      add_by_tensors(dL_dpower, weight, dx, dy, index);
     } else {
-      add_by_shuffles(dL_dpower, weight, dx, dy, index, position);
+      add_by_shuffles(dL_dpower, weight, dx, dy, index);
     }
   }
 
@@ -165,7 +165,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
   }
 
   __device__ __forceinline__ void add_absolute(const S (&dL_dpower)[kLanePixels], const ExponentFactors<S>& conic, S dx,
-                                               S dy, int32_t index, int32_t position) {
+                                               S dy, int32_t index) {
     S sums[kNumAbsoluteSums] = {};
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
@@ -173,17 +173,14 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       sums[0] += abs(dL_dpower[k] * by_mean.x);
       sums[1] += abs(dL_dpower[k] * by_mean.y);
     }
-    add_values(sink, tile, sums, index, position, kNumGateMoments + num_features(), kNumAbsoluteSums);
+    add_values(sink, tile, sums, index, kNumGateMoments + num_features(), kNumAbsoluteSums);
   }
 
   __device__ __forceinline__ void add_by_tensors(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
-                                                 S dx, S dy, int32_t index, int32_t position) {
+                                                 S dx, S dy, int32_t index) {
     *reinterpret_cast<float4*>(&tensors.stage.values[batch][4 * tile.lane]) =
         make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
-    if (tile.lane == 0) {
-      tensors.stage.gaussians[batch] =
-          make_float4(dx + kWarpTileCentre, dy + kWarpTileCentre, __int_as_float(index), __int_as_float(position));
-    }
+    if (tile.lane == 0) tensors.stage.gaussians[batch] = {{dx + kWarpTileCentre, dy + kWarpTileCentre}, index};
     if (++batch == kTensorBatch) {
       add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, batch);
       batch = 0;
@@ -191,7 +188,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
   }
 
   __device__ __forceinline__ void add_by_shuffles(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
-                                                  S dx, S dy, int32_t index, int32_t position) {
+                                                  S dx, S dy, int32_t index) {
     constexpr int kTogether = kNumGateMoments + (kFeatures != kAnyFeatures ? kFeatures : 0);
     S values[kTogether];
     column_moments(dL_dpower, dx, dy, values);
@@ -202,7 +199,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
         values[kNumGateMoments + f] = share;
       }
     }
-    add_values(sink, tile, values, index, position, 0, kTogether);
+    add_values(sink, tile, values, index, 0, kTogether);
     if constexpr (kFeatures == kAnyFeatures) {
       for (int first = 0; first < num_features(); first += kFeatureChunk) {
         S shares[kFeatureChunk];
@@ -213,7 +210,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
             shares[f] = fma(weight[k], pixels.scaled.get(arguments, tile, k, first + f), shares[f]);
           }
         }
-        add_values(sink, tile, shares, index, position, kNumGateMoments + first, num_features() - first);
+        add_values(sink, tile, shares, index, kNumGateMoments + first, num_features() - first);
       }
     }
   }
@@ -318,7 +315,6 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
   __shared__ TensorStage tensor_stages[Visitor::kTensor ? kWarpsPerTile : 1];
   __shared__ TensorBasis moment_basis;
-  if (Sink::kOnlyOutgrown && !overflows(arguments.saved)) return;
   if (is_idle_block(arguments.saved, arguments.tiles)) return;
   if constexpr (Visitor::kTensor) {
     fill_moment_basis(moment_basis);
@@ -331,7 +327,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
 
   BackwardPixels<S, kFeatures> pixels;
   begin_pixels<kMode, S>(arguments, tile, place, pixels);
-  if (tile.empty || !arguments.sink.takes(tile)) return;
+  if (tile.empty) return;
   const WalkRange range = range_of_segment<kMode, S>(arguments, tile, place.segment, pixels);
   if (range.begin >= range.end) return;
 
@@ -344,17 +340,6 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   count_pairs(arguments, tile.lane, met);
 }
 
-template <class S> Slots<S> allocate_slots(const SavedForward<S>& saved, int length, const Work& work) {
-  const int64_t count = saved.capacity * kSlotsPerInstance;
-  const Slots<S> slots = {allocate<S>(*work.scratch, count * length), allocate<uint8_t>(*work.scratch, count)};
-  check(cudaMemsetAsync(slots.written, 0, count, work.stream), "clearing gradients");
-  return slots;
-}
-
-template <class S> S* allocate_scaled(const BackwardArguments<S>& arguments, Scratch& scratch) {
-  return allocate<S>(scratch, int64_t(arguments.width) * arguments.height * arguments.num_features);
-}
-
 template <class S, int kFeatures, bool kAbsolute = false, class Sink>
 void launch_backward(const BackwardWithSink<S, Sink>& arguments, int64_t blocks, cudaStream_t stream) {
   dispatch_blend(arguments.config.mode, kFeatures, [&](auto mode, auto) {
@@ -364,47 +349,23 @@ void launch_backward(const BackwardWithSink<S, Sink>& arguments, int64_t blocks,
   });
 }
 
-template <class S> struct OutgrownRecords {
-  int64_t size;           // N * length
-  SavedForward<S> saved;  // says whether the instances outgrew their memory
-  OutgrownSink<S> sink;   // read
-  S* records;             // [N, length] written
-};
-
-template <class S> __global__ void store_outgrown_kernel(const __grid_constant__ OutgrownRecords<S> arguments) {
-  if (!overflows(arguments.saved)) return;
-  const int64_t at = int64_t(blockIdx.x) * kStoreBlock + threadIdx.x;
-  if (at < arguments.size) arguments.records[at] = arguments.sink.sum(at);
-}
-
-// Where the instances outgrew their memory, this fills the records by walks over all Gaussians. Else it does nothing.
-template <class S>
-void backward_outgrown(const BackwardWithSink<S, RecordSink<S>>& arguments, Scratch& scratch, cudaStream_t stream) {
-  BackwardWithSink<S, OutgrownSink<S>> outgrown = {};
-  static_cast<BackwardArguments<S>&>(outgrown) = arguments;
-  outgrown.dL_dbackground_rows = nullptr;  // the usual kernel has written them
-  if (outgrown.scaled == nullptr) outgrown.scaled = allocate_scaled(arguments, scratch);
-  const int64_t size = arguments.num_gaussians * arguments.sink.length;
-  OutgrownSink<S>& sink = outgrown.sink;
-  sink.exponents = allocate<int32_t>(scratch, size);
-  sink.sums = allocate<unsigned long long>(scratch, size);
-  sink.length = arguments.sink.length;
-  sink.term_bits = 62;
-  for (int64_t warps = int64_t(arguments.tiles) * kWarpsPerTile; warps > 0; warps /= 2) --sink.term_bits;
-  check(cudaMemsetAsync(sink.exponents, 0, size * sizeof(*sink.exponents), stream), "clearing gradients");
-  check(cudaMemsetAsync(sink.sums, 0, size * sizeof(*sink.sums), stream), "clearing gradients");
-  for (const bool measures : {true, false}) {
-    sink.measures = measures;
-    launch_backward<S, kAnyFeatures>(outgrown, arguments.tiles, stream);
-    outgrown.pairs = nullptr;  // counted once
+// Walks with all terms going to `sink`.
+template <class S, class Sink>
+void walk_backward(const BackwardArguments<S>& arguments, const Sink& sink, cudaStream_t stream) {
+  BackwardWithSink<S, Sink> with_sink = {};
+  static_cast<BackwardArguments<S>&>(with_sink) = arguments;
+  with_sink.sink = sink;
+  if constexpr (sizeof(S) == sizeof(float)) {  // double is for checking: it has only the general kernel
+    const SavedForward<S>& saved = arguments.saved;
+    const int64_t segment_blocks = saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0;
+    if (arguments.scaled == nullptr && arguments.absolute) {
+      return launch_backward<S, kFastFeatures, true>(with_sink, arguments.tiles + segment_blocks, stream);
+    }
+    if (arguments.scaled == nullptr) {
+      return launch_backward<S, kFastFeatures>(with_sink, arguments.tiles + segment_blocks, stream);
+    }
   }
-  OutgrownRecords<S> stored = {};
-  stored.size = size;
-  stored.saved = arguments.saved;
-  stored.sink = sink;
-  stored.records = arguments.sink.records;
-  store_outgrown_kernel<<<blocks_for(size, kStoreBlock), kStoreBlock, 0, stream>>>(stored);
-  DSMOE_CHECK_LAUNCH("store_outgrown");
+  launch_backward<S, kAnyFeatures>(with_sink, arguments.tiles, stream);
 }
 
 template <class S> struct SplitRecords {
@@ -437,59 +398,50 @@ template <class S> S* absolute_records(int64_t size, const Work& work) {
 template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work) {
   const DeviceCamera<S>& camera = frame.camera;
   const RasterConfig<S>& config = frame.config;
-  const SavedForward<S>& saved = frame.saved;
   S* dL_dbackground = pass.gradients.inputs.background;
   Scratch& scratch = *work.scratch;
   const cudaStream_t stream = work.stream;
-  const int64_t tiles = num_tiles(camera.width, camera.height), warps = tiles * kWarpsPerTile;
-  BackwardWithSink<S, RecordSink<S>> arguments = {};
-  static_cast<BlendArguments<S>&>(arguments) = blend_arguments(frame, work);
-  arguments.dL_dimages = pass.gradients.images;
-  arguments.num_features = config.num_features();
-  arguments.tiles = static_cast<int>(tiles);
-  arguments.sink.records = pass.dL_dgaussians;
-  const int length = kNumGateMoments + arguments.num_features;
-  arguments.sink.length = length;
+  const int64_t warps = num_tiles(camera.width, camera.height) * kWarpsPerTile;
+  const int num_features = config.num_features();
   S* means2D_abs = pass.gradients.inputs.means2D_abs;
-  arguments.absolute = means2D_abs != nullptr;
-  if (arguments.absolute) {
-    arguments.sink.length += kNumAbsoluteSums;
-    arguments.sink.records = absolute_records<S>(frame.inputs.num_gaussians * arguments.sink.length, work);
+  const bool absolute = means2D_abs != nullptr;
+  const int length = kNumGateMoments + num_features + (absolute ? kNumAbsoluteSums : 0);
+  const int64_t size = frame.inputs.num_gaussians * length;
+  S* records = absolute ? absolute_records<S>(size, work) : pass.dL_dgaussians;
+  S *rows = nullptr, *scaled = nullptr;
+  if (dL_dbackground != nullptr) rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+  if (sizeof(S) == sizeof(double) || num_features != kFastFeatures) {
+    scaled = allocate<S>(scratch, int64_t(camera.width) * camera.height * num_features);
   }
-  if (saved.instance_width == 2) arguments.sink.slots = allocate_slots<S>(saved, arguments.sink.length, work);
-  if (dL_dbackground != nullptr) {
-    arguments.dL_dbackground_rows = allocate<S>(scratch, warps * (config.num_channels + 1));
+  const auto walk = [&](const auto& sink) {
+    S* band_rows = rows;
+    for_each_band(frame, work, [&](const Frame<S>& band) {
+      BackwardArguments<S> arguments = {};
+      static_cast<BlendArguments<S>&>(arguments) = blend_arguments(band, work);
+      arguments.dL_dimages = pass.gradients.images;
+      arguments.dL_dbackground_rows = band_rows;
+      arguments.scaled = scaled;
+      arguments.num_features = num_features;
+      arguments.tiles = static_cast<int>(num_band_tiles(band));
+      arguments.absolute = absolute;
+      walk_backward(arguments, sink, stream);
+      if (rows != nullptr) band_rows += num_band_tiles(band) * kWarpsPerTile * (config.num_channels + 1);
+    });
+  };
+  if (pass.deterministic) {
+    const auto sums = begin_integer_sums(frame, pass.gradients, work);
+    walk(IntegerSink<S>{sums, length});
+    store_integer_sums(frame, sums, records, work);
+  } else {
+    walk(RecordSink<S>{records, length});
   }
-  bool known = false;                          // the number of features, when compiling
-  if constexpr (sizeof(S) == sizeof(float)) {  // double is for checking: it has only the general kernel
-    known = arguments.num_features == kFastFeatures;
-    const int64_t segment_blocks = saved.segments != nullptr ? num_segment_rows(saved.capacity) : 0;
-    if (known && arguments.absolute) {
-      launch_backward<S, kFastFeatures, true>(arguments, tiles + segment_blocks, stream);
-    } else if (known) {
-      launch_backward<S, kFastFeatures>(arguments, tiles + segment_blocks, stream);
-    }
-  }
-  if (!known) {
-    arguments.scaled = allocate_scaled(arguments, scratch);
-    launch_backward<S, kAnyFeatures>(arguments, tiles, stream);
-  }
-  if (arguments.sink.slots.terms != nullptr && frame.inputs.num_gaussians > 0) {
-    sum_slots<S>({frame.inputs.num_gaussians, arguments.sink.length, saved, frame.images.radii, arguments.sink.slots,
-                  arguments.sink.records},
-                 stream);
-    // Only in a captured graph may later contents have more instances than there is room for.
-    if (is_capturing(stream)) backward_outgrown(arguments, scratch, stream);
-  }
-  if (arguments.absolute && frame.inputs.num_gaussians > 0) {
-    const int64_t count = frame.inputs.num_gaussians;
-    split_records_kernel<S><<<blocks_for(count * arguments.sink.length, kStoreBlock), kStoreBlock, 0, stream>>>(
-        {count, length, camera.width, camera.height, arguments.sink.records, pass.dL_dgaussians, means2D_abs});
+  if (absolute && size > 0) {
+    split_records_kernel<S><<<blocks_for(size, kStoreBlock), kStoreBlock, 0, stream>>>(
+        {frame.inputs.num_gaussians, length - kNumAbsoluteSums, camera.width, camera.height, records,
+         pass.dL_dgaussians, means2D_abs});
     DSMOE_CHECK_LAUNCH("split_records");
   }
-  if (dL_dbackground != nullptr) {
-    sum_columns(arguments.dL_dbackground_rows, warps, config.num_channels + 1, dL_dbackground, stream);
-  }
+  if (rows != nullptr) sum_columns(rows, warps, config.num_channels + 1, dL_dbackground, stream);
 }
 
 #define DSMOE_INSTANTIATE(S) template void blend_backward(const Frame<S>&, const BackwardPass<S>&, const Work&);

@@ -31,7 +31,7 @@ InstanceCapacities::Key InstanceCapacities::key(int device, int64_t width, int64
   return {device, width, height, blend_mode, bits};
 }
 
-int64_t InstanceCapacities::likely(const Key& key, bool mendable) {
+int64_t InstanceCapacities::likely(const Key& key) {
   const std::lock_guard<std::mutex> lock(mutex_);
   const auto found = counts_.find(key);
   if (found == counts_.end()) return -1;
@@ -40,7 +40,7 @@ int64_t InstanceCapacities::likely(const Key& key, bool mendable) {
   count.recent.add(latest);
   const int64_t greatest = count.recent.greatest();
   const bool few = count.calls++ < kFirstCalls;  // views have been counted
-  return greatest < 0 ? -1 : with_margin(greatest, few && !mendable);
+  return greatest < 0 ? -1 : with_margin(greatest, few);
 }
 
 void InstanceCapacities::learn(const Key& key, const int64_t* num_instances, cudaStream_t stream) {

@@ -23,9 +23,8 @@ class InstanceCapacities {
   using Key = std::tuple<int, int64_t, int64_t, int64_t, int>;  // device, width, height, blend mode, bits of N
   static Key key(int device, int64_t width, int64_t height, int64_t blend_mode, int64_t num_gaussians);
 
-  // What is likely to be enough, or -1 where nothing is known of the key. mendable: too little costs the caller only a
-  // second listing, so that a small margin will do.
-  int64_t likely(const Key& key, bool mendable);
+  // What is likely to be enough, or -1 where nothing is known of the key.
+  int64_t likely(const Key& key);
 
   // Learns the count of a rendering that has just been launched, as soon as the device has it.
   void learn(const Key& key, const int64_t* num_instances, cudaStream_t stream);

@@ -1,6 +1,7 @@
 // Sums over the pixels of each Gaussian. The kernel repeats the blend's walk, without features. A warp sums over its
 // pixels, then adds the four numbers to those of the Gaussian by atomics.
 #include "../dispatch.h"
+#include "bands.h"
 #include "dsmoe/contribution.h"
 #include "dsmoe/params.h"
 #include "reduce.cuh"
@@ -103,13 +104,15 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
     check(cudaMemsetAsync(numbers, 0, num_gaussians * sizeof(*numbers), stream), "clearing the contributions");
   };
   clear(sums.pixel_weights), clear(sums.pixels), clear(sums.blend_weights), clear(sums.distances);
-  ContributionArguments<S> arguments{blend_arguments(frame, work)};
-  arguments.pixel_weights = map.pixel_weights;
-  arguments.sums = sums;
-  const unsigned tiles = static_cast<unsigned>(num_tiles(frame.camera.width, frame.camera.height));
-  dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
-    contributions_kernel<S, decltype(mode)::value><<<tiles, kWalkBlock, 0, stream>>>(arguments);
-    DSMOE_CHECK_LAUNCH("contributions");
+  for_each_band(frame, work, [&](const Frame<S>& band) {
+    ContributionArguments<S> arguments{blend_arguments(band, work)};
+    arguments.pixel_weights = map.pixel_weights;
+    arguments.sums = sums;
+    const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
+    dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
+      contributions_kernel<S, decltype(mode)::value><<<tiles, kWalkBlock, 0, stream>>>(arguments);
+      DSMOE_CHECK_LAUNCH("contributions");
+    });
   });
 }
 

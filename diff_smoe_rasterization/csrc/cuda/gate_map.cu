@@ -1,6 +1,7 @@
 // Which Gaussian has the greatest gate in each pixel. The kernel repeats the blend's walk, without features; each lane
 // keeps the greatest weight of its own pixels.
 #include "../dispatch.h"
+#include "bands.h"
 #include "dsmoe/params.h"
 #include "reduce.cuh"
 #include "tile_walk.cuh"
@@ -79,11 +80,13 @@ __global__ void __launch_bounds__(kWalkBlock)
 }  // namespace
 
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work) {
-  const BlendArguments<S> arguments = blend_arguments(frame, work);
-  const unsigned tiles = static_cast<unsigned>(num_tiles(frame.camera.width, frame.camera.height));
-  dispatch_blend(frame.config.mode, kAnyFeatures, [&](auto mode, auto) {
-    gate_map_kernel<S, decltype(mode)::value><<<tiles, kWalkBlock, 0, work.stream>>>(arguments, map);
-    DSMOE_CHECK_LAUNCH("gate_map");
+  for_each_band(frame, work, [&](const Frame<S>& band) {
+    const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
+    dispatch_blend(frame.config.mode, kAnyFeatures, [&](auto mode, auto) {
+      gate_map_kernel<S, decltype(mode)::value>
+          <<<tiles, kWalkBlock, 0, work.stream>>>(blend_arguments(band, work), map);
+      DSMOE_CHECK_LAUNCH("gate_map");
+    });
   });
 }
 

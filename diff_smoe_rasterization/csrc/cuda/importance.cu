@@ -1,6 +1,7 @@
 // What each Gaussian is worth to an image. The kernel repeats the blend's walk beside the finished pixels. A warp sums
 // over its pixels, then adds the three numbers to those of the Gaussian by atomics.
 #include "../dispatch.h"
+#include "bands.h"
 #include "dsmoe/params.h"
 #include "dsmoe/removal.h"
 #include "reduce.cuh"
@@ -160,15 +161,19 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
     check(cudaMemsetAsync(numbers, 0, num_gaussians * sizeof(S), work.stream), "clearing the importance");
   };
   clear(map.sums.shares), clear(map.sums.squared_shares), clear(map.sums.removal_costs);
-  ImportanceArguments<S> arguments{blend_arguments(frame, work)};
-  arguments.map = map;
   const int num_channels = frame.config.num_channels;
-  if (num_channels != 3) arguments.fronts = allocate<S>(*work.scratch, int64_t(num_channels) * width * height);
-  const unsigned tiles = static_cast<unsigned>(num_tiles(width, height));
-  dispatch_blend(frame.config.mode, num_channels, [&](auto mode, auto channels) {
-    importance_kernel<S, decltype(mode)::value, decltype(channels)::value>
-        <<<tiles, kWalkBlock, 0, work.stream>>>(arguments);
-    DSMOE_CHECK_LAUNCH("importance");
+  S* fronts = nullptr;
+  if (num_channels != 3) fronts = allocate<S>(*work.scratch, int64_t(num_channels) * width * height);
+  for_each_band(frame, work, [&](const Frame<S>& band) {
+    ImportanceArguments<S> arguments{blend_arguments(band, work)};
+    arguments.map = map;
+    arguments.fronts = fronts;
+    const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
+    dispatch_blend(frame.config.mode, num_channels, [&](auto mode, auto channels) {
+      importance_kernel<S, decltype(mode)::value, decltype(channels)::value>
+          <<<tiles, kWalkBlock, 0, work.stream>>>(arguments);
+      DSMOE_CHECK_LAUNCH("importance");
+    });
   });
 }
 

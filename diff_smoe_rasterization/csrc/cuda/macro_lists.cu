@@ -9,6 +9,7 @@
 // tile's four squares, so that the warps of the walk do not test footprints again.
 #include <limits>
 
+#include "bands.h"
 #include "device.cuh"
 #include "dsmoe/params.h"
 #include "look_back.cuh"
@@ -44,16 +45,22 @@ struct MacroGrid {
   __host__ __device__ int count() const { return columns * rows; }
 };
 
+// A Gaussian as seen from the band's first row.
+template <class S> __device__ ProjectedGaussian<S> in_band(ProjectedGaussian<S> gaussian, TileBand band) {
+  gaussian.mean.y -= S(band.begin * kTileSize);
+  return gaussian;
+}
+
 template <class S, class Key> struct ListArguments {
   SavedForward<S> saved;  // projected, order and num_ordered are read
-  MacroGrid grid;
-  LookBack look_back;    // zero before
-  int64_t capacity;      // entries there is room for
-  int64_t* num_entries;  // [1] written: how many there are
-  Key* keys;             // [capacity] written: macro tile
-  int32_t* values;       // [capacity] written: Gaussian
-  uint32_t* histograms;  // [passes, kMacroBins] entries with each digit; zero before
-  int passes;            // of the sort
+  MacroGrid grid;         // of the band
+  LookBack look_back;     // zero before
+  int64_t capacity;       // entries there is room for
+  int64_t* num_entries;   // [1] written: how many there are
+  Key* keys;              // [capacity] written: macro tile
+  int32_t* values;        // [capacity] written: Gaussian
+  uint32_t* histograms;   // [passes, kMacroBins] entries with each digit; zero before
+  int passes;             // of the sort
 };
 
 // Neighbouring macro tiles, two 16-bit numbers in one.
@@ -106,7 +113,8 @@ __global__ void __launch_bounds__(kListBlock)
 #pragma unroll
   for (int r = 0; r < kListedPerLane; ++r) {
     rects[r] = {};
-    if (gaussians[r] >= 0) rects[r] = macro_rect(list.saved.projected[gaussians[r]], list.grid);
+    if (gaussians[r] >= 0)
+      rects[r] = macro_rect(in_band(list.saved.projected[gaussians[r]], list.saved.band), list.grid);
     total += rects[r].count();
   }
   for (int step = kWarp / 2; step > 0; step /= 2) total += __shfl_xor_sync(kAllLanes, total, step);
@@ -263,7 +271,7 @@ template <class S> struct TestArguments {
   SavedForward<S> saved;     // projected is read
   const int32_t* radii;      // [N] pixels
   BlendMode mode;            // decides the bounds of footprints
-  TileGrid tiles;
+  TileGrid image, tiles;     // all tiles, and those of the band
   int macro_columns;
   uint64_t* squares;      // [entries] written: which squares the footprint meets
   uint32_t* tile_counts;  // [tiles] entries of each tile; zero before
@@ -305,9 +313,11 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
     if (entry < chunk.end) {
       const int32_t gaussian = arguments.gaussians[entry];
       const ProjectedGaussian<S> projected = arguments.saved.projected[gaussian];
-      const TileRect bounds = tile_bounds(arguments.mode, arguments.tiles, projected.mean,
-                                          bounding_radius<S>(arguments.mode, arguments.radii, gaussian));
-      squares = met_squares(projected, bounds, macro_x, macro_y);
+      TileRect bounds = tile_bounds(arguments.mode, arguments.image, projected.mean,
+                                    bounding_radius<S>(arguments.mode, arguments.radii, gaussian));
+      const TileBand& band = arguments.saved.band;
+      bounds.y0 = max(bounds.y0 - band.begin, 0), bounds.y1 = min(bounds.y1 - band.begin, arguments.tiles.rows);
+      squares = met_squares(in_band(projected, band), bounds, macro_x, macro_y);
       arguments.squares[entry] = squares;
     }
     const uint64_t tiles = tiles_of(squares);
@@ -449,7 +459,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   const SavedForward<S>& saved = frame.saved;
   const cudaStream_t stream = work.stream;
   Scratch& scratch = *work.scratch;
-  const TileGrid tiles(frame.camera.width, frame.camera.height);
+  const TileGrid image(frame.camera.width, frame.camera.height), tiles = band_grid(frame);
   const MacroGrid grid(tiles);
   const int64_t num_tiles = int64_t(tiles.columns) * tiles.rows, macros = grid.count();
   // Where a list of macro tiles is longer than all lists of tiles, it does not fit; num_instances then says so.
@@ -521,6 +531,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   test.saved = saved;
   test.radii = frame.images.radii;
   test.mode = frame.config.mode;
+  test.image = image;
   test.tiles = tiles;
   test.macro_columns = grid.columns;
   test.squares = allocate<uint64_t>(scratch, capacity);
@@ -548,7 +559,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   give.tile_offsets = saved.tile_offsets;
   give.num_instances = saved.num_instances;
   give.capacity = saved.capacity;
-  give.marked = marks_quarters(saved, frame.inputs.num_gaussians);
+  give.marked = marks_quarters(frame.inputs.num_gaussians);
   give.instances = saved.instances;
   give_to_tiles_kernel<<<resident_blocks(most_chunks), kChunk, 0, stream>>>(give);
   DSMOE_CHECK_LAUNCH("give_to_tiles");
@@ -557,7 +568,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
 }  // namespace
 
 template <class S> void bin_by_macro_tiles(const Frame<S>& frame, const Work& work) {
-  const MacroGrid grid(TileGrid(frame.camera.width, frame.camera.height));
+  const MacroGrid grid(band_grid(frame));
   grid.count() <= std::numeric_limits<uint16_t>::max() ? bin_by<uint16_t>(frame, work) : bin_by<uint32_t>(frame, work);
 }
 

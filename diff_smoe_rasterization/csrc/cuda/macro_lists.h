@@ -1,4 +1,4 @@
-// The tile lists of a rendering whose gradients need no slots: by macro tiles.
+// The tile lists, by macro tiles.
 #pragma once
 
 #include "dsmoe/rasterize_cuda.h"

@@ -1,10 +1,6 @@
 // The order of the stages, and the memory between them. A capacity that turns out too small costs time, not
-// correctness (rasterize_cuda.h). So only the first call of a kind waits for the number of instances, and every one
-// whose gradients are reproducible, because each instance must have its slot then.
+// correctness (rasterize_cuda.h). So only the first call of a kind waits for the number of instances.
 #include <algorithm>
-#include <limits>
-#include <stdexcept>
-#include <string>
 
 #include "capacity.h"
 #include "check.h"
@@ -22,26 +18,10 @@ template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream
   return memory;
 }
 
-constexpr int64_t kMostSlots = std::numeric_limits<uint32_t>::max();  // their numbers have 32 bits
-
-void check_slots(int64_t instances) {
-  if (instances <= kMostSlots) return;
-  throw std::overflow_error("rasterize: " + std::to_string(instances) +
-                            " tile instances; with deterministic=True the most is " + std::to_string(kMostSlots));
-}
-
 // Memory for what the depth sort sorts; null in a mode without a depth order.
 template <class S> DepthBits<S>* allocate_depths(const Frame<S>& frame, Scratch& scratch) {
   if (!needs_depth_order(frame.config.mode)) return nullptr;
   return allocate<DepthBits<S>>(scratch, frame.inputs.num_gaussians);
-}
-
-// Waits for a number of the device.
-template <class T> T read(const T* number, const char* what, cudaStream_t stream) {
-  T value = 0;
-  check(cudaMemcpyAsync(&value, number, sizeof(value), cudaMemcpyDeviceToHost, stream), what);
-  check(cudaStreamSynchronize(stream), what);
-  return value;
 }
 
 // Adds the pairs that were counted. Waits for them.
@@ -56,28 +36,21 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
                                  frame.inputs.num_gaussians);
 }
 
-// Returns for how many instances there will be room.
+// Returns for how many instances there will be room, 1 or more; 0 where there are more than are listed at once.
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
-  const bool capturing = is_capturing(run.stream), mendable = run.deterministic && !capturing;
-  int64_t capacity = InstanceCapacities::shared().likely(key, mendable);
-  if (capacity < 0 && capturing) capacity = 8 * frame.inputs.num_gaussians + 1024;
-  if (capacity >= 0) return run.deterministic ? std::min(capacity, kMostSlots) : capacity;
+  const int64_t most = frame.config.most_instances;
+  int64_t capacity = InstanceCapacities::shared().likely(key);
+  if (is_capturing(run.stream)) {  // nothing can be counted then
+    if (capacity < 0) capacity = 8 * frame.inputs.num_gaussians + 1024;
+    return std::min(capacity, most);
+  }
+  if (capacity > 0 && capacity <= most) return capacity;
   count_instances(frame, work);
   const auto count = read(frame.saved.num_instances, "projecting Gaussians", run.stream);
-  if (run.deterministic) check_slots(count);
+  if (count > most) return 0;
   // The lists of macro tiles must fit too. Seldom are they longer, by macro tiles that long Gaussians only pass by.
-  return run.deterministic ? count : count + count / 8;
-}
-
-// Lists the instances, with room for `sizes.capacity`. What depends on the capacity is allocated anew.
-template <class S>
-void list_with_capacity(Frame<S>& frame, const SavedSizes& sizes, Allocator& memory, const Work& work) {
-  frame.saved.instances = nullptr, frame.saved.segments = nullptr, frame.saved.segment_queue = nullptr;
-  allocate_saved(frame.saved, sizes, memory);
-  complete(frame.saved, sizes);
-  bin(frame, work);
-  memory.release();
+  return std::min(most, count + count / 8 + 1);
 }
 
 // Allocates what frame.saved has not got yet, but what depends on the number of instances.
@@ -102,15 +75,11 @@ void draw(Frame<S>& frame, SavedSizes sizes, const DepthBits<S>* depths, const R
   const auto key = capacity_key(frame);
   sizes.capacity = choose_capacity(frame, key, run, work);
   memory.release();
-  list_with_capacity(frame, sizes, memory, work);
-  if (run.deterministic && !is_capturing(run.stream)) {  // each instance must have its slot
-    const int64_t count = read(saved.num_instances, "listing instances", run.stream);
-    check_slots(count);
-    if (count > sizes.capacity) {
-      sizes.capacity = count;
-      list_with_capacity(frame, sizes, memory, work);
-    }
-  }
+  sizes.segments = sizes.segments && sizes.capacity > 0;
+  allocate_saved(saved, sizes, memory);
+  complete(saved, sizes);
+  if (sizes.capacity > 0) bin(frame, work);
+  memory.release();
   InstanceCapacities::shared().learn(key, saved.num_instances, run.stream);
   clock.end(&StageTimes::bin);
 
@@ -168,6 +137,7 @@ void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& r
   EventClock clock(run.times, run.stream);
   BackwardPass<S> pass;
   pass.gradients = gradients;
+  pass.deterministic = run.deterministic;
   pass.dL_dgaussians = begin_records<S>(frame, nullptr, run, memory);
   blend_backward(frame, pass, work);
   clock.end(&StageTimes::blend_backward);
@@ -186,6 +156,7 @@ void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradie
   EventClock clock(run.times, run.stream);
   BackwardPass<S> pass;
   pass.gradients = gradients;
+  pass.deterministic = run.deterministic;
   pass.dL_dgaussians = begin_records(frame, footprints.records, run, memory);
   blend_backward(frame, pass, work);
   finish_records(frame, pass, work);

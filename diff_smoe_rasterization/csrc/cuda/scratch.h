@@ -1,4 +1,4 @@
-// Arrays of scratch memory.
+// Arrays of scratch memory, and numbers that the host waits for.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -16,6 +16,14 @@ template <class T> T* allocate(Scratch& scratch, int64_t count) {
   void* memory = scratch.allocate(static_cast<size_t>(count) * sizeof(T));
   if (memory == nullptr && count > 0) check(cudaErrorMemoryAllocation, "allocating scratch memory");
   return static_cast<T*>(memory);
+}
+
+// Waits for a number of the device.
+template <class T> T read(const T* number, const char* what, cudaStream_t stream) {
+  T value = 0;
+  check(cudaMemcpyAsync(&value, number, sizeof(value), cudaMemcpyDeviceToHost, stream), what);
+  check(cudaStreamSynchronize(stream), what);
+  return value;
 }
 
 }  // namespace cuda

@@ -35,11 +35,17 @@ struct TensorBasis {
   float2 of[kTensorSteps][kWarp];
 };
 
+// A Gaussian whose sums are wanted.
+struct alignas(16) TensorGaussian {
+  Vec2<float> shift;  // of the centre of the warp's pixels from its mean
+  int32_t index;
+};
+
 // What one warp keeps in shared memory.
 struct TensorStage {
   float values[kTensorBatch][kTensorRow];  // dL/dpower and weight of pixel k of lane l, at 4 l + 2 k
   TensorBasis gradients;                   // g', each number in two parts side by side
-  float4 gaussians[kTensorBatch];          // shift to the Gaussian's mean; its index and its place in the list, as bits
+  TensorGaussian gaussians[kTensorBatch];
 };
 
 // What TF32 keeps of a number.

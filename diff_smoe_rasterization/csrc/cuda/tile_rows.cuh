@@ -47,15 +47,6 @@ class WarpLine {
   unsigned begin, total;
 };
 
-// Neighbouring tiles of one row that one Gaussian meets.
-struct alignas(16) TileRow {
-  uint32_t tile;  // the first
-  int32_t width;  // how many
-  int32_t gaussian;
-  int32_t ends;  // whether it is the first or the last of the Gaussian's rows: kFirstRow, kLastRow, both or 0
-};
-constexpr int32_t kFirstRow = 1, kLastRow = 2;
-
 template <class S> class WarpTileRows {
  public:
   // A lane's tiles in shared memory, for all lanes to read. The padding spreads the lanes over the banks.
@@ -63,32 +54,27 @@ template <class S> class WarpTileRows {
     unsigned char tiles[sizeof(FootprintTiles<S>) + 16];
   };
 
-  // gaussian, tiles: of the lane. shared: [32] of the warp.
-  __device__ WarpTileRows(int32_t gaussian, const FootprintTiles<S>& tiles, int columns, Shared* shared, int lane)
-      : gaussian_(gaussian), columns_(columns), shared_(shared), line_(max(0, tiles.end() - tiles.begin()), lane) {
+  // tiles: of the lane. shared: [32] of the warp.
+  __device__ WarpTileRows(const FootprintTiles<S>& tiles, Shared* shared, int lane)
+      : shared_(shared), line_(max(0, tiles.end() - tiles.begin()), lane) {
     memcpy(shared[lane].tiles, &tiles, sizeof(tiles));
     __syncwarp();
   }
 
   __device__ unsigned total() const { return line_.total; }
 
-  // Returns row k of all rows. All lanes must call it together.
-  __device__ TileRow at(unsigned k) const {
+  // How many tiles row k of all rows has. All lanes must call it together.
+  __device__ unsigned width(unsigned k) const {
     const int owner = line_.owner(k);
     const unsigned row = k - from_lane(line_.begin, owner);
-    const int32_t gaussian = from_lane(gaussian_, owner);
-    if (k >= line_.total) return {};
+    if (k >= line_.total) return 0;
     FootprintTiles<S> tiles;
     memcpy(&tiles, shared_[owner].tiles, sizeof(tiles));
-    const int y = tiles.begin() + static_cast<int>(row);
-    const auto span = tiles.row(y);
-    const int32_t ends = (row == 0 ? kFirstRow : 0) | (y + 1 == tiles.end() ? kLastRow : 0);
-    return {static_cast<uint32_t>(y) * columns_ + span.x0, max(0, span.x1 - span.x0), gaussian, ends};
+    const auto span = tiles.row(tiles.begin() + static_cast<int>(row));
+    return static_cast<unsigned>(max(0, span.x1 - span.x0));
   }
 
  private:
-  int32_t gaussian_;
-  int columns_;
   const Shared* shared_;
   WarpLine line_;
 };

@@ -42,7 +42,7 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   arguments.config = frame.config;
   arguments.saved = frame.saved;
   arguments.images = frame.images;
-  arguments.marked = marks_quarters(frame.saved, frame.inputs.num_gaussians);
+  arguments.marked = marks_quarters(frame.inputs.num_gaussians);
   arguments.pairs = work.pairs;
   return arguments;
 }
@@ -58,14 +58,11 @@ template <class S> class EntrySource {
     marked = listed && arguments.marked;
     begin = listed ? saved.tile_offsets[tile] : 0;
     length = static_cast<int32_t>(listed ? saved.tile_offsets[tile + 1] - begin : *saved.num_ordered);
-    entries_ = listed ? saved.instances + begin * saved.instance_width : saved.order;
-    stride_ = listed ? saved.instance_width : 1;
+    entries_ = listed ? saved.instances + begin : saved.order;
     wanted_ = marked ? 1u << (kMarkShift + quarter) : kSign;
   }
 
-  __device__ uint32_t entry(int32_t position) const {
-    return static_cast<uint32_t>(entries_[int64_t(position) * stride_]);
-  }
+  __device__ uint32_t entry(int32_t position) const { return static_cast<uint32_t>(entries_[position]); }
 
   // Stands for an entry, and meets no pixels.
   __device__ uint32_t no_entry() const { return marked ? 0 : kSign; }
@@ -76,11 +73,6 @@ template <class S> class EntrySource {
     return static_cast<int32_t>(marked ? entry & ((1u << kMarkShift) - 1) : entry);
   }
 
-  // Where the gradient of a listed entry goes, if it has slots.
-  __device__ uint32_t slot(int32_t position) const {
-    return static_cast<uint32_t>(entries_[2 * int64_t(position) + 1]);
-  }
-
   bool listed;     // the entries are the tile's list; else the depth order, which knows nothing of tiles
   bool marked;     // an entry says which quarters it may meet
   int64_t begin;   // the list's first instance
@@ -89,8 +81,7 @@ template <class S> class EntrySource {
  private:
   static constexpr uint32_t kSign = 1u << 31;
 
-  const int32_t* entries_;  // [length, stride]
-  int stride_;              // numbers an entry
+  const int32_t* entries_;  // [length]
   uint32_t wanted_;         // the bit of an entry that tells
 };
 
@@ -102,7 +93,8 @@ template <class S> class WarpTile {
 
   __device__ WarpTile(const BlendArguments<S>& arguments, int tile, int quarter) : quarter(quarter) {
     lane = threadIdx.x % kWarp;
-    tile_x = tile % arguments.tile_columns, tile_y = tile / arguments.tile_columns;
+    index = tile;
+    tile_x = tile % arguments.tile_columns, tile_y = arguments.saved.band.begin + tile / arguments.tile_columns;
     constexpr int kAcross = kTileSize / kWarpTile;
     const int x0 = tile_x * kTileSize + quarter % kAcross * kWarpTile;
     const int y0 = tile_y * kTileSize + quarter / kAcross * kWarpTile;
@@ -121,6 +113,7 @@ template <class S> class WarpTile {
 
   int quarter;  // of the tile, row by row
   int lane;
+  int index;           // of the tile in the band
   int tile_x, tile_y;  // of the tile, in tiles
   int x, y;            // of the lane's first pixel
   bool empty;          // no pixel of the warp lies in the image

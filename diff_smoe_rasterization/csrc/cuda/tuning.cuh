@@ -1,6 +1,6 @@
 // Sizes that decide how fast the kernels are, each with its reason. Results depend on them only through the order in
 // which numbers are added. Sizes that decide how memory is laid out are elsewhere: kTileSize in constants.h;
-// kSegmentLength and kSlotsPerInstance in rasterize_cuda.h; kBoxPoints in neighbors.h.
+// kSegmentLength in rasterize_cuda.h; kBoxPoints in neighbors.h.
 #pragma once
 
 #include "device.cuh"
@@ -17,7 +17,6 @@ constexpr int kWarpsPerTile = (kTileSize / kWarpTile) * (kTileSize / kWarpTile);
 constexpr int kWalkBlock = kWarpsPerTile * kWarp;           // threads: one block a tile
 constexpr int kLanePixels = kWarpTile * kWarpTile / kWarp;  // one below the other
 constexpr int kLaneStep = kWarpTile / kLanePixels;          // rows between them
-static_assert(kWarpsPerTile == kSlotsPerInstance, "each quarter of a tile has its slot");
 
 // Features that come along with an entry: as many floats as one vector load takes.
 constexpr int kFeatureChunk = 4;
@@ -51,9 +50,6 @@ constexpr int kTensorBatch = 8;
 // Threads a block. Large blocks, because the look-back goes from block to block.
 constexpr int kListBlock = 256;
 constexpr int kListWarps = kListBlock / kWarp;
-// Rows of tiles of a warp that are kept in shared memory between counting and listing: three for each of 32 Gaussians.
-// Rows beyond them are found again.
-constexpr int kKeptRows = 96;
 // A warp takes up to 32 Gaussians, and fewer where a multiprocessor would get less than this many warps: half of the 64
 // that it can hold, enough to hide the latency of loads.
 constexpr int kEnoughWarpsPerMultiprocessor = 32;

@@ -7,6 +7,7 @@
 #include "dsmoe/constants.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "io/python_bindings.h"
+#include "most_instances.h"
 #include "profiling.h"
 #include "tensors.h"
 
@@ -105,6 +106,7 @@ PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
   m.attr("options") = options();
   m.attr("saved") = saved();
   m.def("build_info", &build_info);
+  m.def("set_most_instances", &dsmoe::binding::set_most_instances);
   m.def("set_profiling", &dsmoe::binding::set_profiling);
   m.def("stage_times", &stage_times);
   py::module_ io = m.def_submodule("io");

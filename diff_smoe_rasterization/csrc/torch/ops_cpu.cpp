@@ -101,7 +101,8 @@ struct Cpu {
   static SavedForward<S> unpack(const char* function, const Saved& tensors, SavedSizes sizes, at::Device device) {
     SavedForward<S> saved;
     unpack_saved(function, tensors, saved, sizes, device);
-    sizes.num_instances = saved.instance_offsets[sizes.num_gaussians];
+    sizes.num_instances =
+        saved_length(tensors, saved, "instances") > 0 ? saved.instance_offsets[sizes.num_gaussians] : 0;
     unpack_saved(function, tensors, saved, sizes, device);
     return saved;
   }
@@ -127,6 +128,7 @@ struct Cpu {
     own.inputs.num_gaussians = radii.numel();
     own.config = config;
     own.config.num_threads = at::get_num_threads();
+    own.images.radii = mutable_data<int32_t>(radii);
     set_image(own.camera, options);
     SavedSizes sizes = cpu::saved_sizes(own);
     sizes.num_features = -1;
@@ -141,6 +143,7 @@ struct Cpu {
     own.inputs.num_gaussians = radii.numel();
     own.config = config;
     own.config.num_threads = at::get_num_threads();
+    own.images.radii = mutable_data<int32_t>(radii);
     set_image(own.camera, options);
     own.saved = unpack<S>("importance", saved, cpu::saved_sizes(own), radii.device());
     own.saved.gate_sum = mutable_data<S>(gate_sum);

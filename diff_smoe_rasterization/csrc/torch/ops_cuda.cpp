@@ -114,7 +114,7 @@ struct Cuda {
                                       at::Device device) {
     cuda::SavedForward<S> saved;
     sizes.segments = saved_length(tensors, saved, "segments") > 0;
-    sizes.capacity = saved_length(tensors, saved, "instances") / (sizes.slots ? 2 : 1);
+    sizes.capacity = saved_length(tensors, saved, "instances");
     unpack_saved(function, tensors, saved, sizes, device);
     complete(saved, sizes);
     return saved;
@@ -147,7 +147,8 @@ struct Cuda {
     auto sizes = cuda::saved_sizes(own, how);
     sizes.num_features = -1;
     own.saved = unpack<S>("contributions", saved, sizes, radii.device());
-    cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream});
+    TensorMemory memory(pixel_weights);
+    cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream, &memory});
   }
 
   template <class S>
@@ -162,10 +163,7 @@ struct Cuda {
     own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
     own.saved.gate_sum = mutable_data<S>(gate_sum);
     TensorMemory memory(gate_sum);
-    cuda::Work work;
-    work.stream = how.stream;
-    work.scratch = &memory;
-    cuda::importance(own, map, work);
+    cuda::importance(own, map, {how.stream, &memory});
   }
 
   static at::Tensor pack_footprints(const at::Tensor& gates, const at::Tensor& features, const at::Tensor& radii,

@@ -10,6 +10,7 @@
 
 #include "dsmoe/rasterize.h"
 #include "fields.h"
+#include "most_instances.h"
 
 namespace dsmoe {
 namespace binding {
@@ -135,6 +136,7 @@ template <class S> RasterConfig<S> blend_config(const at::Tensor& background_gat
   out.background_gate = static_cast<S>(options.fixed_background_gate);
   out.background_gate_at = data<S>(background_gate);
   out.alpha_min = static_cast<float>(options.alpha_min);  // thresholds are float32 values in every scalar type
+  out.most_instances = most_instances();
   return out;
 }
 

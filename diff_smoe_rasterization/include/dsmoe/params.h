@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <limits>
 
 #include "dsmoe/project.h"
 
@@ -12,6 +13,18 @@ namespace dsmoe {
 inline int64_t num_tiles(int width, int height) {
   const TileGrid grid(width, height);
   return static_cast<int64_t>(grid.columns) * grid.rows;
+}
+
+// No more tile instances than this are listed at once, unless a caller says so: 3 to 13 GB of memory, as backend and
+// pass are. A rendering with more is made in bands: rows of tiles, half-open, by default all that an image has.
+constexpr int64_t kMostInstances = int64_t(1) << 28;
+struct TileBand {
+  int begin = 0, end = std::numeric_limits<int>::max();
+};
+
+// How many tiles a band has.
+inline int64_t band_tiles(const TileGrid& grid, const TileBand& band) {
+  return static_cast<int64_t>(grid.columns) * (min(band.end, grid.rows) - band.begin);
 }
 
 template <class S> struct GaussianInputs {
@@ -41,7 +54,8 @@ template <class S> struct RasterConfig {
   bool clamp_color = true;  // colours from shs are at least 0
   bool depth = false;       // the expected depth is asked for
   bool inverse_depth = false;
-  int num_threads = 1;  // CPU backend; below 1 counts as 1
+  int num_threads = 1;                      // CPU backend; below 1 counts as 1
+  int64_t most_instances = kMostInstances;  // that are listed at once, 1 or more
 
   DSMOE_HD S gate_of_background() const {
     return background_gate_at != nullptr ? *background_gate_at : background_gate;
@@ -63,12 +77,13 @@ struct TileInstance {
 template <class S> struct SavedForward {
   ProjectedGaussian<S>* projected = nullptr;  // [N]
   S* features = nullptr;                      // [N, F]
-  int64_t* instance_offsets = nullptr;        // [N + 1] first slot of each Gaussian; the last entry is I
+  int64_t* instance_offsets = nullptr;        // [N + 1] first slot of each Gaussian; the last entry: how many there are
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
-  TileInstance* instances = nullptr;          // [I]
+  TileInstance* instances = nullptr;          // [I], or null: no lists are kept, each pass makes them band by band
   S* final_transmittance = nullptr;           // [H, W] T_{N+1}
   S* gate_sum = nullptr;                      // [H, W] the denominator: the caller's image
   int32_t* last_contributor = nullptr;        // [H, W] how many entries of the tile's list the numerator has seen
+  TileBand band;                              // the rows of tiles that tile_offsets and instances are of
 };
 
 // The numbers that decide how long those arrays are.
@@ -77,7 +92,7 @@ struct SavedSizes {
   int64_t num_features = 0;    // F; -1: not known
   int64_t tiles = 0;           // of the image
   int64_t pixels = 0;          // H W
-  int64_t num_instances = -1;  // I; -1: not known yet
+  int64_t num_instances = -1;  // I where lists are kept; -1: not known yet
 };
 
 // Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. All

@@ -33,7 +33,8 @@ using dsmoe::Gradients;
 template <class S> using Frame = RenderingFrame<S, Camera<S>, SavedForward<S>>;
 
 // Renders frame.inputs to frame.images and fills frame.saved. times: is added to, or null.
-// Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots, and std::bad_alloc.
+// Where there are more than config.most_instances, no lists are kept, and each pass makes them band by band.
+// Throws std::bad_alloc, and what `bin` throws.
 template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* times = nullptr);
 
 // Writes gradients.inputs. `frame` is as `forward` left it.
@@ -87,13 +88,13 @@ class Heap final : public Allocator {
 
 // Fills what frame.saved has for each Gaussian, and frame.images.radii. Returns how many instances there are; 0 where
 // saved.instance_offsets is null, because they are not counted then.
-// Throws std::overflow_error, naming the count, where the instances do not fit 32-bit slots.
 template <class S> int64_t project(const Frame<S>& frame, StageTimes* times = nullptr);
 
-// Fills saved.instance_offsets from the footprints. Returns and throws what `project` does.
+// Fills saved.instance_offsets from the footprints. Returns what `project` does.
 template <class S> int64_t count_instances(const Frame<S>& frame, StageTimes* times = nullptr);
 
-// Fills saved.tile_offsets and saved.instances: the tile lists, front to back.
+// Fills saved.tile_offsets and saved.instances: the tile lists, front to back. Throws std::overflow_error, naming the
+// count, where the instances do not fit 32-bit slots.
 template <class S> void bin(const Frame<S>& frame, StageTimes* times = nullptr);
 
 // Fills frame.images but the radii, and what saved has for each pixel.
@@ -101,11 +102,11 @@ template <class S> void blend(const Frame<S>& frame, StageTimes* times = nullptr
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say. Of the frame it reads the number of
 // Gaussians, the image's size, of config the mode, alpha_min, the background's gate and num_threads, and of saved
-// neither features nor images but last_contributor.
+// neither features nor images but last_contributor; of images the radii where no lists are kept.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map);
 
 // Walks the tile lists once more, and sums what each Gaussian is worth to the image. `frame` is as `forward` left it;
-// of its images only the gate sum is read, through saved.
+// of its images the gate sum is read, through saved, and the radii where no lists are kept.
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map);
 
 // Walks the tile lists once more, and finds in each pixel the Gaussian with the greatest gate. It reads of the frame

@@ -60,10 +60,9 @@ template <class S> struct SavedForward {
   int64_t* num_ordered = nullptr;             // [1] entries of order; culled Gaussians have none in a depth order
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
   int64_t* num_instances = nullptr;           // [1] room that the lists need; where they have less, none is listed
-  int32_t* instances = nullptr;               // [capacity, instance_width] Gaussian (and slot) by tile, front to back
-  int64_t capacity = 0;
-  int instance_width = 1;            // 2: with slots, for gradients that are bitwise reproducible
-  int64_t* slot_ranges = nullptr;    // [N, 2] each Gaussian's slots, begin and end; null without slots
+  int32_t* instances = nullptr;               // [capacity] Gaussians by tile, front to back
+  int64_t capacity = 0;              // 0: no lists are kept. Each pass makes them, for some rows of tiles at a time
+  TileBand band;                     // the rows of tiles that tile_offsets and instances are of
   S* segments = nullptr;             // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
   int32_t* segment_queue = nullptr;  // [num_queue_entries(capacity), 2] which segments some pixel has reached, or null
   S* final_transmittance = nullptr;  // [H, W] T_{N+1}
@@ -78,7 +77,6 @@ struct SavedSizes {
   int64_t tiles = 0;          // of the image
   int64_t pixels = 0;         // H W
   int64_t capacity = -1;      // of `instances`; -1: not known yet
-  bool slots = false;         // gradients are bitwise reproducible
   bool segments = false;      // the backward pass walks long lists in segments
 };
 
@@ -92,10 +90,9 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("features", saved.features, stride < 0 ? -1 : sizes.num_gaussians * stride);
   visit("order", saved.order, sizes.num_gaussians);
   visit("tile_offsets", saved.tile_offsets, sizes.tiles + 3);
-  visit("slot_ranges", saved.slot_ranges, sizes.slots ? 2 * sizes.num_gaussians : 0);
   visit("final_transmittance", saved.final_transmittance, sizes.pixels);
   visit("last_contributor", saved.last_contributor, sizes.pixels);
-  visit("instances", saved.instances, known ? sizes.capacity * (sizes.slots ? 2 : 1) : -1);
+  visit("instances", saved.instances, sizes.capacity);
   visit("segments", saved.segments, !sizes.segments ? 0 : known ? num_segment_rows(sizes.capacity) * kSegmentRow : -1);
   visit("segment_queue", saved.segment_queue, !sizes.segments ? 0 : known ? 2 * num_queue_entries(sizes.capacity) : -1);
 }
@@ -105,7 +102,6 @@ template <class S> void complete(SavedForward<S>& saved, const SavedSizes& sizes
   saved.num_ordered = saved.tile_offsets + sizes.tiles + 1;
   saved.num_instances = saved.num_ordered + 1;
   saved.capacity = sizes.capacity;
-  saved.instance_width = sizes.slots ? 2 : 1;
 }
 
 using dsmoe::Gradients;
@@ -116,14 +112,14 @@ template <class S> using Frame = RenderingFrame<S, DeviceCamera<S>, SavedForward
 // How a pass runs.
 struct Run {
   cudaStream_t stream = nullptr;
-  bool deterministic = false;   // forward: gradients will be equal bit for bit from run to run; slower
+  bool deterministic = false;   // backward: gradients are equal bit for bit from run to run; slower
   bool for_backward = true;     // false: what only makes a backward pass faster is left out
   StageTimes* times = nullptr;  // is added to, or null; the pass then waits for its kernels
 };
 
 // Renders frame.inputs to frame.images and fills frame.saved. The first call of a size, mode and order of N waits for
-// the number of instances. So does every call with `deterministic` outside a capture, and every call with `times`.
-// Throws std::overflow_error where `deterministic` has more instances than fit 32-bit slots.
+// the number of instances. So does every call with `times`,
+// and every pass over a rendering that has more than config.most_instances.
 template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory);
 
 // Writes gradients.inputs. `frame` is as `forward` left it.
@@ -160,7 +156,6 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run)
   sizes.num_features = frame.config.num_features();
   sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
   sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
-  sizes.slots = run.deterministic;
   sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
   return sizes;
 }
@@ -211,17 +206,17 @@ template <class S> void sort_by_depth(const Frame<S>& frame, const DepthBits<S>*
 // Fills only frame.saved.num_instances, for a caller that wants exactly as much memory as is needed.
 template <class S> void count_instances(const Frame<S>& frame, const Work& work);
 
-// Fills saved.num_instances, instances, tile_offsets and slot_ranges of the frame, and empties segment_queue.
+// Fills saved.num_instances, instances and tile_offsets of the frame, and empties segment_queue.
 template <class S> void bin(const Frame<S>& frame, const Work& work);
 
-// Fills frame.images but the radii, and what saved has for each pixel.
+// Fills frame.images but the radii, and what saved has for each pixel. This pass and those below make the lists, band
+// by band, where frame.saved.capacity is 0.
 template <class S> void blend(const Frame<S>& frame, const Work& work);
-
-constexpr int kSlotsPerInstance = 4;  // one for each quarter of a tile
 
 // What goes through both stages of a backward pass.
 template <class S> struct BackwardPass {
   Gradients<S> gradients;         // given by the images, wanted by the inputs
+  bool deterministic = false;     // the records are equal bit for bit from run to run
   S* dL_dgaussians = nullptr;     // [N, kNumGateMoments + F] a Gaussian's record: the sums over its pixels; zero before
   bool by_footprints = false;     // the records are those of FootprintGradients: `finish_records` has been there
   const S* dL_ddepths = nullptr;  // [N] as FootprintGradients has them, or null

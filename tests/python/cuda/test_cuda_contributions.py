@@ -5,7 +5,7 @@ import pytest
 import torch
 from comparison import assert_close
 from devices import random_normal
-from scenes import gate_of, op_results, random_scene, with_gate, with_gates
+from scenes import gate_of, random_scene, with_gate, with_gates
 from test_cuda_against_cpu import SCENES, selected
 from test_cuda_graphs import SLEEP, WARM_UP, list_size, own_width, scene_of
 
@@ -26,14 +26,12 @@ def scores(scene, device, dtype, pixel_weights, **settings):
 
 
 @with_gate
-@pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("name", selected(SCENES))
-def test_float64_equals_the_cpu(mode, name, deterministic, gpu):
-    """deterministic: instances have slots beside them then, and the walk must step over those."""
+def test_float64_equals_the_cpu(mode, name, gpu):
     scene = SCENES[name](mode)
     pixel_weights = map_for(scene.settings)
     expected = scores(scene, "cpu", torch.float64, pixel_weights)
-    actual = scores(scene, gpu, torch.float64, pixel_weights, deterministic=deterministic)
+    actual = scores(scene, gpu, torch.float64, pixel_weights)
     assert torch.equal(actual[0].cpu(), expected[0])
     # Roundings of 1e-16 in positions of some hundred pixels and sums of thousands of positive terms.
     assert_close(actual[1], expected[1], 1e-12, "centers")
@@ -112,19 +110,6 @@ def test_lists_that_are_outgrown(mode, gpu):
                                        (*results[1:3], *results[3]), (*expected[1:3], *expected[3])):
             # The same pairs with the same numbers, added in another order: 6e-8 each.
             torch.testing.assert_close(actual, other, rtol=1e-4, atol=1e-5, msg=name)
-
-
-def test_a_deterministic_rendering_has_its_sums(mode, gpu):
-    """Slots lie beside the instances of its lists."""
-    scene = random_scene(mode, 3000, 160, 107, scale=0.03)
-    saved = op_results(scene.to(torch.float32).to(gpu).with_settings(deterministic=True))[1]
-    assert saved["slot_ranges"].numel() == 2 * 3000
-    pixel_weights = map_for(scene.settings)
-    expected = scores(scene, gpu, torch.float32, pixel_weights)[3]
-    actual = scores(scene, gpu, torch.float32, pixel_weights, deterministic=True)[3]
-    assert torch.equal(actual.pixels, expected.pixels)
-    # Positive numbers in another order.
-    torch.testing.assert_close(actual.distances, expected.distances, rtol=1e-5, atol=0)
 
 
 @with_gate

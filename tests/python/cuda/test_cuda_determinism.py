@@ -4,6 +4,7 @@ from __future__ import annotations
 import pytest
 import torch
 from comparison import assert_all_close
+from devices import random_normal
 from scenes import gradients, random_scene, with_gate
 from test_cuda_graphs import TrainingStep, list_size, own_width
 
@@ -16,6 +17,7 @@ CASES = {
     "colours_1": dict(channels=1),
     "colours_7": dict(channels=7, covariance="cov3D"),
     "colour_alone": dict(degree=3, split_dc=True),  # what trainers render, by kernels of its own
+    "opacities_above_1": dict(degree=1, opacity=(0.5, 5.0)),
 }
 
 
@@ -62,12 +64,11 @@ def test_nothing_visible(mode, gpu):
 @pytest.mark.parametrize("dtype, tolerance", [
     # As in test_cuda_graphs: whole lists instead of segments, T rounded in other places.
     (torch.float32, 1e-4),
-    # Terms, some hundred a sum, are rounded at 2^-52 of the largest one.
     (torch.float64, 1e-11)], ids=["float32", "float64"])
 @pytest.mark.parametrize("outputs, degree, width", [(OUTPUTS, 1, 267), ((), 3, 283)],
                          ids=["all_images", "colour_alone"])
 def test_a_captured_graph_that_outgrew_its_lists(mode, outputs, degree, width, dtype, tolerance, gpu):
-    """No slot waits for its instances then; at a size of its own, as the tests of graphs have it."""
+    """The walk over all Gaussians adds in another order; at a size of its own, as the tests of graphs have it."""
     width = own_width(mode, width) + 7 * (dtype == torch.float64)
     small = random_scene(mode, 20_000, width, 151, scale=0.004, opacity=(0.02, 0.2), degree=degree, dtype=dtype)
     larger = small.with_inputs(scales=small.inputs["scales"] * 30)
@@ -84,8 +85,60 @@ def test_a_captured_graph_that_outgrew_its_lists(mode, outputs, degree, width, d
         for name, values in first.items():
             assert torch.equal(results[2][name], values), name
     assert_all_close(first, expected[2], tolerance)
-    step.set_to(small)  # with room again, from its slots
+    step.set_to(small)  # with room again
     graph.replay()
     expected = TrainingStep(small.with_settings(deterministic=True), gpu, outputs, dtype)()
     for name, values in expected[2].items():
         assert torch.equal(results[2][name], values), name
+
+
+def colour_gradients(scene, weights):
+    """The gradients by name of sum(weights * color)."""
+    scene = scene.requiring_grad(camera=False)
+    leaves = scene.leaves()
+    color = rasterize(settings=scene.settings, **scene.inputs).color
+    values = torch.autograd.grad(color, list(leaves.values()), weights, allow_unused=True)
+    return {name: value for name, value in zip(leaves, values) if value is not None}
+
+
+@with_gate
+def test_a_large_gradient_leaves_small_ones_their_digits(mode, gpu):
+    """Units are relative to the largest gradient of the image: here that of one pixel, a million times the others."""
+    scene = random_scene(mode, 4000, 131, 83, scale=0.02, degree=1, dtype=torch.float32).to(gpu)
+    weights = random_normal((3, 83, 131), 1, torch.float32).to(gpu)
+    alone = torch.zeros_like(weights)
+    alone[:, 40, 60] = 1e6
+    beside = weights.clone()
+    beside[:, 40, 60] = 1e6
+    shares = colour_gradients(scene, alone)["means3D"]
+    apart = (shares == 0).all(1)  # Gaussians that the pixel does not see
+    assert 1000 < apart.sum() < 4000
+    weights[:, 40, 60] = 0
+    expected = colour_gradients(scene, weights)
+    actual = colour_gradients(scene.with_settings(deterministic=True), beside)
+    names = [name for name in expected if expected[name].shape[:1] == (4000,)]
+    # As between two orders of the sums.
+    assert_all_close({name: actual[name][apart] for name in names}, {name: expected[name][apart] for name in names},
+                     1e-5)
+
+
+@with_gate
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_gradient_that_is_no_number_reaches_the_same_gaussians(mode, bad, gpu):
+    scene = random_scene(mode, 4000, 131, 83, scale=0.02, degree=1, dtype=torch.float32).to(gpu)
+    weights = random_normal((3, 83, 131), 1, torch.float32).to(gpu)
+    weights[1, 40, 60] = bad
+    usual = colour_gradients(scene, weights)
+    actual = colour_gradients(scene.with_settings(deterministic=True), weights)
+    assert 0 < (~torch.isfinite(usual["means3D"])).any(1).sum() < 2000
+    for name, values in usual.items():
+        assert torch.equal(torch.isfinite(actual[name]), torch.isfinite(values)), name
+
+
+@pytest.mark.parametrize("dtype, tolerance", [
+    (torch.float32, 1e-5), (torch.float64, 1e-12)], ids=["float32", "float64"])
+def test_a_background_gate_above_1(dtype, tolerance, gpu):
+    scene = random_scene("smoe", 4000, 131, 83, scale=0.06, degree=1, dtype=dtype, background_gate=40.0).to(gpu)
+    weights = random_normal((3, 83, 131), 1, dtype).to(gpu)
+    assert_all_close(colour_gradients(scene.with_settings(deterministic=True), weights),
+                     colour_gradients(scene, weights), tolerance)
