@@ -272,7 +272,7 @@ class Run:
                     self.save_checkpoint()
                     trainer.watch.start()
             trainer.watch.stop()
-        if trainer.iteration < config.iterations or interrupt.asked is not None:
+        if trainer.stops():  # in all processes or in none
             raise interrupt.asked or KeyboardInterrupt
         gate, model = trainer.background_gate, trainer.whole_model()
         if trainer.leads:
