@@ -84,7 +84,8 @@ ANTIALIASED = RENDERER.replace("prefiltered=False,", "antialiasing=pipe.antialia
     (RENDERER, "color, _, _", TRAIN, "3dgs-depth"), (RENDERER, "color, radii, depth, alpha", TRAIN, "3dgs-depth-alpha"),
     (RENDERER, "color, radii, inv_depth", TRAIN, None), (RENDERER, "color, radii, weights", TRAIN, None),
     (RENDERER, "color, radii, count, score", TRAIN, None), (RENDERER, "color,", TRAIN, None),
-    (RENDERER.replace("bg=bg_color", "kernel_size=0.1"), "color, radii", TRAIN, None)])
+    (RENDERER.replace("bg=bg_color", "kernel_size=0.1"), "color, radii", TRAIN, None),
+    (RENDERER.replace("bg=bg_color", "blur=0.1"), "color, radii", TRAIN, None)])
 def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, results, train, trainer):
     count = len(getattr(ast.parse(results).body[0].value, "elts", "12"))
     renderer = renderer.replace(ONE_LINE, BY_NAME.format(results))
@@ -92,7 +93,10 @@ def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, res
     if trainer:
         assert patches.apply(tmp_path).trainer == trainer and patches.check(tmp_path).state == "patched"
         return
-    refused(tmp_path, "unknown", "kernel_size" if "kernel_size" in renderer else f"its rasterizer returns {count} ")
+    said = {"kernel_size": "its rasterizer is mip_splatting, for which there is no patch: use `dsmoe run`",
+            "blur": "its GaussianRasterizationSettings have blur"}
+    refused(tmp_path, "unknown", next((said[name] for name in said if name in renderer),
+                                      f"its rasterizer returns {count} "))
 
 
 VISIBLE = """
