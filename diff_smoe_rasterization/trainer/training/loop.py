@@ -252,8 +252,8 @@ class Run:
         self.scalars = Scalars(config.output, trainer.iteration, wanted=trainer.leads)
         new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
                                disable=not self.progress, dynamic_ncols=True)
-        interrupts = DelayedInterrupt(patient=trainer.is_divided)
-        with contextlib.closing(self.scalars), new_bar as bar, interrupts as interrupt:
+        patience = DelayedInterrupt(patient=trainer.is_divided)
+        with contextlib.closing(self.scalars), new_bar as bar, patience as interrupt:
             trainer.wants_stop = lambda: interrupt.asked is not None
             trainer.watch.start()
             ends = trainer.iteration >= config.iterations
