@@ -180,7 +180,7 @@ template <class S> struct GaussianGradients {
   S* background = nullptr;      // [C + 1] by the colour, then by its gate
   CameraGradient<S>* camera = nullptr;
   S* means2D_abs = nullptr;  // [N, 2] sum over pixels of |dL/dpixel| times (W/2, H/2)
-  bool seen_only = false;  // whether the other rows stay as they are, in place of zeros
+  bool seen_only = false;    // whether the other rows stay as they are, in place of zeros
 };
 
 // The gradients by the footprints of N Gaussians: what goes from the backward pass of the blend to that of the

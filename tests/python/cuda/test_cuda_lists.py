@@ -23,8 +23,8 @@ def test_needles_that_pass_by_more_macro_tiles_than_they_meet_tiles(mode, gpu):
     """Their boxes outgrow the room that the count of their tiles suggests. Then the lists are not used, and the next
     rendering has more room.
 
-    Far from its centre the exponent of such a needle is rounding in float32. So the two ways to find a pixel's pairs may
-    differ in some of them: the images are held to each other in the mean.
+    Far from its centre the exponent of such a needle is rounding in float32. So the two ways to find a pixel's pairs
+    may differ in some of them: the images are held to each other in the mean.
     """
     scene = random_scene(mode, 300, 2391, 2377, scale=0.01, degree=0, dtype=torch.float32)
     needle = torch.tensor([6.0, 0.001, 0.001])
