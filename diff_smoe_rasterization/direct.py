@@ -18,8 +18,8 @@ _GRADIENTS = {"color": "color", "alpha": "gate_sum", "depth": "depth", "inverse_
 class DirectRendering:
     """One rendering in three calls: which Gaussians it will show, its images, and their gradients.
 
-    The arguments are those of `rasterize`, and so are the errors and all numbers. It is for loops that save what
-    autograd costs: Python's time, and a pass over memory for every gradient that is only passed on.
+    The arguments are those of `rasterize` but means2D_abs, and so are the errors and all numbers. It is for loops that
+    save what autograd costs: Python's time, and a pass over memory for every gradient that is only passed on.
     """
 
     def __init__(self, means3D: torch.Tensor, opacities: torch.Tensor, settings: GaussianRasterizationSettings,

@@ -73,7 +73,7 @@ def project_gaussians(means3D: torch.Tensor, opacities: torch.Tensor, settings: 
                       shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
                       scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
                       cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> Footprints:
-    """The first half of `rasterize`, whose arguments these are; it raises as `rasterize` does.
+    """The first half of `rasterize`, whose arguments these are, but means2D_abs; it raises as `rasterize` does.
 
     Gradients reach every tensor, but settings.bg and settings.background_gate, which belong to the second half.
     """

@@ -101,7 +101,7 @@ class CudaRenderer final : public Renderer {
     cuda::StreamMemory memory(run.stream);
     cuda::forward(frame_, run, memory);
     const DeviceArray<int32_t> gaussians(options_.gate_map ? pixels : 0), counts(options_.gate_map ? pixels : 0);
-    if (options_.gate_map) cuda::gate_map(frame_, {gaussians.get(), counts.get()}, {run.stream});
+    if (options_.gate_map) cuda::gate_map(frame_, {gaussians.get(), counts.get()}, {run.stream, &memory});
     check(cudaStreamSynchronize(run.stream), "rendering");
     return {view.width, view.height, color.read(), alpha.read(), depth.read(), gaussians.read(), counts.read()};
   }

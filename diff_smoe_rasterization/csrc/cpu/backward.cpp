@@ -154,7 +154,7 @@ void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradie
   const Stopwatch stopwatch(times, &StageTimes::blend_backward);
   const int num_features = frame.config.num_features(), size = kNumGateGradients + num_features;
   parallel_for(frame.config.num_threads, frame.inputs.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
-    RecordSums<S> sums_of(frame, records, gradients.inputs.means2D_abs);
+    RecordSums<S> sums_of(frame, records, nullptr);
     for (int64_t i = begin; i < end; ++i) {
       S* record = footprints.records + i * size;
       PixelSums<S> sums;

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <algorithm>
+#include <stdexcept>
 #include <vector>
 
 #include "capacity.h"
@@ -83,8 +84,12 @@ std::vector<TileBand> cut_into_bands(const Frame<S>& frame, ReusedScratch& scrat
 // Calls visit(frame) where the frame has lists. Else it makes the lists of one band after the other, and calls visit
 // with a frame for each, from top to bottom.
 template <class S, class Visit> void for_each_band(const Frame<S>& frame, const Work& work, Visit visit) {
-  // During a capture nothing can be counted: without lists the walks go through all Gaussians.
-  if (frame.saved.capacity > 0 || is_capturing(work.stream)) return visit(frame);
+  if (frame.saved.capacity > 0) return visit(frame);
+  if (is_capturing(work.stream)) {  // nothing can be counted then
+    throw std::runtime_error(
+        "rasterize: this rendering has more tile instances than are listed at once, so its lists "
+        "are made in bands, which a graph cannot capture; capture its forward pass too");
+  }
   ReusedScratch scratch(*work.scratch);
   const auto bands = cut_into_bands(frame, scratch, work);
   Frame<S> part = frame;

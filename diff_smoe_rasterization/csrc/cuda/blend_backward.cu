@@ -372,6 +372,8 @@ template <class S> struct SplitRecords {
   int64_t num_gaussians;   // N
   int length;              // numbers a record without its absolute sums
   int width, height;       // of the image, pixels
+  const int32_t* radii;    // [N] pixels
+  bool seen_only;          // rows of means2D_abs where the radius is 0 stay as they are
   const S* with_absolute;  // [N, length + kNumAbsoluteSums]
   S* records;              // [N, length] written
   S* means2D_abs;          // [N, kNumAbsoluteSums] written
@@ -383,7 +385,8 @@ template <class S> __global__ void split_records_kernel(const __grid_constant__ 
   const int number = static_cast<int>(at - i * both);
   if (i >= arguments.num_gaussians) return;
   if (number < length) arguments.records[i * length + number] = arguments.with_absolute[at];
-  if (number == length) store_absolute(arguments.with_absolute + at, arguments, arguments.means2D_abs, i);
+  if (number != length || (arguments.seen_only && arguments.radii[i] <= 0)) return;
+  store_absolute(arguments.with_absolute + at, arguments, arguments.means2D_abs, i);
 }
 
 // Records with absolute sums, zero.
@@ -437,8 +440,8 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
   }
   if (absolute && size > 0) {
     split_records_kernel<S><<<blocks_for(size, kStoreBlock), kStoreBlock, 0, stream>>>(
-        {frame.inputs.num_gaussians, length - kNumAbsoluteSums, camera.width, camera.height, records,
-         pass.dL_dgaussians, means2D_abs});
+        {frame.inputs.num_gaussians, length - kNumAbsoluteSums, camera.width, camera.height, frame.images.radii,
+         pass.gradients.inputs.seen_only, records, pass.dL_dgaussians, means2D_abs});
     DSMOE_CHECK_LAUNCH("split_records");
   }
   if (rows != nullptr) sum_columns(rows, warps, config.num_channels + 1, dL_dbackground, stream);

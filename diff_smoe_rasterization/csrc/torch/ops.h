@@ -331,9 +331,9 @@ template <class Backend> void project_backward(const c10::OperatorHandle& op, to
   check_arguments(given, options);
   check_footprint_gradients(records, dL_ddepths, features, radii, given, options);
   for (int i = 0; i < kNumInputs; ++i) {
-    TORCH_CHECK_VALUE(!wanted[i] || (given[i].defined() && i != kBackground && i != kBackgroundGate),
-                      "project_backward: the gradient of ", kInputNames[i],
-                      " is wanted, but no footprint depends on it");
+    TORCH_CHECK_VALUE(
+        !wanted[i] || (given[i].defined() && i != kBackground && i != kBackgroundGate && i != kMeans2DAbs),
+        "project_backward: the gradient of ", kInputNames[i], " is wanted, but no footprint depends on it");
   }
   const typename Backend::Guard guard(given[kMeans3D].device());
   features = padded(features, Backend::feature_columns(features.size(1)));

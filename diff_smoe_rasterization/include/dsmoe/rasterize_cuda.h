@@ -118,8 +118,8 @@ struct Run {
 };
 
 // Renders frame.inputs to frame.images and fills frame.saved. The first call of a size, mode and order of N waits for
-// the number of instances. So does every call with `times`,
-// and every pass over a rendering that has more than config.most_instances.
+// the number of instances. So does every call with `times`, every one whose likely instances, with some room, exceed
+// config.most_instances, and every pass over a rendering that has more than those.
 template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory);
 
 // Writes gradients.inputs. `frame` is as `forward` left it.
@@ -234,8 +234,8 @@ template <class S> void project_backward(const Frame<S>& frame, const BackwardPa
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
 // may differ in their last digits from call to call. Of the frame it reads the number of Gaussians, the image's size,
-// of config the mode, alpha_min and the background's gate, of images the radii, and of saved neither features nor
-// images but last_contributor.
+// of config the mode, alpha_min, the background's gate and most_instances, of images the radii, and of saved neither
+// features nor images but last_contributor. work.scratch is needed, here and in the next two.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work);
 
 // Walks the tile lists once more, and sums what each Gaussian is worth to the image, by atomics as `contributions`.

@@ -23,7 +23,7 @@ def package_rasterizer() -> Rasterize:
 
 
 class Renderer:
-    """Renders a model with one blend mode and background; the only place where the trainer calls `rasterize`."""
+    """Renders a model with one blend mode and background; the only place where the settings of a view are made."""
 
     def __init__(self, model: GaussianModel, blend_mode: str, background: torch.Tensor,
                  antialiasing: bool = False, rasterize: Optional[Rasterize] = None, *,

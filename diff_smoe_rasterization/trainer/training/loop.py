@@ -419,6 +419,8 @@ def _new_trainer(config: TrainConfig, scene: Scene, rasterize: Optional[Rasteriz
     """One view a step in one process has the usual trainer; what has more, the other one."""
     if config.batch == 1 and (group is None or group.size == 1):
         return Trainer(config, scene, rasterize)
+    if rasterize is not None:
+        raise TrainerError("train: rasterize is given; batches of views and several processes need the package's own")
     from ..distributed.trainer import BatchTrainer
 
     return BatchTrainer(config, scene, group or ALONE)

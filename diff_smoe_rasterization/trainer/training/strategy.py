@@ -211,7 +211,8 @@ class ThreeDGSStrategy(Strategy):
         normal = self.context.shards.draw(lambda count: torch.randn(CHILDREN, count, 3, device=scales.device),
                                           len(parents) // CHILDREN)
         offsets = normal.reshape(-1, 3) * scales
-        turned = torch.bmm(quaternion_to_matrix(raw["rotations"]), offsets.unsqueeze(2)).squeeze(2)
+        # No torch.bmm: it may round otherwise for another number of rows, of which a process has only some.
+        turned = (quaternion_to_matrix(raw["rotations"]) * offsets.unsqueeze(1)).sum(2)
         return raw["means3D"] + turned, torch.log(scales / SPLIT_SHRINK)
 
     def prune(self, large_too: bool) -> torch.Tensor:

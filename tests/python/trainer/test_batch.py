@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
-from diff_smoe_rasterization.trainer.errors import ConfigError
+from diff_smoe_rasterization.trainer.errors import ConfigError, TrainerError
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.system.group import ALONE
@@ -143,3 +143,8 @@ def test_training_lowers_the_loss(tiny_config, scene):
 def test_batches_that_do_not_fit_are_refused(tiny_config, options, text):
     with pytest.raises(ConfigError, match=text):
         tiny_config.changed(**options)
+
+
+def test_another_rasterizer_is_refused(tiny_config):
+    with pytest.raises(TrainerError, match="rasterize is given; batches of views"):
+        train(dataclasses.replace(tiny_config, batch=2), progress=False, rasterize=print)
