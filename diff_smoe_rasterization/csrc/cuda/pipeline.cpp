@@ -43,7 +43,7 @@ int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& ke
   int64_t capacity = InstanceCapacities::shared().likely(key);
   if (is_capturing(run.stream)) {  // nothing can be counted then
     if (capacity < 0) capacity = 8 * frame.inputs.num_gaussians + 1024;
-    return std::min(capacity, most);
+    return std::max<int64_t>(1, std::min(capacity, most));
   }
   if (capacity > 0 && capacity <= most) return capacity;
   count_instances(frame, work);
