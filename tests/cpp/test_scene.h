@@ -174,8 +174,9 @@ template <class S> struct Rendering {
   }
 
   SavedForward<S> saved() {
-    return {projected.data(),           features.data(), instance_offsets.data(), tile_offsets.data(), instances.data(),
-            final_transmittance.data(), gate_sum.data(), last_contributor.data()};
+    return {projected.data(),    features.data(),         instance_offsets.data(),
+            tile_offsets.data(), instances.data(),        final_transmittance.data(),
+            gate_sum.data(),     last_contributor.data(), {}};
   }
   ImageOutputs<S> images() {
     return {color.data(), depth.empty() ? nullptr : depth.data(),

@@ -62,7 +62,9 @@ template <class S> void expect_the_cells_of_random_gaussians() {
         const S power = ColumnExponent<S, S>(gaussian.conic, dx).at(dy);
         const auto gate = evaluate_gate<BlendMode::kSmoe>(power, gaussian.opacity, listed.least_alpha);
         counted += gate.counts;
-        if (gate.counts) ASSERT_NE(listed.met & cell, 0u) << "Gaussian " << n << " pixel " << at + lane;
+        if (gate.counts) {
+          ASSERT_NE(listed.met & cell, 0u) << "Gaussian " << n << " pixel " << at + lane;
+        }
         if (!smooth) continue;
         ++smooth_pairs;
         ASSERT_TRUE(gate.counts) << "Gaussian " << n << " pixel " << at + lane;

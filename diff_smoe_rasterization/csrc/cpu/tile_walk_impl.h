@@ -90,8 +90,8 @@ template <class S> struct PixelCenters {
     using P = Pack<S>;
     for (int at = 0; at < kTilePixels; at += P::kLanes) {
       const int cell = at / kCellPixels, first = at % kCellPixels;
-      const P left = S(extent.x0 + cell % kCellColumns * kCellSize),
-              top = S(extent.y0 + cell / kCellColumns * kCellSize);
+      const int row = cell / kCellColumns, column = cell % kCellColumns;
+      const P left = S(extent.x0 + column * kCellSize), top = S(extent.y0 + row * kCellSize);
       (P::load(kSquareOfFour<S>.columns + first) + left).store(x + at);
       (P::load(kSquareOfFour<S>.rows + first) + top).store(y + at);
     }

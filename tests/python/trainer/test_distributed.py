@@ -11,6 +11,7 @@ import pytest
 import torch
 import torch.distributed
 
+import diff_smoe_rasterization
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.distributed.shards import run_of
 from diff_smoe_rasterization.trainer.errors import TrainerError
@@ -19,7 +20,7 @@ from diff_smoe_rasterization.trainer.system import torchrun as torchrun_module
 from diff_smoe_rasterization.trainer.training.loop import train
 
 HERE = os.path.dirname(os.path.abspath(__file__))
-ROOT = os.path.dirname(os.path.dirname(os.path.dirname(HERE)))
+PACKAGES = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterization.__file__)))  # of the one under test
 
 needs_gloo = pytest.mark.skipif(not torch.distributed.is_available() or not torch.distributed.is_gloo_available(),
                                 reason="this torch has no gloo")
@@ -29,8 +30,8 @@ def torchrun(processes, *words, **environment):
     """Runs a program in so many processes. Returns its exit status, output and errors."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes),
                *words]
-    path = os.pathsep.join([ROOT, os.environ.get("PYTHONPATH", "")])
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300,
+    path = os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")])
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=HERE,
                             env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", **environment})
     return result.returncode, result.stdout, result.stderr
 
