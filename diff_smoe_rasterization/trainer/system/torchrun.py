@@ -18,6 +18,8 @@ def check_gpus(gpus: int, device: str) -> None:
     if device != "cuda":
         raise ConfigError(f"{GPUS} is {gpus} with --device {device}; it needs --device cuda")
     there = torch.cuda.device_count()
+    if there == 0:
+        raise ConfigError(f"{GPUS} is {gpus}, and torch finds no GPU here; on CPUs start torchrun with --device cpu")
     if not 1 <= gpus <= there:
         raise ConfigError(f"{GPUS} is {gpus}; it must be at least 1 and at most {there}: so many GPUs torch finds here")
 

@@ -120,3 +120,6 @@ def test_more_gpus_than_there_are_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     with pytest.raises(TrainerError, match="--gpus is 3; it must be at least 1 and at most 2"):
         torchrun_module.check_gpus(3, "cuda")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(TrainerError, match="torch finds no GPU here; on CPUs start torchrun with --device cpu"):
+        torchrun_module.check_gpus(3, "cuda")
