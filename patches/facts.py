@@ -46,8 +46,10 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
         tree = python_tree(data)
         in_try = {id(node) for outer in ast.walk(tree) if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
-        made = _names_of_rasterizers(tree)
+        made, own = _names_of_rasterizers(tree), _calls_of_own_classes(tree)
         for node in ast.walk(tree):
+            if id(node) in own or isinstance(node, ast.Assign) and id(node.value) in own:
+                continue
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 facts.update(_of_import(node, id(node) in in_try))
             elif isinstance(node, ast.Call):
@@ -104,6 +106,20 @@ def _names_of_rasterizers(tree: ast.Module) -> Set[str]:
                and isinstance(node.value, ast.Call) and getattr(node.value.func, "id", "") in aliases
                for target in node.targets if isinstance(target, ast.Name)}
     return aliases | objects | ({"rasterizer"} if aliases else set())
+
+
+def _calls_of_own_classes(tree: ast.Module) -> Set[int]:
+    """The calls of classes that the file defines, and of what it makes of them: a renderer without an extension."""
+    classes = {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    calls = {id(node) for node in ast.walk(tree)
+             if isinstance(node, ast.Call) and getattr(node.func, "id", "") in classes}
+    for function in ast.walk(tree):
+        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            nodes = list(ast.walk(function))
+            made = {target.id for node in nodes if isinstance(node, ast.Assign) and id(node.value) in calls
+                    for target in node.targets if isinstance(target, ast.Name)}
+            calls |= {id(node) for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") in made}
+    return calls
 
 
 def _renders(node: ast.AST, made: Set[str]) -> bool:

@@ -23,10 +23,11 @@ from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MOD
 from . import facts
 from .errors import PatchError
 from .record import Record
-from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE
+from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE, WITHOUT_VARIABLE
 from .trainers import GR, RASTERIZER, TRAINERS, names
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
+SPARSE_ADAM = "SparseGaussianAdam"
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
@@ -101,6 +102,10 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
                    RASTERIZER_VARIABLE: flavour}
     if gate is None:
         del environment[BACKGROUND_GATE_VARIABLE]
+    if _cannot_use_sparse_adam(_folders(words)):
+        environment[WITHOUT_VARIABLE] = SPARSE_ADAM
+        warnings = [*warnings, f"{SPARSE_ADAM} is not offered: where the trainer finds it, it reads get_features_dc of "
+                    "its model, which has none"]
     if "PYTHONPYCACHEPREFIX" not in environment:
         environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     environment["PYTHONPATH"] = os.pathsep.join([str(SHIMS), *filter(None, [environment.get("PYTHONPATH")])])
@@ -147,6 +152,14 @@ def _folders(words: Sequence[str]) -> List[Path]:
     script = next((Path(word).resolve() for word in words if word.endswith(".py") and Path(word).is_file()), None)
     folders = [script.parent, *list(script.parent.parents)[:2]] if script else []
     return list(dict.fromkeys([*folders, Path.cwd()]))
+
+
+def _cannot_use_sparse_adam(folders: Sequence[Path]) -> bool:
+    """Whether the trainer reads get_features_dc, which 3DGS does where it finds SparseGaussianAdam, and defines none."""
+    folder = next((folder for folder in folders if (folder / GR).is_file()), None)
+    sources = [path.read_bytes() for pattern in ("*.py", "*/*.py") for path in folder.glob(pattern)] if folder else []
+    return (any(b".get_features_dc" in source for source in sources)
+            and not any(re.search(rb"def get_features_dc|\bget_features_dc *=", source) for source in sources))
 
 
 def _files(folder: Path, everywhere: bool) -> Dict[str, bytes]:
