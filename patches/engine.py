@@ -81,7 +81,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     known, reason = facts.recognise(found)
     name = trainer or (recorded.manifest["trainer"] if recorded else None)
     chosen = by_name(name) if name else known
-    if chosen is not None and (not chosen.entries or facts.has_a_name_of_its_own(found)):
+    if chosen is not None and (not chosen.entries or facts.is_for_run_alone(found)):
         reason = reason or f"its rasterizer is {chosen.flavour}, for which there is no patch: use `dsmoe run`"
         chosen = None
     if GR not in files or chosen is None or facts.uses_another_rasterizer(found):

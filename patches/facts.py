@@ -52,6 +52,8 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
                 continue
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 facts.update(_of_import(node, id(node) in in_try))
+            elif isinstance(node, ast.ClassDef) and node.name in NAMES:
+                facts.add("defines " + node.name)
             elif isinstance(node, ast.Call):
                 facts.update(_of_call(node, made))
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
@@ -137,9 +139,9 @@ def uses_another_rasterizer(facts: Set[str]) -> bool:
     return bool(_those(facts, "uses "))
 
 
-def has_a_name_of_its_own(facts: Set[str]) -> bool:
-    """Whether one is imported that `dsmoe run` knows by another name than Inria's, which no patch rewrites."""
-    return bool(_those(facts, "from "))
+def is_for_run_alone(facts: Set[str]) -> bool:
+    """Whether the rasterizer has a name that no patch rewrites, or a class of its name lies beside it in the file."""
+    return bool(_those(facts, "from ") or _those(facts, "defines "))
 
 
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
