@@ -155,7 +155,7 @@ def _folders(words: Sequence[str]) -> List[Path]:
 
 
 def _cannot_use_sparse_adam(folders: Sequence[Path]) -> bool:
-    """Whether the trainer reads get_features_dc, which 3DGS does where it finds SparseGaussianAdam, and defines none."""
+    """Whether the trainer reads get_features_dc, as 3DGS does where it finds SparseGaussianAdam, and defines none."""
     folder = next((folder for folder in folders if (folder / GR).is_file()), None)
     sources = [path.read_bytes() for pattern in ("*.py", "*/*.py") for path in folder.glob(pattern)] if folder else []
     return (any(b".get_features_dc" in source for source in sources)

@@ -188,7 +188,7 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
     "feature_3dgs": ("", "semantic_feature=1", "image, feature_map, radii, depth"),
     "langsplat": ("include_feature=1", "language_feature_precomp=1", "image, feature_image, radii"),
-    "cob_gs": ("antialiasing=0, include_mask=0", "mask_precomp=1, mask_signals=1", "image, rendered_mask, radii, depth"),
+    "cob_gs": ("antialiasing=0, include_mask=0", "mask_precomp=1, mask_signals=1", "image, mask_image, radii, depth"),
     "speedy_splat": ("", "scores=1", "image, radii, kernel_times"),
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
     "light_gaussian": ("f_count=1", "", "counts, score, image, radii"), "depth": ("", "", "image, radii, depth"),
@@ -334,8 +334,9 @@ except ImportError:
 print(SparseGaussianAdam is not None)
 GaussianRasterizer(None)
 """
-    renderer = RENDERER.replace("bg=bg_color", "antialiasing=False") + "\n\ndef dc_of(pc):\n    return pc.get_features_dc\n"
-    make(tmp_path, {GR: renderer, "train.py": train, "scene/gaussian_model.py": "class GaussianModel:\n    x = 1\n" + model})
+    renderer = RENDERER.replace("bg=bg_color", "antialiasing=False") + "\n\ndef dc(pc):\n    return pc.get_features_dc\n"
+    model = "class GaussianModel:\n    x = 1\n" + model
+    make(tmp_path, {GR: renderer, "train.py": train, "scene/gaussian_model.py": model})
     result = python("-m", "diff_smoe_rasterization", *PYTHON, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert (result.status, result.out) == (0, f"{is_offered}\n"), result.err
     assert ("SparseGaussianAdam is not offered" in result.err) == (not is_offered)
