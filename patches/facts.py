@@ -36,6 +36,21 @@ def python_tree(data: bytes) -> ast.Module:
             return ast.Module(body=[], type_ignores=[])
 
 
+def further_renderers(files: Mapping[str, bytes]) -> List[str]:
+    """Returns the modules beside the renderer that these files import: they may render by another rasterizer."""
+    folder = GR.rpartition("/")[0]
+    found = set()
+    for name, data in files.items():
+        for node in ast.walk(python_tree(data)):
+            if isinstance(node, ast.ImportFrom):
+                beside = [folder] if node.level and name == GR else []
+                module = ".".join([*beside, *filter(None, [node.module])])
+                found |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
+            elif isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+    return sorted(module.replace(".", "/") + ".py" for module in found if module.startswith(folder + "."))
+
+
 def of_files(files: Mapping[str, bytes]) -> Set[str]:
     """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "returns color, radii".
 

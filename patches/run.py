@@ -165,7 +165,9 @@ def _cannot_use_sparse_adam(folders: Sequence[Path]) -> bool:
 def _files(folder: Path, everywhere: bool) -> Dict[str, bytes]:
     """Returns the files by which a trainer is recognised: those of 3DGS, else, if so asked, all that rasterize."""
     if (folder / GR).is_file():
-        return {name: (folder / name).read_bytes() for name in facts.LOOKED_AT if (folder / name).is_file()}
+        files = {name: (folder / name).read_bytes() for name in facts.LOOKED_AT if (folder / name).is_file()}
+        return {**files, **{name: (folder / name).read_bytes() for name in facts.further_renderers(files)
+                            if (folder / name).is_file()}}
     found = {}
     for pattern in ("*.py", "*/*.py", "*/*/*.py") if everywhere else ():
         for path in folder.glob(pattern):

@@ -157,6 +157,7 @@ def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
 
 OURS = RENDERER.replace("diff_gaussian_rasterization import", "diff_smoe_rasterization.integrations.inria import")
 MS = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
+MASKS = "gaussian_renderer/masks.py"
 PYTHON = [*RUN, "--", sys.executable, "train.py"]
 AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
 
@@ -174,6 +175,9 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     # Under --trainer too: Mini-Splatting, and a renderer of no rasterizer at all.
     ({GR: MS}, PYTHON, "it imports diff_gaussian_rasterization_ms, another rasterizer"),
     ({GR: RENDERER + MS}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
+    # A second renderer beside the first, by which masks are trained.
+    ({MASKS: MS, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_ms, another rasterizer"),
+    ({MASKS: MS, GR: "from . import masks\n" + RENDERER}, PYTHON, "_ms, another rasterizer"),
     ({GR: "from nvdiffrast import rasterize\n"}, AS_INRIA, "nothing imports GaussianRasterizationSettings from")])
 def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_path, dsmoe, monkeypatch):
     monkeypatch.chdir(make(tmp_path, files))
@@ -334,7 +338,7 @@ except ImportError:
 print(SparseGaussianAdam is not None)
 GaussianRasterizer(None)
 """
-    renderer = RENDERER.replace("bg=bg_color", "antialiasing=False") + "\n\ndef dc(pc):\n    return pc.get_features_dc\n"
+    renderer = RENDERER.replace("bg=bg_color", "antialiasing=False") + "\n\ndef dc(pc): return pc.get_features_dc\n"
     model = "class GaussianModel:\n    x = 1\n" + model
     make(tmp_path, {GR: renderer, "train.py": train, "scene/gaussian_model.py": model})
     result = python("-m", "diff_smoe_rasterization", *PYTHON, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
