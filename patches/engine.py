@@ -77,11 +77,13 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     if recorded is None and any(b"import fused_where_equal" in data for data in now.values()):
         before = ("fuse",)
     files = {**now, **(recorded.before if recorded else {})}
-    found = facts.of_files({name: files[name] for name in facts.LOOKED_AT if name in files})
+    looked_at = {name: files[name] for name in facts.LOOKED_AT if name in files}
+    looked_at.update({name: files[name] for name in facts.further_renderers(looked_at) if name in files})
+    found = facts.of_files(looked_at)
     known, reason = facts.recognise(found)
     name = trainer or (recorded.manifest["trainer"] if recorded else None)
     chosen = by_name(name) if name else known
-    if chosen is not None and (not chosen.entries or facts.has_a_name_of_its_own(found)):
+    if chosen is not None and (not chosen.entries or facts.is_for_run_alone(found)):
         reason = reason or f"its rasterizer is {chosen.flavour}, for which there is no patch: use `dsmoe run`"
         chosen = None
     if GR not in files or chosen is None or facts.uses_another_rasterizer(found):

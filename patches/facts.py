@@ -36,6 +36,21 @@ def python_tree(data: bytes) -> ast.Module:
             return ast.Module(body=[], type_ignores=[])
 
 
+def further_renderers(files: Mapping[str, bytes]) -> List[str]:
+    """Returns the modules beside the renderer that these files import: they may render by another rasterizer."""
+    folder = GR.rpartition("/")[0]
+    found = set()
+    for name, data in files.items():
+        for node in ast.walk(python_tree(data)):
+            if isinstance(node, ast.ImportFrom):
+                beside = [folder] if node.level and name == GR else []
+                module = ".".join([*beside, *filter(None, [node.module])])
+                found |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
+            elif isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+    return sorted(module.replace(".", "/") + ".py" for module in found if module.startswith(folder + "."))
+
+
 def of_files(files: Mapping[str, bytes]) -> Set[str]:
     """Returns facts such as "imports GaussianRasterizer", "sets antialiasing", "returns color, radii".
 
@@ -46,10 +61,14 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
         tree = python_tree(data)
         in_try = {id(node) for outer in ast.walk(tree) if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
-        made = _names_of_rasterizers(tree)
+        made, own = _names_of_rasterizers(tree), _calls_of_own_classes(tree)
         for node in ast.walk(tree):
+            if id(node) in own or isinstance(node, ast.Assign) and id(node.value) in own:
+                continue
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 facts.update(_of_import(node, id(node) in in_try))
+            elif isinstance(node, ast.ClassDef) and node.name in NAMES:
+                facts.add("defines " + node.name)
             elif isinstance(node, ast.Call):
                 facts.update(_of_call(node, made))
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
@@ -106,6 +125,20 @@ def _names_of_rasterizers(tree: ast.Module) -> Set[str]:
     return aliases | objects | ({"rasterizer"} if aliases else set())
 
 
+def _calls_of_own_classes(tree: ast.Module) -> Set[int]:
+    """The calls of classes that the file defines, and of what it makes of them: a renderer without an extension."""
+    classes = {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    calls = {id(node) for node in ast.walk(tree)
+             if isinstance(node, ast.Call) and getattr(node.func, "id", "") in classes}
+    for function in ast.walk(tree):
+        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            nodes = list(ast.walk(function))
+            made = {target.id for node in nodes if isinstance(node, ast.Assign) and id(node.value) in calls
+                    for target in node.targets if isinstance(target, ast.Name)}
+            calls |= {id(node) for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") in made}
+    return calls
+
+
 def _renders(node: ast.AST, made: Set[str]) -> bool:
     """Whether it is a call of an object, rasterizer(...) or GaussianRasterizer(...)(...), and not of the class."""
     if not isinstance(node, ast.Call):
@@ -121,9 +154,9 @@ def uses_another_rasterizer(facts: Set[str]) -> bool:
     return bool(_those(facts, "uses "))
 
 
-def has_a_name_of_its_own(facts: Set[str]) -> bool:
-    """Whether one is imported that `dsmoe run` knows by another name than Inria's, which no patch rewrites."""
-    return bool(_those(facts, "from "))
+def is_for_run_alone(facts: Set[str]) -> bool:
+    """Whether the rasterizer has a name that no patch rewrites, or a class of its name lies beside it in the file."""
+    return bool(_those(facts, "from ") or _those(facts, "defines "))
 
 
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:

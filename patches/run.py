@@ -23,10 +23,11 @@ from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MOD
 from . import facts
 from .errors import PatchError
 from .record import Record
-from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE
+from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE, WITHOUT_VARIABLE
 from .trainers import GR, RASTERIZER, TRAINERS, names
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
+SPARSE_ADAM = "SparseGaussianAdam"
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
@@ -101,6 +102,10 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
                    RASTERIZER_VARIABLE: flavour}
     if gate is None:
         del environment[BACKGROUND_GATE_VARIABLE]
+    if _cannot_use_sparse_adam(_folders(words)):
+        environment[WITHOUT_VARIABLE] = SPARSE_ADAM
+        warnings = [*warnings, f"{SPARSE_ADAM} is not offered: where the trainer finds it, it reads get_features_dc of "
+                    "its model, which has none"]
     if "PYTHONPYCACHEPREFIX" not in environment:
         environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     environment["PYTHONPATH"] = os.pathsep.join([str(SHIMS), *filter(None, [environment.get("PYTHONPATH")])])
@@ -149,10 +154,20 @@ def _folders(words: Sequence[str]) -> List[Path]:
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
+def _cannot_use_sparse_adam(folders: Sequence[Path]) -> bool:
+    """Whether the trainer reads get_features_dc, as 3DGS does where it finds SparseGaussianAdam, and defines none."""
+    folder = next((folder for folder in folders if (folder / GR).is_file()), None)
+    sources = [path.read_bytes() for pattern in ("*.py", "*/*.py") for path in folder.glob(pattern)] if folder else []
+    return (any(b".get_features_dc" in source for source in sources)
+            and not any(re.search(rb"def get_features_dc|\bget_features_dc *=", source) for source in sources))
+
+
 def _files(folder: Path, everywhere: bool) -> Dict[str, bytes]:
     """Returns the files by which a trainer is recognised: those of 3DGS, else, if so asked, all that rasterize."""
     if (folder / GR).is_file():
-        return {name: (folder / name).read_bytes() for name in facts.LOOKED_AT if (folder / name).is_file()}
+        files = {name: (folder / name).read_bytes() for name in facts.LOOKED_AT if (folder / name).is_file()}
+        return {**files, **{name: (folder / name).read_bytes() for name in facts.further_renderers(files)
+                            if (folder / name).is_file()}}
     found = {}
     for pattern in ("*.py", "*/*.py", "*/*/*.py") if everywhere else ():
         for path in folder.glob(pattern):

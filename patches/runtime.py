@@ -20,6 +20,7 @@ from diff_smoe_rasterization.settings import (
 
 SHIMS = Path(__file__).resolve().parent / "shims"
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
+WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
 
 
@@ -149,7 +150,7 @@ def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
 
     GaussianRasterizer.__init__ = noted
     _say_rasterizer(flavour)
-    offered = {name: getattr(module, name) for name in module.__all__}
+    offered = {name: getattr(module, name) for name in module.__all__ if name != os.environ.get(WITHOUT_VARIABLE)}
     return {name: _noting(value) if name.startswith("rasterize_") else value for name, value in offered.items()}
 
 
