@@ -404,7 +404,7 @@ def _with_lpips(net: str, device: str) -> Measure:
     """The trainer's metrics and LPIPS of images without a mask. Raises TrainerError where its weights are not there."""
     from .benchmarks.errors import BenchError
     from .benchmarks.suite.lpips import lpips_network
-    from .benchmarks.suite.weights import check_weights
+    from .benchmarks.suite.names import check_weights
     from .trainer.results.metrics import image_metrics, quantised
 
     kind = {"vgg": "lpips_vgg_std", "alex": "lpips_alex"}[net]

@@ -18,15 +18,13 @@ from ...trainer.system.files import write_json_atomically, write_text_atomically
 from ...trainer.system.output_folder import make_folder, only_one
 from ..errors import BenchError
 from . import require
-from .cell import SHARING, identity, shown
+from .cell import die_with_parent, identity
 from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite
-from .names import CELL_NAME, CELLS_FOLDER, ROW_NAME, ROWS_NAME, SUITE_NAME, blend_of
+from .names import CELL_NAME, CELLS_FOLDER, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
 from .preparation import made_scene, prepared_method, what_is_missing
-from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
-from .rows import CellFile, CellRow, Row, cell_folders, read_object
+from .rows import CellFile, CellRow, Row, at_once, cell_folders, read_object
 from .selection import chosen, earlier_rows, plan
-from .weights import check_weights, files_of_weights
 
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 
@@ -36,13 +34,9 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
               only: Sequence[str] = (), per_gpu: int = 1, rows: Optional[str] = None) -> List[Row]:
     """Runs what is not done of a suite; returns the rows of its cells, failed ones included.
 
-    name: a file or a shipped suite. results: by default bench_results/NAME. jobs: cells at once, by default per_gpu
-    on each GPU, or one on the CPU. slurm: None, or Snakemake's default resources ("slurm_partition=gpu"). only:
-    "field=value" of cells that are run. per_gpu: cells that one GPU is given at once. Where it, or jobs on the CPU, is
-    beyond 1, times are not the machine's own, and rows say so. rows: a file of rows, or a folder, whose cells
-    are not run again, failed ones neither unless retry_failed. Raises BenchError.
-
-    Where nothing is to be done, neither a GPU nor Snakemake is needed.
+    name: a file or a shipped suite. results: by default bench_results/NAME. The others are the options of `dsmoe bench
+    run`; slurm: None, or Snakemake's default resources. Raises BenchError. Where nothing is to be done, neither a GPU
+    nor Snakemake is needed.
     """
     suite = load_suite(find_suite(name))
     check_sharing(suite, jobs, slurm, per_gpu)
@@ -52,11 +46,10 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     earlier = earlier_rows(rows, suite.cells) if rows else {}
     check_folder(suite, results)
     done: Dict[str, Row] = {}
-    for cell in cells:
-        known = [read_row(results, cell["id"]), earlier.get(cell["id"])]
-        usable = [row for row in known if row and (row["ok"] or not retry_failed)]
-        if usable:
-            done[cell["id"]] = usable[0]
+    for name in (cell["id"] for cell in cells):
+        for row in (earlier.get(name), read_row(results, name)):  # the folder's own goes first
+            if row and (row["ok"] or not retry_failed):
+                done[name] = row
     if rows:
         print(f"{sum(row is earlier.get(name) for name, row in done.items())} of {len(cells)} cells taken from {rows}")
     to_do = [cell for cell in cells if cell["id"] not in done]
@@ -86,27 +79,25 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
 
 
 def check_folder(suite: Suite, results: str) -> None:
-    """Raises BenchError where the folder has rows of another suite or of another protocol, or a row that is none.
+    """Raises BenchError where the folder has rows of another suite or of another protocol, or a row that is none."""
+    def parts(cell: Mapping[str, Any]) -> Dict[str, Dict[str, Any]]:
+        """What must stay as it is of a scene or a method that is there already; others may be added."""
+        return {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
+                f"scene {cell['scene'].get('name')}: ": cell["scene"],
+                f"method {cell['method'].get('label')}: ": cell["method"]}
 
-    What it is a row of, its cell's file says. Scenes and methods that are new, and values of the axes, may be added.
-    """
     if os.path.exists(results) and not os.path.isdir(results):
         raise BenchError(f"{results}: is a file; it must be a folder, or a name where there is nothing yet")
-    here = {"": {"name": suite.name}, "protocol.": suite.protocol,
-            **{f"scene {scene['name']}: ": scene for scene in suite.scenes},
-            **{f"method {method['label']}: ": method for method in suite.methods}}
+    here = {what: part for cell in suite.cells for what, part in parts(cell).items()}
     differ: List[str] = []
     for name in cell_folders(results):
         cell = read_object(os.path.join(results, CELLS_FOLDER, name, CELL_NAME), CellFile)
         if cell is None or read_row(results, name) is None:
             continue
-        there = {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
-                 f"scene {cell['scene'].get('name')}: ": cell["scene"],
-                 f"method {cell['method'].get('label')}: ": cell["method"]}
-        differ += [f"{what}{field} is {there[what].get(field)!r} there and {here[what].get(field)!r} here"
-                   for what in there if what in here
-                   for field in sorted({*there[what], *here[what]} - {*NOT_IN_THE_IDENTITY, "axes", "refused"})
-                   if there[what].get(field) != here[what].get(field)]
+        differ += [f"{what}{field} is {there.get(field)!r} there and {here[what].get(field)!r} here"
+                   for what, there in parts(cell).items() if what in here
+                   for field in sorted({*there, *here[what]} - {*NOT_IN_THE_IDENTITY, "refused"})
+                   if there.get(field) != here[what].get(field)]
     if differ:
         raise BenchError(f"{results}: holds rows of another suite or of another protocol, which are not put together: "
                          f"{'; '.join(dict.fromkeys(differ))}. Choose another folder with -o")
@@ -137,26 +128,20 @@ def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
 
 
 def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, done: Mapping[str, Row]) -> None:
-    """Writes RESULTS/suite.json and each cell's file, with scenes made and checkouts patched. Raises BenchError.
-
-    done: rows by their cell's name; those of elsewhere are written here, as the suite's own.
-    """
-    scenes: Dict[str, Dict[str, Any]] = {}
+    """Writes RESULTS/suite.json, each cell's file, with scenes made and checkouts patched, and rows of elsewhere."""
+    scenes: Dict[str, Dict[str, Any]] = {}  # as they are run
     methods: Dict[str, Dict[str, Any]] = {}
     for cell in cells:
         folder = os.path.join(results, CELLS_FOLDER, cell["id"])
         file, row = os.path.join(folder, CELL_NAME), os.path.join(folder, ROW_NAME)
         if cell["id"] in done:
-            if not os.path.isfile(row):
-                write_json_atomically(row, {**done[cell["id"]], **identity(cell)})
-            if not os.path.isfile(file):
-                write_json_atomically(file, cell)
+            for path, content in ((row, {**done[cell["id"]], **identity(cell)}), (file, cell)):
+                if not os.path.isfile(path):
+                    write_json_atomically(path, content)
             continue
         scene, method = cell["scene"]["name"], cell["method"]["label"]  # what no cell needs is not prepared
-        if scene not in scenes:
-            scenes[scene] = made_scene(cell["scene"], results)
-        if method not in methods:
-            methods[method] = prepared_method(cell["method"], results)
+        scenes[scene] = scenes.get(scene) or made_scene(cell["scene"], results)
+        methods[method] = methods.get(method) or prepared_method(cell["method"], results)
         write_json_atomically(file, {**cell, "scene": scenes[scene], "method": methods[method]})
         if os.path.isfile(row):
             os.remove(row)
@@ -191,18 +176,17 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
             slurm: Optional[Sequence[str]], per_gpu: int = 1) -> List[str]:
     """Snakemake's command line, for cells that are all to be run. Raises BenchError."""
     require("snakemake")
-    on_gpu = suite.protocol["device"] == "cuda"
+    on_gpu, each = suite.protocol["device"] == "cuda", suite.protocol.get("gpus", 1)
     gpus = visible_gpus() if on_gpu and slurm is None else []
     if on_gpu and slurm is None and not gpus:
         raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine; for the "
                          "CPU set protocol.device: cpu")
-    each = suite.protocol.get("gpus", 1)
     if gpus and each > len(gpus):
         raise BenchError(f"protocol.gpus is {each}, and torch finds {len(gpus)} on this machine")
-    at_once = min(jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus) // each)), len(cells))
+    together = min(jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus) // each)), len(cells))
     # Spread over the GPUs first: no more cells share one than must. In a queue nobody counts: 0.
-    per_device = 0 if slurm is not None else min(per_gpu, -(-at_once // len(gpus))) if gpus else at_once
-    threads = threads_of_each(at_once) if slurm is None else threads_asked_for(slurm)
+    per_device = 0 if slurm is not None else min(per_gpu, -(-together // len(gpus))) if gpus else together
+    threads = threads_of_each(together) if slurm is None else threads_asked_for(slurm)
     said = {"cells": json.dumps([cell["id"] for cell in cells]), "python": sys.executable, "threads": threads,
             "gpus_each": each if on_gpu else 0, "per_device": per_device,
             "gpus": json.dumps(gpus)}  # a list: Snakemake takes a bare 0 for a number
@@ -213,12 +197,12 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
     if slurm is not None:
         if importlib.util.find_spec("snakemake_executor_plugin_slurm") is None:
             raise BenchError("--slurm needs Snakemake's plugin: pip install snakemake-executor-plugin-slurm")
-        words += ["--executor", "slurm", "--jobs", str(at_once)]
+        words += ["--executor", "slurm", "--jobs", str(together)]
         # Named resources bring Snakemake's own, 1000 MB among them; with 0 a cell has what the queue gives it.
         memory = [] if any(word.startswith("mem") for word in slurm) else ["mem_mb=0"]
         words += ["--default-resources", *slurm, *memory] if slurm else []
     else:
-        words += ["--cores", str(at_once * threads)]
+        words += ["--cores", str(together * threads)]
         words += ["--resources", f"gpu={per_device * len(gpus)}"] if on_gpu else []
     headline = [f"{CELLS_FOLDER}/{cell['id']}/{ROW_NAME}" for cell in cells if cell["headline"]]
     return words + (["--prioritize", *headline] if headline else [])
@@ -233,7 +217,7 @@ def threads_of_each(at_once: int) -> int:
 
 
 def threads_asked_for(resources: Sequence[str]) -> int:
-    """Threads of a cell in Slurm's queue: what its resources say as cpus_per_task=N, else 1. Raises BenchError."""
+    """Threads of a cell in Slurm's queue, by its resources."""
     threads = dict(resource.partition("=")[::2] for resource in resources).get("cpus_per_task", "1")
     if not (threads.isascii() and threads.isdecimal() and int(threads)):
         raise BenchError(f"--slurm cpus_per_task={threads}: must be a number of at least 1")
@@ -253,7 +237,8 @@ def environment() -> Dict[str, str]:
     """Of Snakemake and its cells: this package is found from any folder, and its commit is known."""
     path = [ROOT if os.path.isfile(os.path.join(ROOT, "sources.txt")) else os.path.dirname(ROOT)]
     path += [os.path.abspath(item) for item in os.environ.get("PYTHONPATH", "").split(os.pathsep) if item]
-    known = {COMMIT_VARIABLE: project_commit(), **files_of_weights()}
+    known = {COMMIT_VARIABLE: project_commit(),
+             **{name: os.path.abspath(os.environ[name]) for name in VARIABLES.values() if os.environ.get(name)}}
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path), "PYTHONSAFEPATH": "1",  # nothing of a cell's folder
             **{name: value for name, value in known.items() if value}}
 
@@ -268,14 +253,17 @@ def collect(results: str) -> Dict[str, Row]:
 
 def rows_table(rows: List[Row]) -> str:
     """A line for each row: what a terminal shows at the end."""
-    lines = []
-    for row in rows:
-        name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("schedule") or "own schedule",
-                          shown(row["densify_grad_threshold"], "g"), f"s{row['seed']}"])
-        at_once = max((row.get("machine") or {}).get(key) or 1 for key in SHARING.values())
-        told = (f"  {shown(row.get('psnr'), '.2f')} dB  SSIM {shown(row.get('ssim'), '.4f')}  "
-                f"{shown(row.get('num_gaussians'), ',')} Gaussians  {shown(row.get('train_seconds'), '.1f')} s  "
-                f"{shown(row.get('fps'), '.1f')} FPS" + (f" ({at_once} cells at once)" if at_once > 1 else "")
-                if row["ok"] else f"  FAILED: {row.get('reason')}")
-        lines.append(f"{name}:{told}")
-    return "\n".join(lines)
+    return "\n".join(map(_line, rows))
+
+
+def _line(row: Row) -> str:
+    def shown(field: str, form: str) -> str:
+        return "-" if row.get(field) is None else format(row[field], form)
+
+    name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("schedule") or "own schedule",
+                      shown("densify_grad_threshold", "g"), f"s{row['seed']}"])
+    if not row["ok"]:
+        return f"{name}:  FAILED: {row.get('reason')}"
+    return (f"{name}:  {shown('psnr', '.2f')} dB  SSIM {shown('ssim', '.4f')}  {shown('num_gaussians', ',')} Gaussians"
+            f"  {shown('train_seconds', '.1f')} s  {shown('fps', '.1f')} FPS"
+            + (f" ({at_once(row)} cells at once)" if at_once(row) > 1 else ""))

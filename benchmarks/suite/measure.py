@@ -13,11 +13,9 @@ import torch
 import torch.nn.functional as F
 
 from ...trainer.results.metrics import image_metrics, psnr, quantised
-from ..errors import BenchError
 from .lpips import Distance, lpips_network
-from .names import LPIPS_KINDS
+from .names import VARIABLES, net_of
 from .protocol import EDGE_REACH, STRONG_GRADIENT
-from .weights import VARIABLES, net_of
 
 LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601
 
@@ -33,10 +31,7 @@ def edge_mask(target: torch.Tensor) -> torch.Tensor:
 
 
 def edge_psnr(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None) -> Optional[float]:
-    """PSNR in dB of two images [3, H, W] over the pixels of `edge_mask(target)` that the mask [1, H, W], if any, keeps.
-
-    None where there are no such pixels.
-    """
+    """PSNR in dB over the pixels of `edge_mask(target)` that the mask [1, H, W], if any, keeps; None without any."""
     edges = edge_mask(target)
     if mask is not None:
         edges &= mask[0] > 0
@@ -48,12 +43,10 @@ class Measures:
     """All metrics of one rendering; LPIPS of each kind whose weights are at hand."""
 
     def __init__(self, device: str, lpips: Sequence[str] = ()) -> None:
-        """lpips: names of LPIPS_KINDS. Raises BenchError for another name."""
+        """lpips: names of LPIPS_KINDS."""
         self.reasons: Dict[str, Optional[str]] = {}  # why a kind of LPIPS is absent; None where it is measured
         self._networks: Dict[str, Distance] = {}
         for kind in lpips:
-            if kind not in LPIPS_KINDS:
-                raise BenchError(f"lpips is {kind!r}; it must be one of {', '.join(LPIPS_KINDS)}")
             try:
                 self._networks[kind] = lpips_network(kind, device)
                 self.reasons[kind] = None

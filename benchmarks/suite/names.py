@@ -1,7 +1,12 @@
 """The names of what a suite may ask for, and of the files in RESULTS; the Snakefile repeats the latter."""
 from __future__ import annotations
 
-from typing import Any, Mapping
+import json
+import os
+from pathlib import Path
+from typing import Any, Mapping, Sequence, Union
+
+from ..errors import BenchError
 
 NATIVE = "native"
 LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
@@ -33,6 +38,13 @@ RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "po
           "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
           "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval")
 
+# LPIPS's weights, .npz: conv1.weight [outputs, inputs, h, w], conv1.bias, ..., lin0.weight, ..., lin4.weight.
+VARIABLES = {"vgg": "DSMOE_LPIPS_VGG", "alex": "DSMOE_LPIPS_ALEX"}
+
+
+def read_json(path: Union[str, Path]) -> Any:
+    return json.loads(Path(path).read_text(encoding="utf-8"))
+
 
 def blend_of(row: Mapping[str, Any]) -> str:
     """The blend of a row or a cell: its mode, in `smoe` with its gate, such as "smoe 0.05" or "smoe learned".
@@ -43,3 +55,16 @@ def blend_of(row: Mapping[str, Any]) -> str:
     if row["blend_mode"] != "smoe" or gate == 0:
         return row["blend_mode"]
     return f"smoe {gate if isinstance(gate, str) else format(gate, 'g')}"
+
+
+def net_of(kind: str) -> str:
+    return "alex" if kind == "lpips_alex" else "vgg"
+
+
+def check_weights(kinds: Sequence[str]) -> None:
+    """Raises BenchError where a variable names a file of weights that is wanted and not there."""
+    for kind in kinds:
+        variable = VARIABLES[net_of(kind)]
+        if os.environ.get(variable) and not os.path.isfile(os.environ[variable]):
+            raise BenchError(f"{variable}: {os.environ[variable]}: no such file, where the weights of {kind} must be; "
+                             "name it, or unset the variable to have torchmetrics download them")

@@ -58,10 +58,7 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
 
 
 def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Dict[str, Any]:
-    """The protocol of a row of the native trainer; a checkout's notes replace what is otherwise there.
-
-    measured: the protocol that the trainer's `result_row` gives.
-    """
+    """The protocol of a row: that of the trainer's `result_row`, and the harness's. A checkout's notes win over it."""
     rules = {**RULES, "lpips": {row["kind"]: RULES["lpips"][row["kind"]] for row in lpips}}
     return {**measured, **rules, "images": config.images, "downscaler": downscaler(config, measured["downscaler"]),
             "sh_degree": config.sh_degree, "recipe": {name: getattr(config, name) for name in RECIPE},
@@ -81,15 +78,8 @@ def downscaler(config: TrainConfig, name: str) -> str:
     return name
 
 
-def machine_of(device: str) -> Dict[str, Any]:
-    """What a cell ran on."""
-    from ...trainer.system.environment import machine, versions
-
-    return {"device": machine(device), "versions": versions()}
-
-
 def project_commit() -> Optional[str]:
-    """The commit of this project's files, "+" behind it where they were changed since; None where nothing says it."""
+    """That of this project's files, as `commit_of` has it; None where nothing says it."""
     known = os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT)
     if known is None:
         with contextlib.suppress(ImportError):

@@ -73,10 +73,8 @@ def read_object(path: str, model: Type[Any] = dict) -> Optional[Dict[str, Any]]:
 
 
 def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
-    """The object that a text in json is, of which all that is read has its type. Raises ReportError.
-
-    place: where the text stands, in words.
-    """
+    """The object that a text in json is, of which all that is read has its type. Raises ReportError, which names the
+    place of the text."""
     try:
         found = json.loads(text)
     except ValueError as error:
@@ -97,8 +95,7 @@ def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
 def read_rows(results: str) -> List[Row]:
     """The rows of a results folder (cells/*/row.json and rows.jsonl) or of one .jsonl file, sorted by cell.
 
-    A cell's own row.json wins over rows.jsonl, and there the last line of a cell. Raises ReportError where there are
-    none, or where one is damaged.
+    A cell's own row.json wins over rows.jsonl, and there the last line of a cell. Raises ReportError.
     """
     listed = results if os.path.isfile(results) else os.path.join(results, ROWS_NAME)
     lines = _text(listed).split("\n") if os.path.isfile(listed) else []
@@ -109,6 +106,12 @@ def read_rows(results: str) -> List[Row]:
         raise ReportError(f"{results}: no rows: neither {CELLS_FOLDER}/*/{ROW_NAME} nor {ROWS_NAME}")
     rows = {row["cell"]: row for row in found}
     return [rows[name] for name in sorted(rows)]
+
+
+def at_once(row: Row) -> int:
+    """How many cells may have been at work at once on the row's GPU or CPU."""
+    machine = row.get("machine") or {}
+    return max(machine.get("cells_per_gpu") or 1, machine.get("cells_at_once") or 1)
 
 
 def cell_folders(results: str) -> List[str]:

@@ -31,7 +31,6 @@ def one_of(names: Any) -> Any:
 
 
 def some(item: Any) -> Any:
-    """A list of different values, at least one."""
     return Annotated[List[item], LEAST, DIFFERENT]
 
 
@@ -81,8 +80,6 @@ Options = create_model("Options", __base__=Part, **{
 
 
 class Protocol(Part):
-    """What is the same for all cells."""
-
     iterations: Positive = 30_000
     batch: Positive = None  # views a step; this and gpus stand only where they are given, as in earlier rows
     gpus: Positive = None  # of each cell

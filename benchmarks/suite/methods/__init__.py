@@ -1,7 +1,4 @@
-"""Ways to train and render a cell: the native trainer, and public trainers' checkouts by the shape of their commands.
-
-A method is a function of a cell and a folder that returns an `Outcome`.
-"""
+"""Ways to train and render a cell: the native trainer, and public trainers' checkouts."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -19,8 +16,6 @@ from ..protocol import BYTES_PER_GAUSSIAN
 
 @dataclass
 class Outcome:
-    """What a method leaves of a cell."""
-
     scene: Scene
     evaluation: Evaluation
     lpips: List[Dict[str, Any]]  # a row {value, kind, reason} for each kind asked for
@@ -36,7 +31,6 @@ class Outcome:
 
     @property
     def common_bytes(self) -> Optional[int]:
-        """Size in the common container."""
         return self.num_gaussians * BYTES_PER_GAUSSIAN if self.are_gaussians else None
 
 

@@ -69,7 +69,7 @@ def synchronise():
 
 
 def shift_seeds(seed):
-    """Every seed that the script sets becomes the seed plus this one: the trainers fix theirs to 0."""
+    """Adds this one to every seed that the script sets: the trainers fix theirs to 0."""
     import numpy
     import torch
 
@@ -115,8 +115,7 @@ def watch_loop(iterations, views):
     return found
 
 
-def timed(function, arguments, keywords):
-    """(result, seconds)"""
+def timed(function, *arguments, **keywords):
     synchronise()
     began = time.perf_counter()
     result = function(*arguments, **keywords)
@@ -159,7 +158,7 @@ def watch_scenes(hold_out):
 
 
 def renderings_of(scene, attribute, folder):
-    """The record's entries of the test views, rendered by the scene's model itself: model.render(view)["render"]."""
+    """The record's entries of the test views, rendered by the scene's model itself."""
     import torch
 
     model, views, found = getattr(scene, attribute), scene.getTestCameras(), {}
@@ -167,7 +166,7 @@ def renderings_of(scene, attribute, folder):
         for view in views[:WARM_UPS]:
             model.render(view)
         for number, view in enumerate(views):
-            result, seconds = timed(model.render, (view,), {})
+            result, seconds = timed(model.render, view)
             found[view.image_name] = keep(folder, number, view, result["render"], seconds)
     found["num_gaussians"] = len(model.get_xyz)
     return found
@@ -187,7 +186,7 @@ def watch_renderings(folder):
         for _ in range(0 if pending["warm"] else WARM_UPS):
             render(view, model, *arguments, **keywords)
         pending["warm"] = True
-        result, seconds = timed(render, (view, model) + arguments, keywords)
+        result, seconds = timed(render, view, model, *arguments, **keywords)
         number = numbers.setdefault(view.image_name, len(numbers))
         found[view.image_name] = keep(folder, number, view, result["render"], seconds + pending["seconds"])
         pending["seconds"] = 0.0
@@ -203,7 +202,7 @@ def watch_renderings(folder):
                 return prefilter(*arguments, **keywords)
             if not pending["warm"]:
                 prefilter(*arguments, **keywords)
-            result, pending["seconds"] = timed(prefilter, arguments, keywords)
+            result, pending["seconds"] = timed(prefilter, *arguments, **keywords)
             return result
 
         gaussian_renderer.prefilter_voxel = prefiltered
@@ -239,9 +238,8 @@ class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         self.name = name
 
     def find_spec(self, fullname, path=None, target=None):
-        if fullname.partition(".")[0] == self.name:
-            return importlib.machinery.ModuleSpec(fullname, self, is_package=True)
-        return None
+        ours = fullname.partition(".")[0] == self.name
+        return importlib.machinery.ModuleSpec(fullname, self, is_package=True) if ours else None
 
     def create_module(self, spec):
         return Absent(spec.name)

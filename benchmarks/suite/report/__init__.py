@@ -6,7 +6,6 @@ collects images; page.html and .css are the page. paper.json holds the paper's p
 from __future__ import annotations
 
 import base64
-import json
 import os
 import shutil
 import tempfile
@@ -18,12 +17,12 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from ....trainer.system.output_folder import Record, make_folder, own_record, write_record
-from ..names import CELLS_FOLDER, SUITE_NAME
-from ..rows import ReportError, Row, of_one_protocol, read_rows
+from ..names import CELLS_FOLDER, SUITE_NAME, read_json
+from ..rows import ReportError, Row, at_once, of_one_protocol, read_rows
 from .curves import Picture, draw_all
-from .groups import at_once, grouped, is_alone, safe_name, some
+from .groups import grouped, is_alone, safe_name, some
 from .images import ERROR_COLORS, ERROR_FULL_SCALE, collect
-from .layouts import commits, end_of, read_paper, tables_of
+from .layouts import commits, end_of, tables_of
 from .tables import Table, to_csv, to_latex, to_markdown
 
 __all__ = ["ReportError", "report"]
@@ -49,11 +48,10 @@ class Section(NamedTuple):
 
 
 def report(results: str, output: str) -> str:
-    """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT.
+    """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT; returns the page's path.
 
-    OUTPUT/index.html, report.md, tables/, figures/, images/; an earlier report there is replaced once the new one is
-    made. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged or where rows
-    cannot be compared, TrainerError where nothing can be written in OUTPUT or where there is something else.
+    An earlier report there is replaced once the new one is made. Raises ReportError where there are no rows, where a
+    row is damaged or where rows cannot be compared, TrainerError where OUTPUT cannot be written or has something else.
     """
     rows = read_rows(results)
     make_folder(output)
@@ -71,10 +69,9 @@ def report(results: str, output: str) -> str:
 
 def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Section:
     """Writes what a report has of one suite, but for its part of the page."""
-    paper = read_paper()
     absent = _absent(results, suite, rows)
     rows, left_out = of_one_protocol(rows)
-    tables = tables_of(suite, rows, paper)
+    tables = tables_of(suite, rows)
     for table in tables:
         for form, text in (("md", to_markdown(table)), ("csv", to_csv(table)), ("tex", to_latex(table))):
             _write(output, os.path.join("tables", f"{table.name}.{form}"), text)
@@ -88,15 +85,11 @@ def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Sect
 
 def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
     """The static page: figures inside it and images beside it; it needs no network."""
-    def data_url(path: str) -> str:
-        with open(path, "rb") as file:
-            return "data:image/svg+xml;base64," + base64.b64encode(file.read()).decode("ascii")
-
-    folder = os.path.dirname(os.path.abspath(__file__))
-    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True, trim_blocks=True,
-                                     lstrip_blocks=True, keep_trailing_newline=True,
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
+                                     trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                                      undefined=jinja2.StrictUndefined)
-    environment.filters["data_url"] = data_url
+    environment.filters["data_url"] = lambda path: (
+        "data:image/svg+xml;base64," + base64.b64encode(Path(path).read_bytes()).decode("ascii"))
     scale = ", ".join(to_hex(colormaps[ERROR_COLORS](step / 8)) for step in range(9))
     return environment.get_template("page.html").render(
         generator=COMMAND, sections=sections, commits=measured_with, error_scale=scale,
@@ -104,7 +97,6 @@ def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
 
 
 def _markdown(sections: Sequence[Section]) -> str:
-    """All tables and figures as one page for code hosts."""
     parts = ["# Benchmark report\n"]
     for section in sections:
         parts.append(f"## {section.suite}\n\n{section.counts}.\n")
@@ -114,16 +106,14 @@ def _markdown(sections: Sequence[Section]) -> str:
 
 
 def _write(folder: str, name: str, text: str) -> None:
-    path = os.path.join(folder, name)
-    os.makedirs(os.path.dirname(path), exist_ok=True)
-    with open(path, "w", encoding="utf-8") as file:
-        file.write(text)
+    path = Path(folder, name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 def _counts(rows: Sequence[Row]) -> str:
-    failed = sum(not row["ok"] for row in rows)
     numbers = [_number(len({row[of] for row in rows}), of) for of in ("cell", "scene", "seed")]
-    return "{} on {}, {}; {} failed".format(*numbers, failed or "none")
+    return "{} on {}, {}; {} failed".format(*numbers, sum(not row["ok"] for row in rows) or "none")
 
 
 def _number(count: int, of: str) -> str:
@@ -133,16 +123,15 @@ def _number(count: int, of: str) -> str:
 def _absent(results: str, suite: str, rows: Sequence[Row]) -> str:
     """Which cells of the suite have no row yet, where RESULTS is a folder that lists its cells."""
     try:
-        with open(os.path.join(results, SUITE_NAME), encoding="utf-8") as file:
-            said = json.load(file)
+        said = read_json(Path(results, SUITE_NAME))
         cells = said["cells"] if said["name"] == suite else []
         absent = sorted(set(cells) - {row["cell"] for row in rows})
     except (OSError, ValueError, KeyError, TypeError):
         return ""
     if not absent:
         return ""
-    return f"; {len(absent)} of {_number(len(cells), 'cell')} {'has' if len(absent) == 1 else 'have'} no row yet: " \
-           f"{some(absent, MOST_ABSENT)}"
+    has = "has" if len(absent) == 1 else "have"
+    return f"; {len(absent)} of {_number(len(cells), 'cell')} {has} no row yet: {some(absent, MOST_ABSENT)}"
 
 
 def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
@@ -150,17 +139,18 @@ def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
     measured = [row for row in rows if row["ok"]]
     found = []
     for scene in sorted({row["scene"] for row in measured}):
-        here, rules = [row for row in measured if row["scene"] == scene], {}
+        here = [row for row in measured if row["scene"] == scene]
+        rules: Dict[str, Dict[str, None]] = {}  # of each the values, as a set in order
         for row in here:
             said = {name: value for name, value in (row.get("protocol") or {}).items() if name not in NOT_PROTOCOL}
             said.update(iterations=row.get("iterations"), schedules=row.get("schedule") or "the method's own")
             for name, value in said.items():
-                values = rules.setdefault(name.replace("_", " "), [])
-                if value is not None and _plain(name, value) not in values:
-                    values.append(_plain(name, value))
+                values = rules.setdefault(name.replace("_", " "), {})
+                values.update({} if value is None else {_plain(name, value): None})
         beside = [at_once(row) for row in here if not is_alone(row)]
         if beside:
-            rules["cells that shared their GPU or CPU"] = [f"{len(beside)} of {len(here)}, up to {max(beside)} at once"]
+            words = f"{len(beside)} of {len(here)}, up to {max(beside)} at once"
+            rules["cells that shared their GPU or CPU"] = {words: None}
         found.append({"scene": scene, "rules": {name: "; ".join(values) for name, values in sorted(rules.items())}})
     return found
 

@@ -9,7 +9,7 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Sequenc
 from ....settings import BLEND_MODES
 from ....trainer.config import LEARNED
 from ..names import blend_of
-from ..rows import ReportError, Row
+from ..rows import ReportError, Row, at_once
 
 PAPER_ITERATIONS, PAPER_SCHEDULE = 30000, "3dgs"
 MILLION = 1e6
@@ -45,18 +45,12 @@ class Setting(NamedTuple):
 
     @property
     def mode(self) -> str:
-        """The blend mode, whatever the gate."""
         return self.blend.partition(" ")[0]
 
-    @property
-    def source(self) -> str:
-        """The method's label, which says where a checkout is unpatched or fused."""
-        told = self.variant in (None, "native", "patched") or self.variant in self.name
-        return self.name if told else f"{self.name}-{self.variant}"
-
     def label(self, blend: bool = True) -> str:
-        """Such as "native, smoe, steady"."""
-        words = [self.source] + [self.blend] * blend
+        """Such as "native, smoe, steady"; it says where a checkout is unpatched or fused."""
+        told = self.variant in (None, "native", "patched") or self.variant in self.name
+        words = [self.name if told else f"{self.name}-{self.variant}"] + [self.blend] * blend
         words += [self.schedule] if self.schedule not in (None, PAPER_SCHEDULE) else []
         words += ["fixed number"] if self.budget is not None else []
         words += [f"{self.iterations:,} iterations"] if self.iterations not in (None, PAPER_ITERATIONS) else []
@@ -85,11 +79,8 @@ class Cell(NamedTuple):
     printed: str = ""
 
     def shown(self, digits: int, signed: bool = False, plus_minus: str = " ± ") -> str:
-        """As tables show it."""
-        if self.printed:
-            return self.printed
-        if self.value is None:
-            return self.text or DASH
+        if self.printed or self.value is None:
+            return self.printed or self.text or DASH
         value = round(self.value, digits) + 0.0  # no "-0.00"
         spread = "" if self.spread is None else f"{plus_minus}{self.spread:,.{digits}f}"
         return f"{value:{'+' if signed and value else ''},.{digits}f}{spread}"
@@ -105,21 +96,25 @@ class Group:
     """The cells of one setting on one scene: one row for each seed."""
 
     def __init__(self, setting: Setting, scene: str, rows: Iterable[Row]):
-        self.setting, self.scene = setting, scene
-        self.rows, self.failed = [], []
-        for row in rows:
-            (self.rows if row["ok"] else self.failed).append(row)
+        all_rows = list(rows)
+        self.setting, self.scene, self.said = setting, scene, all_rows[0]
+        self.rows, self.failed = ([row for row in all_rows if row["ok"] is ok] for ok in (True, False))
         self.by_seed = {row["seed"]: row for row in self.rows}
         self.figures = {seed: figures_of(row) for seed, row in self.by_seed.items()}
 
     def dataset(self, datasets: Dict[str, Sequence[str]]) -> Optional[str]:
         """The data set that the scene is of: as its rows say, else the one that has a scene of this name."""
         named = next((dataset for dataset, scenes in datasets.items() if self.scene in scenes), None)
-        return (self.rows + self.failed)[0].get("dataset", named)
+        return self.said.get("dataset", named)
 
     def measured(self, name: str) -> Cell:
         """The figure's mean and spread over seeds."""
         return over([self], name, lambda figures: figures[0])
+
+    def measured_or_failed(self, names: Sequence[str]) -> List[Cell]:
+        """Those of several figures; where no seed has any, PSNR's place says so."""
+        failed = bool(self.failed and not self.rows)
+        return [Cell(text="failed") if failed and name == "psnr" else self.measured(name) for name in names]
 
     def seeds(self) -> str:
         """How many seeds the figures are of, such as "3", or "2 of 3" where one failed."""
@@ -142,14 +137,7 @@ def figures_of(row: Row) -> Dict[str, float]:
     return {name: value for name, value in found.items() if value is not None and (name not in TIMES or is_alone(row))}
 
 
-def at_once(row: Row) -> int:
-    """How many cells may have been at work at once on the row's GPU or CPU."""
-    machine = row.get("machine") or {}
-    return max(machine.get("cells_per_gpu") or 1, machine.get("cells_at_once") or 1)
-
-
 def is_alone(row: Row) -> bool:
-    """Whether no other cell may have been at work on the row's GPU or CPU."""
     return at_once(row) == 1
 
 
@@ -165,7 +153,6 @@ def lpips_figures(groups: Iterable[Group]) -> List[str]:
 
 
 def lpips_reasons(rows: Iterable[Row]) -> List[str]:
-    """Which kinds of LPIPS are missing, and why."""
     return sorted({f"{lpips['kind']}: {lpips['reason']}" for row in rows for lpips in _lpips(row)
                    if lpips.get("value") is None and lpips.get("reason")})
 
@@ -218,13 +205,11 @@ def over(groups: Sequence[Group], name: str, combine: Callable[[List[float]], fl
 
 
 def difference(figures: Sequence[float]) -> float:
-    """By how much the second is larger; NaN where one is infinite."""
     first, second = figures
     return second - first if math.isfinite(first) and math.isfinite(second) else math.nan
 
 
 def ratio(figures: Sequence[float]) -> float:
-    """The second over the first; NaN where that is 0."""
     first, second = figures
     return second / first if first else math.nan
 

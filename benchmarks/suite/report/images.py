@@ -21,8 +21,8 @@ ERROR_COLORS = "inferno"
 def collect(results: str, suite: str, rows: Sequence[Row], output: str) -> List[Dict[str, Any]]:
     """Writes OUTPUT/images of a suite's cells, and the errors of renderings.
 
-    Of several seeds that is shown which the most blends have images of. Returns for every scene and setting, with paths
-    relative to OUTPUT: {"title", "views": [{"name", "images": [{"label", "path"}]}]}. Raises ReportError.
+    Returns for every scene and setting, with paths relative to OUTPUT:
+    {"title", "views": [{"name", "images": [{"label", "path"}]}]}. Raises ReportError.
     """
     compared: Dict[Any, List[Group]] = {}
     for group in grouped(rows, end_of):
@@ -37,7 +37,7 @@ def collect(results: str, suite: str, rows: Sequence[Row], output: str) -> List[
 
 
 def _folders(results: str, groups: Sequence[Group]) -> Dict[str, str]:
-    """The images folder of each blend that has one, of one seed."""
+    """The images folder of each blend that has one, of the seed which the most blends have images of."""
     folders: Dict[int, Dict[str, str]] = {}
     for group in groups:
         for row in group.rows:
@@ -58,7 +58,6 @@ def _views(folders: Dict[str, str], output: str, folder: str) -> List[Dict[str, 
 
 
 def _images(folders: Dict[str, str], name: str, output: str, prefix: str) -> List[Dict[str, str]]:
-    """Writes the images of one view."""
     truths = {blend: _pixels(os.path.join(path, "gt", name)) for blend, path in folders.items()}
     truth = next(iter(truths.values()))
     found = {"ground truth": truth}

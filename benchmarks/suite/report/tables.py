@@ -8,7 +8,7 @@ from typing import Dict, List, NamedTuple, Tuple
 
 from .groups import LPIPS, Cell
 
-OURS, PAPER = "ours", "paper"
+OURS, PAPER = "ours", "paper"  # whose figures a row has
 # How a figure is headed and with how many digits it is printed.
 FIGURES: Dict[str, Tuple[str, int]] = {
     "seeds": ("seeds", 0), "psnr": ("PSNR [dB]", 2), "psnr_float": ("PSNR, floats [dB]", 2),
@@ -35,22 +35,27 @@ class Column(NamedTuple):
 
 
 class TableRow(NamedTuple):
-    """Labels, then one cell for each column; source: OURS, or PAPER for figures that are the paper's."""
+    """Labels, then one cell for each column."""
 
     labels: Tuple[str, ...]
-    cells: Tuple[Cell, ...]
+    cells: List[Cell]
     source: str = OURS
 
 
 class Table(NamedTuple):
-    """labels: the headings of the first columns."""
-
     name: str  # of its files
     title: str
-    labels: Tuple[str, ...]
-    columns: Tuple[Column, ...]
-    rows: Tuple[TableRow, ...]
-    notes: Tuple[str, ...] = ()
+    labels: Tuple[str, ...]  # the headings of the first columns
+    columns: List[Column]
+    rows: List[TableRow]
+    notes: List[str]
+
+    def without_empty_columns(self) -> Table:
+        """The table without the columns that no row has anything in."""
+        kept = [any(cell.value is not None or cell.text for cell in column)
+                for column in zip(*(row.cells for row in self.rows))]
+        return self._replace(columns=list(itertools.compress(self.columns, kept)),
+                             rows=[row._replace(cells=list(itertools.compress(row.cells, kept))) for row in self.rows])
 
     def headings(self) -> List[Tuple[str, int]]:
         """The groups of columns, each with its number of columns."""
@@ -58,7 +63,6 @@ class Table(NamedTuple):
         return [(group, len(list(columns))) for group, columns in groups]
 
     def shown(self, row: TableRow, plus_minus: str = " ± ") -> List[str]:
-        """The figures of a row as they are shown."""
         return [cell.shown(column.digits, column.signed, plus_minus) for cell, column in zip(row.cells, self.columns)]
 
     def lines(self, plus_minus: str = " ± ") -> List[List[str]]:
@@ -75,15 +79,6 @@ def column(name: str, group: str = "", difference: bool = False) -> Column:
 def printed(text: str) -> Cell:
     """One of the paper's figures, as printed there."""
     return Cell(float(text), printed="0" + text if text.startswith(".") else text)
-
-
-def without_empty_columns(table: Table) -> Table:
-    """The table without the columns that no row has anything in."""
-    kept = [any(row.cells[index].value is not None or row.cells[index].text for row in table.rows)
-            for index in range(len(table.columns))]
-    return table._replace(columns=tuple(itertools.compress(table.columns, kept)),
-                          rows=tuple(row._replace(cells=tuple(itertools.compress(row.cells, kept)))
-                                     for row in table.rows))
 
 
 def to_markdown(table: Table) -> str:
@@ -127,13 +122,13 @@ def _escaped(text: str) -> str:
 
 def to_csv(table: Table) -> str:
     """Figures unrounded, ours with a column of their spread wherever a row has one."""
-    spread = [any(row.cells[index].spread is not None for row in table.rows) for index in range(len(table.columns))]
-    names = [[name.full_name, f"{name.full_name} sd"][:1 + wide] for name, wide in zip(table.columns, spread)]
+    spread = [any(cell.spread is not None for cell in column) for column in zip(*(row.cells for row in table.rows))]
+    lines = [["source", *table.labels], *([row.source, *row.labels] for row in table.rows)]
+    figures = [[(name.full_name, f"{name.full_name} sd") for name in table.columns],
+               *([(cell.unrounded(), "" if cell.spread is None else repr(cell.spread)) for cell in row.cells]
+                 for row in table.rows)]
+    for line, pairs in zip(lines, figures):
+        line += [text for pair, wide in zip(pairs, spread) for text in pair[:1 + wide]]
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["source", *table.labels, *itertools.chain(*names)])
-    for row in table.rows:
-        figures = [[cell.unrounded(), "" if cell.spread is None else repr(cell.spread)][:1 + wide]
-                   for cell, wide in zip(row.cells, spread)]
-        writer.writerow([row.source, *row.labels, *itertools.chain(*figures)])
+    csv.writer(text, lineterminator="\n").writerows(lines)
     return text.getvalue()

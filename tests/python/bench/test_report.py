@@ -15,7 +15,7 @@ from diff_smoe_rasterization.benchmarks.suite.report import ReportError, layouts
 
 def table_of(entries, name, suite="table1"):
     """The table NAME of rows; None where the suite has none."""
-    made = layouts.tables_of(suite, entries, layouts.read_paper())
+    made = layouts.tables_of(suite, entries)
     return next((table for table in made if table.name == f"{suite}_{name}"), None)
 
 
