@@ -42,7 +42,7 @@ def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
     return {"cell": cell["id"], "suite": cell["suite"], "method": method["name"], "label": method["label"],
             "variant": method["variant"], "scene": scene["name"], "dataset": scene["dataset"],
             **{axis: cell[axis] for axis in AXES}, "iterations": cell["protocol"]["iterations"],
-            "end": method.get("end"), "budget": method.get("budget")}
+            "end": method.get("end"), "budget": cell.get("budget", method.get("budget"))}
 
 
 def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float]) -> Dict[str, Any]:
@@ -227,7 +227,7 @@ def main(argv: Optional[List[str]] = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
-    psnr = "-" if row["psnr"] is None else f"{row['psnr']:.2f}"
+    psnr = "-" if row.get("psnr") is None else f"{row['psnr']:.2f}"
     tell(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {psnr} dB" if row["ok"] else
                                f"failed: {row['reason']}"))
     return 0

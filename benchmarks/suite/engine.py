@@ -20,7 +20,7 @@ from ..errors import BenchError
 from . import require
 from .cell import die_with_parent, identity
 from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite
-from .names import CELL_NAME, CELLS_FOLDER, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
+from .names import CELL_NAME, CELLS_FOLDER, NATIVE, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
 from .preparation import made_scene, prepared_method, what_is_missing
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .rows import CellFile, CellRow, Row, at_once, cell_folders, read_object
@@ -261,7 +261,9 @@ def _line(row: Row) -> str:
         return "-" if row.get(field) is None else format(row[field], form)
 
     name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("schedule") or "own schedule",
-                      shown("densify_grad_threshold", "g"), f"s{row['seed']}"])
+                      shown("densify_grad_threshold", "g"),
+                      *([f"n{row['budget']}"] if row["method"] == NATIVE and row.get("budget") else []),
+                      f"s{row['seed']}"])
     if not row["ok"]:
         return f"{name}:  FAILED: {row.get('reason')}"
     return (f"{name}:  {shown('psnr', '.2f')} dB  SSIM {shown('ssim', '.4f')}  {shown('num_gaussians', ',')} Gaussians"

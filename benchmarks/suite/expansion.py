@@ -21,7 +21,7 @@ from ...trainer.config import BATCHED, LEARNED
 from ...trainer.errors import ConfigError
 from ..errors import BenchError
 from . import schema
-from .names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, RECIPE, WITHOUT_SCHEDULE, blend_of
+from .names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, OF_NATIVE_ALONE, RECIPE, WITHOUT_SCHEDULE, blend_of
 from .protocol import config_of
 
 SHIPPED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "shipped")
@@ -223,7 +223,7 @@ def _can_follow(protocol: Dict[str, Any], name: str, where: str) -> None:
            f"protocol: {name} ({where}) raises the SH degree every 1000 steps, whatever the recipe: scale_recipe and "
            "options.sh_degree_interval are for the native trainer alone")
     for option, value in protocol["options"].items():
-        refuse(option in LACKS[name] and value is not False,
+        refuse(option in (*LACKS[name], *OF_NATIVE_ALONE) and value is not False,
                f"protocol.options.{option}: {name} ({where}) has no such option, or means something else by it: its "
                "recipe could not be the protocol's")
 
@@ -239,6 +239,7 @@ def _can_train(scene: Dict[str, Any], method: Dict[str, Any], axes: Dict[str, Li
            f"{what}: init_points is {scene['init_points']}, but checkouts start from all points")
     refuse(LEARNED in axes["background_gates"] and method["variant"] != "unpatched",
            f"{what}: background_gates: {LEARNED!r} is for the native trainer alone; it must be a number")
+    refuse(axes["budgets"] != [0], f"{what}: budgets: are for the native trainer alone; leave them out")
     refuse(name in COUNTED_BY and len(thresholds) > 1,
            f"{what}: {name} has no threshold ({COUNTED_BY.get(name)} stands for it): {len(thresholds)} of them would "
            "be the same training over again; give the method densify_grad_thresholds of one value, which names its "
@@ -267,15 +268,17 @@ def _cells(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, A
              for name, part in (("method", method), ("scene", scene))}
 
     def cell(values: Dict[str, Any]) -> Dict[str, Any]:
+        if not values["budget"]:  # cells without one are named as they were before there were budgets
+            values = {name: value for name, value in values.items() if name != "budget"}
         made = {"suite": content["name"], **plain, **values, "protocol": protocol, "images": content["images"],
                 "keep_models": content["keep_models"], "headline": wanted is not None and all(
-                    values[AXIS_OF[axis]] in (*chosen, None) for axis, chosen in wanted.items())}
+                    values.get(AXIS_OF[axis], 0) in (*chosen, None) for axis, chosen in wanted.items())}
         return {"id": cell_id(made), **made}
 
     first, *_ = seeds = axes["seeds"]
     combined = dict.fromkeys(itertools.starmap(_gated, itertools.product(*axes.values())))
     made = [cell(dict(zip(AXIS_OF.values(), chosen))) for chosen in combined]
-    return made + [cell({**{name: one[name] for name in AXIS_OF.values()}, "seed": seed})
+    return made + [cell({**{name: one.get(name, 0) for name in AXIS_OF.values()}, "seed": seed})
                    for one in made if one["headline"] and one["seed"] == first
                    for seed in content["headline_seeds"] if seed not in seeds]
 
@@ -289,14 +292,15 @@ def _gated(blend_mode: str, gate: Any, *rest: Any) -> Tuple[Any, ...]:
 def cell_id(cell: Dict[str, Any]) -> str:
     """A readable name, and a checksum of everything that decides the figures: another protocol is another cell."""
     blend = blend_of(cell)
-    identity = {**{key: cell[key] for key in ("densify_grad_threshold", "schedule", "seed", "protocol")},
-                "blend_mode": blend}
+    named = ("densify_grad_threshold", "schedule", "budget", "seed", "protocol")
+    identity = {**{key: cell[key] for key in named if key in cell}, "blend_mode": blend}
     for key in ("method", "scene"):
         identity[key] = {name: value for name, value in cell[key].items() if name not in NOT_IN_THE_IDENTITY}
     checksum = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:6]
     threshold = re.sub(r"\.?0+$", "", f"{cell['densify_grad_threshold']:.7f}")
     return "_".join([cell["method"]["label"], cell["scene"]["name"], blend.replace(" ", "-"),
-                     cell["schedule"] or "own", threshold, f"s{cell['seed']}", checksum])
+                     cell["schedule"] or "own", threshold, *([f"n{cell['budget']}"] if "budget" in cell else []),
+                     f"s{cell['seed']}", checksum])
 
 
 def _paths(given: Dict[str, Any], fields: Sequence[str], where: str, folder: str) -> Dict[str, Any]:

@@ -17,6 +17,7 @@ CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True
 WITHOUT_SCHEDULE = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
 COUNTED_BY = {"taming": "--budget", "dbs": "--cap_max"}  # they are given a number of primitives, and have no threshold
 NEEDS = {"dbs": "--cap_max"}  # an argument without which a method has no size
+OF_NATIVE_ALONE = ("strategy_options",)
 # Options of the recipe that a trainer has no flag for, or whose flag does nothing or means something else in it.
 OF_3DGS_ALONE = ("antialiasing", "feature_lr", "percent_dense", "opacity_reset_interval")
 LACKS = {"3dgs-2023": ("antialiasing",), "3dgs-2024": (), "c3dgs": ("antialiasing",), "2dgs": ("antialiasing",),
@@ -36,7 +37,8 @@ SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its ce
 # Options of the native trainer that a suite may set: those of the recipe. The others have a field of their own.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
           "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
-          "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval")
+          "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval",
+          "strategy_options")
 
 # LPIPS's weights, .npz: conv1.weight [outputs, inputs, h, w], conv1.bias, ..., lin0.weight, ..., lin4.weight.
 VARIABLES = {"vgg": "DSMOE_LPIPS_VGG", "alex": "DSMOE_LPIPS_ALEX"}

@@ -49,7 +49,7 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
         iterations=protocol["iterations"], batch=protocol.get("batch", 1),
         resolution=scene["resolution"], images=scene["images"], principal_point=protocol["principal_point"],
         white_background=scene["background"] == "white", init_points=scene["init_points"],
-        schedule=cell["schedule"] or "3dgs", seed=cell["seed"], device=protocol["device"],
+        schedule=cell["schedule"] or "3dgs", budget=cell.get("budget", 0), seed=cell["seed"], device=protocol["device"],
         densify_grad_threshold=cell["densify_grad_threshold"], eval_every=protocol["evaluate_every"],
         checkpoint_every=protocol["checkpoint_every"])
     if protocol["scale_recipe"]:
@@ -61,7 +61,8 @@ def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Di
     """The protocol of a row: that of the trainer's `result_row`, and the harness's. A checkout's notes win over it."""
     rules = {**RULES, "lpips": {row["kind"]: RULES["lpips"][row["kind"]] for row in lpips}}
     return {**measured, **rules, "images": config.images, "downscaler": downscaler(config, measured["downscaler"]),
-            "sh_degree": config.sh_degree, "recipe": {name: getattr(config, name) for name in RECIPE},
+            "sh_degree": config.sh_degree,
+            "recipe": {name: getattr(config, name) for name in RECIPE if getattr(config, name) != ""},
             "eval": "every test view of the split, none left out"}
 
 

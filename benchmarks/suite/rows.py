@@ -154,10 +154,14 @@ def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
 
 
 def _rules(row: Row) -> Dict[str, Any]:
-    """The rules that the row states, by name; the entries of one that is a dict stand alone."""
+    """The rules that the row states, by name; the entries of one that is a dict stand alone.
+
+    `gate` brings learning rates of its own: its recipes are compared with each other.
+    """
     found: Dict[str, Any] = {}
     for name, value in (row.get("protocol") or {}).items():
         if name in RULES or name.startswith(RULE_PREFIXES):
+            name = "recipe of gate" if (name, row.get("schedule")) == ("recipe", "gate") else name
             found.update({f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict)
                          else {name: value})
     return {name: value for name, value in found.items() if value is not None}

@@ -42,6 +42,7 @@ Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_+-]*$", max_length=6
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Budget = Annotated[int, must(lambda value: value == 0 or value >= 4, "it must be 0, which is none, or at least 4")]
 Threshold = Annotated[float, Field(gt=0, le=1e6)]  # its digits become a part of file names
 Gate = Annotated[Any, must(lambda value: value == LEARNED or (type(value) in (int, float) and 0 <= value < math.inf),
                            f"it must be a number of at least 0, or {LEARNED!r}")]
@@ -71,11 +72,12 @@ class Axes(Part):
     background_gates: some(Gate) = [0]
     densify_grad_thresholds: some(Threshold) = list(THRESHOLDS)
     schedules: some(one_of(SCHEDULES)) = ["3dgs"]
+    budgets: some(Budget) = [0]
     seeds: some(Seed) = [0]
 
 
 Options = create_model("Options", __base__=Part, **{
-    option.name: ({"int": int, "float": float, "bool": bool}[str(option.type)], None)
+    option.name: ({"int": int, "float": float, "bool": bool, "str": str}[str(option.type)], None)
     for option in fields(TrainConfig) if option.name in RECIPE})
 
 

@@ -42,7 +42,8 @@ def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, A
 
 
 def _said(cell: Dict[str, Any], field: str) -> Any:
-    return {"method": cell["method"]["label"], "scene": cell["scene"]["name"]}.get(field, cell.get(field))
+    return {"method": cell["method"]["label"], "scene": cell["scene"]["name"],
+            "budget": cell.get("budget", 0)}.get(field, cell.get(field))
 
 
 def _same(value: Any, text: str) -> bool:

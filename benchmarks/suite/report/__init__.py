@@ -31,7 +31,7 @@ PAGE_NAME = "index.html"
 COMMAND = "dsmoe bench report"
 MOST_ABSENT = 3  # cells without a row that are named
 NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
-                "continued", "arguments", "background_gate")  # of one cell, or said otherwise
+                "continued", "arguments", "background_gate", "budget")  # of one cell, or said otherwise
 
 
 class Section(NamedTuple):

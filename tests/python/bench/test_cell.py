@@ -145,3 +145,12 @@ def test_a_row_says_that_its_cell_shared_its_processor(worked):
     assert alone["machine"] == shared["machine"] and alone["protocol"] == shared["protocol"]
     again = worked("two", 1, keep_models=True)
     assert again["protocol"]["continued"] and again["machine"]["cells_at_once"] == 3
+
+
+def test_a_cell_of_a_budget_ends_with_it(worked, content):
+    """By the strategy `gate`, whose options the recipe of the row has."""
+    options = {**content["protocol"]["options"], "strategy_options": "overshoot=2"}
+    row = worked("out", schedules=["gate"], budgets=[40], protocol={**content["protocol"], "options": options})
+    assert row["ok"], row["reason"]
+    assert row["num_gaussians"] == row["budget"] == row["protocol"]["budget"] == 40
+    assert row["protocol"]["recipe"]["strategy_options"] == "overshoot=2" and "_gate_0.005_n40_s0_" in row["cell"]

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
+from diff_smoe_rasterization.benchmarks.suite import selection
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite, read_yaml
 from diff_smoe_rasterization.benchmarks.suite.protocol import config_of
 from diff_smoe_rasterization.benchmarks.suite.schema import THRESHOLDS
@@ -16,7 +17,7 @@ yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install py
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "captures", "captures_ablation",
-                 "captures_baselines", "gate", "gate_equal")
+                 "captures_baselines", "gate", "gate_equal", "budgets")
 
 
 def changed(content, **fields):
@@ -67,6 +68,16 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tmp_path):
     assert name(scenes=[{**scene, "path": str(tmp_path)}]) == name(scenes=[{**scene, "path": "$NOT_THERE"}]) == name()
 
 
+def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
+    cells = expand(changed(content, budgets=[0, 30, 40], headline={"budgets": [40]}, headline_seeds=[1]), "").cells
+    assert [(cell.get("budget"), cell["seed"]) for cell in cells if cell["blend_mode"] == "alpha"] == [
+        (None, 0), (30, 0), (40, 0), (40, 1)]
+    assert {cell["id"] for cell in cells if "budget" not in cell} == {cell["id"] for cell in expand(content, "").cells}
+    assert [config_of(cell).budget for cell in cells[:3]] == [0, 30, 40] and len({cell["id"] for cell in cells}) == 8
+    assert {cell["budget"] for cell in selection.chosen(cells, ["budget=40"])} == {40}
+    assert all("budget" not in cell for cell in selection.chosen(cells, ["budget=0"]))
+
+
 SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "blend_modes": ["smoe"]}
 
 
@@ -77,6 +88,9 @@ SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "bl
     ({"background_gates": ["leanred"]}, ["background_gates[0]", "leanred"]),
     ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
     ({"densify_grad_thresholds": [1e300]}, ["densify_grad_thresholds[0]", "less than or equal to 1000000"]),
+    ({"budgets": [3]}, ["budgets[0]", "0, which is none, or at least 4"]),
+    ({"schedules": ["gate"]}, ["--budget is 0", "--strategy gate"]),
+    ({"protocol": {"options": {"strategy_options": "overshoot=2"}}}, ["--strategy-options", "only gate has some"]),
     ({"seeds": 0}, ["seeds", "a valid list, such as [0]"]),
     ({"seeds": [1.0]}, ["seeds[0]", "1.0", "integer"]),
     ({"name": "../x"}, ["name"]),
@@ -153,6 +167,7 @@ def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
     ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "background": "white"}], "schedules": ["steady"]},
      "lego is white"),
     ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "init_points": 10}]}, "3dgs-2023: init_points is 10"),
+    ("3dgs-2023", {"budgets": [500]}, "budgets: are for the native trainer alone"),
     ("3dgs-2023", {"background_gates": ["learned"]}, "background_gates: 'learned' is for the native"),
     *((name, {"protocol": {"options": {option: value}}}, rf"protocol.options.{option}: {name} \(methods\[1\]\)")
       for name, option, value in (("3dgs-2023", "antialiasing", True), ("taming", "feature_lr", 0.01),
