@@ -52,8 +52,7 @@ def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float])
             "protocol": {}, "commit": {"project": None, "trainer": None}, "machine": {}, "history": [], "per_view": []}
 
 
-def measured_row(cell: Dict[str, Any], output: str, started: float,
-                 per_device: Optional[int] = None) -> Dict[str, Any]:
+def measured_row(cell: Dict[str, Any], output: str, started: float, per_device: Optional[int]) -> Dict[str, Any]:
     """Trains and measures; per_device is as in `supervise`."""
     from ...trainer.results.rows import result_row
     from ...trainer.system.environment import machine, versions
@@ -81,7 +80,7 @@ def measured_row(cell: Dict[str, Any], output: str, started: float,
 
 
 def note_sharing(output: str, per_device: Optional[int]) -> Optional[int]:
-    """Writes beside the checkpoint how many cells may have this one's device; returns the most of earlier attempts."""
+    """Writes beside the checkpoint how many cells may have the device; returns the most of earlier attempts."""
     path = Path(output, "run", SHARING_NAME)
     earlier = read_json(path) if path.is_file() else None
     if (per_device or 0) > (earlier or 0):
@@ -94,13 +93,13 @@ def write_images(output: str, outcome: Any) -> None:
     from ...trainer.inspection import to_image
     from ...trainer.results.pictures import file_names
 
-    views = {view.camera.name: view for view in outcome.scene.test}
-    files = dict(zip(views, file_names(list(views))))
-    for name, rendering in outcome.renders.items():
-        for kind, image in (("gt", views[name].image_float()), ("render", rendering)):
-            folder = os.path.join(output, "images", kind)
-            os.makedirs(folder, exist_ok=True)
-            to_image(image).save(os.path.join(folder, files[name] + ".png"))
+    names = [view.camera.name for view in outcome.scene.test]
+    for file, view in zip(file_names(names), outcome.scene.test):
+        if view.camera.name in outcome.renders:
+            for kind, image in (("gt", view.image_float()), ("render", outcome.renders[view.camera.name])):
+                folder = Path(output, "images", kind)
+                folder.mkdir(parents=True, exist_ok=True)
+                to_image(image).save(folder / f"{file}.png")
 
 
 def work(cell: Dict[str, Any], output: str, started: float, per_device: Optional[int] = None) -> None:
@@ -184,14 +183,6 @@ def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: floa
         time.sleep(poll_seconds)
 
 
-def tell(text: str) -> None:
-    """Prints a line where it can be printed: Snakemake would remove the row of a command that failed at this."""
-    try:
-        print(text, flush=True)
-    except (OSError, ValueError):  # whoever read the output has gone; or its encoding lacks a character
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where the rest goes when the process ends
-
-
 def main(argv: Optional[List[str]] = None) -> int:
     """Runs the command; 0 where there is a row, whatever it says."""
     parser = argparse.ArgumentParser(prog="python -I -m diff_smoe_rasterization.benchmarks.suite.cell",
@@ -228,8 +219,11 @@ def main(argv: Optional[List[str]] = None) -> int:
     except KeyboardInterrupt:
         return 130
     psnr = "-" if row.get("psnr") is None else f"{row['psnr']:.2f}"
-    tell(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {psnr} dB" if row["ok"] else
-                               f"failed: {row['reason']}"))
+    try:
+        print(f"{row['cell']}:", f"{row['num_gaussians']} Gaussians, PSNR {psnr} dB" if row["ok"] else
+              f"failed: {row['reason']}", flush=True)
+    except (OSError, ValueError):  # Snakemake would remove the row of a command that failed here
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0
 
 

@@ -19,7 +19,7 @@ from ...trainer.system.output_folder import make_folder, only_one
 from ..errors import BenchError
 from . import require
 from .cell import die_with_parent, identity
-from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite
+from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
 from .names import CELL_NAME, CELLS_FOLDER, NATIVE, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
 from .preparation import made_scene, prepared_method, what_is_missing
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
@@ -86,8 +86,8 @@ def check_folder(suite: Suite, results: str) -> None:
                 f"scene {cell['scene'].get('name')}: ": cell["scene"],
                 f"method {cell['method'].get('label')}: ": cell["method"]}
 
-    if os.path.exists(results) and not os.path.isdir(results):
-        raise BenchError(f"{results}: is a file; it must be a folder, or a name where there is nothing yet")
+    refuse(os.path.exists(results) and not os.path.isdir(results),
+           f"{results}: is a file; it must be a folder, or a name where there is nothing yet")
     here = {what: part for cell in suite.cells for what, part in parts(cell).items()}
     differ: List[str] = []
     for name in cell_folders(results):
@@ -98,17 +98,16 @@ def check_folder(suite: Suite, results: str) -> None:
                    for what, there in parts(cell).items() if what in here
                    for field in sorted({*there, *here[what]} - {*NOT_IN_THE_IDENTITY, "refused"})
                    if there.get(field) != here[what].get(field)]
-    if differ:
-        raise BenchError(f"{results}: holds rows of another suite or of another protocol, which are not put together: "
-                         f"{'; '.join(dict.fromkeys(differ))}. Choose another folder with -o")
+    refuse(differ, f"{results}: holds rows of another suite or of another protocol, which are not put together: "
+                   f"{'; '.join(dict.fromkeys(differ))}. Choose another folder with -o")
 
 
 def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
     """Runs Snakemake, which inherits the lock and shares it with its cells (cell.py, --hold); returns its status.
 
-    Where this process is interrupted or ends, however it ends, Snakemake is killed, since on a signal that it can catch
-    it waits for the cells that run here. Those of a queue it is to cancel (is_queued): it gets one SIGINT. A second one
-    would end it before it has, and so would a SIGHUP; in a session of its own it does not get the terminal's.
+    However this process ends, Snakemake is killed, since on a signal that it can catch it waits for the cells that run
+    here. Those of a queue it is to cancel (is_queued): it gets one SIGINT. A second one would end it before it has, and
+    so would a SIGHUP; in a session of its own it does not get the terminal's.
     """
     import fcntl
 
@@ -153,23 +152,22 @@ def read_row(results: str, name: str) -> Optional[Row]:
     """The row in a cell's folder; None where there is none. Raises BenchError where it is damaged or another cell's."""
     path = os.path.join(results, CELLS_FOLDER, name, ROW_NAME)
     row = read_object(path, CellRow)
-    if row is not None and row["cell"] != name:
-        raise BenchError(f"{path}: is the row of another cell, {row['cell']}; remove it to have it made anew")
+    other = name if row is None else row["cell"]
+    refuse(other != name, f"{path}: is the row of another cell, {other}; remove it to have it made anew")
     return row
 
 
 def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[str]], per_gpu: int) -> None:
     """Raises BenchError where --jobs, --slurm and --per-gpu are out of range or do not go together."""
     for option, number in (("--jobs", jobs), ("--per-gpu", per_gpu)):
-        if number is not None and number < 1:
-            raise BenchError(f"{option} is {number}; it must be at least 1")
+        refuse(number is not None and number < 1, f"{option} is {number}; it must be at least 1")
     for word in slurm or ():
-        if not all(word.partition("=")):
-            raise BenchError(f"--slurm {word}: must be KEY=VALUE, such as slurm_partition=gpu; the suite comes first")
-    if per_gpu > 1 and (suite.protocol["device"] != "cuda" or slurm is not None):
-        raise BenchError(f"--per-gpu is {per_gpu}; it is for protocol.device cuda, without --slurm")
-    if per_gpu > 1 and suite.protocol.get("gpus", 1) > 1:
-        raise BenchError(f"--per-gpu is {per_gpu}; it must be 1 with protocol.gpus {suite.protocol['gpus']}")
+        refuse(not all(word.partition("=")),
+               f"--slurm {word}: must be KEY=VALUE, such as slurm_partition=gpu; the suite comes first")
+    refuse(per_gpu > 1 and (suite.protocol["device"] != "cuda" or slurm is not None),
+           f"--per-gpu is {per_gpu}; it is for protocol.device cuda, without --slurm")
+    gpus = suite.protocol.get("gpus", 1)
+    refuse(per_gpu > 1 and gpus > 1, f"--per-gpu is {per_gpu}; it must be 1 with protocol.gpus {gpus}")
 
 
 def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optional[int],
@@ -178,15 +176,17 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
     require("snakemake")
     on_gpu, each = suite.protocol["device"] == "cuda", suite.protocol.get("gpus", 1)
     gpus = visible_gpus() if on_gpu and slurm is None else []
-    if on_gpu and slurm is None and not gpus:
-        raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine; for the "
-                         "CPU set protocol.device: cpu")
-    if gpus and each > len(gpus):
-        raise BenchError(f"protocol.gpus is {each}, and torch finds {len(gpus)} on this machine")
+    refuse(on_gpu and slurm is None and not gpus,
+           "protocol.device is cuda, and torch finds no CUDA device on this machine; for the CPU set protocol.device: "
+           "cpu")
+    refuse(gpus and each > len(gpus), f"protocol.gpus is {each}, and torch finds {len(gpus)} on this machine")
     together = min(jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus) // each)), len(cells))
     # Spread over the GPUs first: no more cells share one than must. In a queue nobody counts: 0.
     per_device = 0 if slurm is not None else min(per_gpu, -(-together // len(gpus))) if gpus else together
-    threads = threads_of_each(together) if slurm is None else threads_asked_for(slurm)
+    asked = dict(word.partition("=")[::2] for word in slurm or ()).get("cpus_per_task", "1")
+    refuse(not (asked.isascii() and asked.isdecimal() and int(asked)),
+           f"--slurm cpus_per_task={asked}: must be a number of at least 1")
+    threads = threads_of_each(together) if slurm is None else int(asked)
     said = {"cells": json.dumps([cell["id"] for cell in cells]), "python": sys.executable, "threads": threads,
             "gpus_each": each if on_gpu else 0, "per_device": per_device,
             "gpus": json.dumps(gpus)}  # a list: Snakemake takes a bare 0 for a number
@@ -195,8 +195,8 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
              "--rerun-triggers", "mtime", "--scheduler", "greedy",
              "--config", *(f"{name}={value}" for name, value in said.items())]
     if slurm is not None:
-        if importlib.util.find_spec("snakemake_executor_plugin_slurm") is None:
-            raise BenchError("--slurm needs Snakemake's plugin: pip install snakemake-executor-plugin-slurm")
+        refuse(importlib.util.find_spec("snakemake_executor_plugin_slurm") is None,
+               "--slurm needs Snakemake's plugin: pip install snakemake-executor-plugin-slurm")
         words += ["--executor", "slurm", "--jobs", str(together)]
         # Named resources bring Snakemake's own, 1000 MB among them; with 0 a cell has what the queue gives it.
         memory = [] if any(word.startswith("mem") for word in slurm) else ["mem_mb=0"]
@@ -214,14 +214,6 @@ def threads_of_each(at_once: int) -> int:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(torch.get_num_threads(), cores // at_once))
-
-
-def threads_asked_for(resources: Sequence[str]) -> int:
-    """Threads of a cell in Slurm's queue, by its resources."""
-    threads = dict(resource.partition("=")[::2] for resource in resources).get("cpus_per_task", "1")
-    if not (threads.isascii() and threads.isdecimal() and int(threads)):
-        raise BenchError(f"--slurm cpus_per_task={threads}: must be a number of at least 1")
-    return int(threads)
 
 
 def visible_gpus() -> List[str]:

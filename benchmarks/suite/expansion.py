@@ -25,6 +25,8 @@ from .names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, OF_NATIVE_ALONE,
 from .protocol import config_of
 
 SHIPPED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "shipped")
+Values = Dict[str, Any]
+Axes = Dict[str, List[Any]]
 AXIS_OF = {axis: axis[:-1] for axis in schema.Axes.model_fields}
 # Where things lie changes no figure.
 NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "base_commit", "unset")
@@ -32,13 +34,11 @@ NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "base_c
 
 @dataclass(frozen=True)
 class Suite:
-    """A checked suite."""
-
     name: str
-    protocol: Dict[str, Any]
-    scenes: List[Dict[str, Any]]
-    methods: List[Dict[str, Any]]
-    cells: List[Dict[str, Any]]
+    protocol: Values
+    scenes: List[Values]
+    methods: List[Values]
+    cells: List[Values]
 
 
 def find_suite(name: str) -> str:
@@ -63,7 +63,10 @@ def load_suite(path: str) -> Suite:
 
 def expand(content: Any, folder: str) -> Suite:
     """A suite from what its file says; relative paths are taken from `folder`. Raises BenchError."""
-    content = with_scenes_of_a_file(content, folder)
+    if isinstance(content, dict) and isinstance(content.get("scenes"), str):
+        path = os.path.join(folder, content["scenes"])
+        refuse(not os.path.isfile(path), f"scenes: {path}: no such file")
+        content = {**content, "scenes": read_yaml(path)}
     schema.check(content)
     content = {**schema.defaults(schema.Axes), **schema.defaults(schema.SuiteFile), **content}
     protocol = {**schema.defaults(schema.Protocol), **(content["protocol"] or {})}
@@ -75,8 +78,12 @@ def expand(content: Any, folder: str) -> Suite:
         names = [item[key] for item in items]
         for index, name in enumerate(names):
             refuse(name in names[:index], f"{field}[{index}].{key}: {name!r} is there already")
-    _one_downscaler(scenes)
-    cells: List[Dict[str, Any]] = []
+    supplied = [scene["name"] for scene in scenes if re.search(r"_\d+$", scene["images"])]
+    resized = [scene["name"] for scene in scenes if scene["resolution"] not in (-1, 1)]
+    refuse(supplied and resized,  # their figures differ by half a decibel
+           f"scenes: {''.join(supplied[-1:])} takes images as they were reduced by others, {''.join(resized[-1:])} is "
+           "reduced by the loader: two downscalers in one suite, whose figures do not compare")
+    cells: List[Values] = []
     for scene, method in itertools.product(scenes, methods):
         axes = {axis: {**content, **scene["axes"], **method["axes"]}[axis] for axis in AXIS_OF}
         if method["name"] != NATIVE:
@@ -94,15 +101,6 @@ def expand(content: Any, folder: str) -> Suite:
 def refuse(wrong: Any, words: str) -> None:
     if wrong:
         raise BenchError(words)
-
-
-def with_scenes_of_a_file(content: Any, folder: str) -> Any:
-    """The content with its list of scenes, where `scenes` names a file that has it. Raises BenchError."""
-    if not isinstance(content, dict) or not isinstance(content.get("scenes"), str):
-        return content
-    path = os.path.join(folder, content["scenes"])
-    refuse(not os.path.isfile(path), f"scenes: {path}: no such file")
-    return {**content, "scenes": read_yaml(path)}
 
 
 def read_yaml(path: str) -> Any:
@@ -128,7 +126,7 @@ def read_yaml(path: str) -> Any:
         raise BenchError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
 
 
-def _scene(scene: Dict[str, Any], where: str, protocol: Dict[str, Any], folder: str) -> Dict[str, Any]:
+def _scene(scene: Values, where: str, protocol: Values, folder: str) -> Values:
     """A scene with its defaults; under `axes` the axes that it has values of its own for."""
     refuse(("path" in scene) == ("synthetic" in scene), f"{where}: give either `path` or `synthetic`")
     given, axes = _apart(scene)
@@ -138,13 +136,13 @@ def _scene(scene: Dict[str, Any], where: str, protocol: Dict[str, Any], folder: 
     return {**usual, **given, **_paths(given, ("path",), where, folder), "axes": axes}
 
 
-def _apart(part: Dict[str, Any]) -> Tuple[Dict[str, Any], Dict[str, Any]]:
+def _apart(part: Values) -> Tuple[Values, Axes]:
     """What a scene or a method says, and apart from that its axes."""
     return ({key: value for key, value in part.items() if key not in AXIS_OF},
             {axis: part[axis] for axis in AXIS_OF if axis in part})
 
 
-def _method(method: Dict[str, Any], where: str, protocol: Dict[str, Any], folder: str) -> Dict[str, Any]:
+def _method(method: Values, where: str, protocol: Values, folder: str) -> Values:
     """The method with its defaults, and under `axes` the axes that it has values of its own for."""
     name = method["name"]
     given, axes = _apart(method)
@@ -161,7 +159,12 @@ def _method(method: Dict[str, Any], where: str, protocol: Dict[str, Any], folder
     refuse((name == "c3dgs") != ("base" in given),
            f"{where}.base: c3dgs, and nothing else, needs it: a 3DGS checkout that trains what it compresses")
     arguments = [str(word) for word in given.get("arguments", [])]
-    _no_protocol_among(arguments, name, where)
+    for word in arguments:  # also as argparse takes flags: --res for --resolution, -r4 for -r 4
+        flag = word.partition("=")[0]
+        shortened = flag.startswith("--") and any(known.startswith(flag) for known in SET_BY_THE_HARNESS)
+        refuse((shortened or word[:2] in SET_BY_THE_HARNESS) and flag not in OWN_FLAGS.get(name, ()),
+               f"{where}.arguments: {word} is the same for all methods of a suite, which would mix protocols "
+               "otherwise; it belongs to protocol, scenes or the axes")
     can_be_patched = CHECKOUTS[name]
     variant = given.setdefault("variant", "patched" if can_be_patched else "unpatched")
     refuse(variant == "native" or (variant != "unpatched" and not can_be_patched),
@@ -202,17 +205,7 @@ SET_BY_THE_HARNESS = ("-s", "--source_path", "-m", "--model_path", "-r", "--reso
 OWN_FLAGS = {"taming": ("--densification_interval", "--mode")}
 
 
-def _no_protocol_among(arguments: Sequence[str], name: str, where: str) -> None:
-    """Refuses those flags, also as argparse takes them: --res for --resolution, -r4 for -r 4."""
-    for word in arguments:
-        flag = word.partition("=")[0]
-        shortened = flag.startswith("--") and any(known.startswith(flag) for known in SET_BY_THE_HARNESS)
-        refuse((shortened or word[:2] in SET_BY_THE_HARNESS) and flag not in OWN_FLAGS.get(name, ()),
-               f"{where}.arguments: {word} is the same for all methods of a suite, which would mix protocols "
-               "otherwise; it belongs to protocol, scenes or the axes")
-
-
-def _can_follow(protocol: Dict[str, Any], name: str, where: str) -> None:
+def _can_follow(protocol: Values, name: str, where: str) -> None:
     """Raises BenchError where a checkout cannot follow the protocol."""
     refuse(protocol["principal_point"] != "centre",
            f"protocol.principal_point: is 'scene', but the loader of {name} ({where}) moves it to the image centre; it "
@@ -228,7 +221,7 @@ def _can_follow(protocol: Dict[str, Any], name: str, where: str) -> None:
                "recipe could not be the protocol's")
 
 
-def _can_train(scene: Dict[str, Any], method: Dict[str, Any], axes: Dict[str, List[Any]]) -> None:
+def _can_train(scene: Values, method: Values, axes: Axes) -> None:
     """Raises BenchError where a checkout cannot train a scene as the suite says."""
     name, thresholds = method["name"], axes["densify_grad_thresholds"]
     what = f"scenes: {scene['name']}, methods: {method['label']}"
@@ -246,7 +239,7 @@ def _can_train(scene: Dict[str, Any], method: Dict[str, Any], axes: Dict[str, Li
            "cells")
 
 
-def _can_divide(protocol: Dict[str, Any], method: Dict[str, Any], axes: Dict[str, List[Any]]) -> None:
+def _can_divide(protocol: Values, method: Values, axes: Axes) -> None:
     """Raises BenchError where the method cannot train on batches of views or on several GPUs, as the protocol says."""
     for field in ("batch", "gpus"):
         if protocol.get(field, 1) == 1:
@@ -260,14 +253,13 @@ def _can_divide(protocol: Dict[str, Any], method: Dict[str, Any], axes: Dict[str
            f"protocol.gpus is {protocol.get('gpus')}; it needs protocol.device: cuda")
 
 
-def _cells(content: Dict[str, Any], protocol: Dict[str, Any], scene: Dict[str, Any], method: Dict[str, Any],
-           axes: Dict[str, List[Any]]) -> List[Dict[str, Any]]:
+def _cells(content: Values, protocol: Values, scene: Values, method: Values, axes: Axes) -> List[Values]:
     """Every combination of the axes; headline cells also with `headline_seeds`."""
     wanted = content["headline"]
     plain = {name: {key: value for key, value in part.items() if key != "axes"}
              for name, part in (("method", method), ("scene", scene))}
 
-    def cell(values: Dict[str, Any]) -> Dict[str, Any]:
+    def cell(values: Values) -> Values:
         if not values["budget"]:  # cells without one are named as they were before there were budgets
             values = {name: value for name, value in values.items() if name != "budget"}
         made = {"suite": content["name"], **plain, **values, "protocol": protocol, "images": content["images"],
@@ -289,7 +281,7 @@ def _gated(blend_mode: str, gate: Any, *rest: Any) -> Tuple[Any, ...]:
     return (blend_mode, own if own == LEARNED else float(own), *rest)
 
 
-def cell_id(cell: Dict[str, Any]) -> str:
+def cell_id(cell: Values) -> str:
     """A readable name, and a checksum of everything that decides the figures: another protocol is another cell."""
     blend = blend_of(cell)
     named = ("densify_grad_threshold", "schedule", "budget", "seed", "protocol")
@@ -303,12 +295,12 @@ def cell_id(cell: Dict[str, Any]) -> str:
                      f"s{cell['seed']}", checksum])
 
 
-def _paths(given: Dict[str, Any], fields: Sequence[str], where: str, folder: str) -> Dict[str, Any]:
+def _paths(given: Values, fields: Sequence[str], where: str, folder: str) -> Values:
     """The paths among these fields as absolute ones, with environment variables put in.
 
     Where a variable is not set, `unset` says which: it matters to those who run a cell that needs it.
     """
-    found: Dict[str, Any] = {}
+    found: Values = {}
 
     def absolute(text: str, field: str) -> str:
         path = os.path.expanduser(os.path.expandvars(text))
@@ -319,18 +311,7 @@ def _paths(given: Dict[str, Any], fields: Sequence[str], where: str, folder: str
         # A variable is of the shell, in the folder at hand.
         return os.path.normpath(os.path.join(os.getcwd() if text.startswith("$") else folder, path))
 
-    for field in fields:
-        if field in given:
-            value = given[field]
-            found[field] = (absolute(value, field) if isinstance(value, str) else
-                            [absolute(text, field) for text in value])
+    for field in filter(given.__contains__, fields):
+        value = given[field]
+        found[field] = absolute(value, field) if isinstance(value, str) else [absolute(text, field) for text in value]
     return found
-
-
-def _one_downscaler(scenes: List[Dict[str, Any]]) -> None:
-    """Supplied reductions (images_4) and reductions by the loader give figures that differ by half a decibel."""
-    supplied = [scene["name"] for scene in scenes if re.search(r"_\d+$", scene["images"])]
-    resized = [scene["name"] for scene in scenes if scene["resolution"] not in (-1, 1)]
-    refuse(supplied and resized,
-           f"scenes: {''.join(supplied[-1:])} takes images as they were reduced by others, {''.join(resized[-1:])} is "
-           "reduced by the loader: two downscalers in one suite, whose figures do not compare")

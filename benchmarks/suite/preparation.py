@@ -19,7 +19,7 @@ NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", 
 
 
 def what_is_missing(cells: List[Dict[str, Any]]) -> List[str]:
-    """What these cells need and is not there: variables, folders of scenes and of checkouts; and what to do."""
+    """What these cells need and is not there, and what to do."""
     scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
     methods = {cell["method"]["label"]: cell["method"] for cell in cells}
     absent = [f"{part['unset']}; set it" for part in (*scenes.values(), *methods.values()) if "unset" in part]

@@ -67,7 +67,6 @@ def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Di
 
 
 def downscaler(config: TrainConfig, name: str) -> str:
-    """How images came to their size: as the files are, or resized by the loader."""
     from ...trainer.scenes.images import image_size, target_size  # they load torch, which a suite does without
     from ...trainer.scenes.scene import read_layout
 
@@ -93,17 +92,13 @@ def commit_of(folder: str) -> Optional[str]:
 
     None without git, and for a folder inside of another checkout, whose commit says nothing about it.
     """
-    top = _git(folder, "rev-parse", "--show-toplevel")
-    commit = _git(folder, "rev-parse", "HEAD")
-    if not top or not commit or os.path.realpath(top) != os.path.realpath(folder):
-        return None
-    return commit + ("+" if _git(folder, "status", "--porcelain", "--untracked-files=no") else "")
+    def git(*words: str) -> str:
+        return subprocess.run(["git", "-C", folder, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                              check=True).stdout.decode().strip()
 
-
-def _git(folder: str, *words: str) -> Optional[str]:
     try:
-        answer = subprocess.run(["git", "-C", folder, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                                check=True)
+        if os.path.realpath(git("rev-parse", "--show-toplevel")) != os.path.realpath(folder):
+            return None
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):
         return None
-    return answer.stdout.decode().strip()

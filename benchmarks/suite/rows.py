@@ -32,9 +32,7 @@ class ReportError(BenchError):
     """Rows cannot be reported; the text says which and why."""
 
 
-class Part(BaseModel):
-    """What is read of an object; it may have other fields too."""
-
+class Part(BaseModel):  # of an object that may have other fields too
     model_config = ConfigDict(strict=True)
 
 
@@ -115,7 +113,6 @@ def at_once(row: Row) -> int:
 
 
 def cell_folders(results: str) -> List[str]:
-    """The names in RESULTS/cells."""
     folder = os.path.join(results, CELLS_FOLDER)
     return sorted(os.listdir(folder)) if os.path.isdir(folder) else []
 
@@ -129,10 +126,7 @@ def _text(path: str) -> str:
 
 
 def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
-    """The rows that can stand in common tables, and in words which cannot: of each scene, those of a rarer protocol.
-
-    Raises ReportError where no protocol of a scene is the commonest.
-    """
+    """The rows that can stand in common tables, and in words which cannot: of each scene, those of a rarer protocol."""
     left_out: Dict[str, List[str]] = {}  # why, and the cells
     for place in sorted({(row["suite"], row["scene"]) for row in rows}):
         said = {row["cell"]: _rules(row) for row in rows if row["ok"] and (row["suite"], row["scene"]) == place}

@@ -125,7 +125,7 @@ def check(content: Any) -> None:
 
 
 def first_mistake(error: ValidationError) -> Tuple[str, str]:
-    """The place of the first mistake that pydantic found, such as scenes[0].name, and what is wrong there."""
+    """The place, such as scenes[0].name, and what is wrong there."""
     found = min(error.errors(), key=lambda one: list(map(str, one["loc"])))
     where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in found["loc"]).lstrip(".")
     kind, given, said = found["type"], found["input"], found["msg"]

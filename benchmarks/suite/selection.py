@@ -11,10 +11,7 @@ SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")
 
 
 def earlier_rows(path: str, cells: List[Dict[str, Any]]) -> Dict[str, Row]:
-    """The rows of a file, or of a folder of results, that are of these cells, by the cells' names.
-
-    A name holds a checksum of all that decides the figures. Raises BenchError where no row is of a cell.
-    """
+    """Those of a file, or of a folder of results, that are of these cells, by name. Raises BenchError without any."""
     rows, names = read_rows(path), {cell["id"] for cell in cells}
     found = {row["cell"]: row for row in rows if row["cell"] in names}
     if not found:

@@ -1,8 +1,8 @@
 """Public trainers' checkouts as methods: one class for each shape of commands.
 
 Each command runs in the checkout's folder and Python, observed by observer.py. Renderings come back as floats and are
-measured here, against this project's own ground truth, as the native trainer's are: one split, one downscaler, one set
-of metrics for all. A checkout that renders other views, or was trained on other images, is refused.
+measured here, against this project's own ground truth. A checkout that renders other views, or was trained on other
+images, is refused.
 """
 from __future__ import annotations
 
@@ -81,7 +81,6 @@ class ThreeDGS:
         return [str(word) for word in words] + (self.method["arguments"] if self.trains_with_arguments else [])
 
     def test_arguments(self) -> List[Any]:
-        """Views are held out; none is looked at while it trains."""
         return ["--eval", "--test_iterations", -1]
 
     def recipe_arguments(self) -> List[str]:
@@ -95,7 +94,6 @@ class ThreeDGS:
         return flags + [str(word) for name, value in options.items() for word in ("--" + name, value)]
 
     def recipe(self) -> Dict[str, Any]:
-        """The options of the recipe that the suite sets."""
         options = self.cell["protocol"]["options"]
         return {name: getattr(self.config, name) for name in RECIPE if name in options}
 
@@ -150,15 +148,11 @@ class ThreeDGS:
 
 
 class Taming(ThreeDGS):
-    """Taming 3DGS: the same commands; it finds edges with torchvision while it trains."""
-
-    stubs = ()
+    stubs = ()  # it finds edges with torchvision while it trains
 
 
 class TwoDGS(ThreeDGS):
-    """2D Gaussian Splatting: the same commands; render.py also extracts meshes, with libraries that are not needed."""
-
-    stubs = (*ThreeDGS.stubs, "open3d", "trimesh", "mediapy")
+    stubs = (*ThreeDGS.stubs, "open3d", "trimesh", "mediapy")  # for meshes, which are not extracted
     render_arguments = ("--skip_mesh",)
 
 
@@ -219,8 +213,7 @@ class HAC(InOneProcess):
 class DBS(InOneProcess):
     """Deformable Beta Splatting: train.py alone; the number of primitives is given (`--cap_max`), no threshold.
 
-    Its own `--eval` trains until the test views are best, and keeps that model. Here views are held out, and that is
-    all: the protocol's iterations, the last model.
+    Its own `--eval` keeps the model that is best on the test views. Here they are held out, and that is all.
     """
 
     # Of its viewer, of its compression, and one that its rasterizer imports and does not use.

@@ -2,12 +2,12 @@
 
     python observer.py RECORD.json --seed N --iterations N [--renders FOLDER] ... -- SCRIPT ARGUMENT...
 
-It runs in the trainer's own Python and imports nothing of this project. What it relies on is the interface that the
-trainers have in common: they seed with constants, show their loop as a tqdm bar over the iterations, and render by
+It runs in the trainer's own Python and imports nothing of this project. It relies on what the trainers have in common:
+they seed with constants, show their loop as a tqdm bar over the iterations, and render by
 `gaussian_renderer.render(view, model, ...)["render"]` (HAC after `prefilter_voxel`) or `model.render(view)["render"]`.
 
-RECORD.json: loop_seconds, peak_gpu_mib (up to where the bar of a training is closed), num_gaussians, views [{name,
-milliseconds, file, truth}]. The files of the renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
+RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, views [{name, milliseconds, file, truth}]. The files of the
+renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
 """
 import argparse
 import importlib.abc
@@ -23,8 +23,8 @@ import types
 WARM_UPS = 2
 
 
-def main(argv=None):
-    words = list(sys.argv[1:] if argv is None else argv)
+def main():
+    words = sys.argv[1:]
     split = words.index("--")
     parser = argparse.ArgumentParser()
     parser.add_argument("record")
@@ -37,14 +37,17 @@ def main(argv=None):
     parser.add_argument("--model-renders", metavar="ATTRIBUTE")
     options = parser.parse_args(words[:split])
     script, arguments = words[split + 1], words[split + 2:]
-    sys.argv = [script] + arguments
+    sys.argv = [script, *arguments]
     sys.path[0] = os.path.dirname(os.path.abspath(script))
     import torch
 
     for name in filter(None, options.stub.split(",")):  # after torch, as the trainers import them
         stub(name)
-    if options.no_pictures:
-        write_no_pictures()
+    if options.no_pictures:  # what is rendered is kept as floats, and torchvision may be absent
+        stub("torchvision")
+        import torchvision.utils
+
+        torchvision.utils.save_image = lambda *arguments, **keywords: None
     shift_seeds(options.seed)
     views = watch_renderings(options.renders) if options.renders and not options.model_renders else {}
     scenes = watch_scenes(options.hold_out) if options.model_renders else []
@@ -55,10 +58,9 @@ def main(argv=None):
             views.update(renderings_of(scenes[-1], options.model_renders, options.renders))
     finally:
         peak = torch.cuda.max_memory_allocated() / 2 ** 20 if torch.cuda.is_available() else None
-        record = {"loop_seconds": bar.get("seconds"), "peak_gpu_mib": bar.get("peak", peak),
-                  "num_gaussians": views.pop("num_gaussians", None), "views": list(views.values())}
         with open(options.record, "w") as file:
-            json.dump(record, file)
+            json.dump({"loop_seconds": bar.get("seconds"), "peak_gpu_mib": bar.get("peak", peak),
+                       "num_gaussians": views.pop("num_gaussians", None), "views": list(views.values())}, file)
 
 
 def synchronise():
@@ -81,7 +83,7 @@ def shift_seeds(seed):
 
 
 def watch_loop(iterations, views):
-    """Times the bar over so many iterations, from where it is made to where it is closed; returns where that goes.
+    """Times the bar over so many iterations; returns where that goes.
 
     Where the bar of the final rendering begins, earlier entries of `views` go: HAC renders training views on the way.
     """
@@ -128,17 +130,16 @@ def keep(folder, number, view, image, seconds):
     import numpy
 
     os.makedirs(folder, exist_ok=True)
-    files = [os.path.join(folder, f"{kind}_{number}.npy") for kind in ("render", "truth")]
-    for path, kept in zip(files, (image, view.original_image[:3])):
+    files = {kind: os.path.join(folder, f"{kind}_{number}.npy") for kind in ("file", "truth")}
+    for path, kept in zip(files.values(), (image, view.original_image[:3])):
         numpy.save(path, kept.detach().float().cpu().numpy())
-    return {"name": view.image_name, "milliseconds": 1000 * seconds, "file": files[0], "truth": files[1]}
+    return {"name": view.image_name, "milliseconds": 1000 * seconds, **files}
 
 
 def watch_scenes(hold_out):
-    """Keeps every scene.Scene that is made; with hold_out the split is made as `--eval` makes it, and only that.
+    """Keeps every scene.Scene that is made; with hold_out the split is made as `--eval` makes it.
 
-    Where `--eval` does more (Deformable Beta Splatting then chooses its model and its last iteration on the test
-    views), the split is wanted without the rest.
+    Only that: Deformable Beta Splatting then also chooses its model and its last iteration on the test views.
     """
     import scene
 
@@ -209,14 +210,6 @@ def watch_renderings(folder):
     return found
 
 
-def write_no_pictures():
-    """torchvision's save_image does nothing: what is rendered is kept as floats, and torchvision may be absent."""
-    stub("torchvision")
-    import torchvision.utils
-
-    torchvision.utils.save_image = lambda *arguments, **keywords: None
-
-
 class Absent(types.ModuleType):
     """Stands for a module that is imported and not used; anything may be asked of it, nothing called."""
 
@@ -232,8 +225,6 @@ class Absent(types.ModuleType):
 
 
 class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds one module and all below it, as Absents."""
-
     def __init__(self, name):
         self.name = name
 
@@ -249,10 +240,7 @@ class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def stub(name):
-    """Lets a module be imported that this Python lacks, or has and cannot import: turtle without tkinter is one.
-
-    It is imported here, if it is there: nothing else tells whether it can be.
-    """
+    """Lets a module be imported that this Python lacks, or has and cannot import: turtle without tkinter is one."""
     try:
         importlib.import_module(name)
     except (Exception, SystemExit):  # of whatever kind: the module is not needed

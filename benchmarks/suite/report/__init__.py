@@ -35,8 +35,6 @@ NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "ve
 
 
 class Section(NamedTuple):
-    """What the page shows of one suite."""
-
     suite: str
     id: str  # in the page
     counts: str
@@ -68,7 +66,6 @@ def report(results: str, output: str) -> str:
 
 
 def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Section:
-    """Writes what a report has of one suite, but for its part of the page."""
     absent = _absent(results, suite, rows)
     rows, left_out = of_one_protocol(rows)
     tables = tables_of(suite, rows)
@@ -79,12 +76,13 @@ def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Sect
     images = collect(results, suite, rows, output)
     here = any(os.path.isdir(os.path.join(results, CELLS_FOLDER, row["cell"])) for row in rows)
     no_images = "No images: the suite asked for none." if here else "No images: rows of another folder."
-    counts = "; ".join([_counts(rows) + absent, *left_out])
-    return Section(suite, safe_name(suite), counts, tables, pictures, images, no_images, _protocols(rows))
+    numbers = [_number(len({row[of] for row in rows}), of) for of in ("cell", "scene", "seed")]
+    counts = "{} on {}, {}; {} failed".format(*numbers, sum(not row["ok"] for row in rows) or "none") + absent
+    return Section(suite, safe_name(suite), "; ".join([counts, *left_out]), tables, pictures, images, no_images,
+                   _protocols(rows))
 
 
 def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
-    """The static page: figures inside it and images beside it; it needs no network."""
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
                                      trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                                      undefined=jinja2.StrictUndefined)
@@ -111,11 +109,6 @@ def _write(folder: str, name: str, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def _counts(rows: Sequence[Row]) -> str:
-    numbers = [_number(len({row[of] for row in rows}), of) for of in ("cell", "scene", "seed")]
-    return "{} on {}, {}; {} failed".format(*numbers, sum(not row["ok"] for row in rows) or "none")
-
-
 def _number(count: int, of: str) -> str:
     return f"{count} {of}" if count == 1 else f"{count} {of}s"
 
@@ -135,7 +128,6 @@ def _absent(results: str, suite: str, rows: Sequence[Row]) -> str:
 
 
 def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
-    """Of every scene: what its rows say of their protocol, once."""
     measured = [row for row in rows if row["ok"]]
     found = []
     for scene in sorted({row["scene"] for row in measured}):

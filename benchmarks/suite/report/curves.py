@@ -33,16 +33,13 @@ LEGEND_MARK, LEGEND_LETTER = 0.85, 0.082  # what a mark, and a letter of its lab
 
 
 class Picture(NamedTuple):
-    """A figure's file, an SVG with a PNG beside it, and what it shows in words."""
-
-    name: str
+    name: str  # of its files
     title: str
-    alt: str
-    path: str
+    alt: str  # what it shows, in words
+    path: str  # of the SVG, which has a PNG beside it
 
 
 def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
-    """Draws a figure for every scene of a suite into a folder."""
     pictures = []
     for scene in sorted({group.scene for group in groups}):
         shown = [group for group in groups if group.scene == scene and group.rows]
@@ -129,7 +126,7 @@ def _drawn(group: Group, name: str) -> bool:
 
 
 def legend(drawn: Figure, handles: Sequence[object]) -> None:
-    """Puts a legend above the panels, in a strip that makes the figure higher."""
+    """Above the panels, in a strip that makes the figure higher."""
     widest = LEGEND_MARK + LEGEND_LETTER * max(len(handle.get_label()) for handle in handles)
     columns = max(1, min(len(handles), int(drawn.get_figwidth() // widest)))
     lines = -(-len(handles) // columns)

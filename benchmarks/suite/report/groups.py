@@ -57,7 +57,7 @@ class Setting(NamedTuple):
         return ", ".join(words)
 
     def amount(self) -> str:
-        """What is varied along a curve, such as "0.005"."""
+        """What is varied along a curve."""
         if self.budget is not None:
             return f"{self.budget:,} Gaussians"
         return DASH if self.threshold is None else f"{self.threshold:g}"
@@ -86,7 +86,6 @@ class Cell(NamedTuple):
         return f"{value:{'+' if signed and value else ''},.{digits}f}{spread}"
 
     def unrounded(self) -> str:
-        """The number, a whole one without ".0"; the text in its place."""
         if self.printed or self.value is None:
             return self.printed or self.text
         return str(int(self.value)) if float(self.value).is_integer() else repr(self.value)
@@ -95,17 +94,16 @@ class Cell(NamedTuple):
 class Group:
     """The cells of one setting on one scene: one row for each seed."""
 
-    def __init__(self, setting: Setting, scene: str, rows: Iterable[Row]):
-        all_rows = list(rows)
-        self.setting, self.scene, self.said = setting, scene, all_rows[0]
-        self.rows, self.failed = ([row for row in all_rows if row["ok"] is ok] for ok in (True, False))
+    def __init__(self, setting: Setting, scene: str, rows: Sequence[Row]):
+        self.setting, self.scene = setting, scene
+        self.rows, self.failed = ([row for row in rows if row["ok"] is ok] for ok in (True, False))
         self.by_seed = {row["seed"]: row for row in self.rows}
         self.figures = {seed: figures_of(row) for seed, row in self.by_seed.items()}
 
     def dataset(self, datasets: Dict[str, Sequence[str]]) -> Optional[str]:
-        """The data set that the scene is of: as its rows say, else the one that has a scene of this name."""
+        """The one that the rows name, else the one that has a scene of this name."""
         named = next((dataset for dataset, scenes in datasets.items() if self.scene in scenes), None)
-        return self.said.get("dataset", named)
+        return (self.rows + self.failed)[0].get("dataset", named)
 
     def measured(self, name: str) -> Cell:
         """The figure's mean and spread over seeds."""
@@ -122,8 +120,7 @@ class Group:
 
 
 def figures_of(row: Row) -> Dict[str, float]:
-    """What was measured of a row that is ok, by name: fields; size_own_mb, size_common_mb, num_gaussians_m,
-    learned_gate; lpips:KIND. Times of a cell that shared its machine are left out."""
+    """What was measured of a row that is ok, by name. Times of a cell that shared its machine are left out."""
     size = row.get("size_bytes") or {}
     millions = {"num_gaussians_m": row.get("num_gaussians"), "size_own_mb": size.get("own"),
                 "size_common_mb": size.get("common")}
@@ -142,7 +139,6 @@ def is_alone(row: Row) -> bool:
 
 
 def device_of(row: Row) -> Optional[str]:
-    """What the row was measured on, such as "NVIDIA H200"."""
     return (row.get("machine") or {}).get("device")
 
 
@@ -163,10 +159,7 @@ def _lpips(row: Row) -> List[Row]:
 
 
 def grouped(rows: Iterable[Row], end_of: Callable[[Row], Optional[str]]) -> List[Group]:
-    """Groups of seeds, in the order of scene, method, schedule, threshold (the largest first), blend.
-
-    end_of says to which end of the paper's tables a row belongs. Raises ReportError.
-    """
+    """Groups of seeds, in order; end_of says to which end of the paper's tables a row belongs. Raises ReportError."""
     found: Dict[Tuple[Setting, str], Dict[int, Row]] = {}
     for row in rows:
         setting = Setting(row["method"], row.get("label") or row["method"], row.get("variant"), blend_of(row),
@@ -176,20 +169,20 @@ def grouped(rows: Iterable[Row], end_of: Callable[[Row], Optional[str]]) -> List
         if twin is not row:
             raise ReportError(f"cells {twin['cell']} and {row['cell']} have the same setting, scene and seed "
                               f"{row['seed']}; keep one, or give their methods different labels")
-    groups = [Group(setting, scene, members.values()) for (setting, scene), members in found.items()]
+    groups = [Group(setting, scene, list(members.values())) for (setting, scene), members in found.items()]
     return sorted(groups, key=lambda group: (group.scene, group.setting.order()))
 
 
 def safe_name(name: str) -> str:
-    """A name of a suite, scene or image that is a file name, a URL and an HTML id alike."""
+    """A file name, a URL and an HTML id alike."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name)
 
 
 def over(groups: Sequence[Group], name: str, combine: Callable[[List[float]], float],
          seeds: Optional[Set[int]] = None) -> Cell:
-    """Mean and spread of combine([the figure of each group]) over the seeds that all groups have it of.
+    """Mean and spread of combine([the figure of each group]) over the seeds, of these, that all groups have it of.
 
-    seeds: no others. What combine gives as NaN is left out. Times are of one machine, or there are none.
+    What combine gives as NaN is left out. Times are of one machine, or there are none.
     """
     found = [{seed for seed, figures in group.figures.items() if name in figures} for group in groups]
     common = set.intersection(*found, *([] if seeds is None else [seeds]))
@@ -215,5 +208,4 @@ def ratio(figures: Sequence[float]) -> float:
 
 
 def some(names: Sequence[str], most: int) -> str:
-    """The first of the names, and how many more there are."""
     return "; ".join([*names[:most], *([f"{len(names) - most} more"] if names[most:] else [])])

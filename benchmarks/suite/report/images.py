@@ -48,7 +48,6 @@ def _folders(results: str, groups: Sequence[Group]) -> Dict[str, str]:
 
 
 def _views(folders: Dict[str, str], output: str, folder: str) -> List[Dict[str, Any]]:
-    """The views that every blend has images of."""
     names = [set(os.listdir(os.path.join(path, "render"))) for path in folders.values()]
     common = sorted(set.intersection(*names)) if names else []
     if common:

@@ -10,7 +10,7 @@ from ..rows import Row
 from . import groups as grouping
 from . import tables
 from .groups import Cell, Group, Setting, device_of, grouped, is_alone, lpips_figures, over, safe_name, some
-from .tables import OURS, Column, Table, TableRow, column, printed
+from .tables import OURS, Column, Table, TableRow, column
 
 PAPER = read_json(Path(__file__).with_name("paper.json"))  # what it prints, and which names of ours stand for its rows
 SOURCE = PAPER["source"] + "."
@@ -83,9 +83,9 @@ def _both_ends(groups: Sequence[Group], table: str, places: Sequence[Place],
     notes: Dict[str, None] = {}
     for end in END_NAMES:
         for method, averages in PAPER[table][end].items():
-            rows.append(_papers((end, method), [
-                cell for place, _ in places
-                for cell in _printed(table, averages.get(place) if place else averages, names)]))
+            figures = [cell for place, _ in places
+                       for cell in _printed(table, averages.get(place) if place else averages, names)]
+            rows.append(TableRow((end, method), figures, tables.PAPER))
         settings = _settings(groups, end, table)
         for setting in settings:
             means = [mean for _, scenes in places for mean in _averages(setting, settings, scenes, names)]
@@ -101,7 +101,7 @@ def table3(groups: Sequence[Group]) -> Table:
     ablated = {(group.setting.pair, group.scene) for group in groups
                if group.setting.blend in ("smoe_tn", "smoe_std")}
     where = f"{PAPER['table3']['dataset']}, {PAPER['table3']['end']}"
-    rows = [_papers((where, "", ABLATION[mode], ""), _printed("table3", figures, names))
+    rows = [TableRow((where, "", ABLATION[mode], ""), _printed("table3", figures, names), tables.PAPER)
             for mode, figures in PAPER["table3"]["rows"].items()]
     rows += [TableRow((f"{group.scene}, {group.setting.amount()}", group.setting.label(blend=False),
                        f"{group.setting.blend}: {ABLATION[group.setting.blend]}", group.seeds()),
@@ -155,12 +155,11 @@ def _papers_deltas(names: Sequence[str]) -> Iterator[TableRow]:
             found = {"psnr": smoe["psnr"] - alpha["psnr"], "ssim": smoe["ssim"] - alpha["ssim"],
                      "num_gaussians": smoe["num_gaussians_m"] / alpha["num_gaussians_m"],
                      "size_own_mb": smoe["size_own_mb"] / alpha["size_own_mb"]}
-            yield _papers((dataset, "3DGS", f"{PAPER['ends'][end]:g} ({end})", ""),
-                          [Cell(found.get(name)) for name in names])
+            yield TableRow((dataset, "3DGS", f"{PAPER['ends'][end]:g} ({end})", ""),
+                           [Cell(found.get(name)) for name in names], tables.PAPER)
 
 
 def cells(groups: Sequence[Group]) -> Table:
-    """Every setting on every scene, averaged over seeds, with all that was measured."""
     names = ["psnr", "psnr_float", "psnr_edge", "ssim", *lpips_figures(groups), "num_gaussians", "size_own_mb",
              "size_common_mb", "train_seconds", "wall_seconds", "fps", "peak_gpu_mib", "learned_gate"]
     rows = [TableRow((group.scene, group.setting.label(), group.setting.amount(), group.seeds()),
@@ -227,19 +226,15 @@ def _seed_notes(setting: Setting, groups: Sequence[Group]) -> Iterator[str]:
 
 
 def _unequal(one: Row, other: Row) -> str:
-    """The commits of two rows where they differ."""
     first, second = one.get("commit") or {}, other.get("commit") or {}
     return ", ".join(f"{name} {first.get(name) or 'unknown'} and {second.get(name) or 'unknown'}"
                      for name in sorted({*first, *second}) if first.get(name) != second.get(name))
 
 
-def _papers(labels: Tuple[str, ...], figures: List[Cell]) -> TableRow:
-    return TableRow(labels, figures, tables.PAPER)
-
-
 def _printed(table: str, values: Optional[Sequence[str]], names: Sequence[str]) -> List[Cell]:
-    found = dict(zip(PAPER[table]["columns"], values or ()))
-    return [printed(found[name]) if name in found else Cell() for name in names]
+    found = {name: "0" + text if text.startswith(".") else text
+             for name, text in zip(PAPER[table]["columns"], values or ())}
+    return [Cell(float(found[name]), printed=found[name]) if name in found else Cell() for name in names]
 
 
 def _by_dataset(groups: Sequence[Group]) -> Dict[str, List[str]]:
@@ -250,7 +245,6 @@ def _by_dataset(groups: Sequence[Group]) -> Dict[str, List[str]]:
 
 
 def _scene_notes(ours: Dict[str, List[str]]) -> List[str]:
-    """Which scenes our averages are of, where the paper's are of more; which of its data sets are left out."""
     notes = [f"{dataset}: ours is of {', '.join(ours[dataset])} alone; the paper averages {len(scenes)} scenes."
              for dataset, scenes in PAPER["datasets"].items() if dataset in ours and ours[dataset] != sorted(scenes)]
     absent = [dataset for dataset in PAPER["datasets"] if dataset not in ours]
@@ -260,7 +254,6 @@ def _scene_notes(ours: Dict[str, List[str]]) -> List[str]:
 
 
 def _notes(groups: Sequence[Group]) -> List[str]:
-    """What a reader must know of the figures: spread, megabytes, LPIPS, machines."""
     notes = [SPREAD_NOTE]
     if any({"size_own_mb", "size_common_mb"} & {*figures} for group in groups for figures in group.figures.values()):
         notes.append("1 MB is 1,000,000 bytes. Own size: the method's own container; common size: one for all methods.")
@@ -284,5 +277,4 @@ def _shared_notes(groups: Sequence[Group]) -> List[str]:
 
 
 def commits(rows: Sequence[Row]) -> List[str]:
-    """The commits of this project and of trainers that rows were measured with."""
     return sorted({f"{name} {value}" for row in rows for name, value in (row.get("commit") or {}).items() if value})

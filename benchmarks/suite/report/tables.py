@@ -22,11 +22,9 @@ LPIPS_NAMES = {"lpips_alex": "LPIPS Alex", "lpips_vgg_std": "LPIPS VGG", "lpips_
 
 
 class Column(NamedTuple):
-    """A column of figures; columns of one group stand under one heading."""
-
     name: str
     digits: int
-    group: str = ""
+    group: str = ""  # the heading above it, which it shares with its neighbours
     signed: bool = False
 
     @property
@@ -35,8 +33,6 @@ class Column(NamedTuple):
 
 
 class TableRow(NamedTuple):
-    """Labels, then one cell for each column."""
-
     labels: Tuple[str, ...]
     cells: List[Cell]
     source: str = OURS
@@ -66,23 +62,15 @@ class Table(NamedTuple):
         return [cell.shown(column.digits, column.signed, plus_minus) for cell, column in zip(row.cells, self.columns)]
 
     def lines(self, plus_minus: str = " ± ") -> List[List[str]]:
-        """The words of each row: source, labels, figures."""
         return [[row.source, *row.labels, *self.shown(row, plus_minus)] for row in self.rows]
 
 
 def column(name: str, group: str = "", difference: bool = False) -> Column:
-    """The column of a figure, or of its differences."""
     heading, digits = (LPIPS_NAMES.get(name[len(LPIPS):], name), 3) if name.startswith(LPIPS) else FIGURES[name]
     return Column("Δ " + heading if difference else heading, digits, group, difference)
 
 
-def printed(text: str) -> Cell:
-    """One of the paper's figures, as printed there."""
-    return Cell(float(text), printed="0" + text if text.startswith(".") else text)
-
-
 def to_markdown(table: Table) -> str:
-    """A heading, a Markdown table, then the notes as a list."""
     head = ["source", *table.labels, *(column.full_name for column in table.columns)]
     rule = ["---"] * (1 + len(table.labels)) + ["---:"] * len(table.columns)
     lines = ["| " + " | ".join(text.replace("|", "\\|").replace("\n", " ") for text in line) + " |"
