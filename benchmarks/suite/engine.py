@@ -19,13 +19,13 @@ from ...trainer.system.output_folder import make_folder, only_one
 from ..errors import BenchError
 from . import require
 from .cell import die_with_parent, identity
-from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
+from .expansion import AXIS_OF, NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
 from .names import CELL_NAME, CELLS_FOLDER, NATIVE, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
 from .preparation import made_scene, prepared_method, what_is_missing
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
-from .rows import CellFile, CellRow, Row, at_once, cell_folders, read_object
-from .selection import chosen, earlier_rows, plan
+from .rows import CellFile, CellRow, Row, at_once, cell_folders, read_object, read_rows
 
+SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 
 
@@ -76,6 +76,50 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
                          f"same command continues; {log if os.path.isdir(log) else 'what it printed'} says what "
                          "happened")
     return here
+
+
+def earlier_rows(path: str, cells: List[Dict[str, Any]]) -> Dict[str, Row]:
+    """Those of a file, or of a folder of results, that are of these cells, by name. Raises BenchError without any."""
+    rows, names = read_rows(path), {cell["id"] for cell in cells}
+    found = {row["cell"]: row for row in rows if row["cell"] in names}
+    refuse(not found, f"--rows {path}: none of its {len(rows)} rows is of a cell of this suite")
+    return found
+
+
+def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, Any]]:
+    """The cells for which every "field=value" holds; several values of one field may be given. Raises BenchError."""
+    wanted: Dict[str, List[str]] = {}
+    for text in only:
+        field, equals, value = text.partition("=")
+        refuse(not equals or field not in SELECTORS,
+               f"--only {text}: must be FIELD=VALUE with a field of {', '.join(SELECTORS)}")
+        there = dict.fromkeys(_said(cell, field) for cell in cells)
+        refuse(not any(_same(entry, value) for entry in there),
+               f"--only {field}={value}: no cell of the suite is so; its cells have {', '.join(map(str, there))}")
+        wanted.setdefault(field, []).append(value)
+    found = [cell for cell in cells
+             if all(any(_same(_said(cell, field), value) for value in values) for field, values in wanted.items())]
+    refuse(not found, f"--only {' '.join(only)}: no cell of the suite is so")
+    return found
+
+
+def _said(cell: Dict[str, Any], field: str) -> Any:
+    return {"method": cell["method"]["label"], "scene": cell["scene"]["name"],
+            "budget": cell.get("budget", 0)}.get(field, cell.get(field))
+
+
+def _same(value: Any, text: str) -> bool:
+    try:
+        return value == float(text) if isinstance(value, float) else str(value).lower() == text.lower()
+    except ValueError:
+        return False
+
+
+def plan(cells: List[Dict[str, Any]], done: Mapping[str, Row], absent: Sequence[str]) -> str:
+    """What --dry-run prints: a line for each cell, what is not there yet, and how many cells are how far."""
+    states = ["to do" if cell["id"] not in done else "done" if done[cell["id"]]["ok"] else "failed" for cell in cells]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in ("done", "to do", "failed"))
+    return "\n".join([*(f"{state}  {cell['id']}" for state, cell in zip(states, cells)), *absent, counts])
 
 
 def check_folder(suite: Suite, results: str) -> None:

@@ -12,6 +12,7 @@ import json
 import os
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Dict, List, Sequence, Tuple
 
 import yaml
@@ -24,7 +25,7 @@ from . import schema
 from .names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, OF_NATIVE_ALONE, RECIPE, WITHOUT_SCHEDULE, blend_of
 from .protocol import config_of
 
-SHIPPED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "shipped")
+SHIPPED = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("*.yaml")}
 Values = Dict[str, Any]
 Axes = Dict[str, List[Any]]
 AXIS_OF = {axis: axis[:-1] for axis in schema.Axes.model_fields}
@@ -43,13 +44,10 @@ class Suite:
 
 def find_suite(name: str) -> str:
     """The path of a suite: a file, or the name of one that is shipped. Raises BenchError."""
-    if os.path.isfile(name):
-        return name
-    shipped = os.path.join(SHIPPED, name + ".yaml")
-    if os.path.isfile(shipped):
-        return shipped
-    names = sorted(os.path.splitext(file)[0] for file in os.listdir(SHIPPED) if file.endswith(".yaml"))
-    raise BenchError(f"{name}: no such file, and no suite that is shipped ({', '.join(names)})")
+    is_file = os.path.isfile(name)
+    refuse(not is_file and name not in SHIPPED,
+           f"{name}: no such file, and no suite that is shipped ({', '.join(sorted(SHIPPED))})")
+    return name if is_file else SHIPPED[name]
 
 
 def load_suite(path: str) -> Suite:

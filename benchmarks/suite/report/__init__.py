@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple, Sequence
+from typing import Any, Dict, List, Sequence
 
 import jinja2
 from matplotlib import colormaps
@@ -19,11 +19,11 @@ from matplotlib.colors import to_hex
 from ....trainer.system.output_folder import Record, make_folder, own_record, write_record
 from ..names import CELLS_FOLDER, SUITE_NAME, read_json
 from ..rows import ReportError, Row, at_once, of_one_protocol, read_rows
-from .curves import Picture, draw_all
+from .curves import draw_all
 from .groups import grouped, is_alone, safe_name, some
 from .images import ERROR_COLORS, ERROR_FULL_SCALE, collect
 from .layouts import commits, end_of, tables_of
-from .tables import Table, to_csv, to_latex, to_markdown
+from .tables import to_text
 
 __all__ = ["ReportError", "report"]
 
@@ -32,17 +32,6 @@ COMMAND = "dsmoe bench report"
 MOST_ABSENT = 3  # cells without a row that are named
 NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
                 "continued", "arguments", "background_gate", "budget")  # of one cell, or said otherwise
-
-
-class Section(NamedTuple):
-    suite: str
-    id: str  # in the page
-    counts: str
-    tables: List[Table]
-    pictures: List[Picture]
-    images: List[Dict[str, Any]]
-    no_images: str  # why, where there are none
-    protocols: List[Dict[str, Any]]
 
 
 def report(results: str, output: str) -> str:
@@ -65,24 +54,25 @@ def report(results: str, output: str) -> str:
     return os.path.join(output, PAGE_NAME)
 
 
-def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Section:
+def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Dict[str, Any]:
+    """What the page shows of one suite; its tables, figures and images are written."""
     absent = _absent(results, suite, rows)
     rows, left_out = of_one_protocol(rows)
     tables = tables_of(suite, rows)
     for table in tables:
-        for form, text in (("md", to_markdown(table)), ("csv", to_csv(table)), ("tex", to_latex(table))):
-            _write(output, os.path.join("tables", f"{table.name}.{form}"), text)
+        for form in ("md", "csv", "tex"):
+            _write(output, os.path.join("tables", f"{table.name}.{form}"), to_text(table, form))
     pictures = draw_all(suite, grouped(rows, end_of), os.path.join(output, "figures"))
     images = collect(results, suite, rows, output)
     here = any(os.path.isdir(os.path.join(results, CELLS_FOLDER, row["cell"])) for row in rows)
     no_images = "No images: the suite asked for none." if here else "No images: rows of another folder."
     numbers = [_number(len({row[of] for row in rows}), of) for of in ("cell", "scene", "seed")]
     counts = "{} on {}, {}; {} failed".format(*numbers, sum(not row["ok"] for row in rows) or "none") + absent
-    return Section(suite, safe_name(suite), "; ".join([counts, *left_out]), tables, pictures, images, no_images,
-                   _protocols(rows))
+    return {"suite": suite, "id": safe_name(suite), "counts": "; ".join([counts, *left_out]), "tables": tables,
+            "pictures": pictures, "images": images, "no_images": no_images, "protocols": _protocols(rows)}
 
 
-def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
+def _page(sections: Sequence[Dict[str, Any]], measured_with: Sequence[str]) -> str:
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
                                      trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                                      undefined=jinja2.StrictUndefined)
@@ -94,12 +84,12 @@ def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
         error_full=f"{ERROR_FULL_SCALE:g}")
 
 
-def _markdown(sections: Sequence[Section]) -> str:
+def _markdown(sections: Sequence[Dict[str, Any]]) -> str:
     parts = ["# Benchmark report\n"]
     for section in sections:
-        parts.append(f"## {section.suite}\n\n{section.counts}.\n")
-        parts += map(to_markdown, section.tables)
-        parts += [f"![{picture.alt}](figures/{picture.name}.png)\n" for picture in section.pictures]
+        parts.append(f"## {section['suite']}\n\n{section['counts']}.\n")
+        parts += [to_text(table, "md") for table in section["tables"]]
+        parts += [f"![{picture.alt}](figures/{picture.name}.png)\n" for picture in section["pictures"]]
     return "\n".join(parts)
 
 

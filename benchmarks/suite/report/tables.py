@@ -4,7 +4,10 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+from pathlib import Path
 from typing import Dict, List, NamedTuple, Tuple
+
+import jinja2
 
 from .groups import LPIPS, Cell
 
@@ -58,6 +61,9 @@ class Table(NamedTuple):
         groups = itertools.groupby(self.columns, key=lambda column: column.group)
         return [(group, len(list(columns))) for group, columns in groups]
 
+    def head(self, named: str) -> List[str]:
+        return ["source", *self.labels, *(getattr(column, named) for column in self.columns)]
+
     def shown(self, row: TableRow, plus_minus: str = " ± ") -> List[str]:
         return [cell.shown(column.digits, column.signed, plus_minus) for cell, column in zip(row.cells, self.columns)]
 
@@ -70,42 +76,27 @@ def column(name: str, group: str = "", difference: bool = False) -> Column:
     return Column("Δ " + heading if difference else heading, digits, group, difference)
 
 
-def to_markdown(table: Table) -> str:
-    head = ["source", *table.labels, *(column.full_name for column in table.columns)]
-    rule = ["---"] * (1 + len(table.labels)) + ["---:"] * len(table.columns)
-    lines = ["| " + " | ".join(text.replace("|", "\\|").replace("\n", " ") for text in line) + " |"
-             for line in [head, rule, *table.lines()]]
-    return "\n".join([f"### {table.title}", "", *lines, *[""] * bool(table.notes),
-                      *(f"- {note}" for note in table.notes), ""])
-
-
 PLUS_MINUS = r" $\pm$ "
 SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--", "−": "$-$",
            "×": r"$\times$", "Δ": r"$\Delta$", "≥": r"$\geq$", "\n": " ",
            **{sign: "\\" + sign for sign in "&%$#_{}"}}
 
 
-def to_latex(table: Table) -> str:
-    """A table for booktabs; the paper's rows are in italics and marked."""
-    lines = [r"\begin{table}", r"\centering", rf"\caption{{{_escaped(table.title)}}}",
-             rf"\begin{{tabular}}{{l{'l' * len(table.labels)}{'r' * len(table.columns)}}}", r"\toprule"]
-    if any(column.group for column in table.columns):
-        spans = [f"\\multicolumn{{{width}}}{{c}}{{{_escaped(group)}}}" for group, width in table.headings()]
-        lines.append(" & ".join([""] * (1 + len(table.labels)) + spans) + r" \\")
-    head = ["source", *table.labels, *(column.name for column in table.columns)]
-    lines += [" & ".join(map(_escaped, head)) + r" \\", r"\midrule"]
-    for row, before, texts in zip(table.rows, (None, *table.rows), table.lines(PLUS_MINUS)):
-        if before and row.labels[0] != before.labels[0]:
-            lines.append(r"\midrule")
-        command = r"\textit{%s}" if row.source == PAPER else "%s"
-        lines.append(" & ".join(command % _escaped(text) for text in texts) + r" \\")
-    lines += [r"\bottomrule", r"\end{tabular}", *(rf"\par\footnotesize {_escaped(note)}" for note in table.notes)]
-    return "\n".join([*lines, r"\end{table}", ""])
-
-
 def _escaped(text: str) -> str:
     """For LaTeX; a plus-minus in mathematics is left as it is."""
     return PLUS_MINUS.join("".join(SPECIAL.get(letter, letter) for letter in part) for part in text.split(PLUS_MINUS))
+
+
+TEXTS = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), variable_start_string="<<",
+                           variable_end_string=">>", undefined=jinja2.StrictUndefined, trim_blocks=True,
+                           lstrip_blocks=True, keep_trailing_newline=True)
+TEXTS.filters.update(tex=_escaped, md=lambda text: text.replace("|", "\\|").replace("\n", " "))
+
+
+def to_text(table: Table, form: str) -> str:
+    """form: "md", "tex" (booktabs; the paper's rows are in italics) or "csv"."""
+    return to_csv(table) if form == "csv" else TEXTS.get_template(f"table.{form}").render(
+        table=table, plus_minus=PLUS_MINUS)
 
 
 def to_csv(table: Table) -> str:

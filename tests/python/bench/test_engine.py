@@ -16,7 +16,7 @@ import torch
 from bench_commands import command, environment, rows_of, wait_for
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite import engine, selection
+from diff_smoe_rasterization.benchmarks.suite import engine
 from diff_smoe_rasterization.benchmarks.suite.cell import failed_row
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.names import blend_of
@@ -347,14 +347,14 @@ def test_cells_are_chosen_by_their_fields(content):
                          (["headline=true"], {"alpha", "smoe", "smoe 0.05", "smoe learned"}),
                          (["background_gate=5e-2"], {"smoe 0.05"}), (["background_gate=0"], {"smoe"}),
                          (["background_gate=1"], {"alpha"}), (["background_gate=learned"], {"smoe learned"})):
-        chosen = selection.chosen(cells, words)
+        chosen = engine.chosen(cells, words)
         assert {blend_of(cell) for cell in chosen} == found
         assert {cell["seed"] for cell in chosen} == ({1} if words == ["headline=true"] else {0, 1})
     with pytest.raises(BenchError, match="--only blend_mode=smoe_std: .* alpha, smoe"):
-        selection.chosen(cells, ["blend_mode=smoe_std"])
+        engine.chosen(cells, ["blend_mode=smoe_std"])
     for wrong in ("blend_mode", "mode=alpha"):
         with pytest.raises(BenchError, match="--only " + wrong):
-            selection.chosen(cells, [wrong])
+            engine.chosen(cells, [wrong])
 
 
 def words_of(suite, *arguments, **more):

@@ -177,7 +177,7 @@ def test_a_failed_cell_is_a_row_with_its_reason():
                failed("killed", scene="fox", seed=1)]
     table = table_of(entries, "failures")
     assert {line.labels[1] for line in table.rows} == {"out of memory | 12 GiB", "killed"}
-    assert "out of memory \\| 12 GiB" in tables.to_markdown(table)
+    assert "out of memory \\| 12 GiB" in tables.to_text(table, "md")
     assert shown(table_of(entries, "cells"), "PSNR [dB]", method="native, smoe") == ["failed"]
     assert shown(table_of(entries, "cells"), "PSNR [dB]", scene="fox", seeds="1 of 2") == ["20.00"]
     assert shown(table_of(entries, "deltas"), "Δ PSNR [dB]") == ["smoe failed"]
@@ -196,11 +196,11 @@ def test_every_line_of_latex_and_markdown_has_all_columns(name):
     entries = [row(blend_mode=mode, seed=seed) for mode in ("alpha", "smoe", "smoe_tn") for seed in (0, 1)]
     table = table_of([*entries, failed("50 % of a_b & c\\d #1", scene="fox")], name)
     width = 1 + len(table.labels) + len(table.columns)
-    body = [line for line in tables.to_latex(table).split("\n") if line.endswith(r"\\") and "multicolumn" not in line]
+    body = [line for line in tables.to_text(table, "tex").split("\n") if line.endswith(r"\\") and "multicolumn" not in line]
     assert {line.replace(r"\&", "").count("&") for line in body} == {width - 1} and len(body) == len(table.rows) + 1
     if name == "failures":
         assert r"50 \% of a\_b \& c\textbackslash{}d \#1" in body[-1]
-    lines = [line for line in tables.to_markdown(table).split("\n") if line.startswith("|")]
+    lines = [line for line in tables.to_text(table, "md").split("\n") if line.startswith("|")]
     assert {line.count("|") for line in lines} == {width + 1} and len(lines) == len(table.rows) + 2
 
 

@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite import selection
+from diff_smoe_rasterization.benchmarks.suite import engine
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite, read_yaml
 from diff_smoe_rasterization.benchmarks.suite.protocol import config_of
 from diff_smoe_rasterization.benchmarks.suite.schema import THRESHOLDS
-from diff_smoe_rasterization.benchmarks.suite.selection import earlier_rows
 
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 
@@ -74,8 +73,8 @@ def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
         (None, 0), (30, 0), (40, 0), (40, 1)]
     assert {cell["id"] for cell in cells if "budget" not in cell} == {cell["id"] for cell in expand(content, "").cells}
     assert [config_of(cell).budget for cell in cells[:3]] == [0, 30, 40] and len({cell["id"] for cell in cells}) == 8
-    assert {cell["budget"] for cell in selection.chosen(cells, ["budget=40"])} == {40}
-    assert all("budget" not in cell for cell in selection.chosen(cells, ["budget=0"]))
+    assert {cell["budget"] for cell in engine.chosen(cells, ["budget=40"])} == {40}
+    assert all("budget" not in cell for cell in engine.chosen(cells, ["budget=0"]))
 
 
 SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "blend_modes": ["smoe"]}
@@ -234,5 +233,5 @@ def test_rows_from_before_there_were_gates_are_of_todays_cells(name, lacking, so
     if not rows.is_file():
         pytest.skip("the rows are in the repository, not in its source distribution")
     cells = [cell for cell in load_suite(find_suite(name)).cells if cell["seed"] == 0]
-    found = earlier_rows(str(rows), cells)
+    found = engine.earlier_rows(str(rows), cells)
     assert {cell["background_gate"] for cell in cells if cell["id"] not in found} == lacking
