@@ -37,7 +37,6 @@ FIGURES = ("psnr", "psnr_float", "ssim", "psnr_edge", "num_gaussians", "train_se
 
 
 def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
-    """What a row says of its cell, whether it was measured or failed."""
     method, scene = cell["method"], cell["scene"]
     return {"cell": cell["id"], "suite": cell["suite"], "method": method["name"], "label": method["label"],
             "variant": method["variant"], "scene": scene["name"], "dataset": scene["dataset"],
@@ -157,7 +156,6 @@ def last_line(path: str) -> str:
 
 
 def how_it_ended(status: int, log_path: str) -> str:
-    """The reason for a row where a process left none."""
     words = last_line(log_path)
     how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
     memory = "; the system may have been out of memory" if status == -signal.SIGKILL else ""
@@ -184,7 +182,6 @@ def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: floa
 
 
 def main(argv: Optional[List[str]] = None) -> int:
-    """Runs the command; 0 where there is a row, whatever it says."""
     parser = argparse.ArgumentParser(prog="python -I -m diff_smoe_rasterization.benchmarks.suite.cell",
                                      description="Trains and measures one cell of a suite.")
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")

@@ -1,8 +1,4 @@
-"""Runs a suite with Snakemake: what is still to be done, how many cells at once, on which GPUs or in which queue.
-
-What is done is what has a row, so that a run that was killed continues where it was. RESULTS/rows.jsonl is the
-concatenation of the rows.
-"""
+"""Runs a suite with Snakemake. What is done is what has a row: a run that was killed continues where it was."""
 from __future__ import annotations
 
 import importlib.util
@@ -69,12 +65,10 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         finally:
             measured = collect(results)
     here = [measured[cell["id"]] for cell in cells if cell["id"] in measured]
-    lacking = len(cells) - len(here)
-    if status != 0 or lacking:
-        log = os.path.join(results, ".snakemake", "log")
-        raise BenchError(f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The "
-                         f"same command continues; {log if os.path.isdir(log) else 'what it printed'} says what "
-                         "happened")
+    lacking, log = len(cells) - len(here), os.path.join(results, ".snakemake", "log")
+    refuse(status != 0 or lacking,
+           f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The same command "
+           f"continues; {log if os.path.isdir(log) else 'what it printed'} says what happened")
     return here
 
 
@@ -116,7 +110,6 @@ def _same(value: Any, text: str) -> bool:
 
 
 def plan(cells: List[Dict[str, Any]], done: Mapping[str, Row], absent: Sequence[str]) -> str:
-    """What --dry-run prints: a line for each cell, what is not there yet, and how many cells are how far."""
     states = ["to do" if cell["id"] not in done else "done" if done[cell["id"]]["ok"] else "failed" for cell in cells]
     counts = ", ".join(f"{states.count(state)} {state}" for state in ("done", "to do", "failed"))
     return "\n".join([*(f"{state}  {cell['id']}" for state, cell in zip(states, cells)), *absent, counts])
@@ -202,7 +195,6 @@ def read_row(results: str, name: str) -> Optional[Row]:
 
 
 def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[str]], per_gpu: int) -> None:
-    """Raises BenchError where --jobs, --slurm and --per-gpu are out of range or do not go together."""
     for option, number in (("--jobs", jobs), ("--per-gpu", per_gpu)):
         refuse(number is not None and number < 1, f"{option} is {number}; it must be at least 1")
     for word in slurm or ():
@@ -216,7 +208,6 @@ def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[st
 
 def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optional[int],
             slurm: Optional[Sequence[str]], per_gpu: int = 1) -> List[str]:
-    """Snakemake's command line, for cells that are all to be run. Raises BenchError."""
     require("snakemake")
     on_gpu, each = suite.protocol["device"] == "cuda", suite.protocol.get("gpus", 1)
     gpus = visible_gpus() if on_gpu and slurm is None else []
@@ -280,7 +271,6 @@ def environment() -> Dict[str, str]:
 
 
 def collect(results: str) -> Dict[str, Row]:
-    """Every row in RESULTS/cells by its cell's name; writes RESULTS/rows.jsonl."""
     found = {name: read_row(results, name) for name in cell_folders(results)}
     rows = {name: row for name, row in found.items() if row is not None}
     write_text_atomically(os.path.join(results, ROWS_NAME), "".join(json.dumps(row) + "\n" for row in rows.values()))
@@ -288,7 +278,6 @@ def collect(results: str) -> Dict[str, Row]:
 
 
 def rows_table(rows: List[Row]) -> str:
-    """A line for each row: what a terminal shows at the end."""
     return "\n".join(map(_line, rows))
 
 

@@ -1,9 +1,4 @@
-"""Suites: a YAML file that says what is trained on what, checked and expanded to cells.
-
-A cell is one training and its measurement, as plain values: the command of cell.py needs nothing else. What makes two
-figures comparable stands once in a suite (`protocol`, and each scene's images), never in a method, so that a suite
-cannot mix protocols; what would mix them nevertheless is refused here.
-"""
+"""Suites: a YAML file that says what is trained on what, checked and expanded to cells, in one protocol."""
 from __future__ import annotations
 
 import hashlib
@@ -51,7 +46,6 @@ def find_suite(name: str) -> str:
 
 
 def load_suite(path: str) -> Suite:
-    """Reads, checks and expands a suite. Raises BenchError naming the file, the field and what it must be."""
     content = read_yaml(path)
     try:
         return expand(content, os.path.dirname(os.path.abspath(path)))
@@ -135,7 +129,6 @@ def _scene(scene: Values, where: str, protocol: Values, folder: str) -> Values:
 
 
 def _apart(part: Values) -> Tuple[Values, Axes]:
-    """What a scene or a method says, and apart from that its axes."""
     return ({key: value for key, value in part.items() if key not in AXIS_OF},
             {axis: part[axis] for axis in AXIS_OF if axis in part})
 
@@ -204,7 +197,6 @@ OWN_FLAGS = {"taming": ("--densification_interval", "--mode")}
 
 
 def _can_follow(protocol: Values, name: str, where: str) -> None:
-    """Raises BenchError where a checkout cannot follow the protocol."""
     refuse(protocol["principal_point"] != "centre",
            f"protocol.principal_point: is 'scene', but the loader of {name} ({where}) moves it to the image centre; it "
            "must be 'centre', or the figures would not be comparable")
@@ -220,7 +212,6 @@ def _can_follow(protocol: Values, name: str, where: str) -> None:
 
 
 def _can_train(scene: Values, method: Values, axes: Axes) -> None:
-    """Raises BenchError where a checkout cannot train a scene as the suite says."""
     name, thresholds = method["name"], axes["densify_grad_thresholds"]
     what = f"scenes: {scene['name']}, methods: {method['label']}"
     refuse(scene["background"] == "white" and "steady" in axes["schedules"],
@@ -238,7 +229,6 @@ def _can_train(scene: Values, method: Values, axes: Axes) -> None:
 
 
 def _can_divide(protocol: Values, method: Values, axes: Axes) -> None:
-    """Raises BenchError where the method cannot train on batches of views or on several GPUs, as the protocol says."""
     for field in ("batch", "gpus"):
         if protocol.get(field, 1) == 1:
             continue
@@ -294,10 +284,7 @@ def cell_id(cell: Values) -> str:
 
 
 def _paths(given: Values, fields: Sequence[str], where: str, folder: str) -> Values:
-    """The paths among these fields as absolute ones, with environment variables put in.
-
-    Where a variable is not set, `unset` says which: it matters to those who run a cell that needs it.
-    """
+    """The paths among these fields as absolute ones; `unset` says which variable is not set, for whoever needs it."""
     found: Values = {}
 
     def absolute(text: str, field: str) -> str:

@@ -21,11 +21,7 @@ POOLING = {"alex": [None, (3, 2), (3, 2), None, None], "vgg": [None, (2, 2), (2,
 
 
 def lpips_network(kind: str, device: str) -> Distance:
-    """LPIPS of two images; `kind` is one of LPIPS_KINDS.
-
-    lpips_vgg_inria feeds [0, 1] into a network made for [-1, 1], as the code of 3DGS does. Raises what the absence of
-    weights raises.
-    """
+    """LPIPS of a kind of LPIPS_KINDS. lpips_vgg_inria feeds [0, 1] into a network made for [-1, 1], as 3DGS does."""
     net, normalise = net_of(kind), kind != "lpips_vgg_inria"
     if os.environ.get(VARIABLES[net]):
         return FileLpips(net, os.environ[VARIABLES[net]], normalise, device)
@@ -39,8 +35,6 @@ def lpips_network(kind: str, device: str) -> Distance:
 
 
 class FileLpips:
-    """LPIPS from a file of weights."""
-
     def __init__(self, net: str, path: str, normalise: bool, device: str) -> None:
         """normalise: images in [0, 1] are taken to [-1, 1]. Raises OSError and ValueError."""
         arrays = arrays_of(path)

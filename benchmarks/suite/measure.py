@@ -1,8 +1,4 @@
-"""What is measured of a rendering: PSNR, SSIM, PSNR near edges and LPIPS, the same way whatever program rendered.
-
-Every metric is one number of one image; a scene's figure is the mean over its test views (results/evaluation.py of the
-trainer).
-"""
+"""What is measured of a rendering, the same way whatever program rendered: one number of one image for each metric."""
 from __future__ import annotations
 
 import math
@@ -43,7 +39,6 @@ class Measures:
     """All metrics of one rendering; LPIPS of each kind whose weights are at hand."""
 
     def __init__(self, device: str, lpips: Sequence[str] = ()) -> None:
-        """lpips: names of LPIPS_KINDS."""
         self.reasons: Dict[str, Optional[str]] = {}  # why a kind of LPIPS is absent; None where it is measured
         self._networks: Dict[str, Distance] = {}
         for kind in lpips:
@@ -58,10 +53,7 @@ class Measures:
 
     def __call__(self, color: torch.Tensor, target: torch.Tensor,
                  mask: Optional[torch.Tensor] = None) -> Dict[str, Optional[float]]:
-        """color: a rendering [3, H, W]; target: its ground truth in [0, 1].
-
-        mask: [1, H, W], the view's, if it has one; LPIPS is then that of both images times the mask.
-        """
+        """color: a rendering [3, H, W]; mask: [1, H, W], the view's; LPIPS is then that of both images times the mask."""
         png = quantised(color)
         metrics: Dict[str, Optional[float]] = {**image_metrics(color, target, mask),
                                                "psnr_edge": edge_psnr(png, target, mask)}
@@ -84,7 +76,6 @@ class Measures:
 
 
 def headline_lpips(rows: Sequence[Dict[str, object]]) -> Dict[str, object]:
-    """The first kind that has a value, else the first."""
     if not rows:
         return {"value": None, "kind": None, "reason": "the suite asks for none"}
     return next((row for row in rows if row["value"] is not None), rows[0])

@@ -49,10 +49,7 @@ def read_json(path: Union[str, Path]) -> Any:
 
 
 def blend_of(row: Mapping[str, Any]) -> str:
-    """The blend of a row or a cell: its mode, in `smoe` with its gate, such as "smoe 0.05" or "smoe learned".
-
-    "smoe" alone is gate 0, the paper's Eq. 7: that of rows that say none, which are older than the gate.
-    """
+    """Such as "smoe 0.05" or "smoe learned"; rows that say no gate are older than it, and of 0, the paper's Eq. 7."""
     gate = row.get("background_gate") or 0
     if row["blend_mode"] != "smoe" or gate == 0:
         return row["blend_mode"]

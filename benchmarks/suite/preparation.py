@@ -19,7 +19,6 @@ NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", 
 
 
 def what_is_missing(cells: List[Dict[str, Any]]) -> List[str]:
-    """What these cells need and is not there, and what to do."""
     scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
     methods = {cell["method"]["label"]: cell["method"] for cell in cells}
     absent = [f"{part['unset']}; set it" for part in (*scenes.values(), *methods.values()) if "unset" in part]
@@ -46,10 +45,7 @@ def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
 
 
 def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
-    """The method with its checkouts as they are run: patched ones are copies in RESULTS/checkouts.
-
-    Where a checkout cannot be used, `refused` says why: that is what its cells' rows will say.
-    """
+    """The method with its checkouts as they are run; `refused` says why they cannot be, as its cells' rows will."""
     if method["name"] == NATIVE:
         return method
     try:
@@ -61,7 +57,6 @@ def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
 
 
 def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
-    """The folder of a checkout as it is run. Raises BenchError or PatchError."""
     path = method[key]
     if not CHECKOUTS[method["name"]]:
         return path

@@ -1,8 +1,4 @@
-"""The rules that make two rows comparable, as data: each row carries them.
-
-What the trainer already writes down (split, sizes, downscaler, background, metrics) comes from its `result_row`; here
-are the harness's own. A rule that a reader would have to know beforehand is a rule that is missing here.
-"""
+"""The rules that make two rows comparable, as data: each row carries them. What the trainer writes down is its own."""
 from __future__ import annotations
 
 import contextlib

@@ -91,10 +91,7 @@ def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
 
 
 def read_rows(results: str) -> List[Row]:
-    """The rows of a results folder (cells/*/row.json and rows.jsonl) or of one .jsonl file, sorted by cell.
-
-    A cell's own row.json wins over rows.jsonl, and there the last line of a cell. Raises ReportError.
-    """
+    """The rows of RESULTS or of one .jsonl file, by cell; a cell's own row.json wins, then its last line. Raises ReportError."""
     listed = results if os.path.isfile(results) else os.path.join(results, ROWS_NAME)
     lines = _text(listed).split("\n") if os.path.isfile(listed) else []
     found = [checked(line, f"{listed}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
@@ -107,7 +104,6 @@ def read_rows(results: str) -> List[Row]:
 
 
 def at_once(row: Row) -> int:
-    """How many cells may have been at work at once on the row's GPU or CPU."""
     machine = row.get("machine") or {}
     return max(machine.get("cells_per_gpu") or 1, machine.get("cells_at_once") or 1)
 
@@ -148,10 +144,7 @@ def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
 
 
 def _rules(row: Row) -> Dict[str, Any]:
-    """The rules that the row states, by name; the entries of one that is a dict stand alone.
-
-    `gate` brings learning rates of its own: its recipes are compared with each other.
-    """
+    """The rules that the row states, by name; `gate` brings learning rates of its own, which are compared with each other."""
     found: Dict[str, Any] = {}
     for name, value in (row.get("protocol") or {}).items():
         if name in RULES or name.startswith(RULE_PREFIXES):

@@ -114,7 +114,6 @@ SuiteFile = create_model(
 
 
 def check(content: Any) -> None:
-    """Raises BenchError naming the first field of a suite that is wrong, and how."""
     if content is None:
         raise BenchError("the file is empty")
     try:

@@ -8,7 +8,7 @@ import torch
 
 from ....trainer.config import TrainConfig
 from ....trainer.results.evaluation import Evaluation
-from ....trainer.scenes.scene import Scene
+from ....trainer.scenes.scene import Scene, load_scene
 from ...errors import BenchError
 from ..names import NATIVE
 from ..protocol import BYTES_PER_GAUSSIAN
@@ -35,7 +35,6 @@ class Outcome:
 
 
 def run(cell: Dict[str, Any], output: str) -> Outcome:
-    """Trains, renders and measures a cell in the folder `output`. Raises TrainerError."""
     if cell["method"]["name"] == NATIVE:
         from .native import run_native
 
@@ -45,8 +44,9 @@ def run(cell: Dict[str, Any], output: str) -> Outcome:
     return run_checkout(cell, output)
 
 
-def require_test_views(scene: Scene, config: TrainConfig) -> Scene:
-    """The scene. Raises BenchError, before anything is trained, where there would be nothing to measure."""
+def scene_of(config: TrainConfig) -> Scene:
+    """Raises BenchError, before anything is trained, where there would be nothing to measure."""
+    scene = load_scene(config, progress=False)
     if not scene.test:
         raise BenchError(f"scene {config.scene} has no test views: nothing could be measured")
     return scene

@@ -21,13 +21,13 @@ from ....trainer.config import TrainConfig
 from ....trainer.results.evaluation import Evaluation, summary
 from ....trainer.results.pictures import evenly_spaced
 from ....trainer.scenes.images import View
-from ....trainer.scenes.scene import Scene, load_scene
+from ....trainer.scenes.scene import Scene
 from ...errors import BenchError
 from ..cell import die_with_parent, last_line
 from ..measure import Measures
 from ..names import COUNTED_BY, RECIPE, read_json
 from ..protocol import commit_of, config_of
-from . import Outcome, require_test_views
+from . import Outcome, scene_of
 
 OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py")
 # Mean difference between the trainer's ground truth and ours: rounding leaves half a grey level at the most, another
@@ -62,18 +62,14 @@ class ThreeDGS:
                             *self.render_arguments, renders=self.renders, observed=("--no-pictures",))
 
     def train_arguments(self) -> List[str]:
-        """What the protocol and the axes are in the trainer's words."""
         config = self.config
         words = ["-s", self.scene, "-m", self.model, *self.test_arguments(), "--iterations", config.iterations,
                  "--save_iterations", config.iterations, "--port", 0]  # a free one: cells run side by side
         if self.method["name"] not in COUNTED_BY:
             words += ["--densify_grad_threshold", config.densify_grad_threshold]
-        if config.resolution != -1:
-            words += ["-r", config.resolution]
-        if config.images != "images":
-            words += ["--images", config.images]
-        if config.white_background:
-            words.append("--white_background")
+        words += ["-r", config.resolution] if config.resolution != -1 else []
+        words += ["--images", config.images] if config.images != "images" else []
+        words += ["--white_background"] if config.white_background else []
         words += self.recipe_arguments()
         if self.method["variant"] != "unpatched":
             words += ["--blend_mode", config.blend_mode]
@@ -139,7 +135,6 @@ class ThreeDGS:
         return read_json(record)
 
     def environment(self) -> Dict[str, str]:
-        """Of the commands: a patched checkout needs this package; nothing is left in the checkout's folders."""
         ours = os.environ.get("PYTHONPATH", "").split(os.pathsep)
         path = [item for item in [*self.method["pythonpath"], *ours] if item]
         environment = {name: value for name, value in os.environ.items()
@@ -176,7 +171,6 @@ class C3DGS(ThreeDGS):
         return {**trained, "peak_gpu_mib": None if None in peaks else max(peaks)}
 
     def train_seconds(self, trained: Dict[str, Any]) -> Optional[float]:
-        """Training, and what compress.py says of its own stages; None where it says nothing."""
         path = os.path.join(self.model, "times.json")
         if trained["loop_seconds"] is None or not os.path.isfile(path):
             return None
@@ -233,11 +227,10 @@ SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDG
 
 
 def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
-    """Trains, renders and measures. Raises TrainerError."""
     if cell["method"].get("refused"):
         raise BenchError(cell["method"]["refused"])
     config = config_of(cell, output)
-    scene = require_test_views(load_scene(config, progress=False), config)
+    scene = scene_of(config)
     shape = SHAPES[cell["method"]["name"]](cell, config, output)
     for left in (shape.model, shape.renders, shape.scene):  # of an earlier attempt; these trainers do not continue one
         shutil.rmtree(left, ignore_errors=True)
@@ -289,8 +282,8 @@ def matched(scene: Scene, seen: List[Dict[str, Any]], label: str) -> List[Tuple[
     """Our test views with the trainer's renderings. Raises BenchError where the split is not the same."""
     by_name = {Path(row["name"]).stem: row for row in seen}  # trainers keep folder and extension, or drop them
     expected = {Path(view.camera.name).stem for view in scene.test}
-    if set(by_name) != expected:
-        wrong = sorted(expected ^ set(by_name))
+    wrong = sorted(expected ^ set(by_name))
+    if wrong:
         raise BenchError(f"{label} rendered {len(by_name)} test views, the split has {len(expected)} "
                          f"({', '.join(wrong[:3])}, ... are in one of them alone): another split gives other figures")
     return [(view, by_name[Path(view.camera.name).stem]) for view in scene.test]
@@ -298,8 +291,7 @@ def matched(scene: Scene, seen: List[Dict[str, Any]], label: str) -> List[Tuple[
 
 def measured(pairs: List[Tuple[View, Dict[str, Any]]], measures: Measures, device: str) -> Tuple[float, Evaluation]:
     """The largest mean difference between both ground truths, and the figures. Raises BenchError beyond the limit."""
-    per_view: List[Dict[str, Any]] = []
-    largest = 0.0
+    per_view, largest = [], 0.0
     for view, seen in pairs:
         truth, theirs = view.image_float(), torch.from_numpy(np.load(seen["truth"]))
         if theirs.shape != truth.shape:

@@ -13,7 +13,6 @@ from ....trainer.results.evaluation import evaluate
 from ....trainer.results.modelfile import model_path
 from ....trainer.results.pictures import evenly_spaced
 from ....trainer.results.rows import read_results
-from ....trainer.scenes.scene import load_scene
 from ....trainer.system import torchrun
 from ....trainer.system.process import set_up_process
 from ....trainer.training.checkpoint import CHECKPOINT_NAME
@@ -21,7 +20,7 @@ from ....trainer.training.loop import HISTORY_NAME, train
 from ..measure import Measures
 from ..names import read_json
 from ..protocol import config_of
-from . import Outcome, require_test_views
+from . import Outcome, scene_of
 
 
 def run_native(cell: Dict[str, Any], output: str) -> Outcome:
@@ -33,7 +32,7 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     if on_gpu:
         torch.cuda.reset_peak_memory_stats()
     continued = os.path.isfile(os.path.join(folder, CHECKPOINT_NAME))
-    scene = require_test_views(load_scene(config, progress=False), config).to(config.device)
+    scene = scene_of(config).to(config.device)
     gpus = cell["protocol"].get("gpus", 1)
     row = train_on(gpus, config) if gpus > 1 else train(config, resume=True, progress=False, scene=scene)
     # The peak of a part of the training would be taken for that of the whole.
@@ -56,10 +55,7 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
 
 
 def train_on(gpus: int, config: TrainConfig) -> Dict[str, Any]:
-    """Trains in as many processes, continuing where an earlier attempt stopped; returns the run's row.
-
-    Raises TrainerError where one of them fails; what they printed says why.
-    """
+    """Trains in as many processes, continuing an earlier attempt; returns the run's row. Raises TrainerError."""
     os.makedirs(config.output, exist_ok=True)
     if not holds_run(config.output):
         config.save(config.output)

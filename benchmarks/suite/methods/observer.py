@@ -83,10 +83,7 @@ def shift_seeds(seed):
 
 
 def watch_loop(iterations, views):
-    """Times the bar over so many iterations; returns where that goes.
-
-    Where the bar of the final rendering begins, earlier entries of `views` go: HAC renders training views on the way.
-    """
+    """Times the bar over so many iterations; returns where that goes."""
     import torch
     import tqdm
 
@@ -96,7 +93,7 @@ def watch_loop(iterations, views):
         def __init__(self, *arguments, **keywords):
             super().__init__(*arguments, **keywords)
             words = getattr(self, "desc", "")  # a bar that is disabled has none
-            if words.startswith("Rendering progress"):
+            if words.startswith("Rendering progress"):  # the final one; HAC renders training views on the way
                 views.clear()
             self.counted = self.total == iterations
             self.trains = self.counted or words.startswith("Training progress")
@@ -126,7 +123,6 @@ def timed(function, *arguments, **keywords):
 
 
 def keep(folder, number, view, image, seconds):
-    """Writes a rendering and its ground truth; returns the record's entry."""
     import numpy
 
     os.makedirs(folder, exist_ok=True)
@@ -159,7 +155,6 @@ def watch_scenes(hold_out):
 
 
 def renderings_of(scene, attribute, folder):
-    """The record's entries of the test views, rendered by the scene's model itself."""
     import torch
 
     model, views, found = getattr(scene, attribute), scene.getTestCameras(), {}

@@ -1,8 +1,4 @@
-"""What `dsmoe bench report` writes of a folder of results: tables, figures, images and a page.
-
-groups.py averages rows; layouts.py says which tables there are and tables.py writes them; curves.py draws; images.py
-collects images; page.html and .css are the page. paper.json holds the paper's printed figures.
-"""
+"""What `dsmoe bench report` writes of a folder of results. groups.py averages, layouts.py says which tables there are."""
 from __future__ import annotations
 
 import base64
@@ -104,7 +100,6 @@ def _number(count: int, of: str) -> str:
 
 
 def _absent(results: str, suite: str, rows: Sequence[Row]) -> str:
-    """Which cells of the suite have no row yet, where RESULTS is a folder that lists its cells."""
     try:
         said = read_json(Path(results, SUITE_NAME))
         cells = said["cells"] if said["name"] == suite else []

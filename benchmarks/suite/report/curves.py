@@ -120,7 +120,6 @@ def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
 
 
 def _drawn(group: Group, name: str) -> bool:
-    """Whether the figure has a place on an axis: one of amounts may be logarithmic."""
     mean = group.measured(name).value
     return mean is not None and math.isfinite(mean) and (mean > 0 or name not in AMOUNTS)
 

@@ -21,8 +21,6 @@ LPIPS = "lpips:"  # the figure's name goes on with its kind, such as lpips_alex
 
 
 class Setting(NamedTuple):
-    """What a cell varies, except the scene and the seed."""
-
     method: str
     name: str  # the method's label in the suite: it tells apart what the other fields do not
     variant: Optional[str]
@@ -92,8 +90,6 @@ class Cell(NamedTuple):
 
 
 class Group:
-    """The cells of one setting on one scene: one row for each seed."""
-
     def __init__(self, setting: Setting, scene: str, rows: Sequence[Row]):
         self.setting, self.scene = setting, scene
         self.rows, self.failed = ([row for row in rows if row["ok"] is ok] for ok in (True, False))
@@ -106,7 +102,6 @@ class Group:
         return (self.rows + self.failed)[0].get("dataset", named)
 
     def measured(self, name: str) -> Cell:
-        """The figure's mean and spread over seeds."""
         return over([self], name, lambda figures: figures[0])
 
     def measured_or_failed(self, names: Sequence[str]) -> List[Cell]:
@@ -154,7 +149,6 @@ def lpips_reasons(rows: Iterable[Row]) -> List[str]:
 
 
 def _lpips(row: Row) -> List[Row]:
-    """What the row says of each kind of LPIPS; a suite may ask for none."""
     return [lpips for lpips in row.get("lpips_all") or [row.get("lpips")] if lpips and lpips.get("kind")]
 
 

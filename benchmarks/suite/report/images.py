@@ -19,19 +19,14 @@ ERROR_COLORS = "inferno"
 
 
 def collect(results: str, suite: str, rows: Sequence[Row], output: str) -> List[Dict[str, Any]]:
-    """Writes OUTPUT/images of a suite's cells, and the errors of renderings.
-
-    Returns for every scene and setting, with paths relative to OUTPUT:
-    {"title", "views": [{"name", "images": [{"label", "path"}]}]}. Raises ReportError.
-    """
+    """Writes OUTPUT/images of a suite's cells and their errors; returns what there is of every scene and setting."""
     compared: Dict[Any, List[Group]] = {}
     for group in grouped(rows, end_of):
         compared.setdefault((group.scene, group.setting.pair), []).append(group)
     found = []
     for number, ((scene, setting), groups) in enumerate(compared.items()):
         amount = "" if setting.threshold is None and setting.budget is None else f", threshold {setting.amount()}"
-        folder = f"images/{safe_name(suite)}-{number}"
-        views = _views(_folders(results, groups), output, folder)
+        views = _views(_folders(results, groups), output, f"images/{safe_name(suite)}-{number}")
         found += [{"title": f"{scene}: {setting.label(blend=False)}{amount}", "views": views}] if views else []
     return found
 

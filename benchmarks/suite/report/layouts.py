@@ -65,7 +65,6 @@ def table1(groups: Sequence[Group]) -> Table:
 
 
 def table2(groups: Sequence[Group]) -> Table:
-    """The paper's Table 2: other trainers with the gate put in; averages over all scenes at hand."""
     names = ["psnr", "ssim", "lpips:paper", *lpips_figures(groups), "num_gaussians_m", "size_own_mb", "train_seconds",
              "fps", SEEDS]
     scenes = sorted({group.scene for group in groups})
@@ -96,7 +95,6 @@ def _both_ends(groups: Sequence[Group], table: str, places: Sequence[Place],
 
 
 def table3(groups: Sequence[Group]) -> Table:
-    """The paper's Table 3: the gate without the transmittance, in its denominator and altogether."""
     names = ["psnr", "ssim", "lpips:paper", *lpips_figures(groups), "train_seconds", "num_gaussians_m"]
     ablated = {(group.setting.pair, group.scene) for group in groups
                if group.setting.blend in ("smoe_tn", "smoe_std")}
@@ -147,7 +145,6 @@ def deltas(groups: Sequence[Group], base: str, blend: str) -> Table:
 
 
 def _papers_deltas(names: Sequence[str]) -> Iterator[TableRow]:
-    """What the paper's Table 1 says of smoe against alpha."""
     for end in END_NAMES:
         for dataset in PAPER["datasets"]:
             alpha, smoe = (dict(zip(PAPER["table1"]["columns"], map(float, PAPER["table1"][end][method][dataset])))
@@ -216,7 +213,6 @@ def _seeds(groups: Sequence[Group]) -> Tuple[Set[int], Set[int]]:
 
 
 def _seed_notes(setting: Setting, groups: Sequence[Group]) -> Iterator[str]:
-    """Which seeds averages leave out, and why."""
     for seed in sorted(_seeds(groups)[1]):
         lacking = [f"{group.setting.blend} "
                    f"{'failed' if any(row['seed'] == seed for row in group.failed) else 'was not run'} on {group.scene}"
@@ -238,7 +234,6 @@ def _printed(table: str, values: Optional[Sequence[str]], names: Sequence[str]) 
 
 
 def _by_dataset(groups: Sequence[Group]) -> Dict[str, List[str]]:
-    """The scenes at hand of each of the paper's data sets that has some."""
     found = {dataset: sorted({group.scene for group in groups if group.dataset(PAPER["datasets"]) == dataset})
              for dataset in PAPER["datasets"]}
     return {dataset: scenes for dataset, scenes in found.items() if scenes}

@@ -50,14 +50,12 @@ class Table(NamedTuple):
     notes: List[str]
 
     def without_empty_columns(self) -> Table:
-        """The table without the columns that no row has anything in."""
         kept = [any(cell.value is not None or cell.text for cell in column)
                 for column in zip(*(row.cells for row in self.rows))]
         return self._replace(columns=list(itertools.compress(self.columns, kept)),
                              rows=[row._replace(cells=list(itertools.compress(row.cells, kept))) for row in self.rows])
 
     def headings(self) -> List[Tuple[str, int]]:
-        """The groups of columns, each with its number of columns."""
         groups = itertools.groupby(self.columns, key=lambda column: column.group)
         return [(group, len(list(columns))) for group, columns in groups]
 
