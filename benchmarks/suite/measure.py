@@ -53,7 +53,7 @@ class Measures:
 
     def __call__(self, color: torch.Tensor, target: torch.Tensor,
                  mask: Optional[torch.Tensor] = None) -> Dict[str, Optional[float]]:
-        """color: a rendering [3, H, W]; mask: [1, H, W], the view's; LPIPS is then that of both images times the mask."""
+        """color: a rendering [3, H, W]; mask: [1, H, W], the view's, by which LPIPS multiplies both images."""
         png = quantised(color)
         metrics: Dict[str, Optional[float]] = {**image_metrics(color, target, mask),
                                                "psnr_edge": edge_psnr(png, target, mask)}

@@ -91,7 +91,10 @@ def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
 
 
 def read_rows(results: str) -> List[Row]:
-    """The rows of RESULTS or of one .jsonl file, by cell; a cell's own row.json wins, then its last line. Raises ReportError."""
+    """The rows of RESULTS or of one .jsonl file, sorted by cell. Raises ReportError.
+
+    A cell's own row.json wins over rows.jsonl, and there the last line of a cell.
+    """
     listed = results if os.path.isfile(results) else os.path.join(results, ROWS_NAME)
     lines = _text(listed).split("\n") if os.path.isfile(listed) else []
     found = [checked(line, f"{listed}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
@@ -144,7 +147,7 @@ def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
 
 
 def _rules(row: Row) -> Dict[str, Any]:
-    """The rules that the row states, by name; `gate` brings learning rates of its own, which are compared with each other."""
+    """The rules that the row states, by name. `gate` brings learning rates of its own: its recipes are compared."""
     found: Dict[str, Any] = {}
     for name, value in (row.get("protocol") or {}).items():
         if name in RULES or name.startswith(RULE_PREFIXES):

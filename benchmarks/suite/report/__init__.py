@@ -1,4 +1,8 @@
-"""What `dsmoe bench report` writes of a folder of results. groups.py averages, layouts.py says which tables there are."""
+"""What `dsmoe bench report` writes of a folder of results: tables, figures, images and a page.
+
+groups.py averages rows; layouts.py says which tables there are; table.* and page.* are their texts. paper.json holds
+the paper's printed figures.
+"""
 from __future__ import annotations
 
 import base64
