@@ -190,16 +190,6 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_written(
     assert not (tmp_path / "results").exists()
 
 
-def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, bench):
-    content, _, results = finished
-    longer = write_suite({**content, "protocol": {**content["protocol"], "iterations": 13}}, tmp_path)
-    before = sorted(results.rglob("*"))
-    for more in ([], ["--dry-run"]):
-        status, told = bench(longer, results, "--only", "scene=tiny", *more)
-        assert status == 1 and "protocol.iterations is 12 there and 13 here" in told
-    assert sorted(results.rglob("*")) == before
-
-
 def test_scenes_and_methods_that_have_rows_stay_as_they_are(content, tmp_path, bench):
     """Where they lie may change; what is new may be added; the axes may be extended."""
     for folder in ("taming", "moved"):
@@ -215,7 +205,9 @@ def test_scenes_and_methods_that_have_rows_stay_as_they_are(content, tmp_path, b
     def said(**changes):
         return bench(write_suite({**content, **changes}, tmp_path), results, "--dry-run", *alpha)[1]
 
-    for changes, told in (({"scenes": [{**scene, "resolution": 2}]}, "scene tiny: resolution is -1 there and 2 here"),
+    longer = {"protocol": {**content["protocol"], "iterations": 13}}
+    for changes, told in ((longer, "protocol.iterations is 12 there and 13 here"),
+                          ({"scenes": [{**scene, "resolution": 2}]}, "scene tiny: resolution is -1 there and 2 here"),
                           ({"scenes": [{**scene, "dataset": "X"}]}, "scene tiny: dataset is None there and 'X' here"),
                           ({"scenes": [{"name": "tiny", "synthetic": {"views": 3}}]}, "scene tiny: synthetic is None"),
                           ({"methods": [{**method, "arguments": ["--cams", 20]}]},
@@ -397,26 +389,6 @@ def test_cells_of_two_gpus_take_two_of_three(on_gpus, monkeypatch):
     on_gpus.protocol["gpus"] = 4
     with pytest.raises(BenchError, match="protocol.gpus is 4, and torch finds 3 on this machine"):
         words_of(on_gpus, None, None)
-
-
-@pytest.mark.parametrize("protocol, more, text", [
-    (dict(gpus=2, device="cpu"), {}, "protocol.gpus is 2; it needs protocol.device: cuda"),
-    (dict(gpus=2, device="cuda", principal_point="centre"), {"methods": [{"name": "3dgs-2023", "path": "x"}]},
-     "but method 3dgs-2023 knows none; only native does"),
-    (dict(batch=2), {"schedules": ["mcmc"]}, "protocol.batch is 2, but schedule mcmc knows none"),
-    (dict(batch=5), {}, "--iterations is 12; it must be a multiple of --batch, 5")])
-def test_batches_and_gpus_that_cannot_be_are_refused(content, protocol, more, text):
-    content["protocol"].update(protocol)
-    with pytest.raises(BenchError, match=text):
-        expand({**content, **more}, "")
-
-
-def test_a_cells_name_is_as_it_was_without_batches(content):
-    def names(**protocol):
-        return {cell["id"] for cell in expand({**content, "protocol": {**content["protocol"], **protocol}}, "").cells}
-
-    assert not names() & names(batch=2)
-    assert all("batch" not in cell["protocol"] and "gpus" not in cell["protocol"] for cell in expand(content, "").cells)
 
 
 def test_queues_are_snakemakes_business(on_gpus, monkeypatch):

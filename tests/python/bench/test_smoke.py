@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import csv
-import math
 import subprocess
 
 import pytest
@@ -18,13 +17,10 @@ def test_the_suite_smoke(tmp_path):
         done = subprocess.run(command("bench", *words), env=environment(), cwd=str(tmp_path), stdout=subprocess.PIPE,
                               stderr=subprocess.STDOUT)
         assert done.returncode == 0, done.stdout.decode(errors="replace")
-    rows = rows_of(tmp_path / "results").values()
+    rows = list(rows_of(tmp_path / "results").values())
     for row in rows:
-        figures = [row[name] for name in ("psnr", "psnr_float", "psnr_edge", "ssim", "train_seconds", "wall_seconds",
-                                          "fps", "num_gaussians")]
-        assert all(math.isfinite(figure) and figure > 0 for figure in figures), row["cell"]
         halfway, = row["history"]
-        assert halfway["iteration"] == 150 and row["psnr"] > halfway["psnr"] and row["machine"]["cells_at_once"] == 1
+        assert row["ok"] and halfway["iteration"] == 150 and row["psnr"] > halfway["psnr"]
     with open(tmp_path / "report" / "tables" / "smoke_cells.csv", encoding="utf-8", newline="") as file:
         printed = [(float(line["PSNR [dB]"]), float(line["#Gaussians"])) for line in csv.DictReader(file)]
     assert sorted(printed) == sorted((row["psnr"], row["num_gaussians"]) for row in rows) and len(printed) == 4

@@ -62,7 +62,9 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tmp_path):
         return expand(changed(content, **changes), "").cells[0]["id"]
 
     scene, = content["scenes"]
-    assert name(protocol={**content["protocol"], "iterations": 13}) != name() != name(
+    assert len({name(), *(name(protocol={**content["protocol"], **changes}) for changes in (
+        {"iterations": 13}, {"batch": 2}, {"batch": 1}))}) == 4
+    assert "batch" not in expand(content, "").cells[0]["protocol"] and name() != name(
         scenes=[{**scene, "background": "white"}])
     assert name(scenes=[{**scene, "path": str(tmp_path)}]) == name(scenes=[{**scene, "path": "$NOT_THERE"}]) == name()
 
@@ -106,6 +108,10 @@ SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "bl
     ({"methods": [SMOE_OF_ANOTHER]}, ["methods[0].blend_modes", "its own blending"]),
     ({"methods": [{"name": "2dgs", "path": "p", "variant": "patched"}]}, ["methods[0].variant"]),
     ({"protocol": {"iterations": 0}}, ["protocol.iterations"]),
+    ({"protocol": {"gpus": 2, "device": "cpu"}}, ["protocol.gpus is 2; it needs protocol.device: cuda"]),
+    ({"protocol": {"gpus": 2}, "methods": [{"name": "3dgs-2023", "path": "x"}]}, ["method 3dgs-2023 knows none"]),
+    ({"protocol": {"batch": 2}, "schedules": ["mcmc"]}, ["protocol.batch is 2, but schedule mcmc knows none"]),
+    ({"protocol": {"batch": 7}}, ["--iterations is 30000; it must be a multiple of --batch, 7"]),
     ({"protocol": {"options": {"densify_until": 1}}}, ["protocol.options", "densify_until"]),
     ({"protocol": {"options": {"lambda_dssim": 2}}}, ["--lambda-dssim", "2"]),
     ({"protocol": {"options": {"densify_from_iter": "x"}}}, ["protocol.options.densify_from_iter"]),
