@@ -447,3 +447,20 @@ def test_cells_are_told_the_gpus_and_their_threads(content, tmp_path, monkeypatc
     assert len(told) == 2
     for line in told:
         assert line.startswith("3 threads: ") and line.endswith(" --gpus 0 --locks .locks --per-device 2")
+
+
+@pytest.mark.slow  # a minute
+def test_the_suite_smoke(tmp_path):
+    """From end to end, as a user types it."""
+    pytest.importorskip("matplotlib", reason="a report needs matplotlib")
+    for words in (["run", "smoke", "-o", "results"], ["report", "results", "-o", "report"]):
+        done = subprocess.run(command("bench", *words), env=environment(), cwd=str(tmp_path), stdout=subprocess.PIPE,
+                              stderr=subprocess.STDOUT)
+        assert done.returncode == 0, done.stdout.decode(errors="replace")
+    rows = list(rows_of(tmp_path / "results").values())
+    for row in rows:
+        halfway, = row["history"]
+        assert row["ok"] and halfway["iteration"] == 150 and row["psnr"] > halfway["psnr"]
+    with open(tmp_path / "report" / "tables" / "smoke_cells.csv", encoding="utf-8", newline="") as file:
+        printed = [(float(line["PSNR [dB]"]), float(line["#Gaussians"])) for line in csv.DictReader(file)]
+    assert sorted(printed) == sorted((row["psnr"], row["num_gaussians"]) for row in rows) and len(printed) == 4
