@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import json
-import math
 import subprocess
 import sys
 import time
@@ -15,7 +14,6 @@ from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.methods import native
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.results.rendering import Renderer
 
 
 def python_that(says, folder, monkeypatch):
@@ -115,20 +113,6 @@ def worked(content, tmp_path):
     return row
 
 
-def test_pixels_that_are_no_numbers_are_a_rows_reason(worked, monkeypatch):
-    render = Renderer.__call__
-
-    def broken(renderer, camera, **arguments):
-        rendering = render(renderer, camera, **arguments)
-        if camera.name == "view_008.png":  # the second of two test views
-            rendering.color[0, 5, 5] = math.nan
-        return rendering
-
-    monkeypatch.setattr(Renderer, "__call__", broken)
-    row = worked("out")
-    assert not row["ok"] and "the rendering of view_008.png has NaN or infinite pixels" in row["reason"]
-
-
 def test_a_row_is_written_before_its_model_is_removed(worked, tmp_path, monkeypatch):
     """Whatever happens in between, nothing is trained again."""
     there = []
@@ -145,3 +129,12 @@ def test_a_row_says_that_its_cell_shared_its_processor(worked):
     assert alone["machine"] == shared["machine"] and alone["protocol"] == shared["protocol"]
     again = worked("two", 1, keep_models=True)
     assert again["protocol"]["continued"] and again["machine"]["cells_at_once"] == 3
+
+
+def test_a_cell_of_a_budget_ends_with_it(worked, content):
+    """By the strategy `gate`, whose options the recipe of the row has."""
+    options = {**content["protocol"]["options"], "strategy_options": "overshoot=2"}
+    row = worked("out", schedules=["gate"], budgets=[40], protocol={**content["protocol"], "options": options})
+    assert row["ok"], row["reason"]
+    assert row["num_gaussians"] == row["budget"] == row["protocol"]["budget"] == 40
+    assert row["protocol"]["recipe"]["strategy_options"] == "overshoot=2" and "_gate_0.005_n40_s0_" in row["cell"]

@@ -16,7 +16,7 @@ import torch
 from bench_commands import command, environment, rows_of, wait_for
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite import engine, selection
+from diff_smoe_rasterization.benchmarks.suite import engine
 from diff_smoe_rasterization.benchmarks.suite.cell import failed_row
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.names import blend_of
@@ -190,16 +190,6 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_written(
     assert not (tmp_path / "results").exists()
 
 
-def test_results_of_another_protocol_are_not_added_to(finished, tmp_path, bench):
-    content, _, results = finished
-    longer = write_suite({**content, "protocol": {**content["protocol"], "iterations": 13}}, tmp_path)
-    before = sorted(results.rglob("*"))
-    for more in ([], ["--dry-run"]):
-        status, told = bench(longer, results, "--only", "scene=tiny", *more)
-        assert status == 1 and "protocol.iterations is 12 there and 13 here" in told
-    assert sorted(results.rglob("*")) == before
-
-
 def test_scenes_and_methods_that_have_rows_stay_as_they_are(content, tmp_path, bench):
     """Where they lie may change; what is new may be added; the axes may be extended."""
     for folder in ("taming", "moved"):
@@ -215,7 +205,9 @@ def test_scenes_and_methods_that_have_rows_stay_as_they_are(content, tmp_path, b
     def said(**changes):
         return bench(write_suite({**content, **changes}, tmp_path), results, "--dry-run", *alpha)[1]
 
-    for changes, told in (({"scenes": [{**scene, "resolution": 2}]}, "scene tiny: resolution is -1 there and 2 here"),
+    longer = {"protocol": {**content["protocol"], "iterations": 13}}
+    for changes, told in ((longer, "protocol.iterations is 12 there and 13 here"),
+                          ({"scenes": [{**scene, "resolution": 2}]}, "scene tiny: resolution is -1 there and 2 here"),
                           ({"scenes": [{**scene, "dataset": "X"}]}, "scene tiny: dataset is None there and 'X' here"),
                           ({"scenes": [{"name": "tiny", "synthetic": {"views": 3}}]}, "scene tiny: synthetic is None"),
                           ({"methods": [{**method, "arguments": ["--cams", 20]}]},
@@ -347,14 +339,14 @@ def test_cells_are_chosen_by_their_fields(content):
                          (["headline=true"], {"alpha", "smoe", "smoe 0.05", "smoe learned"}),
                          (["background_gate=5e-2"], {"smoe 0.05"}), (["background_gate=0"], {"smoe"}),
                          (["background_gate=1"], {"alpha"}), (["background_gate=learned"], {"smoe learned"})):
-        chosen = selection.chosen(cells, words)
+        chosen = engine.chosen(cells, words)
         assert {blend_of(cell) for cell in chosen} == found
         assert {cell["seed"] for cell in chosen} == ({1} if words == ["headline=true"] else {0, 1})
     with pytest.raises(BenchError, match="--only blend_mode=smoe_std: .* alpha, smoe"):
-        selection.chosen(cells, ["blend_mode=smoe_std"])
+        engine.chosen(cells, ["blend_mode=smoe_std"])
     for wrong in ("blend_mode", "mode=alpha"):
         with pytest.raises(BenchError, match="--only " + wrong):
-            selection.chosen(cells, [wrong])
+            engine.chosen(cells, [wrong])
 
 
 def words_of(suite, *arguments, **more):
@@ -397,26 +389,6 @@ def test_cells_of_two_gpus_take_two_of_three(on_gpus, monkeypatch):
     on_gpus.protocol["gpus"] = 4
     with pytest.raises(BenchError, match="protocol.gpus is 4, and torch finds 3 on this machine"):
         words_of(on_gpus, None, None)
-
-
-@pytest.mark.parametrize("protocol, more, text", [
-    (dict(gpus=2, device="cpu"), {}, "protocol.gpus is 2; it needs protocol.device: cuda"),
-    (dict(gpus=2, device="cuda", principal_point="centre"), {"methods": [{"name": "3dgs-2023", "path": "x"}]},
-     "but method 3dgs-2023 knows none; only native does"),
-    (dict(batch=2), {"schedules": ["mcmc"]}, "protocol.batch is 2, but schedule mcmc knows none"),
-    (dict(batch=5), {}, "--iterations is 12; it must be a multiple of --batch, 5")])
-def test_batches_and_gpus_that_cannot_be_are_refused(content, protocol, more, text):
-    content["protocol"].update(protocol)
-    with pytest.raises(BenchError, match=text):
-        expand({**content, **more}, "")
-
-
-def test_a_cells_name_is_as_it_was_without_batches(content):
-    def names(**protocol):
-        return {cell["id"] for cell in expand({**content, "protocol": {**content["protocol"], **protocol}}, "").cells}
-
-    assert not names() & names(batch=2)
-    assert all("batch" not in cell["protocol"] and "gpus" not in cell["protocol"] for cell in expand(content, "").cells)
 
 
 def test_queues_are_snakemakes_business(on_gpus, monkeypatch):
@@ -475,3 +447,20 @@ def test_cells_are_told_the_gpus_and_their_threads(content, tmp_path, monkeypatc
     assert len(told) == 2
     for line in told:
         assert line.startswith("3 threads: ") and line.endswith(" --gpus 0 --locks .locks --per-device 2")
+
+
+@pytest.mark.slow  # a minute
+def test_the_suite_smoke(tmp_path):
+    """From end to end, as a user types it."""
+    pytest.importorskip("matplotlib", reason="a report needs matplotlib")
+    for words in (["run", "smoke", "-o", "results"], ["report", "results", "-o", "report"]):
+        done = subprocess.run(command("bench", *words), env=environment(), cwd=str(tmp_path), stdout=subprocess.PIPE,
+                              stderr=subprocess.STDOUT)
+        assert done.returncode == 0, done.stdout.decode(errors="replace")
+    rows = list(rows_of(tmp_path / "results").values())
+    for row in rows:
+        halfway, = row["history"]
+        assert row["ok"] and halfway["iteration"] == 150 and row["psnr"] > halfway["psnr"]
+    with open(tmp_path / "report" / "tables" / "smoke_cells.csv", encoding="utf-8", newline="") as file:
+        printed = [(float(line["PSNR [dB]"]), float(line["#Gaussians"])) for line in csv.DictReader(file)]
+    assert sorted(printed) == sorted((row["psnr"], row["num_gaussians"]) for row in rows) and len(printed) == 4

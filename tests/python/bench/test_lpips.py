@@ -9,7 +9,7 @@ from test_measure import step_image
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import lpips, measure
-from diff_smoe_rasterization.benchmarks.suite import weights as files
+from diff_smoe_rasterization.benchmarks.suite import names as files
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures
 
 

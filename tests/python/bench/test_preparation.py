@@ -6,8 +6,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from bench_commands import small_trainers
 from PIL import Image
-from small_trainers import small_trainers
 
 from diff_smoe_rasterization.benchmarks.suite import preparation
 

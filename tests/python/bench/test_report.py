@@ -1,4 +1,4 @@
-"""The benchmark's report: averages, tables beside the paper's, deltas, failures, refusals."""
+"""The benchmark's report: averages, tables beside the paper's, deltas, failures, refusals, curves."""
 from __future__ import annotations
 
 import csv
@@ -9,13 +9,20 @@ import math
 import pytest
 from report_rows import PROTOCOL, failed, row, write_rows
 
-from diff_smoe_rasterization.benchmarks.suite import rows
-from diff_smoe_rasterization.benchmarks.suite.report import ReportError, layouts, tables
+pytest.importorskip("matplotlib", reason="a report needs matplotlib")
+from diff_smoe_rasterization.benchmarks.suite import rows  # noqa: E402
+from diff_smoe_rasterization.benchmarks.suite.report import (  # noqa: E402
+    ReportError,
+    curves,
+    groups,
+    layouts,
+    tables,
+)
 
 
 def table_of(entries, name, suite="table1"):
     """The table NAME of rows; None where the suite has none."""
-    made = layouts.tables_of(suite, entries, layouts.read_paper())
+    made = layouts.tables_of(suite, entries)
     return next((table for table in made if table.name == f"{suite}_{name}"), None)
 
 
@@ -177,7 +184,7 @@ def test_a_failed_cell_is_a_row_with_its_reason():
                failed("killed", scene="fox", seed=1)]
     table = table_of(entries, "failures")
     assert {line.labels[1] for line in table.rows} == {"out of memory | 12 GiB", "killed"}
-    assert "out of memory \\| 12 GiB" in tables.to_markdown(table)
+    assert "out of memory \\| 12 GiB" in tables.to_text(table, "md")
     assert shown(table_of(entries, "cells"), "PSNR [dB]", method="native, smoe") == ["failed"]
     assert shown(table_of(entries, "cells"), "PSNR [dB]", scene="fox", seeds="1 of 2") == ["20.00"]
     assert shown(table_of(entries, "deltas"), "Δ PSNR [dB]") == ["smoe failed"]
@@ -196,11 +203,12 @@ def test_every_line_of_latex_and_markdown_has_all_columns(name):
     entries = [row(blend_mode=mode, seed=seed) for mode in ("alpha", "smoe", "smoe_tn") for seed in (0, 1)]
     table = table_of([*entries, failed("50 % of a_b & c\\d #1", scene="fox")], name)
     width = 1 + len(table.labels) + len(table.columns)
-    body = [line for line in tables.to_latex(table).split("\n") if line.endswith(r"\\") and "multicolumn" not in line]
+    lines = tables.to_text(table, "tex").split("\n")
+    body = [line for line in lines if line.endswith(r"\\") and "multicolumn" not in line]
     assert {line.replace(r"\&", "").count("&") for line in body} == {width - 1} and len(body) == len(table.rows) + 1
     if name == "failures":
         assert r"50 \% of a\_b \& c\textbackslash{}d \#1" in body[-1]
-    lines = [line for line in tables.to_markdown(table).split("\n") if line.startswith("|")]
+    lines = [line for line in tables.to_text(table, "md").split("\n") if line.startswith("|")]
     assert {line.count("|") for line in lines} == {width + 1} and len(lines) == len(table.rows) + 2
 
 
@@ -253,3 +261,51 @@ def test_a_field_of_another_type_is_refused(tmp_path, name, value):
 def test_one_setting_twice_is_refused():
     with pytest.raises(ReportError, match="same setting, scene and seed 0"):
         table_of([row(), {**row(), "cell": "again"}], "cells")
+
+
+@pytest.fixture
+def closed_figures():
+    yield
+    curves.plt.close("all")
+
+
+def groups_of(entries):
+    return groups.grouped(entries, layouts.end_of)
+
+
+def test_a_curve_goes_through_the_means_from_few_gaussians_to_many(closed_figures):
+    entries = [row(threshold=0.0002, psnr=30.0, num_gaussians=900),
+               row(threshold=0.005, psnr=20.0, num_gaussians=100), row(seed=1, psnr=22.0, num_gaussians=300),
+               row(blend_mode="smoe", psnr=25.0, num_gaussians=50)]
+    axes = curves.rate_distortion(groups_of(entries)).axes
+    # Rows: PSNR, SSIM, LPIPS; columns: number, own size, common size.
+    assert [axis.get_ylabel() for axis in axes[::3]] == ["PSNR [dB]", "SSIM", "LPIPS Alex (lower is better)"]
+    assert [axis.get_xlabel() for axis in axes[-3:]] == ["#Gaussians", "own size [MB]", "common size [MB]"]
+    alpha, smoe = (container.lines[0].get_xydata().tolist() for container in axes[0].containers)
+    assert alpha == [[200, 21], [900, 30]] and smoe == [[50, 25]]
+    whisker = axes[0].containers[0].lines[2][0].get_segments()[0]
+    assert whisker[1, 1] - whisker[0, 1] == pytest.approx(2 * 2 ** 0.5)  # seeds 20 and 22: sd is the root of 2
+
+
+def test_what_has_no_place_on_an_axis_is_left_out(closed_figures):
+    entries = [row(psnr=float("inf")), row(threshold=0.002, num_gaussians=0), row(threshold=0.001, num_gaussians=7)]
+    psnr = curves.rate_distortion(groups_of(entries)).axes[0]
+    assert [line.get_xydata().tolist() for line in psnr.containers[0].lines[:1]] == [[[7, 20]]]
+    nothing = [row(num_gaussians=0, size_bytes={"own": 0, "common": 0})]
+    assert curves.rate_distortion(groups_of(nothing)) is None
+
+
+def test_the_legend_lies_inside_and_above_the_panels(closed_figures):
+    entries = [row(blend_mode=mode, label=f"{'a long name of method ' * 2}{method}", schedule="steady",
+                   threshold=threshold)
+               for mode in ("alpha", "smoe") for method in range(4) for threshold in (0.005, 0.0002)]
+    drawn = curves.rate_distortion(groups_of(entries))
+    drawn.canvas.draw()
+    box = drawn.legends[0].get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= drawn.bbox.x1 and box.y1 <= drawn.bbox.y1
+    assert box.y0 >= max(axis.get_window_extent().y1 for axis in drawn.axes)
+
+
+def test_what_was_not_measured_is_not_drawn(closed_figures, tmp_path):
+    nothing = row(psnr=None, ssim=None, lpips=None, train_seconds=None, fps=None)
+    assert curves.draw_all("table1", groups_of([nothing, failed(scene="fox")]), str(tmp_path)) == []

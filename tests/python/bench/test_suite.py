@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
+from diff_smoe_rasterization.benchmarks.suite import engine
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite, read_yaml
 from diff_smoe_rasterization.benchmarks.suite.protocol import config_of
 from diff_smoe_rasterization.benchmarks.suite.schema import THRESHOLDS
-from diff_smoe_rasterization.benchmarks.suite.selection import earlier_rows
 
 yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "captures", "captures_ablation",
-                 "captures_baselines", "gate", "gate_equal")
+                 "captures_baselines", "gate", "gate_equal", "budgets")
 
 
 def changed(content, **fields):
@@ -62,9 +62,21 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tmp_path):
         return expand(changed(content, **changes), "").cells[0]["id"]
 
     scene, = content["scenes"]
-    assert name(protocol={**content["protocol"], "iterations": 13}) != name() != name(
+    assert len({name(), *(name(protocol={**content["protocol"], **changes}) for changes in (
+        {"iterations": 13}, {"batch": 2}, {"batch": 1}))}) == 4
+    assert "batch" not in expand(content, "").cells[0]["protocol"] and name() != name(
         scenes=[{**scene, "background": "white"}])
     assert name(scenes=[{**scene, "path": str(tmp_path)}]) == name(scenes=[{**scene, "path": "$NOT_THERE"}]) == name()
+
+
+def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
+    cells = expand(changed(content, budgets=[0, 30, 40], headline={"budgets": [40]}, headline_seeds=[1]), "").cells
+    assert [(cell.get("budget"), cell["seed"]) for cell in cells if cell["blend_mode"] == "alpha"] == [
+        (None, 0), (30, 0), (40, 0), (40, 1)]
+    assert {cell["id"] for cell in cells if "budget" not in cell} == {cell["id"] for cell in expand(content, "").cells}
+    assert [config_of(cell).budget for cell in cells[:3]] == [0, 30, 40] and len({cell["id"] for cell in cells}) == 8
+    assert {cell["budget"] for cell in engine.chosen(cells, ["budget=40"])} == {40}
+    assert all("budget" not in cell for cell in engine.chosen(cells, ["budget=0"]))
 
 
 SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "blend_modes": ["smoe"]}
@@ -77,6 +89,9 @@ SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "bl
     ({"background_gates": ["leanred"]}, ["background_gates[0]", "leanred"]),
     ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
     ({"densify_grad_thresholds": [1e300]}, ["densify_grad_thresholds[0]", "less than or equal to 1000000"]),
+    ({"budgets": [3]}, ["budgets[0]", "0, which is none, or at least 4"]),
+    ({"schedules": ["gate"]}, ["--budget is 0", "--strategy gate"]),
+    ({"protocol": {"options": {"strategy_options": "overshoot=2"}}}, ["--strategy-options", "only gate has some"]),
     ({"seeds": 0}, ["seeds", "a valid list, such as [0]"]),
     ({"seeds": [1.0]}, ["seeds[0]", "1.0", "integer"]),
     ({"name": "../x"}, ["name"]),
@@ -93,6 +108,10 @@ SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "bl
     ({"methods": [SMOE_OF_ANOTHER]}, ["methods[0].blend_modes", "its own blending"]),
     ({"methods": [{"name": "2dgs", "path": "p", "variant": "patched"}]}, ["methods[0].variant"]),
     ({"protocol": {"iterations": 0}}, ["protocol.iterations"]),
+    ({"protocol": {"gpus": 2, "device": "cpu"}}, ["protocol.gpus is 2; it needs protocol.device: cuda"]),
+    ({"protocol": {"gpus": 2}, "methods": [{"name": "3dgs-2023", "path": "x"}]}, ["method 3dgs-2023 knows none"]),
+    ({"protocol": {"batch": 2}, "schedules": ["mcmc"]}, ["protocol.batch is 2, but schedule mcmc knows none"]),
+    ({"protocol": {"batch": 7}}, ["--iterations is 30000; it must be a multiple of --batch, 7"]),
     ({"protocol": {"options": {"densify_until": 1}}}, ["protocol.options", "densify_until"]),
     ({"protocol": {"options": {"lambda_dssim": 2}}}, ["--lambda-dssim", "2"]),
     ({"protocol": {"options": {"densify_from_iter": "x"}}}, ["protocol.options.densify_from_iter"]),
@@ -153,6 +172,7 @@ def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
     ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "background": "white"}], "schedules": ["steady"]},
      "lego is white"),
     ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "init_points": 10}]}, "3dgs-2023: init_points is 10"),
+    ("3dgs-2023", {"budgets": [500]}, "budgets: are for the native trainer alone"),
     ("3dgs-2023", {"background_gates": ["learned"]}, "background_gates: 'learned' is for the native"),
     *((name, {"protocol": {"options": {option: value}}}, rf"protocol.options.{option}: {name} \(methods\[1\]\)")
       for name, option, value in (("3dgs-2023", "antialiasing", True), ("taming", "feature_lr", 0.01),
@@ -219,5 +239,5 @@ def test_rows_from_before_there_were_gates_are_of_todays_cells(name, lacking, so
     if not rows.is_file():
         pytest.skip("the rows are in the repository, not in its source distribution")
     cells = [cell for cell in load_suite(find_suite(name)).cells if cell["seed"] == 0]
-    found = earlier_rows(str(rows), cells)
+    found = engine.earlier_rows(str(rows), cells)
     assert {cell["background_gate"] for cell in cells if cell["id"] not in found} == lacking
