@@ -239,6 +239,12 @@ __global__ void __launch_bounds__(kWalkBlock, kBlendBlocks)
   for (int k = 0; k < kLanePixels; ++k) lists.transmittances[lists.at(row, tile, k)] = transmittance[k];
 }
 
+template <class S, BlendMode kMode> void transmit(const ForwardArguments<S>& arguments, cudaStream_t stream) {
+  if (arguments.lists.rows == 0) return;
+  transmit_kernel<S, kMode><<<arguments.lists.rows, kWalkBlock, 0, stream>>>(arguments);
+  DSMOE_CHECK_LAUNCH("transmit");
+}
+
 }  // namespace
 
 template <class S> void blend(const Frame<S>& frame, const Work& work) {
@@ -252,10 +258,7 @@ template <class S> void blend(const Frame<S>& frame, const Work& work) {
       constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
       if constexpr (kWalksSegments<S, kFeatures>) {
         if (frame.saved.capacity > 0) arguments.lists = find_long_lists(frame, work);
-        if (Blend<kMode>::kNeedsDepthOrder && arguments.lists.rows > 0) {
-          transmit_kernel<S, kMode><<<arguments.lists.rows, kWalkBlock, 0, work.stream>>>(arguments);
-          DSMOE_CHECK_LAUNCH("transmit");
-        }
+        if constexpr (Blend<kMode>::kNeedsDepthOrder) transmit<S, kMode>(arguments, work.stream);
       }
       blend_kernel<S, kMode, kFeatures>
           <<<arguments.tiles + arguments.lists.rows, kWalkBlock, 0, work.stream>>>(arguments);
