@@ -108,18 +108,16 @@ __device__ void append_segments(const ForwardArguments<S>& arguments, const Warp
                                 int segments, BlendedPixel<S, kFastFeatures> (&pixels)[kLanePixels]) {
   const LongLists<S>& lists = arguments.lists;
   const bool noted = arguments.saved.segments != nullptr;
+  for (auto& pixel : pixels) pixel = {PixelState<S>::open(), {}, 0};
   int segment = 0;
   for (; segment < segments; ++segment) {
-    if (segment > 0 && Blend<kMode>::kStopsEarly && are_full(pixels)) break;
-    if (segment > 0 && noted) begin_segment(arguments, tile, segment, pixels);
+    if (Blend<kMode>::kStopsEarly && are_full(pixels)) break;
+    if (noted && segment > 0) begin_segment(arguments, tile, segment, pixels);
     for (int k = 0; k < kLanePixels; ++k) {
       const auto next = lists.blends[lists.at(first_row + segment, tile, k)];
-      if (segment == 0) {
-        pixels[k] = next;
-      } else if (append<kMode>(pixels[k].state, next.state)) {
-        for (int f = 0; f < kFastFeatures; ++f) pixels[k].sums[f] += next.sums[f];
-        pixels[k].last = max(pixels[k].last, next.last);
-      }
+      if (!append<kMode>(pixels[k].state, next.state)) continue;
+      for (int f = 0; f < kFastFeatures; ++f) pixels[k].sums[f] += next.sums[f];
+      pixels[k].last = max(pixels[k].last, next.last);
     }
   }
   if (noted) end_segments(arguments, tile, segment - 1, pixels);
@@ -169,8 +167,7 @@ __device__ void blend_part(const ForwardArguments<S>& arguments, const WarpTile<
   for (int k = 0; k < kLanePixels; ++k) {
     blended[k] = {PixelState<S>::open(), {}, 0};
     if (!whole && Blend<kMode>::kNeedsDepthOrder) {
-      blended[k].state = PixelState<S>::behind(
-          transmittance_before(arguments.lists, tile, first_row, part.segment, k));
+      blended[k].state = PixelState<S>::behind(transmittance_before(arguments.lists, tile, first_row, part.segment, k));
     }
     if (!tile.inside(arguments, k)) blended[k].state = PixelState<S>::behind(S(0));  // full
   }
@@ -183,6 +180,7 @@ __device__ void blend_part(const ForwardArguments<S>& arguments, const WarpTile<
   const bool noted = whole && Visitor::kInSegments && has_segments(arguments.saved, tile);
   Visitor visitor = {arguments, tile, blended, arguments.config.alpha_cut(), noted ? kSegmentLength : INT32_MAX};
   const unsigned met = walk_tile(stage, range, visitor);
+  if (first_feature == 0) count_pairs(arguments, tile.lane, met);
   if constexpr (Visitor::kInSegments) {
     if (noted) {
       // Where pixels do not stop, the backward pass walks the whole list.
@@ -190,13 +188,11 @@ __device__ void blend_part(const ForwardArguments<S>& arguments, const WarpTile<
       end_segments(arguments, tile, visitor.next_segment / kSegmentLength - 1, blended);
     }
     if (!whole) {
-      if (first_feature == 0) count_pairs(arguments, tile.lane, met);
       if (!keep_segment(arguments.lists, tile, first_row, part, blended)) return;
       append_segments<kMode>(arguments, tile, first_row, part.segments, blended);
     }
   }
   write_pixels<S, kMode>(arguments, tile, first_feature, blended);
-  if (whole && first_feature == 0) count_pairs(arguments, tile.lane, met);
 }
 
 template <class S, BlendMode kMode, int kFeatures>

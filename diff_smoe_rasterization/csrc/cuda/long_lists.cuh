@@ -33,11 +33,11 @@ struct ListPart {
 
 // The segments of the long lists of a rendering, those of one list side by side and in order.
 template <class S> struct LongLists {
-  int rows;                               // segments there is room for; 0: no list is long
-  int* count;                             // [1] segments there are; where they have no room, no list is long
-  ListPart* parts;                        // [rows]
-  int* arrivals;                          // [rows, quarters] in a list's first row, how many warps are done
-  S* transmittances;                      // [rows, pixels of a tile] each segment's T alone
+  int rows;                                // segments there is room for; 0: no list is long
+  int* count;                              // [1] segments there are; where they have no room, no list is long
+  ListPart* parts;                         // [rows]
+  int* arrivals;                           // [rows, quarters] in a list's first row, how many warps are done
+  S* transmittances;                       // [rows, pixels of a tile] each segment's T alone
   BlendedPixel<S, kFastFeatures>* blends;  // [rows, pixels of a tile] each segment's, from the T in front of it
 
   __device__ int num_segments() const { return rows > 0 && *count <= rows ? *count : 0; }
