@@ -13,7 +13,7 @@ template <class S> struct ForwardArguments : BlendArguments<S> {
   int tiles;  // of the band
 };
 
-// Notes the state of the pixels where a segment begins, and queues the segment for the backward pass.
+// Notes the state of the pixels where a segment begins.
 template <class S, int kSums>
 __device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
                               const BlendedPixel<S, kSums> (&pixels)[kLanePixels]) {
@@ -22,9 +22,6 @@ __device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile
     SegmentPixel<S> begin = {abs(pixels[k].state.transmittance), {}};
     for (int f = 0; f < kSums; ++f) begin.sums[f] = pixels[k].sums[f];
     segment_pixel(arguments.saved, tile, segment, k) = begin;
-  }
-  if (tile.lane == 0) {
-    segment_queue(arguments.saved).push(tile.index, tile.quarter, segment);
   }
 }
 
@@ -62,7 +59,9 @@ template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
   // Begins the segments up to that of the entry at `position`.
   __device__ __forceinline__ void begin_segments(int32_t position) {
     for (; next_segment <= position; next_segment += kSegmentLength) {
-      begin_segment(arguments, tile, next_segment / kSegmentLength, pixels);
+      const int segment = next_segment / kSegmentLength;
+      begin_segment(arguments, tile, segment, pixels);
+      if (tile.lane == 0) segment_queue(arguments.saved).push(tile.index, tile.quarter, segment);
     }
   }
 

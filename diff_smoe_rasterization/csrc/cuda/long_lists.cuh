@@ -88,6 +88,17 @@ __global__ void __launch_bounds__(kLongListBlock)
   }
   __syncthreads();
   if (threadIdx.x == 0) *lists.count = count;
+  if (saved.segment_queue == nullptr || count > lists.rows) return;
+  // The four quarters of a segment stand side by side: the backward pass gives them to one block.
+  for (int row = threadIdx.x; row < count; row += kLongListBlock) {
+    const ListPart part = lists.parts[row];
+    if (part.segment == 0) continue;  // the backward pass walks it without being told
+    int2* entries = segment_queue(saved).entries;
+    const int first = 1 + atomicAdd(&entries[0].x, kWarpsPerTile);
+    for (int quarter = 0; quarter < kWarpsPerTile; ++quarter) {
+      entries[first + quarter] = make_int2(part.tile * kWarpsPerTile + quarter, part.segment);
+    }
+  }
 }
 
 // Finds the long lists of the frame. Lists of more than kMostSegments in all are not long: that bounds the memory.

@@ -108,15 +108,12 @@ __global__ void __launch_bounds__(kSortBlock, kSortBlocks)
   // Ranks: pairs of equal digits keep their order. A warp has neighbouring pairs, 32 at a time.
   const int64_t first = int64_t(block) * kSortTile<Key> + warp * kWarp * kItems + lane;
   Key keys[kItems];
-  int32_t values[kItems];
   uint32_t ranks[kItems];
   unsigned exist = 0;
 #pragma unroll
   for (int i = 0; i < kItems; ++i) {
     const int64_t at = first + i * kWarp;
     keys[i] = at < count ? pass.keys[at] : Key(0);
-    values[i] = static_cast<int32_t>(at);
-    if (at < count && pass.values != nullptr) values[i] = pass.values[at];
     if (at < count && (pass.values != nullptr || keys[i] != static_cast<Key>(~Key(0)))) exist |= 1u << i;
   }
   const auto digit = [&](Key key) { return static_cast<uint32_t>(key >> pass.shift) & (kBins - 1); };
@@ -176,8 +173,9 @@ __global__ void __launch_bounds__(kSortBlock, kSortBlocks)
   for (int i = 0; i < kItems; ++i) {
     if (!(exist >> i & 1)) continue;
     const uint32_t d = digit(keys[i]), place = starts[d] + warp_counts[warp][d] + ranks[i];
+    const int64_t at = first + i * kWarp;
     block_keys[place] = keys[i];
-    block_values[place] = values[i];
+    block_values[place] = pass.values != nullptr ? pass.values[at] : static_cast<int32_t>(at);
   }
   __syncthreads();
   for (uint32_t k = threadIdx.x; k < in_block; k += kSortBlock) {
