@@ -81,56 +81,24 @@ template <class Real> Gate<Real> gate_of(const Pixel& pixel, int i) {
   return {Real(pixel.alpha[i]), Real(pixel.alpha[i]), pixel.counts[i]};
 }
 
-// The sums over a part of a pixel's pairs.
-template <class Real> struct PartSums {
-  PixelState<Real> state;
-  Real color = 0, depth = 0, inverse_depth = 0;
-  int last = 0;
-};
-
-// Blends pairs `begin` to `end`; state: in front of them.
-template <BlendMode kMode, class Real>
-PartSums<Real> blend_pairs(const Pixel& pixel, int begin, int end, PixelState<Real> state) {
-  PartSums<Real> sums = {state};
-  for (int i = begin; i < end; ++i) {
-    const auto pair = Blend<kMode>::accumulate(sums.state, gate_of<Real>(pixel, i));
-    sums.color += pair.weight * Real(pixel.color[i]);
-    sums.depth += pair.weight * Real(pixel.depth[i]);
-    sums.inverse_depth += pair.weight * Real(pixel.inverse_depth[i]);
-    if (pair.contributes) sums.last = i + 1;
-  }
-  return sums;
-}
-
-template <BlendMode kMode, class Real> Finished finished(const Pixel& pixel, const PartSums<Real>& sums) {
-  Finished out;
-  const auto end = sums.state.end(Real(pixel.background_gate));
-  out.color = finish_feature<kMode>(FeatureRule::kBlended, end, sums.color, Real(pixel.background));
-  out.depth = finish_feature<kMode>(FeatureRule::kAveraged, end, sums.depth, Real(0));
-  out.inverse_depth = finish_feature<kMode>(FeatureRule::kBlended, end, sums.inverse_depth, Real(0));
-  out.gate_sum = sums.state.gate_sum;
-  out.transmittance = abs(sums.state.transmittance);
-  out.last = sums.last;
-  return out;
-}
-
 template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
-  return finished<kMode, Real>(pixel, blend_pairs<kMode>(pixel, 0, pixel.size(), PixelState<Real>::open()));
-}
-
-// The same in two walks, of which the second knows of the pairs in front of `middle` only their T.
-template <BlendMode kMode, class Real> Finished blended_in_two(const Pixel& pixel, int middle) {
-  Real transmittance = 1;
-  for (int i = 0; i < middle; ++i) transmittance *= pixel.counts[i] ? Real(1) - Real(pixel.alpha[i]) : Real(1);
-  auto front = PixelState<Real>::open();
-  if (Blend<kMode>::kNeedsDepthOrder) front = PixelState<Real>::behind(transmittance);
-  auto sums = blend_pairs<kMode>(pixel, 0, middle, PixelState<Real>::open());
-  const auto behind = blend_pairs<kMode>(pixel, middle, pixel.size(), front);
-  if (append<kMode>(sums.state, behind.state)) {
-    sums.color += behind.color, sums.depth += behind.depth, sums.inverse_depth += behind.inverse_depth;
-    sums.last = std::max(sums.last, behind.last);
+  auto state = PixelState<Real>::open();
+  Real color = 0, depth = 0, inverse_depth = 0;
+  Finished out;
+  for (int i = 0; i < pixel.size(); ++i) {
+    const auto pair = Blend<kMode>::accumulate(state, gate_of<Real>(pixel, i));
+    color += pair.weight * Real(pixel.color[i]);
+    depth += pair.weight * Real(pixel.depth[i]);
+    inverse_depth += pair.weight * Real(pixel.inverse_depth[i]);
+    if (pair.contributes) out.last = i + 1;
   }
-  return finished<kMode, Real>(pixel, sums);
+  const auto end = state.end(Real(pixel.background_gate));
+  out.color = finish_feature<kMode>(FeatureRule::kBlended, end, color, Real(pixel.background));
+  out.depth = finish_feature<kMode>(FeatureRule::kAveraged, end, depth, Real(0));
+  out.inverse_depth = finish_feature<kMode>(FeatureRule::kBlended, end, inverse_depth, Real(0));
+  out.gate_sum = state.gate_sum;
+  out.transmittance = abs(state.transmittance);
+  return out;
 }
 
 Pixel random_pixel(Random& random, int count, double largest_alpha) {
@@ -188,21 +156,6 @@ TYPED_TEST(BlendOf, EqualsThePapersSums) {
     const Pixel pixel = random_pixel(random, 40, i % 2 ? 0.05 : 0.9);  // half of them fill up
     expect_the_papers_sums<TypeParam::value, double>(pixel, 40 * 1.2e-16);
     expect_the_papers_sums<TypeParam::value, float>(pixel, 40 * 6e-8);
-  }
-}
-
-TYPED_TEST(BlendOf, AppendsWhatPairsBehindHaveBlended) {
-  Random random(2);
-  for (int i = 0; i < 50; ++i) {
-    const Pixel pixel = i == 0 ? saturated_pixel() : random_pixel(random, 40, i % 2 ? 0.05 : 0.9);
-    for (int middle = 0; middle <= pixel.size(); ++middle) {
-      const Finished expected = paper(TypeParam::value, pixel, paper_stop<double>(pixel));
-      const Finished actual = blended_in_two<TypeParam::value, double>(pixel, middle);
-      expect_near(actual, expected, 40 * 1.2e-16);  // as above
-      if (Blend<TypeParam::value>::kNeedsDepthOrder) {
-        EXPECT_NEAR(actual.transmittance, expected.transmittance, 40 * 1.2e-16);
-      }
-    }
   }
 }
 

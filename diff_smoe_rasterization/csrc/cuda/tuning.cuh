@@ -35,14 +35,6 @@ constexpr int kVisitsPerCheck = 8;
 constexpr int kBlendUnroll = 2;
 constexpr int kBlendBlocks = 6;
 
-// Lists that the blend splits: those with more than this share of all instances. An H200 has room for 792 blocks at
-// once. A list with more than one of 792 shares would take longer than everything else.
-constexpr int kListShares = 792;
-// Segments of long lists there is room for, of 7 KiB each.
-constexpr int kMostSegments = 4096;
-constexpr int kLongListBlock = 1024;  // threads of the one block that finds the long lists, a tile each
-constexpr int kTransmitUnroll = 4;    // as kBlendUnroll; this walk has fewer registers to keep
-
 // Blocks of the backward walk that one multiprocessor holds at once, where the number of features is known: 5 x 128
 // threads leave each thread 96 registers, nearly all that the kernel asks for.
 constexpr int kBackwardBlocks = 5;

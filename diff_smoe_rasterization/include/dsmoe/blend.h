@@ -66,11 +66,6 @@ template <class Real> struct PixelState {
   Real gate_sum;       // W, accumulated: as 1 - T it would lose all digits where it is small; ablations: sum alpha
 
   static DSMOE_HD PixelState open() { return {Real(Scalar<Real>(1)), Real(Scalar<Real>(0))}; }
-  // Behind pairs that have left this T: full where that is less than a pixel keeps.
-  static DSMOE_HD PixelState behind(Real transmittance) {
-    const Mask<Real> full = transmittance < Real(Scalar<Real>(kTransmittanceCut));
-    return {select(full, -transmittance, transmittance), Real(Scalar<Real>(0))};
-  }
   DSMOE_HD Mask<Real> is_open() const { return transmittance > Real(Scalar<Real>(0)); }
   DSMOE_HD PixelEnd<Real> end(Scalar<Real> background_gate) const {
     return {abs(transmittance), gate_sum, background_gate};
@@ -184,17 +179,6 @@ DSMOE_HD constexpr bool within_radius(BlendMode mode) {
   BlendModes::for_each(
       [&](auto of) { within |= decltype(of)::value == mode && Blend<decltype(of)::value>::kWithinRadius; });
   return within;
-}
-
-// Appends the sums of pairs that lie behind the pixel's own, and began with the T in front of them. Returns whether the
-// pixel still took pairs there.
-template <BlendMode kMode, class Real>
-DSMOE_HD Mask<Real> append(PixelState<Real>& pixel, const PixelState<Real>& behind) {
-  const Mask<Real> open = pixel.is_open();
-  const Mask<Real> sums = open | Mask<Real>(!Blend<kMode>::kStopsEarly);
-  pixel.gate_sum = pixel.gate_sum + select(sums, behind.gate_sum, Real(Scalar<Real>(0)));
-  pixel.transmittance = select(open, behind.transmittance, pixel.transmittance);
-  return open;
 }
 
 // Continues a backward walk in front of pairs that another walk takes. transmittance: T in front of those pairs.

@@ -206,17 +206,6 @@ def test_lists_of_several_segments(mode, name, gpu):
 
 
 @with_gate
-@pytest.mark.parametrize("name", ["faint", "filling"])
-def test_lists_of_several_segments_give_the_same_bits(mode, name, gpu):
-    """Whichever warp is done with its segment first."""
-    scene = LONG_LISTS[name](mode).to(torch.float32).to(gpu)
-    first = rasterize(settings=scene.settings, outputs=("alpha",), **scene.inputs)
-    for _ in range(30):
-        again = rasterize(settings=scene.settings, outputs=("alpha",), **scene.inputs)
-        assert torch.equal(again.color, first.color) and torch.equal(again.alpha, first.alpha)
-
-
-@with_gate
 @pytest.mark.sanitize
 def test_renderings_without_gradients_keep_no_segments(mode, gpu):
     """They have no use for them. Images are the same bit for bit, and a backward pass would be right nevertheless."""

@@ -77,13 +77,10 @@ def test_the_sums_account_for_every_pair_of_the_image(mode, dtype, gpu):
 @with_gates
 @pytest.mark.sanitize
 def test_lists_that_are_outgrown(mode, gpu):
-    """A graph whose contents outgrow the lists it was captured with: the walk goes over the depth order then.
-
-    No list is so long that the blend splits it, which rounds T in other places. So all pixels stop at the same pairs.
-    """
-    small = scene_of(mode, num_gaussians=20_000, width=own_width(mode, 427), height=301, scale=0.004,
+    """A graph whose contents outgrow the lists it was captured with: the walk goes over the depth order then."""
+    small = scene_of(mode, num_gaussians=20_000, width=own_width(mode, 227), height=151, scale=0.004,
                      opacity=(0.02, 0.2))
-    larger = small.with_inputs(scales=small.inputs["scales"] * 15)
+    larger = small.with_inputs(scales=small.inputs["scales"] * 30)
     pixel_weights = map_for(small.settings).to(gpu)
     held = small.to(torch.float32).to(gpu)
 
