@@ -52,14 +52,15 @@ __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const T
   __syncwarp();
   TensorSums sums = sum_pixels(stage, basis, tile.lane);
   const TensorLane at(tile.lane);
-  const TensorGaussian gaussian = stage.gaussians[at.row];
-  recentre(sums, gaussian.shift, tile.lane);
+  const StagedPlace<float> place = stage.rows[at.row].place;
+  recentre(sums, {tile.rect.x0 + kWarpTileCentre - place.mean.x, tile.rect.y0 + kWarpTileCentre - place.mean.y},
+           tile.lane);
   __syncwarp();
   if (at.row >= count || at.column >= kFastFeatures) return;
-  sink.to_record(gaussian.index, kRecord, [&](auto add) {
-    add(2 * at.column, sums.moments[0]);
-    add(2 * at.column + 1, sums.moments[1]);
-    add(kNumGateMoments + at.column, sums.feature);
+  sink.to_record(place.gaussian, kRecord, 2 * at.column, [&](auto add) {
+    add(0, sums.moments[0]);
+    add(1, sums.moments[1]);
+    add(kNumGateMoments - at.column, sums.feature);
   });
 }
 
@@ -71,7 +72,7 @@ __device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values
   const TransposedSum<kCount> sum(tile.lane);
   sum(values);
   if (!sum.holds || sum.number >= wanted) return;
-  sink.to_record(gaussian, sink.length, [&](auto add) { add(first + sum.number, values[0]); });
+  sink.to_record(gaussian, sink.length, first + sum.number, [&](auto add) { add(0, values[0]); });
 }
 
 // Sums the six moments over a lane's pixels, which lie one below the other.
@@ -89,9 +90,10 @@ template <class S> __device__ void column_moments(const S (&dL_dpower)[kLanePixe
   moments[3] = sums.xx, moments[4] = sums.xy, moments[5] = sums.yy;
 }
 
-// What the walk knows of a lane's pixels.
+// What the walk knows of a lane's pixels. Where all pairs' g'.c loses b, the walk keeps b apart and begins g'.c at -b.
 template <class S, int kFeatures> struct BackwardPixels {
   PixelBackward<S> state[kLanePixels];
+  S begin[kLanePixels];
   ScaledGradients<S, kFeatures> scaled;  // g'
   int32_t last[kLanePixels];             // entries of the list that the numerator has seen
 };
@@ -141,17 +143,20 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
     S weight[kLanePixels], dL_dpower[kLanePixels];
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      S value = S(0);
+      S value = pixels.begin[k];
       for (int f = 0; f < num_features(); ++f) {
         value = fma(pixels.scaled.get(arguments, tile, k, f), feature(f), value);
       }
       const auto pair = Blend<kMode>::backward(pixels.state[k], gate[k], value, contributes[k]);
       weight[k] = pair.weight;
-      dL_dpower[k] = gate_backward(gate[k], pair.gamma);
+      dL_dpower[k] = pair.gamma;
+    }
+    if (gaussian.opacity > S(kAlphaMax)) {  // else no pixel has met the clamp
+      for (int k = 0; k < kLanePixels; ++k) dL_dpower[k] = gate_backward(gate[k], dL_dpower[k]);
     }
     if (is_absolute()) add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
     if constexpr (kTensor) {
-      add_by_tensors(dL_dpower, weight, dx, dy, index);
+      add_by_tensors(dL_dpower, weight, gaussian);
     } else {
       add_by_shuffles(dL_dpower, weight, dx, dy, index);
     }
@@ -177,10 +182,10 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
   }
 
   __device__ __forceinline__ void add_by_tensors(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
-                                                 S dx, S dy, int32_t index) {
-    *reinterpret_cast<float4*>(&tensors.stage.values[batch][4 * tile.lane]) =
-        make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
-    if (tile.lane == 0) tensors.stage.gaussians[batch] = {{dx + kWarpTileCentre, dy + kWarpTileCentre}, index};
+                                                 const StagedPlace<S>& place) {
+    TensorRow& row = tensors.stage.rows[batch];
+    row.values[tile.lane] = make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
+    if (tile.lane == 0) row.place = place;
     if (++batch == kTensorBatch) {
       add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, batch);
       batch = 0;
@@ -330,6 +335,10 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   if (tile.empty) return;
   const WalkRange range = range_of_segment<kMode, S>(arguments, tile, place.segment, pixels);
   if (range.begin >= range.end) return;
+  for (int k = 0; k < kLanePixels; ++k) {
+    pixels.begin[k] = Blend<kMode>::kSuffixAboutBase ? -pixels.state[k].base : S(0);
+    if (Blend<kMode>::kSuffixAboutBase) pixels.state[k].base = S(0);
+  }
 
   TensorStage& tensor_stage = tensor_stages[Visitor::kTensor ? warp : 0];
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);

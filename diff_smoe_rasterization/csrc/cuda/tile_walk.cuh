@@ -122,12 +122,14 @@ template <class S> class WarpTile {
 };
 
 // A Gaussian that meets the warp's pixels, as the visitors read it.
-template <class S> struct alignas(16) StagedShape {
-  Vec2<S> mean;              // pixels
-  ExponentFactors<S> conic;  // per px^2
-  S opacity;
+template <class S> struct alignas(16) StagedPlace {
+  Vec2<S> mean;      // pixels
   int32_t gaussian;  // its number
   int32_t position;  // of the entry in the list
+};
+template <class S> struct alignas(16) StagedShape : StagedPlace<S> {
+  ExponentFactors<S> conic;  // per px^2
+  S opacity;
 };
 template <class S, bool kWithFeatures> struct alignas(16) StagedGaussian : StagedShape<S> {
   S features[kFeatureChunk];
@@ -241,7 +243,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
     *reinterpret_cast<Chunk*>(loaded.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
   }
   StagedShape<S>& shape = loaded.staged;
-  shape = {gaussian.mean, ExponentFactors<S>(gaussian.conic), gaussian.opacity, entry.gaussian, entry.position};
+  shape = {{gaussian.mean, entry.gaussian, entry.position}, ExponentFactors<S>(gaussian.conic), gaussian.opacity};
   if (tile.source.marked) return loaded;
   loaded.meets = may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
   if (!tile.source.listed) {
@@ -280,8 +282,9 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
     next = load_entry<Visitor, S>(visitor, entry, lane < count, range);
     visitor.begin_batch(first);
     met += staged;
-    for (int j = 0; j < staged; j += kVisitsPerCheck) {
-      const int end = min(j + kVisitsPerCheck, staged);
+    constexpr int kTogether = Visitor::kStopsEarly ? kVisitsPerCheck : kWarp;
+    for (int j = 0; j < staged; j += kTogether) {
+      const int end = min(j + kTogether, staged);
 #pragma unroll(Visitor::kUnroll)
       for (int i = j; i < end; ++i) visitor.visit(stage.gaussians[i]);
       if constexpr (Visitor::kStopsEarly) {

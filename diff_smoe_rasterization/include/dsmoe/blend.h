@@ -99,19 +99,19 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
   return {select(contributes, gate.alpha * before, Real(S(0))), contributes};
 }
 
-// The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it.
+// The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it. With alpha 0 it
+// changes nothing, so that a pair which does not contribute needs one select.
 template <class Real>
 DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real u,
                                               Mask<Real> contributes) {
   using S = Scalar<Real>;
-  const Real inverse = reciprocal(Real(S(1)) - gate.alpha);
-  const Real transmittance = pixel.transmittance * inverse;
-  const Real weight = select(contributes, gate.alpha * transmittance, Real(S(0)));
-  const Real weighted = weight * u;
-  const Real gamma = weighted - gate.alpha * inverse * pixel.suffix;
-  pixel.transmittance = select(contributes, transmittance, pixel.transmittance);
+  const Real alpha = select(contributes, gate.alpha, Real(S(0)));
+  const Real inverse = reciprocal(Real(S(1)) - alpha);
+  pixel.transmittance = pixel.transmittance * inverse;
+  const Real weight = alpha * pixel.transmittance, weighted = weight * u;
+  const Real gamma = weighted - alpha * inverse * pixel.suffix;
   pixel.suffix = pixel.suffix + weighted;
-  return {select(contributes, gamma, Real(S(0))), weight};
+  return {gamma, weight};
 }
 
 // The arithmetic of all modes, and the facts that most of them share. kTInNumerator: w_i is alpha_i T_i; else alpha_i.
