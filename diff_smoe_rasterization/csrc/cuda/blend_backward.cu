@@ -149,10 +149,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       }
       const auto pair = Blend<kMode>::backward(pixels.state[k], gate[k], value, contributes[k]);
       weight[k] = pair.weight;
-      dL_dpower[k] = pair.gamma;
-    }
-    if (gaussian.opacity > S(kAlphaMax)) {  // else no pixel has met the clamp
-      for (int k = 0; k < kLanePixels; ++k) dL_dpower[k] = gate_backward(gate[k], dL_dpower[k]);
+      dL_dpower[k] = pair.power;
     }
     if (is_absolute()) add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
     if constexpr (kTensor) {
@@ -187,7 +184,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
     row.values[tile.lane] = make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
     if (tile.lane == 0) row.place = place;
     if (++batch == kTensorBatch) {
-      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, batch);
+      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, kTensorBatch);
       batch = 0;
     }
   }

@@ -47,7 +47,7 @@ template <class S> constexpr S kNoRest = sizeof(S) == sizeof(float) ? S(1 << 21)
 struct alignas(16) SumExtent {
   int16_t area;            // pixels of the footprint
   int16_t x, y;            // pixels from its centre
-  int16_t steep;           // what gate_backward multiplies by
+  int16_t steep;           // of o G, where it is above the clamp of alpha
   int16_t pull_x, pull_y;  // dpower/dmean
 };
 
