@@ -44,15 +44,14 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Sums a batch by tensor cores, and gives the sums of its first `count` Gaussians to the sink. kRecord: numbers of a
-// record.
+// Sums a batch by tensor cores, and gives the sums of its `count` Gaussians to the sink. kRecord: numbers of a record.
 template <int kRecord, class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
-                          const TensorBasis& basis, int count) {
+                          const TensorBasis& basis, const StagedGaussian<float, true>* gaussians, int count) {
   __syncwarp();
   TensorSums sums = sum_pixels(stage, basis, tile.lane);
   const TensorLane at(tile.lane);
-  const StagedPlace<float> place = stage.rows[at.row].place;
+  const StagedPlace<float> place = gaussians[at.row];
   recentre(sums, {tile.rect.x0 + kWarpTileCentre - place.mean.x, tile.rect.y0 + kWarpTileCentre - place.mean.y},
            tile.lane);
   __syncwarp();
@@ -109,8 +108,8 @@ struct TensorShare {
 template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kInSegments = false;
-  static constexpr int kUnroll = 1;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
+  static constexpr int kUnroll = kTensor ? kBackwardUnroll : 1;
   static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
 
   __device__ __forceinline__ bool is_absolute() const {
@@ -135,9 +134,10 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       contributes[k] = gate[k].counts && gaussian.position < pixels.last[k];
       any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
     }
-    if (!__any_sync(kAllLanes, any)) return;
+    // By tensor cores each Gaussian has its row, and few of them touch no pixel.
+    if (!kTensor && !__any_sync(kAllLanes, any)) return;
 
-    const int32_t index = gaussian.gaussian, position = gaussian.position;
+    const int32_t index = gaussian.gaussian;
     const S* features = arguments.saved.features + int64_t(index) * feature_stride(num_features());
     const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? gaussian.features[f] : features[f]; };
     S weight[kLanePixels], dL_dpower[kLanePixels];
@@ -151,18 +151,19 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       weight[k] = pair.weight;
       dL_dpower[k] = pair.power;
     }
-    if (is_absolute()) add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
+    if (is_absolute() && (!kTensor || __any_sync(kAllLanes, any))) add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
     if constexpr (kTensor) {
-      add_by_tensors(dL_dpower, weight, gaussian);
+      row->values[tile.lane] = make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
+      ++row;
     } else {
       add_by_shuffles(dL_dpower, weight, dx, dy, index);
     }
   }
 
-  // Adds what still waits in the tensor stage.
-  __device__ __forceinline__ void finish() {
+  __device__ __forceinline__ void end_visits(const StagedGaussian<S, true>* gaussians, int count) {
     if constexpr (kTensor) {
-      if (batch > 0) add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, batch);
+      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, gaussians, count);
+      row = tensors.stage.rows;
     }
   }
 
@@ -176,17 +177,6 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       sums[1] += abs(dL_dpower[k] * by_mean.y);
     }
     add_values(sink, tile, sums, index, kNumGateMoments + num_features(), kNumAbsoluteSums);
-  }
-
-  __device__ __forceinline__ void add_by_tensors(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
-                                                 const StagedPlace<S>& place) {
-    TensorRow& row = tensors.stage.rows[batch];
-    row.values[tile.lane] = make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
-    if (tile.lane == 0) row.place = place;
-    if (++batch == kTensorBatch) {
-      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, kTensorBatch);
-      batch = 0;
-    }
   }
 
   __device__ __forceinline__ void add_by_shuffles(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
@@ -223,7 +213,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
   BackwardPixels<S, kFeatures>& pixels;
   TensorShare tensors;
   AlphaCut<S> cut;
-  int batch;  // Gaussians that wait in the tensor stage
+  TensorRow* row;  // of the tensor stage, for the next Gaussian
 };
 
 // Sets what a warp's pixels start with, before any pair. Where the background's gradients are wanted, it also writes
@@ -340,9 +330,9 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   TensorStage& tensor_stage = tensor_stages[Visitor::kTensor ? warp : 0];
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
   Visitor visitor = {
-      arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(), 0};
+      arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(),
+      tensor_stage.rows};
   const unsigned met = walk_tile<S>(stages[warp], range, visitor);
-  visitor.finish();
   count_pairs(arguments, tile.lane, met);
 }
 

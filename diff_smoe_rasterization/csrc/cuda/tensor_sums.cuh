@@ -33,11 +33,11 @@ struct TensorBasis {
   float4 of[kTensorSteps / 2][kWarp];
 };
 
-// A Gaussian whose sums are wanted. The 16 bytes behind its numbers have a second use: the quads of a warp that read two
-// rows at once meet different banks.
+// The numbers of one Gaussian. With a gap behind them, the quads of a warp that read two rows at once meet different
+// banks.
 struct TensorRow {
   float4 values[kWarp];  // of each lane: dL/dpower and weight of its first pixel, then of its second
-  StagedPlace<float> place;
+  float4 gap;
 };
 
 // What one warp keeps in shared memory.

@@ -13,6 +13,8 @@
 // Warps do not wait for each other.
 #pragma once
 
+#include <type_traits>
+
 #include "device.cuh"
 #include "dsmoe/features.h"
 #include "tile_rows.cuh"
@@ -256,6 +258,10 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
   return loaded;
 }
 
+// Whether a visitor has end_visits.
+template <class Visitor, class = void> constexpr bool kEndsVisits = false;
+template <class Visitor> constexpr bool kEndsVisits<Visitor, std::void_t<decltype(&Visitor::end_visits)>> = true;
+
 // The walk itself. Returns how many entries met the warp's pixels. A visitor has
 //
 //   kBackToFront, kStopsEarly, kReadsFeatures   what it wants of the walk, static
@@ -265,6 +271,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
 //   begin_batch(position)         called before the staged entries are visited, whose first one was at `position`
 //   visit(staged)                 one staged entry, for all lanes
 //   is_done()                     the walk may end; called now and then
+//   end_visits(first, count)      called after up to kVisitsPerCheck visits, of these staged entries; may be left out
 template <class S, class Visitor>
 __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, const WalkRange& range, Visitor& visitor) {
   const int lane = visitor.tile.lane;
@@ -282,14 +289,14 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
     next = load_entry<Visitor, S>(visitor, entry, lane < count, range);
     visitor.begin_batch(first);
     met += staged;
-    constexpr int kTogether = Visitor::kStopsEarly ? kVisitsPerCheck : kWarp;
-    for (int j = 0; j < staged; j += kTogether) {
-      const int end = min(j + kTogether, staged);
+    for (int j = 0; j < staged; j += kVisitsPerCheck) {
+      const int end = min(j + kVisitsPerCheck, staged);
 #pragma unroll(Visitor::kUnroll)
       for (int i = j; i < end; ++i) visitor.visit(stage.gaussians[i]);
       if constexpr (Visitor::kStopsEarly) {
         if (visitor.is_done()) return met - staged + end;
       }
+      if constexpr (kEndsVisits<Visitor>) visitor.end_visits(stage.gaussians + j, end - j);
     }
     __syncwarp();
   }
