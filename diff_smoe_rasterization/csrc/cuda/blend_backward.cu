@@ -89,10 +89,10 @@ template <class S> __device__ void column_moments(const S (&dL_dpower)[kLanePixe
   moments[3] = sums.xx, moments[4] = sums.xy, moments[5] = sums.yy;
 }
 
-// What the walk knows of a lane's pixels. Where all pairs' g'.c loses b, the walk keeps b apart and begins g'.c at -b.
+// What the walk knows of a lane's pixels.
 template <class S, int kFeatures> struct BackwardPixels {
   PixelBackward<S> state[kLanePixels];
-  S begin[kLanePixels];
+  S value_begin[kLanePixels];            // with what the sum g'.c begins
   ScaledGradients<S, kFeatures> scaled;  // g'
   int32_t last[kLanePixels];             // entries of the list that the numerator has seen
 };
@@ -143,7 +143,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
     S weight[kLanePixels], dL_dpower[kLanePixels];
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      S value = pixels.begin[k];
+      S value = pixels.value_begin[k];
       for (int f = 0; f < num_features(); ++f) {
         value = fma(pixels.scaled.get(arguments, tile, k, f), feature(f), value);
       }
@@ -151,7 +151,8 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       weight[k] = pair.weight;
       dL_dpower[k] = pair.power;
     }
-    if (is_absolute() && (!kTensor || __any_sync(kAllLanes, any))) add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
+    if (is_absolute() && (!kTensor || __any_sync(kAllLanes, any)))
+      add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
     if constexpr (kTensor) {
       row->values[tile.lane] = make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
       ++row;
@@ -322,15 +323,16 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   if (tile.empty) return;
   const WalkRange range = range_of_segment<kMode, S>(arguments, tile, place.segment, pixels);
   if (range.begin >= range.end) return;
+  // Where u is g'.c - b, the sum g'.c begins with -b. That saves the subtraction.
   for (int k = 0; k < kLanePixels; ++k) {
-    pixels.begin[k] = Blend<kMode>::kSuffixAboutBase ? -pixels.state[k].base : S(0);
+    pixels.value_begin[k] = Blend<kMode>::kSuffixAboutBase ? -pixels.state[k].base : S(0);
     if (Blend<kMode>::kSuffixAboutBase) pixels.state[k].base = S(0);
   }
 
   TensorStage& tensor_stage = tensor_stages[Visitor::kTensor ? warp : 0];
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
   Visitor visitor = {
-      arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(),
+      arguments,        arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(),
       tensor_stage.rows};
   const unsigned met = walk_tile<S>(stages[warp], range, visitor);
   count_pairs(arguments, tile.lane, met);

@@ -4,7 +4,7 @@
 //   dL/dfeature [Gaussians, 3] = weights   [Gaussians, 64 pixels] x [64 pixels, 3]: g'
 //
 // with u and v the pixel's place in the warp's 8x8. They are half-integers, which TF32 holds exactly. Factors that TF32
-// does not hold are split in two, so that the products keep 21 bits. Eight Gaussians go at a time: the upper parts of
+// does not hold are split in two, so that the products keep 20 bits. Eight Gaussians go at a time: the upper parts of
 // their numbers are the upper rows of a 16-row operand, the lower parts the lower ones.
 #pragma once
 
@@ -46,7 +46,8 @@ struct TensorStage {
   TensorBasis gradients;  // g', each number in two parts side by side
 };
 
-// What TF32 keeps of a number.
+// What TF32 keeps of a number, but for its last bit: where nothing but bits that the operands ignore are masked, the
+// compiler copies the number instead, in one more instruction.
 inline __device__ float tf32_part(float value) { return __uint_as_float(__float_as_uint(value) & 0xffffc000u); }
 
 // sums += a x b; the low bits of the operands are ignored.

@@ -18,8 +18,8 @@
 //
 //   dL/dalpha_i = T_i u_i - R_i / (1 - alpha_i),   dL/dc_i = w_i g'
 //
-// dL/dalpha grows like 1 / D. What leaves the pair is dL/dpower = o G dL/dalpha, which stays bounded. The clamp of alpha
-// passes the gradient straight through, as Inria's rasterizer does and a drop-in must.
+// dL/dalpha grows like 1 / D. What leaves the pair is dL/dpower = o G dL/dalpha, which stays bounded. The clamp of
+// alpha passes the gradient straight through, as Inria's rasterizer does and a drop-in must.
 //
 // where b = g'.C: each expert is compared with the pixel's own colour. At lambda = 1 all terms in b cancel, and the
 // mode alpha leaves them out.
@@ -101,10 +101,9 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
   return {select(contributes, gate.alpha * before, Real(S(0))), contributes};
 }
 
-// The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it. logit: of the gate,
-// or 0 where the pair does not contribute; then nothing changes.
-template <class Real>
-DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real u) {
+// The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it. logit: of the
+// gate, or 0 where the pair does not contribute; then nothing changes.
+template <class Real> DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real u) {
   using S = Scalar<Real>;
   const Real alpha = clamped(logit);
   const Real inverse = reciprocal(Real(S(1)) - alpha);
