@@ -140,10 +140,11 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
     const Real zero = Scalar<Real>(0), logit = select(contributes, gate.logit, zero);
     if constexpr (kTInNumerator) {
       auto pair = transmit_backward(pixel, logit, kSuffixAboutBase ? value - pixel.base : value);
+      pair.power = select(contributes, pair.power, zero);  // a pixel's base may be no number
       if (!kTInDenominator) pair.power = pair.power - select(gate.counts, gate.logit * pixel.base, zero);
       return pair;
     }
-    return {logit * (value - pixel.base), clamped(logit)};
+    return {select(contributes, logit * (value - pixel.base), zero), clamped(logit)};
   }
 };
 
