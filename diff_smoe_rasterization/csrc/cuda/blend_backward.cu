@@ -110,7 +110,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
   static constexpr bool kReadsFeatures = true, kInSegments = false;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
   static constexpr int kUnroll = kTensor ? kBackwardUnroll : 1;
-  static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
+  [[maybe_unused]] static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
 
   __device__ __forceinline__ bool is_absolute() const {
     return kFeatures != kAnyFeatures ? kAbsolute : arguments.absolute;
