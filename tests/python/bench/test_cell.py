@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from bench_commands import environment
+from checkouts import environment
 
 from diff_smoe_rasterization.benchmarks.suite import cell as cells
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand

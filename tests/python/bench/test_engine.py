@@ -13,7 +13,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from bench_commands import command, environment, rows_of, wait_for
+import yaml
+from bench_commands import command, rows_of, wait_for
+from checkouts import environment
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import engine
@@ -23,8 +25,7 @@ from diff_smoe_rasterization.benchmarks.suite.names import blend_of
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.errors import TrainerError
 
-yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
-snakemake = pytest.importorskip("snakemake", reason="the engine is Snakemake: pip install snakemake")
+pytest.importorskip("snakemake", reason="the engine is Snakemake: pip install snakemake")
 
 
 def write_suite(content, folder):
@@ -77,7 +78,6 @@ def test_a_row_says_what_was_measured_and_how(finished):
 
 
 def test_the_report_of_a_run_holds_what_its_rows_say(finished, tmp_path):
-    pytest.importorskip("matplotlib", reason="a report needs matplotlib")
     assert main(["bench", "report", str(finished[2]), "-o", str(tmp_path)]) == 0
     rows = {row["ok"]: row for row in rows_of(finished[2]).values()}
     found = {}
@@ -452,7 +452,6 @@ def test_cells_are_told_the_gpus_and_their_threads(content, tmp_path, monkeypatc
 @pytest.mark.slow  # a minute
 def test_the_suite_smoke(tmp_path):
     """From end to end, as a user types it."""
-    pytest.importorskip("matplotlib", reason="a report needs matplotlib")
     for words in (["run", "smoke", "-o", "results"], ["report", "results", "-o", "report"]):
         done = subprocess.run(command("bench", *words), env=environment(), cwd=str(tmp_path), stdout=subprocess.PIPE,
                               stderr=subprocess.STDOUT)

@@ -6,7 +6,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from bench_commands import small_trainers
+from checkouts import make_checkout
 from PIL import Image
 
 from diff_smoe_rasterization.benchmarks.suite import preparation
@@ -29,7 +29,8 @@ def test_a_made_up_scene_is_made_anew_where_its_parameters_have_changed(tmp_path
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 def test_the_copy_of_a_checkout_follows_it_and_has_its_commit(tmp_path):
-    folder = small_trainers().make_checkout(tmp_path / "checkout")
+    pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
+    folder = make_checkout(tmp_path / "checkout")
 
     def git(*words):
         who = ["-c", "user.name=Somebody", "-c", "user.email=somebody@example.org"]

@@ -9,9 +9,8 @@ import math
 import pytest
 from report_rows import PROTOCOL, failed, row, write_rows
 
-pytest.importorskip("matplotlib", reason="a report needs matplotlib")
-from diff_smoe_rasterization.benchmarks.suite import rows  # noqa: E402
-from diff_smoe_rasterization.benchmarks.suite.report import (  # noqa: E402
+from diff_smoe_rasterization.benchmarks.suite import rows
+from diff_smoe_rasterization.benchmarks.suite.report import (
     ReportError,
     curves,
     groups,

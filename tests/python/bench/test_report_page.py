@@ -10,10 +10,8 @@ import pytest
 from PIL import Image
 from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images, write_rows
 
-pytest.importorskip("matplotlib", reason="a report needs matplotlib")
-pytest.importorskip("jinja2", reason="a report needs jinja2")
-from diff_smoe_rasterization.benchmarks.suite.report import ReportError, images, report  # noqa: E402
-from diff_smoe_rasterization.trainer.errors import TrainerError  # noqa: E402
+from diff_smoe_rasterization.benchmarks.suite.report import ReportError, images, report
+from diff_smoe_rasterization.trainer.errors import TrainerError
 
 
 @pytest.fixture(scope="module")

@@ -5,14 +5,13 @@ import copy
 from pathlib import Path
 
 import pytest
+import yaml
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import engine
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite, read_yaml
 from diff_smoe_rasterization.benchmarks.suite.protocol import config_of
 from diff_smoe_rasterization.benchmarks.suite.schema import THRESHOLDS
-
-yaml = pytest.importorskip("yaml", reason="suites are YAML files: pip install pyyaml")
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "captures", "captures_ablation",
