@@ -1,10 +1,20 @@
-"""`dsmoe bench` as commands, and what they leave."""
+"""A small suite, `dsmoe bench` as commands, and what they leave."""
 from __future__ import annotations
 
 import json
 import sys
 import time
 from pathlib import Path
+
+
+def tiny_suite(scene):
+    """What a suite file says: two cells of twelve steps, done in seconds."""
+    return {"name": "tiny", "protocol": {"iterations": 12, "device": "cpu", "principal_point": "scene", "lpips": [],
+                                         "checkpoint_every": 4, "evaluate_every": 6,
+                                         "options": {"densify_from_iter": 2, "densify_until_iter": 10,
+                                                     "densification_interval": 4}},
+            "scenes": [{"name": "tiny", "path": scene}], "methods": [{"name": "native"}],
+            "blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": [0.005]}
 
 
 def command(*words):
