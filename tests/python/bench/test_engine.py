@@ -404,26 +404,18 @@ def test_on_the_cpu_cells_share_its_cores(jobs, count, at_once, threads, content
         at_once, threads, at_once * threads)))
 
 
-CELL_PYTHON = """#!/bin/sh
-case "$*" in *snakemake*) exec "{python}" "$@" ;; esac
-cp "../${{4#cells/}}.json" "$4/row.json"
-echo "$OMP_NUM_THREADS threads: $*" >>told
-"""
-
-
 def test_cells_are_told_the_gpus_and_their_threads(content, tmp_path, monkeypatch):
-    """One GPU, called 0, which Snakemake would take for a number; another program stands for the cells' Python."""
+    """One GPU, called 0, which Snakemake would take for a number. The cells' Python writes down its words and fails."""
     content["protocol"].update(device="cuda", principal_point="centre")
-    for cell in expand(content, "").cells:
-        (tmp_path / f"{cell['id']}.json").write_text(done_row(cell))
     python = tmp_path / "python"
-    python.write_text(CELL_PYTHON.format(python=sys.executable))
+    python.write_text(f'#!/bin/sh\ncase "$*" in *snakemake*) exec "{sys.executable}" "$@" ;; esac\n'
+                      'echo "$OMP_NUM_THREADS threads: $*" >>told\nexit 1\n')
     python.chmod(0o755)
     monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
     monkeypatch.setattr(engine.sys, "executable", str(python))
     monkeypatch.setattr(engine, "threads_of_each", lambda at_once: 6 // at_once)
     words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results"), "--per-gpu", "2"]
-    assert main(words) == 0
+    assert main(words) == 1
     told = (tmp_path / "results" / "told").read_text().splitlines()
     assert len(told) == 2
     for line in told:

@@ -117,8 +117,6 @@ def test_lpips_of_a_file_agrees_with_the_definition(weights, normalise):
         expected = lpips_in_double(net, {name: file[name] for name in file.files}, image, target, normalise)
     # The float32 network is 1e-5 off the float64 one: sums of some thousand terms.
     assert network(image, target) == pytest.approx(expected, rel=1e-4)
-    closer = 0.9 * target + 0.1 * image
-    assert network(closer, target) < network(image, target)
 
 
 @pytest.mark.parametrize("kind, variable, net", [("lpips_alex", "DSMOE_LPIPS_ALEX", "alex"),
