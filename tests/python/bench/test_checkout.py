@@ -83,14 +83,12 @@ def small(scene, tmp_path_factory):
 
 
 def row_of(cell, output):
-    output.mkdir()
     work(cell, str(output), 0.0)
     return json.loads((output / "row.json").read_text())
 
 
 def test_a_patched_checkout_gives_a_row(small, tmp_path):
-    output = tmp_path / "out"
-    row = row_of(small("3dgs-2023"), output)
+    row = row_of(small("3dgs-2023"), tmp_path)
     assert row["ok"], row["reason"]
     assert (row["method"], row["variant"], row["blend_mode"]) == ("3dgs-2023", "patched", "smoe")
     assert all(row[figure] > 0 for figure in ("psnr", "psnr_float", "ssim", "fps", "num_gaussians"))
@@ -102,8 +100,8 @@ def test_a_patched_checkout_gives_a_row(small, tmp_path):
     # The ground truth was rounded to 8 bits on its way here: a quarter of a grey level on average.
     assert 0 < row["protocol"]["ground_truth_difference"] < 0.5 / 255
     assert row["protocol"]["test_views"] == len(row["per_view"]) == 1
-    assert (output / "images" / "render" / "view0.png").is_file()
-    assert not (output / "renders").exists() and not (output / "run").exists()
+    assert (tmp_path / "images" / "render" / "view0.png").is_file()
+    assert not (tmp_path / "renders").exists() and not (tmp_path / "run").exists()
 
 
 @pytest.fixture
@@ -258,7 +256,7 @@ def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
     python = tmp_path / "python"
     python.write_text("#!/bin/sh\necho told >&2\necho 'train.py: error: no such flag' >&2\nexit 2\n")
     python.chmod(0o755)
-    row = row_of(small("3dgs-2023", python=str(python)), tmp_path / "out")
+    row = row_of(small("3dgs-2023", python=str(python)), tmp_path)
     assert not row["ok"]
     assert "train.py of 3dgs-2023 ended with status 2: train.py: error: no such flag (" in row["reason"]
 
@@ -287,7 +285,7 @@ def test_a_fused_checkout_is_a_copy_of_its_own(small, tmp_path):
     fused, patched = (small("3dgs-2023", variant=variant)["method"]["path"] for variant in ("fused", "patched"))
     losses = [Path(path, "utils", "loss_utils.py").read_text() for path in (fused, patched)]
     assert ["@fused_where_equal" in text for text in losses] == [True, False]
-    row = row_of(cell, tmp_path / "out")
+    row = row_of(cell, tmp_path)
     assert row["ok"] and row["variant"] == "fused"
     assert row["protocol"]["arguments"][-4:] == ["--blend_mode", "smoe", "--background_gate", "0.0"]
     # A checkout that was fused already is used as it is, and is not the patched one.
