@@ -1,6 +1,4 @@
 """A small suite, `dsmoe bench` as commands, and what they leave."""
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,6 +1,4 @@
 """The small suite as a fixture; what is skipped without the packages of benchmarks."""
-from __future__ import annotations
-
 import importlib.util
 import sys
 from pathlib import Path

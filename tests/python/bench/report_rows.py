@@ -1,6 +1,4 @@
 """Made-up rows of a benchmark, with figures that are easy to work out by hand, and flat images to go with them."""
-from __future__ import annotations
-
 import json
 
 from PIL import Image

@@ -1,6 +1,4 @@
 """A cell by itself: one process, one row whatever happens, a GPU of its own or shared."""
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

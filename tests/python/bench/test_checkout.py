@@ -2,8 +2,6 @@
 
 The small trainer is that of the patches' tests.
 """
-from __future__ import annotations
-
 import functools
 import importlib
 import json
@@ -95,7 +93,6 @@ def test_a_patched_checkout_gives_a_row(small, tmp_path):
     protocol = row["protocol"]
     assert protocol["schedule"] == row["schedule"] == "3dgs" and protocol["recipe"] == {}
     assert protocol["densify_grad_threshold"] == 0.0001 and protocol["sh_degree"] == 3
-    assert row["size_bytes"]["common"] == 236 * row["num_gaussians"]
     assert 0 < row["train_seconds"] < row["wall_seconds"]
     # The ground truth was rounded to 8 bits on its way here: a quarter of a grey level on average.
     assert 0 < row["protocol"]["ground_truth_difference"] < 0.5 / 255

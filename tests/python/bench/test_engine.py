@@ -1,6 +1,4 @@
 """From a suite to rows: what is done is not done again, what fails is a row, what is killed continues."""
-from __future__ import annotations
-
 import contextlib
 import csv
 import dataclasses

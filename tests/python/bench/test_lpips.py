@@ -1,6 +1,4 @@
 """LPIPS from files of weights, against its definition; and where there are none."""
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import real_data

@@ -1,6 +1,4 @@
 """Metrics against what follows from their definitions."""
-from __future__ import annotations
-
 import json
 import math
 from types import SimpleNamespace

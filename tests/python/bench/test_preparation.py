@@ -1,6 +1,4 @@
 """What cells need is made, and made anew where what it was made of has changed."""
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,6 +1,4 @@
 """The benchmark's report: averages, tables beside the paper's, deltas, failures, refusals, curves."""
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -244,17 +242,11 @@ def test_one_setting_twice_is_refused():
         table_of([row(), {**row(), "cell": "again"}], "cells")
 
 
-@pytest.fixture
-def closed_figures():
-    yield
-    curves.plt.close("all")
-
-
 def groups_of(entries):
     return groups.grouped(entries, layouts.end_of)
 
 
-def test_a_curve_goes_through_the_means_from_few_gaussians_to_many(closed_figures):
+def test_a_curve_goes_through_the_means_from_few_gaussians_to_many():
     entries = [row(threshold=0.0002, psnr=30.0, num_gaussians=900),
                row(threshold=0.005, psnr=20.0, num_gaussians=100), row(seed=1, psnr=22.0, num_gaussians=300),
                row(blend_mode="smoe", psnr=25.0, num_gaussians=50)]
@@ -268,7 +260,7 @@ def test_a_curve_goes_through_the_means_from_few_gaussians_to_many(closed_figure
     assert whisker[1, 1] - whisker[0, 1] == pytest.approx(2 * 2 ** 0.5)  # seeds 20 and 22: sd is the root of 2
 
 
-def test_what_has_no_place_on_an_axis_is_left_out(closed_figures, tmp_path):
+def test_what_has_no_place_on_an_axis_is_left_out(tmp_path):
     entries = [row(psnr=float("inf")), row(threshold=0.002, num_gaussians=0), row(threshold=0.001, num_gaussians=7)]
     psnr = curves.rate_distortion(groups_of(entries)).axes[0]
     assert [line.get_xydata().tolist() for line in psnr.containers[0].lines[:1]] == [[[7, 20]]]
@@ -277,7 +269,7 @@ def test_what_has_no_place_on_an_axis_is_left_out(closed_figures, tmp_path):
         assert curves.draw_all("table1", groups_of([nothing]), str(tmp_path)) == []
 
 
-def test_the_legend_lies_inside_and_above_the_panels(closed_figures):
+def test_the_legend_lies_inside_and_above_the_panels():
     entries = [row(blend_mode=mode, label=f"{'a long name of method ' * 2}{method}", schedule="steady",
                    threshold=threshold)
                for mode in ("alpha", "smoe") for method in range(4) for threshold in (0.005, 0.0002)]

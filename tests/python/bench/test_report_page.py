@@ -1,6 +1,4 @@
 """The report's folder and its page: complete without a network, replaced as a whole, nothing of others in it lost."""
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,4 @@
 """Suites: what they expand to, and which mistakes are refused with the name of the field."""
-from __future__ import annotations
-
-import copy
 from pathlib import Path
 
 import pytest
@@ -18,14 +15,10 @@ SHIPPED_NAMES = ("table1", "table2", "table3", "fig4", "fig5", "smoke", "capture
                  "captures_baselines", "gate", "gate_equal", "budgets")
 
 
-def changed(content, **fields):
-    return {**copy.deepcopy(content), **fields}
-
-
 def on_cuda(content, **fields):
     """The suite with what a checkout needs: CUDA and a centred principal point."""
-    protocol = {"device": "cuda", "principal_point": "centre", **fields.pop("protocol", {})}
-    return changed(content, protocol=protocol, **fields)
+    protocol = {"device": "cuda", "principal_point": "centre", **fields.get("protocol", {})}
+    return {**content, **fields, "protocol": protocol}
 
 
 def test_cells_are_every_combination(content):
@@ -33,7 +26,7 @@ def test_cells_are_every_combination(content):
     scenes = [{**content["scenes"][0], "name": name} for name in ("one", "two")]
     scenes[1]["densify_grad_thresholds"] = [0.001]
     methods = [{"name": "native"}, {"name": "native", "label": "other", "densify_grad_thresholds": [0.0001]}]
-    cells = expand(changed(content, scenes=scenes, methods=methods, schedules=["3dgs", "steady"], seeds=[0, 1],
+    cells = expand(dict(content, scenes=scenes, methods=methods, schedules=["3dgs", "steady"], seeds=[0, 1],
                            headline={"densify_grad_thresholds": [0.005]}, headline_seeds=[1, 2]), "").cells
     thresholds = {("one", "native"): 0.005, ("two", "native"): 0.001, ("one", "other"): 1e-4, ("two", "other"): 1e-4}
     assert {(cell["scene"]["name"], cell["method"]["label"], cell["blend_mode"], cell["schedule"], cell["seed"],
@@ -46,7 +39,7 @@ def test_cells_are_every_combination(content):
 
 def test_gates_are_of_smoe_alone(content):
     """And a cell of gate 0 is the one that a suite without gates has, so that its rows stay."""
-    cells = expand(changed(content, blend_modes=["smoe_tn", "smoe", "alpha"],
+    cells = expand(dict(content, blend_modes=["smoe_tn", "smoe", "alpha"],
                            background_gates=["learned", 0, 0.05]), "").cells
     assert [(cell["blend_mode"], cell["background_gate"], config_of(cell).background_gate) for cell in cells] == [
         ("smoe_tn", 0, 0), ("smoe", "learned", "learned"), ("smoe", 0, 0), ("smoe", 0.05, 0.05), ("alpha", 1, 1)]
@@ -58,7 +51,7 @@ def test_gates_are_of_smoe_alone(content):
 def test_the_name_of_a_cell_is_that_of_its_figures(content, tmp_path):
     """Another protocol is another cell; another place of the same data is not."""
     def name(**changes):
-        return expand(changed(content, **changes), "").cells[0]["id"]
+        return expand(dict(content, **changes), "").cells[0]["id"]
 
     scene, = content["scenes"]
     assert len({name(), *(name(protocol={**content["protocol"], **changes}) for changes in (
@@ -69,7 +62,7 @@ def test_the_name_of_a_cell_is_that_of_its_figures(content, tmp_path):
 
 
 def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
-    cells = expand(changed(content, budgets=[0, 30, 40], headline={"budgets": [40]}, headline_seeds=[1]), "").cells
+    cells = expand(dict(content, budgets=[0, 30, 40], headline={"budgets": [40]}, headline_seeds=[1]), "").cells
     assert [(cell.get("budget"), cell["seed"]) for cell in cells if cell["blend_mode"] == "alpha"] == [
         (None, 0), (30, 0), (40, 0), (40, 1)]
     assert {cell["id"] for cell in cells if "budget" not in cell} == {cell["id"] for cell in expand(content, "").cells}
@@ -117,7 +110,7 @@ SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "bl
 ])
 def test_a_mistake_names_its_field(content, change, words):
     with pytest.raises(BenchError) as error:
-        expand(changed(content, **change), "")
+        expand(dict(content, **change), "")
     for word in words:
         assert word in str(error.value)
 
@@ -145,7 +138,7 @@ def test_a_relative_path_is_from_the_suites_folder_and_one_in_a_variable_from_th
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DATA", "data")
     scenes = [{"name": "a", "path": "data/a"}, {"name": "b", "path": "${DATA}/b"}, {"name": "c", "path": "${NO}/a"}]
-    one, other, lacking = expand(changed(content, scenes=scenes), "/suites").scenes
+    one, other, lacking = expand(dict(content, scenes=scenes), "/suites").scenes
     assert (one["path"], other["path"]) == ("/suites/data/a", str(tmp_path / "data" / "b"))
     assert lacking["unset"] == "scenes[2].path: $NO is not set; it is a part of '${NO}/a'"
 
@@ -180,8 +173,8 @@ def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
 def test_what_a_checkout_cannot_follow_is_refused(name, changes, words, content):
     method = {"name": name, "path": "p", "arguments": ["--cap_max", 5] if name == "dbs" else []}
     with pytest.raises(BenchError, match=words):
-        expand(on_cuda(content, methods=[{"name": "native"}, method], **copy.deepcopy(changes)), "")
-    assert expand(on_cuda(content, **copy.deepcopy(changes)), "").cells  # the native trainer can
+        expand(on_cuda(content, methods=[{"name": "native"}, method], **changes), "")
+    assert expand(on_cuda(content, **changes), "").cells  # the native trainer can
     assert expand(on_cuda(content, methods=[method], protocol={"options": {"antialiasing": False}}), "").cells
 
 
