@@ -32,8 +32,7 @@ def test_the_copy_of_a_checkout_follows_it_and_has_its_commit(tmp_path):
 
     def git(*words):
         who = ["-c", "user.name=Somebody", "-c", "user.email=somebody@example.org"]
-        return subprocess.run(["git", "-C", str(folder), *who, *words], check=True, stdout=subprocess.PIPE,
-                              universal_newlines=True).stdout.strip()
+        return subprocess.check_output(["git", "-C", str(folder), *who, *words], text=True).strip()
 
     def prepared(**changes):
         return preparation.prepared_method({"name": "3dgs-2023", "label": "ours", "variant": "patched",

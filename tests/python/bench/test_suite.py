@@ -1,4 +1,5 @@
 """Suites: what they expand to, and which mistakes are refused with the name of the field."""
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -194,11 +195,8 @@ def test_a_method_without_a_threshold_is_trained_once(name, arguments, content):
 def test_a_budget_is_that_of_the_arguments(name, arguments, right, content):
     """Taming's --budget is a count with --mode final_count, and else a multiple of the number of points."""
     suite = on_cuda(content, methods=[{"name": name, "path": "p", "arguments": arguments.split(), "budget": 999}])
-    if right:
-        assert expand(suite, "").cells
-    else:
-        with pytest.raises(BenchError, match=r"methods\[0\].budget: is 999"):
-            expand(suite, "")
+    with nullcontext() if right else pytest.raises(BenchError, match=r"methods\[0\].budget: is 999"):
+        expand(suite, "")
 
 
 @pytest.fixture
