@@ -170,12 +170,11 @@ def test_a_damaged_row_is_named_before_anything_is_run(damaged, copied, finished
     (["--per-gpu", "2"], "protocol.device cuda"), (["--per-gpu", "2", "--slurm"], "without --slurm"),
     (["--slurm", "gpu"], "--slurm gpu: must be KEY=VALUE"), (["--slurm", "=gpu"], "--slurm =gpu: must be KEY=VALUE"),
     (["--only", "blend_mode=smoe_std"], "--only blend_mode=smoe_std: no cell of the suite is so; its cells have alpha"),
-    (["--only", "blend_mode"], "--only blend_mode: must be"), (["--only", "mode=alpha"], "--only mode=alpha: must be"),
-    *((["--slurm", f"cpus_per_task={number}"], f"cpus_per_task={number}: must be a number of at least 1")
-      for number in ("0", "-2", "all", "\u0663"))])
+    (["--only", "blend_mode"], "--only blend_mode: must be"), (["--only", "mode=alpha"], "--only mode=alpha: must be")])
 def test_options_that_do_not_go_together_are_refused_before_anything_is_written(words, told, content, tmp_path, bench):
-    status, said = bench(write_suite(content, tmp_path), tmp_path / "results", *words)
-    assert status == 1 and told in said
+    for more in ([], ["--dry-run"]):
+        status, said = bench(write_suite(content, tmp_path), tmp_path / "results", *words, *more)
+        assert status == 1 and told in said
     assert not (tmp_path / "results").exists()
 
 
@@ -375,6 +374,9 @@ def test_queues_are_snakemakes_business(on_gpus, monkeypatch):
         assert (words["--executor"], words["gpus"], words["per_device"]) == ("slurm", "[]", "0")
         assert words["threads"] == threads
         assert words["all"][words["all"].index("--default-resources") + 1:][:2] == resources
+    for number in ("0", "-2", "all", "", "\u0663"):
+        with pytest.raises(BenchError, match=f"cpus_per_task={number}: must be a number of at least 1"):
+            words_of(on_gpus, None, [f"cpus_per_task={number}"])
 
 
 @pytest.mark.parametrize("jobs, count, at_once, threads", [

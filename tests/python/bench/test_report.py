@@ -43,8 +43,9 @@ def test_a_cell_is_the_mean_over_seeds_with_its_spread():
     assert shown(table, "PSNR [dB]", "PSNR at edges [dB]", "own size [MB]", "LPIPS Alex") == [
         "24.00 ± 1.00", "22.00 ± 1.00", "2.0 ± 0.0", "0.250 ± 0.000"]
     assert "GPU peak [MiB]" not in shown(table)  # no row has it
-    line, = csv.DictReader(io.StringIO(tables.to_csv(table)))
-    assert line["source"] == "ours" and float(line["PSNR [dB]"]) == 24 and float(line["PSNR [dB] sd"]) == 1
+    averaged, single = csv.DictReader(io.StringIO(tables.to_csv(table_of([*entries, row("fox")], "cells"))))
+    assert (averaged["source"], float(averaged["PSNR [dB]"]), float(averaged["PSNR [dB] sd"])) == ("ours", 24, 1)
+    assert single["PSNR [dB] sd"] == ""
     assert shown(table_of(entries[:1], "cells"), "PSNR [dB]") == ["23.00"]  # one seed has no spread
 
 
@@ -224,7 +225,8 @@ def test_rules_that_one_row_does_not_state_are_not_compared():
 @pytest.mark.parametrize("text, reason", [
     ("{", "line 1: not valid json"), ("[]", "line 1: expected one object"), ("", "no rows"),
     ('{"cell": "a"}', "lacks suite, ok, method"), ("\xff", "rows.jsonl: not text in UTF-8"),
-    *((json.dumps({**row(), name: value}), rf"rows.jsonl, line 1: {name}[\[\]0-9]*(\.\w+)? is .*; it must be ")
+    *((f"{json.dumps(row())}\n{json.dumps({**row(), name: value})}",
+       rf"rows.jsonl, line 2: {name}[\[\]0-9]*(\.\w+)? is .*; it must be ")
       for name, value in (
           ("cell", ["a"]), ("psnr", "12.3"), ("ssim", math.nan), ("fps", math.inf), ("psnr", -math.inf),
           ("num_gaussians", True), ("train_seconds", 10 ** 400), ("seed", True), ("label", 1),
