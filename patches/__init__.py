@@ -8,7 +8,7 @@ record.py keeps the originals. shims/ is what `dsmoe run` puts in front of an un
 patched trainer imports.
 """
 from .engine import apply, check, diff, plan, revert
-from .errors import PatchError
+from .source import PatchError
 from .trainers import names
 
 TRAINERS = names()

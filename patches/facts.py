@@ -116,19 +116,9 @@ def _renders(node: ast.AST, made: Set[str]) -> bool:
     return is_object and getattr(called, "id", "") in made
 
 
-def uses_another_rasterizer(facts: Set[str]) -> bool:
-    """Whether one of another name is imported, which no patch and no run can take the place of."""
-    return bool(_those(facts, "uses "))
-
-
-def has_a_name_of_its_own(facts: Set[str]) -> bool:
-    """Whether one is imported that `dsmoe run` knows by another name than Inria's, which no patch rewrites."""
-    return bool(_those(facts, "from "))
-
-
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     """Returns the rasterizer whose API is called and "", or None and why it is none that is known."""
-    foreign = sorted(_those(facts, "uses "))
+    foreign = sorted(those(facts, "uses "))
     if foreign:
         return None, f"it imports {', '.join(foreign)}, another rasterizer, which would render in this one's place"
     others = [contract for name, contract in MODULES.items() if "from " + name in facts]
@@ -140,24 +130,24 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     said = {"sets": "its GaussianRasterizationSettings have {}", "takes": "its rasterizer is called with {}",
             "needs": "it imports {}"}
     for kind, text in said.items():
-        names = _those(facts, kind + " ") - set().union(*(entry[kind] for entry in known.values()))
+        names = those(facts, kind + " ") - set().union(*(entry[kind] for entry in known.values()))
         if names:
             return None, (text.format(", ".join(sorted(names))) + ", which no rasterizer has that is known here "
                           f"({', '.join(sorted(known))})")
     shown = others or [contract for contract in CONTRACTS if contract.module == RASTERIZER
                        and (not contract.signs or facts & set(contract.signs))]
     fitting = [contract for contract in shown
-               if all(_those(facts, kind + " ") <= known[contract.name][kind] for kind in said)]
+               if all(those(facts, kind + " ") <= known[contract.name][kind] for kind in said)]
     for contract in fitting:
-        if all(_fits_one(found, contract) for found in _those(facts, "returns ")):
+        if all(_fits_one(found, contract) for found in those(facts, "returns ")):
             return contract, ""
     nearest = (fitting or shown)[0]
-    found = next((found for found in sorted(_those(facts, "returns ")) if not _fits_one(found, nearest)), "")
+    found = next((found for found in sorted(those(facts, "returns ")) if not _fits_one(found, nearest)), "")
     return None, (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which "
                   f"it resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
 
 
-def _those(facts: Set[str], kind: str) -> Set[str]:
+def those(facts: Set[str], kind: str) -> Set[str]:
     return {fact[len(kind):] for fact in facts if fact.startswith(kind)}
 
 

@@ -11,7 +11,7 @@ import shutil
 from pathlib import Path
 from typing import Any, Dict, Mapping, NamedTuple, Optional
 
-from .errors import PatchError
+from .source import PatchError
 
 FOLDER = ".dsmoe_patch"
 FORMAT = 1

@@ -3,10 +3,9 @@ from __future__ import annotations
 
 import pytest
 
-cst = pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
-
-from diff_smoe_rasterization.patches.rules import ON_REQUEST  # noqa: E402
-from diff_smoe_rasterization.patches.trainers import RUNTIME  # noqa: E402
+from diff_smoe_rasterization.patches.rules import ON_REQUEST
+from diff_smoe_rasterization.patches.source import Source
+from diff_smoe_rasterization.patches.trainers import RUNTIME
 
 RULES = {rule.name: rule for rules in ON_REQUEST.values() for rule in rules}
 BEFORE_AND_AFTER = [
@@ -83,9 +82,9 @@ BEFORE_AND_AFTER = [
 def test_what_a_rule_changes(name, before, after):
     rule = RULES[name]
     assert any(hint in before for hint in rule.hints)
-    changed = rule.change(cst.parse_module(before))
-    assert (changed and changed.code) == after
-    assert changed is None or rule.change(changed) is None  # it is not applied twice
+    changed = rule.change(Source("x.py", before.encode()))
+    assert (changed and changed.decode()) == after
+    assert changed is None or rule.change(Source("x.py", changed)) is None  # it is not applied twice
 
 
 def test_every_rule_is_tried_above():
