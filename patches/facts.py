@@ -1,4 +1,4 @@
-"""What a checkout imports and calls, from which it is told which rasterizer's API it calls. Needs no LibCST."""
+"""What a checkout imports and calls, from which it is told which rasterizer's API it calls."""
 from __future__ import annotations
 
 import ast

@@ -1,4 +1,4 @@
-"""The trainers that can be patched, as a table. It has names and structure, no line of a trainer; needs no LibCST.
+"""The trainers that can be patched, as a table. It has names and structure, no line of a trainer.
 
 A checkout is the first trainer of TRAINERS that calls the rasterizer it calls and whose signs it shows; facts.py says
 what signs are. integrations/contracts.py is the table of rasterizers.

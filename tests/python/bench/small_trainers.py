@@ -5,14 +5,11 @@ import importlib
 import sys
 from pathlib import Path
 
-import pytest
-
 PATCHES = Path(__file__).resolve().parents[1] / "patches"
 
 
 def small_trainers():
     """The module that makes checkouts of it."""
-    pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
     sys.path.insert(0, str(PATCHES))
     try:
         return importlib.import_module("checkouts")

@@ -299,7 +299,6 @@ def test_a_python_without_the_package_is_named(tmp_path, dsmoe, monkeypatch):
 
 
 def test_a_patched_checkout_is_refused_until_nothing_of_the_patch_is_left(tmp_path):
-    pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
     patches.apply(make(tmp_path))
     words = [sys.executable, str(tmp_path / "train.py")], "smoe", None, environment()
     with pytest.raises(patches.PatchError, match="patched already"):

@@ -7,14 +7,11 @@ import re
 from pathlib import Path
 
 import pytest
+from checkouts import changed_files, contents, make_checkout
+from tiny import ARGS, GR, RENDERER, TRAIN, make, refused
 
-pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
-
-from checkouts import changed_files, contents, make_checkout  # noqa: E402
-from tiny import ARGS, GR, RENDERER, TRAIN, make, refused  # noqa: E402
-
-from diff_smoe_rasterization import patches  # noqa: E402
-from diff_smoe_rasterization.patches import facts  # noqa: E402
+from diff_smoe_rasterization import patches
+from diff_smoe_rasterization.patches import facts
 
 STATEMENTS = ("from diff_smoe_rasterization.", "**pipe.blend,",
               "self.blend_mode, self.background_gate = default_blend()", "pipe.blend = blend_of(dataset)",
@@ -52,8 +49,8 @@ def test_in_public_checkouts_only_the_statements_change(name):
         pytest.skip(f"DSMOE_TRAINERS names no folder with a public checkout {name}")
     before = contents(folder)
     only_statements_change(patches.diff(folder))
-    found = {rule.name: files for (_, rule), files in patches.check(folder, fuse=True).requested.items()}
-    assert found == {"fused-loss": ["utils/loss_utils.py"], "fused-adam": ["scene/gaussian_model.py"]}
+    assert patches.check(folder, fuse=True).requested == {
+        "fused-loss": ["utils/loss_utils.py"], "fused-adam": ["scene/gaussian_model.py"]}
     assert contents(folder) == before
 
 

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from checkouts import contents, make_checkout
 
-pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
-
-from diff_smoe_rasterization import BLEND_MODES, patches  # noqa: E402
-from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED  # noqa: E402
+from diff_smoe_rasterization import BLEND_MODES, patches
+from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED
 
 RUN = ("-m", "diff_smoe_rasterization", "run", "--blend-mode")
 
