@@ -7,8 +7,6 @@ README.md says what is in which file.
 """
 from .engine import apply, check, diff, plan, revert
 from .source import PatchError
-from .trainers import names
-
-TRAINERS = names()
+from .trainers import TRAINER_NAMES as TRAINERS
 
 __all__ = ["PatchError", "TRAINERS", "apply", "check", "diff", "plan", "revert"]

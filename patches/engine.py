@@ -19,7 +19,7 @@ from . import facts, record, scripts
 from .record import FOLDER, Record
 from .rules import ON_REQUEST, Misfit, Rule, rules_of
 from .source import PatchError, Source
-from .trainers import GR, RASTERIZER, TRAINERS, Trainer, names
+from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
 PathLike = Union[str, Path]
@@ -310,7 +310,7 @@ def by_name(name: str) -> Trainer:
     for trainer in TRAINERS:
         if trainer.name == name:
             return trainer
-    raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(names())}")
+    raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(TRAINER_NAMES)}")
 
 
 def _root(path: PathLike) -> Path:

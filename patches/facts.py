@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import ast
 import re
-import warnings
 from typing import Dict, Iterator, List, Mapping, Optional, Set, Tuple
 
 from diff_smoe_rasterization.integrations.contracts import (
@@ -17,6 +16,7 @@ from diff_smoe_rasterization.integrations.contracts import (
 )
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
+from .source import PatchError, Source
 from .trainers import GR, INTEGRATIONS, TRAINERS, Trainer
 
 PATCHED = "imports from " + INTEGRATIONS
@@ -28,12 +28,10 @@ RENDERERS = {"render", "prefilter_voxel", "*"}
 
 def python_tree(data: bytes) -> ast.Module:
     """Returns the syntax tree of a file as Python's own parser has it; of one that cannot be parsed an empty one."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # such as of invalid escapes in a string
-        try:
-            return ast.parse(data)
-        except (SyntaxError, ValueError):
-            return ast.Module(body=[], type_ignores=[])
+    try:
+        return Source("", data).tree
+    except PatchError:
+        return ast.Module(body=[], type_ignores=[])
 
 
 def of_files(files: Mapping[str, bytes]) -> Set[str]:

@@ -168,7 +168,7 @@ def weights_only(source: Source) -> Iterator[Edit]:
 def unsigned_bytes(source: Source) -> Iterator[Edit]:
     """`dtype=np.byte` becomes `dtype=np.uint8`."""
     for node in source.nodes(ast.keyword):
-        if node.arg == "dtype" and dotted(node.value) in ("np.byte", "numpy.byte"):
+        if node.arg == "dtype" and dotted(node.value) in ("np.byte", "numpy.byte") and source.is_placed(node.value):
             _, end = source.span(node.value)
             yield Edit(end - len("byte"), end, "uint8")
 
@@ -176,7 +176,7 @@ def unsigned_bytes(source: Source) -> Iterator[Edit]:
 def builtin_types(source: Source) -> Iterator[Edit]:
     """`np.int` becomes `int`."""
     for node in source.nodes(ast.Attribute):
-        if re.fullmatch(r"(np|numpy)\.(int|float|bool|object)", dotted(node)):
+        if re.fullmatch(r"(np|numpy)\.(int|float|bool|object)", dotted(node)) and source.is_placed(node):
             yield Edit(*source.span(node), node.attr)
 
 

@@ -24,7 +24,7 @@ from . import facts
 from .record import Record
 from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE
 from .source import PatchError
-from .trainers import GR, RASTERIZER, TRAINERS, names
+from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
@@ -111,7 +111,7 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
     """Returns the flavour, for which trainer it was chosen, and what speaks against it."""
     by_name = {**{name: name for name in FLAVOURS}, **{known.name: known.flavour for known in TRAINERS}}
     if trainer is not None and trainer not in by_name:
-        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(names())}, or for "
+        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
     reasons = []
     folders = _folders(words)

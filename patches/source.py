@@ -6,7 +6,7 @@ import io
 import re
 import tokenize
 import warnings
-from typing import Iterable, Iterator, NamedTuple, Tuple
+from typing import Any, Dict, Iterable, Iterator, NamedTuple, Tuple
 
 
 class PatchError(RuntimeError):
@@ -29,7 +29,7 @@ class Source:
 
     def __init__(self, name: str, data: bytes) -> None:
         """Raises PatchError where it cannot be parsed."""
-        self.name, self.data = name, data
+        self.data = data
         try:
             self.encoding = tokenize.detect_encoding(io.BytesIO(data).readline)[0]
             text = data.decode(self.encoding)
@@ -79,7 +79,7 @@ class Source:
                 break
             place += 1
             if isinstance(statement, ast.ImportFrom) and statement.module == module:
-                if name not in {alias.name for alias in statement.names}:
+                if {name, "*"}.isdisjoint(alias.name for alias in statement.names):
                     start = re.compile(rb"import[\s(\\]*").search(self.text, self.span(statement)[0]).end()
                     yield Edit(start, start, name + ", ")
                 return
@@ -90,7 +90,12 @@ class Source:
 
     def calls(self, name: str) -> Iterator[ast.Call]:
         """Yields the calls of what has this name, with dots in it."""
-        return (node for node in self.nodes(ast.Call) if dotted(node.func) == name)
+        return (node for node in self.nodes(ast.Call) if dotted(node.func) == name and self.is_placed(node.func))
+
+    def is_placed(self, name: ast.AST) -> bool:
+        """Whether a name is where its node says; before Python 3.12 one in an f-string of some lines is elsewhere."""
+        start, end = self.span(name)
+        return self.text[start:end].decode(errors="replace") == dotted(name)
 
     def nodes(self, kind: type) -> Iterator[ast.AST]:
         return (node for node in ast.walk(self.tree) if isinstance(node, kind))
@@ -112,6 +117,6 @@ def on_top(node: ast.AST) -> Iterator[ast.stmt]:
                 yield from on_top(child)
 
 
-def keywords_of(call: ast.Call) -> dict:
+def keywords_of(call: ast.Call) -> Dict[Any, ast.expr]:
     """Returns the values of a call's keywords; None is the key of `**more`."""
     return {keyword.arg: keyword.value for keyword in call.keywords}

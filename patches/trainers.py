@@ -65,8 +65,4 @@ TRAINERS = (
     Trainer("3dgs-depth", "depth", USUAL),
     Trainer("3dgs-depth-alpha", "depth_alpha", USUAL),
 )
-
-
-def names() -> Tuple[str, ...]:
-    """The names of the trainers."""
-    return tuple(sorted({trainer.name for trainer in TRAINERS}))
+TRAINER_NAMES = tuple(sorted({trainer.name for trainer in TRAINERS}))
