@@ -54,19 +54,23 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
 
 def _status_of(words: Sequence[str], environment: Dict[str, str]) -> int:
     """Runs the command, to which signals of this process go. Returns its exit status; -N where signal N ended it."""
-    # What is ignored, as under nohup, the command inherits.
-    signals = [number for number in FORWARDED if signal.getsignal(number) != signal.SIG_IGN]
-    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # until there is a process to send them to
-    child = subprocess.Popen(list(words), env=environment,
-                             preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_UNBLOCK, signals))
+    child: Optional[subprocess.Popen] = None
+    early: List[int] = []  # signals that came while the command was being started
 
     def forward(number: int, _: object) -> None:
-        if number != signal.SIGINT or not _is_in_foreground():
+        if child is None:
+            early.append(number)
+        elif number != signal.SIGINT or not _is_in_foreground():
             child.send_signal(number)
 
-    for number in signals:
+    for number in FORWARDED:
+        if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup: the command inherits that, but no handler
+            signal.signal(number, forward)
+    child = subprocess.Popen(list(words), env=environment)
+    for received in early:
+        child.send_signal(received)
+    for number in FORWARDED:
         signal.signal(number, forward)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
     return child.wait()
 
 
