@@ -46,7 +46,6 @@ class Plan(NamedTuple):
     record: Optional[Record]
     changes: Tuple[Change, ...] = ()
     notes: Tuple[str, ...] = ()  # scripts that no rule reaches, files that stay, and where each rule on request is
-    requested: Mapping[str, List[str]] = {}  # the files that each rule of the options changes
     written: bool = False  # whether `apply` wrote files by this plan
 
     def refusal(self) -> str:
@@ -144,7 +143,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
             if f"from {RASTERIZER}._C ".encode() in files[name]:
                 patched.notes.append(f"{name}: the import from {RASTERIZER}._C stays; where it fails, the file has to "
                                      "do without what it names")
-    requested, notes = {}, []
+    notes = []
     for option in options:
         by_rule = {rule.name: [name for name in sorted(files)
                                if any(hint.encode() in files[name] for hint in rule.hints)
@@ -154,7 +153,6 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
                   for rule in ON_REQUEST[option] if by_rule[rule.name]]
         skipped = [name for name, changed in by_rule.items() if not changed]
         notes += [f"{option}: skipped, nothing matches: {', '.join(skipped)}"] if skipped else []
-        requested.update(by_rule)
     notes = [*patched.notes, *scripts.notes(root, files, chosen), *notes]
     if recorded and not patched.problems:
         is_current = all(now.get(change.name) == change.after for change in patched.changes())
@@ -167,15 +165,14 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         notes.insert(0, f"--trainer {trainer}: " + (
             f"by what it imports and calls this is {known.name}, whose rasterizer has another API ({known.flavour}, "
             f"not {chosen.flavour})" if known else reason))
-    return Plan(root, state, chosen.name, tuple(reasons), options, applied, recorded, patched.changes(), tuple(notes),
-                requested)
+    return Plan(root, state, chosen.name, tuple(reasons), options, applied, recorded, patched.changes(), tuple(notes))
 
 
 def plan(path: PathLike, **options: Any) -> Plan:
     """Plans a patch, with the options of `check`. Raises PatchError where it is refused."""
     planned = check(path, **options)
     states = set(planned.record.states().values()) if planned.record else {"not finished"}
-    if planned.state in ("patchable", "patched") or states <= {"patched", "original"}:
+    if planned.state in ("patchable", "patched") or states <= {"patched", "original", "cut"}:
         return planned
     raise PatchError(planned.refusal())
 
@@ -248,8 +245,8 @@ def revert(path: PathLike) -> Dict[str, bool]:
     gone = [name for name, state in states.items() if state == "gone"]
     if gone:
         raise PatchError(f"{gone[0]}: {_SINCE['gone']}; nothing was touched. {_WAY_OUT}")
-    back = {name: recorded.before[name] if state == "patched" else _without_patch(recorded, name)
-            for name, state in states.items() if state in ("patched", "changed")}
+    back = {name: _without_patch(recorded, name) if state == "changed" else recorded.before[name]
+            for name, state in states.items() if state in ("patched", "changed", "cut")}
     try:
         _write(root, back)
     except OSError as error:
@@ -260,7 +257,8 @@ def revert(path: PathLike) -> Dict[str, bool]:
 
 _WAY_OUT = (f"Undo your edit; or copy what lies in {FOLDER}/originals over the checkout, by which your edit is lost, "
             f"and delete {FOLDER}")
-_SINCE = {"changed": "was changed since it was patched", "gone": "was removed since it was patched",
+_SINCE = {"cut": "is empty, as a kill leaves it: `apply` finishes the patch, `revert` takes it back",
+          "changed": "was changed since it was patched", "gone": "was removed since it was patched",
           "replaced": "was changed since, and is not patched any more; `revert` leaves it, and puts back the others",
           "original": "is not patched, or not any more: `apply` finishes the patch, `revert` takes it back"}
 

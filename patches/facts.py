@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import ast
 import re
-from typing import Dict, Iterator, List, Mapping, Optional, Set, Tuple
+from typing import Dict, Iterator, Mapping, Optional, Set, Tuple
 
 from diff_smoe_rasterization.integrations.contracts import (
     ARGUMENTS,
@@ -137,10 +137,10 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     fitting = [contract for contract in shown
                if all(those(facts, kind + " ") <= known[contract.name][kind] for kind in said)]
     for contract in fitting:
-        if all(_fits_one(found, contract) for found in those(facts, "returns ")):
+        if all(_fits(found, contract) for found in those(facts, "returns ")):
             return contract, ""
     nearest = (fitting or shown)[0]
-    found = next((found for found in sorted(those(facts, "returns ")) if not _fits_one(found, nearest)), "")
+    found = next((found for found in sorted(those(facts, "returns ")) if not _fits(found, nearest)), "")
     return None, (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which "
                   f"it resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
 
@@ -155,16 +155,13 @@ def _known(contract: Contract) -> Dict[str, Set[str]]:
             "needs": {*NAMES, *contract.names}}
 
 
-def _fits_one(found: str, contract: Contract) -> bool:
-    return any(_fits(found, results) for results in (contract.results, *contract.other_results))
-
-
-def _fits(found: str, results: Tuple[str, ...]) -> bool:
-    """Whether what a caller names its results by can be these."""
-    names: List[str] = found.split(", ")
-    return len(names) == len(results) and all(
+def _fits(found: str, contract: Contract) -> bool:
+    """Whether what a caller names its results by can be those of a rasterizer."""
+    names = found.split(", ")
+    return any(len(names) == len(results) and all(
         name.startswith("_") or RESULTS.get(result, ("", ""))[1] in name.lower()
         and not (result == "depth" and "inv" in name.lower()) for name, result in zip(names, results))
+        for results in (contract.results, *contract.other_results))
 
 
 def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:

@@ -89,17 +89,18 @@ class Killed(BaseException):
 
 
 def failing_at(step, error, monkeypatch):
-    """Raises an error in place of the step-th writing of a file, once; returns the list of files that were written."""
+    """Raises an error in place of the step-th writing of a file, once; a kill leaves that file empty."""
     written, write = [], Path.write_bytes
 
     def counted(path, data):
         written.append(path)
         if len(written) == step:
+            if isinstance(error, Killed):
+                write(path, b"")
             raise error
         return write(path, data)
 
     monkeypatch.setattr(Path, "write_bytes", counted)
-    return written
 
 
 # A record has two copies of each of four files; then the files are written.
