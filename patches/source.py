@@ -6,7 +6,7 @@ import io
 import re
 import tokenize
 import warnings
-from typing import Any, Dict, Iterable, Iterator, NamedTuple, Tuple
+from typing import Any, Dict, Iterable, Iterator, NamedTuple, Optional, Tuple
 
 
 class PatchError(RuntimeError):
@@ -53,7 +53,7 @@ class Source:
             place = end
         return b"".join([*parts, self.text[place:]]).decode().encode(self.encoding)
 
-    def span(self, node: ast.AST) -> Tuple[int, int]:
+    def span(self, node: Any) -> Tuple[int, int]:
         """Returns where a node begins and where it ends, without parentheses around it."""
         return (self.lines[node.lineno - 1] + node.col_offset, self.lines[node.end_lineno - 1] + node.end_col_offset)
 
@@ -97,11 +97,11 @@ class Source:
         start, end = self.span(name)
         return self.text[start:end].decode(errors="replace") == dotted(name)
 
-    def nodes(self, kind: type) -> Iterator[ast.AST]:
+    def nodes(self, kind: type) -> Iterator[Any]:
         return (node for node in ast.walk(self.tree) if isinstance(node, kind))
 
 
-def dotted(node: ast.AST) -> str:
+def dotted(node: Optional[ast.AST]) -> str:
     """Returns a name with its dots, "" for other expressions."""
     if isinstance(node, ast.Attribute):
         return dotted(node.value) and f"{dotted(node.value)}.{node.attr}"

@@ -89,14 +89,13 @@ class Killed(BaseException):
 
 
 def failing_at(step, error, monkeypatch):
-    """Raises an error in place of the step-th writing of a file, once; a kill leaves that file empty."""
+    """Raises an error in place of the step-th writing of a file, once; that file is empty then."""
     written, write = [], Path.write_bytes
 
     def counted(path, data):
         written.append(path)
         if len(written) == step:
-            if isinstance(error, Killed):
-                write(path, b"")
+            write(path, b"")
             raise error
         return write(path, data)
 
