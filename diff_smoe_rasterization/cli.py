@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 
 from ._version import __version__
-from .patches.errors import PatchError
+from .patches import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.config import (
     PRINCIPAL_POINTS,

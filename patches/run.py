@@ -21,10 +21,10 @@ from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_o
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
 
 from . import facts
-from .errors import PatchError
 from .record import Record
 from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE, WITHOUT_VARIABLE
-from .trainers import GR, RASTERIZER, TRAINERS, names
+from .source import PatchError
+from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 SPARSE_ADAM = "SparseGaussianAdam"
@@ -120,7 +120,7 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
     """Returns the flavour, for which trainer it was chosen, and what speaks against it."""
     by_name = {**{name: name for name in FLAVOURS}, **{known.name: known.flavour for known in TRAINERS}}
     if trainer is not None and trainer not in by_name:
-        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(names())}, or for "
+        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
     reasons = []
     folders = _folders(words)
@@ -135,7 +135,7 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
         known, reason = facts.recognise(found)
         if known and trainer is None:
             return known.flavour, f"{known.name if (folder / GR).is_file() else 'the trainer'} in {folder}", []
-        is_other = facts.uses_another_rasterizer(found)
+        is_other = facts.those(found, "uses ")
         if trainer is not None and (is_other or found and not any(fact.startswith("keeps ") for fact in found)):
             raise PatchError(f"{folder}: {reason}; --trainer {trainer} cannot help")
         if found and not (known and known.flavour == by_name[trainer]):

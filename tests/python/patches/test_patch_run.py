@@ -49,7 +49,7 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path, python):
 ENDS = {  # what a command does, and how `dsmoe run` ends then
     "made(None)": (0, ""), "pass": (1, "rendered nothing: what was trained or rendered was not smoe"),
     "import os, signal; os.kill(os.getpid(), signal.SIGTERM)": (-15, ""),
-    "import os, signal; os.kill(os.getpid(), signal.SIGKILL)": (-9, ""), "sys.exit(3)": (3, ""),
+    "import os, signal; os.kill(os.getpid(), signal.SIGKILL)": (-9, ""),
     "import contextlib, diff_gaussian_rasterization as d\nwith contextlib.suppress(TypeError): d.rasterize_gaussians()":
         (0, "")}
 
@@ -217,15 +217,15 @@ def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(fl
     assert made["DSMOE_RASTERIZER"] == flavour and f"{module} will be {flavour} of this package" in lines[0]
 
 
-@pytest.mark.parametrize("flavour", ["absgs", "fastgs"])
-def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(flavour, tmp_path, python):
-    contract = next(contract for contract in CONTRACTS if contract.name == flavour)
-    script = (f"from {contract.module} import GaussianRasterizer, GaussianRasterizationSettings\n"
-              "print(GaussianRasterizer.__module__)\nGaussianRasterizer(None)\n")
+def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(tmp_path, python):
+    modules = {contract.module: contract.name for contract in CONTRACTS if contract.name in ("absgs", "fastgs")}
+    script = "".join(f"from {module} import GaussianRasterizer, GaussianRasterizationSettings\n"
+                     "print(GaussianRasterizer.__module__)\nGaussianRasterizer(None)\n" for module in modules)
     make(tmp_path, {"x.py": script})
-    result = python("-m", "diff_smoe_rasterization", *RUN, "--trainer", flavour, "--", sys.executable, "x.py",
+    result = python("-m", "diff_smoe_rasterization", *RUN, "--trainer", "absgs", "--", sys.executable, "x.py",
                     cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
-    assert (result.status, result.out) == (0, f"diff_smoe_rasterization.integrations.{flavour}\n"), result.err
+    said = [f"diff_smoe_rasterization.integrations.{flavour}" for flavour in modules.values()]
+    assert (result.status, result.out.splitlines()) == (0, said), result.err
 
 
 GSPLAT = {  # a gsplat of some lines: its version, and a strategy that has taken its functions by name
@@ -251,8 +251,7 @@ print(ops.compute_relocation.__module__, ops.quat_scale_to_covar_preci.__module_
 """
 
 
-@pytest.mark.parametrize("version, radii", [("1.4.0", [1, 1]), ("1.5.3", [1, 1, 2]), ("1.6.0+cu13", [1, 1, 2]),
-                                            (None, [1, 1, 2])])
+@pytest.mark.parametrize("version, radii", [("1.4.0", [1, 1]), ("1.6.0+cu13", [1, 1, 2]), (None, [1, 1, 2])])
 def test_gsplat_gets_this_rasterizer_and_keeps_its_strategies(version, radii, tmp_path, python):
     """version None: where gsplat is not installed, there is the rasterizer alone."""
     make(tmp_path, {GR: None, "x.py": CALL_GSPLAT + (CALL_STRATEGY if version else "")})
@@ -323,7 +322,6 @@ def test_a_rasterizer_that_the_file_defines_is_not_the_extensions(tmp_path, monk
     make(tmp_path, {GR: TWO_RASTERIZERS.replace("rasterizer(means3D=1)", "rasterizer(means3D=1, cov3Ds_precomp=2)")})
     with pytest.raises(patches.PatchError, match="its rasterizer is called with cov3Ds_precomp, which no"):
         run.prepare(*words)
-    pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
     refused(make(tmp_path, {GR: TWO_RASTERIZERS}), "for which there is no patch: use `dsmoe run`")
 
 
@@ -356,7 +354,6 @@ def test_a_python_without_the_package_is_named(tmp_path, dsmoe, monkeypatch):
 
 
 def test_a_patched_checkout_is_refused_until_nothing_of_the_patch_is_left(tmp_path):
-    pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
     patches.apply(make(tmp_path))
     words = [sys.executable, str(tmp_path / "train.py")], "smoe", None, environment()
     with pytest.raises(patches.PatchError, match="patched already"):
