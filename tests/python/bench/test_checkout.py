@@ -30,7 +30,6 @@ from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.methods import checkout as shapes
 from diff_smoe_rasterization.benchmarks.suite.methods import observer
 
-pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
 ITERATIONS = 7
 
 

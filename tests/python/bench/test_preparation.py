@@ -27,7 +27,6 @@ def test_a_made_up_scene_is_made_anew_where_its_parameters_have_changed(tmp_path
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 def test_the_copy_of_a_checkout_follows_it_and_has_its_commit(tmp_path):
-    pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
     folder = make_checkout(tmp_path / "checkout")
 
     def git(*words):
