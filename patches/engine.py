@@ -86,7 +86,10 @@ class Patched:
         after = rule.change(self.sources[name])
         if after in (None, self.sources[name].data):
             return None if after is None else False
-        self.sources[name] = Source(name, after)
+        try:
+            self.sources[name] = Source(name, after)
+        except PatchError as error:
+            raise Misfit(f"{name}: what {rule.name} would make of it {str(error).partition(': ')[2]}") from None
         self.rules.setdefault(name, []).append(rule.name)
         return True
 
@@ -94,7 +97,7 @@ class Patched:
         """Applies a rule that may match or not; returns whether it did. A file that cannot be read stays."""
         try:
             return bool(self.apply(name, rule))
-        except PatchError as error:
+        except (PatchError, Misfit) as error:
             self.notes = list(dict.fromkeys([*self.notes, f"left as it is: {error}"]))
             return False
 
@@ -259,7 +262,7 @@ def revert(path: PathLike) -> Dict[str, bool]:
 
 _WAY_OUT = (f"Undo your edit; or copy what lies in {FOLDER}/originals over the checkout, by which your edit is lost, "
             f"and delete {FOLDER}")
-_SINCE = {"cut": "is empty, as a kill leaves it: `apply` finishes the patch, `revert` takes it back",
+_SINCE = {"cut": "is written in part, as a kill leaves it: `apply` finishes the patch, `revert` takes it back",
           "changed": "was changed since it was patched", "gone": "was removed since it was patched",
           "replaced": "was changed since, and is not patched any more; `revert` leaves it, and puts back the others",
           "original": "is not patched, or not any more: `apply` finishes the patch, `revert` takes it back"}

@@ -68,7 +68,7 @@ class Record(NamedTuple):
         now, after = (self.root / name).read_bytes(), self.after[name]
         if now in (self.before[name], after):
             return "original" if now == self.before[name] else "patched"
-        if not now:  # a kill while it was written
+        if after.startswith(now) or self.before[name].startswith(now):  # a kill while it was written
             return "cut"
         # One that imported this package and no longer does was replaced, as by git checkout.
         return "replaced" if PACKAGE in after and PACKAGE not in now else "changed"

@@ -103,7 +103,7 @@ def _with_line(source: Source, body: List[ast.stmt], place: int, line: str) -> I
     """A function's body with one more statement, where it has not that."""
     wanted = ast.dump(ast.parse(line).body[0])
     is_there = any(ast.dump(statement) == wanted for statement in body)
-    yield from [DONE] if is_there else source.line_before(body[place], line)
+    yield from [DONE] if is_there else source.line_before(body, place, line)
 
 
 def model_options(source: Source) -> Iterator[Edit]:
@@ -207,7 +207,9 @@ def lpips_when_used(source: Source) -> Iterator[Edit]:
 def _behind_import(source: Source, line: ast.stmt, names: str) -> Iterator[Edit]:
     """An import from runtime.py above a line, and below the comments above it."""
     start, _ = source.span(line)
-    yield Edit(start, start, f"from {RUNTIME} import {names}{source.newline}{source.indent(line)}")
+    indent = source.indent(line)
+    between = "; " if indent.strip() else f"{source.newline}{indent}"  # such as behind `else:`
+    yield Edit(start, start, f"from {RUNTIME} import {names}{between}")
 
 
 def without_standard(source: Source) -> Iterator[Edit]:

@@ -6,7 +6,7 @@ import io
 import re
 import tokenize
 import warnings
-from typing import Any, Dict, Iterable, Iterator, NamedTuple, Optional, Tuple
+from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
 
 
 class PatchError(RuntimeError):
@@ -36,7 +36,7 @@ class Source:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # such as of invalid escapes in a string
                 self.tree = ast.parse(text, name)
-        except (SyntaxError, ValueError) as error:
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise PatchError(f"{name}: is not Python that can be parsed: {error}") from None
         self.text = text.encode()
         lines = self.text.splitlines(keepends=True)
@@ -62,10 +62,12 @@ class Source:
         start, _ = self.span(statement)
         return self.text[self.lines[statement.lineno - 1]:start].decode()
 
-    def line_before(self, statement: ast.stmt, line: str) -> Iterator[Edit]:
-        """One more line before a statement and the comments above it; none where the statement begins no line."""
-        number, indent = statement.lineno - 1, self.indent(statement)
-        while number and self.text[self.lines[number - 1]:self.lines[number]].lstrip()[:1] in (b"", b"#"):
+    def line_before(self, body: List[ast.stmt], place: int, line: str) -> Iterator[Edit]:
+        """One more line before a statement of a body and the comments above it; none where it begins no line."""
+        statement, indent = body[place], self.indent(body[place])
+        number = min(node.lineno for node in (statement, *getattr(statement, "decorator_list", ()))) - 1
+        above = body[place - 1].end_lineno if place else 0  # whose own lines may look like comments
+        while number > above and self.text[self.lines[number - 1]:self.lines[number]].lstrip()[:1] in (b"", b"#"):
             number -= 1
         if not indent.strip():
             yield Edit(self.lines[number], self.lines[number], f"{indent}{line}{self.newline}")

@@ -7,7 +7,7 @@
 // |w g'| <= |dL/df|. The pairs behind a pair weigh at most T (1 - alpha) together, so alpha / (1 - alpha) |R| is at
 // most w max |u|, and
 //
-//   |gamma| <= 2 max(1, lambda) (sum_f 2 |dL/df| max |c_f| + |dL/dW|)
+//   |alpha dL/dalpha| <= 2 max(1, lambda) (sum_f 2 |dL/df| max |c_f| + |dL/dW|)
 //
 // with the largest gradient and the largest feature of the whole image. A moment has up to two factors of distance,
 // which the footprint bounds; a sum has no more terms than the footprint has pixels.

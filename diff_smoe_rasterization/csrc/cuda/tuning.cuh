@@ -44,7 +44,7 @@ constexpr int kBackwardBlocks = 5;
 constexpr int kGeneralWalkBlocks = 1;
 
 // Sums by tensor cores: how many Gaussians one warp sums together. They fill the 16 rows of an operand, eight rows for
-// dL/dpower and eight for the weights.
+// the upper parts of their numbers and eight for the lower ones.
 constexpr int kTensorBatch = 8;
 static_assert(kTensorBatch == kVisitsPerCheck, "the walk says where a batch ends");
 

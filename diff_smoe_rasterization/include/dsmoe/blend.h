@@ -102,7 +102,7 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
 }
 
 // The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it. logit: of the
-// gate, or 0 where the pair does not contribute; then nothing changes.
+// gate, or 0 where the pair does not contribute; then nothing changes, since the reciprocal of 1 is 1.
 template <class Real> DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real u) {
   using S = Scalar<Real>;
   const Real alpha = clamped(logit);

@@ -1,6 +1,7 @@
 """The engine of the patches: what is planned, written, kept and put back, and when not."""
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 from pathlib import Path
@@ -42,6 +43,20 @@ def test_every_form_of_text_comes_back(tmp_path, form):
     assert after == added and b"pipe.blend = blend_of(dataset)" in after
     patches.revert(tmp_path)
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("body", [
+    '    """Trains.\n\n    # see README"""\n', '    @functools.lru_cache\n    def first():\n        return 0\n'])
+def test_a_line_is_put_before_a_statement_and_into_no_other(tmp_path, body):
+    """Behind a docstring that looks like comments, and above what decorates the first statement."""
+    text = TRAIN.replace("    # the first iteration is 1\n", body)
+    make(tmp_path, {"train.py": text})
+    patches.apply(tmp_path)
+    function = next(node for node in ast.parse((tmp_path / "train.py").read_text()).body
+                    if isinstance(node, ast.FunctionDef))
+    assert any(ast.unparse(line) == "pipe.blend = blend_of(dataset)" for line in function.body)
+    patches.revert(tmp_path)
+    assert (tmp_path / "train.py").read_text() == text
 
 
 @pytest.mark.parametrize("name, old, new, rule", [
@@ -89,13 +104,13 @@ class Killed(BaseException):
 
 
 def failing_at(step, error, monkeypatch):
-    """Raises an error in place of the step-th writing of a file, once; that file is empty then."""
+    """Raises an error within the step-th writing of a file, once; that file is empty then, or has its first half."""
     written, write = [], Path.write_bytes
 
     def counted(path, data):
         written.append(path)
         if len(written) == step:
-            write(path, b"")
+            write(path, data[:len(data) // 2 * (step % 2)])
             raise error
         return write(path, data)
 
