@@ -5,11 +5,13 @@ opacities under 0.99, where the gradient is passed straight through a clamp.
 """
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from comparison import threshold_margin
-from devices import on_the_cpu
-from scenes import random_scene, with_gate
+from devices import on_the_cpu, random_normal
+from scenes import random_scene, with_gate, with_gates
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -69,3 +71,29 @@ def test_every_entry_of_the_jacobian(mode, device):
         return diff_smoe_rasterization.rasterize(settings=settings, **tensors).color
 
     check_gradients(function, leaves, device)
+
+
+@with_gates
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("options", [{}, {"absolute": True}, {"deterministic": True}, {"channels": 5}],
+                         ids=["usual", "absolute", "deterministic", "five_channels"])
+def test_a_nan_reaches_the_shapes_of_its_pixels_gaussians_alone(mode, options, dtype, device):
+    """A pair that does not contribute has no gradient. The colours of Gaussians beside the pixel may be NaN."""
+    options = {"channels": 3, **options}
+    absolute = options.pop("absolute", False)
+    # So faint that no pixel is full, behind which smoe_tn would still count pairs.
+    scene = random_scene(mode, 400, 41, 27, scale=0.06, opacity=(0.02, 0.2), dtype=dtype, **options)
+    if absolute:
+        scene = scene.with_inputs(means2D_abs=torch.zeros(400, 2, dtype=dtype))
+    scene = scene.requiring_grad(camera=False)
+    rendering, splats = diff_smoe_rasterization.rasterize_with_splats(settings=scene.settings, **scene.inputs)
+    pixel = torch.zeros(27, 41, dtype=dtype)
+    pixel[13, 21] = 1
+    there = splats.contributions(pixel).pixel_weights > 0
+    assert 1 < there.sum() < 40
+    weights = random_normal(rendering.color.shape, 1, dtype)
+    weights[1, 13, 21] = math.nan
+    names = ["means3D", "means2D", "opacities", "scales", "rotations"] + ["means2D_abs"] * absolute
+    gradient = torch.autograd.grad(rendering.color, [scene.inputs[name] for name in names], weights)
+    for name, values in zip(names, gradient):
+        assert torch.equal(~torch.isfinite(values).all(1), there), name
