@@ -44,7 +44,8 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Sums a batch by tensor cores, and gives the sums of its `count` Gaussians to the sink. kRecord: numbers of a record.
+// Sums a batch by tensor cores, and gives the sums of its `count` Gaussians to the sink. Where the batch is not full,
+// the other rows hold what an earlier one left; nobody takes their sums. kRecord: numbers of a record.
 template <int kRecord, class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
                           const TensorBasis& basis, const StagedGaussian<float, true>* gaussians, int count) {
@@ -134,7 +135,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       contributes[k] = gate[k].counts && gaussian.position < pixels.last[k];
       any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
     }
-    // By tensor cores each Gaussian has its row, and few of them touch no pixel.
+    // By tensor cores every Gaussian has its row, also the few that touch no pixel.
     if (!kTensor && !__any_sync(kAllLanes, any)) return;
 
     const int32_t index = gaussian.gaussian;
@@ -151,8 +152,9 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       weight[k] = pair.weight;
       dL_dpower[k] = pair.power;
     }
-    if (is_absolute() && (!kTensor || __any_sync(kAllLanes, any)))
+    if (is_absolute() && (!kTensor || __any_sync(kAllLanes, any))) {
       add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
+    }
     if constexpr (kTensor) {
       row->values[tile.lane] = make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
       ++row;
@@ -323,7 +325,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   if (tile.empty) return;
   const WalkRange range = range_of_segment<kMode, S>(arguments, tile, place.segment, pixels);
   if (range.begin >= range.end) return;
-  // Where u is g'.c - b, the sum g'.c begins with -b. That saves the subtraction.
+  // Where u is g'.c - b, the sum g'.c begins with -b, and b is 0 from here on. That saves a subtraction a pair.
   for (int k = 0; k < kLanePixels; ++k) {
     pixels.value_begin[k] = Blend<kMode>::kSuffixAboutBase ? -pixels.state[k].base : S(0);
     if (Blend<kMode>::kSuffixAboutBase) pixels.state[k].base = S(0);

@@ -9,8 +9,9 @@
 //
 //   |alpha dL/dalpha| <= 2 max(1, lambda) (sum_f 2 |dL/df| max |c_f| + |dL/dW|)
 //
-// with the largest gradient and the largest feature of the whole image. A moment has up to two factors of distance,
-// which the footprint bounds; a sum has no more terms than the footprint has pixels.
+// with the largest gradient and the largest feature of the whole image. Where alpha is clamped, dL/dpower is larger by
+// o G / alpha. A moment has up to two factors of distance, which the footprint bounds; a sum has no more terms than the
+// footprint has pixels.
 #pragma once
 
 #include "../dispatch.h"
@@ -47,7 +48,7 @@ template <class S> constexpr S kNoRest = sizeof(S) == sizeof(float) ? S(1 << 21)
 struct alignas(16) SumExtent {
   int16_t area;            // pixels of the footprint
   int16_t x, y;            // pixels from its centre
-  int16_t steep;           // of o G, where it is above the clamp of alpha
+  int16_t steep;           // of the largest o G / alpha
   int16_t pull_x, pull_y;  // dpower/dmean
 };
 

@@ -46,8 +46,8 @@ struct TensorStage {
   TensorBasis gradients;  // g', each number in two parts side by side
 };
 
-// What TF32 keeps of a number, but for its last bit: where nothing but bits that the operands ignore are masked, the
-// compiler copies the number instead, in one more instruction.
+// The upper part of a number: what TF32 keeps of it, but for the last bit. With a mask of just the bits that the
+// operands ignore, the compiler would copy the number in place of masking it, in one more instruction.
 inline __device__ float tf32_part(float value) { return __uint_as_float(__float_as_uint(value) & 0xffffc000u); }
 
 // sums += a x b; the low bits of the operands are ignored.
@@ -81,7 +81,8 @@ inline __device__ void fill_moment_basis(TensorBasis& basis) {
   }
 }
 
-// Fills the right-hand operand of the features from each lane's g' of its two pixels.
+// Fills the right-hand operand of the features from each lane's g' of its two pixels. The lanes exchange them through
+// rows of the stage.
 inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&scaled)[kLanePixels][kFastFeatures],
                                            int lane) {
   for (int f = 0; f < kFastFeatures; ++f) stage.rows[f].values[lane] = make_float4(scaled[0][f], 0, scaled[1][f], 0);

@@ -270,8 +270,8 @@ template <class Visitor> constexpr bool kEndsVisits<Visitor, std::void_t<decltyp
 //   arguments, tile               the rendering, and the warp's place in it
 //   begin_batch(position)         called before the staged entries are visited, whose first one was at `position`
 //   visit(staged)                 one staged entry, for all lanes
-//   is_done()                     the walk may end; called now and then
 //   end_visits(first, count)      called after up to kVisitsPerCheck visits, of these staged entries; may be left out
+//   is_done()                     the walk may end; called after end_visits, where the visitor stops early
 template <class S, class Visitor>
 __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, const WalkRange& range, Visitor& visitor) {
   const int lane = visitor.tile.lane;
@@ -293,10 +293,10 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
       const int end = min(j + kVisitsPerCheck, staged);
 #pragma unroll(Visitor::kUnroll)
       for (int i = j; i < end; ++i) visitor.visit(stage.gaussians[i]);
+      if constexpr (kEndsVisits<Visitor>) visitor.end_visits(stage.gaussians + j, end - j);
       if constexpr (Visitor::kStopsEarly) {
         if (visitor.is_done()) return met - staged + end;
       }
-      if constexpr (kEndsVisits<Visitor>) visitor.end_visits(stage.gaussians + j, end - j);
     }
     __syncwarp();
   }

@@ -14,15 +14,16 @@
 //
 //   C = (sum c_i w_i + lambda T bg) / D,   D = W + lambda T         (smoe at 0; alpha at 1, where D is 1)
 //
-// With g' = dL/dC / D, u_i = g'.c_i - b and the suffix R_i = sum_{j>i} w_j u_j, which begins at lambda T (g'.bg - b):
+// With g' = dL/dC / D, b = g'.C, u_i = g'.c_i - b and the suffix R_i = sum_{j>i} w_j u_j, which begins at
+// lambda T (g'.bg - b):
 //
 //   dL/dalpha_i = T_i u_i - R_i / (1 - alpha_i),   dL/dc_i = w_i g'
 //
+// Each expert is compared with the pixel's own colour. At lambda = 1 all terms in b cancel, and the mode alpha leaves
+// them out.
+//
 // dL/dalpha grows like 1 / D. What leaves the pair is dL/dpower = o G dL/dalpha, which stays bounded. The clamp of
 // alpha passes the gradient straight through, as Inria's rasterizer does and a drop-in must.
-//
-// where b = g'.C: each expert is compared with the pixel's own colour. At lambda = 1 all terms in b cancel, and the
-// mode alpha leaves them out.
 #pragma once
 
 #include <type_traits>
@@ -86,6 +87,7 @@ template <class Real> struct PixelBackward {
   Real base;           // b
 };
 
+// 0 where the pair has no part in the pixel.
 template <class Real> struct PairGradient {
   Real power;   // dL/dpower = o G dL/dalpha
   Real weight;  // w; dL/dc = w g'
@@ -102,7 +104,8 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
 }
 
 // The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it. logit: of the
-// gate, or 0 where the pair does not contribute; then nothing changes, since the reciprocal of 1 is 1.
+// gate, or 0 where the pair does not contribute. Then T stays, since the reciprocal of 1 is 1, and so does R where u is
+// a number.
 template <class Real> DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real u) {
   using S = Scalar<Real>;
   const Real alpha = clamped(logit);
@@ -140,7 +143,7 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
     const Real zero = Scalar<Real>(0), logit = select(contributes, gate.logit, zero);
     if constexpr (kTInNumerator) {
       auto pair = transmit_backward(pixel, logit, kSuffixAboutBase ? value - pixel.base : value);
-      pair.power = select(contributes, pair.power, zero);  // a pixel's base may be no number
+      pair.power = select(contributes, pair.power, zero);  // logit is 0 then, but u may be no number
       if (!kTInDenominator) pair.power = pair.power - select(gate.counts, gate.logit * pixel.base, zero);
       return pair;
     }
