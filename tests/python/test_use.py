@@ -128,8 +128,8 @@ def test_forward_mode_is_refused():
     def render(scales, settings=scene.settings):
         return rasterize(settings=settings, **{**scene.inputs, "scales": scales}).color
 
-    def refused(function, *arguments):
-        with pytest.raises(NotImplementedError, match="forward-mode derivatives .* are not implemented"):
+    def refused(function, *arguments, words="forward-mode derivatives .* are not implemented"):
+        with pytest.raises(NotImplementedError, match=words):
             function(*arguments)
 
     scales = scene.inputs["scales"]
@@ -145,7 +145,9 @@ def test_forward_mode_is_refused():
         refused(activate, scene.inputs["opacities"].view(-1, 1), dual, scene.inputs["rotations"])
         refused(fused_ssim, forward_ad.make_dual(image, image), image)
         refused(l1_ssim_loss, forward_ad.make_dual(image, image), image)
-        refused(torch.ops.diff_smoe_rasterization.rasterize, *op_arguments(scene.with_inputs(scales=dual)))
+        # PyTorch 2.4 itself refuses this one, before the op is called.
+        refused(torch.ops.diff_smoe_rasterization.rasterize, *op_arguments(scene.with_inputs(scales=dual)),
+                words="forward-mode derivatives .* are not implemented|implement the jvp function")
         refused(torch.ops.diff_smoe_rasterization.radii, *op_arguments(scene.with_inputs(scales=dual), "radii"))
     if hasattr(torch, "func"):
         for function in [render] + [torch.compile(render, backend="eager")] * hasattr(torch.library, "opcheck"):
