@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import datetime
 import os
+import time
 from typing import List, Optional, Sequence
 
 import torch
@@ -125,4 +126,7 @@ def join_group(device: str) -> Group:
 def leave_group(group: Group) -> None:
     """Ends what `join_group` began."""
     if group is not ALONE:
+        # gloo's threads need Python's lock to let go of the last tensors. In torch 2.4 destroy_process_group holds
+        # that lock while it waits for these threads: for ever, but for this moment without it.
+        time.sleep(0.2)
         torch.distributed.destroy_process_group()
