@@ -49,12 +49,15 @@ class Renderer:
         """
         return self._render(self.rasterize, camera, background, background_gate, **arguments)
 
-    @torch.no_grad()
-    def with_splats(self, camera: Camera) -> Tuple[Rendering, Splats]:
-        """An image, and what its pixels say of each Gaussian."""
+    def with_splats(self, camera: Camera, background: Optional[torch.Tensor] = None,
+                    background_gate: Optional[torch.Tensor] = None,
+                    **arguments: Any) -> Tuple[Rendering, Optional[Splats]]:
+        """An image, and what its pixels say of each Gaussian, where the rasterizer is the package's."""
+        if self.rasterize is not package_rasterizer():
+            return self(camera, background, background_gate, **arguments), None
         from ... import rasterize_with_splats
 
-        return self._render(rasterize_with_splats, camera)
+        return self._render(rasterize_with_splats, camera, background, background_gate, **arguments)
 
     def _render(self, function: Callable[..., Any], camera: Camera, background: Optional[torch.Tensor] = None,
                 background_gate: Optional[torch.Tensor] = None, **arguments: Any) -> Any:

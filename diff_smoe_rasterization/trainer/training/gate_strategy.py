@@ -6,14 +6,14 @@ they can be compared: `Splats.importance`. The rules and what they are worth: do
 """
 from __future__ import annotations
 
-from typing import Any, Dict, List, NamedTuple, Optional, Tuple
+from typing import Any, Dict, Optional, Tuple
 
 import torch
 
 from ..errors import ConfigError
 from ..gate_options import parse_gate_options
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
-from ..scenes.images import View, as_float
+from ..scenes.images import as_float
 from .drawing import draw
 from .strategy import SteadyStrategy, Step, StrategyContext
 
@@ -35,13 +35,6 @@ CHILD_SCALE = 0.65
 CHILD_COVER = 0.744
 
 
-class Scores(NamedTuple):
-    """Sums over the training views that were looked at."""
-
-    costs: torch.Tensor  # [N] squared change of the images on the Gaussian's removal
-    errors: torch.Tensor  # [N] squared error of the images where the Gaussian is, by its share
-
-
 class GateStrategy(SteadyStrategy):
     """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
 
@@ -56,8 +49,10 @@ class GateStrategy(SteadyStrategy):
         last = config.iterations - 1  # the last iteration changes nothing
         self.removals = [min(last, round(until * (REMOVALS_BEGIN + (REMOVALS_END - REMOVALS_BEGIN) * i / count)))
                          for i in range(count)]
-        self.move_interval = max(1, round(MOVE_INTERVAL * until))
+        interval = max(1, round(MOVE_INTERVAL * until))
         self.moves_end = round(MOVES_END * until)
+        self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)
+                      if iteration > self.removals[-1] and self.options.moves > 0]
         self._check_reach()
 
     def _check_reach(self) -> None:
@@ -73,6 +68,8 @@ class GateStrategy(SteadyStrategy):
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
 
     def before_backward(self, step: Step) -> None:
+        if self._looks(step.iteration):
+            self._score(step)
         if self.options.anneal != 1:
             span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
             share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
@@ -81,8 +78,7 @@ class GateStrategy(SteadyStrategy):
     def after_step(self, step: Step) -> None:
         if step.iteration in self.removals:
             self.remove(1 + sum(later > step.iteration for later in self.removals))
-        elif (self.options.moves > 0 and self.removals[-1] < step.iteration <= self.moves_end
-              and step.iteration % self.move_interval == 0):
+        elif step.iteration in self.moves:
             self.move()
 
     @property
@@ -111,18 +107,17 @@ class GateStrategy(SteadyStrategy):
             return
         ratio = model.num_gaussians / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
-        costs = self.score().costs
-        mask = torch.zeros_like(costs, dtype=torch.bool)
-        mask[torch.topk(costs, kept).indices] = True
+        mask = torch.zeros_like(self.costs, dtype=torch.bool)
+        mask[torch.topk(self.costs, kept).indices] = True
         self.context.optimizer.keep(mask)
         self._forget_statistics()
 
     def move(self) -> None:
         """Moves the cheapest Gaussians to others, drawn by their error, which are split there."""
-        scores = self.score()
-        count = int(self.options.moves * len(scores.costs))
-        costs, sources = torch.topk(scores.costs, count, largest=False)
-        errors = scores.errors.clone()
+        count = int(self.options.moves * len(self.costs))
+        costs, sources = torch.topk(self.costs, count, largest=False)
+        errors = self.errors
+        self._forget_scores()
         errors[sources] = 0
         count = min(count, int((errors > 0).sum()))
         if count == 0:
@@ -151,30 +146,35 @@ class GateStrategy(SteadyStrategy):
         for rows, place in ((parents, means + offsets), (places, means - offsets)):
             self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
 
-    def score(self) -> Scores:
-        """Renders training views, and sums what each Gaussian is worth to them."""
-        zeros = self.context.model.raw["means3D"].new_zeros(self.context.model.num_gaussians)
-        costs, errors = zeros, zeros.clone()
-        for view in self._some_views():
-            rendering, splats = self.context.render.with_splats(view.camera)
-            error = (rendering.color - as_float(view.image)).square().sum(0)
-            mask = view.mask_float()
-            weights = torch.ones_like(error) if mask is None else mask[0]
-            importance = splats.importance(weights, weights * error)
-            costs += importance.removal_costs
-            errors += importance.shares
-        return Scores(costs, errors)
+    def _looks(self, iteration: int) -> bool:
+        """Whether the next decision looks at this step's view."""
+        removes = self.context.model.num_gaussians > self.context.config.budget
+        following = next((later for later in [*self.removals, *self.moves] if later >= iteration), None)
+        return (following is not None and following - iteration < self.options.views
+                and (removes or following > self.removals[-1]))
 
-    def _some_views(self) -> List[View]:
-        """Views as evenly spread as their order is, from a random one on."""
-        views = self.context.views
-        count = min(self.options.views, len(views))
-        first = int(torch.randint(len(views), ()))
-        return [views[(first + i * len(views) // count) % len(views)] for i in range(count)]
+    def _score(self, step: Step) -> None:
+        """Adds what each Gaussian is worth to the view that the step has rendered."""
+        error = (step.rendering.color.detach() - as_float(step.target)).square().sum(0)
+        mask = step.view.mask_float()
+        weights = torch.ones_like(error) if mask is None else mask[0]
+        importance = step.splats().importance(weights, weights * error)
+        self.costs += importance.removal_costs
+        self.errors += importance.shares
+
+    def _forget_statistics(self) -> None:
+        super()._forget_statistics()
+        self._forget_scores()
+
+    def _forget_scores(self) -> None:
+        zeros = torch.zeros_like(self.view_count)
+        # Sums over the views since, [N]: squared change of the images on the Gaussian's removal, and squared error of
+        # the images where the Gaussian is, by its share.
+        self.costs, self.errors = zeros, zeros.clone()
 
     def state_dict(self) -> Dict[str, Any]:
-        return {**super().state_dict(), "start": self.start}
+        return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         super().load_state_dict(state)
-        self.start = state["start"]
+        self.start, self.costs, self.errors = state["start"], state["costs"], state["errors"]

@@ -16,6 +16,8 @@ from ...direct import DirectRendering
 from ...extension import _C  # noqa: F401  (loading it registers the ops)
 from ...gaussians import activate
 from ...settings import Rendering
+from ...splats import Splats
+from ..errors import TrainerError
 from ..model import PARAMETERS, GaussianModel, GaussianOptimizer
 from ..results.rendering import Renderer
 from ..scenes.cameras import Camera
@@ -30,6 +32,7 @@ class AutogradPasses:
 
     def __init__(self, model: GaussianModel, optimizer: GaussianOptimizer, renderer: Renderer) -> None:
         self.model, self.optimizer, self.renderer = model, optimizer, renderer
+        self._splats: Optional[Splats] = None
 
     def render(self, camera: Camera, background: Optional[torch.Tensor],
                background_gate: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
@@ -38,12 +41,19 @@ class AutogradPasses:
         background, background_gate: in place of the renderer's; the latter gets its gradient.
         """
         means2D = torch.zeros_like(self.model.raw["means3D"], requires_grad=True)
-        rendering = self.renderer(camera, background=background, means2D=means2D, background_gate=background_gate)
+        rendering, self._splats = self.renderer.with_splats(camera, background, background_gate, means2D=means2D)
         self._color = rendering.color
         return rendering, means2D
 
+    def splats(self) -> Splats:
+        """What the image of `render` says of each Gaussian."""
+        if self._splats is None:
+            raise TrainerError("the strategy asks for splats, which only the package's own rasterizer has")
+        return self._splats
+
     def backward(self, dL_dcolor: torch.Tensor) -> None:
         """From the gradient by the image [3, H, W] to those by all parameters."""
+        self._splats = None  # which holds on to memory
         self._color.backward(dL_dcolor)
 
     def update(self) -> None:
@@ -82,6 +92,11 @@ class DirectPasses:
         rendering = self._direct.render()
         self._radii = rendering.radii
         return rendering, self._means2D
+
+    def splats(self) -> Splats:
+        """What the image of `render` says of each Gaussian."""
+        assert self._direct is not None, "render comes first"
+        return self._direct.splats()
 
     @torch.no_grad()
     def backward(self, dL_dcolor: torch.Tensor) -> None:
