@@ -51,10 +51,8 @@ class Renderer:
 
     def with_splats(self, camera: Camera, background: Optional[torch.Tensor] = None,
                     background_gate: Optional[torch.Tensor] = None,
-                    **arguments: Any) -> Tuple[Rendering, Optional[Splats]]:
-        """An image, and what its pixels say of each Gaussian, where the rasterizer is the package's."""
-        if self.rasterize is not package_rasterizer():
-            return self(camera, background, background_gate, **arguments), None
+                    **arguments: Any) -> Tuple[Rendering, Splats]:
+        """An image by the package's rasterizer, and what its pixels say of each Gaussian."""
         from ... import rasterize_with_splats
 
         return self._render(rasterize_with_splats, camera, background, background_gate, **arguments)

@@ -6,14 +6,15 @@ they can be compared: `Splats.importance`. The rules and what they are worth: do
 """
 from __future__ import annotations
 
-from typing import Any, Dict, Optional, Tuple
+from typing import Any, Dict, Optional, Set, Tuple
 
 import torch
 
+from ...splats import Splats
 from ..errors import ConfigError
 from ..gate_options import parse_gate_options
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
-from ..scenes.images import as_float
+from ..scenes.images import View, as_float
 from .drawing import draw
 from .strategy import SteadyStrategy, Step, StrategyContext
 
@@ -68,8 +69,8 @@ class GateStrategy(SteadyStrategy):
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
 
     def before_backward(self, step: Step) -> None:
-        if self._looks(step.iteration):
-            self._score(step)
+        if self._looks(step):
+            self._look(step.view, step.target, step.rendering.color, step.splats())
         if self.options.anneal != 1:
             span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
             share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
@@ -107,6 +108,7 @@ class GateStrategy(SteadyStrategy):
             return
         ratio = model.num_gaussians / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
+        self._look_at_more()
         mask = torch.zeros_like(self.costs, dtype=torch.bool)
         mask[torch.topk(self.costs, kept).indices] = True
         self.context.optimizer.keep(mask)
@@ -114,10 +116,11 @@ class GateStrategy(SteadyStrategy):
 
     def move(self) -> None:
         """Moves the cheapest Gaussians to others, drawn by their error, which are split there."""
+        self._look_at_more()
         count = int(self.options.moves * len(self.costs))
         costs, sources = torch.topk(self.costs, count, largest=False)
         errors = self.errors
-        self._forget_scores()
+        self._forget_looks()
         errors[sources] = 0
         count = min(count, int((errors > 0).sum()))
         if count == 0:
@@ -146,35 +149,52 @@ class GateStrategy(SteadyStrategy):
         for rows, place in ((parents, means + offsets), (places, means - offsets)):
             self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
 
-    def _looks(self, iteration: int) -> bool:
+    def _looks(self, step: Step) -> bool:
         """Whether the next decision looks at this step's view."""
         removes = self.context.model.num_gaussians > self.context.config.budget
-        following = next((later for later in [*self.removals, *self.moves] if later >= iteration), None)
-        return (following is not None and following - iteration < self.options.views
-                and (removes or following > self.removals[-1]))
+        following = next((later for later in [*self.removals, *self.moves] if later >= step.iteration), None)
+        return (following is not None and following - step.iteration < self._wanted_views
+                and (removes or following > self.removals[-1]) and step.view.camera.name not in self.seen)
 
-    def _score(self, step: Step) -> None:
-        """Adds what each Gaussian is worth to the view that the step has rendered."""
-        error = (step.rendering.color.detach() - as_float(step.target)).square().sum(0)
-        mask = step.view.mask_float()
+    @property
+    def _wanted_views(self) -> int:
+        return min(self.options.views, len(self.context.views))
+
+    def _look(self, view: View, target: torch.Tensor, color: torch.Tensor, splats: Splats) -> None:
+        """Adds what each Gaussian is worth to one rendering."""
+        error = (color.detach() - as_float(target)).square().sum(0)
+        mask = view.mask_float()
         weights = torch.ones_like(error) if mask is None else mask[0]
-        importance = step.splats().importance(weights, weights * error)
+        importance = splats.importance(weights, weights * error)
         self.costs += importance.removal_costs
         self.errors += importance.shares
+        self.seen.add(view.camera.name)
+
+    def _look_at_more(self) -> None:
+        """Renders views for the decision alone, evenly spread, where the steps before it were too few."""
+        unseen = [view for view in self.context.views if view.camera.name not in self.seen]
+        count = min(self._wanted_views - len(self.seen), len(unseen))
+        first = int(torch.randint(len(unseen), ())) if count > 0 else 0
+        for i in range(count):
+            view = unseen[(first + i * len(unseen) // count) % len(unseen)]
+            rendering, splats = self.context.render.with_splats(view.camera)
+            self._look(view, view.image, rendering.color, splats)
 
     def _forget_statistics(self) -> None:
         super()._forget_statistics()
-        self._forget_scores()
+        self._forget_looks()
 
-    def _forget_scores(self) -> None:
-        zeros = torch.zeros_like(self.view_count)
-        # Sums over the views since, [N]: squared change of the images on the Gaussian's removal, and squared error of
-        # the images where the Gaussian is, by its share.
-        self.costs, self.errors = zeros, zeros.clone()
+    def _forget_looks(self) -> None:
+        """Begins new sums, [N], over the views that the next decision looks at."""
+        self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
+        self.errors = torch.zeros_like(self.view_count)  # their squared error where the Gaussian is, by its share
+        self.seen: Set[str] = set()
 
     def state_dict(self) -> Dict[str, Any]:
-        return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors}
+        return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors,
+                "seen": sorted(self.seen)}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.start, self.costs, self.errors = state["start"], state["costs"], state["errors"]
+        self.seen = set(state["seen"])

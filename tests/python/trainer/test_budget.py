@@ -88,7 +88,7 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, kille
 
 def looking(trainer, monkeypatch):
     """The strategy after steps over every training view, none of which has changed a Gaussian."""
-    monkeypatch.setattr(trainer.strategy, "_looks", lambda iteration: True)
+    monkeypatch.setattr(trainer.strategy, "_looks", lambda step: True)
     monkeypatch.setattr(trainer.strategy, "after_backward", lambda step: None)
     monkeypatch.setattr(trainer.optimizer, "step", lambda: None)
     for _ in trainer.scene.train:
@@ -97,15 +97,29 @@ def looking(trainer, monkeypatch):
 
 
 def test_a_decision_looks_at_the_last_steps_before_it(tiny_config, monkeypatch):
-    """Removals at 16, 19, 22, 25, then moves; of two steps each decision looks at the views."""
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options="removals=4,views=2")
-    strategy, seen = trainer.strategy, []
-    score = strategy._score
-    monkeypatch.setattr(strategy, "_score", lambda step: (seen.append(step.iteration), score(step)))
+    """Removals at 16, 19, 22, 25; what a decision wants beyond the steps since the last one is rendered for it."""
+    wanted = 5
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options=f"removals=4,views={wanted}")
+    strategy, log = trainer.strategy, {}
+    look, more = strategy._look, strategy._look_at_more
+
+    def counted_look(view, *rest):
+        log.setdefault(trainer.iteration, []).append(view.camera.name)
+        look(view, *rest)
+
+    def at_the_decision():
+        more()
+        assert len(strategy.seen) == wanted
+
+    monkeypatch.setattr(strategy, "_look", counted_look)
+    monkeypatch.setattr(strategy, "_look_at_more", at_the_decision)
     while trainer.iteration < 25:
         trainer.step()
-        assert bool(strategy.costs.any()) == (trainer.iteration in (15, 18, 21, 24)), "a decision forgets"
-    assert seen == [15, 16, 18, 19, 21, 22, 24, 25]
+    assert all(len(names) == 1 for iteration, names in log.items() if iteration not in (16, 19, 22, 25))
+    decisions = [sum((names for iteration, names in log.items() if first <= iteration <= last), [])
+                 for first, last in ((12, 16), (17, 19), (20, 22), (23, 25))]
+    assert all(len(names) == len(set(names)) == wanted for names in decisions), "each view once"
+    assert min(log) == 12
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
@@ -169,6 +183,7 @@ def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
     costs[7], errors[3], costs[8], errors[4] = 0.5, 10.0, 1.0, 4.0
     errors[7] = 1e6  # the cheapest is no place for another one
     strategy.costs, strategy.errors = costs, errors
+    monkeypatch.setattr(strategy, "_look_at_more", lambda: None)
     moved = []
     monkeypatch.setattr(strategy, "split", lambda parents, places: moved.append((parents.tolist(), places.tolist())))
     strategy.move()
