@@ -21,7 +21,7 @@ class GateOptions:
     overshoot: float = _setting(10.0, lambda x: x == 0 or 1 <= x < math.inf, "0 or at least 1")
     # Steps down to the budget.
     removals: int = _setting(16, lambda x: x >= 1, "at least 1")
-    # Training views that a decision looks at: those of the steps before it, and others where these are too few.
+    # Training views that a decision looks at.
     views: int = _setting(96, lambda x: x >= 1, "at least 1")
     # The most Gaussians that move at a time, as a part of all; 0: none.
     moves: float = _setting(0.1, lambda x: 0 <= x <= 1, "between 0 and 1")

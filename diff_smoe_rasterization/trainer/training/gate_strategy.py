@@ -6,7 +6,7 @@ they can be compared: `Splats.importance`. The rules and what they are worth: do
 """
 from __future__ import annotations
 
-from typing import Any, Dict, Optional, Set, Tuple
+from typing import Any, Dict, Optional, Tuple
 
 import torch
 
@@ -40,9 +40,9 @@ class GateStrategy(SteadyStrategy):
     """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
 
     def __init__(self, context: StrategyContext) -> None:
-        super().__init__(context)
         config = context.config
         self.options = parse_gate_options(config.strategy_options)
+        super().__init__(context)
         self.start = context.model.num_gaussians
         until = config.densify_until_iter
         self.growth_ends = round(GROWTH_ENDS * until)
@@ -108,7 +108,7 @@ class GateStrategy(SteadyStrategy):
             return
         ratio = model.num_gaussians / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
-        self._look_at_more()
+        self._look_at_the_rest()
         mask = torch.zeros_like(self.costs, dtype=torch.bool)
         mask[torch.topk(self.costs, kept).indices] = True
         self.context.optimizer.keep(mask)
@@ -116,7 +116,7 @@ class GateStrategy(SteadyStrategy):
 
     def move(self) -> None:
         """Moves the cheapest Gaussians to others, drawn by their error, which are split there."""
-        self._look_at_more()
+        self._look_at_the_rest()
         count = int(self.options.moves * len(self.costs))
         costs, sources = torch.topk(self.costs, count, largest=False)
         errors = self.errors
@@ -150,15 +150,11 @@ class GateStrategy(SteadyStrategy):
             self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
 
     def _looks(self, step: Step) -> bool:
-        """Whether the next decision looks at this step's view."""
+        """Whether the next decision looks at this step's view: once, in the last round of the views before it."""
         removes = self.context.model.num_gaussians > self.context.config.budget
         following = next((later for later in [*self.removals, *self.moves] if later >= step.iteration), None)
-        return (following is not None and following - step.iteration < self._wanted_views
-                and (removes or following > self.removals[-1]) and step.view.camera.name not in self.seen)
-
-    @property
-    def _wanted_views(self) -> int:
-        return min(self.options.views, len(self.context.views))
+        return (following is not None and following - step.iteration < len(self.context.views)
+                and (removes or following > self.removals[-1]) and step.view.camera.name in self.sought)
 
     def _look(self, view: View, target: torch.Tensor, color: torch.Tensor, splats: Splats) -> None:
         """Adds what each Gaussian is worth to one rendering."""
@@ -168,33 +164,33 @@ class GateStrategy(SteadyStrategy):
         importance = splats.importance(weights, weights * error)
         self.costs += importance.removal_costs
         self.errors += importance.shares
-        self.seen.add(view.camera.name)
+        self.sought.discard(view.camera.name)
 
-    def _look_at_more(self) -> None:
-        """Renders views for the decision alone, evenly spread, where the steps before it were too few."""
-        unseen = [view for view in self.context.views if view.camera.name not in self.seen]
-        count = min(self._wanted_views - len(self.seen), len(unseen))
-        first = int(torch.randint(len(unseen), ())) if count > 0 else 0
-        for i in range(count):
-            view = unseen[(first + i * len(unseen) // count) % len(unseen)]
-            rendering, splats = self.context.render.with_splats(view.camera)
-            self._look(view, view.image, rendering.color, splats)
+    def _look_at_the_rest(self) -> None:
+        """Renders what the steps before the decision did not show."""
+        for view in self.context.views:
+            if view.camera.name in self.sought:
+                rendering, splats = self.context.render.with_splats(view.camera)
+                self._look(view, view.image, rendering.color, splats)
 
     def _forget_statistics(self) -> None:
         super()._forget_statistics()
         self._forget_looks()
 
     def _forget_looks(self) -> None:
-        """Begins new sums, [N], over the views that the next decision looks at."""
+        """Begins new sums, [N], for the next decision, and chooses its views, evenly spread."""
         self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
         self.errors = torch.zeros_like(self.view_count)  # their squared error where the Gaussian is, by its share
-        self.seen: Set[str] = set()
+        views = self.context.views
+        count = min(self.options.views, len(views))
+        first = int(torch.randint(len(views), ()))
+        self.sought = {views[(first + i * len(views) // count) % len(views)].camera.name for i in range(count)}
 
     def state_dict(self) -> Dict[str, Any]:
         return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors,
-                "seen": sorted(self.seen)}
+                "sought": sorted(self.sought)}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.start, self.costs, self.errors = state["start"], state["costs"], state["errors"]
-        self.seen = set(state["seen"])
+        self.sought = set(state["sought"])

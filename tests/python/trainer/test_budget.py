@@ -96,30 +96,25 @@ def looking(trainer, monkeypatch):
     return trainer.strategy
 
 
-def test_a_decision_looks_at_the_last_steps_before_it(tiny_config, monkeypatch):
-    """Removals at 16, 19, 22, 25; what a decision wants beyond the steps since the last one is rendered for it."""
-    wanted = 5
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options=f"removals=4,views={wanted}")
+def test_a_decision_looks_once_at_each_of_its_views(tiny_config, monkeypatch):
+    """Removals at 16, 19, 22, 25. Of the five views that each wants, what the steps before do not show is rendered."""
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options="removals=4,views=5")
     strategy, log = trainer.strategy, {}
-    look, more = strategy._look, strategy._look_at_more
+    look = strategy._look
 
-    def counted_look(view, *rest):
+    def logged(view, *rest):
         log.setdefault(trainer.iteration, []).append(view.camera.name)
         look(view, *rest)
 
-    def at_the_decision():
-        more()
-        assert len(strategy.seen) == wanted
-
-    monkeypatch.setattr(strategy, "_look", counted_look)
-    monkeypatch.setattr(strategy, "_look_at_more", at_the_decision)
+    monkeypatch.setattr(strategy, "_look", logged)
     while trainer.iteration < 25:
         trainer.step()
-    assert all(len(names) == 1 for iteration, names in log.items() if iteration not in (16, 19, 22, 25))
-    decisions = [sum((names for iteration, names in log.items() if first <= iteration <= last), [])
-                 for first, last in ((12, 16), (17, 19), (20, 22), (23, 25))]
-    assert all(len(names) == len(set(names)) == wanted for names in decisions), "each view once"
-    assert min(log) == 12
+    decisions = (16, 19, 22, 25)
+    assert all(len(names) == 1 for iteration, names in log.items() if iteration not in decisions)
+    for first, last in zip((16 - len(trainer.scene.train) + 1, 17, 20, 23), decisions):
+        names = sum((names for iteration, names in log.items() if first <= iteration <= last), [])
+        assert len(names) == len(set(names)) == 5
+    assert len(log) > len(decisions), "some by the steps' own renderings"
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
@@ -183,7 +178,7 @@ def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
     costs[7], errors[3], costs[8], errors[4] = 0.5, 10.0, 1.0, 4.0
     errors[7] = 1e6  # the cheapest is no place for another one
     strategy.costs, strategy.errors = costs, errors
-    monkeypatch.setattr(strategy, "_look_at_more", lambda: None)
+    monkeypatch.setattr(strategy, "_look_at_the_rest", lambda: None)
     moved = []
     monkeypatch.setattr(strategy, "split", lambda parents, places: moved.append((parents.tolist(), places.tolist())))
     strategy.move()
