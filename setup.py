@@ -213,7 +213,7 @@ def packages():
             f"{PACKAGE}.export": ["page/*"],
             f"{PACKAGE}.patches": ["shims/*/*.py"],  # shims are no packages of ours
             f"{PACKAGE}.benchmarks.suite": ["Snakefile", "shipped/*.yaml", "shipped/scenes/*.yaml"],
-            f"{PACKAGE}.benchmarks.suite.report": ["*.json", "page.*"]}
+            f"{PACKAGE}.benchmarks.suite.report": ["*.json", "page.*", "table.*"]}
     return {"packages": names, "package_dir": folders, "package_data": data}
 
 

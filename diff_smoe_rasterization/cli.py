@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 
 from ._version import __version__
-from .patches.errors import PatchError
+from .patches import PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.config import (
     PRINCIPAL_POINTS,
@@ -224,7 +224,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                                          "becomes a row with its reason, and the command returns 1.",
                              usage="%(prog)s SUITE [-o RESULTS] [OPTION ...]")  # --slurm would take a SUITE behind it
     run.add_argument("suite", metavar="SUITE", help="a .yaml file, or a shipped one: smoke, table1, table2, table3, "
-                                                    "fig4, fig5, captures, captures_ablation, captures_baselines")
+                                                    "fig4, fig5, captures, captures_ablation, captures_baselines, "
+                                                    "gate, gate_equal, budgets")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
     run.add_argument("--jobs", type=int, metavar="N",
                      help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
@@ -235,8 +236,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                      help="submit cells to Slurm; resources of each, such as slurm_partition=gpu runtime=120 "
                           "mem_mb=32000 cpus_per_task=8")
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
-                     help="only such cells; fields: method, scene, blend_mode, schedule, densify_grad_threshold, "
-                          "seed, headline")
+                     help="only such cells; fields: method, scene, blend_mode, background_gate, schedule, "
+                          "densify_grad_threshold, budget, seed, headline")
     run.add_argument("--rows", metavar="FILE|RESULTS",
                      help="a file of rows (.jsonl), or a folder of results, whose cells are not run again")
     run.add_argument("--retry-failed", action="store_true", help="run failed cells again")
@@ -404,7 +405,7 @@ def _with_lpips(net: str, device: str) -> Measure:
     """The trainer's metrics and LPIPS of images without a mask. Raises TrainerError where its weights are not there."""
     from .benchmarks.errors import BenchError
     from .benchmarks.suite.lpips import lpips_network
-    from .benchmarks.suite.weights import check_weights
+    from .benchmarks.suite.names import check_weights
     from .trainer.results.metrics import image_metrics, quantised
 
     kind = {"vgg": "lpips_vgg_std", "alex": "lpips_alex"}[net]

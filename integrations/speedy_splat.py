@@ -2,7 +2,7 @@
 
 That gradient is here what the removal of a Gaussian changes, `Splats.importance().removal_costs`: exact in each blend
 mode, where the original has the squared derivative by the kernel. The trainer reads the order of the scores alone.
-`kernel_times` is one zero.
+`kernel_times` is one NaN: nothing is timed, and the trainer divides by it.
 """
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _render(settings, inputs):
         color, radii = _Scored.apply(rendering.color, scores, splats), rendering.radii
     else:
         color, radii = results_of(("color", "radii"), settings, inputs)
-    return color, radii, color.new_zeros(1)
+    return color, radii, color.new_full((1,), float("nan"))
 
 
 GaussianRasterizationSettings, GaussianRasterizer, rasterize_gaussians = classes_of("speedy_splat", __name__, _render)

@@ -1,9 +1,8 @@
-"""What a checkout imports and calls, from which it is told which rasterizer's API it calls. Needs no LibCST."""
+"""What a checkout imports and calls, from which it is told which rasterizer's API it calls."""
 from __future__ import annotations
 
 import ast
 import re
-import warnings
 from typing import Dict, Iterator, List, Mapping, Optional, Set, Tuple
 
 from diff_smoe_rasterization.integrations.contracts import (
@@ -17,6 +16,7 @@ from diff_smoe_rasterization.integrations.contracts import (
 )
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
+from .source import PatchError, Source
 from .trainers import GR, INTEGRATIONS, TRAINERS, Trainer
 
 PATCHED = "imports from " + INTEGRATIONS
@@ -28,12 +28,25 @@ RENDERERS = {"render", "prefilter_voxel", "*"}
 
 def python_tree(data: bytes) -> ast.Module:
     """Returns the syntax tree of a file as Python's own parser has it; of one that cannot be parsed an empty one."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # such as of invalid escapes in a string
-        try:
-            return ast.parse(data)
-        except (SyntaxError, ValueError):
-            return ast.Module(body=[], type_ignores=[])
+    try:
+        return Source("", data).tree
+    except PatchError:
+        return ast.Module(body=[], type_ignores=[])
+
+
+def further_renderers(files: Mapping[str, bytes]) -> List[str]:
+    """Returns the modules beside the renderer that these files import: they may render by another rasterizer."""
+    folder = GR.rpartition("/")[0]
+    found = set()
+    for name, data in files.items():
+        for node in ast.walk(python_tree(data)):
+            if isinstance(node, ast.ImportFrom):
+                beside = [folder] if node.level and name == GR else []
+                module = ".".join([*beside, *filter(None, [node.module])])
+                found |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
+            elif isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+    return sorted(module.replace(".", "/") + ".py" for module in found if module.startswith(folder + "."))
 
 
 def of_files(files: Mapping[str, bytes]) -> Set[str]:
@@ -46,10 +59,14 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
         tree = python_tree(data)
         in_try = {id(node) for outer in ast.walk(tree) if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
-        made = _names_of_rasterizers(tree)
+        made, own = _names_of_rasterizers(tree), _calls_of_own_classes(tree)
         for node in ast.walk(tree):
+            if id(node) in own or isinstance(node, ast.Assign) and id(node.value) in own:
+                continue
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 facts.update(_of_import(node, id(node) in in_try))
+            elif isinstance(node, ast.ClassDef) and node.name in NAMES:
+                facts.add("defines " + node.name)
             elif isinstance(node, ast.Call):
                 facts.update(_of_call(node, made))
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
@@ -106,6 +123,20 @@ def _names_of_rasterizers(tree: ast.Module) -> Set[str]:
     return aliases | objects | ({"rasterizer"} if aliases else set())
 
 
+def _calls_of_own_classes(tree: ast.Module) -> Set[int]:
+    """The calls of classes that the file defines, and of what it makes of them: a renderer without an extension."""
+    classes = {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    calls = {id(node) for node in ast.walk(tree)
+             if isinstance(node, ast.Call) and getattr(node.func, "id", "") in classes}
+    for function in ast.walk(tree):
+        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            nodes = list(ast.walk(function))
+            made = {target.id for node in nodes if isinstance(node, ast.Assign) and id(node.value) in calls
+                    for target in node.targets if isinstance(target, ast.Name)}
+            calls |= {id(node) for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") in made}
+    return calls
+
+
 def _renders(node: ast.AST, made: Set[str]) -> bool:
     """Whether it is a call of an object, rasterizer(...) or GaussianRasterizer(...)(...), and not of the class."""
     if not isinstance(node, ast.Call):
@@ -116,19 +147,14 @@ def _renders(node: ast.AST, made: Set[str]) -> bool:
     return is_object and getattr(called, "id", "") in made
 
 
-def uses_another_rasterizer(facts: Set[str]) -> bool:
-    """Whether one of another name is imported, which no patch and no run can take the place of."""
-    return bool(_those(facts, "uses "))
-
-
-def has_a_name_of_its_own(facts: Set[str]) -> bool:
-    """Whether one is imported that `dsmoe run` knows by another name than Inria's, which no patch rewrites."""
-    return bool(_those(facts, "from "))
+def is_for_run_alone(facts: Set[str]) -> bool:
+    """Whether the rasterizer has a name that no patch rewrites, or a class of its name lies beside it in the file."""
+    return bool(those(facts, "from ") or those(facts, "defines "))
 
 
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     """Returns the rasterizer whose API is called and "", or None and why it is none that is known."""
-    foreign = sorted(_those(facts, "uses "))
+    foreign = sorted(those(facts, "uses "))
     if foreign:
         return None, f"it imports {', '.join(foreign)}, another rasterizer, which would render in this one's place"
     others = [contract for name, contract in MODULES.items() if "from " + name in facts]
@@ -140,24 +166,24 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     said = {"sets": "its GaussianRasterizationSettings have {}", "takes": "its rasterizer is called with {}",
             "needs": "it imports {}"}
     for kind, text in said.items():
-        names = _those(facts, kind + " ") - set().union(*(entry[kind] for entry in known.values()))
+        names = those(facts, kind + " ") - set().union(*(entry[kind] for entry in known.values()))
         if names:
             return None, (text.format(", ".join(sorted(names))) + ", which no rasterizer has that is known here "
                           f"({', '.join(sorted(known))})")
     shown = others or [contract for contract in CONTRACTS if contract.module == RASTERIZER
                        and (not contract.signs or facts & set(contract.signs))]
     fitting = [contract for contract in shown
-               if all(_those(facts, kind + " ") <= known[contract.name][kind] for kind in said)]
+               if all(those(facts, kind + " ") <= known[contract.name][kind] for kind in said)]
     for contract in fitting:
-        if all(_fits_one(found, contract) for found in _those(facts, "returns ")):
+        if all(_fits(found, contract) for found in those(facts, "returns ")):
             return contract, ""
     nearest = (fitting or shown)[0]
-    found = next((found for found in sorted(_those(facts, "returns ")) if not _fits_one(found, nearest)), "")
+    found = next((found for found in sorted(those(facts, "returns ")) if not _fits(found, nearest)), "")
     return None, (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which "
                   f"it resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
 
 
-def _those(facts: Set[str], kind: str) -> Set[str]:
+def those(facts: Set[str], kind: str) -> Set[str]:
     return {fact[len(kind):] for fact in facts if fact.startswith(kind)}
 
 
@@ -167,16 +193,13 @@ def _known(contract: Contract) -> Dict[str, Set[str]]:
             "needs": {*NAMES, *contract.names}}
 
 
-def _fits_one(found: str, contract: Contract) -> bool:
-    return any(_fits(found, results) for results in (contract.results, *contract.other_results))
-
-
-def _fits(found: str, results: Tuple[str, ...]) -> bool:
-    """Whether what a caller names its results by can be these."""
-    names: List[str] = found.split(", ")
-    return len(names) == len(results) and all(
+def _fits(found: str, contract: Contract) -> bool:
+    """Whether what a caller names its results by can be those of a rasterizer."""
+    names = found.split(", ")
+    return any(len(names) == len(results) and all(
         name.startswith("_") or RESULTS.get(result, ("", ""))[1] in name.lower()
         and not (result == "depth" and "inv" in name.lower()) for name, result in zip(names, results))
+        for results in (contract.results, *contract.other_results))
 
 
 def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:

@@ -11,7 +11,7 @@ import shutil
 from pathlib import Path
 from typing import Any, Dict, Mapping, NamedTuple, Optional
 
-from .errors import PatchError
+from .source import PatchError
 
 FOLDER = ".dsmoe_patch"
 FORMAT = 1
@@ -43,7 +43,7 @@ class Record(NamedTuple):
             raise PatchError(f"{FOLDER}/manifest.json: the record of the patch is damaged ({error}); put the files "
                              f"back from your version control, then delete {FOLDER}") from None
         record = cls(root, manifest, before, after)
-        return record if {"patched", "changed"} & set(record.states().values()) else None
+        return None if set(record.states().values()) <= {"original", "replaced", "gone"} else record
 
     @staticmethod
     def make(root: Path, before: Mapping[str, bytes], after: Mapping[str, bytes], **notes: Any) -> None:
@@ -54,10 +54,12 @@ class Record(NamedTuple):
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 copy.write_bytes(data)
         (root / FOLDER / ".gitignore").write_text("*\n")
-        (root / FOLDER / "manifest.json").write_text(json.dumps({"format": FORMAT, **notes}) + "\n", encoding="utf-8")
+        unfinished = root / FOLDER / "manifest.part"
+        unfinished.write_text(json.dumps({"format": FORMAT, **notes}) + "\n", encoding="utf-8")
+        unfinished.replace(root / FOLDER / "manifest.json")
 
     def states(self) -> Dict[str, str]:
-        """Returns of each file whether it is "original", "patched", or "changed", "replaced" or "gone" since."""
+        """Returns of each file whether it is "original", "patched", or "cut", "changed", "replaced" or "gone" since."""
         return {name: self._state(name) for name in self.before}
 
     def _state(self, name: str) -> str:
@@ -66,6 +68,8 @@ class Record(NamedTuple):
         now, after = (self.root / name).read_bytes(), self.after[name]
         if now in (self.before[name], after):
             return "original" if now == self.before[name] else "patched"
+        if after.startswith(now) or self.before[name].startswith(now):  # a kill while it was written
+            return "cut"
         # One that imported this package and no longer does was replaced, as by git checkout.
         return "replaced" if PACKAGE in after and PACKAGE not in now else "changed"
 

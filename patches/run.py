@@ -21,12 +21,13 @@ from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_o
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
 
 from . import facts
-from .errors import PatchError
 from .record import Record
-from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE
-from .trainers import GR, RASTERIZER, TRAINERS, names
+from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE, WITHOUT_VARIABLE
+from .source import PatchError
+from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
+SPARSE_ADAM = "SparseGaussianAdam"
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
@@ -101,6 +102,10 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
                    RASTERIZER_VARIABLE: flavour}
     if gate is None:
         del environment[BACKGROUND_GATE_VARIABLE]
+    if _cannot_use_sparse_adam(_folders(words)):
+        environment[WITHOUT_VARIABLE] = SPARSE_ADAM
+        warnings = [*warnings, f"{SPARSE_ADAM} is not offered: where the trainer finds it, it reads get_features_dc of "
+                    "its model, which has none"]
     if "PYTHONPYCACHEPREFIX" not in environment:
         environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     environment["PYTHONPATH"] = os.pathsep.join([str(SHIMS), *filter(None, [environment.get("PYTHONPATH")])])
@@ -115,7 +120,7 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
     """Returns the flavour, for which trainer it was chosen, and what speaks against it."""
     by_name = {**{name: name for name in FLAVOURS}, **{known.name: known.flavour for known in TRAINERS}}
     if trainer is not None and trainer not in by_name:
-        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(names())}, or for "
+        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
     reasons = []
     folders = _folders(words)
@@ -130,7 +135,7 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
         known, reason = facts.recognise(found)
         if known and trainer is None:
             return known.flavour, f"{known.name if (folder / GR).is_file() else 'the trainer'} in {folder}", []
-        is_other = facts.uses_another_rasterizer(found)
+        is_other = facts.those(found, "uses ")
         if trainer is not None and (is_other or found and not any(fact.startswith("keeps ") for fact in found)):
             raise PatchError(f"{folder}: {reason}; --trainer {trainer} cannot help")
         if found and not (known and known.flavour == by_name[trainer]):
@@ -149,10 +154,20 @@ def _folders(words: Sequence[str]) -> List[Path]:
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
+def _cannot_use_sparse_adam(folders: Sequence[Path]) -> bool:
+    """Whether the trainer reads get_features_dc, as 3DGS does where it finds SparseGaussianAdam, and defines none."""
+    folder = next((folder for folder in folders if (folder / GR).is_file()), None)
+    sources = [path.read_bytes() for pattern in ("*.py", "*/*.py") for path in folder.glob(pattern)] if folder else []
+    return (any(b".get_features_dc" in source for source in sources)
+            and not any(re.search(rb"def get_features_dc|\bget_features_dc *=", source) for source in sources))
+
+
 def _files(folder: Path, everywhere: bool) -> Dict[str, bytes]:
     """Returns the files by which a trainer is recognised: those of 3DGS, else, if so asked, all that rasterize."""
     if (folder / GR).is_file():
-        return {name: (folder / name).read_bytes() for name in facts.LOOKED_AT if (folder / name).is_file()}
+        files = {name: (folder / name).read_bytes() for name in facts.LOOKED_AT if (folder / name).is_file()}
+        return {**files, **{name: (folder / name).read_bytes() for name in facts.further_renderers(files)
+                            if (folder / name).is_file()}}
     found = {}
     for pattern in ("*.py", "*/*.py", "*/*/*.py") if everywhere else ():
         for path in folder.glob(pattern):

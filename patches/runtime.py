@@ -20,6 +20,7 @@ from diff_smoe_rasterization.settings import (
 
 SHIMS = Path(__file__).resolve().parent / "shims"
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
+WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
 
 
@@ -140,16 +141,9 @@ def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
     flavour = flavour or os.environ[RASTERIZER_VARIABLE]
     flavour = "inria" if flavour == "gsplat" else flavour  # gsplat's wrapper of Inria's rasterizer imports that
     module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
-    original = GaussianRasterizer.__init__
-
-    def noted(self: Any, *arguments: Any, **keywords: Any) -> None:
-        GaussianRasterizer.__init__ = original
-        _note_use()
-        original(self, *arguments, **keywords)
-
-    GaussianRasterizer.__init__ = noted
+    GaussianRasterizer.__init__ = _noting(GaussianRasterizer.__init__)
     _say_rasterizer(flavour)
-    offered = {name: getattr(module, name) for name in module.__all__}
+    offered = {name: getattr(module, name) for name in module.__all__ if name != os.environ.get(WITHOUT_VARIABLE)}
     return {name: _noting(value) if name.startswith("rasterize_") else value for name, value in offered.items()}
 
 
@@ -207,33 +201,24 @@ def is_installed(module: str) -> bool:
         sys.path[:] = path
 
 
-class _Absent:
-    """A module that is not installed: its attributes raise the ImportError when they are used."""
-
-    def __init__(self, error: ImportError) -> None:
-        self._error = error
-
-    def __getattr__(self, name: str) -> Any:
-        raise self._error
-
-
 def optional_import(name: str) -> Any:
-    """Returns the module, or a stand-in where it is not installed."""
+    """Returns the module; where it is not installed, a stand-in whose attributes raise the ImportError."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        return _Absent(error)
+        absent, reason = types.ModuleType(name), error
+
+        def missed(_: str) -> Any:
+            raise reason
+
+        absent.__getattr__ = missed  # type: ignore[method-assign]
+        return absent
 
 
 def deferred(make: Callable[[], Callable[..., Any]]) -> Callable[..., Any]:
     """Returns a function that calls make() when it is called first, and then what make() returned."""
     made = functools.lru_cache(maxsize=None)(make)
-
-    @functools.wraps(make)
-    def call(*arguments: Any, **keywords: Any) -> Any:
-        return made()(*arguments, **keywords)
-
-    return call
+    return lambda *arguments, **keywords: made()(*arguments, **keywords)
 
 
 def nan_without_network(metric: Callable[..., Any]) -> Callable[..., Any]:
@@ -342,14 +327,13 @@ def unique_rows(input: Any, sorted: bool = True, return_inverse: bool = False, r
 
     if dim != 0 or input.dim() == 0 or input.numel() == 0 or input.is_floating_point() or input.is_complex():
         return torch.unique(input, sorted, return_inverse, return_counts, dim)
-    columns = input.reshape(len(input), -1)
-    unique, inverse = columns[:1, :0], torch.zeros(len(input), dtype=torch.int64, device=input.device)
-    for column in columns.unbind(1):
+    inverse = torch.zeros(len(input), dtype=torch.int64, device=input.device)
+    for column in input.reshape(len(input), -1).unbind(1):
         values, rank = torch.unique(column, return_inverse=True)
         # Of the columns so far and this one. Both are ranks below N: no key reaches N^2, of which int64 takes N < 3e9.
-        key, inverse, counts = torch.unique(inverse * len(values) + rank, return_inverse=True, return_counts=True)
-        unique = torch.cat([unique[key // len(values)], values[key % len(values), None]], dim=1)
-    unique = unique.reshape(-1, *input.shape[1:])
+        _, inverse, counts = torch.unique(inverse * len(values) + rank, return_inverse=True, return_counts=True)
+    unique = input.new_empty(len(counts), *input.shape[1:])
+    unique[inverse] = input  # of rows that are equal any one
     results = (unique,) + (inverse,) * return_inverse + (counts,) * return_counts
     return results if len(results) > 1 else unique
 

@@ -52,7 +52,7 @@ def notes(root: Path, files: Dict[str, bytes], trainer: Trainer) -> List[str]:
         if not any(word in data for word in (RASTERIZER.encode(), b"gaussian_renderer", SETTINGS.encode())):
             continue
         found = facts.of_files({name: data})
-        # `from ... import` is a rule's (patch.py) in the files that are looked at.
+        # `from ... import` is a rule's in the files that are looked at.
         if "keeps the original" in found or "keeps the original by name" in found and name not in files:
             lines.append(f"{name}: imports the original rasterizer, which no rule changes there; this package's is "
                          f"`from {INTEGRATIONS}.{trainer.flavour} import ...`")

@@ -1,4 +1,4 @@
-"""The trainers that can be patched, as a table. It has names and structure, no line of a trainer; needs no LibCST.
+"""The trainers that can be patched, as a table. It has names and structure, no line of a trainer.
 
 A checkout is the first trainer of TRAINERS that calls the rasterizer it calls and whose signs it shows; facts.py says
 what signs are. integrations/contracts.py is the table of rasterizers.
@@ -65,8 +65,4 @@ TRAINERS = (
     Trainer("3dgs-depth", "depth", USUAL),
     Trainer("3dgs-depth-alpha", "depth_alpha", USUAL),
 )
-
-
-def names() -> Tuple[str, ...]:
-    """The names of the trainers."""
-    return tuple(sorted({trainer.name for trainer in TRAINERS}))
+TRAINER_NAMES = tuple(sorted({trainer.name for trainer in TRAINERS}))

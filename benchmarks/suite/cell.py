@@ -2,58 +2,59 @@
 
     python -I -m diff_smoe_rasterization.benchmarks.suite.cell CELL.json OUT [--gpus 0,1 --per-device 2 --locks FOLDER]
 
-OUT/row.json is written in any case but one: where this command itself is killed, so that whoever started it starts it
-again. The work is done in a process of its own, whose end, a crash or a lack of memory included, becomes a row with the
-reason. OUT/log.txt is what it printed.
+OUT/row.json is written in any case but one: where this command itself is killed, and is to be started again. The work
+is done in a process of its own, whose end, a crash or a lack of memory included, becomes a row with the reason.
+OUT/log.txt is what it printed.
 """
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
-import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 import traceback
+from pathlib import Path
 from typing import IO, Any, Dict, List, Optional, Tuple
 
 from ...trainer.errors import TrainerError
 from ...trainer.system.files import write_json_atomically
 from ...trainer.system.output_folder import locked
-from .names import ROW_NAME
-from .processes import die_with_parent, last_line
+from .names import ROW_NAME, read_json
 
 LOG_NAME = "log.txt"
 SHARING = {"cuda": "cells_per_gpu", "cpu": "cells_at_once"}  # what a row's machine calls it, by device
 SHARING_NAME = "cells_at_once.json"  # beside a checkpoint: its seconds were counted while so many shared the device
 AXES = ("blend_mode", "background_gate", "schedule", "densify_grad_threshold", "seed", "headline")
+PROGRESS_BAR = re.compile(r"\|.*\| \d+/\d+ \[")  # tqdm's
+LONGEST = 300  # characters of a log's last line
 FIGURES = ("psnr", "psnr_float", "ssim", "psnr_edge", "num_gaussians", "train_seconds", "fps", "peak_gpu_mib")
 
 
 def identity(cell: Dict[str, Any]) -> Dict[str, Any]:
-    """What a row says of its cell, whether it was measured or failed."""
     method, scene = cell["method"], cell["scene"]
     return {"cell": cell["id"], "suite": cell["suite"], "method": method["name"], "label": method["label"],
             "variant": method["variant"], "scene": scene["name"], "dataset": scene["dataset"],
             **{axis: cell[axis] for axis in AXES}, "iterations": cell["protocol"]["iterations"],
-            "end": method.get("end"), "budget": method.get("budget")}
+            "end": method.get("end"), "budget": cell.get("budget", method.get("budget"))}
 
 
 def failed_row(cell: Dict[str, Any], reason: str, wall_seconds: Optional[float]) -> Dict[str, Any]:
-    """The row of a cell that gave no figures."""
     return {**identity(cell), "ok": False, "reason": reason, **dict.fromkeys(FIGURES),
             "lpips": {"value": None, "kind": next(iter(cell["protocol"]["lpips"]), None), "reason": "the cell failed"},
             "lpips_all": [], "size_bytes": {"own": None, "common": None}, "wall_seconds": wall_seconds,
             "protocol": {}, "commit": {"project": None, "trainer": None}, "machine": {}, "history": [], "per_view": []}
 
 
-def measured_row(cell: Dict[str, Any], output: str, started: float,
-                 per_device: Optional[int] = None) -> Dict[str, Any]:
-    """Trains and measures. per_device: as `supervise` has it. Raises what goes wrong."""
+def measured_row(cell: Dict[str, Any], output: str, started: float, per_device: Optional[int]) -> Dict[str, Any]:
+    """Trains and measures; per_device is as in `supervise`."""
     from ...trainer.results.rows import result_row
+    from ...trainer.system.environment import machine, versions
     from . import methods, protocol
     from .measure import headline_lpips
 
@@ -73,18 +74,16 @@ def measured_row(cell: Dict[str, Any], output: str, started: float,
             "peak_gpu_mib": outcome.peak_gpu_mib,
             "protocol": {**protocol.protocol_of(trained["protocol"], config, outcome.lpips), **outcome.notes},
             "commit": {"project": protocol.project_commit(), "trainer": outcome.commit},
-            "machine": {**protocol.machine_of(config.device), **sharing}, "history": outcome.history,
-            "per_view": evaluation.per_view}
+            "machine": {"device": machine(config.device), "versions": versions(), **sharing},
+            "history": outcome.history, "per_view": evaluation.per_view}
 
 
 def note_sharing(output: str, per_device: Optional[int]) -> Optional[int]:
-    """Writes beside the checkpoint how many cells may have this one's device; returns the most of earlier attempts."""
-    path, earlier = os.path.join(output, "run", SHARING_NAME), None
-    if os.path.isfile(path):
-        with open(path, encoding="utf-8") as file:
-            earlier = json.load(file)
+    """Writes beside the checkpoint how many cells may have the device; returns the most of earlier attempts."""
+    path = Path(output, "run", SHARING_NAME)
+    earlier = read_json(path) if path.is_file() else None
     if (per_device or 0) > (earlier or 0):
-        write_json_atomically(path, per_device)
+        write_json_atomically(str(path), per_device)
     return earlier
 
 
@@ -93,28 +92,26 @@ def write_images(output: str, outcome: Any) -> None:
     from ...trainer.inspection import to_image
     from ...trainer.results.pictures import file_names
 
-    views = {view.camera.name: view for view in outcome.scene.test}
-    files = dict(zip(views, file_names(list(views))))
-    for name, rendering in outcome.renders.items():
-        for kind, image in (("gt", views[name].image_float()), ("render", rendering)):
-            folder = os.path.join(output, "images", kind)
-            os.makedirs(folder, exist_ok=True)
-            to_image(image).save(os.path.join(folder, files[name] + ".png"))
+    names = [view.camera.name for view in outcome.scene.test]
+    for file, view in zip(file_names(names), outcome.scene.test):
+        if view.camera.name in outcome.renders:
+            for kind, image in (("gt", view.image_float()), ("render", outcome.renders[view.camera.name])):
+                folder = Path(output, "images", kind)
+                folder.mkdir(parents=True, exist_ok=True)
+                to_image(image).save(folder / f"{file}.png")
 
 
 def work(cell: Dict[str, Any], output: str, started: float, per_device: Optional[int] = None) -> None:
     """The inner process: writes the row, and removes what is no longer needed. Raises nothing but what kills it."""
-    path = os.path.join(output, ROW_NAME)
     try:
         row = measured_row(cell, output, started, per_device)
+    except TrainerError as error:
+        row = failed_row(cell, str(error), time.time() - started)
     except Exception as error:  # whatever it is, it is the row's reason; KeyboardInterrupt and SystemExit are not
-        if not isinstance(error, TrainerError):
-            traceback.print_exc()
-        text = str(error) if isinstance(error, TrainerError) else f"{type(error).__name__}: {error}"
-        write_json_atomically(path, failed_row(cell, text, time.time() - started))
-        return
-    write_json_atomically(path, row)
-    if not cell["keep_models"]:
+        traceback.print_exc()
+        row = failed_row(cell, f"{type(error).__name__}: {error}", time.time() - started)
+    write_json_atomically(os.path.join(output, ROW_NAME), row)
+    if row["ok"] and not cell["keep_models"]:
         shutil.rmtree(os.path.join(output, "run"), ignore_errors=True)
 
 
@@ -125,8 +122,7 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device
     gpu: those that the process is given, "0" or "0,1"; None: as the machine has them. per_device: how many cells may
     have that GPU, or on the CPU this machine, at once; None where nobody counts. held: a lock that the process has too.
     """
-    with open(cell_path, encoding="utf-8") as file:
-        cell = json.load(file)
+    cell = read_json(cell_path)
     os.makedirs(output, exist_ok=True)
     row_path, log_path = os.path.join(output, ROW_NAME), os.path.join(output, LOG_NAME)
     if os.path.isfile(row_path):
@@ -140,22 +136,30 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device
                                  env=environment, preexec_fn=die_with_parent, pass_fds=[held.fileno()] if held else [])
     if not os.path.isfile(row_path):
         write_json_atomically(row_path, failed_row(cell, how_it_ended(status, log_path), time.time() - started))
-    with open(row_path, encoding="utf-8") as file:
-        return json.load(file)
+    return read_json(row_path)
+
+
+def die_with_parent(end: int = signal.SIGTERM) -> None:
+    """Sends this process the signal `end` when the one that started it has ended, in whatever way (Linux)."""
+    import ctypes
+
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).prctl(1, int(end), 0, 0, 0)  # 1 is PR_SET_PDEATHSIG
+
+
+def last_line(path: str) -> str:
+    """The last line of a log that says something, which a progress bar does not; empty where nothing was printed."""
+    text = Path(path).read_text(encoding="utf-8", errors="replace").replace("\r", "\n")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    lines = [line for line in lines if not PROGRESS_BAR.search(line)] or lines
+    return lines[-1][:LONGEST] if lines else ""
 
 
 def how_it_ended(status: int, log_path: str) -> str:
-    """The reason for a row where a process left none."""
     words = last_line(log_path)
     how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
     memory = "; the system may have been out of memory" if status == -signal.SIGKILL else ""
     return f"the process {how}{memory}" + (f"; its last line: {words}" if words else "")
-
-
-def gpus_of(cell_path: str) -> int:
-    """How many GPUs the cell takes."""
-    with open(cell_path, encoding="utf-8") as file:
-        return json.load(file)["protocol"].get("gpus", 1)
 
 
 def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: float = 1.0) -> Tuple[str, IO[str]]:
@@ -177,21 +181,7 @@ def claim_gpu(gpus: List[str], folder: str, per_gpu: int = 1, poll_seconds: floa
         time.sleep(poll_seconds)
 
 
-def shown(value: Optional[float], form: str) -> str:
-    """A figure as text; "-" where there is none, or an infinite one, for which json has no number."""
-    return "-" if value is None else format(value, form)
-
-
-def tell(text: str) -> None:
-    """Prints a line where it can be printed: Snakemake would remove the row of a command that failed at this."""
-    try:
-        print(text, flush=True)
-    except (OSError, ValueError):  # whoever read the output has gone; or its encoding lacks a character
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where the rest goes when the process ends
-
-
 def main(argv: Optional[List[str]] = None) -> int:
-    """Runs the command; 0 where there is a row, whatever it says."""
     parser = argparse.ArgumentParser(prog="python -I -m diff_smoe_rasterization.benchmarks.suite.cell",
                                      description="Trains and measures one cell of a suite.")
     parser.add_argument("cell", metavar="CELL.json", help="what is trained on what, as plain values")
@@ -207,30 +197,30 @@ def main(argv: Optional[List[str]] = None) -> int:
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
     if arguments.inside:
-        with open(arguments.cell, encoding="utf-8") as file:
-            work(json.load(file), arguments.output, time.time(), arguments.per_device)
+        work(read_json(arguments.cell), arguments.output, time.time(), arguments.per_device)
         return 0
-    gpu, locks, held, per_device = None, [], None, arguments.per_device
-    try:
+    gpu, held, per_device = None, None, arguments.per_device
+    try:  # the locks are held until the process ends
         if arguments.hold:
             die_with_parent()
             held = locked(arguments.hold, shared=True)
         if arguments.gpus:
             per_device = per_device or 1
             claims = [claim_gpu(arguments.gpus.split(","), arguments.locks or arguments.output, per_device)
-                      for _ in range(gpus_of(arguments.cell))]
-            gpu, locks = ",".join(name for name, _ in claims), [lock for _, lock in claims]
+                      for _ in range(read_json(arguments.cell)["protocol"].get("gpus", 1))]
+            gpu = ",".join(name for name, _ in claims)
         row = supervise(arguments.cell, arguments.output, gpu, per_device, held)
     except TrainerError as error:
         print(f"{arguments.cell}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
-    finally:
-        for file in filter(None, (*locks, held)):
-            file.close()
-    tell(f"{row['cell']}: " + (f"{row['num_gaussians']} Gaussians, PSNR {shown(row['psnr'], '.2f')} dB" if row["ok"]
-                               else f"failed: {row['reason']}"))
+    psnr = "-" if row.get("psnr") is None else f"{row['psnr']:.2f}"
+    try:
+        print(f"{row['cell']}:", f"{row['num_gaussians']} Gaussians, PSNR {psnr} dB" if row["ok"] else
+              f"failed: {row['reason']}", flush=True)
+    except (OSError, ValueError):  # Snakemake would remove the row of a command that failed here
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return 0
 
 

@@ -1,8 +1,4 @@
-"""Runs a suite with Snakemake: what is still to be done, how many cells at once, on which GPUs or in which queue.
-
-What is done is what has a row, so that a run that was killed continues where it was. RESULTS/rows.jsonl is the
-concatenation of the rows.
-"""
+"""Runs a suite with Snakemake. What is done is what has a row: a run that was killed continues where it was."""
 from __future__ import annotations
 
 import importlib.util
@@ -18,16 +14,14 @@ from ...trainer.system.files import write_json_atomically, write_text_atomically
 from ...trainer.system.output_folder import make_folder, only_one
 from ..errors import BenchError
 from . import require
-from .cell import SHARING, identity, shown
-from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite
-from .names import CELL_NAME, CELLS_FOLDER, ROW_NAME, ROWS_NAME, SUITE_NAME, blend_of
+from .cell import die_with_parent, identity
+from .expansion import AXIS_OF, NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
+from .names import CELL_NAME, CELLS_FOLDER, NATIVE, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
 from .preparation import made_scene, prepared_method, what_is_missing
-from .processes import die_with_parent
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
-from .rows import CellFile, CellRow, Row, cell_folders, read_object
-from .selection import chosen, earlier_rows, plan
-from .weights import check_weights, files_of_weights
+from .rows import CellFile, CellRow, Row, at_once, cell_folders, read_object, read_rows
 
+SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 
 
@@ -36,13 +30,9 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
               only: Sequence[str] = (), per_gpu: int = 1, rows: Optional[str] = None) -> List[Row]:
     """Runs what is not done of a suite; returns the rows of its cells, failed ones included.
 
-    name: a file or a shipped suite. results: by default bench_results/NAME. jobs: cells at once, by default per_gpu
-    on each GPU, or one on the CPU. slurm: None, or Snakemake's default resources ("slurm_partition=gpu"). only:
-    "field=value" of cells that are run. per_gpu: cells that one GPU is given at once. Where it, or jobs on the CPU, is
-    beyond 1, times are not the machine's own, and rows say so. rows: a file of rows, or a folder, whose cells
-    are not run again, failed ones neither unless retry_failed. Raises BenchError.
-
-    Where nothing is to be done, neither a GPU nor Snakemake is needed.
+    name: a file or a shipped suite. results: by default bench_results/NAME. The others are the options of `dsmoe bench
+    run`; slurm: None, or Snakemake's default resources. Raises BenchError. Where nothing is to be done, neither a GPU
+    nor Snakemake is needed.
     """
     suite = load_suite(find_suite(name))
     check_sharing(suite, jobs, slurm, per_gpu)
@@ -52,11 +42,10 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     earlier = earlier_rows(rows, suite.cells) if rows else {}
     check_folder(suite, results)
     done: Dict[str, Row] = {}
-    for cell in cells:
-        known = [read_row(results, cell["id"]), earlier.get(cell["id"])]
-        usable = [row for row in known if row and (row["ok"] or not retry_failed)]
-        if usable:
-            done[cell["id"]] = usable[0]
+    for name in (cell["id"] for cell in cells):
+        for row in (earlier.get(name), read_row(results, name)):  # the folder's own goes first
+            if row and (row["ok"] or not retry_failed):
+                done[name] = row
     if rows:
         print(f"{sum(row is earlier.get(name) for name, row in done.items())} of {len(cells)} cells taken from {rows}")
     to_do = [cell for cell in cells if cell["id"] not in done]
@@ -76,48 +65,86 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         finally:
             measured = collect(results)
     here = [measured[cell["id"]] for cell in cells if cell["id"] in measured]
-    lacking = len(cells) - len(here)
-    if status != 0 or lacking:
-        log = os.path.join(results, ".snakemake", "log")
-        raise BenchError(f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The "
-                         f"same command continues; {log if os.path.isdir(log) else 'what it printed'} says what "
-                         "happened")
+    lacking, log = len(cells) - len(here), os.path.join(results, ".snakemake", "log")
+    refuse(status != 0 or lacking,
+           f"snakemake ended with status {status}; {lacking} of {len(cells)} cells have no row yet. The same command "
+           f"continues; {log if os.path.isdir(log) else 'what it printed'} says what happened")
     return here
 
 
-def check_folder(suite: Suite, results: str) -> None:
-    """Raises BenchError where the folder has rows of another suite or of another protocol, or a row that is none.
+def earlier_rows(path: str, cells: List[Dict[str, Any]]) -> Dict[str, Row]:
+    """Those of a file, or of a folder of results, that are of these cells, by name. Raises BenchError without any."""
+    rows, names = read_rows(path), {cell["id"] for cell in cells}
+    found = {row["cell"]: row for row in rows if row["cell"] in names}
+    refuse(not found, f"--rows {path}: none of its {len(rows)} rows is of a cell of this suite")
+    return found
 
-    What it is a row of, its cell's file says. Scenes and methods that are new, and values of the axes, may be added.
-    """
-    if os.path.exists(results) and not os.path.isdir(results):
-        raise BenchError(f"{results}: is a file; it must be a folder, or a name where there is nothing yet")
-    here = {"": {"name": suite.name}, "protocol.": suite.protocol,
-            **{f"scene {scene['name']}: ": scene for scene in suite.scenes},
-            **{f"method {method['label']}: ": method for method in suite.methods}}
+
+def chosen(cells: List[Dict[str, Any]], only: Sequence[str]) -> List[Dict[str, Any]]:
+    """The cells for which every "field=value" holds; several values of one field may be given. Raises BenchError."""
+    wanted: Dict[str, List[str]] = {}
+    for text in only:
+        field, equals, value = text.partition("=")
+        refuse(not equals or field not in SELECTORS,
+               f"--only {text}: must be FIELD=VALUE with a field of {', '.join(SELECTORS)}")
+        there = dict.fromkeys(_said(cell, field) for cell in cells)
+        refuse(not any(_same(entry, value) for entry in there),
+               f"--only {field}={value}: no cell of the suite is so; its cells have {', '.join(map(str, there))}")
+        wanted.setdefault(field, []).append(value)
+    found = [cell for cell in cells
+             if all(any(_same(_said(cell, field), value) for value in values) for field, values in wanted.items())]
+    refuse(not found, f"--only {' '.join(only)}: no cell of the suite is so")
+    return found
+
+
+def _said(cell: Dict[str, Any], field: str) -> Any:
+    return {"method": cell["method"]["label"], "scene": cell["scene"]["name"],
+            "budget": cell.get("budget", 0)}.get(field, cell.get(field))
+
+
+def _same(value: Any, text: str) -> bool:
+    try:
+        return value == float(text) if isinstance(value, float) else str(value).lower() == text.lower()
+    except ValueError:
+        return False
+
+
+def plan(cells: List[Dict[str, Any]], done: Mapping[str, Row], absent: Sequence[str]) -> str:
+    states = ["to do" if cell["id"] not in done else "done" if done[cell["id"]]["ok"] else "failed" for cell in cells]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in ("done", "to do", "failed"))
+    return "\n".join([*(f"{state}  {cell['id']}" for state, cell in zip(states, cells)), *absent, counts])
+
+
+def check_folder(suite: Suite, results: str) -> None:
+    """Raises BenchError where the folder has rows of another suite or of another protocol, or a row that is none."""
+    def parts(cell: Mapping[str, Any]) -> Dict[str, Dict[str, Any]]:
+        """What must stay as it is of a scene or a method that is there already; others may be added."""
+        return {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
+                f"scene {cell['scene'].get('name')}: ": cell["scene"],
+                f"method {cell['method'].get('label')}: ": cell["method"]}
+
+    refuse(os.path.exists(results) and not os.path.isdir(results),
+           f"{results}: is a file; it must be a folder, or a name where there is nothing yet")
+    here = {what: part for cell in suite.cells for what, part in parts(cell).items()}
     differ: List[str] = []
     for name in cell_folders(results):
         cell = read_object(os.path.join(results, CELLS_FOLDER, name, CELL_NAME), CellFile)
         if cell is None or read_row(results, name) is None:
             continue
-        there = {"": {"name": cell["suite"]}, "protocol.": cell["protocol"],
-                 f"scene {cell['scene'].get('name')}: ": cell["scene"],
-                 f"method {cell['method'].get('label')}: ": cell["method"]}
-        differ += [f"{what}{field} is {there[what].get(field)!r} there and {here[what].get(field)!r} here"
-                   for what in there if what in here
-                   for field in sorted({*there[what], *here[what]} - {*NOT_IN_THE_IDENTITY, "axes", "refused"})
-                   if there[what].get(field) != here[what].get(field)]
-    if differ:
-        raise BenchError(f"{results}: holds rows of another suite or of another protocol, which are not put together: "
-                         f"{'; '.join(dict.fromkeys(differ))}. Choose another folder with -o")
+        differ += [f"{what}{field} is {there.get(field)!r} there and {here[what].get(field)!r} here"
+                   for what, there in parts(cell).items() if what in here
+                   for field in sorted({*there, *here[what]} - {*NOT_IN_THE_IDENTITY, "refused"})
+                   if there.get(field) != here[what].get(field)]
+    refuse(differ, f"{results}: holds rows of another suite or of another protocol, which are not put together: "
+                   f"{'; '.join(dict.fromkeys(differ))}. Choose another folder with -o")
 
 
 def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
     """Runs Snakemake, which inherits the lock and shares it with its cells (cell.py, --hold); returns its status.
 
-    Where this process is interrupted or ends, however it ends, Snakemake is killed, since on a signal that it can catch
-    it waits for the cells that run here. Those of a queue it is to cancel (is_queued): it gets one SIGINT. A second one
-    would end it before it has, and so would a SIGHUP; in a session of its own it does not get the terminal's.
+    However this process ends, Snakemake is killed, since on a signal that it can catch it waits for the cells that run
+    here. Those of a queue it is to cancel (is_queued): it gets one SIGINT. A second one would end it before it has, and
+    so would a SIGHUP; in a session of its own it does not get the terminal's.
     """
     import fcntl
 
@@ -137,26 +164,20 @@ def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:
 
 
 def write_cells(suite: Suite, cells: List[Dict[str, Any]], results: str, done: Mapping[str, Row]) -> None:
-    """Writes RESULTS/suite.json and each cell's file, with scenes made and checkouts patched. Raises BenchError.
-
-    done: rows by their cell's name; those of elsewhere are written here, as the suite's own.
-    """
-    scenes: Dict[str, Dict[str, Any]] = {}
+    """Writes RESULTS/suite.json, each cell's file, with scenes made and checkouts patched, and rows of elsewhere."""
+    scenes: Dict[str, Dict[str, Any]] = {}  # as they are run
     methods: Dict[str, Dict[str, Any]] = {}
     for cell in cells:
         folder = os.path.join(results, CELLS_FOLDER, cell["id"])
         file, row = os.path.join(folder, CELL_NAME), os.path.join(folder, ROW_NAME)
         if cell["id"] in done:
-            if not os.path.isfile(row):
-                write_json_atomically(row, {**done[cell["id"]], **identity(cell)})
-            if not os.path.isfile(file):
-                write_json_atomically(file, cell)
+            for path, content in ((row, {**done[cell["id"]], **identity(cell)}), (file, cell)):
+                if not os.path.isfile(path):
+                    write_json_atomically(path, content)
             continue
         scene, method = cell["scene"]["name"], cell["method"]["label"]  # what no cell needs is not prepared
-        if scene not in scenes:
-            scenes[scene] = made_scene(cell["scene"], results)
-        if method not in methods:
-            methods[method] = prepared_method(cell["method"], results)
+        scenes[scene] = scenes.get(scene) or made_scene(cell["scene"], results)
+        methods[method] = methods.get(method) or prepared_method(cell["method"], results)
         write_json_atomically(file, {**cell, "scene": scenes[scene], "method": methods[method]})
         if os.path.isfile(row):
             os.remove(row)
@@ -168,41 +189,39 @@ def read_row(results: str, name: str) -> Optional[Row]:
     """The row in a cell's folder; None where there is none. Raises BenchError where it is damaged or another cell's."""
     path = os.path.join(results, CELLS_FOLDER, name, ROW_NAME)
     row = read_object(path, CellRow)
-    if row is not None and row["cell"] != name:
-        raise BenchError(f"{path}: is the row of another cell, {row['cell']}; remove it to have it made anew")
+    other = name if row is None else row["cell"]
+    refuse(other != name, f"{path}: is the row of another cell, {other}; remove it to have it made anew")
     return row
 
 
 def check_sharing(suite: Suite, jobs: Optional[int], slurm: Optional[Sequence[str]], per_gpu: int) -> None:
-    """Raises BenchError where --jobs, --slurm and --per-gpu are out of range or do not go together."""
     for option, number in (("--jobs", jobs), ("--per-gpu", per_gpu)):
-        if number is not None and number < 1:
-            raise BenchError(f"{option} is {number}; it must be at least 1")
+        refuse(number is not None and number < 1, f"{option} is {number}; it must be at least 1")
     for word in slurm or ():
-        if not all(word.partition("=")):
-            raise BenchError(f"--slurm {word}: must be KEY=VALUE, such as slurm_partition=gpu; the suite comes first")
-    if per_gpu > 1 and (suite.protocol["device"] != "cuda" or slurm is not None):
-        raise BenchError(f"--per-gpu is {per_gpu}; it is for protocol.device cuda, without --slurm")
-    if per_gpu > 1 and suite.protocol.get("gpus", 1) > 1:
-        raise BenchError(f"--per-gpu is {per_gpu}; it must be 1 with protocol.gpus {suite.protocol['gpus']}")
+        refuse(not all(word.partition("=")),
+               f"--slurm {word}: must be KEY=VALUE, such as slurm_partition=gpu; the suite comes first")
+    refuse(per_gpu > 1 and (suite.protocol["device"] != "cuda" or slurm is not None),
+           f"--per-gpu is {per_gpu}; it is for protocol.device cuda, without --slurm")
+    gpus = suite.protocol.get("gpus", 1)
+    refuse(per_gpu > 1 and gpus > 1, f"--per-gpu is {per_gpu}; it must be 1 with protocol.gpus {gpus}")
 
 
 def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optional[int],
             slurm: Optional[Sequence[str]], per_gpu: int = 1) -> List[str]:
-    """Snakemake's command line, for cells that are all to be run. Raises BenchError."""
     require("snakemake")
-    on_gpu = suite.protocol["device"] == "cuda"
+    on_gpu, each = suite.protocol["device"] == "cuda", suite.protocol.get("gpus", 1)
     gpus = visible_gpus() if on_gpu and slurm is None else []
-    if on_gpu and slurm is None and not gpus:
-        raise BenchError("protocol.device is cuda, and torch finds no CUDA device on this machine; for the "
-                         "CPU set protocol.device: cpu")
-    each = suite.protocol.get("gpus", 1)
-    if gpus and each > len(gpus):
-        raise BenchError(f"protocol.gpus is {each}, and torch finds {len(gpus)} on this machine")
-    at_once = min(jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus) // each)), len(cells))
+    refuse(on_gpu and slurm is None and not gpus,
+           "protocol.device is cuda, and torch finds no CUDA device on this machine; for the CPU set protocol.device: "
+           "cpu")
+    refuse(gpus and each > len(gpus), f"protocol.gpus is {each}, and torch finds {len(gpus)} on this machine")
+    together = min(jobs or (len(cells) if slurm is not None else max(1, per_gpu * len(gpus) // each)), len(cells))
     # Spread over the GPUs first: no more cells share one than must. In a queue nobody counts: 0.
-    per_device = 0 if slurm is not None else min(per_gpu, -(-at_once // len(gpus))) if gpus else at_once
-    threads = threads_of_each(at_once) if slurm is None else threads_asked_for(slurm)
+    per_device = 0 if slurm is not None else min(per_gpu, -(-together // len(gpus))) if gpus else together
+    asked = dict(word.partition("=")[::2] for word in slurm or ()).get("cpus_per_task", "1")
+    refuse(not (asked.isascii() and asked.isdecimal() and int(asked)),
+           f"--slurm cpus_per_task={asked}: must be a number of at least 1")
+    threads = threads_of_each(together) if slurm is None else int(asked)
     said = {"cells": json.dumps([cell["id"] for cell in cells]), "python": sys.executable, "threads": threads,
             "gpus_each": each if on_gpu else 0, "per_device": per_device,
             "gpus": json.dumps(gpus)}  # a list: Snakemake takes a bare 0 for a number
@@ -211,14 +230,14 @@ def command(suite: Suite, cells: List[Dict[str, Any]], results: str, jobs: Optio
              "--rerun-triggers", "mtime", "--scheduler", "greedy",
              "--config", *(f"{name}={value}" for name, value in said.items())]
     if slurm is not None:
-        if importlib.util.find_spec("snakemake_executor_plugin_slurm") is None:
-            raise BenchError("--slurm needs Snakemake's plugin: pip install snakemake-executor-plugin-slurm")
-        words += ["--executor", "slurm", "--jobs", str(at_once)]
+        refuse(importlib.util.find_spec("snakemake_executor_plugin_slurm") is None,
+               "--slurm needs Snakemake's plugin: pip install snakemake-executor-plugin-slurm")
+        words += ["--executor", "slurm", "--jobs", str(together)]
         # Named resources bring Snakemake's own, 1000 MB among them; with 0 a cell has what the queue gives it.
         memory = [] if any(word.startswith("mem") for word in slurm) else ["mem_mb=0"]
         words += ["--default-resources", *slurm, *memory] if slurm else []
     else:
-        words += ["--cores", str(at_once * threads)]
+        words += ["--cores", str(together * threads)]
         words += ["--resources", f"gpu={per_device * len(gpus)}"] if on_gpu else []
     headline = [f"{CELLS_FOLDER}/{cell['id']}/{ROW_NAME}" for cell in cells if cell["headline"]]
     return words + (["--prioritize", *headline] if headline else [])
@@ -230,14 +249,6 @@ def threads_of_each(at_once: int) -> int:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(torch.get_num_threads(), cores // at_once))
-
-
-def threads_asked_for(resources: Sequence[str]) -> int:
-    """Threads of a cell in Slurm's queue: what its resources say as cpus_per_task=N, else 1. Raises BenchError."""
-    threads = dict(resource.partition("=")[::2] for resource in resources).get("cpus_per_task", "1")
-    if not (threads.isascii() and threads.isdecimal() and int(threads)):
-        raise BenchError(f"--slurm cpus_per_task={threads}: must be a number of at least 1")
-    return int(threads)
 
 
 def visible_gpus() -> List[str]:
@@ -253,13 +264,13 @@ def environment() -> Dict[str, str]:
     """Of Snakemake and its cells: this package is found from any folder, and its commit is known."""
     path = [ROOT if os.path.isfile(os.path.join(ROOT, "sources.txt")) else os.path.dirname(ROOT)]
     path += [os.path.abspath(item) for item in os.environ.get("PYTHONPATH", "").split(os.pathsep) if item]
-    known = {COMMIT_VARIABLE: project_commit(), **files_of_weights()}
+    known = {COMMIT_VARIABLE: project_commit(),
+             **{name: os.path.abspath(os.environ[name]) for name in VARIABLES.values() if os.environ.get(name)}}
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path), "PYTHONSAFEPATH": "1",  # nothing of a cell's folder
             **{name: value for name, value in known.items() if value}}
 
 
 def collect(results: str) -> Dict[str, Row]:
-    """Every row in RESULTS/cells by its cell's name; writes RESULTS/rows.jsonl."""
     found = {name: read_row(results, name) for name in cell_folders(results)}
     rows = {name: row for name, row in found.items() if row is not None}
     write_text_atomically(os.path.join(results, ROWS_NAME), "".join(json.dumps(row) + "\n" for row in rows.values()))
@@ -267,15 +278,19 @@ def collect(results: str) -> Dict[str, Row]:
 
 
 def rows_table(rows: List[Row]) -> str:
-    """A line for each row: what a terminal shows at the end."""
-    lines = []
-    for row in rows:
-        name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("schedule") or "own schedule",
-                          shown(row["densify_grad_threshold"], "g"), f"s{row['seed']}"])
-        at_once = max((row.get("machine") or {}).get(key) or 1 for key in SHARING.values())
-        told = (f"  {shown(row.get('psnr'), '.2f')} dB  SSIM {shown(row.get('ssim'), '.4f')}  "
-                f"{shown(row.get('num_gaussians'), ',')} Gaussians  {shown(row.get('train_seconds'), '.1f')} s  "
-                f"{shown(row.get('fps'), '.1f')} FPS" + (f" ({at_once} cells at once)" if at_once > 1 else "")
-                if row["ok"] else f"  FAILED: {row.get('reason')}")
-        lines.append(f"{name}:{told}")
-    return "\n".join(lines)
+    return "\n".join(map(_line, rows))
+
+
+def _line(row: Row) -> str:
+    def shown(field: str, form: str) -> str:
+        return "-" if row.get(field) is None else format(row[field], form)
+
+    name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("schedule") or "own schedule",
+                      shown("densify_grad_threshold", "g"),
+                      *([f"n{row['budget']}"] if row["method"] == NATIVE and row.get("budget") else []),
+                      f"s{row['seed']}"])
+    if not row["ok"]:
+        return f"{name}:  FAILED: {row.get('reason')}"
+    return (f"{name}:  {shown('psnr', '.2f')} dB  SSIM {shown('ssim', '.4f')}  {shown('num_gaussians', ',')} Gaussians"
+            f"  {shown('train_seconds', '.1f')} s  {shown('fps', '.1f')} FPS"
+            + (f" ({at_once(row)} cells at once)" if at_once(row) > 1 else ""))

@@ -7,7 +7,7 @@ from typing import Callable, Dict, List, Sequence
 import numpy as np
 import torch
 
-from .weights import VARIABLES, net_of
+from .names import VARIABLES, net_of
 
 Distance = Callable[[torch.Tensor, torch.Tensor], float]  # of two images [3, H, W] in [0, 1]
 
@@ -21,11 +21,7 @@ POOLING = {"alex": [None, (3, 2), (3, 2), None, None], "vgg": [None, (2, 2), (2,
 
 
 def lpips_network(kind: str, device: str) -> Distance:
-    """LPIPS of two images; `kind` is one of LPIPS_KINDS.
-
-    lpips_vgg_std, lpips_alex: images taken to [-1, 1], as the metric is defined. lpips_vgg_inria: [0, 1] goes into a
-    network made for [-1, 1], as the code of 3DGS has it. Raises what the absence of weights raises.
-    """
+    """LPIPS of a kind of LPIPS_KINDS. lpips_vgg_inria feeds [0, 1] into a network made for [-1, 1], as 3DGS does."""
     net, normalise = net_of(kind), kind != "lpips_vgg_inria"
     if os.environ.get(VARIABLES[net]):
         return FileLpips(net, os.environ[VARIABLES[net]], normalise, device)
@@ -35,19 +31,12 @@ def lpips_network(kind: str, device: str) -> Distance:
         raise ImportError("torchmetrics with torchvision is not installed (pip install torchmetrics "
                           "torchvision)") from error
     network = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=normalise).to(device)
-
-    def distance(image: torch.Tensor, target: torch.Tensor) -> float:
-        with torch.no_grad():
-            return float(network(image[None], target[None]))
-
-    return distance
+    return torch.no_grad()(lambda image, target: float(network(image[None], target[None])))
 
 
 class FileLpips:
-    """LPIPS from a file of weights; see weights.py."""
-
     def __init__(self, net: str, path: str, normalise: bool, device: str) -> None:
-        """net: a key of BLOCKS. normalise: images in [0, 1] are taken to [-1, 1]. Raises OSError and ValueError."""
+        """normalise: images in [0, 1] are taken to [-1, 1]. Raises OSError and ValueError."""
         arrays = arrays_of(path)
         self.normalise, self.linear, self.blocks = normalise, [], []
         self.shift, self.scale = (torch.tensor(values, device=device)[:, None, None] for values in (SHIFT, SCALE))
@@ -64,11 +53,11 @@ class FileLpips:
             layers: List[torch.nn.Module] = [torch.nn.MaxPool2d(*pooling)] if pooling else []
             for side, stride, padding in convolutions:
                 number += 1
-                name = f"conv{number}"
-                outputs = (*np.shape(arrays.get(f"{name}.weight", ())), 1)[0]
+                weight, bias = f"conv{number}.weight", f"conv{number}.bias"
+                outputs = (*np.shape(arrays.get(weight, ())), 1)[0]
                 layer = torch.nn.Conv2d(inputs, outputs, side, stride, padding)
-                layer.weight.data = array(f"{name}.weight", [outputs, inputs, side, side])
-                layer.bias.data = array(f"{name}.bias", [outputs])
+                layer.weight.data = array(weight, [outputs, inputs, side, side])
+                layer.bias.data = array(bias, [outputs])
                 layers += [layer, torch.nn.ReLU()]
                 inputs = outputs
             self.blocks.append(torch.nn.Sequential(*layers))

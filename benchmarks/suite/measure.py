@@ -1,8 +1,4 @@
-"""What is measured of a rendering: PSNR, SSIM, PSNR near edges and LPIPS, the same way whatever program rendered.
-
-Every metric is one number of one image; a scene's figure is the mean over its test views (results/evaluation.py of the
-trainer).
-"""
+"""What is measured of a rendering, the same way whatever program rendered: one number of one image for each metric."""
 from __future__ import annotations
 
 import math
@@ -13,11 +9,9 @@ import torch
 import torch.nn.functional as F
 
 from ...trainer.results.metrics import image_metrics, psnr, quantised
-from ..errors import BenchError
 from .lpips import Distance, lpips_network
-from .names import LPIPS_KINDS
+from .names import VARIABLES, net_of
 from .protocol import EDGE_REACH, STRONG_GRADIENT
-from .weights import VARIABLES, net_of
 
 LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601
 
@@ -33,10 +27,7 @@ def edge_mask(target: torch.Tensor) -> torch.Tensor:
 
 
 def edge_psnr(image: torch.Tensor, target: torch.Tensor, mask: Optional[torch.Tensor] = None) -> Optional[float]:
-    """PSNR in dB of two images [3, H, W] over the pixels of `edge_mask(target)` that the mask [1, H, W], if any, keeps.
-
-    None where there are no such pixels.
-    """
+    """PSNR in dB over the pixels of `edge_mask(target)` that the mask [1, H, W], if any, keeps; None without any."""
     edges = edge_mask(target)
     if mask is not None:
         edges &= mask[0] > 0
@@ -48,12 +39,9 @@ class Measures:
     """All metrics of one rendering; LPIPS of each kind whose weights are at hand."""
 
     def __init__(self, device: str, lpips: Sequence[str] = ()) -> None:
-        """lpips: names of LPIPS_KINDS. Raises BenchError for another name."""
         self.reasons: Dict[str, Optional[str]] = {}  # why a kind of LPIPS is absent; None where it is measured
         self._networks: Dict[str, Distance] = {}
         for kind in lpips:
-            if kind not in LPIPS_KINDS:
-                raise BenchError(f"lpips is {kind!r}; it must be one of {', '.join(LPIPS_KINDS)}")
             try:
                 self._networks[kind] = lpips_network(kind, device)
                 self.reasons[kind] = None
@@ -65,10 +53,7 @@ class Measures:
 
     def __call__(self, color: torch.Tensor, target: torch.Tensor,
                  mask: Optional[torch.Tensor] = None) -> Dict[str, Optional[float]]:
-        """color: a rendering [3, H, W]; target: its ground truth in [0, 1].
-
-        mask: [1, H, W], the view's, if it has one; LPIPS is then that of both images times the mask.
-        """
+        """color: a rendering [3, H, W]; mask: [1, H, W], the view's, by which LPIPS multiplies both images."""
         png = quantised(color)
         metrics: Dict[str, Optional[float]] = {**image_metrics(color, target, mask),
                                                "psnr_edge": edge_psnr(png, target, mask)}
@@ -91,7 +76,6 @@ class Measures:
 
 
 def headline_lpips(rows: Sequence[Dict[str, object]]) -> Dict[str, object]:
-    """The first kind that has a value, else the first."""
     if not rows:
         return {"value": None, "kind": None, "reason": "the suite asks for none"}
     return next((row for row in rows if row["value"] is not None), rows[0])

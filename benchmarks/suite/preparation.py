@@ -12,26 +12,21 @@ from .names import CHECKOUTS, NATIVE
 from .protocol import commit_of
 from .rows import read_object
 
+# The fields of a method that name checkouts, and what is wanted there, in words.
+CHECKOUT_FIELDS = {"path": "a checkout of {} must be",
+                   "base": "the 3DGS checkout must be that trains what {} compresses"}
 NOT_COPIED = shutil.ignore_patterns(".git", "__pycache__", "output", "outputs", "build")
 
 
 def what_is_missing(cells: List[Dict[str, Any]]) -> List[str]:
-    """What these cells need and is not there: variables, folders of scenes and of checkouts; and what to do."""
     scenes = {cell["scene"]["name"]: cell["scene"] for cell in cells}
     methods = {cell["method"]["label"]: cell["method"] for cell in cells}
     absent = [f"{part['unset']}; set it" for part in (*scenes.values(), *methods.values()) if "unset" in part]
     wanted = [(scene, "path", f"scene {name}", "") for name, scene in scenes.items() if scene["path"] is not None]
-    wanted += [(method, key, f"method {label}: {key}", f", where {words}") for label, method in methods.items()
-               for key, words in wanted_checkouts(method).items()]
+    wanted += [(method, key, f"method {label}: {key}", f", where {text.format(method['name'])}")
+               for label, method in methods.items() for key, text in CHECKOUT_FIELDS.items() if key in method]
     return absent + [f"{what}: {part[key]}: no such folder{where}; name it" for part, key, what, where in wanted
                      if "unset" not in part and not os.path.isdir(part[key])]
-
-
-def wanted_checkouts(method: Dict[str, Any]) -> Dict[str, str]:
-    """The fields of a method that name checkouts, and what is wanted there, in words."""
-    wanted = {"path": f"a checkout of {method['name']} must be",
-              "base": f"the 3DGS checkout must be that trains what {method['name']} compresses"}
-    return {key: words for key, words in wanted.items() if key in method}
 
 
 def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
@@ -50,14 +45,11 @@ def made_scene(scene: Dict[str, Any], results: str) -> Dict[str, Any]:
 
 
 def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
-    """The method with its checkouts as they are run: patched ones are copies in RESULTS/checkouts.
-
-    Where a checkout cannot be used, `refused` says why: that is what its cells' rows will say.
-    """
+    """The method with its checkouts as they are run; `refused` says why they cannot be, as its cells' rows will."""
     if method["name"] == NATIVE:
         return method
     try:
-        paths = {key: prepared_checkout(method, key, results) for key in wanted_checkouts(method)}
+        paths = {key: prepared_checkout(method, key, results) for key in CHECKOUT_FIELDS if key in method}
     except (patches.PatchError, BenchError, OSError) as error:
         return {**method, "refused": " ".join(str(error).split())}
     commits = {"path": "commit", "base": "base_commit"}  # of what is copied, not of a copy
@@ -65,7 +57,6 @@ def prepared_method(method: Dict[str, Any], results: str) -> Dict[str, Any]:
 
 
 def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
-    """The folder of a checkout as it is run. Raises BenchError or PatchError."""
     path = method[key]
     if not CHECKOUTS[method["name"]]:
         return path
@@ -78,13 +69,9 @@ def prepared_checkout(method: Dict[str, Any], key: str, results: str) -> str:
         raise BenchError(f"{path} is patched with --fuse, which the suite calls `variant: fused`")
     if method["variant"] == "unpatched" or (is_patched and is_fused == (method["variant"] == "fused")):
         return path
+    # A patched copy, made anew; the checkout itself stays as it is.
     folder = os.path.join(results, "checkouts", f"{method['label']}-{key}")
-    return patched_copy(path, folder, fuse=method["variant"] == "fused")
-
-
-def patched_copy(path: str, folder: str, fuse: bool) -> str:
-    """A patched copy of a checkout, made anew; the checkout itself stays as it is. Raises PatchError."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(path, folder, ignore=NOT_COPIED)
-    patches.apply(folder, modernise=True, fuse=fuse)
+    patches.apply(folder, modernise=True, fuse=method["variant"] == "fused")
     return folder

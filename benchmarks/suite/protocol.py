@@ -1,8 +1,4 @@
-"""The rules that make two rows comparable, as data: each row carries them.
-
-What the trainer already writes down (split, sizes, downscaler, background, metrics) comes from its `result_row`; here
-are the harness's own. A rule that a reader would have to know beforehand is a rule that is missing here.
-"""
+"""The rules that make two rows comparable, as data: each row carries them. What the trainer writes down is its own."""
 from __future__ import annotations
 
 import contextlib
@@ -49,7 +45,7 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
         iterations=protocol["iterations"], batch=protocol.get("batch", 1),
         resolution=scene["resolution"], images=scene["images"], principal_point=protocol["principal_point"],
         white_background=scene["background"] == "white", init_points=scene["init_points"],
-        schedule=cell["schedule"] or "3dgs", seed=cell["seed"], device=protocol["device"],
+        schedule=cell["schedule"] or "3dgs", budget=cell.get("budget", 0), seed=cell["seed"], device=protocol["device"],
         densify_grad_threshold=cell["densify_grad_threshold"], eval_every=protocol["evaluate_every"],
         checkpoint_every=protocol["checkpoint_every"])
     if protocol["scale_recipe"]:
@@ -58,18 +54,15 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
 
 
 def protocol_of(measured: Dict[str, Any], config: TrainConfig, lpips: Any) -> Dict[str, Any]:
-    """The protocol of a row of the native trainer; a checkout's notes replace what is otherwise there.
-
-    measured: the protocol that the trainer's `result_row` gives.
-    """
+    """The protocol of a row: that of the trainer's `result_row`, and the harness's. A checkout's notes win over it."""
     rules = {**RULES, "lpips": {row["kind"]: RULES["lpips"][row["kind"]] for row in lpips}}
     return {**measured, **rules, "images": config.images, "downscaler": downscaler(config, measured["downscaler"]),
-            "sh_degree": config.sh_degree, "recipe": {name: getattr(config, name) for name in RECIPE},
+            "sh_degree": config.sh_degree,
+            "recipe": {name: getattr(config, name) for name in RECIPE if getattr(config, name) != ""},
             "eval": "every test view of the split, none left out"}
 
 
 def downscaler(config: TrainConfig, name: str) -> str:
-    """How images came to their size: as the files are, or resized by the loader."""
     from ...trainer.scenes.images import image_size, target_size  # they load torch, which a suite does without
     from ...trainer.scenes.scene import read_layout
 
@@ -81,15 +74,8 @@ def downscaler(config: TrainConfig, name: str) -> str:
     return name
 
 
-def machine_of(device: str) -> Dict[str, Any]:
-    """What a cell ran on."""
-    from ...trainer.system.environment import machine, versions
-
-    return {"device": machine(device), "versions": versions()}
-
-
 def project_commit() -> Optional[str]:
-    """The commit of this project's files, "+" behind it where they were changed since; None where nothing says it."""
+    """That of this project's files, as `commit_of` has it; None where nothing says it."""
     known = os.environ.get(COMMIT_VARIABLE) or commit_of(ROOT)
     if known is None:
         with contextlib.suppress(ImportError):
@@ -102,17 +88,13 @@ def commit_of(folder: str) -> Optional[str]:
 
     None without git, and for a folder inside of another checkout, whose commit says nothing about it.
     """
-    top = _git(folder, "rev-parse", "--show-toplevel")
-    commit = _git(folder, "rev-parse", "HEAD")
-    if not top or not commit or os.path.realpath(top) != os.path.realpath(folder):
-        return None
-    return commit + ("+" if _git(folder, "status", "--porcelain", "--untracked-files=no") else "")
+    def git(*words: str) -> str:
+        return subprocess.run(["git", "-C", folder, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                              check=True).stdout.decode().strip()
 
-
-def _git(folder: str, *words: str) -> Optional[str]:
     try:
-        answer = subprocess.run(["git", "-C", folder, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                                check=True)
+        if os.path.realpath(git("rev-parse", "--show-toplevel")) != os.path.realpath(folder):
+            return None
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):
         return None
-    return answer.stdout.decode().strip()

@@ -32,9 +32,7 @@ class ReportError(BenchError):
     """Rows cannot be reported; the text says which and why."""
 
 
-class Part(BaseModel):
-    """What is read of an object; it may have other fields too."""
-
+class Part(BaseModel):  # of an object that may have other fields too
     model_config = ConfigDict(strict=True)
 
 
@@ -73,10 +71,8 @@ def read_object(path: str, model: Type[Any] = dict) -> Optional[Dict[str, Any]]:
 
 
 def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
-    """The object that a text in json is, of which all that is read has its type. Raises ReportError.
-
-    place: where the text stands, in words.
-    """
+    """The object that a text in json is, of which all that is read has its type. Raises ReportError, which names the
+    place of the text."""
     try:
         found = json.loads(text)
     except ValueError as error:
@@ -95,10 +91,9 @@ def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
 
 
 def read_rows(results: str) -> List[Row]:
-    """The rows of a results folder (cells/*/row.json and rows.jsonl) or of one .jsonl file, sorted by cell.
+    """The rows of RESULTS or of one .jsonl file, sorted by cell. Raises ReportError.
 
-    A cell's own row.json wins over rows.jsonl, and there the last line of a cell. Raises ReportError where there are
-    none, or where one is damaged.
+    A cell's own row.json wins over rows.jsonl, and there the last line of a cell.
     """
     listed = results if os.path.isfile(results) else os.path.join(results, ROWS_NAME)
     lines = _text(listed).split("\n") if os.path.isfile(listed) else []
@@ -111,8 +106,12 @@ def read_rows(results: str) -> List[Row]:
     return [rows[name] for name in sorted(rows)]
 
 
+def at_once(row: Row) -> int:
+    machine = row.get("machine") or {}
+    return max(machine.get("cells_per_gpu") or 1, machine.get("cells_at_once") or 1)
+
+
 def cell_folders(results: str) -> List[str]:
-    """The names in RESULTS/cells."""
     folder = os.path.join(results, CELLS_FOLDER)
     return sorted(os.listdir(folder)) if os.path.isdir(folder) else []
 
@@ -126,10 +125,7 @@ def _text(path: str) -> str:
 
 
 def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
-    """The rows that can stand in common tables, and in words which cannot: of each scene, those of a rarer protocol.
-
-    Raises ReportError where no protocol of a scene is the commonest.
-    """
+    """The rows that can stand in common tables, and in words which cannot: of each scene, those of a rarer protocol."""
     left_out: Dict[str, List[str]] = {}  # why, and the cells
     for place in sorted({(row["suite"], row["scene"]) for row in rows}):
         said = {row["cell"]: _rules(row) for row in rows if row["ok"] and (row["suite"], row["scene"]) == place}
@@ -151,10 +147,11 @@ def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
 
 
 def _rules(row: Row) -> Dict[str, Any]:
-    """The rules that the row states, by name; the entries of one that is a dict stand alone."""
+    """The rules that the row states, by name. `gate` brings learning rates of its own: its recipes are compared."""
     found: Dict[str, Any] = {}
     for name, value in (row.get("protocol") or {}).items():
         if name in RULES or name.startswith(RULE_PREFIXES):
+            name = "recipe of gate" if (name, row.get("schedule")) == ("recipe", "gate") else name
             found.update({f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict)
                          else {name: value})
     return {name: value for name, value in found.items() if value is not None}

@@ -31,7 +31,6 @@ def one_of(names: Any) -> Any:
 
 
 def some(item: Any) -> Any:
-    """A list of different values, at least one."""
     return Annotated[List[item], LEAST, DIFFERENT]
 
 
@@ -43,6 +42,7 @@ Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_+-]*$", max_length=6
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Budget = Annotated[int, must(lambda value: value == 0 or value >= 4, "it must be 0, which is none, or at least 4")]
 Threshold = Annotated[float, Field(gt=0, le=1e6)]  # its digits become a part of file names
 Gate = Annotated[Any, must(lambda value: value == LEARNED or (type(value) in (int, float) and 0 <= value < math.inf),
                            f"it must be a number of at least 0, or {LEARNED!r}")]
@@ -72,17 +72,16 @@ class Axes(Part):
     background_gates: some(Gate) = [0]
     densify_grad_thresholds: some(Threshold) = list(THRESHOLDS)
     schedules: some(one_of(SCHEDULES)) = ["3dgs"]
+    budgets: some(Budget) = [0]
     seeds: some(Seed) = [0]
 
 
 Options = create_model("Options", __base__=Part, **{
-    option.name: ({"int": int, "float": float, "bool": bool}[str(option.type)], None)
+    option.name: ({"int": int, "float": float, "bool": bool, "str": str}[str(option.type)], None)
     for option in fields(TrainConfig) if option.name in RECIPE})
 
 
 class Protocol(Part):
-    """What is the same for all cells."""
-
     iterations: Positive = 30_000
     batch: Positive = None  # views a step; this and gpus stand only where they are given, as in earlier rows
     gpus: Positive = None  # of each cell
@@ -115,7 +114,6 @@ SuiteFile = create_model(
 
 
 def check(content: Any) -> None:
-    """Raises BenchError naming the first field of a suite that is wrong, and how."""
     if content is None:
         raise BenchError("the file is empty")
     try:
@@ -126,7 +124,7 @@ def check(content: Any) -> None:
 
 
 def first_mistake(error: ValidationError) -> Tuple[str, str]:
-    """The place of the first mistake that pydantic found, such as scenes[0].name, and what is wrong there."""
+    """The place, such as scenes[0].name, and what is wrong there."""
     found = min(error.errors(), key=lambda one: list(map(str, one["loc"])))
     where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in found["loc"]).lstrip(".")
     kind, given, said = found["type"], found["input"], found["msg"]

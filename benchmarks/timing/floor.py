@@ -29,13 +29,13 @@ _SUMS = 1 + _FEATURES + 1  # gate sum; colour; last contributor
 FORWARD = {mode: gate + _SUMS + (0 if mode == "smoe_std" else _TRANSMIT) for mode, gate in _GATE.items()}
 
 _RECIPROCAL = 3  # estimate and one Newton step, the cheapest that float accuracy allows
-# 1 - alpha; reciprocal; T; weight; w u; alpha / (1 - alpha); gamma; kept T; suffix; and u
-_TRANSMIT_BACKWARD = 1 + _RECIPROCAL + 8
+# 1 - alpha; reciprocal; T; weight; T u - R / (1 - alpha); suffix; and u
+_TRANSMIT_BACKWARD = 1 + _RECIPROCAL + 6
 _VALUE = 1 + _FEATURES  # within the list's seen part?; g'.c
-_MOMENTS = 3 + 3  # dL/dpower past the clamp: multiply, max, multiply; sums of it times 1, dy, dy^2
+_MOMENTS = 1 + 3  # dL/dpower; sums of it times 1, dy, dy^2
 _BACKWARD_REST = _VALUE + _FEATURES + _MOMENTS
-BACKWARD = {mode: gate + _BACKWARD_REST + (2 if mode == "smoe_std" else _TRANSMIT_BACKWARD)
-            for mode, gate in _GATE.items()}  # smoe_std: u and w u alone
+BACKWARD = {mode: gate + _BACKWARD_REST + (1 if mode == "smoe_std" else _TRANSMIT_BACKWARD)
+            for mode, gate in _GATE.items()}  # smoe_std: u alone
 
 
 def multiply_adds_per_second(threads: int, size: int = 1024, repeats: int = 12) -> float:

@@ -34,9 +34,9 @@ _SUMS = 3 + 1 + 1  # colour; gate sum; last contributor
 FORWARD = {mode: _GATE + tests + _SUMS + (0 if mode == "smoe_std" else _TRANSMITTANCE)
            for mode, tests in _TESTS.items()}
 
-_VALUE = 3 + 1  # u = g'.c - b; w u
-_TRANSMITTANCE_BACKWARD = 1 + 1 + 2 + 1 + 1 + 1  # 1 - alpha; reciprocal; T; weight; alpha / (1 - alpha); gamma; suffix
-_GRADIENTS = 3 + 2 + 6  # colour; past the clamp; moments of dL/dpower
+_VALUE = 3  # u = g'.c - b
+_TRANSMITTANCE_BACKWARD = 1 + 1 + 1 + 1 + 2 + 1  # 1 - alpha; reciprocal; T; weight; T u - R / (1 - alpha); suffix
+_GRADIENTS = 3 + 1 + 6  # colour; dL/dpower; its moments
 BACKWARD = {mode: _GATE + tests + _VALUE + _GRADIENTS + (0 if mode == "smoe_std" else _TRANSMITTANCE_BACKWARD)
             for mode, tests in _TESTS.items()}
 

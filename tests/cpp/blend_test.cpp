@@ -221,7 +221,7 @@ struct Weights {
 };
 
 struct PixelGradient {
-  Vector gamma;  // alpha dL/dalpha
+  Vector power;  // dL/dpower, which is alpha dL/dalpha: no alpha is clamped
   Vector color, depth, inverse_depth;
   double background = 0, background_gate = 0;
 };
@@ -243,7 +243,7 @@ template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel
   PixelGradient out;
   out.background = by_color.background;
   out.background_gate = by_color.background_gate + by_depth.background_gate + by_inverse_depth.background_gate;
-  out.gamma = out.color = out.depth = out.inverse_depth = Vector(pixel.size());
+  out.power = out.color = out.depth = out.inverse_depth = Vector(pixel.size());
   for (int i = pixel.size() - 1; i >= 0; --i) {
     if (i == middle - 1) {
       Pixel front = pixel;
@@ -256,7 +256,7 @@ template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel
     const auto gate = gate_of<Real>(pixel, i);
     const auto pair = Blend<kMode>::backward(constants, gate, value, gate.counts & (i < forward.last));
     behind += pair.weight * value;
-    out.gamma[i] = pair.gamma;
+    out.power[i] = pair.power;
     out.color[i] = pair.weight * color;
     out.depth[i] = pair.weight * depth;
     out.inverse_depth[i] = pair.weight * inverse_depth;
@@ -270,7 +270,7 @@ template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel
 
 Vector flat(const Pixel& pixel, const PixelGradient& g) {
   Vector out;
-  for (int i = 0; i < pixel.size(); ++i) out.push_back(g.gamma[i] / pixel.alpha[i]);
+  for (int i = 0; i < pixel.size(); ++i) out.push_back(g.power[i] / pixel.alpha[i]);
   for (const Vector* part : {&g.color, &g.depth, &g.inverse_depth}) out.insert(out.end(), part->begin(), part->end());
   out.push_back(g.background);
   out.push_back(g.background_gate);
@@ -327,7 +327,7 @@ TYPED_TEST(BlendOf, BackwardIsTheDerivativeBehindAFullPixel) {
   // Hidden pairs move the denominator of smoe_tn and nothing else.
   for (const int hidden : {4, 5, 6}) {
     const bool moves = TypeParam::value == BlendMode::kSmoeTn || TypeParam::value == BlendMode::kSmoeStd;
-    EXPECT_EQ(g.gamma[hidden] != 0, moves);
+    EXPECT_EQ(g.power[hidden] != 0, moves);
     EXPECT_EQ(g.color[hidden] != 0, TypeParam::value == BlendMode::kSmoeStd);
   }
 }
@@ -354,7 +354,7 @@ TYPED_TEST(BlendOf, EachOutputAloneHasItsOwnDerivative) {
   }
 }
 
-// Alphas near 1e-6 under one gate: dL/dalpha is near 1e6, and gamma, not dL/dalpha, is what the kernels carry.
+// Alphas near 1e-6 under one gate: dL/dalpha is near 1e6, and dL/dpower is what leaves the pair.
 TYPED_TEST(BlendOf, FloatGradientsOfAFaintPixelKeepFiveDigits) {
   Pixel pixel;
   pixel.counts.assign(3, true);
@@ -362,17 +362,17 @@ TYPED_TEST(BlendOf, FloatGradientsOfAFaintPixelKeepFiveDigits) {
   pixel.color = {0.2, 0.7, 0.9};
   pixel.depth = {1, 2, 3};
   pixel.inverse_depth = {1, 0.5, 1.0 / 3};
-  const Vector wide = backward<TypeParam::value, double>(pixel, {}).gamma;
+  const Vector wide = backward<TypeParam::value, double>(pixel, {}).power;
   // Differences between features of equal size lose about one digit to cancellation.
-  expect_near_all(backward<TypeParam::value, float>(pixel, {}).gamma, wide, 1e-5);
+  expect_near_all(backward<TypeParam::value, float>(pixel, {}).power, wide, 1e-5);
 }
 
 TYPED_TEST(BlendOf, FloatGradientsReachTheDeepestPair) {
   // Front to back, the last of 300 pairs would lose percents to cancellation.
   Random random(4);
   const Pixel pixel = random_pixel(random, 300, 0.05);
-  const Vector wide = backward<TypeParam::value, double>(pixel, {}).gamma;
-  const Vector narrow = backward<TypeParam::value, float>(pixel, {}).gamma;
+  const Vector wide = backward<TypeParam::value, double>(pixel, {}).power;
+  const Vector narrow = backward<TypeParam::value, float>(pixel, {}).power;
   const Vector deepest_wide(wide.end() - 20, wide.end()), deepest_narrow(narrow.end() - 20, narrow.end());
   // T is rebuilt by at most 300 divisions, each off by 6e-8: 2e-5, and u cancels a digit or so.
   expect_near_all(deepest_narrow, deepest_wide, 1e-4);
@@ -388,14 +388,14 @@ TYPED_TEST(GatedBlendOf, AClosedGateGivesItsGradientToTheBackground) {
   const PixelGradient g = backward<TypeParam::value, double>(pixel, {0.7, -0.4, 0.9, 0});
   EXPECT_EQ(g.background, 0.7);
   for (int i = 0; i < 2; ++i) {
-    EXPECT_EQ(g.gamma[i], 0);
+    EXPECT_EQ(g.power[i], 0);
     EXPECT_EQ(g.color[i], 0);
     EXPECT_EQ(g.depth[i], 0);
     EXPECT_EQ(g.inverse_depth[i], 0);
   }
   // The gate sum itself is an output too, and still moves.
   const PixelGradient on_sum = backward<TypeParam::value, double>(pixel, {0, 0, 0, 0.3});
-  EXPECT_DOUBLE_EQ(on_sum.gamma[1], 0.3 * 2e-32);
+  EXPECT_DOUBLE_EQ(on_sum.power[1], 0.3 * 2e-32);
 }
 
 }  // namespace

@@ -125,10 +125,31 @@ TYPED_TEST(GateOfMode, GateCutOffIsOnTheKernelAndAlphaCutOffOnTheAlpha) {
 TYPED_TEST(GateOfMode, ClampPassesTheGradientStraightThrough) {
   for (const double opacity : {0.3, 0.99, 1.0, 4.0}) {
     const auto gate = evaluate_gate<TypeParam::value>(-0.1, opacity, 0.0);
-    const double dL_dalpha = -1.3;
+    const double dL_dalpha = -1.3;  // g'.c of a pixel's only pair
+    PixelBackward<double> pixel = {1 - gate.alpha, 0, 0};
+    const auto pair = Blend<TypeParam::value>::backward(pixel, gate, dL_dalpha, true);
     const double expected = opacity * std::exp(-0.1) * dL_dalpha;  // as if alpha were o G
-    // 1 / 0.99f is rounded once to double and multiplied back.
-    EXPECT_NEAR(gate_backward(gate, gate.alpha * dL_dalpha), expected, 1e-14);
+    // 1 - alpha is rounded, and T in front of the pair is a quotient by it.
+    EXPECT_NEAR(pair.power, expected, 1e-13);
+  }
+}
+
+TYPED_TEST(GateOfMode, APairThatDoesNotCountHandsBackZeroWhateverItsExponent) {
+  // An indefinite covariance (cov3D_precomp is the caller's) gives exponents without bound.
+  const auto expect_zero = [](auto power) {
+    using S = decltype(power);
+    const auto gate = evaluate_gate<TypeParam::value>(power, S(0.5), S(0));
+    ASSERT_FALSE(gate.counts);
+    PixelBackward<S> pixel = {S(0.25), S(0.2), S(0.1)};
+    const auto pair = Blend<TypeParam::value>::backward(pixel, gate, S(0.7), false);
+    EXPECT_EQ(pair.power, 0) << "power " << power;
+    EXPECT_EQ(pair.weight, 0) << "power " << power;
+    EXPECT_EQ(pixel.transmittance, S(0.25));
+    EXPECT_EQ(pixel.suffix, S(0.2));
+  };
+  for (const double power : {1.0, 100.0, 1000.0}) {
+    expect_zero(power);
+    expect_zero(static_cast<float>(power));
   }
 }
 
@@ -143,17 +164,6 @@ TEST(AlphaCut, CutsFaintPairsOutsideThreeSigmaAlone) {
   EXPECT_EQ(AlphaCut<double>(0.5, 0.255f).of(1e-9), 0.5) << "the caller's alpha_min cuts everywhere";
   EXPECT_EQ(AlphaCut<double>(0, 0).of(0.7), 0) << "Eq. 7 cuts on G alone";
   EXPECT_EQ((AlphaCut<float>(0, 0.1f).faint), static_cast<float>((AlphaCut<double>(0, 0.1).faint)));
-}
-
-TEST(Gate, APairThatDoesNotCountHandsBackZeroWhateverItsExponent) {
-  // An indefinite covariance (cov3D_precomp is the caller's) gives exponents without bound.
-  for (const double power : {1.0, 100.0, 1000.0}) {
-    const auto gate = evaluate_gate<Cut::kKernel>(power, 0.5, 0.0);
-    ASSERT_FALSE(gate.counts);
-    EXPECT_EQ(gate_backward(gate, 0.0), 0) << "power " << power;
-    const auto narrow = evaluate_gate<Cut::kKernel>(static_cast<float>(power), 0.5f, 0.0f);
-    EXPECT_EQ(gate_backward(narrow, 0.0f), 0) << "power " << power;
-  }
 }
 
 // x: mean 2, conic 3, opacity. The loss is a weighted sum of squares of o G over a few pixels.

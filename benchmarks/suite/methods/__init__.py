@@ -1,7 +1,4 @@
-"""Ways to train and render a cell: the native trainer, and public trainers' checkouts by the shape of their commands.
-
-A method is a function of a cell and a folder that returns an `Outcome`.
-"""
+"""Ways to train and render a cell: the native trainer, and public trainers' checkouts."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -11,7 +8,7 @@ import torch
 
 from ....trainer.config import TrainConfig
 from ....trainer.results.evaluation import Evaluation
-from ....trainer.scenes.scene import Scene
+from ....trainer.scenes.scene import Scene, load_scene
 from ...errors import BenchError
 from ..names import NATIVE
 from ..protocol import BYTES_PER_GAUSSIAN
@@ -19,8 +16,6 @@ from ..protocol import BYTES_PER_GAUSSIAN
 
 @dataclass
 class Outcome:
-    """What a method leaves of a cell."""
-
     scene: Scene
     evaluation: Evaluation
     lpips: List[Dict[str, Any]]  # a row {value, kind, reason} for each kind asked for
@@ -36,12 +31,10 @@ class Outcome:
 
     @property
     def common_bytes(self) -> Optional[int]:
-        """Size in the common container."""
         return self.num_gaussians * BYTES_PER_GAUSSIAN if self.are_gaussians else None
 
 
 def run(cell: Dict[str, Any], output: str) -> Outcome:
-    """Trains, renders and measures a cell in the folder `output`. Raises TrainerError."""
     if cell["method"]["name"] == NATIVE:
         from .native import run_native
 
@@ -51,8 +44,9 @@ def run(cell: Dict[str, Any], output: str) -> Outcome:
     return run_checkout(cell, output)
 
 
-def require_test_views(scene: Scene, config: TrainConfig) -> Scene:
-    """The scene. Raises BenchError, before anything is trained, where there would be nothing to measure."""
+def scene_of(config: TrainConfig) -> Scene:
+    """Raises BenchError, before anything is trained, where there would be nothing to measure."""
+    scene = load_scene(config, progress=False)
     if not scene.test:
         raise BenchError(f"scene {config.scene} has no test views: nothing could be measured")
     return scene

@@ -1,16 +1,16 @@
 """Public trainers' checkouts as methods: one class for each shape of commands.
 
 Each command runs in the checkout's folder and Python, observed by observer.py. Renderings come back as floats and are
-measured here, against this project's own ground truth, as the native trainer's are: one split, one downscaler, one set
-of metrics for all. A checkout that renders other views, or was trained on other images, is refused.
+measured here, against this project's own ground truth. A checkout that renders other views, or was trained on other
+images, is refused.
 """
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any, Dict, List, Optional, Tuple, Type
 
 import numpy as np
@@ -21,13 +21,13 @@ from ....trainer.config import TrainConfig
 from ....trainer.results.evaluation import Evaluation, summary
 from ....trainer.results.pictures import evenly_spaced
 from ....trainer.scenes.images import View
-from ....trainer.scenes.scene import Scene, load_scene
+from ....trainer.scenes.scene import Scene
 from ...errors import BenchError
+from ..cell import die_with_parent, last_line
 from ..measure import Measures
-from ..names import COUNTED_BY, RECIPE
-from ..processes import die_with_parent, last_line
+from ..names import COUNTED_BY, RECIPE, read_json
 from ..protocol import commit_of, config_of
-from . import Outcome, require_test_views
+from . import Outcome, scene_of
 
 OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py")
 # Mean difference between the trainer's ground truth and ours: rounding leaves half a grey level at the most, another
@@ -43,6 +43,7 @@ class ThreeDGS:
     render_arguments: Tuple[str, ...] = ()
     container = "point_cloud.ply"
     of_gaussians = True  # as those of 3DGS are, with SH colours
+    trains_with_arguments = True  # the method's are those of train.py
 
     def __init__(self, cell: Dict[str, Any], config: TrainConfig, output: str) -> None:
         self.cell, self.config, self.output = cell, config, os.path.abspath(output)
@@ -53,41 +54,35 @@ class ThreeDGS:
         self.arguments: List[str] = []  # of the commands that made the model
 
     def train(self) -> Dict[str, Any]:
-        """Trains; returns the observer's record."""
+        """This and `render` return the observer's record."""
         return self.command("train", self.method["path"], "train.py", *self.train_arguments())
 
     def render(self) -> Dict[str, Any]:
-        """Renders the test views; returns the observer's record."""
         return self.command("render", self.method["path"], "render.py", "-m", self.model, "--skip_train", "--quiet",
                             *self.render_arguments, renders=self.renders, observed=("--no-pictures",))
 
     def train_arguments(self) -> List[str]:
-        """What the protocol and the axes are in the trainer's words."""
         config = self.config
         words = ["-s", self.scene, "-m", self.model, *self.test_arguments(), "--iterations", config.iterations,
-                 "--save_iterations", config.iterations,
-                 "--port", 0]  # 0: a free one, since cells run side by side
+                 "--save_iterations", config.iterations, "--port", 0]  # a free one: cells run side by side
         if self.method["name"] not in COUNTED_BY:
             words += ["--densify_grad_threshold", config.densify_grad_threshold]
-        if config.resolution != -1:
-            words += ["-r", config.resolution]
-        if config.images != "images":
-            words += ["--images", config.images]
-        if config.white_background:
-            words.append("--white_background")
+        words += ["-r", config.resolution] if config.resolution != -1 else []
+        words += ["--images", config.images] if config.images != "images" else []
+        words += ["--white_background"] if config.white_background else []
         words += self.recipe_arguments()
         if self.method["variant"] != "unpatched":
             words += ["--blend_mode", config.blend_mode]
             words += ["--background_gate", config.background_gate] if config.blend_mode == "smoe" else []
-        return [str(word) for word in words] + self.own_arguments()
+        return [str(word) for word in words] + (self.method["arguments"] if self.trains_with_arguments else [])
 
     def test_arguments(self) -> List[Any]:
-        """Views are held out; none is looked at while it trains."""
         return ["--eval", "--test_iterations", -1]
 
     def recipe_arguments(self) -> List[str]:
         """What the suite says of the recipe, default of ours or not; what it does not say is the trainer's own."""
-        options = {name: value for name, value in self.recipe().items() if name != "sh_degree_interval"}
+        options = self.recipe()
+        options.pop("sh_degree_interval", None)
         if self.config.schedule == "steady":
             # Size prune and reset both wait for the interval: beyond the last iteration there is neither.
             options["opacity_reset_interval"] = self.config.iterations + 1
@@ -95,7 +90,6 @@ class ThreeDGS:
         return flags + [str(word) for name, value in options.items() for word in ("--" + name, value)]
 
     def recipe(self) -> Dict[str, Any]:
-        """The options of the recipe that the suite sets."""
         options = self.cell["protocol"]["options"]
         return {name: getattr(self.config, name) for name in RECIPE if name in options}
 
@@ -113,20 +107,13 @@ class ThreeDGS:
             rules["base_commit"] = self.method.get("base_commit") or commit_of(self.method["base"])
         return rules
 
-    def own_arguments(self) -> List[str]:
-        """What the method adds to them."""
-        return list(self.method["arguments"])
-
     def own_bytes(self) -> int:
-        """Size of what the method calls its model."""
         return size_of(os.path.join(self.model, "point_cloud", f"iteration_{self.config.iterations}", self.container))
 
     def train_seconds(self, trained: Dict[str, Any]) -> Optional[float]:
-        """Seconds of the loop."""
         return trained["loop_seconds"]
 
-    def command(self, name: str, folder: str, script: str, *words: str,
-                renders: Optional[str] = None,
+    def command(self, name: str, folder: str, script: str, *words: str, renders: Optional[str] = None,
                 observed: Tuple[str, ...] = ()) -> Dict[str, Any]:
         """Runs a script in the checkout; returns the observer's record. Raises BenchError with how it ended."""
         record = os.path.join(self.output, name + ".json")
@@ -145,11 +132,9 @@ class ThreeDGS:
         if status != 0:
             raise BenchError(f"{script} of {self.method['label']} ended with status {status}: "
                              f"{last_line(log) or 'it printed nothing'} (all of it is in {os.path.basename(log)})")
-        with open(record, encoding="utf-8") as file:
-            return json.load(file)
+        return read_json(record)
 
     def environment(self) -> Dict[str, str]:
-        """Of the commands: a patched checkout needs this package; nothing is left in the checkout's folders."""
         ours = os.environ.get("PYTHONPATH", "").split(os.pathsep)
         path = [item for item in [*self.method["pythonpath"], *ours] if item]
         environment = {name: value for name, value in os.environ.items()
@@ -158,15 +143,11 @@ class ThreeDGS:
 
 
 class Taming(ThreeDGS):
-    """Taming 3DGS: the same commands; it finds edges with torchvision while it trains."""
-
-    stubs = ()
+    stubs = ()  # it finds edges with torchvision while it trains
 
 
 class TwoDGS(ThreeDGS):
-    """2D Gaussian Splatting: the same commands; render.py also extracts meshes, with libraries that are not needed."""
-
-    stubs = (*ThreeDGS.stubs, "open3d", "trimesh", "mediapy")
+    stubs = (*ThreeDGS.stubs, "open3d", "trimesh", "mediapy")  # for meshes, which are not extracted
     render_arguments = ("--skip_mesh",)
 
 
@@ -175,6 +156,7 @@ class C3DGS(ThreeDGS):
 
     stubs = ()  # compress.py measures LPIPS
     container = "point_cloud.npz"
+    trains_with_arguments = False  # they are those of compress.py
 
     def train(self) -> Dict[str, Any]:
         self.model = os.path.join(self.output, "run", "base")
@@ -188,16 +170,11 @@ class C3DGS(ThreeDGS):
         peaks = [record["peak_gpu_mib"] for record in (trained, finished)]
         return {**trained, "peak_gpu_mib": None if None in peaks else max(peaks)}
 
-    def own_arguments(self) -> List[str]:
-        return []  # the method's are those of compress.py
-
     def train_seconds(self, trained: Dict[str, Any]) -> Optional[float]:
-        """Training, and what compress.py says of its own stages; None where it says nothing."""
         path = os.path.join(self.model, "times.json")
         if trained["loop_seconds"] is None or not os.path.isfile(path):
             return None
-        with open(path, encoding="utf-8") as file:
-            return trained["loop_seconds"] + json.load(file)["total"]
+        return trained["loop_seconds"] + read_json(path)["total"]
 
     def own_bytes(self) -> int:
         folder = os.path.join(self.model, "point_cloud")
@@ -211,8 +188,7 @@ class InOneProcess(ThreeDGS):
         return self.command("train", self.method["path"], "train.py", *self.train_arguments(), renders=self.renders)
 
     def render(self) -> Dict[str, Any]:
-        with open(os.path.join(self.output, "train.json"), encoding="utf-8") as file:
-            return json.load(file)
+        return read_json(os.path.join(self.output, "train.json"))
 
 
 class HAC(InOneProcess):
@@ -231,8 +207,7 @@ class HAC(InOneProcess):
 class DBS(InOneProcess):
     """Deformable Beta Splatting: train.py alone; the number of primitives is given (`--cap_max`), no threshold.
 
-    Its own `--eval` trains until the test views are best, and keeps that model. Here views are held out, and that is
-    all: the protocol's iterations, the last model.
+    Its own `--eval` keeps the model that is best on the test views. Here they are held out, and that is all.
     """
 
     # Of its viewer, of its compression, and one that its rasterizer imports and does not use.
@@ -252,11 +227,10 @@ SHAPES: Dict[str, Type[ThreeDGS]] = {"3dgs-2023": ThreeDGS, "3dgs-2024": ThreeDG
 
 
 def run_checkout(cell: Dict[str, Any], output: str) -> Outcome:
-    """Trains, renders and measures. Raises TrainerError."""
     if cell["method"].get("refused"):
         raise BenchError(cell["method"]["refused"])
     config = config_of(cell, output)
-    scene = require_test_views(load_scene(config, progress=False), config)
+    scene = scene_of(config)
     shape = SHAPES[cell["method"]["name"]](cell, config, output)
     for left in (shape.model, shape.renders, shape.scene):  # of an earlier attempt; these trainers do not continue one
         shutil.rmtree(left, ignore_errors=True)
@@ -291,11 +265,8 @@ def portable(words: List[str]) -> List[str]:
 
 
 def linked_scene(source: str, folder: str) -> None:
-    """Makes a folder that holds a scene: trainers write point clouds beside what they read, or over it.
-
-    Point clouds (.ply) are copied, all else is linked. So the scene stays as it is, and cells side by side do not write
-    the same file.
-    """
+    """Makes a folder that holds a scene. Trainers write point clouds beside what they read, or over it: these are
+    copied, all else is linked."""
     os.makedirs(folder)
     for name in os.listdir(source):
         path, link = os.path.abspath(os.path.join(source, name)), os.path.join(folder, name)
@@ -309,19 +280,18 @@ def linked_scene(source: str, folder: str) -> None:
 
 def matched(scene: Scene, seen: List[Dict[str, Any]], label: str) -> List[Tuple[View, Dict[str, Any]]]:
     """Our test views with the trainer's renderings. Raises BenchError where the split is not the same."""
-    by_name = {stem(row["name"]): row for row in seen}
-    expected = {stem(view.camera.name) for view in scene.test}
-    if set(by_name) != expected:
-        wrong = sorted(expected ^ set(by_name))
+    by_name = {Path(row["name"]).stem: row for row in seen}  # trainers keep folder and extension, or drop them
+    expected = {Path(view.camera.name).stem for view in scene.test}
+    wrong = sorted(expected ^ set(by_name))
+    if wrong:
         raise BenchError(f"{label} rendered {len(by_name)} test views, the split has {len(expected)} "
                          f"({', '.join(wrong[:3])}, ... are in one of them alone): another split gives other figures")
-    return [(view, by_name[stem(view.camera.name)]) for view in scene.test]
+    return [(view, by_name[Path(view.camera.name).stem]) for view in scene.test]
 
 
 def measured(pairs: List[Tuple[View, Dict[str, Any]]], measures: Measures, device: str) -> Tuple[float, Evaluation]:
     """The largest mean difference between both ground truths, and the figures. Raises BenchError beyond the limit."""
-    per_view: List[Dict[str, Any]] = []
-    largest = 0.0
+    per_view, largest = [], 0.0
     for view, seen in pairs:
         truth, theirs = view.image_float(), torch.from_numpy(np.load(seen["truth"]))
         if theirs.shape != truth.shape:
@@ -337,15 +307,8 @@ def measured(pairs: List[Tuple[View, Dict[str, Any]]], measures: Measures, devic
     return largest, summary(per_view)
 
 
-def stem(name: str) -> str:
-    """An image's name without folder and extension, which trainers keep or drop."""
-    return os.path.splitext(os.path.basename(name))[0]
-
-
 def size_of(path: str) -> int:
     """Bytes of a file, or of all files in a folder. Raises BenchError where it is absent."""
-    if os.path.isfile(path):
-        return os.path.getsize(path)
-    if not os.path.isdir(path):
+    if not os.path.exists(path):
         raise BenchError(f"{path}: no such file; the trainer left no model there")
-    return sum(os.path.getsize(os.path.join(folder, name)) for folder, _, names in os.walk(path) for name in names)
+    return sum(file.stat().st_size for file in [Path(path), *Path(path).rglob("*")] if file.is_file())

@@ -1,9 +1,8 @@
 """The native trainer as a method of the harness."""
 from __future__ import annotations
 
-import json
 import os
-from typing import Any, Dict, List
+from typing import Any, Dict
 
 import torch
 
@@ -14,14 +13,14 @@ from ....trainer.results.evaluation import evaluate
 from ....trainer.results.modelfile import model_path
 from ....trainer.results.pictures import evenly_spaced
 from ....trainer.results.rows import read_results
-from ....trainer.scenes.scene import load_scene
 from ....trainer.system import torchrun
 from ....trainer.system.process import set_up_process
 from ....trainer.training.checkpoint import CHECKPOINT_NAME
 from ....trainer.training.loop import HISTORY_NAME, train
 from ..measure import Measures
+from ..names import read_json
 from ..protocol import config_of
-from . import Outcome, require_test_views
+from . import Outcome, scene_of
 
 
 def run_native(cell: Dict[str, Any], output: str) -> Outcome:
@@ -33,13 +32,13 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     if on_gpu:
         torch.cuda.reset_peak_memory_stats()
     continued = os.path.isfile(os.path.join(folder, CHECKPOINT_NAME))
-    scene = require_test_views(load_scene(config, progress=False), config).to(config.device)
+    scene = scene_of(config).to(config.device)
     gpus = cell["protocol"].get("gpus", 1)
     row = train_on(gpus, config) if gpus > 1 else train(config, resume=True, progress=False, scene=scene)
     # The peak of a part of the training would be taken for that of the whole.
     peak = torch.cuda.max_memory_allocated() / 2**20 if on_gpu and gpus == 1 and not continued else None
     measures = Measures(config.device, cell["protocol"]["lpips"])  # after the peak, of which its networks are no part
-    ply = model_path(folder, config.iterations)
+    ply, history = model_path(folder, config.iterations), os.path.join(folder, HISTORY_NAME)
     renderer = open_renderer(config, ply, config.blend_mode, config.device)
     evaluation = evaluate(renderer, scene.test, config.device, measure=measures)
     renders = {}
@@ -49,16 +48,14 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
             renders[camera.name] = renderer(camera).color.cpu()
     return Outcome(scene=scene, evaluation=evaluation, lpips=measures.lpips_of(evaluation.metrics),
                    num_gaussians=row["num_gaussians"], own_bytes=os.path.getsize(ply),
-                   train_seconds=row["train_seconds"], peak_gpu_mib=peak, history=_history(folder), renders=renders,
+                   train_seconds=row["train_seconds"], peak_gpu_mib=peak, renders=renders,
+                   history=read_json(history) if os.path.isfile(history) else [],
                    notes={"continued": continued, "scale_recipe": cell["protocol"]["scale_recipe"],
                           "background_gate": row["background_gate"], **({"gpus": gpus} if gpus > 1 else {})})
 
 
 def train_on(gpus: int, config: TrainConfig) -> Dict[str, Any]:
-    """Trains in as many processes, continuing where an earlier attempt stopped; returns the run's row.
-
-    Raises TrainerError where one of them fails; what they printed says why.
-    """
+    """Trains in as many processes, continuing an earlier attempt; returns the run's row. Raises TrainerError."""
     os.makedirs(config.output, exist_ok=True)
     if not holds_run(config.output):
         config.save(config.output)
@@ -66,11 +63,3 @@ def train_on(gpus: int, config: TrainConfig) -> Dict[str, Any]:
     if status != 0:
         raise TrainerError(f"the training on {gpus} GPUs ended with status {status}; log.txt says why")
     return read_results(config.output)[0]
-
-
-def _history(folder: str) -> List[Dict[str, Any]]:
-    path = os.path.join(folder, HISTORY_NAME)
-    if not os.path.isfile(path):
-        return []
-    with open(path, encoding="utf-8") as file:
-        return json.load(file)

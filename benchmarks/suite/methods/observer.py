@@ -2,12 +2,12 @@
 
     python observer.py RECORD.json --seed N --iterations N [--renders FOLDER] ... -- SCRIPT ARGUMENT...
 
-It runs in the trainer's own Python and imports nothing of this project. What it relies on is the interface that the
-trainers have in common: they seed with constants, show their loop as a tqdm bar over the iterations, and render by
+It runs in the trainer's own Python and imports nothing of this project. It relies on what the trainers have in common:
+they seed with constants, show their loop as a tqdm bar over the iterations, and render by
 `gaussian_renderer.render(view, model, ...)["render"]` (HAC after `prefilter_voxel`) or `model.render(view)["render"]`.
 
-RECORD.json: loop_seconds, peak_gpu_mib (up to where the bar of a training is closed), num_gaussians, views [{name,
-milliseconds, file, truth}]. The files of the renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
+RECORD.json: loop_seconds, peak_gpu_mib, num_gaussians, views [{name, milliseconds, file, truth}]. The files of the
+renderings are arrays [3, H, W] of float32, unclamped, in FOLDER.
 """
 import argparse
 import importlib.abc
@@ -23,8 +23,8 @@ import types
 WARM_UPS = 2
 
 
-def main(argv=None):
-    words = list(sys.argv[1:] if argv is None else argv)
+def main():
+    words = sys.argv[1:]
     split = words.index("--")
     parser = argparse.ArgumentParser()
     parser.add_argument("record")
@@ -37,14 +37,17 @@ def main(argv=None):
     parser.add_argument("--model-renders", metavar="ATTRIBUTE")
     options = parser.parse_args(words[:split])
     script, arguments = words[split + 1], words[split + 2:]
-    sys.argv = [script] + arguments
+    sys.argv = [script, *arguments]
     sys.path[0] = os.path.dirname(os.path.abspath(script))
     import torch
 
     for name in filter(None, options.stub.split(",")):  # after torch, as the trainers import them
         stub(name)
-    if options.no_pictures:
-        write_no_pictures()
+    if options.no_pictures:  # what is rendered is kept as floats, and torchvision may be absent
+        stub("torchvision")
+        import torchvision.utils
+
+        torchvision.utils.save_image = lambda *arguments, **keywords: None
     shift_seeds(options.seed)
     views = watch_renderings(options.renders) if options.renders and not options.model_renders else {}
     scenes = watch_scenes(options.hold_out) if options.model_renders else []
@@ -55,10 +58,9 @@ def main(argv=None):
             views.update(renderings_of(scenes[-1], options.model_renders, options.renders))
     finally:
         peak = torch.cuda.max_memory_allocated() / 2 ** 20 if torch.cuda.is_available() else None
-        record = {"loop_seconds": bar.get("seconds"), "peak_gpu_mib": bar.get("peak", peak),
-                  "num_gaussians": views.pop("num_gaussians", None), "views": list(views.values())}
         with open(options.record, "w") as file:
-            json.dump(record, file)
+            json.dump({"loop_seconds": bar.get("seconds"), "peak_gpu_mib": bar.get("peak", peak),
+                       "num_gaussians": views.pop("num_gaussians", None), "views": list(views.values())}, file)
 
 
 def synchronise():
@@ -69,7 +71,7 @@ def synchronise():
 
 
 def shift_seeds(seed):
-    """Every seed that the script sets becomes the seed plus this one: the trainers fix theirs to 0."""
+    """Adds this one to every seed that the script sets: the trainers fix theirs to 0."""
     import numpy
     import torch
 
@@ -81,10 +83,7 @@ def shift_seeds(seed):
 
 
 def watch_loop(iterations, views):
-    """Times the bar over so many iterations, from where it is made to where it is closed; returns where that goes.
-
-    Where the bar of the final rendering begins, earlier entries of `views` go: HAC renders training views on the way.
-    """
+    """Times the bar over so many iterations; returns where that goes."""
     import torch
     import tqdm
 
@@ -94,7 +93,7 @@ def watch_loop(iterations, views):
         def __init__(self, *arguments, **keywords):
             super().__init__(*arguments, **keywords)
             words = getattr(self, "desc", "")  # a bar that is disabled has none
-            if words.startswith("Rendering progress"):
+            if words.startswith("Rendering progress"):  # the final one; HAC renders training views on the way
                 views.clear()
             self.counted = self.total == iterations
             self.trains = self.counted or words.startswith("Training progress")
@@ -115,8 +114,7 @@ def watch_loop(iterations, views):
     return found
 
 
-def timed(function, arguments, keywords):
-    """(result, seconds)"""
+def timed(function, *arguments, **keywords):
     synchronise()
     began = time.perf_counter()
     result = function(*arguments, **keywords)
@@ -125,21 +123,19 @@ def timed(function, arguments, keywords):
 
 
 def keep(folder, number, view, image, seconds):
-    """Writes a rendering and its ground truth; returns the record's entry."""
     import numpy
 
     os.makedirs(folder, exist_ok=True)
-    files = [os.path.join(folder, f"{kind}_{number}.npy") for kind in ("render", "truth")]
-    for path, kept in zip(files, (image, view.original_image[:3])):
+    files = {kind: os.path.join(folder, f"{kind}_{number}.npy") for kind in ("file", "truth")}
+    for path, kept in zip(files.values(), (image, view.original_image[:3])):
         numpy.save(path, kept.detach().float().cpu().numpy())
-    return {"name": view.image_name, "milliseconds": 1000 * seconds, "file": files[0], "truth": files[1]}
+    return {"name": view.image_name, "milliseconds": 1000 * seconds, **files}
 
 
 def watch_scenes(hold_out):
-    """Keeps every scene.Scene that is made; with hold_out the split is made as `--eval` makes it, and only that.
+    """Keeps every scene.Scene that is made; with hold_out the split is made as `--eval` makes it.
 
-    Where `--eval` does more (Deformable Beta Splatting then chooses its model and its last iteration on the test
-    views), the split is wanted without the rest.
+    Only that: Deformable Beta Splatting then also chooses its model and its last iteration on the test views.
     """
     import scene
 
@@ -159,7 +155,6 @@ def watch_scenes(hold_out):
 
 
 def renderings_of(scene, attribute, folder):
-    """The record's entries of the test views, rendered by the scene's model itself: model.render(view)["render"]."""
     import torch
 
     model, views, found = getattr(scene, attribute), scene.getTestCameras(), {}
@@ -167,7 +162,7 @@ def renderings_of(scene, attribute, folder):
         for view in views[:WARM_UPS]:
             model.render(view)
         for number, view in enumerate(views):
-            result, seconds = timed(model.render, (view,), {})
+            result, seconds = timed(model.render, view)
             found[view.image_name] = keep(folder, number, view, result["render"], seconds)
     found["num_gaussians"] = len(model.get_xyz)
     return found
@@ -187,7 +182,7 @@ def watch_renderings(folder):
         for _ in range(0 if pending["warm"] else WARM_UPS):
             render(view, model, *arguments, **keywords)
         pending["warm"] = True
-        result, seconds = timed(render, (view, model) + arguments, keywords)
+        result, seconds = timed(render, view, model, *arguments, **keywords)
         number = numbers.setdefault(view.image_name, len(numbers))
         found[view.image_name] = keep(folder, number, view, result["render"], seconds + pending["seconds"])
         pending["seconds"] = 0.0
@@ -203,19 +198,11 @@ def watch_renderings(folder):
                 return prefilter(*arguments, **keywords)
             if not pending["warm"]:
                 prefilter(*arguments, **keywords)
-            result, pending["seconds"] = timed(prefilter, arguments, keywords)
+            result, pending["seconds"] = timed(prefilter, *arguments, **keywords)
             return result
 
         gaussian_renderer.prefilter_voxel = prefiltered
     return found
-
-
-def write_no_pictures():
-    """torchvision's save_image does nothing: what is rendered is kept as floats, and torchvision may be absent."""
-    stub("torchvision")
-    import torchvision.utils
-
-    torchvision.utils.save_image = lambda *arguments, **keywords: None
 
 
 class Absent(types.ModuleType):
@@ -233,15 +220,12 @@ class Absent(types.ModuleType):
 
 
 class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds one module and all below it, as Absents."""
-
     def __init__(self, name):
         self.name = name
 
     def find_spec(self, fullname, path=None, target=None):
-        if fullname.partition(".")[0] == self.name:
-            return importlib.machinery.ModuleSpec(fullname, self, is_package=True)
-        return None
+        ours = fullname.partition(".")[0] == self.name
+        return importlib.machinery.ModuleSpec(fullname, self, is_package=True) if ours else None
 
     def create_module(self, spec):
         return Absent(spec.name)
@@ -251,10 +235,7 @@ class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def stub(name):
-    """Lets a module be imported that this Python lacks, or has and cannot import: turtle without tkinter is one.
-
-    It is imported here, if it is there: nothing else tells whether it can be.
-    """
+    """Lets a module be imported that this Python lacks, or has and cannot import: turtle without tkinter is one."""
     try:
         importlib.import_module(name)
     except (Exception, SystemExit):  # of whatever kind: the module is not needed

@@ -1,30 +1,29 @@
 """What `dsmoe bench report` writes of a folder of results: tables, figures, images and a page.
 
-groups.py averages rows; layouts.py says which tables there are and tables.py writes them; curves.py draws; images.py
-collects images; page.html and .css are the page. paper.json holds the paper's printed figures.
+groups.py averages rows; layouts.py says which tables there are; table.* and page.* are their texts. paper.json holds
+the paper's printed figures.
 """
 from __future__ import annotations
 
 import base64
-import json
 import os
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple, Sequence
+from typing import Any, Dict, List, Sequence
 
 import jinja2
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from ....trainer.system.output_folder import Record, make_folder, own_record, write_record
-from ..names import CELLS_FOLDER, SUITE_NAME
-from ..rows import ReportError, Row, of_one_protocol, read_rows
-from .curves import Picture, draw_all
-from .groups import at_once, grouped, is_alone, safe_name, some
+from ..names import CELLS_FOLDER, SUITE_NAME, read_json
+from ..rows import ReportError, Row, at_once, of_one_protocol, read_rows
+from .curves import draw_all
+from .groups import grouped, is_alone, safe_name, some
 from .images import ERROR_COLORS, ERROR_FULL_SCALE, collect
-from .layouts import commits, end_of, read_paper, tables_of
-from .tables import Table, to_csv, to_latex, to_markdown
+from .layouts import commits, end_of, tables_of
+from .tables import to_text
 
 __all__ = ["ReportError", "report"]
 
@@ -32,28 +31,14 @@ PAGE_NAME = "index.html"
 COMMAND = "dsmoe bench report"
 MOST_ABSENT = 3  # cells without a row that are named
 NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
-                "continued", "arguments", "background_gate")  # of one cell, or said otherwise
-
-
-class Section(NamedTuple):
-    """What the page shows of one suite."""
-
-    suite: str
-    id: str  # in the page
-    counts: str
-    tables: List[Table]
-    pictures: List[Picture]
-    images: List[Dict[str, Any]]
-    no_images: str  # why, where there are none
-    protocols: List[Dict[str, Any]]
+                "continued", "arguments", "background_gate", "budget")  # of one cell, or said otherwise
 
 
 def report(results: str, output: str) -> str:
-    """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT.
+    """Writes the report of RESULTS (a folder, or one .jsonl of rows) into the folder OUTPUT; returns the page's path.
 
-    OUTPUT/index.html, report.md, tables/, figures/, images/; an earlier report there is replaced once the new one is
-    made. Returns the page's path. Raises ReportError where there are no rows, where a row is damaged or where rows
-    cannot be compared, TrainerError where nothing can be written in OUTPUT or where there is something else.
+    An earlier report there is replaced once the new one is made. Raises ReportError where there are no rows, where a
+    row is damaged or where rows cannot be compared, TrainerError where OUTPUT cannot be written or has something else.
     """
     rows = read_rows(results)
     make_folder(output)
@@ -69,61 +54,49 @@ def report(results: str, output: str) -> str:
     return os.path.join(output, PAGE_NAME)
 
 
-def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Section:
-    """Writes what a report has of one suite, but for its part of the page."""
-    paper = read_paper()
+def _section(results: str, suite: str, rows: Sequence[Row], output: str) -> Dict[str, Any]:
+    """What the page shows of one suite; its tables, figures and images are written."""
     absent = _absent(results, suite, rows)
     rows, left_out = of_one_protocol(rows)
-    tables = tables_of(suite, rows, paper)
+    tables = tables_of(suite, rows)
     for table in tables:
-        for form, text in (("md", to_markdown(table)), ("csv", to_csv(table)), ("tex", to_latex(table))):
-            _write(output, os.path.join("tables", f"{table.name}.{form}"), text)
+        for form in ("md", "csv", "tex"):
+            _write(output, os.path.join("tables", f"{table.name}.{form}"), to_text(table, form))
     pictures = draw_all(suite, grouped(rows, end_of), os.path.join(output, "figures"))
     images = collect(results, suite, rows, output)
     here = any(os.path.isdir(os.path.join(results, CELLS_FOLDER, row["cell"])) for row in rows)
     no_images = "No images: the suite asked for none." if here else "No images: rows of another folder."
-    counts = "; ".join([_counts(rows) + absent, *left_out])
-    return Section(suite, safe_name(suite), counts, tables, pictures, images, no_images, _protocols(rows))
+    numbers = [_number(len({row[of] for row in rows}), of) for of in ("cell", "scene", "seed")]
+    counts = "{} on {}, {}; {} failed".format(*numbers, sum(not row["ok"] for row in rows) or "none") + absent
+    return {"suite": suite, "id": safe_name(suite), "counts": "; ".join([counts, *left_out]), "tables": tables,
+            "pictures": pictures, "images": images, "no_images": no_images, "protocols": _protocols(rows)}
 
 
-def _page(sections: Sequence[Section], measured_with: Sequence[str]) -> str:
-    """The static page: figures inside it and images beside it; it needs no network."""
-    def data_url(path: str) -> str:
-        with open(path, "rb") as file:
-            return "data:image/svg+xml;base64," + base64.b64encode(file.read()).decode("ascii")
-
-    folder = os.path.dirname(os.path.abspath(__file__))
-    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True, trim_blocks=True,
-                                     lstrip_blocks=True, keep_trailing_newline=True,
+def _page(sections: Sequence[Dict[str, Any]], measured_with: Sequence[str]) -> str:
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
+                                     trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
                                      undefined=jinja2.StrictUndefined)
-    environment.filters["data_url"] = data_url
+    environment.filters["data_url"] = lambda path: (
+        "data:image/svg+xml;base64," + base64.b64encode(Path(path).read_bytes()).decode("ascii"))
     scale = ", ".join(to_hex(colormaps[ERROR_COLORS](step / 8)) for step in range(9))
     return environment.get_template("page.html").render(
         generator=COMMAND, sections=sections, commits=measured_with, error_scale=scale,
         error_full=f"{ERROR_FULL_SCALE:g}")
 
 
-def _markdown(sections: Sequence[Section]) -> str:
-    """All tables and figures as one page for code hosts."""
+def _markdown(sections: Sequence[Dict[str, Any]]) -> str:
     parts = ["# Benchmark report\n"]
     for section in sections:
-        parts.append(f"## {section.suite}\n\n{section.counts}.\n")
-        parts += map(to_markdown, section.tables)
-        parts += [f"![{picture.alt}](figures/{picture.name}.png)\n" for picture in section.pictures]
+        parts.append(f"## {section['suite']}\n\n{section['counts']}.\n")
+        parts += [to_text(table, "md") for table in section["tables"]]
+        parts += [f"![{picture.alt}](figures/{picture.name}.png)\n" for picture in section["pictures"]]
     return "\n".join(parts)
 
 
 def _write(folder: str, name: str, text: str) -> None:
-    path = os.path.join(folder, name)
-    os.makedirs(os.path.dirname(path), exist_ok=True)
-    with open(path, "w", encoding="utf-8") as file:
-        file.write(text)
-
-
-def _counts(rows: Sequence[Row]) -> str:
-    failed = sum(not row["ok"] for row in rows)
-    numbers = [_number(len({row[of] for row in rows}), of) for of in ("cell", "scene", "seed")]
-    return "{} on {}, {}; {} failed".format(*numbers, failed or "none")
+    path = Path(folder, name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 def _number(count: int, of: str) -> str:
@@ -131,36 +104,34 @@ def _number(count: int, of: str) -> str:
 
 
 def _absent(results: str, suite: str, rows: Sequence[Row]) -> str:
-    """Which cells of the suite have no row yet, where RESULTS is a folder that lists its cells."""
     try:
-        with open(os.path.join(results, SUITE_NAME), encoding="utf-8") as file:
-            said = json.load(file)
+        said = read_json(Path(results, SUITE_NAME))
         cells = said["cells"] if said["name"] == suite else []
         absent = sorted(set(cells) - {row["cell"] for row in rows})
     except (OSError, ValueError, KeyError, TypeError):
         return ""
     if not absent:
         return ""
-    return f"; {len(absent)} of {_number(len(cells), 'cell')} {'has' if len(absent) == 1 else 'have'} no row yet: " \
-           f"{some(absent, MOST_ABSENT)}"
+    has = "has" if len(absent) == 1 else "have"
+    return f"; {len(absent)} of {_number(len(cells), 'cell')} {has} no row yet: {some(absent, MOST_ABSENT)}"
 
 
 def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
-    """Of every scene: what its rows say of their protocol, once."""
     measured = [row for row in rows if row["ok"]]
     found = []
     for scene in sorted({row["scene"] for row in measured}):
-        here, rules = [row for row in measured if row["scene"] == scene], {}
+        here = [row for row in measured if row["scene"] == scene]
+        rules: Dict[str, Dict[str, None]] = {}  # of each the values, as a set in order
         for row in here:
             said = {name: value for name, value in (row.get("protocol") or {}).items() if name not in NOT_PROTOCOL}
             said.update(iterations=row.get("iterations"), schedules=row.get("schedule") or "the method's own")
             for name, value in said.items():
-                values = rules.setdefault(name.replace("_", " "), [])
-                if value is not None and _plain(name, value) not in values:
-                    values.append(_plain(name, value))
+                values = rules.setdefault(name.replace("_", " "), {})
+                values.update({} if value is None else {_plain(name, value): None})
         beside = [at_once(row) for row in here if not is_alone(row)]
         if beside:
-            rules["cells that shared their GPU or CPU"] = [f"{len(beside)} of {len(here)}, up to {max(beside)} at once"]
+            words = f"{len(beside)} of {len(here)}, up to {max(beside)} at once"
+            rules["cells that shared their GPU or CPU"] = {words: None}
         found.append({"scene": scene, "rules": {name: "; ".join(values) for name, values in sorted(rules.items())}})
     return found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from typing import Dict, List, NamedTuple, Sequence, Tuple
+from typing import Dict, List, NamedTuple, Sequence
 
 import matplotlib
 
@@ -33,26 +33,27 @@ LEGEND_MARK, LEGEND_LETTER = 0.85, 0.082  # what a mark, and a letter of its lab
 
 
 class Picture(NamedTuple):
-    """A figure's file, an SVG with a PNG beside it, and what it shows in words."""
-
-    name: str
+    name: str  # of its files
     title: str
-    alt: str
-    path: str
+    alt: str  # what it shows, in words
+    path: str  # of the SVG, which has a PNG beside it
 
 
 def draw_all(suite: str, groups: Sequence[Group], folder: str) -> List[Picture]:
-    """Draws a figure for every scene of a suite into a folder."""
     pictures = []
     for scene in sorted({group.scene for group in groups}):
         shown = [group for group in groups if group.scene == scene and group.rows]
+        name, title = safe_name(f"{suite}-{scene}-rd"), f"{scene}: quality against number of Gaussians and size"
+        modes = "; ".join(dict.fromkeys(group.setting.label() for group in shown))
+        path = os.path.join(folder, f"{name}.svg")
         with plt.rc_context(STYLE):
             drawn = rate_distortion(shown)
             if drawn is not None:
-                name, title = safe_name(f"{suite}-{scene}-rd"), f"{scene}: quality against number of Gaussians and size"
-                modes = "; ".join(dict.fromkeys(group.setting.label() for group in shown))
-                pictures.append(Picture(name, title, f"{title} of {modes}; the figures are in the tables",
-                                        save(drawn, folder, name)))
+                os.makedirs(folder, exist_ok=True)
+                drawn.savefig(path, metadata={"Date": None})
+                drawn.savefig(os.path.join(folder, f"{name}.png"), dpi=130)
+                plt.close(drawn)
+                pictures.append(Picture(name, title, f"{title} of {modes}; the figures are in the tables", path))
     return pictures
 
 
@@ -69,10 +70,9 @@ def rate_distortion(groups: Sequence[Group]):
     for line, quality in zip(axes, qualities):
         for axis, amount in zip(line, amounts):
             for series, look in looks.items():
-                members = [group for group in groups if group.setting.series == series
-                           and _drawn(group, quality) and _drawn(group, amount)]
-                points = sorted(((group.measured(amount).value, *group.measured(quality)[:2]) for group in members),
-                                key=lambda point: point[0])
+                points = sorted(((group.measured(amount).value, *group.measured(quality)[:2]) for group in groups
+                                 if group.setting.series == series and _drawn(group, quality)
+                                 and _drawn(group, amount)), key=lambda point: point[0])
                 if points:
                     xs, ys, spreads = zip(*points)
                     axis.errorbar(xs, ys, yerr=[math.nan if spread is None else spread for spread in spreads],
@@ -102,12 +102,17 @@ def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
     alpha, in front of the other blends', are hollow.
     """
     looks: Dict[Setting, Dict[str, object]] = {}
-    styles = _styles(groups)
-    kinds = list(dict.fromkeys(series.pair for series in styles))
+    found = sorted({group.setting.series for group in groups}, key=Setting.order)
+    kinds = list(dict.fromkeys(series.pair for series in found))
+    blends = list(dict.fromkeys(["alpha", "smoe", *sorted(series.blend for series in found)]))
+    marks = {**dict(zip((blend for blend in blends if blend not in MARKS), itertools.cycle(OTHER_MARKS))), **MARKS}
     smaller = min(2, (LARGEST_MARK - MARK) / max(1, len(kinds) - 1))
-    for series, (color, (mark, dash)) in styles.items():
+    for series in found:
+        mark, dash = marks[series.blend]
         points = sum(group.setting.series == series for group in groups)
         hollow, place = series.blend == "alpha", kinds.index(series.pair)
+        # The blends of one method take neighbouring colours.
+        color = COLORS[(place * len(blends) + blends.index(series.blend)) % len(COLORS)]
         looks[series] = {"color": color, "marker": mark, "markersize": MARK + smaller * (len(kinds) - 1 - place),
                          "markerfacecolor": "none" if hollow else color, "markeredgewidth": 1.5,
                          "linestyle": dash if points > 2 else "", "zorder": 3 + place + 0.5 * hollow}
@@ -115,24 +120,12 @@ def _looks(groups: Sequence[Group]) -> Dict[Setting, Dict[str, object]]:
 
 
 def _drawn(group: Group, name: str) -> bool:
-    """Whether the figure has a place on an axis: one of amounts may be logarithmic."""
     mean = group.measured(name).value
     return mean is not None and math.isfinite(mean) and (mean > 0 or name not in AMOUNTS)
 
 
-def _styles(groups: Sequence[Group]) -> Dict[Setting, Tuple[str, Tuple[str, str]]]:
-    """Of every series: a colour, and mark and line of its blend."""
-    found = sorted({group.setting.series for group in groups}, key=Setting.order)
-    kinds = list(dict.fromkeys(series.pair for series in found))
-    blends = list(dict.fromkeys(["alpha", "smoe", *sorted(series.blend for series in found)]))
-    marks = {**dict(zip((blend for blend in blends if blend not in MARKS), itertools.cycle(OTHER_MARKS))), **MARKS}
-    # The blends of one method take neighbouring colours.
-    return {series: (COLORS[(kinds.index(series.pair) * len(blends) + blends.index(series.blend)) % len(COLORS)],
-                     marks[series.blend]) for series in found}
-
-
 def legend(drawn: Figure, handles: Sequence[object]) -> None:
-    """Puts a legend above the panels, in a strip that makes the figure higher."""
+    """Above the panels, in a strip that makes the figure higher."""
     widest = LEGEND_MARK + LEGEND_LETTER * max(len(handle.get_label()) for handle in handles)
     columns = max(1, min(len(handles), int(drawn.get_figwidth() // widest)))
     lines = -(-len(handles) // columns)
@@ -140,13 +133,3 @@ def legend(drawn: Figure, handles: Sequence[object]) -> None:
     drawn.set_figheight(drawn.get_figheight() + height)
     drawn.tight_layout(rect=(0, 0, 1, 1 - height / drawn.get_figheight()))
     drawn.legend(handles=handles, loc="upper center", ncols=columns, handlelength=3)
-
-
-def save(drawn: Figure, folder: str, name: str) -> str:
-    """Writes NAME.svg and NAME.png, and closes the figure; returns the SVG's path."""
-    os.makedirs(folder, exist_ok=True)
-    path = os.path.join(folder, f"{name}.svg")
-    drawn.savefig(path, metadata={"Date": None})
-    drawn.savefig(os.path.join(folder, f"{name}.png"), dpi=130)
-    plt.close(drawn)
-    return path

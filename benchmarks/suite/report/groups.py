@@ -9,7 +9,7 @@ from typing import Callable, Dict, Iterable, List, NamedTuple, Optional, Sequenc
 from ....settings import BLEND_MODES
 from ....trainer.config import LEARNED
 from ..names import blend_of
-from ..rows import ReportError, Row
+from ..rows import ReportError, Row, at_once
 
 PAPER_ITERATIONS, PAPER_SCHEDULE = 30000, "3dgs"
 MILLION = 1e6
@@ -21,8 +21,6 @@ LPIPS = "lpips:"  # the figure's name goes on with its kind, such as lpips_alex
 
 
 class Setting(NamedTuple):
-    """What a cell varies, except the scene and the seed."""
-
     method: str
     name: str  # the method's label in the suite: it tells apart what the other fields do not
     variant: Optional[str]
@@ -45,25 +43,19 @@ class Setting(NamedTuple):
 
     @property
     def mode(self) -> str:
-        """The blend mode, whatever the gate."""
         return self.blend.partition(" ")[0]
 
-    @property
-    def source(self) -> str:
-        """The method's label, which says where a checkout is unpatched or fused."""
-        told = self.variant in (None, "native", "patched") or self.variant in self.name
-        return self.name if told else f"{self.name}-{self.variant}"
-
     def label(self, blend: bool = True) -> str:
-        """Such as "native, smoe, steady"."""
-        words = [self.source] + [self.blend] * blend
+        """Such as "native, smoe, steady"; it says where a checkout is unpatched or fused."""
+        told = self.variant in (None, "native", "patched") or self.variant in self.name
+        words = [self.name if told else f"{self.name}-{self.variant}"] + [self.blend] * blend
         words += [self.schedule] if self.schedule not in (None, PAPER_SCHEDULE) else []
         words += ["fixed number"] if self.budget is not None else []
         words += [f"{self.iterations:,} iterations"] if self.iterations not in (None, PAPER_ITERATIONS) else []
         return ", ".join(words)
 
     def amount(self) -> str:
-        """What is varied along a curve, such as "0.005"."""
+        """What is varied along a curve."""
         if self.budget is not None:
             return f"{self.budget:,} Gaussians"
         return DASH if self.threshold is None else f"{self.threshold:g}"
@@ -85,41 +77,37 @@ class Cell(NamedTuple):
     printed: str = ""
 
     def shown(self, digits: int, signed: bool = False, plus_minus: str = " ± ") -> str:
-        """As tables show it."""
-        if self.printed:
-            return self.printed
-        if self.value is None:
-            return self.text or DASH
+        if self.printed or self.value is None:
+            return self.printed or self.text or DASH
         value = round(self.value, digits) + 0.0  # no "-0.00"
         spread = "" if self.spread is None else f"{plus_minus}{self.spread:,.{digits}f}"
         return f"{value:{'+' if signed and value else ''},.{digits}f}{spread}"
 
     def unrounded(self) -> str:
-        """The number, a whole one without ".0"; the text in its place."""
         if self.printed or self.value is None:
             return self.printed or self.text
         return str(int(self.value)) if float(self.value).is_integer() else repr(self.value)
 
 
 class Group:
-    """The cells of one setting on one scene: one row for each seed."""
-
-    def __init__(self, setting: Setting, scene: str, rows: Iterable[Row]):
+    def __init__(self, setting: Setting, scene: str, rows: Sequence[Row]):
         self.setting, self.scene = setting, scene
-        self.rows, self.failed = [], []
-        for row in rows:
-            (self.rows if row["ok"] else self.failed).append(row)
+        self.rows, self.failed = ([row for row in rows if row["ok"] is ok] for ok in (True, False))
         self.by_seed = {row["seed"]: row for row in self.rows}
         self.figures = {seed: figures_of(row) for seed, row in self.by_seed.items()}
 
     def dataset(self, datasets: Dict[str, Sequence[str]]) -> Optional[str]:
-        """The data set that the scene is of: as its rows say, else the one that has a scene of this name."""
+        """The one that the rows name, else the one that has a scene of this name."""
         named = next((dataset for dataset, scenes in datasets.items() if self.scene in scenes), None)
         return (self.rows + self.failed)[0].get("dataset", named)
 
     def measured(self, name: str) -> Cell:
-        """The figure's mean and spread over seeds."""
         return over([self], name, lambda figures: figures[0])
+
+    def measured_or_failed(self, names: Sequence[str]) -> List[Cell]:
+        """Those of several figures; where no seed has any, PSNR's place says so."""
+        failed = bool(self.failed and not self.rows)
+        return [Cell(text="failed") if failed and name == "psnr" else self.measured(name) for name in names]
 
     def seeds(self) -> str:
         """How many seeds the figures are of, such as "3", or "2 of 3" where one failed."""
@@ -127,8 +115,7 @@ class Group:
 
 
 def figures_of(row: Row) -> Dict[str, float]:
-    """What was measured of a row that is ok, by name: fields; size_own_mb, size_common_mb, num_gaussians_m,
-    learned_gate; lpips:KIND. Times of a cell that shared its machine are left out."""
+    """What was measured of a row that is ok, by name. Times of a cell that shared its machine are left out."""
     size = row.get("size_bytes") or {}
     millions = {"num_gaussians_m": row.get("num_gaussians"), "size_own_mb": size.get("own"),
                 "size_common_mb": size.get("common")}
@@ -142,19 +129,11 @@ def figures_of(row: Row) -> Dict[str, float]:
     return {name: value for name, value in found.items() if value is not None and (name not in TIMES or is_alone(row))}
 
 
-def at_once(row: Row) -> int:
-    """How many cells may have been at work at once on the row's GPU or CPU."""
-    machine = row.get("machine") or {}
-    return max(machine.get("cells_per_gpu") or 1, machine.get("cells_at_once") or 1)
-
-
 def is_alone(row: Row) -> bool:
-    """Whether no other cell may have been at work on the row's GPU or CPU."""
     return at_once(row) == 1
 
 
 def device_of(row: Row) -> Optional[str]:
-    """What the row was measured on, such as "NVIDIA H200"."""
     return (row.get("machine") or {}).get("device")
 
 
@@ -165,21 +144,16 @@ def lpips_figures(groups: Iterable[Group]) -> List[str]:
 
 
 def lpips_reasons(rows: Iterable[Row]) -> List[str]:
-    """Which kinds of LPIPS are missing, and why."""
     return sorted({f"{lpips['kind']}: {lpips['reason']}" for row in rows for lpips in _lpips(row)
                    if lpips.get("value") is None and lpips.get("reason")})
 
 
 def _lpips(row: Row) -> List[Row]:
-    """What the row says of each kind of LPIPS; a suite may ask for none."""
     return [lpips for lpips in row.get("lpips_all") or [row.get("lpips")] if lpips and lpips.get("kind")]
 
 
 def grouped(rows: Iterable[Row], end_of: Callable[[Row], Optional[str]]) -> List[Group]:
-    """Groups of seeds, in the order of scene, method, schedule, threshold (the largest first), blend.
-
-    end_of says to which end of the paper's tables a row belongs. Raises ReportError.
-    """
+    """Groups of seeds, in order; end_of says to which end of the paper's tables a row belongs. Raises ReportError."""
     found: Dict[Tuple[Setting, str], Dict[int, Row]] = {}
     for row in rows:
         setting = Setting(row["method"], row.get("label") or row["method"], row.get("variant"), blend_of(row),
@@ -189,20 +163,20 @@ def grouped(rows: Iterable[Row], end_of: Callable[[Row], Optional[str]]) -> List
         if twin is not row:
             raise ReportError(f"cells {twin['cell']} and {row['cell']} have the same setting, scene and seed "
                               f"{row['seed']}; keep one, or give their methods different labels")
-    groups = [Group(setting, scene, members.values()) for (setting, scene), members in found.items()]
+    groups = [Group(setting, scene, list(members.values())) for (setting, scene), members in found.items()]
     return sorted(groups, key=lambda group: (group.scene, group.setting.order()))
 
 
 def safe_name(name: str) -> str:
-    """A name of a suite, scene or image that is a file name, a URL and an HTML id alike."""
+    """A file name, a URL and an HTML id alike."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name)
 
 
 def over(groups: Sequence[Group], name: str, combine: Callable[[List[float]], float],
          seeds: Optional[Set[int]] = None) -> Cell:
-    """Mean and spread of combine([the figure of each group]) over the seeds that all groups have it of.
+    """Mean and spread of combine([the figure of each group]) over the seeds, of these, that all groups have it of.
 
-    seeds: no others. What combine gives as NaN is left out. Times are of one machine, or there are none.
+    What combine gives as NaN is left out. Times are of one machine, or there are none.
     """
     found = [{seed for seed, figures in group.figures.items() if name in figures} for group in groups]
     common = set.intersection(*found, *([] if seeds is None else [seeds]))
@@ -218,17 +192,14 @@ def over(groups: Sequence[Group], name: str, combine: Callable[[List[float]], fl
 
 
 def difference(figures: Sequence[float]) -> float:
-    """By how much the second is larger; NaN where one is infinite."""
     first, second = figures
     return second - first if math.isfinite(first) and math.isfinite(second) else math.nan
 
 
 def ratio(figures: Sequence[float]) -> float:
-    """The second over the first; NaN where that is 0."""
     first, second = figures
     return second / first if first else math.nan
 
 
 def some(names: Sequence[str], most: int) -> str:
-    """The first of the names, and how many more there are."""
     return "; ".join([*names[:most], *([f"{len(names) - most} more"] if names[most:] else [])])

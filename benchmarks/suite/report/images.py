@@ -19,25 +19,20 @@ ERROR_COLORS = "inferno"
 
 
 def collect(results: str, suite: str, rows: Sequence[Row], output: str) -> List[Dict[str, Any]]:
-    """Writes OUTPUT/images of a suite's cells, and the errors of renderings.
-
-    Of several seeds that is shown which the most blends have images of. Returns for every scene and setting, with paths
-    relative to OUTPUT: {"title", "views": [{"name", "images": [{"label", "path"}]}]}. Raises ReportError.
-    """
+    """Writes OUTPUT/images of a suite's cells and their errors; returns what there is of every scene and setting."""
     compared: Dict[Any, List[Group]] = {}
     for group in grouped(rows, end_of):
         compared.setdefault((group.scene, group.setting.pair), []).append(group)
     found = []
     for number, ((scene, setting), groups) in enumerate(compared.items()):
         amount = "" if setting.threshold is None and setting.budget is None else f", threshold {setting.amount()}"
-        folder = f"images/{safe_name(suite)}-{number}"
-        views = _views(_folders(results, groups), output, folder)
+        views = _views(_folders(results, groups), output, f"images/{safe_name(suite)}-{number}")
         found += [{"title": f"{scene}: {setting.label(blend=False)}{amount}", "views": views}] if views else []
     return found
 
 
 def _folders(results: str, groups: Sequence[Group]) -> Dict[str, str]:
-    """The images folder of each blend that has one, of one seed."""
+    """The images folder of each blend that has one, of the seed which the most blends have images of."""
     folders: Dict[int, Dict[str, str]] = {}
     for group in groups:
         for row in group.rows:
@@ -48,7 +43,6 @@ def _folders(results: str, groups: Sequence[Group]) -> Dict[str, str]:
 
 
 def _views(folders: Dict[str, str], output: str, folder: str) -> List[Dict[str, Any]]:
-    """The views that every blend has images of."""
     names = [set(os.listdir(os.path.join(path, "render"))) for path in folders.values()]
     common = sorted(set.intersection(*names)) if names else []
     if common:
@@ -58,7 +52,6 @@ def _views(folders: Dict[str, str], output: str, folder: str) -> List[Dict[str, 
 
 
 def _images(folders: Dict[str, str], name: str, output: str, prefix: str) -> List[Dict[str, str]]:
-    """Writes the images of one view."""
     truths = {blend: _pixels(os.path.join(path, "gt", name)) for blend, path in folders.items()}
     truth = next(iter(truths.values()))
     found = {"ground truth": truth}

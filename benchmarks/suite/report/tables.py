@@ -4,11 +4,14 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+from pathlib import Path
 from typing import Dict, List, NamedTuple, Tuple
+
+import jinja2
 
 from .groups import LPIPS, Cell
 
-OURS, PAPER = "ours", "paper"
+OURS, PAPER = "ours", "paper"  # whose figures a row has
 # How a figure is headed and with how many digits it is printed.
 FIGURES: Dict[str, Tuple[str, int]] = {
     "seeds": ("seeds", 0), "psnr": ("PSNR [dB]", 2), "psnr_float": ("PSNR, floats [dB]", 2),
@@ -22,11 +25,9 @@ LPIPS_NAMES = {"lpips_alex": "LPIPS Alex", "lpips_vgg_std": "LPIPS VGG", "lpips_
 
 
 class Column(NamedTuple):
-    """A column of figures; columns of one group stand under one heading."""
-
     name: str
     digits: int
-    group: str = ""
+    group: str = ""  # the heading above it, which it shares with its neighbours
     signed: bool = False
 
     @property
@@ -35,65 +36,42 @@ class Column(NamedTuple):
 
 
 class TableRow(NamedTuple):
-    """Labels, then one cell for each column; source: OURS, or PAPER for figures that are the paper's."""
-
     labels: Tuple[str, ...]
-    cells: Tuple[Cell, ...]
+    cells: List[Cell]
     source: str = OURS
 
 
 class Table(NamedTuple):
-    """labels: the headings of the first columns."""
-
     name: str  # of its files
     title: str
-    labels: Tuple[str, ...]
-    columns: Tuple[Column, ...]
-    rows: Tuple[TableRow, ...]
-    notes: Tuple[str, ...] = ()
+    labels: Tuple[str, ...]  # the headings of the first columns
+    columns: List[Column]
+    rows: List[TableRow]
+    notes: List[str]
+
+    def without_empty_columns(self) -> Table:
+        kept = [any(cell.value is not None or cell.text for cell in column)
+                for column in zip(*(row.cells for row in self.rows))]
+        return self._replace(columns=list(itertools.compress(self.columns, kept)),
+                             rows=[row._replace(cells=list(itertools.compress(row.cells, kept))) for row in self.rows])
 
     def headings(self) -> List[Tuple[str, int]]:
-        """The groups of columns, each with its number of columns."""
         groups = itertools.groupby(self.columns, key=lambda column: column.group)
         return [(group, len(list(columns))) for group, columns in groups]
 
+    def head(self, named: str) -> List[str]:
+        return ["source", *self.labels, *(getattr(column, named) for column in self.columns)]
+
     def shown(self, row: TableRow, plus_minus: str = " ± ") -> List[str]:
-        """The figures of a row as they are shown."""
         return [cell.shown(column.digits, column.signed, plus_minus) for cell, column in zip(row.cells, self.columns)]
 
     def lines(self, plus_minus: str = " ± ") -> List[List[str]]:
-        """The words of each row: source, labels, figures."""
         return [[row.source, *row.labels, *self.shown(row, plus_minus)] for row in self.rows]
 
 
 def column(name: str, group: str = "", difference: bool = False) -> Column:
-    """The column of a figure, or of its differences."""
     heading, digits = (LPIPS_NAMES.get(name[len(LPIPS):], name), 3) if name.startswith(LPIPS) else FIGURES[name]
     return Column("Δ " + heading if difference else heading, digits, group, difference)
-
-
-def printed(text: str) -> Cell:
-    """One of the paper's figures, as printed there."""
-    return Cell(float(text), printed="0" + text if text.startswith(".") else text)
-
-
-def without_empty_columns(table: Table) -> Table:
-    """The table without the columns that no row has anything in."""
-    kept = [any(row.cells[index].value is not None or row.cells[index].text for row in table.rows)
-            for index in range(len(table.columns))]
-    return table._replace(columns=tuple(itertools.compress(table.columns, kept)),
-                          rows=tuple(row._replace(cells=tuple(itertools.compress(row.cells, kept)))
-                                     for row in table.rows))
-
-
-def to_markdown(table: Table) -> str:
-    """A heading, a Markdown table, then the notes as a list."""
-    head = ["source", *table.labels, *(column.full_name for column in table.columns)]
-    rule = ["---"] * (1 + len(table.labels)) + ["---:"] * len(table.columns)
-    lines = ["| " + " | ".join(text.replace("|", "\\|").replace("\n", " ") for text in line) + " |"
-             for line in [head, rule, *table.lines()]]
-    return "\n".join([f"### {table.title}", "", *lines, *[""] * bool(table.notes),
-                      *(f"- {note}" for note in table.notes), ""])
 
 
 PLUS_MINUS = r" $\pm$ "
@@ -102,38 +80,32 @@ SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasc
            **{sign: "\\" + sign for sign in "&%$#_{}"}}
 
 
-def to_latex(table: Table) -> str:
-    """A table for booktabs; the paper's rows are in italics and marked."""
-    lines = [r"\begin{table}", r"\centering", rf"\caption{{{_escaped(table.title)}}}",
-             rf"\begin{{tabular}}{{l{'l' * len(table.labels)}{'r' * len(table.columns)}}}", r"\toprule"]
-    if any(column.group for column in table.columns):
-        spans = [f"\\multicolumn{{{width}}}{{c}}{{{_escaped(group)}}}" for group, width in table.headings()]
-        lines.append(" & ".join([""] * (1 + len(table.labels)) + spans) + r" \\")
-    head = ["source", *table.labels, *(column.name for column in table.columns)]
-    lines += [" & ".join(map(_escaped, head)) + r" \\", r"\midrule"]
-    for row, before, texts in zip(table.rows, (None, *table.rows), table.lines(PLUS_MINUS)):
-        if before and row.labels[0] != before.labels[0]:
-            lines.append(r"\midrule")
-        command = r"\textit{%s}" if row.source == PAPER else "%s"
-        lines.append(" & ".join(command % _escaped(text) for text in texts) + r" \\")
-    lines += [r"\bottomrule", r"\end{tabular}", *(rf"\par\footnotesize {_escaped(note)}" for note in table.notes)]
-    return "\n".join([*lines, r"\end{table}", ""])
-
-
 def _escaped(text: str) -> str:
     """For LaTeX; a plus-minus in mathematics is left as it is."""
     return PLUS_MINUS.join("".join(SPECIAL.get(letter, letter) for letter in part) for part in text.split(PLUS_MINUS))
 
 
+TEXTS = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), variable_start_string="<<",
+                           variable_end_string=">>", undefined=jinja2.StrictUndefined, trim_blocks=True,
+                           lstrip_blocks=True, keep_trailing_newline=True)
+TEXTS.filters.update(tex=_escaped, md=lambda text: text.replace("|", "\\|").replace("\n", " "))
+
+
+def to_text(table: Table, form: str) -> str:
+    """form: "md", "tex" (booktabs; the paper's rows are in italics) or "csv"."""
+    return to_csv(table) if form == "csv" else TEXTS.get_template(f"table.{form}").render(
+        table=table, plus_minus=PLUS_MINUS)
+
+
 def to_csv(table: Table) -> str:
     """Figures unrounded, ours with a column of their spread wherever a row has one."""
-    spread = [any(row.cells[index].spread is not None for row in table.rows) for index in range(len(table.columns))]
-    names = [[name.full_name, f"{name.full_name} sd"][:1 + wide] for name, wide in zip(table.columns, spread)]
+    spread = [any(cell.spread is not None for cell in column) for column in zip(*(row.cells for row in table.rows))]
+    lines = [["source", *table.labels], *([row.source, *row.labels] for row in table.rows)]
+    figures = [[(name.full_name, f"{name.full_name} sd") for name in table.columns],
+               *([(cell.unrounded(), "" if cell.spread is None else repr(cell.spread)) for cell in row.cells]
+                 for row in table.rows)]
+    for line, pairs in zip(lines, figures):
+        line += [text for pair, wide in zip(pairs, spread) for text in pair[:1 + wide]]
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["source", *table.labels, *itertools.chain(*names)])
-    for row in table.rows:
-        figures = [[cell.unrounded(), "" if cell.spread is None else repr(cell.spread)][:1 + wide]
-                   for cell, wide in zip(row.cells, spread)]
-        writer.writerow([row.source, *row.labels, *itertools.chain(*figures)])
+    csv.writer(text, lineterminator="\n").writerows(lines)
     return text.getvalue()

@@ -93,7 +93,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     for (int f = 0; f < num_features_; ++f) {
       dL_dfeature(sums, f) = fma(pair.weight, scaled_of(f).load(at), dL_dfeature(sums, f));
     }
-    const P dL_dpower = Pairs::kSmooth ? pair.gamma : gate_backward(gate, pair.gamma);
+    const P dL_dpower = pair.power;
     const P by_x = dL_dpower * pairs.dx, by_y = dL_dpower * pairs.dy;
     GateMoments<P>& m = sums.moments;
     m.one = m.one + dL_dpower;

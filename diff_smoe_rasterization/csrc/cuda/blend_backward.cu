@@ -44,22 +44,22 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
   }
 };
 
-// Sums a batch by tensor cores, and gives the sums of its first `count` Gaussians to the sink. kRecord: numbers of a
-// record.
+// Sums a batch by tensor cores, and gives the sums of its `count` Gaussians to the sink. kRecord: numbers of a record.
 template <int kRecord, class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
-                          const TensorBasis& basis, int count) {
+                          const TensorBasis& basis, const StagedGaussian<float, true>* gaussians, int count) {
   __syncwarp();
   TensorSums sums = sum_pixels(stage, basis, tile.lane);
   const TensorLane at(tile.lane);
-  const TensorGaussian gaussian = stage.gaussians[at.row];
-  recentre(sums, gaussian.shift, tile.lane);
+  const StagedPlace<float> place = gaussians[at.row];
+  recentre(sums, {tile.rect.x0 + kWarpTileCentre - place.mean.x, tile.rect.y0 + kWarpTileCentre - place.mean.y},
+           tile.lane);
   __syncwarp();
   if (at.row >= count || at.column >= kFastFeatures) return;
-  sink.to_record(gaussian.index, kRecord, [&](auto add) {
-    add(2 * at.column, sums.moments[0]);
-    add(2 * at.column + 1, sums.moments[1]);
-    add(kNumGateMoments + at.column, sums.feature);
+  sink.to_record(place.gaussian, kRecord, 2 * at.column, [&](auto add) {
+    add(0, sums.moments[0]);
+    add(1, sums.moments[1]);
+    add(kNumGateMoments - at.column, sums.feature);
   });
 }
 
@@ -71,7 +71,7 @@ __device__ void add_values(const Sink& sink, const WarpTile<S>& tile, S (&values
   const TransposedSum<kCount> sum(tile.lane);
   sum(values);
   if (!sum.holds || sum.number >= wanted) return;
-  sink.to_record(gaussian, sink.length, [&](auto add) { add(first + sum.number, values[0]); });
+  sink.to_record(gaussian, sink.length, first + sum.number, [&](auto add) { add(0, values[0]); });
 }
 
 // Sums the six moments over a lane's pixels, which lie one below the other.
@@ -92,6 +92,7 @@ template <class S> __device__ void column_moments(const S (&dL_dpower)[kLanePixe
 // What the walk knows of a lane's pixels.
 template <class S, int kFeatures> struct BackwardPixels {
   PixelBackward<S> state[kLanePixels];
+  S value_begin[kLanePixels];            // with what the sum g'.c begins
   ScaledGradients<S, kFeatures> scaled;  // g'
   int32_t last[kLanePixels];             // entries of the list that the numerator has seen
 };
@@ -107,9 +108,9 @@ struct TensorShare {
 template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kInSegments = false;
-  static constexpr int kUnroll = 1;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
-  static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
+  static constexpr int kUnroll = kTensor ? kBackwardUnroll : 1;
+  [[maybe_unused]] static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
 
   __device__ __forceinline__ bool is_absolute() const {
     return kFeatures != kAnyFeatures ? kAbsolute : arguments.absolute;
@@ -133,34 +134,37 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       contributes[k] = gate[k].counts && gaussian.position < pixels.last[k];
       any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
     }
-    if (!__any_sync(kAllLanes, any)) return;
+    // By tensor cores each Gaussian has its row, and few of them touch no pixel.
+    if (!kTensor && !__any_sync(kAllLanes, any)) return;
 
-    const int32_t index = gaussian.gaussian, position = gaussian.position;
+    const int32_t index = gaussian.gaussian;
     const S* features = arguments.saved.features + int64_t(index) * feature_stride(num_features());
     const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? gaussian.features[f] : features[f]; };
     S weight[kLanePixels], dL_dpower[kLanePixels];
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      S value = S(0);
+      S value = pixels.value_begin[k];
       for (int f = 0; f < num_features(); ++f) {
         value = fma(pixels.scaled.get(arguments, tile, k, f), feature(f), value);
       }
       const auto pair = Blend<kMode>::backward(pixels.state[k], gate[k], value, contributes[k]);
       weight[k] = pair.weight;
-      dL_dpower[k] = gate_backward(gate[k], pair.gamma);
+      dL_dpower[k] = pair.power;
     }
-    if (is_absolute()) add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
+    if (is_absolute() && (!kTensor || __any_sync(kAllLanes, any)))
+      add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
     if constexpr (kTensor) {
-      add_by_tensors(dL_dpower, weight, dx, dy, index);
+      row->values[tile.lane] = make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
+      ++row;
     } else {
       add_by_shuffles(dL_dpower, weight, dx, dy, index);
     }
   }
 
-  // Adds what still waits in the tensor stage.
-  __device__ __forceinline__ void finish() {
+  __device__ __forceinline__ void end_visits(const StagedGaussian<S, true>* gaussians, int count) {
     if constexpr (kTensor) {
-      if (batch > 0) add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, batch);
+      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, gaussians, count);
+      row = tensors.stage.rows;
     }
   }
 
@@ -174,17 +178,6 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       sums[1] += abs(dL_dpower[k] * by_mean.y);
     }
     add_values(sink, tile, sums, index, kNumGateMoments + num_features(), kNumAbsoluteSums);
-  }
-
-  __device__ __forceinline__ void add_by_tensors(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
-                                                 S dx, S dy, int32_t index) {
-    *reinterpret_cast<float4*>(&tensors.stage.values[batch][4 * tile.lane]) =
-        make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
-    if (tile.lane == 0) tensors.stage.gaussians[batch] = {{dx + kWarpTileCentre, dy + kWarpTileCentre}, index};
-    if (++batch == kTensorBatch) {
-      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, batch);
-      batch = 0;
-    }
   }
 
   __device__ __forceinline__ void add_by_shuffles(const S (&dL_dpower)[kLanePixels], const S (&weight)[kLanePixels],
@@ -221,7 +214,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
   BackwardPixels<S, kFeatures>& pixels;
   TensorShare tensors;
   AlphaCut<S> cut;
-  int batch;  // Gaussians that wait in the tensor stage
+  TensorRow* row;  // of the tensor stage, for the next Gaussian
 };
 
 // Sets what a warp's pixels start with, before any pair. Where the background's gradients are wanted, it also writes
@@ -330,13 +323,18 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
   if (tile.empty) return;
   const WalkRange range = range_of_segment<kMode, S>(arguments, tile, place.segment, pixels);
   if (range.begin >= range.end) return;
+  // Where u is g'.c - b, the sum g'.c begins with -b. That saves the subtraction.
+  for (int k = 0; k < kLanePixels; ++k) {
+    pixels.value_begin[k] = Blend<kMode>::kSuffixAboutBase ? -pixels.state[k].base : S(0);
+    if (Blend<kMode>::kSuffixAboutBase) pixels.state[k].base = S(0);
+  }
 
   TensorStage& tensor_stage = tensor_stages[Visitor::kTensor ? warp : 0];
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
   Visitor visitor = {
-      arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(), 0};
+      arguments,        arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(),
+      tensor_stage.rows};
   const unsigned met = walk_tile<S>(stages[warp], range, visitor);
-  visitor.finish();
   count_pairs(arguments, tile.lane, met);
 }
 

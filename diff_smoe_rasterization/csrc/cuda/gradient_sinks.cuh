@@ -14,11 +14,12 @@ template <class S> struct RecordSink {
   S* records;  // [N, length] sums; zero before
   int length;  // numbers a record
 
-  // Calls put(add), where add(number, term) adds to the record of a Gaussian. numbers: those of a record, a constant
-  // where the caller has one.
-  template <class Put> __device__ __forceinline__ void to_record(int32_t gaussian, int numbers, Put put) const {
-    S* record = records + int64_t(gaussian) * numbers;
-    put([record](int number, S term) { atomicAdd(record + number, term); });
+  // Calls put(add), where add(k, term) adds to number `first` + k of the record of a Gaussian. numbers: those of a
+  // record, a constant where the caller has one.
+  template <class Put>
+  __device__ __forceinline__ void to_record(int32_t gaussian, int numbers, int first, Put put) const {
+    S* from_first = records + int64_t(gaussian) * numbers + first;
+    put([from_first](int k, S term) { atomicAdd(from_first + k, term); });
   }
 };
 
@@ -26,9 +27,9 @@ template <class S> struct IntegerSink {
   IntegerSums<S> sums;
   int length;  // numbers a record
 
-  template <class Put> __device__ __forceinline__ void to_record(int32_t gaussian, int, Put put) const {
+  template <class Put> __device__ __forceinline__ void to_record(int32_t gaussian, int, int first, Put put) const {
     const SumExtent extent = sums.extents[gaussian];
-    put([&](int number, S term) { sums.add(gaussian, extent, number, term); });
+    put([&](int k, S term) { sums.add(gaussian, extent, first + k, term); });
   }
 };
 

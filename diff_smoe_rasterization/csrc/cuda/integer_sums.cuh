@@ -7,7 +7,7 @@
 // |w g'| <= |dL/df|. The pairs behind a pair weigh at most T (1 - alpha) together, so alpha / (1 - alpha) |R| is at
 // most w max |u|, and
 //
-//   |gamma| <= 2 max(1, lambda) (sum_f 2 |dL/df| max |c_f| + |dL/dW|)
+//   |alpha dL/dalpha| <= 2 max(1, lambda) (sum_f 2 |dL/df| max |c_f| + |dL/dW|)
 //
 // with the largest gradient and the largest feature of the whole image. A moment has up to two factors of distance,
 // which the footprint bounds; a sum has no more terms than the footprint has pixels.
@@ -39,7 +39,7 @@ inline __device__ double power_of_two(int e, double) {
 constexpr int kSumBits = 60;
 // The rest of a term below the unit is counted in units of 2^-kRestBits: 2^24 rests of at most half a unit fit.
 constexpr int kRestBits = 38;
-// Terms of this many units or more have no rest that matters: the sums over a warp's pixels have 21 good bits in float.
+// Terms of this many units or more have no rest that matters: the sums over a warp's pixels have 20 good bits in float.
 // Of double every bit is kept.
 template <class S> constexpr S kNoRest = sizeof(S) == sizeof(float) ? S(1 << 21) : S(int64_t(1) << 53);
 
@@ -47,7 +47,7 @@ template <class S> constexpr S kNoRest = sizeof(S) == sizeof(float) ? S(1 << 21)
 struct alignas(16) SumExtent {
   int16_t area;            // pixels of the footprint
   int16_t x, y;            // pixels from its centre
-  int16_t steep;           // what gate_backward multiplies by
+  int16_t steep;           // of o G, where it is above the clamp of alpha
   int16_t pull_x, pull_y;  // dpower/dmean
 };
 

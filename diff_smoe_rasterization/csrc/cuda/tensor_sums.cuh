@@ -4,8 +4,8 @@
 //   dL/dfeature [Gaussians, 3] = weights   [Gaussians, 64 pixels] x [64 pixels, 3]: g'
 //
 // with u and v the pixel's place in the warp's 8x8. They are half-integers, which TF32 holds exactly. Factors that TF32
-// does not hold are split in two, so that the products keep 21 bits. Eight Gaussians go at a time: their dL/dpower are
-// the upper rows of one 16-row operand, their weights the lower ones.
+// does not hold are split in two, so that the products keep 20 bits. Eight Gaussians go at a time: the upper parts of
+// their numbers are the upper rows of a 16-row operand, the lower parts the lower ones.
 #pragma once
 
 #include "dsmoe/gate.h"
@@ -24,32 +24,31 @@ constexpr bool kHasTensorSums = false;
 template <class S, int kFeatures>
 constexpr bool kSumsByTensors = kHasTensorSums && sizeof(S) == sizeof(float) && kFeatures == kFastFeatures;
 constexpr int kTensorSteps = 8;  // of 8 pixels each
-// Numbers between rows: the quads of a warp that read two rows at once meet different banks.
-constexpr int kTensorRow = 2 * kWarpTile * kWarpTile + 4;
 constexpr int kTensorRecord = kNumGateMoments + kFastFeatures;
 constexpr float kWarpTileCentre = (kWarpTile - 1) / 2.0f;
 static_assert(kWarpTile == 8 && kLanePixels == 2, "the places of pixels in the operands");
 
-// A right-hand operand, as the lanes hold it: two numbers a lane for each step.
+// A right-hand operand, as the lanes hold it: two numbers a lane for each of two steps.
 struct TensorBasis {
-  float2 of[kTensorSteps][kWarp];
+  float4 of[kTensorSteps / 2][kWarp];
 };
 
-// A Gaussian whose sums are wanted.
-struct alignas(16) TensorGaussian {
-  Vec2<float> shift;  // of the centre of the warp's pixels from its mean
-  int32_t index;
+// The numbers of one Gaussian. With a gap behind them, the quads of a warp that read two rows at once meet different
+// banks.
+struct TensorRow {
+  float4 values[kWarp];  // of each lane: dL/dpower and weight of its first pixel, then of its second
+  float4 gap;
 };
 
 // What one warp keeps in shared memory.
 struct TensorStage {
-  float values[kTensorBatch][kTensorRow];  // dL/dpower and weight of pixel k of lane l, at 4 l + 2 k
-  TensorBasis gradients;                   // g', each number in two parts side by side
-  TensorGaussian gaussians[kTensorBatch];
+  TensorRow rows[kTensorBatch];
+  TensorBasis gradients;  // g', each number in two parts side by side
 };
 
-// What TF32 keeps of a number.
-inline __device__ float tf32_part(float value) { return __uint_as_float(__float_as_uint(value) & 0xffffe000u); }
+// What TF32 keeps of a number, but for its last bit: where nothing but bits that the operands ignore are masked, the
+// compiler copies the number instead, in one more instruction.
+inline __device__ float tf32_part(float value) { return __uint_as_float(__float_as_uint(value) & 0xffffc000u); }
 
 // sums += a x b; the low bits of the operands are ignored.
 inline __device__ void multiply_add(float (&sums)[4], const float (&a)[4], float2 b) {
@@ -70,36 +69,33 @@ struct TensorLane {
 
 // Fills the right-hand operand of the moments, which all warps of the block share. The caller needs a barrier behind.
 inline __device__ void fill_moment_basis(TensorBasis& basis) {
-  for (int i = threadIdx.x; i < kTensorSteps * kWarp; i += blockDim.x) {
-    const int step = i / kWarp;
+  for (int i = threadIdx.x; i < kTensorSteps / 2 * kWarp; i += blockDim.x) {
+    const int m = i / kWarp;
     const TensorLane lane(i % kWarp);
-    const float u = float(2 * lane.column + step % 2) - kWarpTileCentre;
-    const auto number = [&](float v) {
+    const auto number = [&](int h, int k) {
+      const float u = float(2 * lane.column + h) - kWarpTileCentre, v = float(m + k * kLaneStep) - kWarpTileCentre;
       const float numbers[] = {1.0f, u, v, u * u, u * v, v * v, 0.0f, 0.0f};
       return numbers[lane.row];
     };
-    const float v = float(step / 2) - kWarpTileCentre;
-    basis.of[step][i % kWarp] = make_float2(number(v), number(v + kLaneStep));
+    basis.of[m][i % kWarp] = make_float4(number(0, 0), number(0, 1), number(1, 0), number(1, 1));
   }
 }
 
 // Fills the right-hand operand of the features from each lane's g' of its two pixels.
 inline __device__ void fill_gradient_basis(TensorStage& stage, const float (&scaled)[kLanePixels][kFastFeatures],
                                            int lane) {
-  for (int k = 0; k < kLanePixels; ++k) {
-    for (int f = 0; f < kFastFeatures; ++f) stage.values[f][4 * lane + 2 * k] = scaled[k][f];
-  }
+  for (int f = 0; f < kFastFeatures; ++f) stage.rows[f].values[lane] = make_float4(scaled[0][f], 0, scaled[1][f], 0);
   __syncwarp();
   const TensorLane at(lane);
   const int feature = at.row / 2;
-  for (int step = 0; step < kTensorSteps; ++step) {
-    const auto number = [&](int k) {
-      if (feature >= kFastFeatures) return 0.0f;
-      const int owner = 8 * (step / 2) + 2 * at.column + step % 2;
-      const float value = stage.values[feature][4 * owner + 2 * k];
-      return at.row % 2 == 0 ? tf32_part(value) : value - tf32_part(value);
-    };
-    stage.gradients.of[step][lane] = make_float2(number(0), number(1));
+  const auto part = [&](float value) { return at.row % 2 == 0 ? tf32_part(value) : value - tf32_part(value); };
+  for (int m = 0; m < kTensorSteps / 2; ++m) {
+    float4 basis = make_float4(0, 0, 0, 0);
+    if (feature < kFastFeatures) {
+      const float4 *pair = &stage.rows[feature].values[8 * m + 2 * at.column], left = pair[0], right = pair[1];
+      basis = make_float4(part(left.x), part(left.z), part(right.x), part(right.z));
+    }
+    stage.gradients.of[m][lane] = basis;
   }
   __syncwarp();
 }
@@ -113,26 +109,27 @@ struct TensorSums {
 
 inline __device__ TensorSums sum_pixels(const TensorStage& stage, const TensorBasis& basis, int lane) {
   const TensorLane at(lane);
-  // The upper and the lower parts of the numbers have sums of their own, which need not wait for each other.
+  // Steps 2 m and 2 m + 1 have sums of their own, which need not wait for each other.
   float moments[2][4] = {}, features[2][4] = {};
+  const auto add_step = [](float(&sums)[4], float first, float second, float basis_first, float basis_second) {
+    const float upper[2] = {tf32_part(first), tf32_part(second)};
+    const float parts[4] = {upper[0], first - upper[0], upper[1], second - upper[1]};
+    multiply_add(sums, parts, make_float2(basis_first, basis_second));
+  };
+  const float4* values = &stage.rows[at.row].values[2 * at.column];
 #pragma unroll
   for (int m = 0; m < kTensorSteps / 2; ++m) {
-#pragma unroll
-    for (int h = 0; h < 2; ++h) {
-      const int owner = 8 * m + 2 * at.column + h;
-      const float4 both = *reinterpret_cast<const float4*>(&stage.values[at.row][4 * owner]);
-      const float all[4] = {both.x, both.y, both.z, both.w};
-      float rest[4];
-      for (int i = 0; i < 4; ++i) rest[i] = all[i] - tf32_part(all[i]);
-      const float2 moment_basis = basis.of[2 * m + h][lane], gradient_basis = stage.gradients.of[2 * m + h][lane];
-      multiply_add(moments[0], all, moment_basis);
-      multiply_add(features[0], all, gradient_basis);
-      multiply_add(moments[1], rest, moment_basis);
-      multiply_add(features[1], rest, gradient_basis);
-    }
+    const float4 moment_basis = basis.of[m][lane], gradient_basis = stage.gradients.of[m][lane];
+    const float4 left = values[8 * m], right = values[8 * m + 1];
+    add_step(moments[0], left.x, left.z, moment_basis.x, moment_basis.y);
+    add_step(features[0], left.y, left.w, gradient_basis.x, gradient_basis.y);
+    add_step(moments[1], right.x, right.z, moment_basis.z, moment_basis.w);
+    add_step(features[1], right.y, right.w, gradient_basis.z, gradient_basis.w);
   }
-  return {{moments[0][0] + moments[1][0], moments[0][1] + moments[1][1]},
-          (features[0][2] + features[1][2]) + (features[0][3] + features[1][3])};
+  const auto sum = [](const float(&sums)[2][4], int i) {
+    return (sums[0][i] + sums[0][i + 2]) + (sums[1][i] + sums[1][i + 2]);
+  };
+  return {{sum(moments, 0), sum(moments, 1)}, sum(features, 0) + sum(features, 1)};
 }
 
 // Moves a lane's moments to the Gaussian's mean; the lanes of a quad hold all six between them.

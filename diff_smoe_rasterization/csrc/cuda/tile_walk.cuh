@@ -13,6 +13,8 @@
 // Warps do not wait for each other.
 #pragma once
 
+#include <type_traits>
+
 #include "device.cuh"
 #include "dsmoe/features.h"
 #include "tile_rows.cuh"
@@ -122,12 +124,14 @@ template <class S> class WarpTile {
 };
 
 // A Gaussian that meets the warp's pixels, as the visitors read it.
-template <class S> struct alignas(16) StagedShape {
-  Vec2<S> mean;              // pixels
-  ExponentFactors<S> conic;  // per px^2
-  S opacity;
+template <class S> struct alignas(16) StagedPlace {
+  Vec2<S> mean;      // pixels
   int32_t gaussian;  // its number
   int32_t position;  // of the entry in the list
+};
+template <class S> struct alignas(16) StagedShape : StagedPlace<S> {
+  ExponentFactors<S> conic;  // per px^2
+  S opacity;
 };
 template <class S, bool kWithFeatures> struct alignas(16) StagedGaussian : StagedShape<S> {
   S features[kFeatureChunk];
@@ -241,7 +245,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
     *reinterpret_cast<Chunk*>(loaded.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
   }
   StagedShape<S>& shape = loaded.staged;
-  shape = {gaussian.mean, ExponentFactors<S>(gaussian.conic), gaussian.opacity, entry.gaussian, entry.position};
+  shape = {{gaussian.mean, entry.gaussian, entry.position}, ExponentFactors<S>(gaussian.conic), gaussian.opacity};
   if (tile.source.marked) return loaded;
   loaded.meets = may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
   if (!tile.source.listed) {
@@ -254,6 +258,10 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
   return loaded;
 }
 
+// Whether a visitor has end_visits.
+template <class Visitor, class = void> constexpr bool kEndsVisits = false;
+template <class Visitor> constexpr bool kEndsVisits<Visitor, std::void_t<decltype(&Visitor::end_visits)>> = true;
+
 // The walk itself. Returns how many entries met the warp's pixels. A visitor has
 //
 //   kBackToFront, kStopsEarly, kReadsFeatures   what it wants of the walk, static
@@ -263,6 +271,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
 //   begin_batch(position)         called before the staged entries are visited, whose first one was at `position`
 //   visit(staged)                 one staged entry, for all lanes
 //   is_done()                     the walk may end; called now and then
+//   end_visits(first, count)      called after up to kVisitsPerCheck visits, of these staged entries; may be left out
 template <class S, class Visitor>
 __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, const WalkRange& range, Visitor& visitor) {
   const int lane = visitor.tile.lane;
@@ -287,6 +296,7 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
       if constexpr (Visitor::kStopsEarly) {
         if (visitor.is_done()) return met - staged + end;
       }
+      if constexpr (kEndsVisits<Visitor>) visitor.end_visits(stage.gaussians + j, end - j);
     }
     __syncwarp();
   }

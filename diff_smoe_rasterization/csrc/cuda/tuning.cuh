@@ -26,7 +26,7 @@ constexpr int kReadAhead = 3;
 // Entries that a warp has found and not taken: up to 31, and all that it finds next.
 constexpr int kFoundEntries = 128;
 static_assert(kFoundEntries >= kWarp - 1 + kReadAhead * kWarp, "the ring holds what was found");
-// Visits between two questions whether all pixels are full.
+// Visits between two questions whether all pixels are full, or between two batches of sums by tensor cores.
 constexpr int kVisitsPerCheck = 8;
 
 // Visits of the forward walk that are interleaved: what one waits for, the next one hides. And blocks of it that one
@@ -35,6 +35,8 @@ constexpr int kVisitsPerCheck = 8;
 constexpr int kBlendUnroll = 2;
 constexpr int kBlendBlocks = 6;
 
+// Visits of the backward walk that are interleaved, where it sums by tensor cores.
+constexpr int kBackwardUnroll = 2;
 // Blocks of the backward walk that one multiprocessor holds at once, where the number of features is known: 5 x 128
 // threads leave each thread 96 registers, nearly all that the kernel asks for.
 constexpr int kBackwardBlocks = 5;
@@ -42,8 +44,9 @@ constexpr int kBackwardBlocks = 5;
 constexpr int kGeneralWalkBlocks = 1;
 
 // Sums by tensor cores: how many Gaussians one warp sums together. They fill the 16 rows of an operand, eight rows for
-// dL/dpower and eight for the weights.
+// the upper parts of their numbers and eight for the lower ones.
 constexpr int kTensorBatch = 8;
+static_assert(kTensorBatch == kVisitsPerCheck, "the walk says where a batch ends");
 
 // Lists of instances.
 //

@@ -14,10 +14,12 @@
 //
 //   C = (sum c_i w_i + lambda T bg) / D,   D = W + lambda T         (smoe at 0; alpha at 1, where D is 1)
 //
-// Gradients are formed as gamma_i = alpha_i dL/dalpha_i: dL/dalpha grows like 1 / D, gamma stays bounded. With
-// g' = dL/dC / D, u_i = g'.c_i - b and the suffix R_i = sum_{j>i} w_j u_j, which begins at lambda T (g'.bg - b):
+// With g' = dL/dC / D, u_i = g'.c_i - b and the suffix R_i = sum_{j>i} w_j u_j, which begins at lambda T (g'.bg - b):
 //
-//   gamma_i = w_i u_i - alpha_i / (1 - alpha_i) R_i,   dL/dc_i = w_i g'
+//   dL/dalpha_i = T_i u_i - R_i / (1 - alpha_i),   dL/dc_i = w_i g'
+//
+// dL/dalpha grows like 1 / D. What leaves the pair is dL/dpower = o G dL/dalpha, which stays bounded. The clamp of
+// alpha passes the gradient straight through, as Inria's rasterizer does and a drop-in must.
 //
 // where b = g'.C: each expert is compared with the pixel's own colour. At lambda = 1 all terms in b cancel, and the
 // mode alpha leaves them out.
@@ -85,7 +87,7 @@ template <class Real> struct PixelBackward {
 };
 
 template <class Real> struct PairGradient {
-  Real gamma;   // alpha dL/dalpha
+  Real power;   // dL/dpower = o G dL/dalpha
   Real weight;  // w; dL/dc = w g'
 };
 
@@ -99,19 +101,17 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
   return {select(contributes, gate.alpha * before, Real(S(0))), contributes};
 }
 
-// The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it.
-template <class Real>
-DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real u,
-                                              Mask<Real> contributes) {
+// The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it. logit: of the
+// gate, or 0 where the pair does not contribute; then nothing changes, since the reciprocal of 1 is 1.
+template <class Real> DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real u) {
   using S = Scalar<Real>;
-  const Real inverse = reciprocal(Real(S(1)) - gate.alpha);
-  const Real transmittance = pixel.transmittance * inverse;
-  const Real weight = select(contributes, gate.alpha * transmittance, Real(S(0)));
-  const Real weighted = weight * u;
-  const Real gamma = weighted - gate.alpha * inverse * pixel.suffix;
-  pixel.transmittance = select(contributes, transmittance, pixel.transmittance);
-  pixel.suffix = pixel.suffix + weighted;
-  return {select(contributes, gamma, Real(S(0))), weight};
+  const Real alpha = clamped(logit);
+  const Real inverse = reciprocal(Real(S(1)) - alpha);
+  pixel.transmittance = pixel.transmittance * inverse;
+  const Real dL_dalpha = fma(pixel.transmittance, u, -inverse * pixel.suffix);
+  const Real weight = alpha * pixel.transmittance;
+  pixel.suffix = fma(weight, u, pixel.suffix);
+  return {logit * dL_dalpha, weight};
 }
 
 // The arithmetic of all modes, and the facts that most of them share. kTInNumerator: w_i is alpha_i T_i; else alpha_i.
@@ -137,13 +137,14 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   template <class Real>
   static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
                                               Mask<Real> contributes) {
-    const Real zero = Scalar<Real>(0);
+    const Real zero = Scalar<Real>(0), logit = select(contributes, gate.logit, zero);
     if constexpr (kTInNumerator) {
-      auto pair = transmit_backward(pixel, gate, kSuffixAboutBase ? value - pixel.base : value, contributes);
-      if (!kTInDenominator) pair.gamma = pair.gamma - select(gate.counts, gate.alpha * pixel.base, zero);
+      auto pair = transmit_backward(pixel, logit, kSuffixAboutBase ? value - pixel.base : value);
+      pair.power = select(contributes, pair.power, zero);  // a pixel's base may be no number
+      if (!kTInDenominator) pair.power = pair.power - select(gate.counts, gate.logit * pixel.base, zero);
       return pair;
     }
-    return {select(contributes, gate.alpha * (value - pixel.base), zero), select(contributes, gate.alpha, zero)};
+    return {select(contributes, logit * (value - pixel.base), zero), clamped(logit)};
   }
 };
 

@@ -60,24 +60,20 @@ template <class Real> struct Gate {
   Mask<Real> counts;  // the pair takes part
 };
 
+template <class Real> DSMOE_HD Real clamped(Real logit) { return min(logit, Real(Scalar<Real>(kAlphaMax))); }
+
 template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
   // Where the exponent is above 0 the conic is no ellipse. Such a pair does not count, and must not overflow either.
   const Real kernel = exp(min(power, Real(S(0))));
   Gate<Real> gate;
   gate.logit = Real(opacity) * kernel;
-  gate.alpha = min(gate.logit, Real(S(kAlphaMax)));
+  gate.alpha = clamped(gate.logit);
   if constexpr (kCut == Cut::kAlpha) {
-    gate.counts = (power <= Real(S(0))) & (gate.alpha >= Real(S(kAlphaCut)));
+    gate.counts = (power <= Real(S(0))) & (gate.logit >= Real(S(kAlphaCut)));
   } else {
     gate.counts = (power <= Real(S(0))) & (kernel >= Real(S(kGateCut))) & (gate.logit >= Real(least_alpha));
   }
   return gate;
-}
-
-// dL/dpower from gamma = alpha dL/dalpha. The clamp passes the gradient straight through, as Inria's rasterizer does
-// and a drop-in must: dL/dpower = o G dL/dalpha.
-template <class Real> DSMOE_HD Real gate_backward(const Gate<Real>& gate, Real gamma) {
-  return gamma * max(Real(Scalar<Real>(1)), gate.logit * Real(Scalar<Real>(1.0 / kAlphaMax)));
 }
 
 // Sums over pixels of dL/dpower times 1, d.x, d.y, d.x^2, d.x d.y and d.y^2. The gradients of a Gaussian's shape on the

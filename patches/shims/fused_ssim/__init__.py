@@ -1,4 +1,3 @@
-"""For `dsmoe run`: fused_ssim as it is installed, else this package's."""
 from diff_smoe_rasterization.patches.runtime import is_installed
 
 if not is_installed("fused_ssim"):

@@ -1,2 +1,1 @@
-"""What c3dgs imports from its extension."""
 from diff_smoe_rasterization.integrations.weighted_distance import weightedDistance  # noqa: F401

@@ -1,4 +1,3 @@
-"""For `dsmoe run`: weighted_distance as it is installed, else this package's."""
 from diff_smoe_rasterization.patches.runtime import is_installed
 
 is_installed("weighted_distance._C")

@@ -1,25 +1,22 @@
-"""`dsmoe bench` as commands, and what they leave."""
-from __future__ import annotations
-
+"""A small suite, `dsmoe bench` as commands, and what they leave."""
 import json
-import os
 import sys
 import time
 from pathlib import Path
 
-import diff_smoe_rasterization
 
-ABOVE = str(Path(diff_smoe_rasterization.__file__).resolve().parents[1])  # of the package under test, installed or not
+def tiny_suite(scene):
+    """What a suite file says: two cells of twelve steps, done in seconds."""
+    return {"name": "tiny", "protocol": {"iterations": 12, "device": "cpu", "principal_point": "scene", "lpips": [],
+                                         "checkpoint_every": 4, "evaluate_every": 6,
+                                         "options": {"densify_from_iter": 2, "densify_until_iter": 10,
+                                                     "densification_interval": 4}},
+            "scenes": [{"name": "tiny", "path": scene}], "methods": [{"name": "native"}],
+            "blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": [0.005]}
 
 
 def command(*words):
     return [sys.executable, "-m", "diff_smoe_rasterization", *words]
-
-
-def environment(**more):
-    """Of processes that find that package from any folder."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [ABOVE, os.environ.get("PYTHONPATH", "")])),
-            "OMP_NUM_THREADS": "1", **more}
 
 
 def rows_of(results):

@@ -1,13 +1,15 @@
-"""A suite that finishes in seconds."""
-from __future__ import annotations
-
+"""The small suite as a fixture; what is skipped without the packages of benchmarks."""
 import importlib.util
+import sys
+from pathlib import Path
 
 import pytest
+from bench_commands import tiny_suite
 from tiny_scene import one_thread, tiny_scene  # noqa: F401
 
 LACKING = [name for name in ("yaml", "pydantic", "jinja2", "matplotlib") if importlib.util.find_spec(name) is None]
 WITHOUT_THEM = ("test_lpips", "test_measure")
+sys.path.append(str(Path(__file__).resolve().parents[1] / "patches"))  # the small trainer of those tests
 
 
 class Skipped(pytest.Module):
@@ -25,10 +27,4 @@ def pytest_pycollect_makemodule(module_path, parent):
 
 @pytest.fixture
 def content(tiny_scene):
-    """What a suite file says: two cells of twelve steps."""
-    return {"name": "tiny", "protocol": {"iterations": 12, "device": "cpu", "principal_point": "scene", "lpips": [],
-                                         "checkpoint_every": 4, "evaluate_every": 6,
-                                         "options": {"densify_from_iter": 2, "densify_until_iter": 10,
-                                                     "densification_interval": 4}},
-            "scenes": [{"name": "tiny", "path": tiny_scene}], "methods": [{"name": "native"}],
-            "blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": [0.005]}
+    return tiny_suite(tiny_scene)

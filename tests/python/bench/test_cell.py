@@ -1,21 +1,17 @@
 """A cell by itself: one process, one row whatever happens, a GPU of its own or shared."""
-from __future__ import annotations
-
 import json
-import math
 import subprocess
 import sys
 import time
 
 import pytest
-from bench_commands import environment
+from checkouts import environment
 
 from diff_smoe_rasterization.benchmarks.suite import cell as cells
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.methods import native
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.results.rendering import Renderer
 
 
 def python_that(says, folder, monkeypatch):
@@ -42,12 +38,15 @@ def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatc
     assert "signal 9" in row["reason"] and "memory" in row["reason"] and row["reason"].endswith(": the last words")
 
 
-def test_the_process_of_a_cell_is_told_its_gpu_and_how_many_have_it(cell_file, tmp_path, monkeypatch):
+@pytest.mark.parametrize("gpus, told", [({}, "3"), ({"gpus": 2}, "3,5")])
+def test_the_process_of_a_cell_is_told_its_gpus_and_how_many_have_them(gpus, told, cell_file, tmp_path, monkeypatch):
     python_that("echo $CUDA_VISIBLE_DEVICES $*\n", tmp_path, monkeypatch)
-    assert cells.main([str(cell_file), str(tmp_path / "out"), "--gpus", "7", "--per-device", "2",
+    cell = json.loads(cell_file.read_text())
+    cell_file.write_text(json.dumps({**cell, "protocol": {**cell["protocol"], **gpus}}))
+    assert cells.main([str(cell_file), str(tmp_path / "out"), "--gpus", "3,5,7", "--per-device", "2",
                        "--locks", str(tmp_path / "locks")]) == 0
     said = (tmp_path / "out" / "log.txt").read_text().split()
-    assert said[0] == "7" and said[-3:] == ["--inside", "--per-device", "2"]
+    assert said[0] == told and said[-3:] == ["--inside", "--per-device", "2"]
 
 
 @pytest.mark.parametrize("module", ["cell", "engine", "report"])
@@ -58,33 +57,20 @@ def test_what_needs_no_torch_does_not_load_it(module):
     subprocess.run([sys.executable, "-c", program], check=True, env=environment())
 
 
-def test_cells_that_share_gpus_are_spread_over_them_first(tmp_path):
-    class Raises:
-        """A number of seconds that is never waited."""
+def test_cells_that_share_gpus_are_spread_over_them_first(tmp_path, monkeypatch):
+    def claim():
+        return cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2)
 
-        def __index__(self):
-            raise TimeoutError
-
-    claims = [cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2) for _ in range(4)]
+    monkeypatch.setattr(cells.time, "sleep", lambda seconds: 1 / 0)
+    claims = [claim() for _ in range(4)]
     assert [gpu for gpu, _ in claims] == ["3", "5", "3", "5"]
-    with pytest.raises(TimeoutError):  # a fifth waits
-        cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2, poll_seconds=Raises())
+    with pytest.raises(ZeroDivisionError):  # a fifth waits
+        claim()
     claims.pop(1)[1].close()
-    claims.append(cells.claim_gpu(["3", "5"], str(tmp_path), per_gpu=2))
+    claims.append(claim())
     assert claims[-1][0] == "5"
     for _, lock in claims:
         lock.close()
-
-
-def test_a_cell_takes_as_many_gpus_as_it_says(tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr(cells, "supervise", lambda path, output, gpu, *rest: seen.append(gpu) or {
-        "cell": "c", "ok": False, "reason": "none"})
-    for number, gpus in enumerate(({}, {"gpus": 2})):
-        path = tmp_path / f"{number}.json"
-        path.write_text(json.dumps({"protocol": gpus}))
-        assert cells.main([str(path), str(tmp_path), "--gpus", "3,5,7", "--locks", str(tmp_path / "locks")]) == 0
-    assert seen == ["3", "3,5"]
 
 
 def test_a_cell_of_two_gpus_is_trained_by_torchrun(content, tmp_path, monkeypatch):
@@ -115,20 +101,6 @@ def worked(content, tmp_path):
     return row
 
 
-def test_pixels_that_are_no_numbers_are_a_rows_reason(worked, monkeypatch):
-    render = Renderer.__call__
-
-    def broken(renderer, camera, **arguments):
-        rendering = render(renderer, camera, **arguments)
-        if camera.name == "view_008.png":  # the second of two test views
-            rendering.color[0, 5, 5] = math.nan
-        return rendering
-
-    monkeypatch.setattr(Renderer, "__call__", broken)
-    row = worked("out")
-    assert not row["ok"] and "the rendering of view_008.png has NaN or infinite pixels" in row["reason"]
-
-
 def test_a_row_is_written_before_its_model_is_removed(worked, tmp_path, monkeypatch):
     """Whatever happens in between, nothing is trained again."""
     there = []
@@ -145,3 +117,12 @@ def test_a_row_says_that_its_cell_shared_its_processor(worked):
     assert alone["machine"] == shared["machine"] and alone["protocol"] == shared["protocol"]
     again = worked("two", 1, keep_models=True)
     assert again["protocol"]["continued"] and again["machine"]["cells_at_once"] == 3
+
+
+def test_a_cell_of_a_budget_ends_with_it(worked, content):
+    """By the strategy `gate`, whose options the recipe of the row has."""
+    options = {**content["protocol"]["options"], "strategy_options": "overshoot=2"}
+    row = worked("out", schedules=["gate"], budgets=[40], protocol={**content["protocol"], "options": options})
+    assert row["ok"], row["reason"]
+    assert row["num_gaussians"] == row["budget"] == row["protocol"]["budget"] == 40
+    assert row["protocol"]["recipe"]["strategy_options"] == "overshoot=2" and "_gate_0.005_n40_s0_" in row["cell"]

@@ -1,6 +1,4 @@
 """LPIPS from files of weights, against its definition; and where there are none."""
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import real_data
@@ -9,7 +7,7 @@ from test_measure import step_image
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import lpips, measure
-from diff_smoe_rasterization.benchmarks.suite import weights as files
+from diff_smoe_rasterization.benchmarks.suite import names as files
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures
 
 
@@ -25,47 +23,45 @@ def test_weights_that_are_named_and_not_there_are_refused_where_they_are_wanted(
 @pytest.mark.parametrize("content, said", [
     (b"", "is no .npz file that can be read (EOFError)"),
     (b"some words", "is no .npz file that can be read"),
-    ("half", "is no .npz file that can be read"),
+    (b"PK\x03\x04 and no more", "is no .npz file that can be read"),
     ({"conv1.weight": np.zeros((8, 3, 11, 11))}, "conv1.bias is missing; it must have shape [8]"),
-    ("vgg", "conv1.weight has shape [8, 3, 3, 3]; it must have shape [8, 3, 11, 11]")])
+    ({"conv1.weight": np.zeros((8, 3, 3, 3)), "conv1.bias": np.zeros(8)},
+     "conv1.weight has shape [8, 3, 3, 3]; it must have shape [8, 3, 11, 11]")])
 def test_a_file_that_does_not_fit_is_the_reason(monkeypatch, tmp_path, content, said):
     path = tmp_path / "weights.npz"
     if isinstance(content, bytes):
         path.write_bytes(content)
-    elif isinstance(content, dict):
-        np.savez(path, **content)
     else:
-        made_up_weights(path, "vgg" if content == "vgg" else "alex")
-        if content == "half":
-            path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+        np.savez(path, **content)
     monkeypatch.setenv("DSMOE_LPIPS_ALEX", str(path))
     row, = Measures("cpu", ["lpips_alex"]).lpips_of({})
     assert row["value"] is None and row["reason"].startswith(f"$DSMOE_LPIPS_ALEX: ValueError: {path}")
     assert said in row["reason"]
 
 
-def made_up_weights(path, net="alex", seed=0):
-    """Random weights of the right shapes; of a VGG with an eighth of its channels."""
-    random = np.random.RandomState(seed)
-    outputs = {"alex": (64, 192, 384, 256, 256), "vgg": (8, 8, 16, 16, 32, 32, 32, 64, 64, 64, 64, 64, 64)}[net]
-    sides = {"alex": (11, 5, 3, 3, 3), "vgg": (3,) * 13}[net]
-    compared = {"alex": outputs, "vgg": (8, 16, 32, 64, 64)}[net]
-    arrays = {}
-    for index, (inputs, channels, side) in enumerate(zip((3, *outputs), outputs, sides)):
-        weight = random.randn(channels, inputs, side, side) / (side * inputs ** 0.5)
-        arrays[f"conv{index + 1}.weight"] = weight.astype(np.float32)
-        arrays[f"conv{index + 1}.bias"] = random.randn(channels).astype(np.float32)
-    for index, channels in enumerate(compared):
-        arrays[f"lin{index}.weight"] = random.rand(channels).astype(np.float32)
+# torchvision's networks: (channels, kernel's side, stride, padding) of convolutions, of VGG an eighth of the channels;
+# (side, stride) of maximum poolings; None where LPIPS looks.
+NETWORKS = {"alex": [(64, 11, 4, 2), None, (3, 2), (192, 5, 1, 2), None, (3, 2), (384, 3, 1, 1), None,
+                     (256, 3, 1, 1), None, (256, 3, 1, 1), None],
+            "vgg": [*2 * [(8, 3, 1, 1)], None, (2, 2), *2 * [(16, 3, 1, 1)], None, (2, 2), *3 * [(32, 3, 1, 1)], None,
+                    (2, 2), *3 * [(64, 3, 1, 1)], None, (2, 2), *3 * [(64, 3, 1, 1)], None]}
+
+
+def made_up_weights(path, net="alex"):
+    """Random weights of the right shapes."""
+    random, arrays, inputs, layer, looks = np.random.RandomState(0), {}, 3, 0, 0
+    for part in NETWORKS[net]:
+        if part is None:
+            arrays[f"lin{looks}.weight"] = random.rand(inputs).astype(np.float32)
+            looks += 1
+        elif len(part) == 4:
+            channels, side, _, _ = part
+            layer += 1
+            weight = random.randn(channels, inputs, side, side) / (side * inputs ** 0.5)
+            arrays[f"conv{layer}.weight"] = weight.astype(np.float32)
+            arrays[f"conv{layer}.bias"] = random.randn(channels).astype(np.float32)
+            inputs = channels
     np.savez(path, **arrays)
-    return arrays
-
-
-# torchvision's networks as torch's functions: (kernel's side, stride, padding), M a maximum pooling, and | where LPIPS
-# looks.
-NETWORKS = {"alex": ["11 4 2", "|", "M 3 2", "5 1 2", "|", "M 3 2", "3 1 1", "|", "3 1 1", "|", "3 1 1", "|"],
-            "vgg": "3 1 1;3 1 1;|;M 2 2;3 1 1;3 1 1;|;M 2 2;3 1 1;3 1 1;3 1 1;|;M 2 2;3 1 1;3 1 1;3 1 1;|;M 2 2;"
-                   "3 1 1;3 1 1;3 1 1;|".split(";")}
 
 
 def lpips_in_double(net, arrays, image, target, normalise):
@@ -76,20 +72,18 @@ def lpips_in_double(net, arrays, image, target, normalise):
     a, b = ((x.double() - torch.tensor(mean).double()[:, None, None]) / torch.tensor(deviation)[:, None, None]
             for x in (image, target))
     total, layer, looks = 0.0, 0, 0
-    for word in NETWORKS[net]:
-        if word == "|":
+    for part in NETWORKS[net]:
+        if part is None:
             weight = torch.from_numpy(arrays[f"lin{looks}.weight"]).double().reshape(-1, 1, 1)
             units = (torch.nn.functional.normalize(x, dim=0) for x in (a, b))
             total += float((weight * (next(units) - next(units)) ** 2).sum(dim=0).mean())
             looks += 1
-        elif word.startswith("M"):
-            a, b = (torch.nn.functional.max_pool2d(x[None], *map(int, word[2:].split()))[0] for x in (a, b))
+        elif len(part) == 2:
+            a, b = (torch.nn.functional.max_pool2d(x[None], *part)[0] for x in (a, b))
         else:
             layer += 1
             weight, bias = (torch.from_numpy(arrays[f"conv{layer}.{name}"]).double() for name in ("weight", "bias"))
-            _, stride, padding = map(int, word.split())
-            a, b = (torch.conv2d(x[None], weight, bias, stride, padding)[0].relu() for x in (a, b))
-    assert looks == 5
+            a, b = (torch.conv2d(x[None], weight, bias, *part[2:])[0].relu() for x in (a, b))
     return total
 
 
@@ -117,8 +111,6 @@ def test_lpips_of_a_file_agrees_with_the_definition(weights, normalise):
         expected = lpips_in_double(net, {name: file[name] for name in file.files}, image, target, normalise)
     # The float32 network is 1e-5 off the float64 one: sums of some thousand terms.
     assert network(image, target) == pytest.approx(expected, rel=1e-4)
-    closer = 0.9 * target + 0.1 * image
-    assert network(closer, target) < network(image, target)
 
 
 @pytest.mark.parametrize("kind, variable, net", [("lpips_alex", "DSMOE_LPIPS_ALEX", "alex"),

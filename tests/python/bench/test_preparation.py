@@ -1,13 +1,11 @@
 """What cells need is made, and made anew where what it was made of has changed."""
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+from checkouts import make_checkout
 from PIL import Image
-from small_trainers import small_trainers
 
 from diff_smoe_rasterization.benchmarks.suite import preparation
 
@@ -29,12 +27,11 @@ def test_a_made_up_scene_is_made_anew_where_its_parameters_have_changed(tmp_path
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 def test_the_copy_of_a_checkout_follows_it_and_has_its_commit(tmp_path):
-    folder = small_trainers().make_checkout(tmp_path / "checkout")
+    folder = make_checkout(tmp_path / "checkout")
 
     def git(*words):
         who = ["-c", "user.name=Somebody", "-c", "user.email=somebody@example.org"]
-        return subprocess.run(["git", "-C", str(folder), *who, *words], check=True, stdout=subprocess.PIPE,
-                              universal_newlines=True).stdout.strip()
+        return subprocess.check_output(["git", "-C", str(folder), *who, *words], text=True).strip()
 
     def prepared(**changes):
         return preparation.prepared_method({"name": "3dgs-2023", "label": "ours", "variant": "patched",

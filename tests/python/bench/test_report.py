@@ -1,6 +1,4 @@
-"""The benchmark's report: averages, tables beside the paper's, deltas, failures, refusals."""
-from __future__ import annotations
-
+"""The benchmark's report: averages, tables beside the paper's, deltas, failures, refusals, curves."""
 import csv
 import io
 import json
@@ -10,12 +8,18 @@ import pytest
 from report_rows import PROTOCOL, failed, row, write_rows
 
 from diff_smoe_rasterization.benchmarks.suite import rows
-from diff_smoe_rasterization.benchmarks.suite.report import ReportError, layouts, tables
+from diff_smoe_rasterization.benchmarks.suite.report import (
+    ReportError,
+    curves,
+    groups,
+    layouts,
+    tables,
+)
 
 
 def table_of(entries, name, suite="table1"):
     """The table NAME of rows; None where the suite has none."""
-    made = layouts.tables_of(suite, entries, layouts.read_paper())
+    made = layouts.tables_of(suite, entries)
     return next((table for table in made if table.name == f"{suite}_{name}"), None)
 
 
@@ -39,6 +43,9 @@ def test_a_cell_is_the_mean_over_seeds_with_its_spread():
     assert shown(table, "PSNR [dB]", "PSNR at edges [dB]", "own size [MB]", "LPIPS Alex") == [
         "24.00 ± 1.00", "22.00 ± 1.00", "2.0 ± 0.0", "0.250 ± 0.000"]
     assert "GPU peak [MiB]" not in shown(table)  # no row has it
+    averaged, single = csv.DictReader(io.StringIO(tables.to_csv(table_of([*entries, row("fox")], "cells"))))
+    assert (averaged["source"], float(averaged["PSNR [dB]"]), float(averaged["PSNR [dB] sd"])) == ("ours", 24, 1)
+    assert single["PSNR [dB] sd"] == ""
     assert shown(table_of(entries[:1], "cells"), "PSNR [dB]") == ["23.00"]  # one seed has no spread
 
 
@@ -134,13 +141,9 @@ def test_renderings_that_equal_the_ground_truth_have_an_infinite_psnr(tmp_path):
     assert "PSNR [dB]" not in shown(table_of([nothing], "cells"))
 
 
-def elsewhere(**changes):
-    """A row of another machine, which is ten times as slow."""
-    return row(**{"train_seconds": 1000.0, "fps": 20.0, **changes, "machine": {"device": "Card Y"}})
-
-
 def test_times_of_different_machines_are_neither_averaged_nor_divided():
-    entries = [elsewhere(), smoe(psnr=21.0), row(seed=1), smoe(seed=1)]
+    elsewhere = {"train_seconds": 1000.0, "fps": 20.0, "machine": {"device": "Card Y"}}
+    entries = [row(**elsewhere), smoe(psnr=21.0), row(seed=1), smoe(seed=1)]
     differ = 2 * ["machines differ"]
     assert shown(table_of(entries, "deltas"), "train ratio", "FPS ratio", "Δ PSNR [dB]") == [*differ, "+0.50 ± 0.71"]
     table = table_of(entries, "cells")
@@ -151,19 +154,15 @@ def test_times_of_different_machines_are_neither_averaged_nor_divided():
     # Only seeds that both have are compared.
     assert shown(table_of(entries[1:], "deltas"), "train ratio", "FPS ratio") == ["1.00", "1.00"]
     taming = {"method": "taming", "variant": "patched"}
-    table = table_of([row("truck", **taming), elsewhere(scene="train", **taming)], "table2")
+    table = table_of([row("truck", **taming), row("train", **taming, **elsewhere)], "table2")
     assert shown(table, "PSNR [dB]", "train [s]", "FPS", end="sparse") == ["20.00", *differ]
 
 
-def shared(cells_per_gpu=2, **changes):
-    """A row of a cell that shared its GPU: its times are far from those of `row`."""
-    return row(**{"train_seconds": 7000.0, "wall_seconds": 8000.0, "fps": 3.0, **changes,
-                  "machine": {"device": "Card X", "cells_per_gpu": cells_per_gpu}})
-
-
 def test_times_of_cells_that_shared_their_gpu_are_left_out():
-    entries = [shared(), shared(blend_mode="smoe", psnr=21.0), shared(1, threshold=0.0002),
-               row(threshold=0.0002, seed=1, train_seconds=9000.0), shared(threshold=0.0002, seed=2)]
+    alone, shared = ({"train_seconds": 7000.0, "wall_seconds": 8000.0, "fps": 3.0,
+                      "machine": {"device": "Card X", "cells_per_gpu": count}} for count in (1, 2))
+    entries = [row(**shared), smoe(psnr=21.0, **shared), row(threshold=0.0002, **alone),
+               row(threshold=0.0002, seed=1, train_seconds=9000.0), row(threshold=0.0002, seed=2, **shared)]
     table, delta = table_of(entries, "cells"), table_of(entries, "deltas")
     assert shown(table, "train [s]", "wall [s]", "FPS", "PSNR [dB]", method="native, smoe") == [
         "shared", "shared", "shared", "21.00"]
@@ -177,18 +176,10 @@ def test_a_failed_cell_is_a_row_with_its_reason():
                failed("killed", scene="fox", seed=1)]
     table = table_of(entries, "failures")
     assert {line.labels[1] for line in table.rows} == {"out of memory | 12 GiB", "killed"}
-    assert "out of memory \\| 12 GiB" in tables.to_markdown(table)
+    assert "out of memory \\| 12 GiB" in tables.to_text(table, "md")
     assert shown(table_of(entries, "cells"), "PSNR [dB]", method="native, smoe") == ["failed"]
     assert shown(table_of(entries, "cells"), "PSNR [dB]", scene="fox", seeds="1 of 2") == ["20.00"]
     assert shown(table_of(entries, "deltas"), "Δ PSNR [dB]") == ["smoe failed"]
-
-
-def test_csv_is_unrounded_and_complete():
-    entries = [row(psnr=24.123456789), row(seed=1, psnr=24.123456789), row("fox, the \"red\" one")]
-    bonsai, fox = csv.DictReader(io.StringIO(tables.to_csv(table_of(entries, "cells"))))
-    assert bonsai["source"] == "ours" and float(bonsai["PSNR [dB]"]) == 24.123456789
-    assert float(bonsai["PSNR [dB] sd"]) == 0 and fox["PSNR [dB] sd"] == "" and fox["#Gaussians"] == "40000"
-    assert fox["scene"] == "fox, the \"red\" one"
 
 
 @pytest.mark.parametrize("name", ["table1", "table3", "deltas", "cells", "failures"])
@@ -196,11 +187,12 @@ def test_every_line_of_latex_and_markdown_has_all_columns(name):
     entries = [row(blend_mode=mode, seed=seed) for mode in ("alpha", "smoe", "smoe_tn") for seed in (0, 1)]
     table = table_of([*entries, failed("50 % of a_b & c\\d #1", scene="fox")], name)
     width = 1 + len(table.labels) + len(table.columns)
-    body = [line for line in tables.to_latex(table).split("\n") if line.endswith(r"\\") and "multicolumn" not in line]
+    lines = tables.to_text(table, "tex").split("\n")
+    body = [line for line in lines if line.endswith(r"\\") and "multicolumn" not in line]
     assert {line.replace(r"\&", "").count("&") for line in body} == {width - 1} and len(body) == len(table.rows) + 1
     if name == "failures":
         assert r"50 \% of a\_b \& c\textbackslash{}d \#1" in body[-1]
-    lines = [line for line in tables.to_markdown(table).split("\n") if line.startswith("|")]
+    lines = [line for line in tables.to_text(table, "md").split("\n") if line.startswith("|")]
     assert {line.count("|") for line in lines} == {width + 1} and len(lines) == len(table.rows) + 2
 
 
@@ -230,26 +222,61 @@ def test_rules_that_one_row_does_not_state_are_not_compared():
     assert kept == entries[:3] and "recipe.feature_lr is 0.01 in them and 0.0025 in 2 others" in told
 
 
-@pytest.mark.parametrize("text, reason", [("{", "line 1: not valid json"), ("[]", "line 1: expected one object"),
-                                          ('{"cell": "a"}', "lacks suite, ok, method"), ("", "no rows"),
-                                          (json.dumps({**row(), "cell": ["a"]}), r"line 1: cell is \['a'\]"),
-                                          ("\xff", "rows.jsonl: not text in UTF-8")])
+@pytest.mark.parametrize("text, reason", [
+    ("{", "line 1: not valid json"), ("[]", "line 1: expected one object"), ("", "no rows"),
+    ('{"cell": "a"}', "lacks suite, ok, method"), ("\xff", "rows.jsonl: not text in UTF-8"),
+    *((f"{json.dumps(row())}\n{json.dumps({**row(), name: value})}",
+       rf"rows.jsonl, line 2: {name}[\[\]0-9]*(\.\w+)? is .*; it must be ")
+      for name, value in (
+          ("cell", ["a"]), ("psnr", "12.3"), ("ssim", math.nan), ("fps", math.inf), ("psnr", -math.inf),
+          ("num_gaussians", True), ("train_seconds", 10 ** 400), ("seed", True), ("label", 1),
+          ("lpips_all", [{"kind": 1}]), ("size_bytes", 3), ("size_bytes", {"own": "3"}), ("protocol", []),
+          ("machine", {"cells_per_gpu": "2"}), ("commit", "abc"), ("background_gate", "0.05"),
+          ("background_gate", math.nan)))])
 def test_damaged_results_are_refused(tmp_path, text, reason):
     (tmp_path / "rows.jsonl").write_text(text, encoding="latin-1")
     with pytest.raises(ReportError, match=reason):
         rows.read_rows(str(tmp_path))
 
 
-@pytest.mark.parametrize("name, value", [
-    ("psnr", "12.3"), ("ssim", math.nan), ("fps", math.inf), ("psnr", -math.inf), ("num_gaussians", True),
-    ("train_seconds", 10 ** 400), ("seed", True), ("label", 1), ("lpips_all", [{"kind": 1}]), ("size_bytes", 3),
-    ("size_bytes", {"own": "3"}), ("protocol", []), ("machine", {"cells_per_gpu": "2"}), ("commit", "abc"),
-    ("background_gate", "0.05"), ("background_gate", math.nan)])
-def test_a_field_of_another_type_is_refused(tmp_path, name, value):
-    with pytest.raises(ReportError, match=rf"rows.jsonl, line 2: {name}[\[\]0-9]*(\.\w+)? is .*; it must be "):
-        rows.read_rows(write_rows(tmp_path, [row(), {**smoe(), name: value}]))
-
-
 def test_one_setting_twice_is_refused():
     with pytest.raises(ReportError, match="same setting, scene and seed 0"):
         table_of([row(), {**row(), "cell": "again"}], "cells")
+
+
+def groups_of(entries):
+    return groups.grouped(entries, layouts.end_of)
+
+
+def test_a_curve_goes_through_the_means_from_few_gaussians_to_many():
+    entries = [row(threshold=0.0002, psnr=30.0, num_gaussians=900),
+               row(threshold=0.005, psnr=20.0, num_gaussians=100), row(seed=1, psnr=22.0, num_gaussians=300),
+               row(blend_mode="smoe", psnr=25.0, num_gaussians=50)]
+    axes = curves.rate_distortion(groups_of(entries)).axes
+    # Rows: PSNR, SSIM, LPIPS; columns: number, own size, common size.
+    assert [axis.get_ylabel() for axis in axes[::3]] == ["PSNR [dB]", "SSIM", "LPIPS Alex (lower is better)"]
+    assert [axis.get_xlabel() for axis in axes[-3:]] == ["#Gaussians", "own size [MB]", "common size [MB]"]
+    alpha, smoe = (container.lines[0].get_xydata().tolist() for container in axes[0].containers)
+    assert alpha == [[200, 21], [900, 30]] and smoe == [[50, 25]]
+    whisker = axes[0].containers[0].lines[2][0].get_segments()[0]
+    assert whisker[1, 1] - whisker[0, 1] == pytest.approx(2 * 2 ** 0.5)  # seeds 20 and 22: sd is the root of 2
+
+
+def test_what_has_no_place_on_an_axis_is_left_out(tmp_path):
+    entries = [row(psnr=float("inf")), row(threshold=0.002, num_gaussians=0), row(threshold=0.001, num_gaussians=7)]
+    psnr = curves.rate_distortion(groups_of(entries)).axes[0]
+    assert [line.get_xydata().tolist() for line in psnr.containers[0].lines[:1]] == [[[7, 20]]]
+    for nothing in (row(num_gaussians=0, size_bytes={"own": 0, "common": 0}),
+                    row(psnr=None, ssim=None, lpips=None, train_seconds=None, fps=None), failed()):
+        assert curves.draw_all("table1", groups_of([nothing]), str(tmp_path)) == []
+
+
+def test_the_legend_lies_inside_and_above_the_panels():
+    entries = [row(blend_mode=mode, label=f"{'a long name of method ' * 2}{method}", schedule="steady",
+                   threshold=threshold)
+               for mode in ("alpha", "smoe") for method in range(4) for threshold in (0.005, 0.0002)]
+    drawn = curves.rate_distortion(groups_of(entries))
+    drawn.canvas.draw()
+    box = drawn.legends[0].get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= drawn.bbox.x1 and box.y1 <= drawn.bbox.y1
+    assert box.y0 >= max(axis.get_window_extent().y1 for axis in drawn.axes)

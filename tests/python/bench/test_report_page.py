@@ -1,19 +1,16 @@
 """The report's folder and its page: complete without a network, replaced as a whole, nothing of others in it lost."""
-from __future__ import annotations
-
 import json
 import os
 import re
 import shutil
 
 import pytest
+from checkouts import contents
 from PIL import Image
 from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images, write_rows
 
-pytest.importorskip("matplotlib", reason="a report needs matplotlib")
-pytest.importorskip("jinja2", reason="a report needs jinja2")
-from diff_smoe_rasterization.benchmarks.suite.report import ReportError, images, report  # noqa: E402
-from diff_smoe_rasterization.trainer.errors import TrainerError  # noqa: E402
+from diff_smoe_rasterization.benchmarks.suite.report import ReportError, images, report
+from diff_smoe_rasterization.trainer.errors import TrainerError
 
 
 @pytest.fixture(scope="module")
@@ -57,15 +54,11 @@ def test_the_page_loads_nothing_but_its_own_files(written):
 def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypatch, no_figures):
     output = tmp_path / "report"
     shutil.copytree(written, output)
-
-    def files():
-        return {path.relative_to(output).as_posix(): path.read_bytes() for path in output.rglob("*") if path.is_file()}
-
-    before = files()
+    before = contents(output)
     monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.report._page", lambda *_: 1 / 0)  # written last
     with pytest.raises(ZeroDivisionError):
         report(write_rows(tmp_path / "results", [row("fox")]), str(output))
-    assert files() == before
+    assert contents(output) == before
 
 
 def test_cells_without_a_row_are_named(tmp_path, no_figures):

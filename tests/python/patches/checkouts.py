@@ -26,19 +26,13 @@ def make_scene(folder, seed=1):
     return Path(folder)
 
 
-def contents(folder, record=True):
-    """{path: (mode, bytes or what a link points to)} of all below, without the record if so asked."""
+def contents(folder):
+    """{path: (mode, bytes or what a link points to)} of all below."""
     found = {}
     for path in sorted(Path(folder).rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if record or not (name + "/").startswith((RECORD + "/", RECORD + ".unfinished/")):
-            data = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
-            found[name] = stat.S_IMODE(path.lstat().st_mode), data
+        data = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
+        found[path.relative_to(folder).as_posix()] = stat.S_IMODE(path.lstat().st_mode), data
     return found
-
-
-def changed_files(before, after):
-    return {name for name in set(before) | set(after) if before.get(name) != after.get(name)}
 
 
 def environment(**more):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from checkouts import PACKAGE_PARENT, contents, environment
-from tiny import GR, RENDERER, make
+from tiny import GR, RENDERER, make, refused
 
 from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES
@@ -49,7 +49,7 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path, python):
 ENDS = {  # what a command does, and how `dsmoe run` ends then
     "made(None)": (0, ""), "pass": (1, "rendered nothing: what was trained or rendered was not smoe"),
     "import os, signal; os.kill(os.getpid(), signal.SIGTERM)": (-15, ""),
-    "import os, signal; os.kill(os.getpid(), signal.SIGKILL)": (-9, ""), "sys.exit(3)": (3, ""),
+    "import os, signal; os.kill(os.getpid(), signal.SIGKILL)": (-9, ""),
     "import contextlib, diff_gaussian_rasterization as d\nwith contextlib.suppress(TypeError): d.rasterize_gaussians()":
         (0, "")}
 
@@ -157,6 +157,7 @@ def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
 
 OURS = RENDERER.replace("diff_gaussian_rasterization import", "diff_smoe_rasterization.integrations.inria import")
 MS = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
+MASKS = "gaussian_renderer/masks.py"
 PYTHON = [*RUN, "--", sys.executable, "train.py"]
 AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
 
@@ -166,7 +167,7 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({}, [*RUN, "--"], "there is no command"), ({}, ["run", "--blend_mode", "smoe", "--"], "there is no command"),
     ({}, [*RUN, "--", "no-such-command"], "no-such-command: there is no such command"),
     ({"tool.py": ""}, [*RUN, "--", "./tool.py"], "./tool.py: is not executable; type: python ./tool.py"),
-    ({GR: None}, PYTHON, "name it with --trainer, or the rasterizer whose API it calls (absgs, c3dgs, depth"),
+    ({GR: None}, PYTHON, "name it with --trainer, or the rasterizer whose API it calls (absgs, c3dgs, cob_gs"),
     ({}, [*RUN, "--trainer", "nerf", "--", sys.executable], "there is no trainer 'nerf'; it must be one of 3dgs-2023"),
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
@@ -174,6 +175,9 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     # Under --trainer too: Mini-Splatting, and a renderer of no rasterizer at all.
     ({GR: MS}, PYTHON, "it imports diff_gaussian_rasterization_ms, another rasterizer"),
     ({GR: RENDERER + MS}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
+    # A second renderer beside the first, by which masks are trained.
+    ({MASKS: MS, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_ms, another rasterizer"),
+    ({MASKS: MS, GR: "from . import masks\n" + RENDERER}, PYTHON, "_ms, another rasterizer"),
     ({GR: "from nvdiffrast import rasterize\n"}, AS_INRIA, "nothing imports GaussianRasterizationSettings from")])
 def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_path, dsmoe, monkeypatch):
     monkeypatch.chdir(make(tmp_path, files))
@@ -188,6 +192,7 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
     "feature_3dgs": ("", "semantic_feature=1", "image, feature_map, radii, depth"),
     "langsplat": ("include_feature=1", "language_feature_precomp=1", "image, feature_image, radii"),
+    "cob_gs": ("antialiasing=0, include_mask=0", "mask_precomp=1, mask_signals=1", "image, mask_image, radii, depth"),
     "speedy_splat": ("", "scores=1", "image, radii, kernel_times"),
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
     "light_gaussian": ("f_count=1", "", "counts, score, image, radii"), "depth": ("", "", "image, radii, depth"),
@@ -212,15 +217,15 @@ def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(fl
     assert made["DSMOE_RASTERIZER"] == flavour and f"{module} will be {flavour} of this package" in lines[0]
 
 
-@pytest.mark.parametrize("flavour", ["absgs", "fastgs"])
-def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(flavour, tmp_path, python):
-    contract = next(contract for contract in CONTRACTS if contract.name == flavour)
-    script = (f"from {contract.module} import GaussianRasterizer, GaussianRasterizationSettings\n"
-              "print(GaussianRasterizer.__module__)\nGaussianRasterizer(None)\n")
+def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(tmp_path, python):
+    modules = {contract.module: contract.name for contract in CONTRACTS if contract.name in ("absgs", "fastgs")}
+    script = "".join(f"from {module} import GaussianRasterizer, GaussianRasterizationSettings\n"
+                     "print(GaussianRasterizer.__module__)\nGaussianRasterizer(None)\n" for module in modules)
     make(tmp_path, {"x.py": script})
-    result = python("-m", "diff_smoe_rasterization", *RUN, "--trainer", flavour, "--", sys.executable, "x.py",
+    result = python("-m", "diff_smoe_rasterization", *RUN, "--trainer", "absgs", "--", sys.executable, "x.py",
                     cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
-    assert (result.status, result.out) == (0, f"diff_smoe_rasterization.integrations.{flavour}\n"), result.err
+    said = [f"diff_smoe_rasterization.integrations.{flavour}" for flavour in modules.values()]
+    assert (result.status, result.out.splitlines()) == (0, said), result.err
 
 
 GSPLAT = {  # a gsplat of some lines: its version, and a strategy that has taken its functions by name
@@ -246,8 +251,7 @@ print(ops.compute_relocation.__module__, ops.quat_scale_to_covar_preci.__module_
 """
 
 
-@pytest.mark.parametrize("version, radii", [("1.4.0", [1, 1]), ("1.5.3", [1, 1, 2]), ("1.6.0+cu13", [1, 1, 2]),
-                                            (None, [1, 1, 2])])
+@pytest.mark.parametrize("version, radii", [("1.4.0", [1, 1]), ("1.6.0+cu13", [1, 1, 2]), (None, [1, 1, 2])])
 def test_gsplat_gets_this_rasterizer_and_keeps_its_strategies(version, radii, tmp_path, python):
     """version None: where gsplat is not installed, there is the rasterizer alone."""
     make(tmp_path, {GR: None, "x.py": CALL_GSPLAT + (CALL_STRATEGY if version else "")})
@@ -289,6 +293,57 @@ def test_a_trainer_of_another_layout_is_recognised_by_its_rasterizer(tmp_path, m
     assert made["DSMOE_RASTERIZER"] == "depth_alpha" and lines[0].startswith(f"the trainer in {tmp_path}: ")
 
 
+TWO_RASTERIZERS = """try:
+    from diff_gaussian_rasterization import GaussianRasterizationSettings as Camera, GaussianRasterizer as Theirs
+except ImportError:
+    Theirs = None
+
+
+class GaussianRasterizer:
+    pass
+
+
+def render_slowly(pipe):
+    rasterizer = GaussianRasterizer(raster_settings=1)
+    return rasterizer(means3D=1, cov3Ds_precomp=2)
+
+
+def render(pipe):
+    rasterizer = Theirs(raster_settings=Camera(bg=1, debug=pipe.debug))
+    image, radii, depth = rasterizer(means3D=1)
+"""
+
+
+def test_a_rasterizer_that_the_file_defines_is_not_the_extensions(tmp_path, monkeypatch):
+    """One in plain PyTorch, with another keyword, for where there is no extension; both are called `rasterizer`."""
+    monkeypatch.chdir(make(tmp_path, {GR: TWO_RASTERIZERS}))
+    words = [sys.executable, "train.py"], "smoe", None, environment()
+    assert run.prepare(*words)[0]["DSMOE_RASTERIZER"] == "depth"
+    make(tmp_path, {GR: TWO_RASTERIZERS.replace("rasterizer(means3D=1)", "rasterizer(means3D=1, cov3Ds_precomp=2)")})
+    with pytest.raises(patches.PatchError, match="its rasterizer is called with cov3Ds_precomp, which no"):
+        run.prepare(*words)
+    refused(make(tmp_path, {GR: TWO_RASTERIZERS}), "for which there is no patch: use `dsmoe run`")
+
+
+@pytest.mark.parametrize("model, is_offered", [("", False), ("    def get_features_dc(self): ...\n", True)])
+def test_sparse_adam_is_offered_to_models_that_can_be_rendered_for_it(model, is_offered, tmp_path, python):
+    """Where 3DGS of 2024 finds it, it renders with get_features_dc; forks of other models break there."""
+    train = """from diff_gaussian_rasterization import GaussianRasterizer
+try:
+    from diff_gaussian_rasterization import SparseGaussianAdam
+except ImportError:
+    SparseGaussianAdam = None
+print(SparseGaussianAdam is not None)
+GaussianRasterizer(None)
+"""
+    renderer = RENDERER.replace("bg=bg_color", "antialiasing=False") + "\n\ndef dc(pc): return pc.get_features_dc\n"
+    model = "class GaussianModel:\n    x = 1\n" + model
+    make(tmp_path, {GR: renderer, "train.py": train, "scene/gaussian_model.py": model})
+    result = python("-m", "diff_smoe_rasterization", *PYTHON, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+    assert (result.status, result.out) == (0, f"{is_offered}\n"), result.err
+    assert ("SparseGaussianAdam is not offered" in result.err) == (not is_offered)
+
+
 def test_a_python_without_the_package_is_named(tmp_path, dsmoe, monkeypatch):
     other = tmp_path / "python3"  # a Python that finds nothing but its own library
     other.write_text(f'#!/bin/sh\nexec env -u PYTHONPATH "{sys.executable}" -I -S "$@"\n')
@@ -299,7 +354,6 @@ def test_a_python_without_the_package_is_named(tmp_path, dsmoe, monkeypatch):
 
 
 def test_a_patched_checkout_is_refused_until_nothing_of_the_patch_is_left(tmp_path):
-    pytest.importorskip("libcst", reason="patching needs LibCST: pip install libcst")
     patches.apply(make(tmp_path))
     words = [sys.executable, str(tmp_path / "train.py")], "smoe", None, environment()
     with pytest.raises(patches.PatchError, match="patched already"):

@@ -34,7 +34,7 @@ class ModelParams(ParamGroup):
 
 class PipelineParams(ParamGroup):
     def __init__(self, parser):
-        self.compute_cov3D_python = self.debug = False
+        self.debug = False
         super().__init__(parser, "How it is rendered")
 
 

@@ -6,8 +6,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianR
 from scene.gaussian_model import GaussianModel
 
 
-def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, scaling_modifier=1.0,
-           override_color=None):
+def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, scaling_modifier=1.0):
     """One picture of `pc`, with the points on the screen whose gradient densification reads."""
     view, points = viewpoint_camera, torch.zeros_like(pc.get_xyz, requires_grad=torch.is_grad_enabled())
     settings = GaussianRasterizationSettings(
@@ -19,6 +18,6 @@ def render(viewpoint_camera, pc: GaussianModel, pipe, bg_color: torch.Tensor, sc
         debug=pipe.debug
     )
     image, radii = GaussianRasterizer(raster_settings=settings)(
-        means3D=pc.get_xyz, means2D=points, shs=pc.get_features if override_color is None else None,
-        colors_precomp=override_color, opacities=pc.get_opacity, **pc.shape(pipe))
+        means3D=pc.get_xyz, means2D=points, shs=pc.get_features, opacities=pc.get_opacity,
+        scales=pc.get_scaling, rotations=pc.get_rotation)
     return {"render": image, "viewspace_points": points, "visibility_filter": radii > 0, "radii": radii}

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from simple_knn._C import distCUDA2
 from torch import nn
-from utils.general_utils import Adam, build_covariance
+from utils.general_utils import Adam
 
 
 class GaussianModel:
@@ -16,17 +16,9 @@ class GaussianModel:
 
     get_xyz = property(lambda self: self._xyz)
     get_features = property(lambda self: torch.cat([self._features_dc, self._features_rest], dim=1))
-    get_features_dc = property(lambda self: self._features_dc)
-    get_features_rest = property(lambda self: self._features_rest)
     get_opacity = property(lambda self: self._opacity.sigmoid())
     get_scaling = property(lambda self: self._scaling.exp())
     get_rotation = property(lambda self: nn.functional.normalize(self._rotation))
-
-    def shape(self, pipe):
-        """Scales and rotations, or covariances where the pipeline computes them in Python."""
-        if pipe.compute_cov3D_python:
-            return {"cov3D_precomp": build_covariance(self.get_scaling, self._rotation)}
-        return {"scales": self.get_scaling, "rotations": self.get_rotation}
 
     def oneupSHdegree(self):
         self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)

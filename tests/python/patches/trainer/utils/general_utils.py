@@ -34,17 +34,6 @@ def save_image(image, path):
     Image.fromarray(pixels.numpy().astype(np.uint8)).save(path)
 
 
-def build_covariance(scales, quaternions):
-    """[N, 6] of the ellipsoids with these axes: xx, xy, xz, yy, yz, zz."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions).unbind(-1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    axes = torch.stack(rows, -1).view(-1, 3, 3) * scales[:, None, :]
-    row, column = torch.triu_indices(3, 3)
-    return (axes @ axes.transpose(1, 2))[:, row, column]
-
-
 class Adam:
     """Adam as in torch.optim, whose first use imports all of torch._dynamo: seconds, in every process of a test."""
 
