@@ -8,6 +8,7 @@ import torch
 from .autograd import IMAGES, INPUTS, refuse_forward_mode
 from .rasterizer import _arguments, _rendering
 from .settings import GaussianRasterizationSettings, Rendering
+from .splats import Splats
 
 _OPS = torch.ops.diff_smoe_rasterization
 _COLORS, _BACKGROUND, _OPACITIES = INPUTS.index("colors_precomp"), INPUTS.index("bg"), INPUTS.index("opacities")
@@ -49,6 +50,10 @@ class DirectRendering:
         """The images, without gradient. They must not be changed before `backward`."""
         *self._images, self._saved = _OPS.rasterize(*self._inputs, *self._options, True)
         return _rendering(self._images, self._outputs)
+
+    def splats(self) -> Splats:
+        """What `rasterize_with_splats` returns beside the images, after `render`."""
+        return Splats(self._images, self._saved, self._inputs, self._options)
 
     @torch.no_grad()
     def backward(self, dL_dimages: Dict[str, torch.Tensor], gradients: Dict[str, torch.Tensor]) -> None:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scenes import random_scene, with_gate
 
-from diff_smoe_rasterization import DirectRendering, rasterize, visible_radii
+from diff_smoe_rasterization import DirectRendering, rasterize, rasterize_with_splats, visible_radii
 from diff_smoe_rasterization.settings import OUTPUTS
 
 OLD = 77.0  # what memory holds before a gradient is written to it
@@ -55,6 +55,17 @@ def test_only_what_is_asked_for_is_computed(device):
     assert torch.equal(direct.visible_radii(), visible_radii(scene.inputs["means3D"], scene.settings,
                                                              scales=scene.inputs["scales"],
                                                              rotations=scene.inputs["rotations"]))
+
+
+def test_splats_of_a_direct_rendering(device):
+    """What its pixels say of each Gaussian, before the gradients; on CUDA sums are added in any order."""
+    scene = random_scene("smoe", 300, 61, 43)
+    direct = DirectRendering(settings=scene.settings, **scene.inputs)
+    direct.render()
+    wanted = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1].importance()
+    for actual, expected in zip(direct.splats().importance(), wanted):
+        assert expected.any()
+        torch.testing.assert_close(actual, expected)
 
 
 def test_what_does_not_fit_is_refused(device):

@@ -88,7 +88,7 @@ class BatchTrainer(Trainer):
 
         def blend(view: int) -> None:  # what one view has saved is gone before the next one is blended
             drawn = batch.draw(view, settings[view])
-            loss, gradient = self.loss_of(views[view], colors[view], drawn.color)
+            loss, gradient = self.loss_of(views[view], self.target_of(views[view], colors[view]), drawn.color)
             records[view], dL_dgate = drawn.backward(gradient, self.gate is not None)
             numbers[0, view] = loss
             if self.gate:

@@ -49,12 +49,13 @@ class Renderer:
         """
         return self._render(self.rasterize, camera, background, background_gate, **arguments)
 
-    @torch.no_grad()
-    def with_splats(self, camera: Camera) -> Tuple[Rendering, Splats]:
-        """An image, and what its pixels say of each Gaussian."""
+    def with_splats(self, camera: Camera, background: Optional[torch.Tensor] = None,
+                    background_gate: Optional[torch.Tensor] = None,
+                    **arguments: Any) -> Tuple[Rendering, Splats]:
+        """An image by the package's rasterizer, and what its pixels say of each Gaussian."""
         from ... import rasterize_with_splats
 
-        return self._render(rasterize_with_splats, camera)
+        return self._render(rasterize_with_splats, camera, background, background_gate, **arguments)
 
     def _render(self, function: Callable[..., Any], camera: Camera, background: Optional[torch.Tensor] = None,
                 background_gate: Optional[torch.Tensor] = None, **arguments: Any) -> Any:

@@ -6,10 +6,11 @@ they can be compared: `Splats.importance`. The rules and what they are worth: do
 """
 from __future__ import annotations
 
-from typing import Any, Dict, List, NamedTuple, Optional, Tuple
+from typing import Any, Dict, Optional, Tuple
 
 import torch
 
+from ...splats import Splats
 from ..errors import ConfigError
 from ..gate_options import parse_gate_options
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
@@ -35,20 +36,13 @@ CHILD_SCALE = 0.65
 CHILD_COVER = 0.744
 
 
-class Scores(NamedTuple):
-    """Sums over the training views that were looked at."""
-
-    costs: torch.Tensor  # [N] squared change of the images on the Gaussian's removal
-    errors: torch.Tensor  # [N] squared error of the images where the Gaussian is, by its share
-
-
 class GateStrategy(SteadyStrategy):
     """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
 
     def __init__(self, context: StrategyContext) -> None:
-        super().__init__(context)
         config = context.config
         self.options = parse_gate_options(config.strategy_options)
+        super().__init__(context)
         self.start = context.model.num_gaussians
         until = config.densify_until_iter
         self.growth_ends = round(GROWTH_ENDS * until)
@@ -56,8 +50,10 @@ class GateStrategy(SteadyStrategy):
         last = config.iterations - 1  # the last iteration changes nothing
         self.removals = [min(last, round(until * (REMOVALS_BEGIN + (REMOVALS_END - REMOVALS_BEGIN) * i / count)))
                          for i in range(count)]
-        self.move_interval = max(1, round(MOVE_INTERVAL * until))
+        interval = max(1, round(MOVE_INTERVAL * until))
         self.moves_end = round(MOVES_END * until)
+        self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)
+                      if iteration > self.removals[-1] and self.options.moves > 0]
         self._check_reach()
 
     def _check_reach(self) -> None:
@@ -73,6 +69,8 @@ class GateStrategy(SteadyStrategy):
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
 
     def before_backward(self, step: Step) -> None:
+        if self._looks(step):
+            self._look(step.view, step.target, step.rendering.color, step.splats())
         if self.options.anneal != 1:
             span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
             share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
@@ -81,8 +79,7 @@ class GateStrategy(SteadyStrategy):
     def after_step(self, step: Step) -> None:
         if step.iteration in self.removals:
             self.remove(1 + sum(later > step.iteration for later in self.removals))
-        elif (self.options.moves > 0 and self.removals[-1] < step.iteration <= self.moves_end
-              and step.iteration % self.move_interval == 0):
+        elif step.iteration in self.moves:
             self.move()
 
     @property
@@ -111,18 +108,19 @@ class GateStrategy(SteadyStrategy):
             return
         ratio = model.num_gaussians / budget
         kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
-        costs = self.score().costs
-        mask = torch.zeros_like(costs, dtype=torch.bool)
-        mask[torch.topk(costs, kept).indices] = True
+        self._look_at_the_rest()
+        mask = torch.zeros_like(self.costs, dtype=torch.bool)
+        mask[torch.topk(self.costs, kept).indices] = True
         self.context.optimizer.keep(mask)
         self._forget_statistics()
 
     def move(self) -> None:
         """Moves the cheapest Gaussians to others, drawn by their error, which are split there."""
-        scores = self.score()
-        count = int(self.options.moves * len(scores.costs))
-        costs, sources = torch.topk(scores.costs, count, largest=False)
-        errors = scores.errors.clone()
+        self._look_at_the_rest()
+        count = int(self.options.moves * len(self.costs))
+        costs, sources = torch.topk(self.costs, count, largest=False)
+        errors = self.errors
+        self._forget_looks()
         errors[sources] = 0
         count = min(count, int((errors > 0).sum()))
         if count == 0:
@@ -151,30 +149,48 @@ class GateStrategy(SteadyStrategy):
         for rows, place in ((parents, means + offsets), (places, means - offsets)):
             self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
 
-    def score(self) -> Scores:
-        """Renders training views, and sums what each Gaussian is worth to them."""
-        zeros = self.context.model.raw["means3D"].new_zeros(self.context.model.num_gaussians)
-        costs, errors = zeros, zeros.clone()
-        for view in self._some_views():
-            rendering, splats = self.context.render.with_splats(view.camera)
-            error = (rendering.color - as_float(view.image)).square().sum(0)
-            mask = view.mask_float()
-            weights = torch.ones_like(error) if mask is None else mask[0]
-            importance = splats.importance(weights, weights * error)
-            costs += importance.removal_costs
-            errors += importance.shares
-        return Scores(costs, errors)
+    def _looks(self, step: Step) -> bool:
+        """Whether the next decision looks at this step's view: once, in the last round of the views before it."""
+        removes = self.context.model.num_gaussians > self.context.config.budget
+        following = next((later for later in [*self.removals, *self.moves] if later >= step.iteration), None)
+        return (following is not None and following - step.iteration < len(self.context.views)
+                and (removes or following > self.removals[-1]) and step.view.camera.name in self.sought)
 
-    def _some_views(self) -> List[View]:
-        """Views as evenly spread as their order is, from a random one on."""
+    def _look(self, view: View, target: torch.Tensor, color: torch.Tensor, splats: Splats) -> None:
+        """Adds what each Gaussian is worth to one rendering."""
+        error = (color.detach() - as_float(target)).square().sum(0)
+        mask = view.mask_float()
+        weights = torch.ones_like(error) if mask is None else mask[0]
+        importance = splats.importance(weights, weights * error)
+        self.costs += importance.removal_costs
+        self.errors += importance.shares
+        self.sought.discard(view.camera.name)
+
+    def _look_at_the_rest(self) -> None:
+        """Renders what the steps before the decision did not show."""
+        for view in self.context.views:
+            if view.camera.name in self.sought:
+                rendering, splats = self.context.render.with_splats(view.camera)
+                self._look(view, view.image, rendering.color, splats)
+
+    def _forget_statistics(self) -> None:
+        super()._forget_statistics()
+        self._forget_looks()
+
+    def _forget_looks(self) -> None:
+        """Begins new sums, [N], for the next decision, and chooses its views, evenly spread."""
+        self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
+        self.errors = torch.zeros_like(self.view_count)  # their squared error where the Gaussian is, by its share
         views = self.context.views
         count = min(self.options.views, len(views))
         first = int(torch.randint(len(views), ()))
-        return [views[(first + i * len(views) // count) % len(views)] for i in range(count)]
+        self.sought = {views[(first + i * len(views) // count) % len(views)].camera.name for i in range(count)}
 
     def state_dict(self) -> Dict[str, Any]:
-        return {**super().state_dict(), "start": self.start}
+        return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors,
+                "sought": sorted(self.sought)}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         super().load_state_dict(state)
-        self.start = state["start"]
+        self.start, self.costs, self.errors = state["start"], state["costs"], state["errors"]
+        self.sought = set(state["sought"])

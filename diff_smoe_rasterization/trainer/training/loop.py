@@ -134,8 +134,9 @@ class Trainer:
             passes = DirectPasses if self.direct and not self.strategy.uses_gradients else AutogradPasses
             self._passes = passes(model, self.optimizer, self.renderer)
         rendering, means2D = self._passes.render(view.camera, color, self.gate() if self.gate else None)
-        loss, gradient = self.loss_of(view, color, rendering.color.detach())
-        step = Step(self.iteration, view.camera, rendering, means2D, loss)
+        target = self.target_of(view, color)
+        loss, gradient = self.loss_of(view, target, rendering.color.detach())
+        step = Step(self.iteration, view, target, rendering, self._passes.splats, means2D, loss)
         self.strategy.before_backward(step)
         self._passes.backward(gradient)
         if before_change:
@@ -154,12 +155,14 @@ class Trainer:
             raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
                                "try another --densify-grad-threshold or --strategy steady")
 
-    def loss_of(self, view: View, color: Optional[torch.Tensor],
-                image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-        """The loss of a rendering and its gradient. color: [3] the background, where it is of this step alone."""
-        config = self.config
-        target = view.image if color is None or view.opacity is None else view.image_over(
+    def target_of(self, view: View, color: Optional[torch.Tensor]) -> torch.Tensor:
+        """What a rendering is compared with. color: [3] the background, where it is of this step alone."""
+        return view.image if color is None or view.opacity is None else view.image_over(
             color, self.renderer.background)
+
+    def loss_of(self, view: View, target: torch.Tensor, image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        """The loss of a rendering and its gradient."""
+        config = self.config
         self._report = (image, target, view)
         if view.mask is None:
             return l1_ssim_loss_and_gradient(image, target, config.lambda_dssim)

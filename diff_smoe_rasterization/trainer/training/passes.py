@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from typing import Dict, List, Optional, Set, Tuple
+from typing import Callable, Dict, List, Optional, Set, Tuple
 
 import torch
 
@@ -16,8 +16,9 @@ from ...direct import DirectRendering
 from ...extension import _C  # noqa: F401  (loading it registers the ops)
 from ...gaussians import activate
 from ...settings import Rendering
+from ...splats import Splats
 from ..model import PARAMETERS, GaussianModel, GaussianOptimizer
-from ..results.rendering import Renderer
+from ..results.rendering import Renderer, package_rasterizer
 from ..scenes.cameras import Camera
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -30,6 +31,7 @@ class AutogradPasses:
 
     def __init__(self, model: GaussianModel, optimizer: GaussianOptimizer, renderer: Renderer) -> None:
         self.model, self.optimizer, self.renderer = model, optimizer, renderer
+        self._splats: Optional[Callable[[], Splats]] = None
 
     def render(self, camera: Camera, background: Optional[torch.Tensor],
                background_gate: Optional[torch.Tensor]) -> Tuple[Rendering, torch.Tensor]:
@@ -38,12 +40,24 @@ class AutogradPasses:
         background, background_gate: in place of the renderer's; the latter gets its gradient.
         """
         means2D = torch.zeros_like(self.model.raw["means3D"], requires_grad=True)
-        rendering = self.renderer(camera, background=background, means2D=means2D, background_gate=background_gate)
+        view = (camera, background, background_gate)
+        if self.renderer.rasterize is package_rasterizer():
+            rendering, splats = self.renderer.with_splats(*view, means2D=means2D)
+            self._splats = lambda: splats
+        else:
+            rendering = self.renderer(*view, means2D=means2D)
+            self._splats = lambda: self.renderer.with_splats(*view)[1]
         self._color = rendering.color
         return rendering, means2D
 
+    def splats(self) -> Splats:
+        """What the image of `render` says of each Gaussian."""
+        assert self._splats is not None, "render comes first"
+        return self._splats()
+
     def backward(self, dL_dcolor: torch.Tensor) -> None:
         """From the gradient by the image [3, H, W] to those by all parameters."""
+        self._splats = None  # which holds on to memory
         self._color.backward(dL_dcolor)
 
     def update(self) -> None:
@@ -82,6 +96,11 @@ class DirectPasses:
         rendering = self._direct.render()
         self._radii = rendering.radii
         return rendering, self._means2D
+
+    def splats(self) -> Splats:
+        """What the image of `render` says of each Gaussian."""
+        assert self._direct is not None, "render comes first"
+        return self._direct.splats()
 
     @torch.no_grad()
     def backward(self, dL_dcolor: torch.Tensor) -> None:

@@ -6,16 +6,16 @@ renderings of training views included, is in StrategyContext.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Dict, Iterable, List, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, Iterable, List, Optional, Sequence, Tuple, Union
 
 import torch
 
 from ...gaussians import add_view
 from ...settings import Rendering
+from ...splats import Splats
 from ..config import TrainConfig
 from ..model import GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
 from ..results.rendering import Renderer
-from ..scenes.cameras import Camera
 from ..scenes.images import View
 from .shards import Shards
 
@@ -68,8 +68,10 @@ class Step(StepClock):
     """One training step, as far as it has come when a hook is called."""
 
     iteration: int
-    camera: Camera
+    view: View
+    target: torch.Tensor  # [3, H, W] what the rendering is compared with, uint8 or in 0 to 1
     rendering: Rendering
+    splats: Callable[[], Splats]  # of the rendering; before backward
     means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H) where radii > 0
     loss: torch.Tensor
     batch: int = 1

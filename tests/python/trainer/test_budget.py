@@ -86,15 +86,46 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, kille
     assert row["num_gaussians"] == 120
 
 
+def looking(trainer, monkeypatch):
+    """The strategy after steps over every training view, none of which has changed a Gaussian."""
+    monkeypatch.setattr(trainer.strategy, "_looks", lambda step: True)
+    monkeypatch.setattr(trainer.strategy, "after_backward", lambda step: None)
+    monkeypatch.setattr(trainer.optimizer, "step", lambda: None)
+    for _ in trainer.scene.train:
+        trainer.step()
+    return trainer.strategy
+
+
+def test_a_decision_looks_once_at_each_of_its_views(tiny_config, monkeypatch):
+    """Removals at 16, 19, 22, 25. Of the five views that each wants, what the steps before do not show is rendered."""
+    trainer = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options="removals=4,views=5")
+    strategy, log = trainer.strategy, {}
+    look = strategy._look
+
+    def logged(view, *rest):
+        log.setdefault(trainer.iteration, []).append(view.camera.name)
+        look(view, *rest)
+
+    monkeypatch.setattr(strategy, "_look", logged)
+    while trainer.iteration < 25:
+        trainer.step()
+    decisions = (16, 19, 22, 25)
+    assert all(len(names) == 1 for iteration, names in log.items() if iteration not in decisions)
+    for first, last in zip((16 - len(trainer.scene.train) + 1, 17, 20, 23), decisions):
+        names = sum((names for iteration, names in log.items() if first <= iteration <= last), [])
+        assert len(names) == len(set(names)) == 5
+    assert len(log) > len(decisions), "some by the steps' own renderings"
+
+
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
-def test_scores_are_what_the_views_lose(tiny_config, mode):
+def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
     """The cost of a Gaussian, and all errors together, against renderings of all training views."""
     trainer = trainer_of(tiny_config, schedule="gate", budget=60, blend_mode=mode,
                          **({"background_gate": 0.05} if mode == "smoe" else {}))
     with torch.no_grad():
         trainer.model.raw["opacities"] -= 1.0  # no pixel is full
-    scores = trainer.strategy.score()
-    index = int(scores.costs.argmax())
+    strategy = looking(trainer, monkeypatch)
+    index = int(strategy.costs.argmax())
     others = torch.arange(trainer.model.num_gaussians) != index
 
     def images(rows):
@@ -110,8 +141,8 @@ def test_scores_are_what_the_views_lose(tiny_config, mode):
         error = sum((image - view.image_float()).double().square().sum()
                     for image, view in zip(all_of_them, trainer.scene.train))
     # float32 images; a pixel's squared change is of their last digits' size nowhere that matters.
-    assert float(scores.costs[index]) == pytest.approx(float(cost), rel=1e-4)
-    assert 0.2 * float(error) < float(scores.errors.sum()) <= float(error) * (1 + 1e-5)
+    assert float(strategy.costs[index]) == pytest.approx(float(cost), rel=1e-4)
+    assert 0.2 * float(error) < float(strategy.errors.sum()) <= float(error) * (1 + 1e-5)
 
 
 def test_rates_of_gate_fall_behind_the_moves(tiny_config):
@@ -132,9 +163,9 @@ def test_rates_of_gate_fall_behind_the_moves(tiny_config):
         torch.testing.assert_close(ratio, torch.tensor([1.0] + [factor] * 5))
 
 
-def test_removal_keeps_the_costliest(tiny_config):
+def test_removal_keeps_the_costliest(tiny_config, monkeypatch):
     trainer = trainer_of(tiny_config, schedule="gate", budget=60)
-    costs = trainer.strategy.score().costs
+    costs = looking(trainer, monkeypatch).costs
     kept = trainer.model.raw["means3D"][costs >= costs.sort(descending=True).values[59]].detach().clone()
     trainer.strategy.remove(1)
     assert torch.equal(trainer.model.raw["means3D"], kept)
@@ -146,7 +177,8 @@ def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
     costs, errors = torch.full((count,), 5.0), torch.zeros(count)
     costs[7], errors[3], costs[8], errors[4] = 0.5, 10.0, 1.0, 4.0
     errors[7] = 1e6  # the cheapest is no place for another one
-    monkeypatch.setattr(strategy, "score", lambda: type("Scores", (), {"costs": costs, "errors": errors}))
+    strategy.costs, strategy.errors = costs, errors
+    monkeypatch.setattr(strategy, "_look_at_the_rest", lambda: None)
     moved = []
     monkeypatch.setattr(strategy, "split", lambda parents, places: moved.append((parents.tolist(), places.tolist())))
     strategy.move()

@@ -102,7 +102,7 @@ def test_random_backgrounds_are_behind_rendering_and_image(tiny_config, scene, m
                         lambda image, target, weight: targets.append(target) or l1_ssim(image, target, weight))
     scene = transparent_scene(scene)
     trainer = Trainer(tiny_config.changed(blend_mode="alpha", random_background=True), scene, rasterize)
-    views = [trainer.step().camera for _ in range(4)]
+    views = [trainer.step().view.camera for _ in range(4)]
     assert len({tuple(color.tolist()) for color in backgrounds}) == 4
     assert all(0 <= float(value) <= 1 for color in backgrounds for value in color)
     for camera, color, target in zip(views, backgrounds, targets):
@@ -154,7 +154,7 @@ def test_the_gradient_of_a_masked_loss_is_masked(tiny_config, scene):
     trainer = Trainer(tiny_config, masked_scene(scene, mask))
     trainer.strategy.before_backward = lambda step: step.rendering.color.retain_grad()
     step = trainer.step()
-    view = next(view for view in trainer.scene.train if view.camera is step.camera)
+    view = step.view
     image, weights = step.rendering.color.detach().requires_grad_(), mask.float() / 255
     loss = l1_ssim_loss(image * weights, view.image.float() / 255 * weights, tiny_config.lambda_dssim)
     loss.backward()
