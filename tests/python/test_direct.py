@@ -44,6 +44,27 @@ def test_direct_is_rasterize_bit_for_bit(device, mode, dtype, layout):
         assert torch.equal(gradients[name], tensor.grad), name
 
 
+@pytest.mark.parametrize("dc_apart", [False, True])
+def test_colour_alone_is_rasterize_bit_for_bit(device, dc_apart):
+    """What a trainer asks for: three colours of degree 3 in float, and no camera. It has kernels of its own."""
+    scene = random_scene("alpha", 1200, 61, 43, degree=3, dtype=torch.float32, split_dc=dc_apart)
+    scene = scene.with_settings(deterministic=True)
+    graph = scene.requiring_grad()
+    wanted = rasterize(settings=graph.settings, **graph.inputs)
+    weight = torch.linspace(-1, 1, wanted.color.numel()).view_as(wanted.color)
+    wanted.color.backward(weight)
+
+    direct = DirectRendering(settings=scene.settings, **scene.inputs)
+    assert torch.equal(direct.render().color, wanted.color)
+    gradients = {name: torch.full_like(tensor, OLD) for name, tensor in scene.inputs.items()}
+    direct.backward({"color": weight}, gradients)
+    seen = wanted.radii > 0
+    assert 0.1 < seen.float().mean() < 0.9
+    for name, tensor in graph.inputs.items():
+        assert torch.equal(gradients[name][seen], tensor.grad[seen]), name
+        assert (gradients[name][~seen] == OLD).all(), name
+
+
 def test_only_what_is_asked_for_is_computed(device):
     scene = random_scene("alpha", 50)
     direct = DirectRendering(settings=scene.settings, **scene.inputs)
