@@ -39,7 +39,7 @@ def without_gpus(words: Sequence[str]) -> List[str]:
 
 def torchrun_command(gpus: int, words: Sequence[str]) -> List[str]:
     """What starts a `dsmoe` command, given by its words, in so many processes of this machine."""
-    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(gpus), "-m",
+    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(gpus), "-m",
             __name__.split(".")[0], *words]
 
 

@@ -28,7 +28,7 @@ needs_gloo = pytest.mark.skipif(not torch.distributed.is_available() or not torc
 
 def torchrun(processes, *words, **environment):
     """Runs a program in so many processes. Returns its exit status, output and errors."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes),
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(processes),
                *words]
     path = os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")])
     result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=HERE,
@@ -112,7 +112,7 @@ def test_gpus_starts_torchrun_with_the_same_command(tiny_config, monkeypatch):
     assert main([*words, "--gpus", "2"]) == 3 and main([*words[:2], "--gpus=2", *words[2:], "--device", "cuda"]) == 3
     assert seen == [(2, [*words, "--device", "cuda"])] * 2
     command = torchrun_module.torchrun_command(2, words)
-    assert command[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    assert command[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
     assert command[6:] == ["-m", "diff_smoe_rasterization", *words]
 
 
