@@ -3,50 +3,35 @@ from __future__ import annotations
 
 import ast
 import re
-from typing import Dict, Iterator, List, Mapping, Optional, Set, Tuple
+from typing import Any, Dict, Iterator, Mapping, Optional, Set, Tuple
 
-from diff_smoe_rasterization.integrations.contracts import (
-    ARGUMENTS,
-    CONTRACTS,
-    NAMES,
-    RASTERIZER,
-    RESULTS,
-    SETTINGS,
-    Contract,
-)
+from diff_smoe_rasterization.integrations import contracts
+from diff_smoe_rasterization.integrations.contracts import ARGUMENTS, CONTRACTS, NAMES, RASTERIZER, RESULTS, Contract
 from diff_smoe_rasterization.settings import GaussianRasterizationSettings
 
-from .source import PatchError, Source
+from .source import PatchError, tree_of
 from .trainers import GR, INTEGRATIONS, TRAINERS, Trainer
 
 PATCHED = "imports from " + INTEGRATIONS
+FOLDER = GR.partition("/")[0]
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
 OTHER_RASTERIZER = re.compile(r"diff_(gauss|surfel)\w*")
 MODULES = {contract.module: contract for contract in CONTRACTS if contract.module != RASTERIZER}
-RENDERERS = {"render", "prefilter_voxel", "*"}
 
 
 def python_tree(data: bytes) -> ast.Module:
     """Returns the syntax tree of a file as Python's own parser has it; of one that cannot be parsed an empty one."""
     try:
-        return Source("", data).tree
+        return tree_of(data)
     except PatchError:
         return ast.Module(body=[], type_ignores=[])
 
 
-def further_renderers(files: Mapping[str, bytes]) -> List[str]:
-    """Returns the modules beside the renderer that these files import: they may render by another rasterizer."""
-    folder = GR.rpartition("/")[0]
-    found = set()
-    for name, data in files.items():
-        for node in ast.walk(python_tree(data)):
-            if isinstance(node, ast.ImportFrom):
-                beside = [folder] if node.level and name == GR else []
-                module = ".".join([*beside, *filter(None, [node.module])])
-                found |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
-            elif isinstance(node, ast.Import):
-                found |= {alias.name for alias in node.names}
-    return sorted(module.replace(".", "/") + ".py" for module in found if module.startswith(folder + "."))
+def of_checkout(files: Mapping[str, bytes]) -> Set[str]:
+    """Returns the facts of a checkout like that of 3DGS: of its files, and of renderers that they import."""
+    looked_at = {name: files[name] for name in LOOKED_AT if name in files}
+    beside = {f"{FOLDER}/{module}.py" for module in those(of_files(looked_at), "imports ")}
+    return of_files({**looked_at, **{name: files[name] for name in beside if name in files}})
 
 
 def of_files(files: Mapping[str, bytes]) -> Set[str]:
@@ -59,10 +44,8 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
         tree = python_tree(data)
         in_try = {id(node) for outer in ast.walk(tree) if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
-        made, own = _names_of_rasterizers(tree), _calls_of_own_classes(tree)
+        made = _names_of_rasterizers(tree)
         for node in ast.walk(tree):
-            if id(node) in own or isinstance(node, ast.Assign) and id(node.value) in own:
-                continue
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 facts.update(_of_import(node, id(node) in in_try))
             elif isinstance(node, ast.ClassDef) and node.name in NAMES:
@@ -72,43 +55,39 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
                 facts.add("reads invdepthmap")
             elif isinstance(node, ast.Assign) and _renders(node.value, made) and isinstance(node.targets[0], ast.Tuple):
-                results = [getattr(one, "id", "_") for one in node.targets[0].elts]
-                if not any(isinstance(one, ast.Starred) for one in node.targets[0].elts):
-                    facts.add("returns " + ", ".join(results))
+                results = node.targets[0].elts
+                if not any(isinstance(one, ast.Starred) for one in results):
+                    facts.add("returns " + ", ".join(getattr(one, "id", "_") for one in results))
     return facts
 
 
-def _of_import(node: ast.AST, may_fail: bool) -> Iterator[str]:
+def _of_import(node: Any, may_fail: bool) -> Iterator[str]:
     names = [alias.name for alias in node.names]
     is_whole = isinstance(node, ast.Import)
     for module in names if is_whole else [node.module or ""]:
-        package, last = module.partition(".")[0], module.rpartition(".")[2]
-        yield "imports " + last
-        if package in MODULES:
-            yield "from " + package
-        elif package != RASTERIZER and OTHER_RASTERIZER.fullmatch(package):
-            yield "uses " + package
-        if package == RASTERIZER or package in MODULES:
-            yield "keeps the original" if is_whole else "keeps the original by name"
-        if module == "gaussian_renderer" and (is_whole or RENDERERS & set(names)):
-            yield "renders"
-        if module.startswith(INTEGRATIONS + "."):
+        package, is_ours = module.partition(".")[0], module.startswith(INTEGRATIONS + ".")
+        is_theirs = package == RASTERIZER or package in MODULES
+        yield "imports " + module.rpartition(".")[2]
+        if is_ours:
             yield PATCHED
-        if not is_whole and (package == RASTERIZER or package in MODULES or module.startswith(INTEGRATIONS + ".")):
+        elif is_theirs:
+            yield "from " + package
+        elif OTHER_RASTERIZER.fullmatch(package):
+            yield "uses " + package
+        if not is_whole and (is_ours or is_theirs or module in ("", FOLDER)):
             yield from (f"imports {name}" for name in names)
-        if not is_whole and (package == RASTERIZER or package in MODULES and package != "gsplat") and not may_fail:
+        if not is_whole and is_theirs and package != "gsplat" and not may_fail:
             prefix = "" if module == package else module + "."
             yield from (f"needs {prefix}{name}" for name in names if name != "*")
 
 
 def _of_call(call: ast.Call, made: Set[str]) -> Iterator[str]:
     called = getattr(call.func, "attr", getattr(call.func, "id", ""))  # the last part of the name
-    keywords = [keyword.arg for keyword in call.keywords]  # None: **pipe.blend
+    keywords = [keyword.arg for keyword in call.keywords if keyword.arg]  # without **pipe.blend
     if called == "GaussianRasterizationSettings":
-        yield from (f"sets {name}" for name in keywords if name)
-        yield "blends as it says" if {None, "blend_mode"} & set(keywords) else "blends by default"
+        yield from (f"sets {name}" for name in keywords)
     elif _renders(call, made) and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
-        yield from (f"takes {name}" for name in keywords if name)
+        yield from (f"takes {name}" for name in keywords)
     else:
         yield f"calls {called}"
 
@@ -123,20 +102,6 @@ def _names_of_rasterizers(tree: ast.Module) -> Set[str]:
     return aliases | objects | ({"rasterizer"} if aliases else set())
 
 
-def _calls_of_own_classes(tree: ast.Module) -> Set[int]:
-    """The calls of classes that the file defines, and of what it makes of them: a renderer without an extension."""
-    classes = {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
-    calls = {id(node) for node in ast.walk(tree)
-             if isinstance(node, ast.Call) and getattr(node.func, "id", "") in classes}
-    for function in ast.walk(tree):
-        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            nodes = list(ast.walk(function))
-            made = {target.id for node in nodes if isinstance(node, ast.Assign) and id(node.value) in calls
-                    for target in node.targets if isinstance(target, ast.Name)}
-            calls |= {id(node) for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") in made}
-    return calls
-
-
 def _renders(node: ast.AST, made: Set[str]) -> bool:
     """Whether it is a call of an object, rasterizer(...) or GaussianRasterizer(...)(...), and not of the class."""
     if not isinstance(node, ast.Call):
@@ -149,7 +114,7 @@ def _renders(node: ast.AST, made: Set[str]) -> bool:
 
 def is_for_run_alone(facts: Set[str]) -> bool:
     """Whether the rasterizer has a name that no patch rewrites, or a class of its name lies beside it in the file."""
-    return bool(those(facts, "from ") or those(facts, "defines "))
+    return bool(those(facts, "from ") - {RASTERIZER} or those(facts, "defines "))
 
 
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
@@ -188,8 +153,8 @@ def those(facts: Set[str], kind: str) -> Set[str]:
 
 
 def _known(contract: Contract) -> Dict[str, Set[str]]:
-    ours = set(GaussianRasterizationSettings._fields[len(SETTINGS) + 1:]) - {"clamp_color"}
-    return {"sets": {*SETTINGS, *contract.settings} | ours, "takes": {*ARGUMENTS, *contract.arguments},
+    ours = set(GaussianRasterizationSettings._fields[len(contracts.SETTINGS) + 1:]) - {"clamp_color"}
+    return {"sets": {*contracts.SETTINGS, *contract.settings} | ours, "takes": {*ARGUMENTS, *contract.arguments},
             "needs": {*NAMES, *contract.names}}
 
 
