@@ -68,10 +68,6 @@ class Source:
         line = self.lines[number - 1]
         return line[:len(line) - len(line.lstrip(b" \t\f"))]
 
-    def text(self, statement: ast.stmt) -> str:
-        """Returns the line on which a statement begins, from its first word on."""
-        return self.lines[statement.lineno - 1].decode(errors="replace").strip()
-
     def put(self, text: str, statement: ast.stmt) -> None:
         """Puts a line before a statement. Raises Misfit where that does not begin a line."""
         number = min(node.lineno for node in (statement, *getattr(statement, "decorator_list", ())))

@@ -77,14 +77,14 @@ def test_settings_in_one_line_and_imports_in_a_try_come_back(tmp_path):
 
 
 @pytest.mark.parametrize("name, old, new, rule", [
-    (GR, "debug=pipe.debug", "debug=False", "settings-blend-mode: 1 that look alike"),
-    (GR, "debug=pipe.debug", "debug=other.debug", "settings-blend-mode: 1 that look alike"),
-    (GR, "image_height=camera.height", "camera.height", "settings-blend-mode: 1 that look alike"),
+    (GR, "debug=pipe.debug", "debug=False", "settings-blend-mode: the call in line"),
+    (GR, "image_height=camera", "image_height=\\\ncamera", "settings-blend-mode: the call in line"),
+    (GR, "image_height=camera.height", "camera.height", "settings-blend-mode: the call in line"),
     (GR, "# slow\n    )\n", "# slow\n    )\n    settings = GaussianRasterizationSettings(image_height=1)\n",
-     "settings-blend-mode: 1 that look alike"),
+     "settings-blend-mode: the call in line"),
     ("train.py", "checkpoint):\n    # the first iteration is 1\n    first_iter = 0\n    if checkpoint:",
      "checkpoint): 0; checkpoint = 1\nif 1:\n    if checkpoint:", "pipe-blend-mode: line 5 has more than one"),
-    (GR, "debug=pipe.debug", "debug=pipe['debug']", "settings-blend-mode: 1 that look alike"),
+    (GR, "debug=pipe.debug", "debug=pipe['debug']", "settings-blend-mode: the call in line"),
     (ARGS, "class ModelParams", "class SceneParams", "model-parameter: no match"),
     (ARGS, 'super().__init__(parser, "Loading', 'ParamGroup.__init__(self, parser, "Loading',
      "model-parameter: no match"),
