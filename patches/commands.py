@@ -13,7 +13,7 @@ def apply(arguments: Namespace) -> int:
     planned = engine.apply(arguments.path, **_options(arguments))
     if planned.written:
         print(f"{arguments.path}: patched ({planned.trainer})")
-        _print_lines(f"{change.name}: {', '.join(change.rules) or 'as before the patch'}" for change in planned.changes)
+        _print_lines(f"{name}: {', '.join(dict.fromkeys(rules))}" for name, rules in planned.rules.items())
         print("It knows --blend_mode and --background_gate now, and saves them in cfg_args; `dsmoe patch revert` takes "
               "the patch back.")
     else:

@@ -13,7 +13,7 @@ import re
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Union
 
 from . import facts
 from .rules import OPTIONS, SETTINGS, import_rasterizer, rules_of, settings_blend, start
@@ -28,25 +28,18 @@ OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR)
 PathLike = Union[str, Path]
 
 
-class Change(NamedTuple):
-    """What becomes of one file."""
-
-    name: str  # relative to the checkout
-    now: bytes
-    before: bytes  # without the patch
-    after: bytes
-    rules: Tuple[str, ...]
-
-
 class Plan(NamedTuple):
-    """What `apply` would do, and why it would not."""
+    """What `apply` would do, and why it would not. Files are by name, relative to the checkout."""
 
     root: Path
     state: str  # one of STATES
     trainer: Optional[str]
     reasons: Sequence[str]  # of the state, as lines
     applied: Sequence[str] = ()  # of OPTIONS, those that the files on disk are patched with
-    changes: Sequence[Change] = ()
+    now: Mapping[str, bytes] = {}
+    before: Mapping[str, bytes] = {}  # without the patch
+    after: Mapping[str, bytes] = {}
+    rules: Mapping[str, Sequence[str]] = {}  # of each file
     notes: Sequence[str] = ()  # what no rule reaches
     written: bool = False  # whether `apply` wrote files by this plan
 
@@ -63,16 +56,15 @@ class Patched:
 
     def __init__(self, before: Mapping[str, bytes], trainer: Trainer, options: Sequence[str]) -> None:
         self.before, self.after = before, dict(before)
-        self.rules: Dict[str, List[str]] = {name: [] for name in before}  # that changed it
+        self.rules: Dict[str, List[str]] = {}  # of each file
         self.problems: List[str] = []  # why it cannot be patched
         self.notes: List[str] = []
         for rule in rules_of(trainer):
             why = self.apply(rule.file, rule.name, rule.edit)
             self.problems += [f"{rule.file}: rule {rule.name}: {why}; right would be {rule.says}"] if why else []
-        take = partial(import_rasterizer, trainer=trainer)
         for name, data in before.items():  # a script of the user's must not get another rasterizer
             if name != GR and RASTERIZER.encode() in data and not name.startswith("submodules/"):
-                self.apply(name, "import-rasterizer", take)
+                self.apply(name, "import-rasterizer", partial(import_rasterizer, trainer=trainer))
                 self.notes += [f"{name}: {note}" for note in self.left(name, trainer)]
         for option in options:
             for name, data in before.items():
@@ -94,7 +86,7 @@ class Patched:
         except PatchError as error:
             return str(error)
         self.after[name] = source.data
-        self.rules[name].append(rule)
+        self.rules.setdefault(name, []).append(rule)
         return ""
 
     def left(self, name: str, trainer: Trainer) -> List[str]:
@@ -127,8 +119,6 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         return Plan(root, "unknown", None, [reason if GR in now else f"there is no {GR} in it"], applied)
     wanted = {"modernise": modernise, "fuse": fuse}
     patched = Patched(before, chosen, [name for name in OPTIONS if wanted[name] or name in applied])
-    changes = [Change(name, data, before[name], patched.after[name], tuple(dict.fromkeys(patched.rules[name])))
-               for name, data in now.items() if {data, patched.after[name]} != {before[name]}]
     as_it_was = Patched(before, chosen, applied).after
     wrong = [f"{name}: is not as this version patches it: `apply` finishes the patch, `revert` takes it back"
              for name, data in now.items() if data != as_it_was[name]]
@@ -137,8 +127,8 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         patched.notes.insert(0, f"--trainer {trainer}: " + (
             f"by what it imports and calls this is {known.name}, whose rasterizer has another API ({known.flavour}, "
             f"not {chosen.flavour})" if known else reason))
-    return Plan(root, "drifted" if patched.problems else state, chosen.name,
-                patched.problems or wrong * (state == "half-patched"), applied, changes, patched.notes)
+    state, reasons = ("drifted", patched.problems) if patched.problems else (state, wrong * (state == "half-patched"))
+    return Plan(root, state, chosen.name, reasons, applied, now, before, patched.after, patched.rules, patched.notes)
 
 
 def diff(path: PathLike, **options: Any) -> str:
@@ -153,7 +143,7 @@ def apply(path: PathLike, **options: Any) -> Plan:
     Raises PatchError where it is refused, and then every file is as it was.
     """
     planned = check(path, **options).possible()
-    todo = {change.name: change.after for change in planned.changes if change.now != change.after}
+    todo = {name: data for name, data in planned.after.items() if data != planned.now[name]}
     _write(planned.root, todo)
     return planned._replace(written=bool(todo))
 
@@ -239,8 +229,8 @@ def _root(path: PathLike) -> Path:
 def text_of(planned: Plan) -> str:
     """Returns what the patch changes, as a unified diff."""
     text: List[str] = []
-    for change in planned.changes:
-        old, new = (io.StringIO(data.decode(errors="replace"), newline="").readlines()
-                    for data in (change.before, change.after))
-        text += difflib.unified_diff(old, new, "a/" + change.name, "b/" + change.name)
+    for name in planned.before:
+        old, new = (io.StringIO(files[name].decode(errors="replace"), newline="").readlines()
+                    for files in (planned.before, planned.after))
+        text += difflib.unified_diff(old, new, "a/" + name, "b/" + name)
     return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in text)

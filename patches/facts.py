@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import ast
 import re
-from typing import Any, Dict, Iterator, Mapping, Optional, Set, Tuple
+from typing import Any, Iterator, Mapping, Optional, Set, Tuple
 
 from diff_smoe_rasterization.integrations import contracts
 from diff_smoe_rasterization.integrations.contracts import ARGUMENTS, CONTRACTS, NAMES, RASTERIZER, RESULTS, Contract
@@ -16,6 +16,8 @@ PATCHED = "imports from " + INTEGRATIONS
 FOLDER = GR.partition("/")[0]
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
 OTHER_RASTERIZER = re.compile(r"diff_(gauss|surfel)\w*")
+USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its rasterizer is called with",
+        "needs ": "it imports"}
 MODULES = {contract.module: contract for contract in CONTRACTS if contract.module != RASTERIZER}
 
 
@@ -123,27 +125,24 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     if foreign:
         return None, f"it imports {', '.join(foreign)}, another rasterizer, which would render in this one's place"
     others = [contract for name, contract in MODULES.items() if "from " + name in facts]
-    if others and facts.isdisjoint({"imports " + name for name in NAMES}):
-        return others[0], ""
-    if not facts & {f"imports {name}" for name in NAMES}:
-        return None, f"nothing imports GaussianRasterizationSettings from {RASTERIZER} or {INTEGRATIONS}"
-    known = {contract.name: _known(contract) for contract in CONTRACTS}
-    said = {"sets": "its GaussianRasterizationSettings have {}", "takes": "its rasterizer is called with {}",
-            "needs": "it imports {}"}
-    for kind, text in said.items():
-        names = those(facts, kind + " ") - set().union(*(entry[kind] for entry in known.values()))
+    if facts.isdisjoint("imports " + name for name in NAMES):
+        return (others[0], "") if others else (
+            None, f"nothing imports GaussianRasterizationSettings from {RASTERIZER} or {INTEGRATIONS}")
+    used = {kind + name for kind in USES for name in those(facts, kind)}
+    for kind, text in USES.items():
+        names = those(used - set().union(*map(_known, CONTRACTS)), kind)
         if names:
-            return None, (text.format(", ".join(sorted(names))) + ", which no rasterizer has that is known here "
-                          f"({', '.join(sorted(known))})")
+            return None, (f"{text} {', '.join(sorted(names))}, which no rasterizer has that is known here "
+                          f"({', '.join(sorted(contract.name for contract in CONTRACTS))})")
     shown = others or [contract for contract in CONTRACTS if contract.module == RASTERIZER
                        and (not contract.signs or facts & set(contract.signs))]
-    fitting = [contract for contract in shown
-               if all(those(facts, kind + " ") <= known[contract.name][kind] for kind in said)]
+    fitting = [contract for contract in shown if used <= _known(contract)]
+    returned = sorted(those(facts, "returns "))
     for contract in fitting:
-        if all(_fits(found, contract) for found in those(facts, "returns ")):
+        if all(_fits(found, contract) for found in returned):
             return contract, ""
     nearest = (fitting or shown)[0]
-    found = next((found for found in sorted(those(facts, "returns ")) if not _fits(found, nearest)), "")
+    found = next((found for found in returned if not _fits(found, nearest)), "")
     return None, (f"its rasterizer returns {len(found.split(', '))} results ({found}); that of {nearest.name}, which "
                   f"it resembles, returns {len(nearest.results)} ({', '.join(nearest.results)})")
 
@@ -152,10 +151,12 @@ def those(facts: Set[str], kind: str) -> Set[str]:
     return {fact[len(kind):] for fact in facts if fact.startswith(kind)}
 
 
-def _known(contract: Contract) -> Dict[str, Set[str]]:
+def _known(contract: Contract) -> Set[str]:
+    """The facts by which a caller may use a rasterizer."""
     ours = set(GaussianRasterizationSettings._fields[len(contracts.SETTINGS) + 1:]) - {"clamp_color"}
-    return {"sets": {*contracts.SETTINGS, *contract.settings} | ours, "takes": {*ARGUMENTS, *contract.arguments},
-            "needs": {*NAMES, *contract.names}}
+    return {*(f"sets {name}" for name in (*contracts.SETTINGS, *contract.settings, *ours)),
+            *(f"takes {name}" for name in (*ARGUMENTS, *contract.arguments)),
+            *(f"needs {name}" for name in (*NAMES, *contract.names))}
 
 
 def _fits(found: str, contract: Contract) -> bool:

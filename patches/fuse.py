@@ -2,8 +2,8 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib
+from functools import partial
 from typing import Any, Callable, Dict
 
 from .runtime import say
@@ -20,7 +20,7 @@ def start() -> None:
     torch.optim.Adam = fused_where_it_fits(torch.optim.Adam)
     with contextlib.suppress(ImportError, AttributeError):  # the trainer will say what is missing
         losses: Any = importlib.import_module("utils.loss_utils")
-        losses.ssim = fused_where_equal(losses.ssim)
+        losses.ssim = partial(fused_where_equal, losses.ssim, {})
 
 
 def fused_where_it_fits(adam: Any) -> Any:
@@ -37,35 +37,28 @@ def fused_where_it_fits(adam: Any) -> Any:
     return Adam
 
 
-def fused_where_equal(ssim: Callable[..., Any]) -> Callable[..., Any]:
+def fused_where_equal(ssim: Callable[..., Any], differences: Dict[Any, str], *images: Any, **keywords: Any) -> Any:
     """Returns a trainer's ssim(img1, img2, ...), by `fused_ssim` where that can be.
 
     img1, img2: [3, H, W] or [B, 3, H, W]. Of the first images of a shape both are computed: where they differ in value
     or gradient the trainer's own stays, and a line on stderr says so. It is also called for other arguments and types,
-    and for gradients by img2: the kernel has none of it.
+    and for gradients by img2: the kernel has none of it. differences: by shape, what was found.
     """
-    differences: Dict[Any, str] = {}
+    import torch
 
-    @functools.wraps(ssim)
-    def call(*images: Any, **keywords: Any) -> Any:
-        import torch
+    from diff_smoe_rasterization import fused_ssim
 
-        from diff_smoe_rasterization import fused_ssim
-
-        first, second = images if len(images) == 2 and not keywords else (torch.empty(0),) * 2
-        if (first.dim() not in (3, 4) or first.shape != second.shape or first.device != second.device
-                or {first.dtype, second.dtype} != {torch.float32}
-                or second.requires_grad and torch.is_grad_enabled()):
-            return ssim(*images, **keywords)
-        case = first.device, first.shape
-        if case not in differences:
-            differences[case] = difference_of(ssim, first, second)
-            if differences[case]:
-                say(f"--fuse: {ssim.__module__}.{ssim.__name__} is not SSIM as it is fused here "
-                    f"({differences[case]}): it is computed as before")
-        return ssim(*images) if differences[case] else fused_ssim(*images)
-
-    return call
+    first, second = images if len(images) == 2 and not keywords else (torch.empty(0),) * 2
+    if (first.dim() not in (3, 4) or first.shape != second.shape or first.device != second.device
+            or {first.dtype, second.dtype} != {torch.float32} or second.requires_grad and torch.is_grad_enabled()):
+        return ssim(*images, **keywords)
+    case = first.device, first.shape
+    if case not in differences:
+        differences[case] = difference_of(ssim, first, second)
+        if differences[case]:
+            say(f"--fuse: utils.loss_utils.ssim is not SSIM as it is fused here ({differences[case]}): it is computed "
+                "as before")
+    return ssim(*images) if differences[case] else fused_ssim(*images)
 
 
 def difference_of(own: Callable[..., Any], img1: Any, img2: Any) -> str:

@@ -72,11 +72,6 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
     if gate is not None:
         said += f"; background gate {gate}, {_whence('background_gate', gate, dataset)}"
     say(said)
-    # The option lies in the trainers' OptimizationParams, which are not at hand where a model is rendered.
-    is_other = "--random_background" in sys.argv or getattr(dataset, "white_background", False)
-    if mode != "alpha" and not gate and is_other:
-        _warn(f"--random_background or --white_background in blend mode {mode} without a background gate: the "
-              "background shows only where no gate is open, so it does not penalise transparent Gaussians as in alpha")
     dataset.blend_mode, dataset.background_gate = mode, gate
     return {"blend_mode": mode, "background_gate": gate}
 

@@ -92,18 +92,6 @@ def test_a_wrong_mode_is_refused_by_name(monkeypatch):
         runtime.blend_of(run("Smoe"))
 
 
-@pytest.mark.parametrize("arguments, white", [(["--random_background"], False), ([], True)])
-def test_a_background_that_changes_its_meaning_is_named(monkeypatch, arguments, white):
-    monkeypatch.setattr(sys, "argv", ["train.py"] + arguments)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for harmless in (run("alpha", white_background=white), run("smoe", "0.1", white_background=white)):
-            runtime.blend_of(harmless)
-    for mode, gate in (("smoe", "0"), ("smoe_tn", "")):
-        with pytest.warns(UserWarning, match="_background in blend mode smoe.* without a .*: the background shows"):
-            runtime.blend_of(run(mode, gate, white_background=white))
-
-
 def model(folder, text):
     """A model's folder, whose cfg_args has this text."""
     (folder / "cfg_args").write_text(text)

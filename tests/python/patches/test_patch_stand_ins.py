@@ -6,6 +6,7 @@ import math
 import re
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 import torch
@@ -52,7 +53,7 @@ def fused_calls(monkeypatch):
 
 @pytest.mark.parametrize("shape", [(3, 40, 52), (1, 24, 31), (2, 3, 40, 52)])
 def test_ssim_is_fused_where_it_is_the_same(shape, fused_calls, capsys):
-    call = fuse.fused_where_equal(ssim)
+    call = partial(fuse.fused_where_equal, ssim, {})
     torch.manual_seed(0)
     image, target = torch.rand(shape, requires_grad=True), torch.rand(shape)
     for _ in range(3):
@@ -64,11 +65,11 @@ def test_ssim_is_fused_where_it_is_the_same(shape, fused_calls, capsys):
         torch.testing.assert_close(gradient, torch.autograd.grad(expected, image)[0], rtol=0,
                                    atol=1e-4 * float(gradient.abs().max()))
     assert fused_calls == [shape] * 4  # one of them to compare, once
-    assert capsys.readouterr().err == "" and call.__name__ == "ssim"
+    assert capsys.readouterr().err == ""
 
 
 def test_what_the_kernel_does_not_have_is_computed_as_before(fused_calls):
-    call = fuse.fused_where_equal(ssim)
+    call = partial(fuse.fused_where_equal, ssim, {})
     torch.manual_seed(0)
     one, other = torch.rand(2, 1, 3, 20, 30)
     assert torch.equal(call(one, other, 7), ssim(one, other, 7))
@@ -92,7 +93,7 @@ def test_what_the_kernel_does_not_have_is_computed_as_before(fused_calls):
     lambda img1, img2: ssim(img1, img2) + 0 * (img1 - img1.detach()).sqrt().sum()])  # its gradient alone is NaN
 def test_another_ssim_stays_and_that_is_said_once(other, capsys):
     runtime.say.cache_clear()
-    call = fuse.fused_where_equal(other)
+    call = partial(fuse.fused_where_equal, other, {})
     torch.manual_seed(0)
     one, two = 0.4 + 0.1 * torch.rand(2, 2, 3, 20, 30)  # of so little contrast that SSIM's constants count
     for _ in range(2):
@@ -112,7 +113,7 @@ def test_eigenvectors_in_parts_are_those_of_all_at_once(monkeypatch, shape, at_o
     monkeypatch.setattr(modernise, "EIGH_AT_ONCE", at_once)
     matrices = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
     found, expected = (eigh(matrices, UPLO="U")
-                       for eigh in (modernise.eigh_in_parts(torch.linalg.eigh), torch.linalg.eigh))
+                       for eigh in (partial(modernise.eigh_in_parts, torch.linalg.eigh), torch.linalg.eigh))
     assert torch.equal(found.eigenvalues, expected.eigenvalues)
     assert torch.equal(found.eigenvectors, expected.eigenvectors)
     gradient, expected_gradient = (torch.autograd.grad((result[0] ** 2).sum(), matrices)[0]
@@ -141,7 +142,7 @@ def integers(dtype, shape):
 def test_unique_rows_are_those_of_torch(rows):
     for inverse, counts, is_sorted in itertools.product((False, True), repeat=3):
         found, expected = (unique(rows, is_sorted, inverse, counts, dim=0)
-                           for unique in (modernise.unique_rows(torch.unique), torch.unique))
+                           for unique in (partial(modernise.unique_rows, torch.unique), torch.unique))
         assert isinstance(found, tuple) == isinstance(expected, tuple) == (inverse or counts)
         pairs = list(zip(found, expected)) if isinstance(found, tuple) else [(found, expected)]
         assert len(pairs) == 1 + inverse + counts
@@ -156,7 +157,7 @@ def test_rows_of_integers_are_not_given_to_the_unique_that_may_fail():
         given.append((input.dim(), words[3:]))
         return torch.unique(input, *words, **keywords)
 
-    call, rows = modernise.unique_rows(unique), torch.tensor([[3, 1], [2, 1]])
+    call, rows = partial(modernise.unique_rows, unique), torch.tensor([[3, 1], [2, 1]])
     call(rows, dim=0)
     assert given == [(1, ())] * 4
     assert torch.equal(call(rows), torch.tensor([1, 2, 3])) and call(rows, dim=1).shape == (2, 2)
@@ -201,7 +202,7 @@ assert np.array_equal(np.array(Image.fromarray(picture)), picture)
 torch.save({"loss": np.float64(1)}, sys.argv[1])  # is more than tensors
 assert torch.load(sys.argv[1])["loss"] == 1
 assert type(torch.optim.Adam([torch.ones(1)])).__name__ == "FusedAdam"
-assert all(changed.__wrapped__ for changed in (torch.unique, torch.linalg.eigh))
+assert torch.linalg.eigh(torch.eye(2))[0].tolist() == [1, 1]
 image = torch.rand(3, 20, 20)
 assert ssim(image, image) == 0.5 and torch.equal(torch.ones(3, 1, dtype=int).unique(dim=0), torch.ones(1, 1, dtype=int))
 print(distCUDA2.__module__, scatter_max.__module__)
