@@ -10,7 +10,7 @@ from . import engine
 
 def apply(arguments: Namespace) -> int:
     """Patches."""
-    planned = engine.apply(arguments.path, **_options(arguments))
+    planned = engine.apply(**_options(arguments))
     if planned.written:
         print(f"{arguments.path}: patched ({planned.trainer})")
         _print_lines(f"{name}: {', '.join(dict.fromkeys(rules))}" for name, rules in planned.rules.items())
@@ -24,7 +24,7 @@ def apply(arguments: Namespace) -> int:
 
 def check(arguments: Namespace) -> int:
     """Says in one word how the checkout is, and why."""
-    planned = engine.check(arguments.path, **_options(arguments))
+    planned = engine.check(**_options(arguments))
     options = "".join(f", --{option}" for option in planned.applied)
     print(f"{arguments.path}: {planned.state}" + (f" ({planned.trainer}{options})" if planned.trainer else ""))
     _print_lines((*planned.reasons, *planned.notes))
@@ -33,7 +33,7 @@ def check(arguments: Namespace) -> int:
 
 def diff(arguments: Namespace) -> int:
     """Shows what the patch changes, against the files as they were before any patch."""
-    planned = engine.check(arguments.path, **_options(arguments)).possible()
+    planned = engine.check(**_options(arguments)).possible()
     sys.stdout.write(engine.text_of(planned))
     _print_lines(planned.notes, sys.stderr)
     return 0
@@ -47,7 +47,7 @@ def revert(arguments: Namespace) -> int:
 
 
 def _options(arguments: Namespace) -> Dict[str, Any]:
-    return {name: getattr(arguments, name) for name in ("modernise", "trainer", "fuse")}
+    return {name: getattr(arguments, name) for name in ("path", "modernise", "trainer", "fuse")}
 
 
 def _print_lines(lines: Iterable[str], where: Any = None) -> None:

@@ -17,7 +17,7 @@ from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Seq
 
 from . import facts
 from .rules import OPTIONS, SETTINGS, import_rasterizer, rules_of, settings_blend, start
-from .source import MARK, NO_STANDARD, STANDARD, Misfit, PatchError, Source, tree_of, unpatched
+from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, tree_of, unpatched
 from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
@@ -77,12 +77,12 @@ class Patched:
         """Applies a rule to a file; returns why it does not fit."""
         try:
             if name not in self.after:
-                raise Misfit("there is no such file")
+                raise PatchError("there is no such file")
             source = Source(self.after[name])
             edit(source)
             tree_of(source.data)
             if unpatched(source.data) != self.before[name]:
-                raise Misfit("the patch could not be taken back")
+                raise PatchError("the patch could not be taken back")
         except PatchError as error:
             return str(error)
         self.after[name] = source.data
@@ -110,8 +110,11 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     found = facts.of_checkout(before)
     known, reason = facts.recognise(found)
     recorded = re.search(rf"{MARK} ([\w-]+): ".encode(), now.get(GR, b""))
-    name = trainer or (recorded[1].decode() if recorded else None)
-    chosen = by_name(name) if name else known
+    by_name = {"": known, **{one.name: one for one in reversed(TRAINERS)}}
+    name = trainer or (recorded[1].decode() if recorded else "")
+    if name not in by_name:
+        raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(TRAINER_NAMES)}")
+    chosen = by_name[name]
     if chosen is not None and (not chosen.entries or facts.is_for_run_alone(found)):
         reason = reason or f"its rasterizer is {chosen.flavour}, for which there is no patch: use `dsmoe run`"
         chosen = None
@@ -122,12 +125,11 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     as_it_was = Patched(before, chosen, applied).after
     wrong = [f"{name}: is not as this version patches it: `apply` finishes the patch, `revert` takes it back"
              for name, data in now.items() if data != as_it_was[name]]
-    state = "patched" if not wrong else "patchable" if now == before else "half-patched"
+    state, reasons = (("drifted", patched.problems) if patched.problems else ("patched", []) if not wrong else
+                      ("patchable", []) if now == before else ("half-patched", wrong))
     if trainer and not (known and known.flavour == chosen.flavour):
-        patched.notes.insert(0, f"--trainer {trainer}: " + (
-            f"by what it imports and calls this is {known.name}, whose rasterizer has another API ({known.flavour}, "
-            f"not {chosen.flavour})" if known else reason))
-    state, reasons = ("drifted", patched.problems) if patched.problems else (state, wrong * (state == "half-patched"))
+        reason = f"by what it imports and calls it is {known.name}, which has another API" if known else reason
+        patched.notes.insert(0, f"--trainer {trainer}: {reason}")
     return Plan(root, state, chosen.name, reasons, applied, now, before, patched.after, patched.rules, patched.notes)
 
 
@@ -207,13 +209,6 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
                          "the checkout is") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def by_name(name: str) -> Trainer:
-    for trainer in TRAINERS:
-        if trainer.name == name:
-            return trainer
-    raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(TRAINER_NAMES)}")
 
 
 def _root(path: PathLike) -> Path:

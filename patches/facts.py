@@ -21,14 +21,6 @@ USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its raster
 MODULES = {contract.module: contract for contract in CONTRACTS if contract.module != RASTERIZER}
 
 
-def python_tree(data: bytes) -> ast.Module:
-    """Returns the syntax tree of a file as Python's own parser has it; of one that cannot be parsed an empty one."""
-    try:
-        return tree_of(data)
-    except PatchError:
-        return ast.Module(body=[], type_ignores=[])
-
-
 def of_checkout(files: Mapping[str, bytes]) -> Set[str]:
     """Returns the facts of a checkout like that of 3DGS: of its files, and of renderers that they import."""
     looked_at = {name: files[name] for name in LOOKED_AT if name in files}
@@ -43,7 +35,10 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
     """
     facts: Set[str] = set()
     for data in files.values():
-        tree = python_tree(data)
+        try:
+            tree = tree_of(data)
+        except PatchError:
+            continue
         in_try = {id(node) for outer in ast.walk(tree) if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
         made = _names_of_rasterizers(tree)

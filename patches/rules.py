@@ -1,6 +1,6 @@
 """The rules of a patch: what each puts into a file.
 
-A rule edits a Source. It raises Misfit where what it looks for is not there, or in a form that it does not know.
+A rule edits a Source. It raises PatchError where what it looks for is not there, or in a form that it does not know.
 """
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import re
 from functools import partial
 from typing import Callable, List, NamedTuple, Sequence
 
-from .source import MARK, Misfit, Source
+from .source import MARK, PatchError, Source
 from .trainers import ARGUMENTS, GR, INTEGRATIONS, PACKAGE, RASTERIZER, RUNTIME, Entry, Trainer
 
 SETTINGS = "GaussianRasterizationSettings"
@@ -45,13 +45,13 @@ def import_rasterizer(source: Source, trainer: Trainer) -> None:
         ours = f"{INTEGRATIONS}.{trainer.flavour}".encode()
         source.lines[node.lineno - 1] = above + source.newline + line.replace(RASTERIZER.encode(), ours, 1)
     if not found:
-        raise Misfit("no match")
+        raise PatchError("no match")
 
 
 def _import(source: Source, name: str, found: Sequence[ast.AST]) -> None:
-    """A rule's file gets the import of what the rule put in. Raises Misfit where it found nothing."""
+    """A rule's file gets the import of what the rule put in. Raises PatchError where it found nothing."""
     if not found:
-        raise Misfit("no match")
+        raise PatchError("no match")
     source.put_on_top(f"from {RUNTIME} import {name}  {MARK}")
 
 
@@ -61,7 +61,7 @@ def settings_blend(source: Source) -> None:
     for call in sorted(calls, key=lambda call: call.lineno, reverse=True):
         given = {keyword.arg: keyword.value for keyword in call.keywords}
         pipe = getattr(getattr(given.get("debug"), "value", None), "id", "")
-        misfit = Misfit(f"the call in line {call.lineno} is another")
+        misfit = PatchError(f"the call in line {call.lineno} is another")
         if call.args or {None, "blend_mode"} & set(given) or not pipe or getattr(given["debug"], "attr", "") != "debug":
             raise misfit
         name, value = str(call.keywords[0].arg), call.keywords[0].value

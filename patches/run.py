@@ -37,8 +37,6 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
     environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
     for line in lines:
         print("dsmoe run: " + line, file=sys.stderr)
-    sys.stdout.flush()
-    sys.stderr.flush()
     with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
         used = Path(folder, "used")
         try:

@@ -11,12 +11,8 @@ import warnings
 from pathlib import Path
 from typing import Any, Callable, Dict, Optional, Tuple
 
-from diff_smoe_rasterization.settings import (
-    BLEND_MODES,
-    resolve_background_gate,
-    resolve_blend_mode,
-    training_background_gate,
-)
+from diff_smoe_rasterization import settings
+from diff_smoe_rasterization.settings import BLEND_MODES, resolve_blend_mode
 
 HERE = Path(__file__).resolve().parent
 SHIMS, STAND_INS = HERE / "shims", HERE / "stand_ins"
@@ -68,7 +64,7 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
               "or in another mode); --background_gate says otherwise")
         gate = 0.0
     is_of_smoe = mode != "smoe" and not isinstance(gate, str)
-    gate = training_background_gate(mode, None if gate == "" or is_of_smoe else gate)
+    gate = settings.training_background_gate(mode, None if gate == "" or is_of_smoe else gate)
     if gate is not None:
         said += f"; background gate {gate}, {_whence('background_gate', gate, dataset)}"
     say(said)
@@ -118,7 +114,7 @@ def _noting(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _say_rasterizer(flavour: str) -> None:
     mode = resolve_blend_mode(None)
-    gate = f", background gate {resolve_background_gate(mode, None)}" if mode == "smoe" else ""
+    gate = f", background gate {settings.resolve_background_gate(mode, None)}" if mode == "smoe" else ""
     say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
 
 
@@ -196,12 +192,10 @@ def is_installed(module: str) -> bool:
 
 def _check_renderer() -> None:
     """Raises RuntimeError where the trainer's renderer is not, or no longer, patched: it would ignore the mode."""
-    renderer = sys.modules.get("gaussian_renderer")
-    settings = getattr(renderer, "GaussianRasterizationSettings", None)
-    if settings is not None and "blend_mode" not in getattr(settings, "_fields", ()):
-        checkout = Path(getattr(renderer, "__file__", None) or "PATH/x").parent.parent
+    theirs = getattr(sys.modules.get("gaussian_renderer"), "GaussianRasterizationSettings", None)
+    if theirs is not None and "blend_mode" not in getattr(theirs, "_fields", ()):
         raise RuntimeError("gaussian_renderer uses another rasterizer, which has no blend modes: was it restored after "
-                           f"the patch? type: dsmoe patch check {checkout}")
+                           "the patch? type: dsmoe patch check PATH")
 
 
 def _is_typed(option: str) -> bool:

@@ -24,10 +24,6 @@ class PatchError(RuntimeError):
     """A refusal in plain words: it names the file and the rule, and nothing was written."""
 
 
-class Misfit(PatchError):
-    """What has to be patched is there in a form that the rule does not know."""
-
-
 def tree_of(data: bytes) -> ast.Module:
     """Returns the syntax tree of a file. Raises PatchError where it has none."""
     try:
@@ -69,10 +65,10 @@ class Source:
         return line[:len(line) - len(line.lstrip(b" \t\f"))]
 
     def put(self, text: str, statement: ast.stmt) -> None:
-        """Puts a line before a statement. Raises Misfit where that does not begin a line."""
+        """Puts a line before a statement. Raises PatchError where that does not begin a line."""
         number = min(node.lineno for node in (statement, *getattr(statement, "decorator_list", ())))
         if len(self.indent(number)) != statement.col_offset:
-            raise Misfit(f"line {number} has more than one statement")
+            raise PatchError(f"line {number} has more than one statement")
         if number > 1 and self.lines[number - 2].strip().startswith(MARK.encode()):
             number -= 1  # what it says is of the statement
         self.lines[number - 1] = self.indent(number) + text.encode() + self.newline + self.lines[number - 1]

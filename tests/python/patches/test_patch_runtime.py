@@ -169,7 +169,7 @@ def test_a_renderer_with_another_rasterizer_is_refused(monkeypatch, tmp_path):
     theirs = SimpleNamespace(GaussianRasterizationSettings=namedtuple("Settings", "image_height debug"),
                              __file__=str(tmp_path / "gaussian_renderer/__init__.py"))
     monkeypatch.setitem(sys.modules, "gaussian_renderer", theirs)
-    with pytest.raises(RuntimeError, match=f"another rasterizer.*dsmoe patch check {tmp_path}$"):
+    with pytest.raises(RuntimeError, match="another rasterizer.*dsmoe patch check PATH"):
         runtime.blend_of(run("smoe"))
     ours = SimpleNamespace(GaussianRasterizationSettings=GaussianRasterizationSettings)
     for renderer in (ours, SimpleNamespace()):
