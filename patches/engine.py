@@ -45,10 +45,10 @@ class Plan(NamedTuple):
 
     def possible(self) -> Plan:
         """Returns the plan. Raises PatchError where the checkout cannot be patched."""
-        if self.state not in ("unknown", "drifted"):
-            return self
-        trainer = f" ({self.trainer})" if self.trainer else ""
-        raise PatchError("\n  ".join([f"the checkout is {self.state}{trainer}:", *self.reasons]))
+        if self.state in ("unknown", "drifted"):
+            trainer = f" ({self.trainer})" if self.trainer else ""
+            raise PatchError("\n  ".join([f"the checkout is {self.state}{trainer}:", *self.reasons]))
+        return self
 
 
 class Patched:
@@ -115,7 +115,8 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     if name not in by_name:
         raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(TRAINER_NAMES)}")
     chosen = by_name[name]
-    if chosen is not None and (not chosen.entries or facts.is_for_run_alone(found)):
+    others = facts.those(found, "from ") - {RASTERIZER} or facts.those(found, "defines ")
+    if chosen is not None and (not chosen.entries or others):
         reason = reason or f"its rasterizer is {chosen.flavour}, for which there is no patch: use `dsmoe run`"
         chosen = None
     if GR not in now or chosen is None or facts.those(found, "uses "):
@@ -159,13 +160,12 @@ def revert(path: PathLike) -> List[str]:
     now = _files(root)
     back = {name: unpatched(data) for name, data in now.items() if unpatched(data) != data}
     for name, data in {**now, **back}.items():
-        line = next((line for line in data.splitlines() if MARK.encode() in line), None)
-        if line:
-            raise PatchError(f"{name}: a line of the patch was edited: {line.decode(errors='replace').strip()}\n"
-                             "Undo that edit, or take the line out, then revert again; nothing was touched")
-    for name, data in back.items():
         try:
-            tree_of(data)
+            kept = re.search(rf".*{MARK}.*".encode(), data)
+            if kept:
+                raise PatchError(f"still has `{kept[0].decode(errors='replace').strip()}`")
+            if name in back:
+                tree_of(data)
         except PatchError as error:
             raise PatchError(f"{name}: without the lines of the patch it {error}. Undo your edit of them, then revert "
                              "again; nothing was touched") from None

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import ast
 import re
-from typing import Any, Iterator, Mapping, Optional, Set, Tuple
+from typing import Any, Iterator, List, Mapping, Optional, Sequence, Set, Tuple
 
 from diff_smoe_rasterization.integrations import contracts
 from diff_smoe_rasterization.integrations.contracts import ARGUMENTS, CONTRACTS, NAMES, RASTERIZER, RESULTS, Contract
@@ -36,22 +36,22 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
     facts: Set[str] = set()
     for data in files.values():
         try:
-            tree = tree_of(data)
+            nodes = list(ast.walk(tree_of(data)))
         except PatchError:
             continue
-        in_try = {id(node) for outer in ast.walk(tree) if isinstance(outer, ast.Try) and outer.handlers
+        in_try = {id(node) for outer in nodes if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
-        made = _names_of_rasterizers(tree)
-        for node in ast.walk(tree):
+        renderings = _renderings(nodes)
+        for node in nodes:
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 facts.update(_of_import(node, id(node) in in_try))
             elif isinstance(node, ast.ClassDef) and node.name in NAMES:
                 facts.add("defines " + node.name)
             elif isinstance(node, ast.Call):
-                facts.update(_of_call(node, made))
+                facts.update(_of_call(node, node in renderings))
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
                 facts.add("reads invdepthmap")
-            elif isinstance(node, ast.Assign) and _renders(node.value, made) and isinstance(node.targets[0], ast.Tuple):
+            elif isinstance(node, ast.Assign) and node.value in renderings and isinstance(node.targets[0], ast.Tuple):
                 results = node.targets[0].elts
                 if not any(isinstance(one, ast.Starred) for one in results):
                     facts.add("returns " + ", ".join(getattr(one, "id", "_") for one in results))
@@ -78,40 +78,26 @@ def _of_import(node: Any, may_fail: bool) -> Iterator[str]:
             yield from (f"needs {prefix}{name}" for name in names if name != "*")
 
 
-def _of_call(call: ast.Call, made: Set[str]) -> Iterator[str]:
+def _of_call(call: ast.Call, renders: bool) -> Iterator[str]:
     called = getattr(call.func, "attr", getattr(call.func, "id", ""))  # the last part of the name
     keywords = [keyword.arg for keyword in call.keywords if keyword.arg]  # without **pipe.blend
     if called == "GaussianRasterizationSettings":
         yield from (f"sets {name}" for name in keywords)
-    elif _renders(call, made) and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
+    elif renders and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
         yield from (f"takes {name}" for name in keywords)
     else:
         yield f"calls {called}"
 
 
-def _names_of_rasterizers(tree: ast.Module) -> Set[str]:
-    """The names by which a file knows the class GaussianRasterizer and objects of it."""
-    aliases = {alias.asname or alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)
+def _renderings(nodes: Sequence[ast.AST]) -> List[ast.AST]:
+    """The calls of objects, rasterizer(...) and GaussianRasterizer(...)(...), by whatever names; not of the class."""
+    classes = {alias.asname or alias.name for node in nodes if isinstance(node, ast.ImportFrom)
                for alias in node.names if alias.name.startswith("GaussianRasterizer")}
-    objects = {target.id for node in ast.walk(tree) if isinstance(node, ast.Assign)
-               and isinstance(node.value, ast.Call) and getattr(node.value.func, "id", "") in aliases
-               for target in node.targets if isinstance(target, ast.Name)}
-    return aliases | objects | ({"rasterizer"} if aliases else set())
-
-
-def _renders(node: ast.AST, made: Set[str]) -> bool:
-    """Whether it is a call of an object, rasterizer(...) or GaussianRasterizer(...)(...), and not of the class."""
-    if not isinstance(node, ast.Call):
-        return False
-    called = node.func.func if isinstance(node.func, ast.Call) else node.func
-    is_object = isinstance(node.func, ast.Call) or not any(
-        keyword.arg == "raster_settings" for keyword in node.keywords)
-    return is_object and getattr(called, "id", "") in made
-
-
-def is_for_run_alone(facts: Set[str]) -> bool:
-    """Whether the rasterizer has a name that no patch rewrites, or a class of its name lies beside it in the file."""
-    return bool(those(facts, "from ") - {RASTERIZER} or those(facts, "defines "))
+    calls = [node for node in nodes if isinstance(node, ast.Call)]
+    made = [call for call in calls if getattr(call.func, "id", "") in classes]
+    objects = {getattr(target, "id", "") for node in nodes if isinstance(node, ast.Assign) and node.value in made
+               for target in node.targets} | ({"rasterizer"} if classes else set())
+    return [call for call in calls if call.func in made or getattr(call.func, "id", None) in objects]
 
 
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:

@@ -23,10 +23,7 @@ USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used firs
 
 
 def default_blend() -> Tuple[str, str]:
-    """Returns the defaults of --blend_mode: $DSMOE_BLEND_MODE, else "alpha"; and of --background_gate: "".
-
-    "" is what `training_background_gate` gives for the mode. Raises ValueError where DSMOE_BLEND_MODE names no mode.
-    """
+    """Returns the defaults of --blend_mode, $DSMOE_BLEND_MODE or alpha, and of --background_gate: that of the mode."""
     return resolve_blend_mode(None), ""
 
 
@@ -73,10 +70,7 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
 
 
 def chosen_blend(pipe: Any) -> Dict[str, Any]:
-    """Returns the settings that `blend_of` left in the pipeline's options. Raises RuntimeError where it was not called.
-
-    That is so in scripts of the user's own.
-    """
+    """Returns the settings that `blend_of` left. Raises RuntimeError where a script of the user's did not call it."""
     if not hasattr(pipe, "blend"):
         raise RuntimeError("this script renders without a blend mode; before it renders it needs the statements `from "
                            f"{__name__} import saved_blend_of` and `pipe.blend = saved_blend_of(dataset)`")
@@ -85,10 +79,7 @@ def chosen_blend(pipe: Any) -> Dict[str, Any]:
 
 def _whence(option: str, value: Any, dataset: Any) -> str:
     """Says in words where an option's value comes from; warns where the model's cfg_args has another."""
-    saved, cfg_args = _saved(dataset), Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
-    before = saved.get(option)
-    if option == "background_gate":  # which an earlier version did not record
-        before = saved.get(option, 0.0) if saved.get("blend_mode") == "smoe" else None
+    before, cfg_args = _saved(dataset).get(option), Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
     variable = "DSMOE_" + option.upper()
     whence = (f"as --{option} says" if _is_typed(option) else f"as in {cfg_args}" if before == value else
               f"as in {variable}" if os.environ.get(variable) else "the default")
@@ -122,8 +113,6 @@ def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
     """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
 
     flavour: the module of integrations, where the name that is imported says it; None: the one that the trainer needs.
-    The first rasterizer that is made, or function that is called, is noted for `dsmoe run`, which else says at the end
-    that nothing was rendered.
     """
     from diff_smoe_rasterization import GaussianRasterizer
 
@@ -168,10 +157,7 @@ def gsplat_of_run() -> None:
 
 
 def is_installed(module: str) -> bool:
-    """Whether a package can be imported from elsewhere; then it takes the place of the stand-in that asks.
-
-    module: of the package, one that may fail to load. Where it cannot be had, that is said on stderr.
-    """
+    """Whether a package, with this module of it, can be imported from elsewhere; then it replaces its stand-in."""
     import torch  # noqa: F401  (its libraries are the extensions')
 
     name, path = module.partition(".")[0], sys.path[:]

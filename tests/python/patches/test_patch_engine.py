@@ -198,7 +198,7 @@ def test_edits_stay_when_the_patch_goes(tmp_path, dsmoe):
 
 @pytest.mark.parametrize("name, old, new, words", [
     ("train.py", "    pipe.blend", "    if 1:\n        pipe.blend", "train.py: without the lines of the patch it is"),
-    (GR, "\nfrom diff_smoe", "\n\nfrom diff_smoe", "a line of the patch was edited: # dsmoe patch 3dgs-2023: diff")])
+    (GR, "\nfrom diff_smoe", "\n\nfrom diff_smoe", "it still has `# dsmoe patch 3dgs-2023: diff")])
 def test_an_edit_without_which_no_file_comes_back_is_named(tmp_path, name, old, new, words):
     patches.apply(make(tmp_path))
     (tmp_path / name).write_text((tmp_path / name).read_text().replace(old, new))

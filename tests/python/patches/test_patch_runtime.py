@@ -70,8 +70,6 @@ def test_a_model_in_smoe_of_before_there_were_gates_has_eq_7_and_says_so(tmp_pat
     old = SimpleNamespace(blend_mode="smoe", model_path=str(tmp_path))
     with pytest.warns(UserWarning, match="records no background gate, so it is 0, Eq. 7"):
         assert runtime.blend_of(old) == {"blend_mode": "smoe", "background_gate": 0}
-    with pytest.warns(UserWarning, match="is of a run with background gate 0.0, but this one has .*_gate 0.0$"):
-        runtime.blend_of(run("smoe", "0.25", model_path=str(tmp_path)))
 
 
 @pytest.mark.parametrize("dataset", [SimpleNamespace(), SimpleNamespace(blend_mode=None, background_gate=None)])
