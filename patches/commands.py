@@ -11,13 +11,9 @@ from . import engine
 def apply(arguments: Namespace) -> int:
     """Patches."""
     planned = engine.apply(**_options(arguments))
-    if planned.written:
-        print(f"{arguments.path}: patched ({planned.trainer})")
-        _print_lines(f"{name}: {', '.join(dict.fromkeys(rules))}" for name, rules in planned.rules.items())
-        print("It knows --blend_mode and --background_gate now, and saves them in cfg_args; `dsmoe patch revert` takes "
-              "the patch back.")
-    else:
-        print(f"{arguments.path}: already patched ({planned.trainer}); nothing was written")
+    print(f"{arguments.path}: {'patched' if planned.written else 'already patched'} ({planned.trainer})")
+    _print_lines(f"{name}: {', '.join(dict.fromkeys(rules))}" for name, rules in planned.rules.items())
+    print("It knows --blend_mode and --background_gate, and saves them in cfg_args; `dsmoe patch revert` undoes it.")
     _print_lines(planned.notes)
     return 0
 
@@ -33,9 +29,7 @@ def check(arguments: Namespace) -> int:
 
 def diff(arguments: Namespace) -> int:
     """Shows what the patch changes, against the files as they were before any patch."""
-    planned = engine.check(**_options(arguments)).possible()
-    sys.stdout.write(engine.text_of(planned))
-    _print_lines(planned.notes, sys.stderr)
+    sys.stdout.write(engine.diff(**_options(arguments)))
     return 0
 
 
@@ -50,6 +44,6 @@ def _options(arguments: Namespace) -> Dict[str, Any]:
     return {name: getattr(arguments, name) for name in ("path", "modernise", "trainer", "fuse")}
 
 
-def _print_lines(lines: Iterable[str], where: Any = None) -> None:
+def _print_lines(lines: Iterable[str]) -> None:
     for line in lines:
-        print("  " + line, file=where)
+        print("  " + line)

@@ -22,7 +22,6 @@ from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Tra
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
 UNFINISHED = ".dsmoe_unfinished"  # new files, until all are written
-OF_EARLIER_VERSIONS = ".dsmoe_patch"
 # Signs of an environment, of a run's output and of another checkout.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR)
 PathLike = Union[str, Path]
@@ -136,7 +135,12 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
 
 def diff(path: PathLike, **options: Any) -> str:
     """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
-    return text_of(check(path, **options).possible())
+    planned, text = check(path, **options).possible(), []
+    for name in planned.before:
+        old, new = (io.StringIO(files[name].decode(errors="replace"), newline="").readlines()
+                    for files in (planned.before, planned.after))
+        text += list(difflib.unified_diff(old, new, "a/" + name, "b/" + name))
+    return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in text)
 
 
 def apply(path: PathLike, **options: Any) -> Plan:
@@ -183,7 +187,6 @@ def _files(root: Path) -> Dict[str, bytes]:
                       and name not in ("submodules", "site-packages", "__pycache__")
                       and not any(Path(above, name, sign).exists() for sign in OF_NO_CHECKOUT)]
         paths += [Path(above, name) for name in names if name.endswith(".py")]
-    # is_file: no link to nothing.
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(paths) if path.is_file()}
 
 
@@ -194,7 +197,6 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
         if root.resolve() not in target.parents:
             raise PatchError(f"{name}: is a link to {target}, outside the checkout; copy it into the checkout first")
     unfinished = root / UNFINISHED
-    shutil.rmtree(unfinished, ignore_errors=True)
     try:
         for name, data in files.items():
             (unfinished / name).parent.mkdir(parents=True, exist_ok=True)
@@ -215,17 +217,4 @@ def _root(path: PathLike) -> Path:
     root = Path(path)
     if not root.is_dir():
         raise PatchError(f"{root}: is not a folder; wanted is the checkout's, in which train.py or compress.py lies")
-    if (root / OF_EARLIER_VERSIONS).is_dir():
-        raise PatchError(f"{root}: was patched by an earlier version. Where its files still are, copy what lies in "
-                         f"{OF_EARLIER_VERSIONS}/originals over them; then delete {OF_EARLIER_VERSIONS}")
     return root
-
-
-def text_of(planned: Plan) -> str:
-    """Returns what the patch changes, as a unified diff."""
-    text: List[str] = []
-    for name in planned.before:
-        old, new = (io.StringIO(files[name].decode(errors="replace"), newline="").readlines()
-                    for files in (planned.before, planned.after))
-        text += difflib.unified_diff(old, new, "a/" + name, "b/" + name)
-    return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in text)

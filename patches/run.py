@@ -25,7 +25,6 @@ from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 SPARSE_ADAM = "SparseGaussianAdam"
-FORWARDED = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
@@ -44,7 +43,7 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
         except OSError as error:
             raise PatchError(f"{words[0]}: {error.strerror}") from None
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the command too
-        for number in FORWARDED:
+        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
             if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup, which the command inherits
                 signal.signal(number, lambda received, _: child.send_signal(received))
         status, is_used = child.wait(), used.exists()
@@ -73,8 +72,7 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         environment[WITHOUT_VARIABLE] = SPARSE_ADAM
         warnings = [*warnings, f"{SPARSE_ADAM} is not offered: where the trainer finds it, it reads get_features_dc of "
                     "its model, which has none"]
-    if "PYTHONPYCACHEPREFIX" not in environment:
-        environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
     environment["PYTHONPATH"] = os.pathsep.join(path)
     module = contract_of(flavour).module

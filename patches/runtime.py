@@ -5,6 +5,7 @@ import ast
 import functools
 import importlib
 import os
+import re
 import sys
 import types
 import warnings
@@ -14,8 +15,7 @@ from typing import Any, Callable, Dict, Optional, Tuple
 from diff_smoe_rasterization import settings
 from diff_smoe_rasterization.settings import BLEND_MODES, resolve_blend_mode
 
-HERE = Path(__file__).resolve().parent
-SHIMS, STAND_INS = HERE / "shims", HERE / "stand_ins"
+SHIMS, STAND_INS = (Path(__file__).resolve().parent / name for name in ("shims", "stand_ins"))
 OPTIONS = ("blend_mode", "background_gate")
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
 WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
@@ -44,7 +44,7 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
 
     Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args. Without a
     `blend_mode` (a cfg_args of before the patch): "alpha". In `smoe` without a `background_gate`: 0, Eq. 7.
-    Says on stderr what they are, and whence. Warns, once, where one may not be what was meant.
+    Says on stderr what they are. Warns, once, where one may not be what was meant.
     Raises ValueError where one is wrong, RuntimeError where the renderer has another rasterizer.
     """
     _check_renderer()
@@ -53,18 +53,21 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
               "the patch); --blend_mode says otherwise")
         mode = "alpha"
-    said = f"blend mode {mode}, {_whence('blend_mode', mode, dataset)}"
     if mode not in BLEND_MODES:
-        raise ValueError(f"the {said}; it must be one of {', '.join(BLEND_MODES)}")
+        raise ValueError(f"the blend mode is {mode!r}; it must be one of {', '.join(BLEND_MODES)}")
     if mode == "smoe" and gate is None:
         _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, "
               "or in another mode); --background_gate says otherwise")
         gate = 0.0
     is_of_smoe = mode != "smoe" and not isinstance(gate, str)
     gate = settings.training_background_gate(mode, None if gate == "" or is_of_smoe else gate)
-    if gate is not None:
-        said += f"; background gate {gate}, {_whence('background_gate', gate, dataset)}"
-    say(said)
+    say(f"blend mode {mode}" + (f", background gate {gate}" if gate is not None else ""))
+    # Rendering without an option never warns: it has what cfg_args records.
+    for option, value in (("blend_mode", mode), ("background_gate", gate)):
+        before = _saved(dataset).get(option)
+        if value is not None and before not in (None, value):
+            _warn(f"{dataset.model_path}/cfg_args is of a run with {option} {before}, but this one has {value}; a "
+                  f"training overwrites it. To go on as before, give --{option} {before}")
     dataset.blend_mode, dataset.background_gate = mode, gate
     return {"blend_mode": mode, "background_gate": gate}
 
@@ -75,20 +78,6 @@ def chosen_blend(pipe: Any) -> Dict[str, Any]:
         raise RuntimeError("this script renders without a blend mode; before it renders it needs the statements `from "
                            f"{__name__} import saved_blend_of` and `pipe.blend = saved_blend_of(dataset)`")
     return pipe.blend
-
-
-def _whence(option: str, value: Any, dataset: Any) -> str:
-    """Says in words where an option's value comes from; warns where the model's cfg_args has another."""
-    before, cfg_args = _saved(dataset).get(option), Path(getattr(dataset, "model_path", "") or ".", "cfg_args")
-    variable = "DSMOE_" + option.upper()
-    whence = (f"as --{option} says" if _is_typed(option) else f"as in {cfg_args}" if before == value else
-              f"as in {variable}" if os.environ.get(variable) else "the default")
-    # Rendering without the flag never comes here: it has the value of cfg_args.
-    if before not in (None, value):
-        name = option.replace("_", " ")
-        _warn(f"{cfg_args} is of a run with {name} {before}, but this one has {value}, {whence}; a training overwrites "
-              f"it. To go on as before, give --{option} {before}")
-    return whence
 
 
 def _noting(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -137,13 +126,12 @@ def gsplat_of_run() -> None:
         sys.modules["gsplat.rendering"] = types.ModuleType("gsplat.rendering")
         for module in ("gsplat", "gsplat.rendering"):
             sys.modules[module].__dict__["rasterization"] = None
-    theirs = sys.modules["gsplat"]
-    major, minor = (int(number) for number in str(getattr(theirs, "__version__", "1.5")).split(".")[:2])
+    version = str(getattr(sys.modules["gsplat"], "__version__", "1.5")).split(".")
 
     @functools.wraps(ours.rasterization)
     def rasterization(*arguments: Any, **keywords: Any) -> Any:
         renders, alphas, meta = ours.rasterization(*arguments, **keywords)
-        if (major, minor) < (1, 5):
+        if [int(number) for number in version[:2]] < [1, 5]:
             meta["radii"] = meta["radii"][..., 0]
         return renders, alphas, meta
 
@@ -191,14 +179,11 @@ def _is_typed(option: str) -> bool:
 
 
 def _saved(dataset: Any) -> Dict[str, Any]:
-    """Returns the constants in a model's cfg_args, a Namespace as text; none where there is none."""
-    folder = getattr(dataset, "model_path", "")
-    try:
-        call = ast.parse(Path(folder, "cfg_args").read_text(), mode="eval").body if folder else None
-    except (OSError, ValueError, SyntaxError):
-        return {}
-    return {keyword.arg: keyword.value.value for keyword in getattr(call, "keywords", ())
-            if isinstance(keyword.value, ast.Constant)}
+    """Returns what a model's cfg_args, a Namespace as text, records of the options."""
+    path = Path(getattr(dataset, "model_path", "") or os.devnull, "cfg_args")
+    text = path.read_text(errors="replace") if path.is_file() else ""
+    found = re.findall(r"\b(blend_mode|background_gate)=('\w+'|None|[\d.e+-]+)", text)
+    return {name: ast.literal_eval(value) for name, value in found}
 
 
 @functools.lru_cache(maxsize=None)

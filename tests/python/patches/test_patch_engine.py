@@ -108,8 +108,6 @@ def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
     refused(tmp_path / "checkout/arguments", f"there is no {GR} in it")
     with pytest.raises(patches.PatchError, match="not a folder"):
         patches.apply(tmp_path / "nowhere")
-    (tmp_path / "checkout/.dsmoe_patch").mkdir()
-    refused(tmp_path / "checkout", "was patched by an earlier version", "copy what lies in .dsmoe_patch/originals")
 
 
 class Killed(BaseException):
