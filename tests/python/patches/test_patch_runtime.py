@@ -135,7 +135,8 @@ def test_a_rendering_takes_the_saved_mode_whatever_default_it_brings(monkeypatch
     with pytest.warns(UserWarning, match="is of a run with blend_mode smoe"):
         assert rendered("--blend_mode", "alpha") == ALPHA
     monkeypatch.setattr(sys, "argv", ["render.py", "--back=2"])  # as argparse takes it too
-    assert runtime.saved_blend_of(run("alpha", "2", model_path=str(tmp_path)))["background_gate"] == 2
+    with pytest.warns(UserWarning, match="is of a run with background_gate 0.5"):
+        assert runtime.saved_blend_of(run("alpha", "2", model_path=str(tmp_path)))["background_gate"] == 2
     (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3)")
     monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe")
     with pytest.warns(UserWarning, match="records no blend mode, so it is alpha"):
