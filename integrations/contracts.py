@@ -87,6 +87,8 @@ CONTRACTS = (
              arguments=_behind("opacities", "scores"), signs=("takes scores",)),
     Contract("pixel_gs", "Pixel-GS", ("color", "radii", "pixels"), ("depth_threshold",),
              signs=("sets depth_threshold",)),
+    Contract("nearest_points", "B32xN0/gaussian-splatting", settings=("nearest_points",),
+             signs=("sets nearest_points",)),
     Contract("light_gaussian", "LightGaussian", settings=("f_count",), signs=("sets f_count",),
              other_results=(("counts", "opacity_sums", "color", "radii"),)),
     Contract("inria_2024", "3DGS of 2024 (`antialiasing`, sparse Adam)", ("color", "radii", "inverse_depth"),

@@ -195,6 +195,7 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "cob_gs": ("antialiasing=0, include_mask=0", "mask_precomp=1, mask_signals=1", "image, mask_image, radii, depth"),
     "speedy_splat": ("", "scores=1", "image, radii, kernel_times"),
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
+    "nearest_points": ("nearest_points=1", "", "image, radii"),
     "light_gaussian": ("f_count=1", "", "counts, score, image, radii"), "depth": ("", "", "image, radii, depth"),
     "absgs": ("", "", "image, radii, gs_w"), "fastgs": ("mult=1, get_flag=1", "dc=1", "image, radii, metric_counts"),
     None: ("", "", "image, radii, normals"), "inria": ("", "", "image, radii")}
