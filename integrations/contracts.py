@@ -48,6 +48,7 @@ class Contract(NamedTuple):
     signs: Tuple[str, ...] = ()  # a caller shows one of these (patches/facts.py); none: it needs to show nothing
     module: str = RASTERIZER  # what callers import
     other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings
+    methods: Tuple[str, ...] = ()  # of a rasterizer, beside markVisible
     absolute: int = 0  # columns of means2D behind x and y that get sums of absolute gradients: of both axes, or of each
 
 
@@ -62,7 +63,7 @@ TAMING = ("color", "radii", "counts", "lists", "listsRender", "listsDistance", "
           "accum_weights", "accum_count", "accum_blend", "accum_dist")
 
 CONTRACTS = (
-    Contract("scaffold", "Scaffold-GS, Octree-GS, HAC, HAC++", signs=("calls visible_filter",)),
+    Contract("scaffold", "Scaffold-GS, Octree-GS, HAC, HAC++", signs=("calls visible_filter",), methods=("visible_filter",)),
     Contract("c3dgs", "c3dgs (3DGS-C)", settings=("clamp_color",),
              arguments=(*ARGUMENTS, "sh_indices", "g_indices", "scale_factors"),
              names=("GaussianRasterizerIndexed", "rasterize_gaussians_indexed"),

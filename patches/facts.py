@@ -5,6 +5,8 @@ import ast
 import re
 from typing import Dict, Iterator, List, Mapping, Optional, Set, Tuple
 
+import torch
+
 from diff_smoe_rasterization.integrations.contracts import (
     ARGUMENTS,
     CONTRACTS,
@@ -111,6 +113,9 @@ def _of_call(call: ast.Call, made: Set[str]) -> Iterator[str]:
         yield from (f"takes {name}" for name in keywords if name)
     else:
         yield f"calls {called}"
+        of = getattr(call.func, "value", None)
+        if getattr(getattr(of, "func", of), "id", "") in made and not hasattr(torch.nn.Module, called):
+            yield f"asks {called}"
 
 
 def _names_of_rasterizers(tree: ast.Module) -> Set[str]:
@@ -164,7 +169,7 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
         return None, f"nothing imports GaussianRasterizationSettings from {RASTERIZER} or {INTEGRATIONS}"
     known = {contract.name: _known(contract) for contract in CONTRACTS}
     said = {"sets": "its GaussianRasterizationSettings have {}", "takes": "its rasterizer is called with {}",
-            "needs": "it imports {}"}
+            "needs": "it imports {}", "asks": "its rasterizer has a method {}"}
     for kind, text in said.items():
         names = those(facts, kind + " ") - set().union(*(entry[kind] for entry in known.values()))
         if names:
@@ -190,7 +195,7 @@ def those(facts: Set[str], kind: str) -> Set[str]:
 def _known(contract: Contract) -> Dict[str, Set[str]]:
     ours = set(GaussianRasterizationSettings._fields[len(SETTINGS) + 1:]) - {"clamp_color"}
     return {"sets": {*SETTINGS, *contract.settings} | ours, "takes": {*ARGUMENTS, *contract.arguments},
-            "needs": {*NAMES, *contract.names}}
+            "needs": {*NAMES, *contract.names}, "asks": {"markVisible", *contract.methods}}
 
 
 def _fits(found: str, contract: Contract) -> bool:

@@ -175,6 +175,8 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     # Under --trainer too: Mini-Splatting, and a renderer of no rasterizer at all.
     ({GR: MS}, PYTHON, "it imports diff_gaussian_rasterization_ms, another rasterizer"),
     ({GR: RENDERER + MS}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
+    # DepthAwareGS, whose rasterizer has more than images: without it the training would stop when it first asks.
+    ({GR: RENDERER + "rasterizer.to(0), rasterizer.apply_weights(1)\n"}, PYTHON, "has a method apply_weights, which no"),
     # A second renderer beside the first, by which masks are trained.
     ({MASKS: MS, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_ms, another rasterizer"),
     ({MASKS: MS, GR: "from . import masks\n" + RENDERER}, PYTHON, "_ms, another rasterizer"),
