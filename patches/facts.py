@@ -203,7 +203,7 @@ def _fits(found: str, contract: Contract) -> bool:
     names = found.split(", ")
     return any(len(names) == len(results) and all(
         name.startswith("_") or RESULTS.get(result, ("", ""))[1] in name.lower()
-        and not (result == "depth" and "inv" in name.lower()) for name, result in zip(names, results))
+        and not (result == "depth" and re.search("inv|alpha", name.lower())) for name, result in zip(names, results))
         for results in (contract.results, *contract.other_results))
 
 
