@@ -122,13 +122,14 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
     if trainer is not None and trainer not in by_name:
         raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
-    reasons = []
+    reasons, seen = [], False
     folders = _folders(words)
     for folder in folders:
         for path in (folder / RASTERIZER, folder / f"{RASTERIZER}.py"):
             if folder == folders[0] and path.exists():  # where Python looks first
                 raise PatchError(f"{path} would be imported before this package's; move it away")
         found = facts.of_files(_files(folder, everywhere=folder == folders[0]))
+        seen = seen or bool(found)
         if facts.PATCHED in found or Record.in_force(folder):
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
@@ -141,7 +142,8 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
         if found and not (known and known.flavour == by_name[trainer]):
             reasons.append(f"{folder}: " + (reason or f"by what it imports and calls this is {known.flavour}"))
     if trainer is not None:
-        return by_name[trainer], trainer, reasons or [f"no file that imports {RASTERIZER} was found"][bool(reasons):]
+        module = contract_of(by_name[trainer]).module
+        return by_name[trainer], trainer, reasons or ([] if seen else [f"no file that imports {module} was found"])
     raise PatchError("no trainer that is known was found; name it with --trainer, or the rasterizer whose API it calls "
                      f"({', '.join(FLAVOURS)}):\n  " + "\n  ".join(
                          reasons or [f"there is no {GR} in {', '.join(map(str, folders))}"]))

@@ -280,6 +280,12 @@ def test_what_speaks_against_a_trainer_that_is_named_is_said(tmp_path, dsmoe, mo
     assert "warning: " in lines[1] and "its rasterizer is called with degrees, which no rasterizer has" in lines[1]
     said = dsmoe(*PYTHON)
     assert said.status == 1 and "degrees" in said.err and said.err.count(GR) == 0  # no folder without a renderer
+    monkeypatch.chdir(make(tmp_path / "fitting"))
+    assert len(run.prepare([sys.executable, "train.py"], "smoe", "inria", environment())[1]) == 1  # nothing does
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")  # as for ns-train
+    assert run.prepare([sys.executable], "smoe", "gsplat", environment())[1][1] == (
+        "warning: no file that imports gsplat was found")
 
 
 def test_a_trainer_of_another_layout_is_recognised_by_its_rasterizer(tmp_path, monkeypatch):
