@@ -63,7 +63,8 @@ TAMING = ("color", "radii", "counts", "lists", "listsRender", "listsDistance", "
           "accum_weights", "accum_count", "accum_blend", "accum_dist")
 
 CONTRACTS = (
-    Contract("scaffold", "Scaffold-GS, Octree-GS, HAC, HAC++", signs=("calls visible_filter",), methods=("visible_filter",)),
+    Contract("scaffold", "Scaffold-GS, Octree-GS, HAC, HAC++", signs=("calls visible_filter",),
+             methods=("visible_filter",)),
     Contract("c3dgs", "c3dgs (3DGS-C)", settings=("clamp_color",),
              arguments=(*ARGUMENTS, "sh_indices", "g_indices", "scale_factors"),
              names=("GaussianRasterizerIndexed", "rasterize_gaussians_indexed"),

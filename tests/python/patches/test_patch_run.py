@@ -176,7 +176,7 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({GR: MS}, PYTHON, "it imports diff_gaussian_rasterization_ms, another rasterizer"),
     ({GR: RENDERER + MS}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
     # DepthAwareGS, whose rasterizer has more than images: without it the training would stop when it first asks.
-    ({GR: RENDERER + "rasterizer.to(0), rasterizer.apply_weights(1)\n"}, PYTHON, "has a method apply_weights, which no"),
+    ({GR: RENDERER + "rasterizer.to(0), rasterizer.apply_weights(1)\n"}, PYTHON, "has a method apply_weights, which"),
     # A second renderer beside the first, by which masks are trained.
     ({MASKS: MS, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_ms, another rasterizer"),
     ({MASKS: MS, GR: "from . import masks\n" + RENDERER}, PYTHON, "_ms, another rasterizer"),
@@ -275,7 +275,7 @@ def test_what_speaks_against_a_trainer_that_is_named_is_said(tmp_path, dsmoe, mo
     one_line = "    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)\n"
     renderer = RENDERER.replace(one_line, "    draw = GaussianRasterizer(raster_settings=settings)\n"
                                           "    color, radii = draw(means3D=1, degrees=2)\n")
-    monkeypatch.chdir(make(tmp_path, {GR: renderer}))
+    monkeypatch.chdir(make(tmp_path / "reduced", {GR: renderer}))
     _, lines = run.prepare([sys.executable, "train.py"], "smoe", "inria", environment())
     assert "warning: " in lines[1] and "its rasterizer is called with degrees, which no rasterizer has" in lines[1]
     said = dsmoe(*PYTHON)
