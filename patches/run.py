@@ -106,6 +106,10 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         environment[WITHOUT_VARIABLE] = SPARSE_ADAM
         warnings = [*warnings, f"{SPARSE_ADAM} is not offered: where the trainer finds it, it reads get_features_dc of "
                     "its model, which has none"]
+    own = sorted(path.parent.name for path in _folders(words)[0].glob(f"submodules/*/{RASTERIZER}"))
+    if len(own) > 1:
+        warnings = [*warnings, f"the checkout has {', '.join(own)}, all called {RASTERIZER}: this package's takes the "
+                    "place of each, and renders pinhole cameras alone"]
     if "PYTHONPYCACHEPREFIX" not in environment:
         environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     environment["PYTHONPATH"] = os.pathsep.join([str(SHIMS), *filter(None, [environment.get("PYTHONPATH")])])
@@ -171,7 +175,7 @@ def _files(folder: Path, everywhere: bool) -> Dict[str, bytes]:
         return {**files, **{name: (folder / name).read_bytes() for name in facts.further_renderers(files)
                             if (folder / name).is_file()}}
     found = {}
-    for pattern in ("*.py", "*/*.py", "*/*/*.py") if everywhere else ():
+    for pattern in ("*.py", "*/*.py", "*/*/*.py", "*/*/*/*.py") if everywhere else ():
         for path in folder.glob(pattern):
             if not {"submodules", "site-packages"} & set(path.parts) and path.is_file():
                 data = path.read_bytes()

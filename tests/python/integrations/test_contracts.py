@@ -13,11 +13,13 @@ from diff_smoe_rasterization import rasterize, rasterize_with_splats
 from diff_smoe_rasterization.integrations import (
     absgs,
     cob_gs,
+    depth_alpha,
     fastgs,
     feature_3dgs,
     grouping,
     langsplat,
     light_gaussian,
+    lucid_dreamer,
     mcmc,
     mip_splatting,
     monogs,
@@ -209,6 +211,13 @@ def test_nearest_points_are_none_or_refused():
     assert torch.equal(rendered(nearest_points, scene, {"nearest_points": None})[0], own(scene).color)
     with pytest.raises(NotImplementedError, match="nearest_points are set"):
         rendered(nearest_points, scene, {"nearest_points": torch.zeros(N, 4, 3)})
+
+
+def test_depth_and_what_the_background_has_in_one_image(mode):
+    scene = scene_of(mode)
+    both = rendered(lucid_dreamer, scene)[2]
+    _, _, depth, alpha = rendered(depth_alpha, scene)
+    assert (alpha < 1).any() and torch.equal(both, torch.cat([depth, 1 - alpha]))
 
 
 def test_pixels_and_what_is_near_grows_less(mode):

@@ -197,6 +197,7 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "cob_gs": ("antialiasing=0, include_mask=0", "mask_precomp=1, mask_signals=1", "image, mask_image, radii, depth"),
     "speedy_splat": ("", "scores=1", "image, radii, kernel_times"),
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
+    "lucid_dreamer": ("", "", "image, radii, depth_alpha"),  # no depth: one image has both
     "nearest_points": ("nearest_points=1", "", "image, radii"),
     "light_gaussian": ("f_count=1", "", "counts, score, image, radii"), "depth": ("", "", "image, radii, depth"),
     "absgs": ("", "", "image, radii, gs_w"), "fastgs": ("mult=1, get_flag=1", "dc=1", "image, radii, metric_counts"),
@@ -289,10 +290,10 @@ def test_what_speaks_against_a_trainer_that_is_named_is_said(tmp_path, dsmoe, mo
 
 
 def test_a_trainer_of_another_layout_is_recognised_by_its_rasterizer(tmp_path, monkeypatch):
-    """dreamgaussian, SplaTAM, SuGaR: settings and calls lie elsewhere, under other names."""
-    (tmp_path / "main.py").write_text("import deep.renderer\n")
-    (tmp_path / "deep").mkdir()
-    (tmp_path / "deep/renderer.py").write_text(
+    """dreamgaussian, SplaTAM, SuGaR, pixelSplat: settings and calls lie elsewhere, under other names."""
+    (tmp_path / "main.py").write_text("import src.model.decoder.renderer\n")
+    (tmp_path / "src/model/decoder").mkdir(parents=True)
+    (tmp_path / "src/model/decoder/renderer.py").write_text(
         "from diff_gaussian_rasterization import GaussianRasterizationSettings as Camera\n"
         "from diff_gaussian_rasterization import GaussianRasterizer as Renderer\n"
         "image, radii, depth, alpha = Renderer(raster_settings=Camera())(means3D=1)\n"
@@ -351,6 +352,15 @@ GaussianRasterizer(None)
     result = python("-m", "diff_smoe_rasterization", *PYTHON, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert (result.status, result.out) == (0, f"{is_offered}\n"), result.err
     assert ("SparseGaussianAdam is not offered" in result.err) == (not is_offered)
+
+
+def test_rasterizers_of_one_name_are_named(tmp_path):
+    """op43dgs, of which one is installed."""
+    make(tmp_path, {f"submodules/{lens}/diff_gaussian_rasterization/__init__.py": "" for lens in ("fish", "pinhole")})
+    words = [sys.executable, str(tmp_path / "train.py")], "smoe", None, environment()
+    assert "warning: the checkout has fish, pinhole, all called" in run.prepare(*words)[1][1]
+    (tmp_path / "submodules/fish").rename(tmp_path / "fish")
+    assert len(run.prepare(*words)[1]) == 1
 
 
 def test_a_python_without_the_package_is_named(tmp_path, dsmoe, monkeypatch):

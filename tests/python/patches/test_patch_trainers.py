@@ -60,9 +60,7 @@ ANTIALIASED = RENDERER.replace("prefiltered=False,", "antialiasing=pipe.antialia
     (ANTIALIASED, "color, radii, depth", TRAIN, "3dgs-2024"),  # of September
     (RENDERER, "color, radii, depth", TRAIN, "3dgs-depth"),  # of 4DGaussians and others
     (RENDERER, "color, _, _", TRAIN, "3dgs-depth"), (RENDERER, "color, radii, depth, alpha", TRAIN, "3dgs-depth-alpha"),
-    (RENDERER, "color, radii, inv_depth", TRAIN, None),
-    (RENDERER, "color, radii, depth_alpha", TRAIN, None),  # both in one image, of InfiniteScene
-    (RENDERER, "color, radii, weights", TRAIN, None),
+    (RENDERER, "color, radii, inv_depth", TRAIN, None), (RENDERER, "color, radii, weights", TRAIN, None),
     (RENDERER, "color, radii, count, score", TRAIN, None), (RENDERER, "color,", TRAIN, None),
     (RENDERER.replace("bg=bg_color", "kernel_size=0.1"), "color, radii", TRAIN, None),
     (RENDERER.replace("bg=bg_color", "blur=0.1"), "color, radii", TRAIN, None)])
