@@ -175,7 +175,7 @@ def _files(folder: Path, everywhere: bool) -> Dict[str, bytes]:
         return {**files, **{name: (folder / name).read_bytes() for name in facts.further_renderers(files)
                             if (folder / name).is_file()}}
     found = {}
-    for pattern in ("*.py", "*/*.py", "*/*/*.py", "*/*/*/*.py") if everywhere else ():
+    for pattern in ("*.py", "*/*.py", "*/*/*.py") if everywhere else ():
         for path in folder.glob(pattern):
             if not {"submodules", "site-packages"} & set(path.parts) and path.is_file():
                 data = path.read_bytes()

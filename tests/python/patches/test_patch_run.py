@@ -290,10 +290,10 @@ def test_what_speaks_against_a_trainer_that_is_named_is_said(tmp_path, dsmoe, mo
 
 
 def test_a_trainer_of_another_layout_is_recognised_by_its_rasterizer(tmp_path, monkeypatch):
-    """dreamgaussian, SplaTAM, SuGaR, pixelSplat: settings and calls lie elsewhere, under other names."""
-    (tmp_path / "main.py").write_text("import src.model.decoder.renderer\n")
-    (tmp_path / "src/model/decoder").mkdir(parents=True)
-    (tmp_path / "src/model/decoder/renderer.py").write_text(
+    """dreamgaussian, SplaTAM, SuGaR: settings and calls lie elsewhere, under other names."""
+    (tmp_path / "main.py").write_text("import deep.renderer\n")
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep/renderer.py").write_text(
         "from diff_gaussian_rasterization import GaussianRasterizationSettings as Camera\n"
         "from diff_gaussian_rasterization import GaussianRasterizer as Renderer\n"
         "image, radii, depth, alpha = Renderer(raster_settings=Camera())(means3D=1)\n"
