@@ -13,6 +13,7 @@ SETTINGS = ("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_mo
             "sh_degree", "campos", "prefiltered", "debug")
 ARGUMENTS = ("means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
 NAMES = ("GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians")
+METHODS = ("markVisible", "forward", "to", "cuda", "cpu", "train", "eval")  # of a rasterizer, those of torch among them
 
 RESULTS = {  # what a result is, and a word that is in the name that callers give it, if it must be
     "color": ("[C, H, W]", ""),
@@ -38,7 +39,7 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
 
 
 class Contract(NamedTuple):
-    """What callers of a rasterizer rely on, beside SETTINGS, ARGUMENTS and NAMES, which all of Inria's kind have."""
+    """What callers of a rasterizer rely on, beside SETTINGS, ARGUMENTS, NAMES and METHODS, which all of a kind have."""
 
     name: str  # of the module here, and for `dsmoe run --trainer`
     used_by: str
@@ -49,7 +50,7 @@ class Contract(NamedTuple):
     signs: Tuple[str, ...] = ()  # a caller shows one of these (patches/facts.py); none: it needs to show nothing
     module: str = RASTERIZER  # what callers import
     other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings
-    methods: Tuple[str, ...] = ()  # of a rasterizer, beside markVisible
+    methods: Tuple[str, ...] = ()  # of a rasterizer, beside METHODS
     absolute: int = 0  # columns of means2D behind x and y that get sums of absolute gradients: of both axes, or of each
 
 

@@ -5,11 +5,10 @@ import ast
 import re
 from typing import Dict, Iterator, List, Mapping, Optional, Set, Tuple
 
-import torch
-
 from diff_smoe_rasterization.integrations.contracts import (
     ARGUMENTS,
     CONTRACTS,
+    METHODS,
     NAMES,
     RASTERIZER,
     RESULTS,
@@ -114,7 +113,7 @@ def _of_call(call: ast.Call, made: Set[str]) -> Iterator[str]:
     else:
         yield f"calls {called}"
         of = getattr(call.func, "value", None)
-        if getattr(getattr(of, "func", of), "id", "") in made and not hasattr(torch.nn.Module, called):
+        if getattr(getattr(of, "func", of), "id", "") in made:
             yield f"asks {called}"
 
 
@@ -195,7 +194,7 @@ def those(facts: Set[str], kind: str) -> Set[str]:
 def _known(contract: Contract) -> Dict[str, Set[str]]:
     ours = set(GaussianRasterizationSettings._fields[len(SETTINGS) + 1:]) - {"clamp_color"}
     return {"sets": {*SETTINGS, *contract.settings} | ours, "takes": {*ARGUMENTS, *contract.arguments},
-            "needs": {*NAMES, *contract.names}, "asks": {"markVisible", *contract.methods}}
+            "needs": {*NAMES, *contract.names}, "asks": {*METHODS, *contract.methods}}
 
 
 def _fits(found: str, contract: Contract) -> bool:
