@@ -20,7 +20,7 @@ from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_of
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
 
-from . import facts
+from . import facts, scripts
 from .record import Record
 from .runtime import RASTERIZER_VARIABLE, SHIMS, USED_VARIABLE, WITHOUT_VARIABLE
 from .source import PatchError
@@ -98,6 +98,7 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         raise PatchError(f"{words[0]}: " + (f"is not executable; type: python {words[0]}" if is_script else
                                             "there is no such command"))
     flavour, found, warnings = _flavour(words, trainer)
+    warnings = [*warnings, *scripts.of_one_name(_folders(words)[0])]
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, BACKGROUND_GATE_VARIABLE: str(gate),
                    RASTERIZER_VARIABLE: flavour}
     if gate is None:
@@ -106,10 +107,6 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         environment[WITHOUT_VARIABLE] = SPARSE_ADAM
         warnings = [*warnings, f"{SPARSE_ADAM} is not offered: where the trainer finds it, it reads get_features_dc of "
                     "its model, which has none"]
-    own = sorted(path.parent.name for path in _folders(words)[0].glob(f"submodules/*/{RASTERIZER}"))
-    if len(own) > 1:
-        warnings = [*warnings, f"the checkout has {', '.join(own)}, all called {RASTERIZER}: this package's takes the "
-                    "place of each, and renders pinhole cameras alone"]
     if "PYTHONPYCACHEPREFIX" not in environment:
         environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     environment["PYTHONPATH"] = os.pathsep.join([str(SHIMS), *filter(None, [environment.get("PYTHONPATH")])])

@@ -39,6 +39,13 @@ def other_files(root: Path) -> Dict[str, bytes]:
     return found
 
 
+def of_one_name(root: Path) -> List[str]:
+    """Says which rasterizers of one name a checkout brings, such as one for each kind of lens."""
+    own = sorted(path.parent.name for path in root.glob(f"submodules/*/{RASTERIZER}"))
+    return [f"the checkout has {', '.join(own)}, all called {RASTERIZER}: this package's takes the place of each, and "
+            "renders pinhole cameras alone"] if len(own) > 1 else []
+
+
 def notes(root: Path, files: Dict[str, bytes], trainer: Trainer) -> List[str]:
     """Says which scripts keep the original rasterizer, make settings without a blend mode, or render without one.
 
@@ -47,7 +54,7 @@ def notes(root: Path, files: Dict[str, bytes], trainer: Trainer) -> List[str]:
     files = {name: data for name, data in files.items() if not name.startswith("submodules/")}
     scripts = {**files, **other_files(root)}
     imported = set().union(*map(_imports, scripts.values()))
-    lines = []
+    lines = of_one_name(root)
     for name, data in sorted(scripts.items()):
         if not any(word in data for word in (RASTERIZER.encode(), b"gaussian_renderer", SETTINGS.encode())):
             continue

@@ -359,6 +359,7 @@ def test_rasterizers_of_one_name_are_named(tmp_path):
     make(tmp_path, {f"submodules/{lens}/diff_gaussian_rasterization/__init__.py": "" for lens in ("fish", "pinhole")})
     words = [sys.executable, str(tmp_path / "train.py")], "smoe", None, environment()
     assert "warning: the checkout has fish, pinhole, all called" in run.prepare(*words)[1][1]
+    assert "the checkout has fish, pinhole, all called" in patches.check(tmp_path).notes[0]
     (tmp_path / "submodules/fish").rename(tmp_path / "fish")
     assert len(run.prepare(*words)[1]) == 1
 
