@@ -69,9 +69,10 @@ def notes(root: Path, files: Dict[str, bytes], trainer: Trainer) -> List[str]:
         is_reached = (name in {entry.file for entry in trainer.entries} or re.search(rb"\.blend\s*=[^=]", data)
                       or name[:-len(".py")].replace("/", ".") in imported)
         if "renders" in found and not is_reached:
+            mode = "blend_of" if "calls backward" in found else "saved_blend_of"
             lines.append(f"{name}: renders, but no rule reaches it: before it renders it needs the statements "
-                         f"`from {RUNTIME} import saved_blend_of` and `pipe.blend = saved_blend_of(dataset)`, or it "
-                         "stops with an AttributeError")
+                         f"`from {RUNTIME} import {mode}` and `pipe.blend = {mode}(dataset)`, or it stops with an "
+                         "AttributeError")
     return lines
 
 

@@ -283,7 +283,8 @@ SCRIPTS = {  # of the user's own: text, what is said of it
     "settings.py": ("from diff_gaussian_rasterization import GaussianRasterizationSettings\n"
                     "def show(pipe):\n    return GaussianRasterizationSettings(debug=pipe.debug)\n", "makes Gaussian"),
     "film.py": ("import gaussian_renderer\ngaussian_renderer.render(None)\n", "renders"),
-    "tools/film.py": ("from gaussian_renderer import render\n", "renders"),
+    "tools/film.py": ("from gaussian_renderer import render\n", "pipe.blend = saved_blend_of(dataset)"),
+    "fit.py": ("from gaussian_renderer import render\nrender(None).backward()\n", "pipe.blend = blend_of(dataset)"),
     "all.py": ("from gaussian_renderer import *\n", "renders"),
     "utils/loss.py": ("try:\n    from diff_gaussian_rasterization._C import fusedssim\nexcept ImportError: 0\n",
                       "stays"),
