@@ -127,6 +127,7 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
              for name, data in now.items() if data != as_it_was[name]]
     state, reasons = (("drifted", patched.problems) if patched.problems else ("patched", []) if not wrong else
                       ("patchable", []) if now == before else ("half-patched", wrong))
+    patched.notes += facts.of_one_name(root)
     if trainer and not (known and known.flavour == chosen.flavour):
         reason = f"by what it imports and calls it is {known.name}, which has another API" if known else reason
         patched.notes.insert(0, f"--trainer {trainer}: {reason}")

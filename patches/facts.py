@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import ast
 import re
+from pathlib import Path
 from typing import Any, Iterator, List, Mapping, Optional, Sequence, Set, Tuple
 
 from diff_smoe_rasterization.integrations import contracts
@@ -17,7 +18,7 @@ FOLDER = GR.partition("/")[0]
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
 OTHER_RASTERIZER = re.compile(r"diff_(gauss|surfel)\w*")
 USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its rasterizer is called with",
-        "needs ": "it imports"}
+        "needs ": "it imports", "asks ": "its rasterizer has a method"}
 MODULES = {contract.module: contract for contract in CONTRACTS if contract.module != RASTERIZER}
 
 
@@ -41,14 +42,14 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
             continue
         in_try = {id(node) for outer in nodes if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
-        renderings = _renderings(nodes)
+        renderings, asked = _calls_of_rasterizers(nodes)
         for node in nodes:
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 facts.update(_of_import(node, id(node) in in_try))
             elif isinstance(node, ast.ClassDef) and node.name in NAMES:
                 facts.add("defines " + node.name)
             elif isinstance(node, ast.Call):
-                facts.update(_of_call(node, node in renderings))
+                facts.update(_of_call(node, node in renderings, node in asked))
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
                 facts.add("reads invdepthmap")
             elif isinstance(node, ast.Assign) and node.value in renderings and isinstance(node.targets[0], ast.Tuple):
@@ -78,7 +79,7 @@ def _of_import(node: Any, may_fail: bool) -> Iterator[str]:
             yield from (f"needs {prefix}{name}" for name in names if name != "*")
 
 
-def _of_call(call: ast.Call, renders: bool) -> Iterator[str]:
+def _of_call(call: ast.Call, renders: bool, asks: bool) -> Iterator[str]:
     called = getattr(call.func, "attr", getattr(call.func, "id", ""))  # the last part of the name
     keywords = [keyword.arg for keyword in call.keywords if keyword.arg]  # without **pipe.blend
     if called == "GaussianRasterizationSettings":
@@ -86,18 +87,20 @@ def _of_call(call: ast.Call, renders: bool) -> Iterator[str]:
     elif renders and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
         yield from (f"takes {name}" for name in keywords)
     else:
-        yield f"calls {called}"
+        yield from (f"asks {called}", f"calls {called}")[not asks:]
 
 
-def _renderings(nodes: Sequence[ast.AST]) -> List[ast.AST]:
-    """The calls of objects, rasterizer(...) and GaussianRasterizer(...)(...), by whatever names; not of the class."""
+def _calls_of_rasterizers(nodes: Sequence[ast.AST]) -> Tuple[List[ast.AST], List[ast.AST]]:
+    """The calls of objects, rasterizer(...) and GaussianRasterizer(...)(...), by whatever names; of their methods."""
     classes = {alias.asname or alias.name for node in nodes if isinstance(node, ast.ImportFrom)
                for alias in node.names if alias.name.startswith("GaussianRasterizer")}
     calls = [node for node in nodes if isinstance(node, ast.Call)]
     made = [call for call in calls if getattr(call.func, "id", "") in classes]
     objects = {getattr(target, "id", "") for node in nodes if isinstance(node, ast.Assign) and node.value in made
                for target in node.targets} | ({"rasterizer"} if classes else set())
-    return [call for call in calls if call.func in made or getattr(call.func, "id", None) in objects]
+    owners = [*made, *(node for node in nodes if getattr(node, "id", None) in objects)]
+    return ([call for call in calls if call.func in owners],
+            [call for call in calls if getattr(call.func, "value", None) in owners])
 
 
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
@@ -137,7 +140,8 @@ def _known(contract: Contract) -> Set[str]:
     ours = set(GaussianRasterizationSettings._fields[len(contracts.SETTINGS) + 1:]) - {"clamp_color"}
     return {*(f"sets {name}" for name in (*contracts.SETTINGS, *contract.settings, *ours)),
             *(f"takes {name}" for name in (*ARGUMENTS, *contract.arguments)),
-            *(f"needs {name}" for name in (*NAMES, *contract.names))}
+            *(f"needs {name}" for name in (*NAMES, *contract.names)),
+            *(f"asks {name}" for name in (*contracts.METHODS, *contract.methods))}
 
 
 def _fits(found: str, contract: Contract) -> bool:
@@ -145,7 +149,7 @@ def _fits(found: str, contract: Contract) -> bool:
     names = found.split(", ")
     return any(len(names) == len(results) and all(
         name.startswith("_") or RESULTS.get(result, ("", ""))[1] in name.lower()
-        and not (result == "depth" and "inv" in name.lower()) for name, result in zip(names, results))
+        and not (result == "depth" and re.search("inv|alpha", name.lower())) for name, result in zip(names, results))
         for results in (contract.results, *contract.other_results))
 
 
@@ -156,3 +160,10 @@ def recognise(facts: Set[str]) -> Tuple[Optional[Trainer], str]:
         return None, reason
     return next((trainer for trainer in TRAINERS if trainer.flavour == contract.name
                  and facts.issuperset(trainer.signs)), Trainer(contract.name, contract.name, ())), ""
+
+
+def of_one_name(root: Path) -> List[str]:
+    """Says which rasterizers of one name a checkout brings, such as one for each kind of lens."""
+    own = sorted(path.parent.name for path in root.glob(f"submodules/*/{RASTERIZER}"))
+    return [f"the checkout has {', '.join(own)}, all called {RASTERIZER}: this package's takes the place of each, and "
+            "renders pinhole cameras alone"] if len(own) > 1 else []

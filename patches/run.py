@@ -68,10 +68,11 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     said_gate = ""
     if gate is not None:
         environment[BACKGROUND_GATE_VARIABLE], said_gate = str(gate), f", background gate {gate}"
+    warnings += facts.of_one_name(_folders(words)[0])
     if _cannot_use_sparse_adam(_folders(words)):
         environment[WITHOUT_VARIABLE] = SPARSE_ADAM
-        warnings = [*warnings, f"{SPARSE_ADAM} is not offered: where the trainer finds it, it reads get_features_dc of "
-                    "its model, which has none"]
+        warnings += [f"{SPARSE_ADAM} is not offered: where it is found, the trainer reads get_features_dc of its model, "
+                     "which has none"]
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
     environment["PYTHONPATH"] = os.pathsep.join(path)
@@ -86,13 +87,14 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
     if (trainer or "") not in by_name:
         raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
-    reasons = []
+    reasons, seen = [], False
     folders = _folders(words)
     for path in (folders[0] / RASTERIZER, folders[0] / f"{RASTERIZER}.py"):
         if path.exists():  # where Python looks first
             raise PatchError(f"{path} would be imported before this package's; move it away")
     for folder in folders:
         found = _facts(folder, everywhere=folder == folders[0])
+        seen = seen or bool(found)
         if facts.PATCHED in found:
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
@@ -105,7 +107,8 @@ def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, Li
             reason = f"by what it imports and calls this is {known.flavour}"
         reasons += [f"{folder}: {reason}"] if found and reason else []
     if trainer:
-        return by_name[trainer], trainer, reasons or [f"no file that imports {RASTERIZER} was found"][bool(reasons):]
+        module = contract_of(by_name[trainer]).module
+        return by_name[trainer], trainer, reasons or [f"no file that imports {module} was found"] * (not seen)
     raise PatchError("no trainer that is known was found; name it with --trainer, or the rasterizer whose API it calls "
                      f"({', '.join(FLAVOURS)}):\n  " + "\n  ".join(
                          reasons or [f"there is no {GR} in {', '.join(map(str, folders))}"]))

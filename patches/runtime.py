@@ -76,7 +76,8 @@ def chosen_blend(pipe: Any) -> Dict[str, Any]:
     """Returns the settings that `blend_of` left. Raises RuntimeError where a script of the user's did not call it."""
     if not hasattr(pipe, "blend"):
         raise RuntimeError("this script renders without a blend mode; before it renders it needs the statements `from "
-                           f"{__name__} import saved_blend_of` and `pipe.blend = saved_blend_of(dataset)`")
+                           f"{__name__} import saved_blend_of` and `pipe.blend = saved_blend_of(dataset)`; where it "
+                           "trains, blend_of")
     return pipe.blend
 
 

@@ -130,6 +130,8 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     # Under --trainer too: Mini-Splatting, and a renderer of no rasterizer at all.
     ({GR: MS}, PYTHON, "it imports diff_gaussian_rasterization_ms, another rasterizer"),
     ({GR: RENDERER + MS}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
+    # DepthAwareGS, whose rasterizer has more than images: without it the training would stop when it first asks.
+    ({GR: RENDERER + "rasterizer.to(0), rasterizer.apply_weights(1)\n"}, PYTHON, "has a method apply_weights, which"),
     # A second renderer beside the first, by which masks are trained.
     ({MASKS: MS, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_ms, another rasterizer"),
     ({MASKS: MS, GR: "from . import masks\n" + RENDERER}, PYTHON, "_ms, another rasterizer"),
@@ -150,6 +152,8 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "cob_gs": ("antialiasing=0, include_mask=0", "mask_precomp=1, mask_signals=1", "image, mask_image, radii, depth"),
     "speedy_splat": ("", "scores=1", "image, radii, kernel_times"),
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
+    "lucid_dreamer": ("", "", "image, radii, depth_alpha"),  # no depth: one image has both
+    "nearest_points": ("nearest_points=1", "", "image, radii"),
     "light_gaussian": ("f_count=1", "", "counts, score, image, radii"), "depth": ("", "", "image, radii, depth"),
     "absgs": ("", "", "image, radii, gs_w"), "fastgs": ("mult=1, get_flag=1", "dc=1", "image, radii, metric_counts"),
     None: ("", "", "image, radii, normals"), "inria": ("", "", "image, radii")}
@@ -227,11 +231,17 @@ def test_what_speaks_against_a_trainer_that_is_named_is_said(tmp_path, dsmoe, mo
     one_line = "    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)\n"
     renderer = RENDERER.replace(one_line, "    draw = GaussianRasterizer(raster_settings=settings)\n"
                                           "    color, radii = draw(means3D=1, degrees=2)\n")
-    monkeypatch.chdir(make(tmp_path, {GR: renderer}))
+    monkeypatch.chdir(make(tmp_path / "reduced", {GR: renderer}))
     _, lines = run.prepare([sys.executable, "train.py"], "smoe", "inria", environment())
     assert "warning: " in lines[1] and "its rasterizer is called with degrees, which no rasterizer has" in lines[1]
     said = dsmoe(*PYTHON)
     assert said.status == 1 and "degrees" in said.err and said.err.count(GR) == 0  # no folder without a renderer
+    monkeypatch.chdir(make(tmp_path / "fitting"))
+    assert len(run.prepare([sys.executable, "train.py"], "smoe", "inria", environment())[1]) == 1  # nothing does
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")  # as for ns-train
+    assert run.prepare([sys.executable], "smoe", "gsplat", environment())[1][1] == (
+        "warning: no file that imports gsplat was found")
 
 
 def test_a_trainer_of_another_layout_is_recognised_by_its_rasterizer(tmp_path, monkeypatch):
@@ -265,6 +275,16 @@ GaussianRasterizer(None)
     result = python("-m", "diff_smoe_rasterization", *PYTHON, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert (result.status, result.out) == (0, f"{is_offered}\n"), result.err
     assert ("SparseGaussianAdam is not offered" in result.err) == (not is_offered)
+
+
+def test_rasterizers_of_one_name_are_named(tmp_path):
+    """op43dgs, of which one is installed."""
+    make(tmp_path, {f"submodules/{lens}/diff_gaussian_rasterization/__init__.py": "" for lens in ("fish", "pinhole")})
+    words = [sys.executable, str(tmp_path / "train.py")], "smoe", None, environment()
+    assert "warning: the checkout has fish, pinhole, all called" in run.prepare(*words)[1][1]
+    assert "the checkout has fish, pinhole, all called" in patches.check(tmp_path).notes[0]
+    (tmp_path / "submodules/fish").rename(tmp_path / "fish")
+    assert len(run.prepare(*words)[1]) == 1
 
 
 def test_a_patched_checkout_is_refused_until_nothing_of_the_patch_is_left(tmp_path):
