@@ -71,8 +71,8 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     warnings += facts.of_one_name(_folders(words)[0])
     if _cannot_use_sparse_adam(_folders(words)):
         environment[WITHOUT_VARIABLE] = SPARSE_ADAM
-        warnings += [f"{SPARSE_ADAM} is not offered: where it is found, the trainer reads get_features_dc of its model, "
-                     "which has none"]
+        warnings += [f"{SPARSE_ADAM} is not offered: where it is found, the trainer reads get_features_dc of its model,"
+                     " which has none"]
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
     path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
     environment["PYTHONPATH"] = os.pathsep.join(path)
