@@ -211,7 +211,7 @@ def packages():
         names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
     data = {PACKAGE: ["include/dsmoe/*.h", "csrc/io/*.h", "cmake/*.cmake", "py.typed"],
             f"{PACKAGE}.export": ["page/*"],
-            f"{PACKAGE}.patches": ["shims/*/*.py"],  # shims are no packages of ours
+            f"{PACKAGE}.patches": ["shims/*/*.py", "stand_ins/*/*.py"],  # no packages of ours
             f"{PACKAGE}.benchmarks.suite": ["Snakefile", "shipped/*.yaml", "shipped/scenes/*.yaml"],
             f"{PACKAGE}.benchmarks.suite.report": ["*.json", "page.*", "table.*"]}
     return {"packages": names, "package_dir": folders, "package_data": data}

@@ -201,9 +201,10 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
 
 def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
     actions = patch.add_subparsers(dest="action", required=True, metavar="ACTION")
-    for name, text in (("apply", "patch the checkout; the originals are kept in PATH/.dsmoe_patch"),
+    for name, text in (("apply", "patch the checkout; each line of the patch says so"),
                        ("check", "say whether it is patchable, patched, half-patched, drifted or unknown"),
-                       ("diff", "show what the patch changes"), ("revert", "put every file back byte for byte")):
+                       ("diff", "show what the patch changes, and write nothing"),
+                       ("revert", "take the patch out of every file, byte for byte")):
         action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         action.add_argument("path", metavar="PATH", help="the checkout's folder")
         if name != "revert":
@@ -212,8 +213,6 @@ def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
             action.add_argument("--fuse", action="store_true",
                                 help="also SSIM and Adam by this package's kernels: the same results, sooner")
             action.add_argument("--trainer", metavar="NAME", help="which trainer it is (default: found out)")
-        if name == "apply":
-            action.add_argument("--dry-run", action="store_true", help="show the changes, write nothing")
         action.set_defaults(run=_patch, command_parser=action)
 
 

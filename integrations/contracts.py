@@ -13,6 +13,7 @@ SETTINGS = ("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_mo
             "sh_degree", "campos", "prefiltered", "debug")
 ARGUMENTS = ("means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
 NAMES = ("GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians")
+METHODS = ("markVisible", "forward", "to", "cuda", "cpu", "train", "eval")  # of a rasterizer, those of torch among them
 
 RESULTS = {  # what a result is, and a word that is in the name that callers give it, if it must be
     "color": ("[C, H, W]", ""),
@@ -20,6 +21,7 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "inverse_depth": ("[1, H, W], 1 / z blended as a colour over 0", ""),
     "depth": ("[1, H, W], z blended as a colour over 0", "depth"),
     "alpha": ("[1, H, W], the share of the pixel that the background does not have", "alpha"),
+    "depth_alpha": ("[2, H, W], the depth, and the share of the pixel that the background has", "depth_alpha"),
     "opacity": ("[1, H, W], the same as alpha", "opac"),
     "is_used": ("[N] int32, 1 where the radius is positive", "used"),
     "pixels": ("[N, 1], how many pixels blended the Gaussian", "pixel"),
@@ -37,7 +39,7 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
 
 
 class Contract(NamedTuple):
-    """What callers of a rasterizer rely on, beside SETTINGS, ARGUMENTS and NAMES, which all of Inria's kind have."""
+    """What callers of a rasterizer rely on, beside SETTINGS, ARGUMENTS, NAMES and METHODS, which all of a kind have."""
 
     name: str  # of the module here, and for `dsmoe run --trainer`
     used_by: str
@@ -48,6 +50,7 @@ class Contract(NamedTuple):
     signs: Tuple[str, ...] = ()  # a caller shows one of these (patches/facts.py); none: it needs to show nothing
     module: str = RASTERIZER  # what callers import
     other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings
+    methods: Tuple[str, ...] = ()  # of a rasterizer, beside METHODS
     absolute: int = 0  # columns of means2D behind x and y that get sums of absolute gradients: of both axes, or of each
 
 
@@ -62,7 +65,8 @@ TAMING = ("color", "radii", "counts", "lists", "listsRender", "listsDistance", "
           "accum_weights", "accum_count", "accum_blend", "accum_dist")
 
 CONTRACTS = (
-    Contract("scaffold", "Scaffold-GS, Octree-GS, HAC, HAC++", signs=("calls visible_filter",)),
+    Contract("scaffold", "Scaffold-GS, Octree-GS, HAC, HAC++", signs=("calls visible_filter",),
+             methods=("visible_filter",)),
     Contract("c3dgs", "c3dgs (3DGS-C)", settings=("clamp_color",),
              arguments=(*ARGUMENTS, "sh_indices", "g_indices", "scale_factors"),
              names=("GaussianRasterizerIndexed", "rasterize_gaussians_indexed"),
@@ -87,6 +91,8 @@ CONTRACTS = (
              arguments=_behind("opacities", "scores"), signs=("takes scores",)),
     Contract("pixel_gs", "Pixel-GS", ("color", "radii", "pixels"), ("depth_threshold",),
              signs=("sets depth_threshold",)),
+    Contract("nearest_points", "B32xN0/gaussian-splatting", settings=("nearest_points",),
+             signs=("sets nearest_points",)),
     Contract("light_gaussian", "LightGaussian", settings=("f_count",), signs=("sets f_count",),
              other_results=(("counts", "opacity_sums", "color", "radii"),)),
     Contract("inria_2024", "3DGS of 2024 (`antialiasing`, sparse Adam)", ("color", "radii", "inverse_depth"),
@@ -97,6 +103,7 @@ CONTRACTS = (
              arguments=(*ARGUMENTS, "means2D_densify")),
     Contract("depth_alpha", "dreamgaussian, LGM, DNGaussian, FSGS, SC-GS", ("color", "radii", "depth", "alpha"),
              settings=("confidence",)),
+    Contract("lucid_dreamer", "LucidDreamer, InfiniteScene", ("color", "radii", "depth_alpha")),
     Contract("mcmc", "3DGS-MCMC", ("color", "radii", "is_used"), names=("compute_relocation",)),
     Contract("absgs", "AbsGS", ("color", "radii", "weights"), module=RASTERIZER + "_abs", absolute=2),
     Contract("fastgs", "FastGS", ("color", "radii", "metric_counts"), ("mult", "get_flag", "metric_map"), WITH_DC,

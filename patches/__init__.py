@@ -5,8 +5,8 @@
 
 README.md says what is in which file.
 """
-from .engine import apply, check, diff, plan, revert
+from .engine import apply, check, diff, revert
 from .source import PatchError
 from .trainers import TRAINER_NAMES as TRAINERS
 
-__all__ = ["PatchError", "TRAINERS", "apply", "check", "diff", "plan", "revert"]
+__all__ = ["PatchError", "TRAINERS", "apply", "check", "diff", "revert"]

@@ -1,13 +1,14 @@
 """Stand-ins in plain torch that trainers get on a GPU: on CUDA the results that they have on the CPU."""
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 
 from diff_smoe_rasterization import fused_ssim
 from diff_smoe_rasterization.integrations import weighted_distance
 from diff_smoe_rasterization.integrations.torch_scatter import scatter, scatter_max
-from diff_smoe_rasterization.patches import runtime
-from diff_smoe_rasterization.patches.runtime import unique_rows
+from diff_smoe_rasterization.patches import fuse, modernise
 
 
 def test_the_nearest_row_of_a_codebook(gpu, monkeypatch):
@@ -24,11 +25,12 @@ def test_the_nearest_row_of_a_codebook(gpu, monkeypatch):
 
 
 def test_distinct_rows(gpu):
+    unique_rows = partial(modernise.unique_rows, torch.unique)
     torch.manual_seed(0)
     for low, high in ((-3, 3), (-90, 90), (-2 ** 31, 2 ** 31 - 1)):
         cells = torch.randint(low, high, (20_000, 3), dtype=torch.int32)
         expected = torch.unique(cells, dim=0, return_inverse=True, return_counts=True)
-        for ours, torchs in zip(unique_rows(cells.to(gpu), return_inverse=True, return_counts=True), expected):
+        for ours, torchs in zip(unique_rows(cells.to(gpu), return_inverse=True, return_counts=True, dim=0), expected):
             assert ours.dtype == torchs.dtype and torch.equal(ours.cpu(), torchs)
 
 
@@ -51,7 +53,7 @@ def test_ssim_is_fused_on_the_device_of_its_images(gpu, capsys):
         called.append(img1.shape)
         return fused_ssim(img1.cpu(), img2.cpu()).to(img1.device)
 
-    call = runtime.fused_where_equal(of_the_trainer)
+    call = partial(fuse.fused_where_equal, of_the_trainer, {})
     torch.manual_seed(0)
     image, target = torch.rand(2, 3, 70, 50, device=gpu)
     value = call(image.requires_grad_(), target)

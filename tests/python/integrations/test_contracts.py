@@ -13,14 +13,17 @@ from diff_smoe_rasterization import rasterize, rasterize_with_splats
 from diff_smoe_rasterization.integrations import (
     absgs,
     cob_gs,
+    depth_alpha,
     fastgs,
     feature_3dgs,
     grouping,
     langsplat,
     light_gaussian,
+    lucid_dreamer,
     mcmc,
     mip_splatting,
     monogs,
+    nearest_points,
     pixel_gs,
     speedy_splat,
 )
@@ -33,7 +36,7 @@ TOLERANCE = 1e-11
 N, WIDTH, HEIGHT = 30, 33, 21
 OFTEN_GIVEN = {"confidence": None, "subpixel_offset": None, "kernel_size": 0.3, "projmatrix_raw": None,
                "depth_threshold": 1.0, "metric_map": None, "get_flag": False, "f_count": False,
-               "include_mask": False}
+               "include_mask": False, "nearest_points": None}
 
 
 def scene_of(mode, **more):
@@ -201,6 +204,20 @@ def test_cob_gs_renders_the_stage_without_masks(mode):
     assert torch.equal(depth, expected.inverse_depth) and mask.shape == depth.shape and not mask.any()
     with pytest.raises(NotImplementedError, match="include_mask is set"):
         rendered(cob_gs, scene, {"include_mask": True})
+
+
+def test_nearest_points_are_none_or_refused():
+    scene = scene_of("smoe")
+    assert torch.equal(rendered(nearest_points, scene, {"nearest_points": None})[0], own(scene).color)
+    with pytest.raises(NotImplementedError, match="nearest_points are set"):
+        rendered(nearest_points, scene, {"nearest_points": torch.zeros(N, 4, 3)})
+
+
+def test_depth_and_what_the_background_has_in_one_image(mode):
+    scene = scene_of(mode)
+    both = rendered(lucid_dreamer, scene)[2]
+    _, _, depth, alpha = rendered(depth_alpha, scene)
+    assert (alpha < 1).any() and torch.equal(both, torch.cat([depth, 1 - alpha]))
 
 
 def test_pixels_and_what_is_near_grows_less(mode):

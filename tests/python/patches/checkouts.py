@@ -12,7 +12,6 @@ import diff_smoe_rasterization
 HERE = Path(__file__).resolve().parent
 PACKAGE_PARENT = Path(diff_smoe_rasterization.__file__).resolve().parent.parent  # where it is installed, or the tree
 PACKAGES = HERE / "packages"  # what trainers import beside the rasterizer
-RECORD = ".dsmoe_patch"
 
 
 def make_checkout(folder):

@@ -1,4 +1,4 @@
-"""The engine of the patches: what is planned, written, kept and put back, and when not."""
+"""The engine of the patches: what is planned, written and taken back, and when not."""
 from __future__ import annotations
 
 import ast
@@ -7,28 +7,29 @@ import shutil
 from pathlib import Path
 
 import pytest
-from checkouts import RECORD, contents
-from tiny import ARGS, CHECKOUT, GR, PATCHED, RENDER, TRAIN, make, refused
+from checkouts import contents
+from tiny import ARGS, CHECKOUT, GR, MARK, PATCHED, RENDER, RENDERER, TRAIN, make, refused
 
 from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.patches import engine
-from diff_smoe_rasterization.patches.record import Record
 
 NOBODY = 65534
 
 
 def test_only_the_statements_change(tmp_path):
-    """Comments, blanks, the unusual colons and the missing last newline are where they were."""
-    text = patches.diff(make(tmp_path))
-    before = contents(tmp_path)
-    assert "+    pipe.blend = blend_of(dataset)\n" in text and "No newline at end of file" in text
-    assert patches.check(tmp_path)[1:3] == ("patchable", "3dgs-2023")
-    assert patches.apply(tmp_path).written and not patches.apply(tmp_path).written
+    """Comments, blanks, the unusual colons and the missing last newline are where they were. A copy can be reverted."""
+    checkout, copy = make(tmp_path / "checkout"), tmp_path / "copy"
+    text, before = patches.diff(checkout), contents(checkout)
+    assert "+    pipe.blend = blend_of(dataset)  # dsmoe patch\n" in text and "No newline at end of file" in text
+    assert patches.check(checkout)[1:3] == ("patchable", "3dgs-2023")
+    assert patches.apply(checkout).written and not patches.apply(checkout).written
     for name, expected in PATCHED.items():
-        assert (tmp_path / name).read_text() == expected, name
-    assert patches.check(tmp_path).state == "patched" and patches.diff(tmp_path) == text
-    patches.revert(tmp_path)
-    assert contents(tmp_path) == before
+        assert (checkout / name).read_text() == expected, name
+    assert patches.check(checkout).state == "patched" and patches.diff(checkout) == text
+    for folder in (shutil.copytree(checkout, copy), checkout):
+        patches.revert(folder)
+        assert contents(folder) == before
+    refused(checkout, "no file has a line of a patch", call=patches.revert)
 
 
 @pytest.mark.parametrize("form", [
@@ -38,33 +39,52 @@ def test_only_the_statements_change(tmp_path):
 def test_every_form_of_text_comes_back(tmp_path, form):
     before = contents(make(tmp_path, {name: form(text) for name, text in CHECKOUT.items()}))
     patches.apply(tmp_path)
-    after = (tmp_path / "train.py").read_bytes()
-    added = form(PATCHED["train.py"]) if b"  \n" not in after else after  # the patch's own lines have no blanks
-    assert after == added and b"pipe.blend = blend_of(dataset)" in after
+    assert {name: (tmp_path / name).read_bytes() for name in PATCHED} == {
+        name: form(text) for name, text in PATCHED.items()}
     patches.revert(tmp_path)
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("body", [
-    '    """Trains.\n\n    # see README"""\n', '    @functools.lru_cache\n    def first():\n        return 0\n'])
-def test_a_line_is_put_before_a_statement_and_into_no_other(tmp_path, body):
-    """Behind a docstring that looks like comments, and above what decorates the first statement."""
-    text = TRAIN.replace("    # the first iteration is 1\n", body)
+@pytest.mark.parametrize("old, new", [
+    ("    # the first iteration is 1\n", '    """Trains.\n\n    # see README"""\n'),
+    ("    # the first iteration is 1\n", "    @functools.lru_cache\n    def first():\n        return 0\n"),
+    ("import torch", '"""Trains."""\nfrom __future__ import annotations\nimport torch')])
+def test_a_line_is_put_before_a_statement_and_into_no_other(tmp_path, old, new):
+    """Behind a docstring that looks like comments, above what decorates the first statement, behind __future__."""
+    text = TRAIN.replace(old, new)
     make(tmp_path, {"train.py": text})
     patches.apply(tmp_path)
-    function = next(node for node in ast.parse((tmp_path / "train.py").read_text()).body
-                    if isinstance(node, ast.FunctionDef))
-    assert any(ast.unparse(line) == "pipe.blend = blend_of(dataset)" for line in function.body)
+    tree = ast.parse((tmp_path / "train.py").read_text())
+    compile(tree, "train.py", "exec")
+    function = next(node for node in tree.body if isinstance(node, ast.FunctionDef))
+    assert any(isinstance(line, ast.Assign) and getattr(line.targets[0], "attr", "") == "blend"
+               for line in function.body[:2])
     patches.revert(tmp_path)
     assert (tmp_path / "train.py").read_text() == text
 
 
+def test_settings_in_one_line_and_imports_in_a_try_come_back(tmp_path):
+    text = RENDERER.replace(RENDERER[RENDERER.index("(\n        image"):RENDERER.index("    return")],
+                            "(image_height=(camera.height), debug=pipe.debug)\n")
+    text = text.replace("from diff", "try:\n    from  diff").replace("Rasterizer\n", "Rasterizer\nexcept: 0\n", 1)
+    make(tmp_path, {GR: text})
+    patches.apply(tmp_path)
+    after = (tmp_path / GR).read_text()
+    compile(after, GR, "exec")
+    assert "Settings(**chosen_blend(pipe),  # dsmoe patch\n        image_height=(" in after
+    patches.revert(tmp_path)
+    assert (tmp_path / GR).read_text() == text
+
+
 @pytest.mark.parametrize("name, old, new, rule", [
-    (GR, "debug=pipe.debug", "debug=False", "settings-blend-mode: 1 that look alike"),
-    (GR, "debug=pipe.debug", "debug=other.debug", "settings-blend-mode: 1 that look alike"),
-    (GR, "image_height=camera.height", "camera.height", "settings-blend-mode: 1 that look alike"),
+    (GR, "debug=pipe.debug", "debug=False", "settings-blend-mode: the call in line"),
+    (GR, "image_height=camera", "image_height=\\\ncamera", "settings-blend-mode: the call in line"),
+    (GR, "image_height=camera.height", "camera.height", "settings-blend-mode: the call in line"),
     (GR, "# slow\n    )\n", "# slow\n    )\n    settings = GaussianRasterizationSettings(image_height=1)\n",
-     "settings-blend-mode: 1 that look alike"),
+     "settings-blend-mode: the call in line"),
+    ("train.py", "checkpoint):\n    # the first iteration is 1\n    first_iter = 0\n    if checkpoint:",
+     "checkpoint): 0; checkpoint = 1\nif 1:\n    if checkpoint:", "pipe-blend-mode: line 5 has more than one"),
+    (GR, "debug=pipe.debug", "debug=pipe['debug']", "settings-blend-mode: the call in line"),
     (ARGS, "class ModelParams", "class SceneParams", "model-parameter: no match"),
     (ARGS, 'super().__init__(parser, "Loading', 'ParamGroup.__init__(self, parser, "Loading',
      "model-parameter: no match"),
@@ -75,28 +95,19 @@ def test_drift_is_refused_by_file_and_rule(tmp_path, name, old, new, rule, dsmoe
     make(tmp_path, {name: CHECKOUT[name].replace(old, new)})
     refused(tmp_path, f"{name}: rule {rule}")
     said = dsmoe("patch", "check", tmp_path)
-    assert said.status == 1 and ": drifted (3dgs-2023)" in said.out and f"{name}: rule {rule}" in said.err
+    assert said.status == 1 and ": drifted (3dgs-2023)" in said.out and f"{name}: rule {rule}" in said.out
 
 
 def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
     refused(make(tmp_path / "missing", {"render.py": None}), "render.py: rule pipe-blend-mode: there is no such file")
-    refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py: is not Python", "line 11")
+    refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py: rule pipe-blend-mode: is not Python",
+            "line 11")
     refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", "nothing imports Gaussian")
     refused(make(tmp_path / "checkout"), "no trainer 'x'", *patches.TRAINERS, trainer="x")
     refused(tmp_path / "checkout", "hac", trainer="hac")
-    refused(tmp_path / "checkout/arguments", f"there is no {GR} in", f"such as {tmp_path / 'checkout'}")
+    refused(tmp_path / "checkout/arguments", f"there is no {GR} in it")
     with pytest.raises(patches.PatchError, match="not a folder"):
         patches.apply(tmp_path / "nowhere")
-
-
-def test_a_patch_by_hand_is_half_or_whole(tmp_path):
-    whole = make(tmp_path / "whole", PATCHED)
-    assert patches.check(whole).state == "patched" and not patches.apply(whole).written
-    refused(whole, ".dsmoe_patch", call=patches.revert)
-    refused(whole, "checkpoint-load is not applied", modernise=True)
-    half = make(tmp_path / "half", {**PATCHED, "train.py": TRAIN})
-    refused(half, "train.py: rule pipe-blend-mode: is not applied", "render.py: rule pipe-blend-mode: is applied")
-    refused(half, "there is no .dsmoe_patch", call=patches.revert)
 
 
 class Killed(BaseException):
@@ -104,25 +115,28 @@ class Killed(BaseException):
 
 
 def failing_at(step, error, monkeypatch):
-    """Raises an error within the step-th writing of a file, once; that file is empty then, or has its first half."""
-    written, write = [], Path.write_bytes
+    """Raises an error at the step-th writing or replacing of a file, once; what was being written is cut then."""
+    done, write, replace, remove = [], Path.write_bytes, os.replace, shutil.rmtree
 
-    def counted(path, data):
-        written.append(path)
-        if len(written) == step:
-            write(path, data[:len(data) // 2 * (step % 2)])
-            raise error
-        return write(path, data)
+    def counted(act, *arguments):
+        done.append(arguments)
+        if len(done) != step:
+            return act(*arguments)
+        if act is write:
+            write(arguments[0], arguments[1][:len(arguments[1]) // 2])
+        raise error
 
-    monkeypatch.setattr(Path, "write_bytes", counted)
+    monkeypatch.setattr(Path, "write_bytes", lambda *arguments: counted(write, *arguments))
+    monkeypatch.setattr(os, "replace", lambda *arguments: counted(replace, *arguments))
+    monkeypatch.setattr(shutil, "rmtree", lambda *arguments, **more: (
+        None if isinstance(error, Killed) and len(done) >= step else remove(*arguments, **more)))
 
 
-# A record has two copies of each of four files; then the files are written.
+# Four files are written, then each takes its place.
 @pytest.mark.parametrize("begin, options, step", [
-    *((False, {}, step) for step in (1, 6, 9, 10, 12)), (True, {}, 2), (True, {}, 4), (True, {"modernise": True}, 1),
-    (True, {"modernise": True}, 3), (True, {"modernise": True}, 8), (True, {"modernise": True}, 14)])
+    *((False, {}, step) for step in (1, 4, 5, 8)), (True, {}, 2), (True, {}, 6), (True, {"fuse": True}, 2)])
 def test_a_kill_leaves_what_can_be_finished_or_put_back(tmp_path, monkeypatch, begin, options, step):
-    checkout = make(tmp_path / "checkout")
+    checkout = make(tmp_path / "checkout", {"train.py": TRAIN + "\n\nif __name__ == '__main__':\n    training(*x)\n"})
     before = contents(checkout)
     if begin:
         patches.apply(checkout)
@@ -133,124 +147,83 @@ def test_a_kill_leaves_what_can_be_finished_or_put_back(tmp_path, monkeypatch, b
     patches.apply(finished, **options)
     assert patches.check(finished).state == "patched" and not patches.apply(finished, **options).written
     for path in (checkout, finished):
-        if contents(path) != before:
-            patches.revert(path)
+        assert contents(path) != before
+        patches.revert(path)
         assert contents(path) == before
 
 
-@pytest.mark.parametrize("step", [1, 8, 10])
-def test_a_full_disk_or_a_file_that_may_not_be_written_changes_nothing(tmp_path, monkeypatch, step):
+@pytest.mark.parametrize("step", [1, 4, 5])
+def test_a_full_disk_or_a_folder_that_may_not_be_written_changes_nothing(tmp_path, monkeypatch, step):
     make(tmp_path)
     failing_at(step, OSError(28, "No space left on device"), monkeypatch)
-    refused(tmp_path, "cannot be written, so all was put back: [Errno 28]")
+    refused(tmp_path, "cannot be written: [Errno 28]", f"`dsmoe patch check {tmp_path}` says how the checkout is")
+
+
+SCRIPT = "import torch\nif __name__ == '__main__':\n    torch.load('x')\n"
 
 
 def test_options_are_added_to_a_patch_and_stay_with_it(tmp_path, dsmoe):
-    before = contents(make(tmp_path, {"utils/loss_utils.py": "def ssim(img1, img2):\n    return 1\n"}))
+    setup = "submodules/grid/setup.py"
+    make(tmp_path, {"metrics.py": SCRIPT, "utils/x.py": SCRIPT, setup: "flags = ['-O2', '-std=c++14']\n"})
+    before = contents(tmp_path)
     patches.apply(tmp_path)
-    assert patches.apply(tmp_path, modernise=True).written
-    assert "torch.load(checkpoint, weights_only=False)" in (tmp_path / "train.py").read_text()
-    assert not patches.apply(tmp_path).written and ", with --modernise" in dsmoe("patch", "check", tmp_path).out
-    assert patches.apply(tmp_path, fuse=True).options == ("modernise", "fuse")
-    assert "@fused_where_equal\ndef ssim" in (tmp_path / "utils/loss_utils.py").read_text()
+    assert (tmp_path / "metrics.py").read_text() == SCRIPT
+    for words, options in ((["--fuse"], ["fuse"]), (["--modernise"], ["fuse", "modernise"])):
+        assert patches.check(tmp_path).state == "patched"
+        said = dsmoe("patch", "apply", *words, tmp_path)
+        assert said.status == 0 and f"metrics.py: {', '.join(options)}" in said.out
+        assert patches.check(tmp_path).applied == options and not patches.apply(tmp_path).written
+    first, second, *rest = (tmp_path / "metrics.py").read_text().splitlines(keepends=True)
+    assert first == "from diff_smoe_rasterization.patches import modernise; modernise.start()" + MARK
+    assert second == "from diff_smoe_rasterization.patches import fuse; fuse.start()" + MARK and "".join(rest) == SCRIPT
+    assert (tmp_path / setup).read_text() == "flags = ['-O2', '-DDSMOE_PATCH_STD=14']\n"
+    assert (tmp_path / "utils/x.py").read_text() == SCRIPT
+    assert "patched (3dgs-2023, --fuse, --modernise)" in dsmoe("patch", "check", tmp_path).out
     patches.revert(tmp_path)
     assert contents(tmp_path) == before
 
 
-def test_an_edit_is_neither_overwritten_nor_lost(tmp_path):
-    """Beside the patch's lines too."""
-    before = contents(make(tmp_path))
-    patches.apply(tmp_path)
-    text, mine = (tmp_path / "train.py").read_text(), TRAIN
-    for old, new in (("import torch\n", "import os\nimport torch\n"), ("first_iter = 0\n", "first_iter = 1\n"),
-                     ("    # the first iteration is 1\n", "    print(dataset)\n"),
-                     ("first_iter\n", "first_iter\n\n\nprint()\n")):
-        text, mine = new.join(text.rsplit(old, 1)), new.join(mine.rsplit(old, 1))
-    (tmp_path / "train.py").write_text(text)
-    planned = patches.check(tmp_path)  # every rule is applied
-    assert planned.state == "patched" and planned.reasons[1].startswith("train.py: was edited since")
-    assert not patches.apply(tmp_path).written
-    refused(tmp_path, "train.py: was changed since it was patched: undo your edit", modernise=True)
-    files = patches.revert(tmp_path)
-    assert set(files) == set(PATCHED) and [name for name, is_edited in files.items() if is_edited] == ["train.py"]
-    assert contents(tmp_path) == {**before, "train.py": (before["train.py"][0], mine.encode())}
-
-
-@pytest.mark.parametrize("old, new, words", [
-    ("blend_of(dataset)", "blend_of(other)", [
-        "train.py: you have edited what the patch wrote", "\n-    pipe.blend = blend_of(dataset)",
-        "\n+    pipe.blend = blend_of(other)", "copy what lies in .dsmoe_patch/originals over the checkout"]),
-    ("    pipe.blend", "    if 1:\n        pipe.blend", ["train.py: you have edited"]),
-    ("    pipe.blend", "    if 1:\n      \\\n    pipe.blend", ["train.py: you have edited what the patch wrote, or"])])
-def test_an_edit_of_the_patchs_own_lines_is_shown(tmp_path, old, new, words):
+def test_edits_stay_when_the_patch_goes(tmp_path, dsmoe):
     patches.apply(make(tmp_path))
-    (tmp_path / "train.py").write_text((tmp_path / "train.py").read_text().replace(old, new))
-    refused(tmp_path, "nothing was touched", *words, call=patches.revert)
+    edited = (tmp_path / "train.py").read_text().replace("first_iter = 0", "first_iter = 5") + "\n# mine\n"
+    (tmp_path / "train.py").write_text(edited)
+    assert patches.check(tmp_path).state == "patched" and not patches.apply(tmp_path).written
+    said = dsmoe("patch", "revert", tmp_path)
+    assert said.status == 0 and "as it was before the patch (4 files)" in said.out
+    assert (tmp_path / "train.py").read_text() == TRAIN.replace("first_iter = 0", "first_iter = 5") + "\n# mine\n"
+    assert (tmp_path / GR).read_text() == RENDERER
 
 
-def test_a_patch_by_rules_of_before_is_known_and_brought_up_to_date(tmp_path):
-    """Such as set `pipe.blend_mode` alone."""
-    original = contents(make(tmp_path))
-    former = {name: text.replace("**pipe.blend,", "blend_mode=pipe.blend_mode,").replace(".blend = ", ".blend_mode = ")
-              for name, text in PATCHED.items()}
-    Record.make(tmp_path, *({name: text.encode() for name, text in texts.items()} for texts in (CHECKOUT, former)),
-                version="0", trainer="3dgs-2023", options=[])
-    make(tmp_path, former)
-    planned = patches.check(tmp_path)
-    assert planned.state == "patched" and planned.reasons[0] == "by version 0"
-    assert f"to bring it up to date, type: dsmoe patch apply {tmp_path}" in planned.reasons[1]
-    assert patches.apply(tmp_path).written and not patches.apply(tmp_path).written
-    assert all((tmp_path / name).read_text() == text for name, text in PATCHED.items())
-    patches.revert(tmp_path)
-    assert contents(tmp_path) == original
-
-
-def another_commit(folder):
-    """Replaces every file by that of a later version, as `git checkout` does."""
-    for name, text in CHECKOUT.items():
-        (folder / name).write_text("# a later version\n" + text)
-
-
-@pytest.mark.parametrize("come_back", [make, another_commit])
-def test_a_record_of_which_no_file_is_patched_any_more_is_no_hindrance(tmp_path, come_back):
-    checkout, reverted = make(tmp_path / "checkout"), tmp_path / "reverted"
-    patches.apply(checkout)
-    come_back(checkout)
-    shutil.copytree(checkout, reverted)
-    planned = patches.check(checkout)
-    assert planned.state == "patchable" and "no file is patched any more" in planned.reasons[0]
-    assert patches.apply(checkout).written and patches.check(checkout).state == "patched"
-    patches.revert(checkout)
-    assert patches.revert(reverted) == {} and contents(checkout) == contents(reverted)
-
-
-def test_what_is_patched_beside_replaced_files_is_put_back(tmp_path):
-    """git replaces the trainer's files, and leaves those of its submodules."""
-    setup = "submodules/grid/setup.py"
-    make(tmp_path, {setup: "flags = ['-O2', '-std=c++14']\n"})
-    patches.apply(tmp_path, modernise=True)
-    assert (tmp_path / setup).read_text() == "flags = ['-O2']\n"
-    another_commit(tmp_path)
-    refused(tmp_path, "half-patched", "train.py: was changed since, and is not patched any more; `revert` leaves it")
-    assert patches.revert(tmp_path) == {setup: False} and not (tmp_path / RECORD).exists()
-    assert "c++14" in (tmp_path / setup).read_text() and "a later version" in (tmp_path / "train.py").read_text()
-
-
-def test_a_file_that_was_restored_is_patched_again_and_one_that_was_removed_is_reported(tmp_path):
+@pytest.mark.parametrize("name, old, new, words", [
+    ("train.py", "    pipe.blend", "    if 1:\n        pipe.blend", "train.py: without the lines of the patch it is"),
+    (GR, "\nfrom diff_smoe", "\n\nfrom diff_smoe", "it still has `# dsmoe patch 3dgs-2023: diff")])
+def test_an_edit_without_which_no_file_comes_back_is_named(tmp_path, name, old, new, words):
     patches.apply(make(tmp_path))
-    (tmp_path / "train.py").write_text(TRAIN)
+    (tmp_path / name).write_text((tmp_path / name).read_text().replace(old, new))
+    refused(tmp_path, "nothing was touched", words, call=patches.revert)
+
+
+def test_files_of_another_commit_are_patched_anew(tmp_path):
+    """Single ones that `git checkout` brought, and all."""
+    patches.apply(make(tmp_path))
+    (tmp_path / "train.py").write_text("# a later version\n" + TRAIN)
     planned = patches.check(tmp_path)
-    assert planned.state == "half-patched" and planned.reasons[0].startswith("train.py: is not patched, or not any")
+    assert planned.state == "half-patched" and planned.reasons[0].startswith("train.py: is not as this version")
     assert patches.apply(tmp_path).written and patches.check(tmp_path).state == "patched"
+    make(tmp_path, {"train.py": "# a later version\n" + TRAIN})
+    assert patches.check(tmp_path).state == "patchable" and patches.apply(tmp_path).written
     (tmp_path / "train.py").unlink()
-    refused(tmp_path, "train.py: was removed since", call=patches.revert)
+    refused(tmp_path, "drifted", "train.py: rule pipe-blend-mode: there is no such file")
+    patches.revert(tmp_path)
+    assert (tmp_path / "render.py").read_text() == RENDER and not (tmp_path / "train.py").exists()
 
 
-def test_a_damaged_record_is_no_ground_to_write(tmp_path):
+def test_lines_of_another_version_are_replaced(tmp_path):
     patches.apply(make(tmp_path))
-    (tmp_path / RECORD / "originals/train.py").unlink()
-    for call in (patches.apply, patches.revert, patches.check):
-        refused(tmp_path, "manifest.json: the record of the patch is damaged", "has lost files", call=call)
+    former = PATCHED["train.py"].replace("pipe.blend = blend_of", "pipe.blend_mode = mode_of")
+    (tmp_path / "train.py").write_text(former)
+    assert patches.check(tmp_path).state == "half-patched" and patches.apply(tmp_path).written
+    assert (tmp_path / "train.py").read_text() == PATCHED["train.py"]
 
 
 def test_modes_owners_and_links_stay(tmp_path):
@@ -277,67 +250,49 @@ def test_a_link_out_of_the_checkout_is_refused(tmp_path):
 
 
 SCRIPTS = {  # of the user's own: text, what is said of it
-    "tools/own.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", "imports the original"),
-    "tools/deep/own.py": ("from diff_gaussian_rasterization._C import mark_visible\n", "imports the original"),
-    "whole.py": ("import diff_gaussian_rasterization as dgr\n", "imports the original"),
+    "tools/deep/own.py": ("from diff_gaussian_rasterization._C import mark_visible\n", "is the original rasterizer"),
+    "whole.py": ("import diff_gaussian_rasterization as dgr\n", "is the original rasterizer"),
     "settings.py": ("from diff_gaussian_rasterization import GaussianRasterizationSettings\n"
-                    "def show(pipe):\n    return GaussianRasterizationSettings(debug=pipe.debug)\n", "makes Gaussian"),
-    "film.py": ("import gaussian_renderer\ngaussian_renderer.render(None)\n", "renders"),
-    "tools/film.py": ("from gaussian_renderer import render\n", "renders"),
-    "all.py": ("from gaussian_renderer import *\n", "renders"),
+                    "def show(pipe):\n    return GaussianRasterizationSettings(debug=False)\n", "without a blend mode"),
+    "broken.py": ("import diff_gaussian_rasterization\n\0x", "is the original rasterizer"),
     "utils/loss.py": ("try:\n    from diff_gaussian_rasterization._C import fusedssim\nexcept ImportError: 0\n",
-                      "stays"),
-    "viewer.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", None),  # a rule changes it
-    "mode.py": ("from gaussian_renderer import render\npipe.blend = {}\n", None),
-    "gui.py": ("from gaussian_renderer import network_gui\n", None),
-    "out/backup/film.py": ("from gaussian_renderer import render\n", None),
-    "env/film.py": ("from gaussian_renderer import render\n", None), "out/cfg_args": ("", None),
-    "env/pyvenv.cfg": ("", None), ".cache/film.py": ("from gaussian_renderer import render\n", None),
-    "lib/film.py": ("from gaussian_renderer import render\n", None)}  # train.py imports it
+                      "is the original rasterizer"),
+    "tools/own.py": ("from diff_gaussian_rasterization import GaussianRasterizer\n", None),  # a rule changes it
+    "viewer.py": ("from diff_gaussian_rasterization import GaussianRasterizationSettings\n"
+                  "def show(pipe):\n    return GaussianRasterizationSettings(debug=pipe.debug)\n", None),
+    "why.py": ("# as diff_gaussian_rasterization does\n", None), "out/cfg_args": ("", None),
+    "out/backup/film.py": ("import diff_gaussian_rasterization\n", None), "env/pyvenv.cfg": ("", None),
+    "env/film.py": ("import diff_gaussian_rasterization\n", None),
+    ".cache/film.py": ("import diff_gaussian_rasterization\n", None)}
 
 
-def test_scripts_that_keep_the_original_or_have_no_mode_are_named(tmp_path):
-    tmp_path = make(tmp_path / "checkout", {**{name: text for name, (text, _) in SCRIPTS.items()},
-                                           "train.py": "from lib import film\n" + TRAIN})
+def test_scripts_get_the_rasterizer_and_those_that_no_rule_reaches_are_named(tmp_path):
+    make(tmp_path, {name: text for name, (text, _) in SCRIPTS.items()})
     for _ in range(2):  # before the patch, and when it is there
-        notes = {note.partition(": ")[0]: note for note in patches.plan(tmp_path).notes}
+        notes = {note.partition(": ")[0]: note for note in patches.check(tmp_path).notes}
         assert set(notes) == {name for name, (_, word) in SCRIPTS.items() if word}
         assert all(SCRIPTS[name][1] in note for name, note in notes.items())
         patches.apply(tmp_path)
-    assert "diff_smoe_rasterization.integrations.inria " in (tmp_path / "viewer.py").read_text()
+    for name in ("tools/own.py", "viewer.py"):
+        assert "diff_smoe_rasterization.integrations.inria " in (tmp_path / name).read_text()
+    assert "**chosen_blend(pipe)" in (tmp_path / "viewer.py").read_text()
 
 
-LOAD = "checkpoint = torch.load(path)\n"
-
-
-def test_check_says_what_is_applied(tmp_path, dsmoe):
-    checkout = make(tmp_path / "a checkout", {"utils/loading.py": LOAD})
-    said = dsmoe("patch", "apply", checkout, "--dry-run")
-    assert said.status == 0 and said.out == patches.diff(checkout)
-    said = dsmoe("patch", "apply", checkout)
+def test_what_the_command_says(tmp_path, dsmoe):
+    make(tmp_path)
+    said = dsmoe("patch", "diff", tmp_path)
+    assert said.status == 0 and said.out == patches.diff(tmp_path)
+    assert dsmoe("patch", "check", tmp_path).out == f"{tmp_path}: patchable (3dgs-2023)\n"
+    said = dsmoe("patch", "apply", tmp_path)
     assert said.status == 0 and "train.py: pipe-blend-mode" in said.out
-    assert "already patched" in dsmoe("patch", "apply", checkout).out
-    said = dsmoe("patch", "check", checkout, "--modernise")
-    assert "modernise checkpoint-load: not applied in train.py, utils/loading.py: torch 2.6" in said.out
-    assert dsmoe("patch", "apply", "--modernise", checkout).status == 0
-    said = dsmoe("patch", "check", checkout)
-    assert "modernise checkpoint-load: applied in train.py, utils/loading.py: torch 2.6" in said.out
-    assert "not applied" not in said.out
-    shutil.rmtree(checkout / RECORD)
-    said = dsmoe("patch", "diff", checkout)
-    assert said.status == 0 and "not known without .dsmoe_patch" in said.err
-
-
-def test_what_is_typed_wrongly_shows_the_usage(tmp_path, dsmoe):
+    assert "already patched" in dsmoe("patch", "apply", tmp_path).out
     for words in (["patch", "apply"], ["patch", "revert"]):
         said = dsmoe(*words, tmp_path, "--modernize")
         assert said.status == 2 and f"usage: dsmoe {' '.join(words)} " in said.err and "--modernize" in said.err
-    (make(tmp_path) / "film.py").write_bytes(b"import diff_gaussian_rasterization\n\0x")
-    assert "film.py: is not Python that can be parsed: " in dsmoe("patch", "check", tmp_path).out
 
 
 def test_the_readme_has_every_trainer_rule_and_state():
-    from diff_smoe_rasterization.patches.rules import ON_REQUEST, rules_of
+    from diff_smoe_rasterization.patches.rules import OPTIONS, rules_of
     from diff_smoe_rasterization.patches.trainers import TRAINERS
 
     text = (Path(__file__).resolve().parents[3] / "patches" / "README.md").read_text()
@@ -346,5 +301,4 @@ def test_the_readme_has_every_trainer_rule_and_state():
         assert f"`{trainer.flavour}`" in cells[trainer.name]
         assert {rule.name for rule in rules_of(trainer)} <= set(cells)
         assert all(f"`{rule.function}`" in cells[trainer.name] for rule in trainer.entries)
-    assert {rule.name for rules in ON_REQUEST.values() for rule in rules} <= set(cells)
-    assert all(state in text for state in engine.STATES)
+    assert all(f"## --{option}\n" in text for option in OPTIONS) and all(state in text for state in engine.STATES)

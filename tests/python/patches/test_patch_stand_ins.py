@@ -1,17 +1,20 @@
-"""What --modernise and --fuse bring in computes what the trainer computed; what is absent is missed when it is used."""
+"""What --modernise and --fuse bring in computes what the trainer computed."""
 from __future__ import annotations
 
 import itertools
 import math
 import re
-import urllib.error
+import subprocess
+import sys
+from functools import partial
 
 import pytest
 import torch
+from checkouts import PACKAGE_PARENT, environment
 from torch.nn.functional import conv2d
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization.patches import runtime
+from diff_smoe_rasterization.patches import fuse, modernise, runtime
 
 
 def window(size, sigma=1.5):
@@ -50,23 +53,23 @@ def fused_calls(monkeypatch):
 
 @pytest.mark.parametrize("shape", [(3, 40, 52), (1, 24, 31), (2, 3, 40, 52)])
 def test_ssim_is_fused_where_it_is_the_same(shape, fused_calls, capsys):
-    call = runtime.fused_where_equal(ssim)
+    call = partial(fuse.fused_where_equal, ssim, {})
     torch.manual_seed(0)
     image, target = torch.rand(shape, requires_grad=True), torch.rand(shape)
     for _ in range(3):
         value = call(image, target)
         gradient, = torch.autograd.grad(value, image)
         expected = ssim(image, target)
-        # Rounding, as at runtime.SSIM_ROUNDING; variances of this pair are a quarter of E[x^2].
+        # Rounding, as at fuse.SSIM_ROUNDING; variances of this pair are a quarter of E[x^2].
         assert float(value.detach()) == pytest.approx(float(expected.detach()), abs=1e-5)
         torch.testing.assert_close(gradient, torch.autograd.grad(expected, image)[0], rtol=0,
                                    atol=1e-4 * float(gradient.abs().max()))
     assert fused_calls == [shape] * 4  # one of them to compare, once
-    assert capsys.readouterr().err == "" and call.__name__ == "ssim"
+    assert capsys.readouterr().err == ""
 
 
 def test_what_the_kernel_does_not_have_is_computed_as_before(fused_calls):
-    call = runtime.fused_where_equal(ssim)
+    call = partial(fuse.fused_where_equal, ssim, {})
     torch.manual_seed(0)
     one, other = torch.rand(2, 1, 3, 20, 30)
     assert torch.equal(call(one, other, 7), ssim(one, other, 7))
@@ -89,8 +92,8 @@ def test_what_the_kernel_does_not_have_is_computed_as_before(fused_calls):
     lambda img1, img2: ssim(img1.detach(), img2) + 0 * img1.mean(), lambda img1, img2: ssim(img1, img2) * math.nan,
     lambda img1, img2: ssim(img1, img2) + 0 * (img1 - img1.detach()).sqrt().sum()])  # its gradient alone is NaN
 def test_another_ssim_stays_and_that_is_said_once(other, capsys):
-    runtime._say.cache_clear()
-    call = runtime.fused_where_equal(other)
+    runtime.say.cache_clear()
+    call = partial(fuse.fused_where_equal, other, {})
     torch.manual_seed(0)
     one, two = 0.4 + 0.1 * torch.rand(2, 2, 3, 20, 30)  # of so little contrast that SSIM's constants count
     for _ in range(2):
@@ -104,25 +107,13 @@ def test_another_ssim_stays_and_that_is_said_once(other, capsys):
     assert capsys.readouterr().err.count("is not SSIM as it is fused here") == 1
 
 
-def test_a_module_that_is_absent_is_missed_when_it_is_used():
-    assert runtime.optional_import("math").pi > 3
-    absent = runtime.optional_import("there_is_no_such_module")
-    with pytest.raises(ImportError, match="there_is_no_such_module"):
-        absent.login()
-
-
-def test_what_is_deferred_is_made_once():
-    made = []
-    call = runtime.deferred(lambda: made.append(1) or (lambda value: 2 * value))
-    assert made == [] and call(3) == 6 and call(4) == 8 and made == [1]
-
-
 @pytest.mark.parametrize("shape, at_once", [((7, 3, 3), 3), ((2, 4, 3, 3), 3), ((7, 3, 3), 7), ((3, 3), 1),
                                             ((0, 3, 3), 3)])
 def test_eigenvectors_in_parts_are_those_of_all_at_once(monkeypatch, shape, at_once):
-    monkeypatch.setattr(runtime, "EIGH_AT_ONCE", at_once)
+    monkeypatch.setattr(modernise, "EIGH_AT_ONCE", at_once)
     matrices = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    found, expected = runtime.eigh_in_parts(matrices, UPLO="U"), torch.linalg.eigh(matrices, UPLO="U")
+    found, expected = (eigh(matrices, UPLO="U")
+                       for eigh in (partial(modernise.eigh_in_parts, torch.linalg.eigh), torch.linalg.eigh))
     assert torch.equal(found.eigenvalues, expected.eigenvalues)
     assert torch.equal(found.eigenvectors, expected.eigenvectors)
     gradient, expected_gradient = (torch.autograd.grad((result[0] ** 2).sum(), matrices)[0]
@@ -151,7 +142,7 @@ def integers(dtype, shape):
 def test_unique_rows_are_those_of_torch(rows):
     for inverse, counts, is_sorted in itertools.product((False, True), repeat=3):
         found, expected = (unique(rows, is_sorted, inverse, counts, dim=0)
-                           for unique in (runtime.unique_rows, torch.unique))
+                           for unique in (partial(modernise.unique_rows, torch.unique), torch.unique))
         assert isinstance(found, tuple) == isinstance(expected, tuple) == (inverse or counts)
         pairs = list(zip(found, expected)) if isinstance(found, tuple) else [(found, expected)]
         assert len(pairs) == 1 + inverse + counts
@@ -159,36 +150,73 @@ def test_unique_rows_are_those_of_torch(rows):
             assert one.dtype == other.dtype and torch.equal(one, other)
 
 
-def test_rows_of_integers_are_not_given_to_the_unique_that_may_fail(monkeypatch):
-    unique, given = torch.unique, []
-    monkeypatch.setattr(torch, "unique", lambda input, *words, dim=None, **keywords: (
-        given.append((input.dim(), dim)), unique(input, *words, dim=dim, **keywords))[1])
-    runtime.unique_rows(torch.tensor([[3, 1], [2, 1]]), dim=0)
-    assert given == [(1, None)] * 4
+def test_rows_of_integers_are_not_given_to_the_unique_that_may_fail():
+    given = []
+
+    def unique(input, *words, **keywords):
+        given.append((input.dim(), words[3:]))
+        return torch.unique(input, *words, **keywords)
+
+    call, rows = partial(modernise.unique_rows, unique), torch.tensor([[3, 1], [2, 1]])
+    call(rows, dim=0)
+    assert given == [(1, ())] * 4
+    assert torch.equal(call(rows), torch.tensor([1, 2, 3])) and call(rows, dim=1).shape == (2, 2)
+    assert given[4:] == [(2, (None,)), (2, (1,))]
 
 
-def test_a_metric_is_nan_where_its_weights_cannot_be_had():
-    calls = []
+@pytest.fixture
+def adams():
+    """torch.optim.Adam, and the class that stands in its place under --fuse."""
+    return torch.optim.Adam, fuse.fused_where_it_fits(torch.optim.Adam)
 
-    @runtime.nan_without_network
-    def metric(value):
-        calls.append(value)
-        if value > 1:
-            raise urllib.error.URLError("no route to host")
-        return torch.tensor(value)
 
-    assert metric(1.0) == 1.0
-    with pytest.warns(UserWarning, match="no route to host"):
-        assert torch.isnan(metric(2.0))
-    assert torch.isnan(metric(1.0)) and calls == [1.0, 2.0]
+def test_adam_is_fused_where_it_has_no_other_arguments(adams):
+    theirs, ours = adams
+    parameter = torch.nn.Parameter(torch.ones(2))
+    group = [{"params": [parameter], "lr": 0.5, "name": "xyz"}]
+    for made in (ours(group, lr=0.0, eps=1e-15), ours([parameter]), ours(params=[parameter], betas=(0.9, 0.99)),
+                 ours([parameter], 0.1, (0.9, 0.99), 1e-8)):
+        assert type(made) is diff_smoe_rasterization.FusedAdam
+    assert ours(group, lr=0.0, eps=1e-15).param_groups[0]["lr"] == 0.5
+    for made in (ours([parameter], lr=0.0, weight_decay=0.1), ours([parameter], 0.1, (0.9, 0.99), 1e-8, 0.01)):
+        assert type(made) is theirs
 
-    absent = runtime.optional_import("there_is_no_such_module")
-    with pytest.warns(UserWarning, match="there_is_no_such_module"):
-        assert torch.isnan(runtime.nan_without_network(runtime.deferred(lambda: absent.LPIPS()))(1.0))
+    class Own(ours):
+        pass
 
-    @runtime.nan_without_network
-    def wrong(value):
-        raise ValueError("a bug is no missing network")
+    assert type(Own([parameter], lr=0.1, amsgrad=True)) is Own
 
-    with pytest.raises(ValueError):
-        wrong(1.0)
+
+STARTED = """import sys
+from diff_smoe_rasterization.patches import modernise; modernise.start()
+from diff_smoe_rasterization.patches import fuse; fuse.start()
+import numpy as np, torch
+from PIL import Image
+from utils.loss_utils import ssim
+from simple_knn._C import distCUDA2
+from torch_scatter import scatter_max
+assert (np.int, np.float, np.object) == (int, float, object) and np.zeros(1, np.bool).dtype == bool
+picture = np.array([[[0, 127, 255]]], dtype=np.uint8)
+assert np.array_equal(np.array(Image.fromarray(picture.view(np.byte), "RGB")), picture)
+assert np.array_equal(np.array(Image.fromarray(picture)), picture)
+torch.save({"loss": np.float64(1)}, sys.argv[1])  # is more than tensors
+assert torch.load(sys.argv[1])["loss"] == 1
+assert type(torch.optim.Adam([torch.ones(1)])).__name__ == "FusedAdam"
+assert torch.linalg.eigh(torch.eye(2))[0].tolist() == [1, 1]
+image = torch.rand(3, 20, 20)
+assert ssim(image, image) == 0.5 and torch.equal(torch.ones(3, 1, dtype=int).unique(dim=0), torch.ones(1, 1, dtype=int))
+print(distCUDA2.__module__, scatter_max.__module__)
+"""
+
+
+def test_a_script_that_starts_them_has_them(tmp_path):
+    (tmp_path / "utils").mkdir()
+    (tmp_path / "utils/loss_utils.py").write_text("def ssim(a, b): return 0 * a.sum() + 0.5\n")
+    (tmp_path / "x.py").write_text(STARTED)
+    done = subprocess.run([sys.executable, "x.py", tmp_path / "x.pth"], cwd=tmp_path, capture_output=True, text=True,
+                          env={**environment(), "PYTHONPATH": str(PACKAGE_PARENT)})
+    ours = "diff_smoe_rasterization"
+    assert done.returncode == 0 and done.stdout == f"{ours}.neighbors {ours}.integrations.torch_scatter\n", done.stderr
+    assert "utils.loss_utils.ssim is not SSIM as it is fused here" in done.stderr
+    for name in ("simple_knn", "torch_scatter"):
+        assert f"{name} could not be imported: this package's own takes its place" in done.stderr

@@ -50,17 +50,26 @@ def render_sets(dataset : object, iteration : int, pipeline : object):
     "Renders both sets."
     return render(None, None, pipeline, None)'''
 CHECKOUT = {GR: RENDERER, ARGS: ARGUMENTS, "train.py": TRAIN, "render.py": RENDER}
-BLEND_OF = "import render\nfrom diff_smoe_rasterization.patches.runtime import blend_of\n"
-SAVED_BLEND_OF = BLEND_OF.replace("import blend_of", "import saved_blend_of")
+MARK = "  # dsmoe patch\n"
+
+
+def imported(name):
+    """The line by which a patched file gets a name."""
+    return f"from diff_smoe_rasterization.patches.runtime import {name}{MARK}"
+
+
 PATCHED = {
-    GR: RENDERER.replace("diff_gaussian_rasterization import", "diff_smoe_rasterization.integrations.inria import")
-    .replace("RasterizationSettings(\n", "RasterizationSettings(\n        **pipe.blend,\n"),
-    ARGS: "from diff_smoe_rasterization.patches.runtime import default_blend\n\n" + ARGUMENTS.replace(
-        "sh_degree = 3\n", "sh_degree = 3\n        self.blend_mode, self.background_gate = default_blend()\n"),
-    "train.py": TRAIN.replace("import render\n", BLEND_OF).replace(
-        "checkpoint):\n", "checkpoint):\n    pipe.blend = blend_of(dataset)\n"),
-    "render.py": RENDER.replace("import render\n", SAVED_BLEND_OF).replace(
-        'sets."\n', 'sets."\n    pipeline.blend = saved_blend_of(dataset)\n')}
+    GR: imported("chosen_blend") + RENDERER.replace(
+        "from diff_gaussian_rasterization", "# dsmoe patch 3dgs-2023: diff_gaussian_rasterization\n"
+        "from diff_smoe_rasterization.integrations.inria").replace(
+        "        image_height", f"        **chosen_blend(pipe),{MARK}        image_height"),
+    ARGS: imported("default_blend") + ARGUMENTS.replace(
+        '        super().__init__(parser, "Loading', "        self.blend_mode, self.background_gate = default_blend()"
+        f'{MARK}        super().__init__(parser, "Loading'),
+    "train.py": imported("blend_of") + TRAIN.replace(
+        "    first_iter = 0\n", f"    pipe.blend = blend_of(dataset){MARK}    first_iter = 0\n"),
+    "render.py": imported("saved_blend_of") + RENDER.replace(
+        "    return", f"    pipeline.blend = saved_blend_of(dataset){MARK}    return")}
 
 
 def make(folder, changes=None):
