@@ -78,11 +78,15 @@ def test_growth_ends_where_memory_does(tiny_config, budget, goal):
     assert trainer.strategy.overshoot() == goal
 
 
-@pytest.mark.parametrize("schedule, killed_at", [("gate", 14), ("gate", 24), ("gate", 39), ("mcmc", 24)])
-def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, killed_at):
-    """Checkpoints at 10, 20, 30 lie in growth, between removals and among moves."""
+@pytest.mark.parametrize("schedule, killed_at, settings", [
+    ("gate", 14, ""), ("gate", 24, ""), ("gate", 24, "removals=4,views=5"), ("gate", 39, ""), ("mcmc", 24, "")])
+def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, killed_at, settings):
+    """Checkpoints at 10, 20, 30 lie in growth, between removals and among moves.
+
+    With four removals, at 16, 19, 22 and 25, that at 20 has looked at some of the views of the next one.
+    """
     (_, row), _ = killed_and_resumed(tiny_config, tmp_path, killed_at, schedule=schedule, budget=120,
-                                     densification_interval=4)
+                                     densification_interval=4, strategy_options=settings)
     assert row["num_gaussians"] == 120
 
 
