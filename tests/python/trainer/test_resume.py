@@ -320,7 +320,7 @@ def test_a_damaged_checkpoint_is_named(tiny_config, tmp_path, monkeypatch):
         with open(path, "wb") as file:
             file.write(damaged)
         refused()
-    for strange in ({"format": 2, "plain": "{", "tensors": {}}, Stranger()):
+    for strange in ({"format": checkpoint.FORMAT, "plain": "{", "tensors": {}}, Stranger()):
         torch.save(strange, path)
         refused()
     monkeypatch.setattr(checkpoint, "SAFE_LOAD", False)
