@@ -24,6 +24,8 @@ PACKAGES = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterizati
 
 needs_gloo = pytest.mark.skipif(not torch.distributed.is_available() or not torch.distributed.is_gloo_available(),
                                 reason="this torch has no gloo")
+needs_torchrun = pytest.mark.skipif(torch.__version__.startswith("1.") and sys.version_info >= (3, 11),
+                                    reason="torchrun of PyTorch 1 does not start with Python 3.11 or newer")
 
 
 def torchrun(processes, *words, **environment):
@@ -42,6 +44,7 @@ def model_of(config):
 
 
 @needs_gloo
+@needs_torchrun
 def test_processes_die_and_others_resume_bit_for_bit(tiny_config, tmp_path):
     """Two processes train until one dies; from what they saved, three go on, and one does. 40 views in steps of 4."""
     straight = tiny_config.changed(batch=4, output=str(tmp_path / "straight"))
@@ -73,6 +76,7 @@ def test_processes_die_and_others_resume_bit_for_bit(tiny_config, tmp_path):
 
 @pytest.mark.slow
 @needs_gloo
+@needs_torchrun
 def test_a_budget_holds_for_all_processes_together(tiny_config, tmp_path):
     """One view a step, two processes, of which one blends nothing: the model of the usual training."""
     config = tiny_config.changed(schedule="steady", budget=170, iterations=20, output=str(tmp_path / "one"))
