@@ -18,11 +18,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from bench_commands import wait_for
+from bench_commands import python_that, wait_for
 from checkouts import HERE, PACKAGE_PARENT, PACKAGES, contents, make_checkout, make_scene
 from PIL import Image
 
-from diff_smoe_rasterization import io
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import preparation
 from diff_smoe_rasterization.benchmarks.suite.cell import work
@@ -35,20 +34,15 @@ ITERATIONS = 7
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """The small trainer's scene as a COLMAP model; its cameras do not matter, as a checkout has its own."""
+    """The small trainer's scene in NeRF's form; its cameras do not matter, as a checkout has its own."""
     folder = make_scene(tmp_path_factory.mktemp("bench") / "scene")
     made = runpy.run_path(str(HERE / "trainer" / "scene" / "dataset_readers.py"))["read_made_up_scene"](str(folder))
-    (folder / "images").mkdir()
-    images = []
-    for index, view in enumerate(made.hidden + made.shown, start=1):
-        name = f"{view.image_name}.png"
-        pixels = (np.clip(view.image, 0, 1) * 255).round().astype(np.uint8).transpose(1, 2, 0)
-        Image.fromarray(pixels).save(folder / "images" / name)
-        images.append(io.ColmapImage(index, name, 1, np.array([1.0, 0, 0, 0]), np.array([0.0, 0, index])))
-    height, width = pixels.shape[:2]
-    camera = io.ColmapCamera(1, "PINHOLE", width, height, np.array([30.0, 30.0, width / 2, height / 2]))
-    points = io.Points(made.points, np.zeros(made.points.shape, np.uint8))
-    io.write_colmap(str(folder / "sparse" / "0"), io.ColmapModel({1: camera}, images, points), text=True)
+    for split, views in (("train", made.shown), ("test", made.hidden)):
+        frames = [{"file_path": view.image_name, "transform_matrix": np.eye(4).tolist()} for view in views]
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.9, "frames": frames}))
+        for view in views:
+            pixels = (np.clip(view.image, 0, 1) * 255).round().astype(np.uint8).transpose(1, 2, 0)
+            Image.fromarray(pixels).save(folder / f"{view.image_name}.png")
     return folder
 
 
@@ -248,10 +242,8 @@ def test_a_checkout_that_was_trained_on_other_images_is_refused(shape, value, sa
 
 
 def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
-    python = tmp_path / "python"
-    python.write_text("#!/bin/sh\necho told >&2\necho 'train.py: error: no such flag' >&2\nexit 2\n")
-    python.chmod(0o755)
-    row = row_of(small("3dgs-2023", python=str(python)), tmp_path)
+    python = python_that("echo told >&2\necho 'train.py: error: no such flag' >&2\nexit 2\n", tmp_path)
+    row = row_of(small("3dgs-2023", python=python), tmp_path)
     assert not row["ok"]
     assert "train.py of 3dgs-2023 ended with status 2: train.py: error: no such flag (" in row["reason"]
 
