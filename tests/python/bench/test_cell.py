@@ -45,8 +45,7 @@ def test_the_process_of_a_cell_is_told_its_gpus_and_how_many_have_them(gpus, tol
 @pytest.mark.parametrize("module", ["cell", "engine", "report"])
 def test_what_needs_no_torch_does_not_load_it(module):
     """It takes seconds, of each cell once more."""
-    program = (f"import sys, diff_smoe_rasterization.benchmarks.suite.{module}\n"
-               "sys.exit('torch' in sys.modules)")
+    program = f"import sys, diff_smoe_rasterization.benchmarks.suite.{module}; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True, env=environment())
 
 
