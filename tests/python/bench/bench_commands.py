@@ -19,6 +19,14 @@ def command(*words):
     return [sys.executable, "-m", "diff_smoe_rasterization", *words]
 
 
+def python_that(says, folder):
+    """A shell script that stands for Python; returns its path."""
+    script = Path(folder) / "python"
+    script.write_text("#!/bin/sh\n" + says)
+    script.chmod(0o755)
+    return str(script)
+
+
 def rows_of(results):
     """{cell: row} of RESULTS/rows.jsonl."""
     lines = (Path(results) / "rows.jsonl").read_text().splitlines()

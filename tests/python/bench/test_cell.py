@@ -5,6 +5,7 @@ import sys
 import time
 
 import pytest
+from bench_commands import python_that
 from checkouts import environment
 
 from diff_smoe_rasterization.benchmarks.suite import cell as cells
@@ -12,14 +13,6 @@ from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.methods import native
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.errors import TrainerError
-
-
-def python_that(says, folder, monkeypatch):
-    """A shell script stands for the Python of the process that works."""
-    script = folder / "python"
-    script.write_text("#!/bin/sh\n" + says)
-    script.chmod(0o755)
-    monkeypatch.setattr(cells.sys, "executable", str(script))
 
 
 @pytest.fixture
@@ -31,8 +24,8 @@ def cell_file(content, tmp_path):
 
 def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatch):
     """As the system does where memory is short."""
-    python_that("echo the last words\nprintf 'Training:  50%%|#### | 5/10 [00:01<00:01, 5.0it/s]'\nkill -9 $$\n",
-                tmp_path, monkeypatch)
+    says = "echo the last words\nprintf 'Training:  50%%|#### | 5/10 [00:01<00:01, 5.0it/s]'\nkill -9 $$\n"
+    monkeypatch.setattr(cells.sys, "executable", python_that(says, tmp_path))
     row = cells.supervise(str(cell_file), str(tmp_path / "out"))
     assert not row["ok"] and row["cell"] == json.loads(cell_file.read_text())["id"]
     assert "signal 9" in row["reason"] and "memory" in row["reason"] and row["reason"].endswith(": the last words")
@@ -40,7 +33,7 @@ def test_a_cell_whose_process_is_killed_is_a_row(cell_file, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("gpus, told", [({}, "3"), ({"gpus": 2}, "3,5")])
 def test_the_process_of_a_cell_is_told_its_gpus_and_how_many_have_them(gpus, told, cell_file, tmp_path, monkeypatch):
-    python_that("echo $CUDA_VISIBLE_DEVICES $*\n", tmp_path, monkeypatch)
+    monkeypatch.setattr(cells.sys, "executable", python_that("echo $CUDA_VISIBLE_DEVICES $*\n", tmp_path))
     cell = json.loads(cell_file.read_text())
     cell_file.write_text(json.dumps({**cell, "protocol": {**cell["protocol"], **gpus}}))
     assert cells.main([str(cell_file), str(tmp_path / "out"), "--gpus", "3,5,7", "--per-device", "2",
@@ -52,8 +45,7 @@ def test_the_process_of_a_cell_is_told_its_gpus_and_how_many_have_them(gpus, tol
 @pytest.mark.parametrize("module", ["cell", "engine", "report"])
 def test_what_needs_no_torch_does_not_load_it(module):
     """It takes seconds, of each cell once more."""
-    program = (f"import sys, diff_smoe_rasterization.benchmarks.suite.{module}\n"
-               "sys.exit('torch' in sys.modules)")
+    program = f"import sys, diff_smoe_rasterization.benchmarks.suite.{module}; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True, env=environment())
 
 

@@ -18,11 +18,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from bench_commands import wait_for
+from bench_commands import python_that, wait_for
 from checkouts import HERE, PACKAGE_PARENT, PACKAGES, contents, make_checkout, make_scene
 from PIL import Image
 
-from diff_smoe_rasterization import io
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import preparation
 from diff_smoe_rasterization.benchmarks.suite.cell import work
@@ -35,20 +34,15 @@ ITERATIONS = 7
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """The small trainer's scene as a COLMAP model; its cameras do not matter, as a checkout has its own."""
+    """The small trainer's scene in NeRF's form; its cameras do not matter, as a checkout has its own."""
     folder = make_scene(tmp_path_factory.mktemp("bench") / "scene")
     made = runpy.run_path(str(HERE / "trainer" / "scene" / "dataset_readers.py"))["read_made_up_scene"](str(folder))
-    (folder / "images").mkdir()
-    images = []
-    for index, view in enumerate(made.hidden + made.shown, start=1):
-        name = f"{view.image_name}.png"
-        pixels = (np.clip(view.image, 0, 1) * 255).round().astype(np.uint8).transpose(1, 2, 0)
-        Image.fromarray(pixels).save(folder / "images" / name)
-        images.append(io.ColmapImage(index, name, 1, np.array([1.0, 0, 0, 0]), np.array([0.0, 0, index])))
-    height, width = pixels.shape[:2]
-    camera = io.ColmapCamera(1, "PINHOLE", width, height, np.array([30.0, 30.0, width / 2, height / 2]))
-    points = io.Points(made.points, np.zeros(made.points.shape, np.uint8))
-    io.write_colmap(str(folder / "sparse" / "0"), io.ColmapModel({1: camera}, images, points), text=True)
+    for split, views in (("train", made.shown), ("test", made.hidden)):
+        frames = [{"file_path": view.image_name, "transform_matrix": np.eye(4).tolist()} for view in views]
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.9, "frames": frames}))
+        for view in views:
+            pixels = (np.clip(view.image, 0, 1) * 255).round().astype(np.uint8).transpose(1, 2, 0)
+            Image.fromarray(pixels).save(folder / f"{view.image_name}.png")
     return folder
 
 
@@ -181,20 +175,16 @@ def test_what_comes_before_a_rendering_is_a_part_of_its_time(tmp_path, monkeypat
     assert found["num_gaussians"] == 7 and found["a"]["milliseconds"] >= 50 and len(slow) == 2  # one warms up
 
 
-@pytest.mark.parametrize("other, blend", [
-    ({"seed": 1}, ["--blend_mode", "smoe", "--background_gate", "0.0"]),
-    ({"seed": 2, "background_gates": [0.3]}, ["--blend_mode", "smoe", "--background_gate", "0.3"]),
-    ({"seed": 3, "blend_mode": "alpha"}, ["--blend_mode", "alpha"])])
-def test_blend_and_seed_reach_the_trainer_and_no_variable_does(other, blend, small, started, tmp_path, monkeypatch):
+def test_the_seed_reaches_the_trainer_and_no_variable_does(small, started, tmp_path, monkeypatch):
     variables = {"DSMOE_BLEND_MODE": "smoe_tn", "DSMOE_BACKGROUND_GATE": "0.7"}
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    cell = small("3dgs-2023", **other)
+    cell = small("3dgs-2023", seed=3)
     shapes.ThreeDGS(cell, shapes.config_of(cell), str(tmp_path)).train()
     (line, environment), = started
     ours, trainers = line[:line.index("--")], line[line.index("--"):]
-    assert ours[ours.index("--seed") + 1] == str(other["seed"]) and trainers[-len(blend):] == blend
-    assert trainers[1] == str(Path(cell["method"]["path"], "train.py")) and not set(variables) & set(environment)
+    assert ours[ours.index("--seed") + 1] == "3" and not set(variables) & set(environment)
+    assert trainers[1] == str(Path(cell["method"]["path"], "train.py"))
 
 
 def test_seeds_are_shifted_by_the_cells(monkeypatch):
@@ -221,6 +211,9 @@ def test_a_checkout_must_have_the_same_split(names, wrong):
 
 @pytest.mark.parametrize("name, axes, there, absent, recipe", [
     ("3dgs-2023", {"schedules": ["steady"]}, ["--opacity_reset_interval", str(ITERATIONS + 1)], [], {}),
+    ("3dgs-2023", {}, ["--blend_mode", "smoe", "--background_gate", "0.0"], [], {}),
+    ("3dgs-2023", {"background_gates": [0.3]}, ["--blend_mode", "smoe", "--background_gate", "0.3"], [], {}),
+    ("3dgs-2023", {"blend_mode": "alpha"}, ["--blend_mode", "alpha"], ["--background_gate"], {}),
     ("3dgs-2023", {}, [], ["--opacity_reset_interval", "--opacity_lr"], {}),
     # 0.05, which is our default, is not that of 3DGS of 2024.
     ("3dgs-2024", {"options": {"opacity_lr": 0.05, "antialiasing": True}}, ["--opacity_lr", "0.05"], ["True"],
@@ -248,23 +241,17 @@ def test_a_checkout_that_was_trained_on_other_images_is_refused(shape, value, sa
 
 
 def test_a_trainer_that_fails_is_a_row_with_its_last_words(small, tmp_path):
-    python = tmp_path / "python"
-    python.write_text("#!/bin/sh\necho told >&2\necho 'train.py: error: no such flag' >&2\nexit 2\n")
-    python.chmod(0o755)
-    row = row_of(small("3dgs-2023", python=str(python)), tmp_path)
+    python = python_that("echo told >&2\necho 'train.py: error: no such flag' >&2\nexit 2\n", tmp_path)
+    row = row_of(small("3dgs-2023", python=python), tmp_path)
     assert not row["ok"]
     assert "train.py of 3dgs-2023 ended with status 2: train.py: error: no such flag (" in row["reason"]
 
 
 @pytest.mark.slow
 def test_a_trainer_ends_with_its_cell(small, tmp_path):
-    (tmp_path / "2dgs").mkdir()
-    (tmp_path / "2dgs" / "train.py").write_text(
-        "import os, time\nopen('pid.part', 'w').write(str(os.getpid()))\nos.rename('pid.part', 'pid')\n"
-        "time.sleep(600)\n")
-    cell, pid = tmp_path / "cell.json", tmp_path / "2dgs" / "pid"
-    cell.write_text(json.dumps(small("2dgs", variant="unpatched", blend_mode="alpha",
-                                          path=str(tmp_path / "2dgs"))))
+    cell, pid = tmp_path / "cell.json", tmp_path / "pid"
+    python = python_that(f"echo $$ >{pid}.part\nmv {pid}.part {pid}\nexec sleep 600\n", tmp_path)
+    cell.write_text(json.dumps(small("3dgs-2023", python=python)))
     run = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization.benchmarks.suite.cell", str(cell),
                             str(tmp_path / "out")], cwd=str(tmp_path))
     wait_for(pid.is_file, 60)

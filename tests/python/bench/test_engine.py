@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from bench_commands import command, rows_of, tiny_suite, wait_for
+from bench_commands import command, python_that, rows_of, tiny_suite, wait_for
 from checkouts import environment
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
@@ -95,12 +95,12 @@ def bench(capsys):
     return call
 
 
-def test_what_is_done_is_not_done_again(finished, bench):
-    _, suite, results = finished
-    for words, states, counts in (([], ["done", "failed"], "1 done, 0 to do, 1 failed"),
-                                  (["--retry-failed"], ["done", "to"], "1 done, 1 to do, 0 failed")):
-        *lines, summary = bench(suite, results, "--dry-run", *words)[1].splitlines()
-        assert [line.split()[0] for line in lines] == states and summary == counts
+@pytest.mark.parametrize("words, states, counts", [
+    ([], ["done", "failed"], "1 done, 0 to do, 1 failed"),
+    (["--retry-failed"], ["done", "to"], "1 done, 1 to do, 0 failed")])
+def test_what_is_done_is_not_done_again(words, states, counts, finished, bench):
+    *lines, summary = bench(*finished[1:], "--dry-run", *words)[1].splitlines()
+    assert [line.split()[0] for line in lines] == states and summary == counts
 
 
 @pytest.mark.slow
@@ -394,12 +394,10 @@ def test_on_the_cpu_cells_share_its_cores(jobs, count, at_once, threads, content
 def test_cells_are_told_the_gpus_and_their_threads(content, tmp_path, monkeypatch):
     """One GPU, called 0, which Snakemake would take for a number. The cells' Python writes down its words and fails."""
     content["protocol"].update(device="cuda", principal_point="centre")
-    python = tmp_path / "python"
-    python.write_text(f'#!/bin/sh\ncase "$*" in *snakemake*) exec "{sys.executable}" "$@" ;; esac\n'
-                      'echo "$OMP_NUM_THREADS threads: $*" >>told\nexit 1\n')
-    python.chmod(0o755)
+    python = python_that(f'case "$*" in *snakemake*) exec "{sys.executable}" "$@" ;; esac\n'
+                         'echo "$OMP_NUM_THREADS threads: $*" >>told\nexit 1\n', tmp_path)
     monkeypatch.setattr(engine, "visible_gpus", lambda: ["0"])
-    monkeypatch.setattr(engine.sys, "executable", str(python))
+    monkeypatch.setattr(engine.sys, "executable", python)
     monkeypatch.setattr(engine, "threads_of_each", lambda at_once: 6 // at_once)
     words = ["bench", "run", write_suite(content, tmp_path), "-o", str(tmp_path / "results"), "--per-gpu", "2"]
     assert main(words) == 1

@@ -3,21 +3,20 @@ import numpy as np
 import pytest
 import real_data
 import torch
-from test_measure import step_image
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite import lpips, measure
-from diff_smoe_rasterization.benchmarks.suite import names as files
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures
+from diff_smoe_rasterization.benchmarks.suite.names import check_weights
+from diff_smoe_rasterization.trainer.results.metrics import quantised
 
 
 def test_weights_that_are_named_and_not_there_are_refused_where_they_are_wanted(monkeypatch, tmp_path):
     monkeypatch.setenv("DSMOE_LPIPS_ALEX", str(tmp_path / "absent.npz"))
-    files.check_weights(["lpips_vgg_std"])
+    check_weights(["lpips_vgg_std"])
     with pytest.raises(BenchError, match="DSMOE_LPIPS_ALEX: .*absent.npz: no such file, where the weights of lpips_al"):
-        files.check_weights(["lpips_vgg_std", "lpips_alex"])
+        check_weights(["lpips_vgg_std", "lpips_alex"])
     (tmp_path / "absent.npz").touch()
-    files.check_weights(["lpips_alex"])
+    check_weights(["lpips_alex"])
 
 
 @pytest.mark.parametrize("content, said", [
@@ -66,60 +65,42 @@ def made_up_weights(path, net="alex"):
 
 def lpips_in_double(net, arrays, image, target, normalise):
     """LPIPS by its definition, in float64."""
-    # Of [0, 1], ImageNet's; of [-1, 1] as LPIPS prints them, rounded.
+    # Of [0, 1], ImageNet's mean and deviation; of [-1, 1] as LPIPS prints them, rounded.
     mean, deviation = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]) if normalise else \
         ([-0.030, -0.088, -0.188], [0.458, 0.448, 0.450])
-    a, b = ((x.double() - torch.tensor(mean).double()[:, None, None]) / torch.tensor(deviation)[:, None, None]
-            for x in (image, target))
+    arrays = {name: torch.from_numpy(array).double() for name, array in arrays.items()}
+    x = torch.stack([image, target]).double() - torch.tensor(mean).double()[:, None, None]
+    x /= torch.tensor(deviation)[:, None, None]
     total, layer, looks = 0.0, 0, 0
     for part in NETWORKS[net]:
         if part is None:
-            weight = torch.from_numpy(arrays[f"lin{looks}.weight"]).double().reshape(-1, 1, 1)
-            units = (torch.nn.functional.normalize(x, dim=0) for x in (a, b))
-            total += float((weight * (next(units) - next(units)) ** 2).sum(dim=0).mean())
+            a, b = torch.nn.functional.normalize(x, dim=1)
+            total += float((arrays[f"lin{looks}.weight"].reshape(-1, 1, 1) * (a - b) ** 2).sum(dim=0).mean())
             looks += 1
         elif len(part) == 2:
-            a, b = (torch.nn.functional.max_pool2d(x[None], *part)[0] for x in (a, b))
+            x = torch.nn.functional.max_pool2d(x, *part)
         else:
             layer += 1
-            weight, bias = (torch.from_numpy(arrays[f"conv{layer}.{name}"]).double() for name in ("weight", "bias"))
-            a, b = (torch.conv2d(x[None], weight, bias, *part[2:])[0].relu() for x in (a, b))
+            x = torch.conv2d(x, arrays[f"conv{layer}.weight"], arrays[f"conv{layer}.bias"], *part[2:]).relu()
     return total
 
 
-@pytest.fixture(params=["made up alex", "made up vgg", "published alex"])
-def weights(request, tmp_path):
-    """The network, and its file."""
-    *made_up, net = request.param.split()
-    path = tmp_path / "weights.npz"
-    if made_up[0] == "made":
+@pytest.mark.parametrize("kind, weights", [("lpips_alex", "published"), ("lpips_alex", "made up"),
+                                           ("lpips_vgg_std", "made up"), ("lpips_vgg_inria", "made up")])
+def test_lpips_of_a_file_agrees_with_the_definition(kind, weights, tmp_path, monkeypatch):
+    """Of 8-bit images. [0, 1] normalised by ImageNet's figures is [-1, 1] shifted and scaled as LPIPS has it."""
+    net = kind.split("_")[1]
+    path = str(tmp_path / "weights.npz")
+    if weights == "made up":
         made_up_weights(path, net)
-        return net, str(path)
-    folder = real_data.folder("bonsai")
-    return net, folder.replace("bonsai", "lpips_alex_v01.npz")
-
-
-@pytest.mark.parametrize("normalise", [True, False])
-def test_lpips_of_a_file_agrees_with_the_definition(weights, normalise):
-    """[0, 1] normalised by ImageNet's mean and deviation is [-1, 1] shifted and scaled as LPIPS has it."""
-    net, path = weights
-    random = np.random.RandomState(1)
-    image, target = (torch.from_numpy(random.rand(3, 64, 72).astype(np.float32)) for _ in range(2))
-    network = lpips.FileLpips(net, path, normalise, "cpu")
-    assert network(image, image) == 0
-    with np.load(path) as file:
-        expected = lpips_in_double(net, {name: file[name] for name in file.files}, image, target, normalise)
-    # The float32 network is 1e-5 off the float64 one: sums of some thousand terms.
-    assert network(image, target) == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("kind, variable, net", [("lpips_alex", "DSMOE_LPIPS_ALEX", "alex"),
-                                                 ("lpips_vgg_std", "DSMOE_LPIPS_VGG", "vgg"),
-                                                 ("lpips_vgg_inria", "DSMOE_LPIPS_VGG", "vgg")])
-def test_each_kind_takes_its_file(monkeypatch, tmp_path, kind, variable, net):
-    made_up_weights(tmp_path / "weights.npz", net)
-    monkeypatch.setenv(variable, str(tmp_path / "weights.npz"))
+    else:
+        path = real_data.folder("bonsai").replace("bonsai", "lpips_alex_v01.npz")
+    monkeypatch.setenv(f"DSMOE_LPIPS_{net.upper()}", path)
     measures = Measures("cpu", [kind])
-    value = measures(step_image(64, 64, 32) + 0.1, step_image(64, 64, 32))[kind]
-    expected = lpips.FileLpips(net, str(tmp_path / "weights.npz"), kind != "lpips_vgg_inria", "cpu")
-    assert value == expected(measure.quantised(step_image(64, 64, 32) + 0.1), step_image(64, 64, 32)) > 0
+    image, target = torch.from_numpy(np.random.RandomState(1).rand(2, 3, 64, 72).astype(np.float32))
+    image *= 1.2  # a rendering may exceed 1, its file does not
+    assert measures(quantised(image), quantised(image))[kind] == 0
+    with np.load(path) as file:
+        expected = lpips_in_double(net, dict(file), quantised(image), target, normalise=kind != "lpips_vgg_inria")
+    # The float32 network is 1e-5 off the float64 one: sums of some thousand terms.
+    assert measures(image, target)[kind] == pytest.approx(expected, rel=1e-4)

@@ -1,7 +1,5 @@
 """Metrics against what follows from their definitions."""
-import json
 import math
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -10,7 +8,7 @@ import torch
 from diff_smoe_rasterization.benchmarks.suite import measure
 from diff_smoe_rasterization.benchmarks.suite.measure import Measures, edge_mask, edge_psnr
 from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.results.evaluation import evaluate, summary
+from diff_smoe_rasterization.trainer.results.evaluation import summary
 from diff_smoe_rasterization.trainer.results.metrics import image_metrics
 
 
@@ -48,15 +46,12 @@ def test_edge_pixels_are_found_in_luminance():
     assert edge_mask(image).any()
 
 
-def test_means_count_each_view_once_and_fps_is_the_inverse_of_the_mean_time():
-    rows = [{"name": "a", "milliseconds": 10.0, "psnr": 20.0, "ssim": 0.5, "psnr_float": 21.0, "psnr_edge": None},
-            {"name": "b", "milliseconds": 30.0, "psnr": 30.0, "ssim": 0.7, "psnr_float": 31.0, "psnr_edge": 15.0}]
-    found = summary(rows)
-    assert found.metrics == {"psnr": 25.0, "ssim": 0.6, "psnr_float": 26.0, "psnr_edge": 15.0}
-    assert found.fps == pytest.approx(50.0)  # not 66.7, the mean of 100 and 33.3
+def test_views_without_a_metric_do_not_count_in_its_mean():
+    flat, step = ({"name": "view", "milliseconds": 1.0, **Measures("cpu")(image * 0.9, image)}
+                  for image in (step_image(high=0.2), step_image()))
+    assert flat["psnr_edge"] is None and summary([flat, step]).metrics["psnr_edge"] == step["psnr_edge"] > 0
     nothing = summary([])
     assert nothing.fps is None and set(nothing.metrics.values()) == {None}
-    assert json.dumps(nothing.metrics)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -66,17 +61,12 @@ def test_a_rendering_with_a_pixel_that_is_no_number_has_no_figures(value, metric
     target = step_image()
     broken = target.clone()
     broken[1, 3, 4] = value
-    found = metrics(broken, target)
-    assert all(math.isnan(found[name]) for name in ("psnr", "ssim", "psnr_float"))
-    views = [SimpleNamespace(camera=SimpleNamespace(name=name), image_float=lambda: target, mask=None)
-             for name in ("one", "two")]
-
-    def renderer(camera):
-        return SimpleNamespace(color=broken if camera.name == "two" else target)
-
+    one, two = ({"name": name, "milliseconds": 1.0, **metrics(image, target)}
+                for name, image in (("one", target), ("two", broken)))
+    assert all(math.isnan(two[name]) for name in ("psnr", "ssim", "psnr_float"))
     with pytest.raises(TrainerError, match="^the rendering of two has NaN or infinite pixels$"):
-        evaluate(renderer, views, "cpu", measure=metrics)
-    assert evaluate(renderer, views[:1], "cpu", measure=metrics).metrics["psnr"] == math.inf
+        summary([one, two])
+    assert summary([one]).metrics["psnr"] == math.inf
 
 
 def test_what_a_mask_ignores_changes_no_metric():

@@ -34,6 +34,18 @@ def no_figures(monkeypatch):
     monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.report.draw_all", lambda *_: [])
 
 
+@pytest.fixture
+def texts(tmp_path, no_figures):
+    """From rows, and fields of the suite's record, to what a report of them says in report.md and in index.html."""
+    def made(rows, **suite):
+        results, output = write_rows(tmp_path / "results", rows), tmp_path / "report"
+        (tmp_path / "results" / "suite.json").write_text(json.dumps(suite))
+        report(results, str(output))
+        return [(output / name).read_text(encoding="utf-8") for name in ("report.md", "index.html")]
+
+    return made
+
+
 def test_everything_is_written(written):
     for form in ("md", "csv", "tex"):
         names = {path.stem for path in (written / "tables").glob(f"*.{form}")}
@@ -61,23 +73,13 @@ def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypat
     assert contents(output) == before
 
 
-def test_cells_without_a_row_are_named(tmp_path, no_figures):
-    def counts(rows, **suite):
-        folder = tmp_path / "results"
-        write_rows(folder, rows)
-        (folder / "suite.json").write_text(json.dumps(suite))
-        report(str(folder), str(tmp_path / "report"))
-        return (tmp_path / "report" / "report.md").read_text(encoding="utf-8").split("\n")[4]
-
-    entries, here = [row(), row(seed=1)], "1 cell on 1 scene, 1 seed; none failed"
-    assert counts(entries[:1], name="table1", cells=[entries[0]["cell"], "b"]) == (
-        f"{here}; 1 of 2 cells has no row yet: b.")
-    assert counts(entries[:1], name="table1", cells=[*"edcba", entries[0]["cell"]]) == (
-        f"{here}; 5 of 6 cells have no row yet: a; b; c; 2 more.")
-    for suite in ({"name": "other", "cells": ["b"]}, {"name": "table1"}, {"name": "table1", "cells": 3}):
-        assert counts(entries[:1], **suite) == f"{here}."
-    assert counts(entries, name="table1", cells=[entry["cell"] for entry in entries]) == (
-        "2 cells on 1 scene, 2 seeds; none failed.")
+@pytest.mark.parametrize("name, cells, told", [
+    ("table1", [row()["cell"], "b"], "; 1 of 2 cells has no row yet: b."),
+    ("table1", [*"edcba", row()["cell"]], "; 5 of 6 cells have no row yet: a; b; c; 2 more."),
+    ("table1", [row()["cell"]], "."), ("table1", None, "."), ("table1", 3, "."), ("other", ["b"], ".")])
+def test_cells_without_a_row_are_named(name, cells, told, texts):
+    markdown, _ = texts([row()], name=name, cells=cells)
+    assert markdown.split("\n")[4] == f"1 cell on 1 scene, 1 seed; none failed{told}"
 
 
 def test_what_is_of_others_is_left_alone_and_what_is_of_an_earlier_report_goes(tmp_path, no_figures):
@@ -96,22 +98,21 @@ def test_what_is_of_others_is_left_alone_and_what_is_of_an_earlier_report_goes(t
     assert (report_folder / "mine.txt").is_file()
 
 
-def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(tmp_path, no_figures):
+def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(texts):
     said = {**PROTOCOL, "arguments": ["--port", "0"]}
     entries = [row(protocol=said), row(blend_mode="smoe", schedule="steady", protocol=said,
                                        machine={"cells_per_gpu": 3}), failed(seed=1, iterations=7)]
-    report(write_rows(tmp_path / "results", entries), str(tmp_path / "report"))
-    text = (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
-    rules = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text))
+    _, page = texts(entries)
+    rules = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", page))
     assert rules["iterations"] == "30000" and rules["schedules"] == "3dgs; steady"
     assert rules["cells that shared their GPU or CPU"] == "1 of 2, up to 3 at once" and "arguments" not in rules
 
 
-def test_what_is_left_out_is_said(tmp_path, no_figures):
+def test_what_is_left_out_is_said(texts):
     other = row(seed=2, protocol={**PROTOCOL, "principal_point": "centre"})
-    report(write_rows(tmp_path / "results", [row(), row(seed=1), other]), str(tmp_path / "report"))
+    markdown, _ = texts([row(), row(seed=1), other])
     assert ("2 cells on 1 scene, 2 seeds; none failed; left out, since principal_point is 'centre' in them and 'scene' "
-            f"in 2 others of bonsai: {other['cell']}.") in (tmp_path / "report" / "report.md").read_text("utf-8")
+            f"in 2 others of bonsai: {other['cell']}.") in markdown
 
 
 def test_renderings_stay_as_they_are_and_have_their_decibels(tmp_path):
