@@ -7,23 +7,23 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import io
 import os
 import re
 import shutil
+import tempfile
 from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Union
 
 from . import facts
 from .rules import OPTIONS, SETTINGS, import_rasterizer, rules_of, settings_blend, start
-from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, tree_of, unpatched
+from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, leftover, tree_of, unpatched
 from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
 
 STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
-UNFINISHED = ".dsmoe_unfinished"  # new files, until all are written
-# Signs of an environment, of a run's output and of another checkout.
-OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR)
+UNFINISHED = ".dsmoe_unfinished"  # begins the name of a folder of new files, until all are written
+# Signs of an environment, of a run's output and of another checkout or package.
+OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
 PathLike = Union[str, Path]
 
 
@@ -56,7 +56,9 @@ class Patched:
     def __init__(self, before: Mapping[str, bytes], trainer: Trainer, options: Sequence[str]) -> None:
         self.before, self.after = before, dict(before)
         self.rules: Dict[str, List[str]] = {}  # of each file
-        self.problems: List[str] = []  # why it cannot be patched
+        # Why it cannot be patched.
+        self.problems = [f"{name}: {leftover(data)}; change that line, by which `revert` takes a patch out"
+                         for name, data in before.items() if leftover(data)]
         self.notes: List[str] = []
         for rule in rules_of(trainer):
             why = self.apply(rule.file, rule.name, rule.edit)
@@ -68,7 +70,8 @@ class Patched:
         for option in options:
             for name, data in before.items():
                 if "/" not in name and b"__main__" in data:
-                    self.apply(name, option, partial(start, option=option))
+                    why = self.apply(name, option, partial(start, option=option))
+                    self.notes += [f"{name}: does not begin with {option}.start(): {why}"] if why else []
                 elif name.startswith("submodules/") and STANDARD in data and option == "modernise":
                     self.after[name], self.rules[name] = data.replace(STANDARD, NO_STANDARD), ["cpp-standard"]
 
@@ -102,8 +105,7 @@ class Patched:
 
 def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None, fuse: bool = False) -> Plan:
     """Plans the patch of a checkout in whatever state it is."""
-    root = _root(path)
-    now = _files(root)
+    root, now = Path(path), _files(Path(path))
     before = {name: unpatched(data) for name, data in now.items()}
     applied = [name for name in OPTIONS if any(f"{name}.start()  {MARK}".encode() in data for data in now.values())]
     found = facts.of_checkout(before)
@@ -138,7 +140,7 @@ def diff(path: PathLike, **options: Any) -> str:
     """Returns what the patch changes, as a unified diff against the files as they were before any patch."""
     planned, text = check(path, **options).possible(), []
     for name in planned.before:
-        old, new = (io.StringIO(files[name].decode(errors="replace"), newline="").readlines()
+        old, new = ([line.decode(errors="replace") for line in files[name].splitlines(keepends=True)]
                     for files in (planned.before, planned.after))
         text += list(difflib.unified_diff(old, new, "a/" + name, "b/" + name))
     return "".join(line if line.endswith("\n") else line + "\n\\ No newline at end of file\n" for line in text)
@@ -161,20 +163,19 @@ def revert(path: PathLike) -> List[str]:
 
     Raises PatchError, and touches nothing, where a file has no patch that can be taken out.
     """
-    root = _root(path)
-    now = _files(root)
+    root, now = Path(path), _files(Path(path))
     back = {name: unpatched(data) for name, data in now.items() if unpatched(data) != data}
     for name, data in {**now, **back}.items():
         try:
-            kept = re.search(rf".*{MARK}.*".encode(), data)
-            if kept:
-                raise PatchError(f"still has `{kept[0].decode(errors='replace').strip()}`")
-            if name in back:
+            why = leftover(data, f"|{INTEGRATIONS}" if name in back and name == GR else "")
+            if name in back and not why:
                 tree_of(data)
         except PatchError as error:
-            raise PatchError(f"{name}: without the lines of the patch it {error}. Undo your edit of them, then revert "
-                             "again; nothing was touched") from None
-    if not back and not (root / UNFINISHED).exists():
+            why = str(error)
+        if why:
+            raise PatchError(f"{name}: without the lines of the patch it {why}. Undo your edit of them, then revert "
+                             "again; nothing was touched")
+    if not back and not any(root.glob(UNFINISHED + "*")):
         raise PatchError(f"{root}: no file has a line of a patch, so nothing can be taken back")
     _write(root, back)
     return list(back)
@@ -182,6 +183,8 @@ def revert(path: PathLike) -> List[str]:
 
 def _files(root: Path) -> Dict[str, bytes]:
     """Returns the Python files of a checkout, and how its submodules are built."""
+    if not root.is_dir():
+        raise PatchError(f"{root}: is not a folder; wanted is the checkout's, in which train.py or compress.py lies")
     paths = [*root.glob("submodules/*/setup.py"), *root.glob("submodules/*/backend.py")]
     for above, folders, names in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")
@@ -197,8 +200,10 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
     for name, target in targets.items():
         if root.resolve() not in target.parents:
             raise PatchError(f"{name}: is a link to {target}, outside the checkout; copy it into the checkout first")
-    unfinished = root / UNFINISHED
+        if not os.access(target.parent, os.W_OK):
+            raise PatchError(f"{target.parent}: you may not write in this folder; nothing was touched")
     try:
+        unfinished = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=root))  # of this process alone
         for name, data in files.items():
             (unfinished / name).parent.mkdir(parents=True, exist_ok=True)
             (unfinished / name).write_bytes(data)
@@ -211,11 +216,5 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
         raise PatchError(f"{error.filename or root}: cannot be written: {error}; `dsmoe patch check {root}` says how "
                          "the checkout is") from None
     finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def _root(path: PathLike) -> Path:
-    root = Path(path)
-    if not root.is_dir():
-        raise PatchError(f"{root}: is not a folder; wanted is the checkout's, in which train.py or compress.py lies")
-    return root
+        for unfinished in root.glob(UNFINISHED + "*"):
+            shutil.rmtree(unfinished, ignore_errors=True)

@@ -24,6 +24,7 @@ USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used firs
 
 def default_blend() -> Tuple[str, str]:
     """Returns the defaults of --blend_mode, $DSMOE_BLEND_MODE or alpha, and of --background_gate: that of the mode."""
+    _check_renderer()  # where it alone was restored, the option would be recorded and ignored
     return resolve_blend_mode(None), ""
 
 
@@ -183,7 +184,7 @@ def _saved(dataset: Any) -> Dict[str, Any]:
     """Returns what a model's cfg_args, a Namespace as text, records of the options."""
     path = Path(getattr(dataset, "model_path", "") or os.devnull, "cfg_args")
     text = path.read_text(errors="replace") if path.is_file() else ""
-    found = re.findall(r"\b(blend_mode|background_gate)=('\w+'|None|[\d.e+-]+)", text)
+    found = re.findall(r"(?:\(|, )(blend_mode|background_gate)=('\w+'|None|[\d.e+-]+)", text)
     return {name: ast.literal_eval(value) for name, value in found}
 
 

@@ -18,6 +18,9 @@ from typing import Any, Iterator
 MARK = "# dsmoe patch"
 # A flag of compilers in the place of one that asks for an old standard.
 STANDARD, NO_STANDARD = b"-std=c++14", b"-DDSMOE_PATCH_STD=14"
+# No more than what the rules write, so that a line to which the user has added something is not taken for the patch's.
+LINE = re.compile(rb"(?m)^(\xef\xbb\xbf)?[ \t#]*(from diff_smoe_\S+ import (\w+|(\w+); \4\.start\(\))"
+                  rb"|[\w., ]+ = (\w+_blend_of|blend_of|default_blend)\(\w*\))[ \t]+# dsmoe patch[ \t]*\r?\n")
 
 
 class PatchError(RuntimeError):
@@ -37,9 +40,14 @@ def tree_of(data: bytes) -> ast.Module:
 def unpatched(data: bytes) -> bytes:
     """Returns a file without what a patch put into it."""
     data = re.sub(rb"(?m)^[ \t]*# dsmoe patch [\w-]+: (\w+)\r?\n([ \t]*from[ \t]+)[\w.]+", rb"\2\1", data)
-    data = re.sub(rb"\*\*\w+\(\w+\),  # dsmoe patch\r?\n[ \t]*", b"", data)
-    data = re.sub(rb"(?m)^(\xef\xbb\xbf)?.*  # dsmoe patch\r?\n", rb"\1", data)
-    return data.replace(NO_STANDARD, STANDARD)
+    data = re.sub(rb"(?m)^([^#\n]*)\*\*chosen_blend\(\w+\),[ \t]+# dsmoe patch[ \t]*\r?\n[ \t]*", rb"\1", data)
+    return LINE.sub(rb"\1", data).replace(NO_STANDARD, STANDARD)
+
+
+def leftover(data: bytes, more: str = "") -> str:
+    """Says which line still has the mark (or `more`): an edited line of the patch, or one of the user's; "" if none."""
+    found = re.search(rf".*(?:{MARK}{more}).*".encode(), data)
+    return f"still has `{found[0].decode(errors='replace').strip()}`" if found else ""
 
 
 class Source:
@@ -77,5 +85,7 @@ class Source:
         """Puts a line before the first statement that may have one above it, unless it is there."""
         body = self.tree.body[int(ast.get_docstring(self.tree) is not None):]
         later = [line for line in body if getattr(line, "module", "") != "__future__"]
+        if not later:
+            raise PatchError("it has no statement")
         if text.encode() not in self.data:
             self.put(text, later[0])

@@ -196,11 +196,78 @@ def test_edits_stay_when_the_patch_goes(tmp_path, dsmoe):
 
 @pytest.mark.parametrize("name, old, new, words", [
     ("train.py", "    pipe.blend", "    if 1:\n        pipe.blend", "train.py: without the lines of the patch it is"),
-    (GR, "\nfrom diff_smoe", "\n\nfrom diff_smoe", "it still has `# dsmoe patch 3dgs-2023: diff")])
+    (GR, "\nfrom diff_smoe", "\n\nfrom diff_smoe", "it still has `# dsmoe patch 3dgs-2023: diff"),
+    (GR, "# dsmoe patch 3dgs-2023: diff_gaussian_rasterization\n", "", "still has `from diff_smoe_rasterization."),
+    # Code and words of the user's on a line of the patch.
+    (GR, "(pipe),  #", "(pipe), sh_degree=3,  #", "still has `**chosen_blend(pipe), sh_degree=3,  # dsmoe patch`"),
+    ("train.py", "blend_of(dataset)", "blend_of(dataset); lr = 5", "still has `pipe.blend = blend_of(dataset); lr = 5"),
+    ("train.py", "blend_of(dataset)", "{'blend_mode': 'smoe'}", "still has `pipe.blend = {'blend_mode': 'smoe'}"),
+    ("train.py", "import blend_of", "import blend_of; import wandb", "import wandb  # dsmoe patch`"),
+    ("train.py", "# dsmoe patch\n    first", "# dsmoe patch, mine\n    first", "  # dsmoe patch, mine`")])
 def test_an_edit_without_which_no_file_comes_back_is_named(tmp_path, name, old, new, words):
     patches.apply(make(tmp_path))
     (tmp_path / name).write_text((tmp_path / name).read_text().replace(old, new))
     refused(tmp_path, "nothing was touched", words, call=patches.revert)
+    if "without" not in words:
+        refused(tmp_path, "drifted")
+
+
+def test_an_argument_does_not_become_a_part_of_a_comment(tmp_path):
+    patches.apply(make(tmp_path))
+    text = (tmp_path / GR).read_text().replace("**chosen", "# **chosen")
+    (tmp_path / GR).write_text(text)
+    refused(tmp_path, "still has `# **chosen_blend(pipe),", call=patches.revert)
+
+
+@pytest.mark.parametrize("line", ["x = 1  # dsmoe patch\n", "# dsmoe patch, by me\n",
+                                  '"""\nx  # dsmoe patch\n"""\n'])
+def test_the_mark_in_text_of_the_users_is_named_before_anything_is_written(tmp_path, line):
+    make(tmp_path, {"train.py": TRAIN + line})
+    refused(tmp_path, "drifted", "train.py: still has `", "# dsmoe patch", "change that line")
+    refused(tmp_path, "train.py: ", call=patches.revert)
+
+
+@pytest.mark.parametrize("sign", [".git", "pyproject.toml"])
+def test_another_repository_in_the_checkout_is_let_be(tmp_path, sign):
+    """Such as a clone of this package, whose files speak of the mark."""
+    make(tmp_path, {f"dsmoe/{sign}": "", "dsmoe/own.py": RENDERER, "dsmoe/patches/source.py": "x = 1  # dsmoe patch\n"})
+    before = contents(tmp_path)
+    assert "dsmoe/own.py" not in patches.apply(tmp_path).rules
+    patches.revert(tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_a_script_that_cannot_begin_with_an_option_is_named(tmp_path):
+    texts = {"only.py": '"""Run as __main__."""\n', "two.py": '"""__main__"""; import os\n', "no.py": "__main__ =\n"}
+    notes = patches.apply(make(tmp_path, texts), modernise=True).notes
+    assert [note.partition(": ")[0] for note in notes] == sorted(texts)
+    assert all("does not begin with modernise.start()" in note for note in notes)
+
+
+def test_two_at_once_do_not_share_new_files(tmp_path, monkeypatch):
+    """The second is killed in the middle of a new file, before the first puts its own in place."""
+    replace = os.replace
+    make(tmp_path)
+
+    def first(*arguments):
+        monkeypatch.setattr(os, "replace", replace)
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            failing_at(1, Killed(), patch)
+            patches.apply(tmp_path)
+        return replace(*arguments)
+
+    monkeypatch.setattr(os, "replace", first)
+    patches.apply(tmp_path)
+    assert {name: (tmp_path / name).read_text() for name in PATCHED} == PATCHED
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_folder_that_may_not_be_written_is_named_before_anything_is(tmp_path, monkeypatch):
+    access = os.access
+    make(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "access", lambda path, mode: Path(path).name != "gaussian_renderer" and access(path, mode))
+        refused(tmp_path, "gaussian_renderer: you may not write in this folder")
 
 
 def test_files_of_another_commit_are_patched_anew(tmp_path):
@@ -220,7 +287,7 @@ def test_files_of_another_commit_are_patched_anew(tmp_path):
 
 def test_lines_of_another_version_are_replaced(tmp_path):
     patches.apply(make(tmp_path))
-    former = PATCHED["train.py"].replace("pipe.blend = blend_of", "pipe.blend_mode = mode_of")
+    former = PATCHED["train.py"].replace("pipe.blend = blend_of", "pipe.mode = blend_of")
     (tmp_path / "train.py").write_text(former)
     assert patches.check(tmp_path).state == "half-patched" and patches.apply(tmp_path).written
     assert (tmp_path / "train.py").read_text() == PATCHED["train.py"]

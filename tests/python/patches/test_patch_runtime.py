@@ -143,6 +143,14 @@ def test_a_rendering_takes_the_saved_mode_whatever_default_it_brings(monkeypatch
         assert rendered() == ALPHA
 
 
+def test_a_path_that_looks_like_an_option_is_none(monkeypatch, tmp_path):
+    """Python 3.8 writes a Namespace sorted by name: the path comes last."""
+    saved = "Namespace(background_gate=0.5, blend_mode='smoe', model_path='out/background_gate=0.03')"
+    (tmp_path / "cfg_args").write_text(saved)
+    assert runtime.saved_blend_of(run("alpha", model_path=str(tmp_path))) == {
+        "blend_mode": "smoe", "background_gate": 0.5}
+
+
 def test_a_renderer_with_another_rasterizer_is_refused(monkeypatch, tmp_path):
     """As after `git checkout gaussian_renderer`: the mode would be recorded, and ignored."""
     theirs = SimpleNamespace(GaussianRasterizationSettings=namedtuple("Settings", "image_height debug"),
@@ -150,6 +158,8 @@ def test_a_renderer_with_another_rasterizer_is_refused(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "gaussian_renderer", theirs)
     with pytest.raises(RuntimeError, match="another rasterizer.*dsmoe patch check PATH"):
         runtime.blend_of(run("smoe"))
+    with pytest.raises(RuntimeError, match="another rasterizer"):  # arguments/ alone is patched: no blend_of is called
+        runtime.default_blend()
     ours = SimpleNamespace(GaussianRasterizationSettings=GaussianRasterizationSettings)
     for renderer in (ours, SimpleNamespace()):
         monkeypatch.setitem(sys.modules, "gaussian_renderer", renderer)
