@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
-from typing import Any, Dict, Iterable
+from typing import Any, Dict
 
 from . import engine
 
@@ -12,9 +12,9 @@ def apply(arguments: Namespace) -> int:
     """Patches."""
     planned = engine.apply(**_options(arguments))
     print(f"{arguments.path}: {'patched' if planned.written else 'already patched'} ({planned.trainer})")
-    _print_lines(f"{name}: {', '.join(dict.fromkeys(rules))}" for name, rules in planned.rules.items())
+    sys.stdout.writelines(f"  {name}: {', '.join(dict.fromkeys(rules))}\n" for name, rules in planned.rules.items())
     print("It knows --blend_mode and --background_gate, and saves them in cfg_args; `dsmoe patch revert` undoes it.")
-    _print_lines(planned.notes)
+    sys.stdout.writelines(f"  {note}\n" for note in planned.notes)
     return 0
 
 
@@ -23,7 +23,7 @@ def check(arguments: Namespace) -> int:
     planned = engine.check(**_options(arguments))
     options = "".join(f", --{option}" for option in planned.applied)
     print(f"{arguments.path}: {planned.state}" + (f" ({planned.trainer}{options})" if planned.trainer else ""))
-    _print_lines((*planned.reasons, *planned.notes))
+    sys.stdout.writelines(f"  {line}\n" for line in (*planned.reasons, *planned.notes))
     return 0 if planned.state in ("patchable", "patched") else 1
 
 
@@ -42,8 +42,3 @@ def revert(arguments: Namespace) -> int:
 
 def _options(arguments: Namespace) -> Dict[str, Any]:
     return {name: getattr(arguments, name) for name in ("path", "modernise", "trainer", "fuse")}
-
-
-def _print_lines(lines: Iterable[str]) -> None:
-    for line in lines:
-        print("  " + line)
