@@ -150,7 +150,7 @@ def _fake_rasterize(*arguments):
 def _fake_project(*arguments):
     given = dict(zip((*INPUTS, *OPTIONS), arguments))
     means3D, colors = given["means3D"], given["colors_precomp"]
-    features = (3 if colors is None else colors.shape[1]) + sum(map(int, (given["depth"], given["inverse_depth"])))
+    features = (3 if colors is None else colors.shape[1]) + int(given["depth"]) + int(given["inverse_depth"])
     stored = (features + 3) // 4 * 4 if means3D.device.type == "cuda" else features  # rows of vectors
     return (means3D.new_empty((means3D.shape[0], 8)), means3D.new_empty((means3D.shape[0], stored))[:, :features],
             _fake_radii(means3D))

@@ -123,8 +123,9 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     if GR not in now or chosen is None or facts.those(found, "uses "):
         return Plan(root, "unknown", None, [reason if GR in now else f"there is no {GR} in it"], applied)
     wanted = {"modernise": modernise, "fuse": fuse}
-    patched = Patched(before, chosen, [name for name in OPTIONS if wanted[name] or name in applied])
-    as_it_was = Patched(before, chosen, applied).after
+    options = [name for name in OPTIONS if wanted[name] or name in applied]
+    patched = Patched(before, chosen, options)
+    as_it_was = (patched if options == applied else Patched(before, chosen, applied)).after
     wrong = [f"{name}: is not as this version patches it: `apply` finishes the patch, `revert` takes it back"
              for name, data in now.items() if data != as_it_was[name]]
     state, reasons = (("drifted", patched.problems) if patched.problems else ("patched", []) if not wrong else
@@ -164,8 +165,9 @@ def revert(path: PathLike) -> List[str]:
     Raises PatchError, and touches nothing, where a file has no patch that can be taken out.
     """
     root, now = Path(path), _files(Path(path))
-    back = {name: unpatched(data) for name, data in now.items() if unpatched(data) != data}
-    for name, data in {**now, **back}.items():
+    before = {name: unpatched(data) for name, data in now.items()}
+    back = {name: data for name, data in before.items() if data != now[name]}
+    for name, data in before.items():
         try:
             why = leftover(data, f"|{INTEGRATIONS}" if name in back and name == GR else "")
             if name in back and not why:

@@ -62,14 +62,15 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         raise PatchError(str(error)) from None
     if not words:
         raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
-    flavour, found, warnings = _flavour(words, trainer)
+    folders = _folders(words)
+    flavour, found, warnings = _flavour(folders, trainer)
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: flavour}
     environment.pop(BACKGROUND_GATE_VARIABLE, None)
     said_gate = ""
     if gate is not None:
         environment[BACKGROUND_GATE_VARIABLE], said_gate = str(gate), f", background gate {gate}"
-    warnings += facts.of_one_name(_folders(words)[0])
-    if _cannot_use_sparse_adam(_folders(words)):
+    warnings += facts.of_one_name(folders[0])
+    if _cannot_use_sparse_adam(folders):
         environment[WITHOUT_VARIABLE] = SPARSE_ADAM
         warnings += [f"{SPARSE_ADAM} is not offered: where it is found, the trainer reads get_features_dc of its model,"
                      " which has none"]
@@ -81,14 +82,13 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
                          " each process that imports it says so", *(f"warning: {warning}" for warning in warnings)]
 
 
-def _flavour(words: Sequence[str], trainer: Optional[str]) -> Tuple[str, str, List[str]]:
+def _flavour(folders: Sequence[Path], trainer: Optional[str]) -> Tuple[str, str, List[str]]:
     """Returns the flavour, for which trainer it was chosen, and what speaks against it."""
     by_name = {"": "", **{name: name for name in FLAVOURS}, **{known.name: known.flavour for known in TRAINERS}}
     if (trainer or "") not in by_name:
         raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
     reasons, seen = [], False
-    folders = _folders(words)
     for path in (folders[0] / RASTERIZER, folders[0] / f"{RASTERIZER}.py"):
         if path.exists():  # where Python looks first
             raise PatchError(f"{path} would be imported before this package's; move it away")

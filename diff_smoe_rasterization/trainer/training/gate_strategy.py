@@ -151,10 +151,12 @@ class GateStrategy(SteadyStrategy):
 
     def _looks(self, step: Step) -> bool:
         """Whether the next decision looks at this step's view: once, in the last round of the views before it."""
+        if step.view.camera.name not in self.sought:
+            return False
         removes = self.context.model.num_gaussians > self.context.config.budget
         following = next((later for later in [*self.removals, *self.moves] if later >= step.iteration), None)
         return (following is not None and following - step.iteration < len(self.context.views)
-                and (removes or following > self.removals[-1]) and step.view.camera.name in self.sought)
+                and (removes or following > self.removals[-1]))
 
     def _look(self, view: View, target: torch.Tensor, color: torch.Tensor, splats: Splats) -> None:
         """Adds what each Gaussian is worth to one rendering."""
