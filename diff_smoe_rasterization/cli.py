@@ -302,7 +302,8 @@ def _bench_report(arguments: argparse.Namespace) -> None:
 def _patch(arguments: argparse.Namespace) -> int:
     from .patches import commands
 
-    return getattr(commands, arguments.action)(arguments)
+    options = {name: value for name, value in vars(arguments).items() if name in ("modernise", "fuse", "trainer")}
+    return getattr(commands, arguments.action)(arguments.path, **options)
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -20,7 +20,6 @@ from .rules import OPTIONS, SETTINGS, import_rasterizer, rules_of, settings_blen
 from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, leftover, tree_of, unpatched
 from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
 
-STATES = ("unknown", "patchable", "patched", "half-patched", "drifted")
 UNFINISHED = ".dsmoe_unfinished"  # begins the name of a folder of new files, until all are written
 # Signs of an environment, of a run's output and of another checkout or package.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
@@ -31,7 +30,7 @@ class Plan(NamedTuple):
     """What `apply` would do, and why it would not. Files are by name, relative to the checkout."""
 
     root: Path
-    state: str  # one of STATES
+    state: str  # unknown, patchable, patched, half-patched or drifted
     trainer: Optional[str]
     reasons: Sequence[str]  # of the state, as lines
     applied: Sequence[str] = ()  # of OPTIONS, those that the files on disk are patched with

@@ -42,20 +42,18 @@ def of_files(files: Mapping[str, bytes]) -> Set[str]:
             continue
         in_try = {id(node) for outer in nodes if isinstance(outer, ast.Try) and outer.handlers
                   for line in outer.body for node in ast.walk(line)}
-        renderings, asked = _calls_of_rasterizers(nodes)
+        facts.update(_of_rasterizers(nodes))
         for node in nodes:
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 facts.update(_of_import(node, id(node) in in_try))
             elif isinstance(node, ast.ClassDef) and node.name in NAMES:
                 facts.add("defines " + node.name)
-            elif isinstance(node, ast.Call):
-                facts.update(_of_call(node, node in renderings, node in asked))
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
                 facts.add("reads invdepthmap")
-            elif isinstance(node, ast.Assign) and node.value in renderings and isinstance(node.targets[0], ast.Tuple):
-                results = node.targets[0].elts
-                if not any(isinstance(one, ast.Starred) for one in results):
-                    facts.add("returns " + ", ".join(getattr(one, "id", "_") for one in results))
+            elif isinstance(node, ast.Call):
+                called = getattr(node.func, "attr", getattr(node.func, "id", ""))  # the last part of the name
+                settings = node.keywords if called == "GaussianRasterizationSettings" else ()
+                facts.update([f"calls {called}", *(f"sets {keyword.arg}" for keyword in settings if keyword.arg)])
     return facts
 
 
@@ -79,28 +77,27 @@ def _of_import(node: Any, may_fail: bool) -> Iterator[str]:
             yield from (f"needs {prefix}{name}" for name in names if name != "*")
 
 
-def _of_call(call: ast.Call, renders: bool, asks: bool) -> Iterator[str]:
-    called = getattr(call.func, "attr", getattr(call.func, "id", ""))  # the last part of the name
-    keywords = [keyword.arg for keyword in call.keywords if keyword.arg]  # without **pipe.blend
-    if called == "GaussianRasterizationSettings":
-        yield from (f"sets {name}" for name in keywords)
-    elif renders and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
-        yield from (f"takes {name}" for name in keywords)
-    else:
-        yield from (f"asks {called}", f"calls {called}")[not asks:]
-
-
-def _calls_of_rasterizers(nodes: Sequence[ast.AST]) -> Tuple[List[ast.AST], List[ast.AST]]:
-    """The calls of objects, rasterizer(...) and GaussianRasterizer(...)(...), by whatever names; of their methods."""
+def _of_rasterizers(nodes: Sequence[ast.AST]) -> Iterator[str]:
+    """Calls of objects, rasterizer(...) and GaussianRasterizer(...)(...) by whatever names, and of their methods."""
     classes = {alias.asname or alias.name for node in nodes if isinstance(node, ast.ImportFrom)
                for alias in node.names if alias.name.startswith("GaussianRasterizer")}
     calls = [node for node in nodes if isinstance(node, ast.Call)]
     made = [call for call in calls if getattr(call.func, "id", "") in classes]
-    objects = {getattr(target, "id", "") for node in nodes if isinstance(node, ast.Assign) and node.value in made
-               for target in node.targets} | ({"rasterizer"} if classes else set())
+    assigned = [node for node in nodes if isinstance(node, ast.Assign)]
+    objects = {getattr(target, "id", "") for node in assigned if node.value in made for target in node.targets}
+    objects |= {"rasterizer"} if classes else set()
     owners = [*made, *(node for node in nodes if getattr(node, "id", None) in objects)]
-    return ([call for call in calls if call.func in owners],
-            [call for call in calls if getattr(call.func, "value", None) in owners])
+    for call in calls:
+        keywords = [keyword.arg for keyword in call.keywords if keyword.arg]  # without **pipe.blend
+        if call.func in owners and "means3D" in keywords:  # else it may be another `rasterizer`, such as pytorch3d's
+            yield from (f"takes {name}" for name in keywords)
+        elif isinstance(call.func, ast.Attribute) and call.func.value in owners:
+            yield "asks " + call.func.attr
+    for node in assigned:
+        results = getattr(node.targets[0], "elts", ())
+        is_plain = results and not any(isinstance(one, ast.Starred) for one in results)
+        if is_plain and getattr(node.value, "func", None) in owners:
+            yield "returns " + ", ".join(getattr(one, "id", "_") for one in results)
 
 
 def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:

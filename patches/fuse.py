@@ -6,6 +6,10 @@ import importlib
 from functools import partial
 from typing import Any, Callable, Dict
 
+import torch
+
+from diff_smoe_rasterization import FusedAdam, fused_ssim
+
 from .runtime import say
 
 # Of the largest value. Of a variance E[x^2] - E[x]^2 float32 rounds off some 1e-7 of E[x^2], which may be 1e-4 of the
@@ -15,8 +19,6 @@ SSIM_ROUNDING = 1e-3
 
 def start() -> None:
     """Changes torch.optim.Adam and the trainer's utils.loss_utils.ssim in this process."""
-    import torch
-
     torch.optim.Adam = fused_where_it_fits(torch.optim.Adam)
     with contextlib.suppress(ImportError, AttributeError):  # the trainer will say what is missing
         losses: Any = importlib.import_module("utils.loss_utils")
@@ -25,8 +27,6 @@ def start() -> None:
 
 def fused_where_it_fits(adam: Any) -> Any:
     """Returns a class in the place of torch.optim.Adam: a call makes FusedAdam where that has its arguments."""
-    from diff_smoe_rasterization import FusedAdam
-
     class Adam(adam):
         def __new__(cls, *arguments: Any, **keywords: Any) -> Any:
             if cls is not Adam:  # a class of the trainer's own
@@ -44,10 +44,6 @@ def fused_where_equal(ssim: Callable[..., Any], differences: Dict[Any, str], *im
     or gradient the trainer's own stays, and a line on stderr says so. It is also called for other arguments and types,
     and for gradients by img2: the kernel has none of it. differences: by shape, what was found.
     """
-    import torch
-
-    from diff_smoe_rasterization import fused_ssim
-
     first, second = images if len(images) == 2 and not keywords else (torch.empty(0),) * 2
     if (first.dim() not in (3, 4) or first.shape != second.shape or first.device != second.device
             or {first.dtype, second.dtype} != {torch.float32} or second.requires_grad and torch.is_grad_enabled()):
@@ -63,10 +59,6 @@ def fused_where_equal(ssim: Callable[..., Any], differences: Dict[Any, str], *im
 
 def difference_of(own: Callable[..., Any], img1: Any, img2: Any) -> str:
     """What a similarity of images differs in from ours, its gradient by img1 too; empty where in nothing."""
-    import torch
-
-    from diff_smoe_rasterization import fused_ssim
-
     results = []
     with torch.inference_mode(False), torch.enable_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         try:

@@ -7,6 +7,10 @@ import sys
 from functools import partial
 from typing import Any
 
+import numpy
+import torch
+from PIL import Image
+
 from .runtime import STAND_INS
 
 EIGH_AT_ONCE = 16_384  # cuSOLVER's batched solver of CUDA 12.8 and later fails on batches somewhere above 32,000
@@ -14,10 +18,6 @@ EIGH_AT_ONCE = 16_384  # cuSOLVER's batched solver of CUDA 12.8 and later fails 
 
 def start() -> None:
     """Changes modules of this process; README.md has the list and the reasons."""
-    import numpy
-    import torch
-    from PIL import Image
-
     sys.path.insert(1, str(STAND_INS))  # behind the script's folder
     os.environ.setdefault("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # torch.load, where a call does not say
     for name in ("int", "float", "bool", "object"):
@@ -35,8 +35,6 @@ def picture(fromarray: Any, obj: Any, *arguments: Any, **keywords: Any) -> Any:
 
 def eigh_in_parts(eigh: Any, A: Any, UPLO: str = "L", **keywords: Any) -> Any:
     """What torch.linalg.eigh returns, computed for so many matrices [..., n, n] at once as its CUDA solver can take."""
-    import torch
-
     flat = A.reshape(-1, *A.shape[-2:])
     if len(flat) <= EIGH_AT_ONCE or keywords:
         return eigh(A, UPLO=UPLO, **keywords)
@@ -52,8 +50,6 @@ def unique_rows(unique: Any, input: Any, sorted: bool = True, return_inverse: bo
     With that of CUB (NVIDIA/cccl 5456) processes that share a GPU ended with cudaErrorIllegalAddress. In one dimension
     torch.unique has a radix sort. As in torch, rows are sorted whatever `sorted` says.
     """
-    import torch
-
     if dim != 0 or input.dim() == 0 or input.numel() == 0 or input.is_floating_point() or input.is_complex():
         return unique(input, sorted, return_inverse, return_counts, dim)
     inverse = torch.zeros(len(input), dtype=torch.int64, device=input.device)

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Dict, List, NoReturn, Optional, Sequence, Set, Tuple
+from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
 
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_of
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
@@ -25,6 +25,7 @@ from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 SPARSE_ADAM = "SparseGaussianAdam"
+RASTERIZES = re.compile(rb"(?m)^\s*(from|import) (diff_(gauss|surfel)|gsplat\b)")
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
@@ -64,22 +65,19 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
     folders = _folders(words)
     flavour, found, warnings = _flavour(folders, trainer)
-    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: flavour}
-    environment.pop(BACKGROUND_GATE_VARIABLE, None)
-    said_gate = ""
-    if gate is not None:
-        environment[BACKGROUND_GATE_VARIABLE], said_gate = str(gate), f", background gate {gate}"
+    path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
+    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: flavour,
+                   BACKGROUND_GATE_VARIABLE: "" if gate is None else str(gate), "PYTHONPATH": os.pathsep.join(path),
+                   "PYTHONDONTWRITEBYTECODE": "1"}  # else Python leaves __pycache__ in the checkout
     warnings += facts.of_one_name(folders[0])
     if _cannot_use_sparse_adam(folders):
         environment[WITHOUT_VARIABLE] = SPARSE_ADAM
         warnings += [f"{SPARSE_ADAM} is not offered: where it is found, the trainer reads get_features_dc of its model,"
                      " which has none"]
-    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # else Python leaves __pycache__ in the checkout
-    path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
-    environment["PYTHONPATH"] = os.pathsep.join(path)
+    blend = blend_mode if gate is None else f"{blend_mode}, background gate {gate}"
     module = contract_of(flavour).module
-    return environment, [f"{found}: {module} will be {flavour} of this package, blend mode {blend_mode}{said_gate};"
-                         " each process that imports it says so", *(f"warning: {warning}" for warning in warnings)]
+    return environment, [f"{found}: {module} will be {flavour} of this package, blend mode {blend}; each process that "
+                         "imports it says so", *(f"warning: {warning}" for warning in warnings)]
 
 
 def _flavour(folders: Sequence[Path], trainer: Optional[str]) -> Tuple[str, str, List[str]]:
@@ -93,7 +91,8 @@ def _flavour(folders: Sequence[Path], trainer: Optional[str]) -> Tuple[str, str,
         if path.exists():  # where Python looks first
             raise PatchError(f"{path} would be imported before this package's; move it away")
     for folder in folders:
-        found = _facts(folder, everywhere=folder == folders[0])
+        files = _files(folder, 3 if folder == folders[0] else 0)
+        found = facts.of_checkout(files) if GR in files else facts.of_files(files)
         seen = seen or bool(found)
         if facts.PATCHED in found:
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
@@ -121,23 +120,16 @@ def _folders(words: Sequence[str]) -> List[Path]:
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
-def _read(folder: Path, *patterns: str) -> Dict[str, bytes]:
-    paths = (path for pattern in patterns for path in folder.glob(pattern) if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths
-            if not {"submodules", "site-packages"} & set(path.parts)}
-
-
-def _facts(folder: Path, everywhere: bool) -> Set[str]:
-    """Returns the facts of a checkout like that of 3DGS, else, if so asked, of all files that rasterize."""
-    if (folder / GR).is_file():
-        return facts.of_checkout(_read(folder, "*.py", "*/*.py"))
-    files = _read(folder, "*.py", "*/*.py", "*/*/*.py") if everywhere else {}
-    return facts.of_files({name: data for name, data in files.items() if re.search(
-        rb"^\s*(from|import) (diff_(gauss|surfel)|gsplat\b)", data, re.MULTILINE)})
+def _files(folder: Path, depth: int) -> Dict[str, bytes]:
+    """Returns the files of a checkout like that of 3DGS, else the files that rasterize, `depth` folders deep."""
+    is_checkout = (folder / GR).is_file()
+    paths = [path for pattern in ("*.py", "*/*.py", "*/*/*.py")[:2 if is_checkout else depth]
+             for path in folder.glob(pattern) if path.is_file() and not {"submodules", "site-packages"} & {*path.parts}]
+    files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+    return {name: data for name, data in files.items() if is_checkout or RASTERIZES.search(data)}
 
 
 def _cannot_use_sparse_adam(folders: Sequence[Path]) -> bool:
     """Whether the trainer reads get_features_dc, as 3DGS does where it finds SparseGaussianAdam, and defines none."""
-    folder = next((folder for folder in folders if (folder / GR).is_file()), None)
-    text = b"\n".join(_read(folder, "*.py", "*/*.py").values()) if folder else b""
+    text = b"\n".join(next((_files(folder, 0) for folder in folders if (folder / GR).is_file()), {}).values())
     return b".get_features_dc" in text and not re.search(rb"def get_features_dc|\bget_features_dc *=", text)

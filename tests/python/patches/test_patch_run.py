@@ -103,7 +103,7 @@ def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
         monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
         if mode == "smoe" or asked is None:
             made, lines = run.prepare(words, mode, "scaffold", dict(os.environ), asked)
-            assert made.get("DSMOE_BACKGROUND_GATE") == (str(gate) if mode == "smoe" else None)
+            assert made["DSMOE_BACKGROUND_GATE"] == (str(gate) if mode == "smoe" else "")
             assert (f"blend mode {mode}, background gate {gate};" in lines[0]) == (mode == "smoe")
     for gate in ("-1", "nan") if mode == "smoe" else ("0.1",):
         said = dsmoe("run", "--blend-mode", mode, "--background-gate", gate, "--trainer", "scaffold", "--", *words)
