@@ -47,7 +47,7 @@ def fused_calls(monkeypatch):
         calls.append(tuple(img1.shape))
         return original(img1, img2)
 
-    monkeypatch.setattr(diff_smoe_rasterization, "fused_ssim", counted)
+    monkeypatch.setattr(fuse, "fused_ssim", counted)
     return calls
 
 
