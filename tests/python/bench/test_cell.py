@@ -93,15 +93,6 @@ def worked(content, tmp_path):
     return row
 
 
-def test_a_row_is_written_before_its_model_is_removed(worked, tmp_path, monkeypatch):
-    """Whatever happens in between, nothing is trained again."""
-    there = []
-    monkeypatch.setattr(cells.shutil, "rmtree",
-                        lambda path, **options: there.append((tmp_path / "out" / "row.json").exists()))
-    worked("out")
-    assert there == [True]
-
-
 def test_a_row_says_that_its_cell_shared_its_processor(worked):
     """A training that goes on from one that shared it shared it too: its seconds hold those of that attempt."""
     alone, shared = worked("one", 1), worked("two", 3, keep_models=True)
@@ -111,10 +102,14 @@ def test_a_row_says_that_its_cell_shared_its_processor(worked):
     assert again["protocol"]["continued"] and again["machine"]["cells_at_once"] == 3
 
 
-def test_a_cell_of_a_budget_ends_with_it(worked, content):
-    """By the strategy `gate`, whose options the recipe of the row has."""
+def test_a_cell_of_a_budget_ends_with_it(worked, content, tmp_path, monkeypatch):
+    """By the strategy `gate`, whose options the recipe of the row has. The model goes when the row is there: whatever
+    happens in between, nothing is trained again."""
+    there = []
+    monkeypatch.setattr(cells.shutil, "rmtree", lambda *_, **__: there.append((tmp_path / "out/row.json").exists()))
     options = {**content["protocol"]["options"], "strategy_options": "overshoot=2"}
     row = worked("out", schedules=["gate"], budgets=[40], protocol={**content["protocol"], "options": options})
     assert row["ok"], row["reason"]
     assert row["num_gaussians"] == row["budget"] == row["protocol"]["budget"] == 40
     assert row["protocol"]["recipe"]["strategy_options"] == "overshoot=2" and "_gate_0.005_n40_s0_" in row["cell"]
+    assert there == [True]

@@ -2,7 +2,6 @@
 
 The small trainer is that of the patches' tests.
 """
-import functools
 import importlib
 import json
 import random
@@ -48,13 +47,9 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def small(scene, tmp_path_factory):
-    """Makes cells of the small trainer, which is patched once of each kind."""
+    """Makes cells of the small trainer."""
     folder = tmp_path_factory.mktemp("small")
     checkout = str(make_checkout(folder / "checkout"))
-
-    @functools.lru_cache(maxsize=None)
-    def prepared(method):
-        return preparation.prepared_method(json.loads(method), str(folder / "results"))
 
     def cell(name, variant="patched", seed=0, blend_mode="smoe", options=None, **method):
         """A suite refuses checkouts on the CPU, as the public ones cannot train there: it is set afterwards."""
@@ -65,7 +60,7 @@ def small(scene, tmp_path_factory):
                    "densify_grad_thresholds": [0.0001], "images": 1}
         cell, = expand(content, "").cells
         return {**cell, "protocol": {**cell["protocol"], "device": "cpu"},
-                "method": prepared(json.dumps(cell["method"], sort_keys=True))}
+                "method": preparation.prepared_method(cell["method"], str(folder / "results"))}
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(PACKAGE_PARENT))
@@ -109,13 +104,20 @@ def started(monkeypatch):
     return found
 
 
-def test_c3dgs_compresses_what_another_checkout_has_trained(small, started, tmp_path):
-    cell = small("c3dgs", arguments=["--finetune_iterations", 3])
+def test_c3dgs_compresses_what_another_checkout_has_trained(small, started, tmp_path, monkeypatch):
+    """The seed reaches both, and no variable does."""
+    variables = {"DSMOE_BLEND_MODE": "smoe_tn", "DSMOE_BACKGROUND_GATE": "0.7"}
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    cell = small("c3dgs", arguments=["--finetune_iterations", 3], seed=3)
     base, path = cell["method"]["base"], Path(cell["method"]["path"])
     (path / "compress.py").touch()
     shape = shapes.C3DGS(cell, shapes.config_of(cell), str(tmp_path))
     trained = shape.train()
     (train, _), (compress, _) = started
+    for line, environment in started:
+        assert line[:line.index("--")][line.index("--seed") + 1] == "3"
+        assert not set(variables) & set(environment)
     words = compress[compress.index("--") + 1:]
     assert train[train.index("--") + 1] == f"{base}/train.py" and words[0] == f"{path}/compress.py"
     assert train[train.index("-m") + 1] == words[words.index("--model_path") + 1]
@@ -173,18 +175,6 @@ def test_what_comes_before_a_rendering_is_a_part_of_its_time(tmp_path, monkeypat
         renderer.prefilter_voxel(view, model)
         renderer.render(view, model)
     assert found["num_gaussians"] == 7 and found["a"]["milliseconds"] >= 50 and len(slow) == 2  # one warms up
-
-
-def test_the_seed_reaches_the_trainer_and_no_variable_does(small, started, tmp_path, monkeypatch):
-    variables = {"DSMOE_BLEND_MODE": "smoe_tn", "DSMOE_BACKGROUND_GATE": "0.7"}
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    cell = small("3dgs-2023", seed=3)
-    shapes.ThreeDGS(cell, shapes.config_of(cell), str(tmp_path)).train()
-    (line, environment), = started
-    ours, trainers = line[:line.index("--")], line[line.index("--"):]
-    assert ours[ours.index("--seed") + 1] == "3" and not set(variables) & set(environment)
-    assert trainers[1] == str(Path(cell["method"]["path"], "train.py"))
 
 
 def test_seeds_are_shifted_by_the_cells(monkeypatch):

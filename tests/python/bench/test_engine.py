@@ -95,14 +95,6 @@ def bench(capsys):
     return call
 
 
-@pytest.mark.parametrize("words, states, counts", [
-    ([], ["done", "failed"], "1 done, 0 to do, 1 failed"),
-    (["--retry-failed"], ["done", "to"], "1 done, 1 to do, 0 failed")])
-def test_what_is_done_is_not_done_again(words, states, counts, finished, bench):
-    *lines, summary = bench(*finished[1:], "--dry-run", *words)[1].splitlines()
-    assert [line.split()[0] for line in lines] == states and summary == counts
-
-
 @pytest.mark.slow
 def test_a_failed_cell_is_tried_again_where_that_is_asked_for(copied, finished, tmp_path):
     """The reason is gone, and only the cell that failed is run."""
@@ -116,12 +108,15 @@ def test_a_failed_cell_is_tried_again_where_that_is_asked_for(copied, finished, 
     assert changed == {name for name, row in rows.items() if row["scene"] == "absent"}
 
 
-def test_rows_of_an_earlier_run_elsewhere_are_not_run_again(finished, tmp_path, bench):
+def test_what_is_done_is_not_done_again_here_and_elsewhere(finished, tmp_path, bench):
     content, suite, results = finished
+    *lines, summary = bench(suite, results, "--dry-run")[1].splitlines()
+    assert [line.split()[0] for line in lines] == ["done", "failed"] and summary == "1 done, 0 to do, 1 failed"
     rows, new = ["--rows", str(results / "rows.jsonl")], tmp_path / "new"
     assert bench(suite, new, "--dry-run", *rows)[1].splitlines()[0] == f"2 of 2 cells taken from {rows[1]}"
-    counted, *lines, _ = bench(suite, new, "--dry-run", "--retry-failed", *rows)[1].splitlines()
+    counted, *lines, summary = bench(suite, new, "--dry-run", "--retry-failed", *rows)[1].splitlines()
     assert counted.startswith("1 of 2 cells") and [line.split()[0] for line in lines] == ["done", "to"]
+    assert summary == "1 done, 1 to do, 0 failed"
     longer = write_suite({**content, "protocol": {**content["protocol"], "iterations": 13}}, tmp_path)
     assert "none of its 2 rows is of a cell" in bench(longer, new, *rows)[1]
     assert "absent.jsonl" in bench(suite, new, "--rows", str(tmp_path / "absent.jsonl"))[1]

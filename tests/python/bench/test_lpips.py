@@ -46,21 +46,15 @@ NETWORKS = {"alex": [(64, 11, 4, 2), None, (3, 2), (192, 5, 1, 2), None, (3, 2),
                     (2, 2), *3 * [(64, 3, 1, 1)], None, (2, 2), *3 * [(64, 3, 1, 1)], None]}
 
 
-def made_up_weights(path, net="alex"):
-    """Random weights of the right shapes."""
-    random, arrays, inputs, layer, looks = np.random.RandomState(0), {}, 3, 0, 0
-    for part in NETWORKS[net]:
-        if part is None:
-            arrays[f"lin{looks}.weight"] = random.rand(inputs).astype(np.float32)
-            looks += 1
-        elif len(part) == 4:
-            channels, side, _, _ = part
-            layer += 1
-            weight = random.randn(channels, inputs, side, side) / (side * inputs ** 0.5)
-            arrays[f"conv{layer}.weight"] = weight.astype(np.float32)
-            arrays[f"conv{layer}.bias"] = random.randn(channels).astype(np.float32)
-            inputs = channels
-    np.savez(path, **arrays)
+def made_up_weights(path, net):
+    """Random weights of the right shapes. LPIPS looks right behind convolutions."""
+    random, arrays, inputs, parts = np.random.RandomState(0), {}, 3, NETWORKS[net]
+    for layer, (channels, side, _, _) in enumerate((part for part in parts if len(part or ()) == 4), 1):
+        arrays[f"conv{layer}.weight"] = random.randn(channels, inputs, side, side) / (side * inputs ** 0.5)
+        arrays[f"conv{layer}.bias"], inputs = random.randn(channels), channels
+    for look, part in enumerate(before for before, part in zip(parts, parts[1:]) if part is None):
+        arrays[f"lin{look}.weight"] = random.rand(part[0])
+    np.savez(path, **{name: array.astype(np.float32) for name, array in arrays.items()})
 
 
 def lpips_in_double(net, arrays, image, target, normalise):

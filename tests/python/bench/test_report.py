@@ -47,6 +47,8 @@ def test_a_cell_is_the_mean_over_seeds_with_its_spread():
     assert (averaged["source"], float(averaged["PSNR [dB]"]), float(averaged["PSNR [dB] sd"])) == ("ours", 24, 1)
     assert single["PSNR [dB] sd"] == ""
     assert shown(table_of(entries[:1], "cells"), "PSNR [dB]") == ["23.00"]  # one seed has no spread
+    with pytest.raises(ReportError, match="same setting, scene and seed 0"):
+        table_of([row(), {**row(), "cell": "again"}], "cells")
 
 
 def test_an_average_is_of_the_seeds_that_every_scene_has_in_both_modes():
@@ -237,11 +239,6 @@ def test_damaged_results_are_refused(tmp_path, text, reason):
     (tmp_path / "rows.jsonl").write_text(text, encoding="latin-1")
     with pytest.raises(ReportError, match=reason):
         rows.read_rows(str(tmp_path))
-
-
-def test_one_setting_twice_is_refused():
-    with pytest.raises(ReportError, match="same setting, scene and seed 0"):
-        table_of([row(), {**row(), "cell": "again"}], "cells")
 
 
 def groups_of(entries):
