@@ -121,15 +121,22 @@ struct Cpu {
     });
   }
 
+  // The frame of a rendering that is walked again, what it saved not yet in it.
+  template <class S>
+  static cpu::Frame<S> frame(const at::Tensor& radii, const RasterConfig<S>& config, const Options& options) {
+    cpu::Frame<S> frame;
+    frame.inputs.num_gaussians = radii.numel();
+    frame.config = config;
+    frame.config.num_threads = at::get_num_threads();
+    frame.images.radii = mutable_data<int32_t>(radii);
+    set_image(frame.camera, options);
+    return frame;
+  }
+
   template <class S>
   static void contributions(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
-                            RasterConfig<S> config, const Options& options, const ContributionSums<S>& sums) {
-    cpu::Frame<S> own;
-    own.inputs.num_gaussians = radii.numel();
-    own.config = config;
-    own.config.num_threads = at::get_num_threads();
-    own.images.radii = mutable_data<int32_t>(radii);
-    set_image(own.camera, options);
+                            const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
+    auto own = frame<S>(radii, config, options);
     SavedSizes sizes = cpu::saved_sizes(own);
     sizes.num_features = -1;
     own.saved = unpack<S>("contributions", saved, sizes, radii.device());
@@ -139,12 +146,7 @@ struct Cpu {
   template <class S>
   static void importance(const at::Tensor& gate_sum, const at::Tensor& radii, const Saved& saved,
                          const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
-    cpu::Frame<S> own;
-    own.inputs.num_gaussians = radii.numel();
-    own.config = config;
-    own.config.num_threads = at::get_num_threads();
-    own.images.radii = mutable_data<int32_t>(radii);
-    set_image(own.camera, options);
+    auto own = frame<S>(radii, config, options);
     own.saved = unpack<S>("importance", saved, cpu::saved_sizes(own), radii.device());
     own.saved.gate_sum = mutable_data<S>(gate_sum);
     cpu::importance(own, map);

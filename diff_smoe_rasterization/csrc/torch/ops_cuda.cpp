@@ -135,14 +135,21 @@ struct Cuda {
                             [&] { cuda::backward(own, gradients, how, memory); });
   }
 
+  // The frame of a rendering that is walked again, what it saved not yet in it.
+  template <class S>
+  static cuda::Frame<S> frame(const at::Tensor& radii, const RasterConfig<S>& config, const Options& options) {
+    cuda::Frame<S> frame;
+    frame.inputs.num_gaussians = radii.numel();
+    frame.config = config;
+    frame.images.radii = mutable_data<int32_t>(radii);
+    set_image(frame.camera, options);
+    return frame;
+  }
+
   template <class S>
   static void contributions(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
                             const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
-    cuda::Frame<S> own;
-    own.inputs.num_gaussians = radii.numel();
-    own.config = config;
-    own.images.radii = mutable_data<int32_t>(radii);
-    set_image(own.camera, options);
+    auto own = frame<S>(radii, config, options);
     const cuda::Run how = run(options, nullptr);
     auto sizes = cuda::saved_sizes(own, how);
     sizes.num_features = -1;
@@ -154,11 +161,7 @@ struct Cuda {
   template <class S>
   static void importance(const at::Tensor& gate_sum, const at::Tensor& radii, const Saved& saved,
                          const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
-    cuda::Frame<S> own;
-    own.inputs.num_gaussians = radii.numel();
-    own.config = config;
-    own.images.radii = mutable_data<int32_t>(radii);
-    set_image(own.camera, options);
+    auto own = frame<S>(radii, config, options);
     const cuda::Run how = run(options, nullptr);
     own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
     own.saved.gate_sum = mutable_data<S>(gate_sum);

@@ -4,6 +4,8 @@ import sys
 import time
 from pathlib import Path
 
+COMMAND = [sys.executable, "-m", "diff_smoe_rasterization", "bench"]
+
 
 def tiny_suite(scene):
     """What a suite file says: two cells of twelve steps, done in seconds."""
@@ -13,10 +15,6 @@ def tiny_suite(scene):
                                                      "densification_interval": 4}},
             "scenes": [{"name": "tiny", "path": scene}], "methods": [{"name": "native"}],
             "blend_modes": ["alpha", "smoe"], "densify_grad_thresholds": [0.005]}
-
-
-def command(*words):
-    return [sys.executable, "-m", "diff_smoe_rasterization", *words]
 
 
 def python_that(says, folder):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from bench_commands import command, python_that, rows_of, tiny_suite, wait_for
+from bench_commands import COMMAND, python_that, rows_of, tiny_suite, wait_for
 from checkouts import environment
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
@@ -231,7 +231,7 @@ def running(content, tmp_path):
     content["protocol"].update(iterations=500, checkpoint_every=20, evaluate_every=0)
     content["protocol"]["options"] = {"densify_until_iter": 0}
     suite, results = write_suite({**content, "blend_modes": ["alpha"]}, tmp_path), tmp_path / "results"
-    run = started(command("bench", "run", suite, "-o", str(results)), tmp_path, stdout=subprocess.DEVNULL,
+    run = started([*COMMAND, "run", suite, "-o", str(results)], tmp_path, stdout=subprocess.DEVNULL,
                   stderr=subprocess.PIPE)
     wait_for(lambda: list(results.glob("cells/*/run/checkpoint.pt")), 120)
     folder, = results.glob("cells/*")
@@ -406,7 +406,7 @@ def test_cells_are_told_the_gpus_and_their_threads(content, tmp_path, monkeypatc
 def test_the_suite_smoke(tmp_path):
     """From end to end, as a user types it."""
     for words in (["run", "smoke", "-o", "results"], ["report", "results", "-o", "report"]):
-        subprocess.run(command("bench", *words), env=environment(), cwd=str(tmp_path), check=True)
+        subprocess.run([*COMMAND, *words], env=environment(), cwd=str(tmp_path), check=True)
     rows = rows_of(tmp_path / "results").values()
     for row in rows:
         halfway, = row["history"]

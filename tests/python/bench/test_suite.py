@@ -6,12 +6,11 @@ import pytest
 import yaml
 
 from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite import engine, expansion
+from diff_smoe_rasterization.benchmarks.suite import engine
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite, read_yaml
 from diff_smoe_rasterization.benchmarks.suite.protocol import config_of
 from diff_smoe_rasterization.benchmarks.suite.schema import THRESHOLDS
 
-SHIPPED = Path(expansion.__file__).parent / "shipped"
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 
 
@@ -71,9 +70,6 @@ def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
     assert all("budget" not in cell for cell in engine.chosen(cells, ["budget=0"]))
 
 
-SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "blend_modes": ["smoe"]}
-
-
 @pytest.mark.parametrize("change, words", [
     ({"blend_mode": ["alpha"]}, ["blend_mode", "allowed are background_gates, blend_modes"]),
     ({"blend_modes": ["smooth"]}, ["blend_modes[0]", "smooth"]),
@@ -97,7 +93,8 @@ SMOE_OF_ANOTHER = {"name": "3dgs-2023", "path": "p", "variant": "unpatched", "bl
     ({"methods": [{"name": "native"}, {"name": "native"}]}, ["methods[1].label", "native"]),
     ({"methods": [{"name": "native", "path": "native"}]}, ["methods[0].path", "is for checkouts"]),
     ({"methods": [{"name": "native", "budget": 5}]}, ["methods[0].budget", "taming and dbs"]),
-    ({"methods": [SMOE_OF_ANOTHER]}, ["methods[0].blend_modes", "its own blending"]),
+    ({"methods": [{"name": "3dgs-2023", "path": "p", "variant": "unpatched", "blend_modes": ["smoe"]}]},
+     ["methods[0].blend_modes", "its own blending"]),
     ({"methods": [{"name": "2dgs", "path": "p", "variant": "patched"}]}, ["methods[0].variant"]),
     ({"protocol": {"iterations": 0}}, ["protocol.iterations"]),
     ({"protocol": {"gpus": 2, "device": "cpu"}}, ["protocol.gpus is 2; it needs protocol.device: cuda"]),
@@ -203,7 +200,7 @@ def somewhere(monkeypatch):
         monkeypatch.setenv(variable, "/somewhere")
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in SHIPPED.glob("*.yaml")))
+@pytest.mark.parametrize("name", sorted(path.stem for path in (BENCHMARKS / "suite/shipped").glob("*.yaml")))
 def test_shipped_suites_are_valid(name, somewhere):
     suite = load_suite(find_suite(name))
     assert suite.name == name and suite.cells

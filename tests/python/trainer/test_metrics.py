@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from diff_smoe_rasterization.losses import fused_ssim
+from diff_smoe_rasterization.trainer.errors import TrainerError
+from diff_smoe_rasterization.trainer.results.evaluation import summary
 from diff_smoe_rasterization.trainer.results.metrics import image_metrics, masked_ssim, psnr, quantised
 
 
@@ -61,3 +63,17 @@ def test_masked_ssim_is_that_of_the_masked_pair_over_the_kept_pixels():
     assert metrics["ssim"] == pytest.approx(float(fused_ssim(*quantised_pair)), abs=1e-5)
     assert metrics["psnr"] == pytest.approx(psnr(*quantised_pair), abs=1e-9)  # the same doubles in another order
     assert metrics["psnr_float"] == pytest.approx(psnr(*inside), abs=1e-9)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_rendering_with_a_pixel_that_is_no_number_has_no_figures(value):
+    """One such pixel is enough; the view is named."""
+    target = torch.full((3, 24, 32), 51 / 255)
+    broken = target.clone()
+    broken[1, 3, 4] = value
+    one, two = ({"name": name, "milliseconds": 1.0, **image_metrics(image, target)}
+                for name, image in (("one", target), ("two", broken)))
+    assert all(math.isnan(two[name]) for name in ("psnr", "ssim", "psnr_float"))
+    with pytest.raises(TrainerError, match="^the rendering of two has NaN or infinite pixels$"):
+        summary([one, two])
+    assert summary([one]).metrics["psnr"] == math.inf
