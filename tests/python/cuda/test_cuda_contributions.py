@@ -7,7 +7,7 @@ from comparison import assert_close
 from devices import random_normal
 from scenes import gate_of, random_scene, with_gate, with_gates
 from test_cuda_against_cpu import SCENES, selected
-from test_cuda_graphs import SLEEP, WARM_UP, list_size, own_width, scene_of
+from test_cuda_graphs import SLEEP, graph_of, list_size, own_width, result_while_busy, scene_of
 
 from diff_smoe_rasterization import Contributions, rasterize_with_splats
 
@@ -88,16 +88,7 @@ def test_lists_that_are_outgrown(mode, gpu):
         rendering, splats = rasterize_with_splats(settings=held.settings, **held.inputs)
         return rendering.radii, splats.centers, splats.depths, splats.contributions(pixel_weights)
 
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        for _ in range(WARM_UP):
-            step()
-            torch.cuda.synchronize()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        results = step()
+    graph, results = graph_of(step)
     room = list_size(small, gpu)[0]
     assert list_size(larger, gpu)[1] > room, "nothing is outgrown"
     for scene in (small, larger, small):
@@ -122,20 +113,7 @@ def test_the_host_waits_for_nothing(mode, gpu):
         rendering, splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)
         return splats.centers, splats.depths, splats.contributions(pixel_weights)
 
-    for _ in range(WARM_UP):
-        step()
-        torch.cuda.synchronize()
-    kept = [step() for _ in range(2)]  # so that no memory has to be made below
-    expected = kept[0][2].pixels.clone()
-    del kept
-    torch.cuda.synchronize()
-    awake = torch.cuda.Event()
-    torch.cuda._sleep(SLEEP)
-    awake.record()
-    result = step()
-    assert not awake.query(), "the sums waited for the GPU"
-    torch.cuda.synchronize()
-    assert torch.equal(result[2].pixels, expected)
+    assert torch.equal(result_while_busy(step)[2].pixels, step()[2].pixels)
 
 
 def test_another_stream_and_no_gaussians(mode, gpu):

@@ -6,7 +6,7 @@ import torch
 from comparison import assert_all_close
 from devices import random_normal
 from scenes import gradients, random_scene, with_gate
-from test_cuda_graphs import TrainingStep, list_size, own_width
+from test_cuda_graphs import TrainingStep, graph_of, list_size, own_width
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -73,7 +73,7 @@ def test_a_captured_graph_that_outgrew_its_lists(mode, outputs, degree, width, d
     small = random_scene(mode, 20_000, width, 151, scale=0.004, opacity=(0.02, 0.2), degree=degree, dtype=dtype)
     larger = small.with_inputs(scales=small.inputs["scales"] * 30)
     step = TrainingStep(small.with_settings(deterministic=True), gpu, outputs, dtype)
-    graph, results = step.captured()
+    graph, results = graph_of(step)
     room = list_size(small, gpu)[0]
     assert list_size(larger, gpu)[1] > room, "nothing is outgrown"
     expected = TrainingStep(larger.with_settings(deterministic=True), gpu, outputs, dtype)()

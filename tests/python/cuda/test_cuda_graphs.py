@@ -17,6 +17,40 @@ WARM_UP = 3  # calls; torch's own advice before a capture
 SLEEP = 2_000_000_000  # GPU cycles, about a second: far longer than the host needs to start one pass
 
 
+def warm_up(step):
+    for _ in range(WARM_UP):
+        step()
+        torch.cuda.synchronize()
+
+
+def graph_of(step):
+    """Returns a graph of one call and the tensors that its replay fills."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        warm_up(step)
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        results = step()
+    return graph, results
+
+
+def result_while_busy(step):
+    """Returns the result of a call that returns while the GPU is still busy with earlier work."""
+    warm_up(step)
+    kept = [step() for _ in range(2)]  # so that no memory has to be made below
+    del kept
+    torch.cuda.synchronize()
+    awake = torch.cuda.Event()
+    torch.cuda._sleep(SLEEP)
+    awake.record()
+    result = step()
+    assert not awake.query(), "the host waited for the GPU"
+    torch.cuda.synchronize()
+    return result
+
+
 class TrainingStep:
     """Forward and backward of a scene whose tensors stay where they are."""
 
@@ -41,23 +75,6 @@ class TrainingStep:
         values = {**scene.inputs, **scene.settings._asdict()}
         for name, leaf in self.scene.leaves().items():
             leaf.copy_(values[name])
-
-    def warm_up(self):
-        for _ in range(WARM_UP):
-            self()
-            torch.cuda.synchronize()
-
-    def captured(self):
-        """Returns a graph of one step and the tensors that its replay fills."""
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            self.warm_up()
-        torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            results = self()
-        return graph, results
 
 
 def assert_same(actual, expected):
@@ -89,7 +106,7 @@ def other_camera(scene, other):
                          ids=["harmonics", "dc", "channels"])
 def test_a_replayed_graph_equals_a_call(mode, options, gpu):
     step = TrainingStep(scene_of(mode, **options), gpu)
-    graph, results = step.captured()
+    graph, results = graph_of(step)
     first = scene_of(mode, **options)
     second = with_other_gate(scene_of(mode, seed=1, **options), 0.6)
     turned = with_other_gate(other_camera(first, scene_of(mode, position=(-3.0, 0.5, -2.0), **options)), 0.0)
@@ -125,7 +142,7 @@ def test_contents_that_outgrow_the_captured_lists(mode, outputs, degree, width, 
     larger = small.with_inputs(scales=small.inputs["scales"] * 30)
     in_one_tile = small.with_inputs(means3D=small.inputs["means3D"] * 1e-3)
     step = TrainingStep(small, gpu, outputs)
-    graph, results = step.captured()
+    graph, results = graph_of(step)
     room = list_size(small, gpu)[0]
     assert list_size(larger, gpu)[1] > room, "nothing is outgrown"
     for scene in (small, larger, small, in_one_tile, larger, small):
@@ -140,7 +157,7 @@ def test_a_graph_captured_while_nothing_is_visible(mode, gpu):
     scene = scene_of(mode)
     hidden = scene.with_inputs(means3D=scene.inputs["means3D"] + 30 * scene.settings.campos)
     step = TrainingStep(hidden, gpu)
-    graph, results = step.captured()
+    graph, results = graph_of(step)
     for contents in (scene, hidden, scene):
         expected = TrainingStep(contents, gpu)()
         step.set_to(contents.to(torch.float32))
@@ -153,7 +170,7 @@ def test_eager_calls_between_replays(mode, gpu):
     scene, other = scene_of(mode), TrainingStep(scene_of(mode, seed=3, num_gaussians=9000, scale=0.08), gpu)
     expected = TrainingStep(scene, gpu)()
     step = TrainingStep(scene, gpu)
-    graph, results = step.captured()
+    graph, results = graph_of(step)
     for _ in range(3):
         other()
         graph.replay()
@@ -164,7 +181,7 @@ def test_eager_calls_between_replays(mode, gpu):
 @with_gates
 def test_torch_sees_no_synchronisation(mode, gpu):
     step = TrainingStep(scene_of(mode), gpu)
-    step.warm_up()
+    warm_up(step)
     expected = step()
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
@@ -180,17 +197,7 @@ def test_torch_sees_no_synchronisation(mode, gpu):
 def test_the_host_waits_for_nothing(mode, gpu):
     """Synchronisations that torch does not know of: the GPU is still busy with earlier work when both passes return."""
     step = TrainingStep(scene_of(mode), gpu)
-    step.warm_up()
-    kept = [step() for _ in range(2)]  # so that no memory has to be made below
-    del kept
-    torch.cuda.synchronize()
-    awake = torch.cuda.Event()
-    torch.cuda._sleep(SLEEP)
-    awake.record()
-    result = step()
-    assert not awake.query(), "forward or backward waited for the GPU"
-    torch.cuda.synchronize()
-    assert_same(result, step())
+    assert_same(result_while_busy(step), step())
 
 
 @with_gate

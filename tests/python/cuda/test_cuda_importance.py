@@ -7,7 +7,7 @@ from comparison import assert_close
 from devices import random_normal
 from scenes import random_scene, with_gate, with_gates
 from test_cuda_against_cpu import SCENES, selected
-from test_cuda_graphs import SLEEP, WARM_UP, list_size, own_width, scene_of
+from test_cuda_graphs import SLEEP, graph_of, list_size, own_width, result_while_busy, scene_of
 
 from diff_smoe_rasterization import Importance, rasterize_with_splats
 
@@ -76,16 +76,7 @@ def test_lists_that_are_outgrown(mode, gpu):
     def step():
         return rasterize_with_splats(settings=held.settings, **held.inputs)[1].importance(*maps)
 
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        for _ in range(WARM_UP):
-            step()
-            torch.cuda.synchronize()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        results = step()
+    graph, results = graph_of(step)
     room = list_size(small, gpu)[0]
     assert list_size(larger, gpu)[1] > room, "nothing is outgrown"
     for scene in (small, larger, small):
@@ -106,18 +97,7 @@ def test_the_host_waits_for_nothing(mode, gpu):
     def step():
         return rasterize_with_splats(settings=scene.settings, **scene.inputs)[1].importance(*maps)
 
-    for _ in range(WARM_UP):
-        step()
-        torch.cuda.synchronize()
-    kept = [step() for _ in range(2)]  # so that no memory has to be made below
-    del kept
-    torch.cuda.synchronize()
-    awake = torch.cuda.Event()
-    torch.cuda._sleep(SLEEP)
-    awake.record()
-    step()
-    assert not awake.query(), "the sums waited for the GPU"
-    torch.cuda.synchronize()
+    result_while_busy(step)
 
 
 def test_another_stream_and_no_gaussians(mode, gpu):
