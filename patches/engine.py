@@ -204,7 +204,7 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
         if not os.access(target.parent, os.W_OK):
             raise PatchError(f"{target.parent}: you may not write in this folder; nothing was touched")
     try:
-        unfinished = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=root))  # of this process alone
+        unfinished = Path(tempfile.mkdtemp(prefix=UNFINISHED, suffix=f".{os.getpid()}", dir=root))
         for name, data in files.items():
             (unfinished / name).parent.mkdir(parents=True, exist_ok=True)
             (unfinished / name).write_bytes(data)
@@ -217,5 +217,6 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
         raise PatchError(f"{error.filename or root}: cannot be written: {error}; `dsmoe patch check {root}` says how "
                          "the checkout is") from None
     finally:
-        for unfinished in root.glob(UNFINISHED + "*"):
-            shutil.rmtree(unfinished, ignore_errors=True)
+        for folder in root.glob(UNFINISHED + "*"):  # but those of other processes that still run
+            if folder.suffix[1:] == str(os.getpid()) or not Path("/proc", folder.suffix[1:], "fd").exists():
+                shutil.rmtree(folder, ignore_errors=True)

@@ -25,7 +25,6 @@ from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 SPARSE_ADAM = "SparseGaussianAdam"
-RASTERIZES = re.compile(rb"(?m)^\s*(from|import) (diff_(gauss|surfel)|gsplat\b)")
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
@@ -64,13 +63,14 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     if not words:
         raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
     folders = _folders(words)
-    flavour, found, warnings = _flavour(folders, trainer)
+    files = {folder: _read(folder, everywhere=folder == folders[0]) for folder in folders}
+    flavour, found, warnings = _flavour(files, trainer)
     path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: flavour,
                    BACKGROUND_GATE_VARIABLE: "" if gate is None else str(gate), "PYTHONPATH": os.pathsep.join(path),
                    "PYTHONDONTWRITEBYTECODE": "1"}  # else Python leaves __pycache__ in the checkout
     warnings += facts.of_one_name(folders[0])
-    if _cannot_use_sparse_adam(folders):
+    if _cannot_use_sparse_adam(files):
         environment[WITHOUT_VARIABLE] = SPARSE_ADAM
         warnings += [f"{SPARSE_ADAM} is not offered: where it is found, the trainer reads get_features_dc of its model,"
                      " which has none"]
@@ -80,26 +80,25 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
                          "imports it says so", *(f"warning: {warning}" for warning in warnings)]
 
 
-def _flavour(folders: Sequence[Path], trainer: Optional[str]) -> Tuple[str, str, List[str]]:
+def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str]) -> Tuple[str, str, List[str]]:
     """Returns the flavour, for which trainer it was chosen, and what speaks against it."""
     by_name = {"": "", **{name: name for name in FLAVOURS}, **{known.name: known.flavour for known in TRAINERS}}
     if (trainer or "") not in by_name:
         raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
                          f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
     reasons, seen = [], False
-    for path in (folders[0] / RASTERIZER, folders[0] / f"{RASTERIZER}.py"):
+    for path in (next(iter(files)) / name for name in (RASTERIZER, f"{RASTERIZER}.py")):
         if path.exists():  # where Python looks first
             raise PatchError(f"{path} would be imported before this package's; move it away")
-    for folder in folders:
-        files = _files(folder, 3 if folder == folders[0] else 0)
-        found = facts.of_checkout(files) if GR in files else facts.of_files(files)
+    for folder, texts in files.items():
+        found = facts.of_checkout(texts) if GR in texts else facts.of_files(texts)
         seen = seen or bool(found)
         if facts.PATCHED in found:
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
         known, reason = facts.recognise(found)
         if known and not trainer:
-            return known.flavour, f"{known.name if (folder / GR).is_file() else 'the trainer'} in {folder}", []
+            return known.flavour, f"{known.name if GR in texts else 'the trainer'} in {folder}", []
         if trainer and (facts.those(found, "uses ") or found and not facts.those(found, "from ")):
             raise PatchError(f"{folder}: {reason}; --trainer {trainer} cannot help")
         if known and known.flavour != by_name[trainer or ""]:
@@ -110,7 +109,7 @@ def _flavour(folders: Sequence[Path], trainer: Optional[str]) -> Tuple[str, str,
         return by_name[trainer], trainer, reasons or [f"no file that imports {module} was found"] * (not seen)
     raise PatchError("no trainer that is known was found; name it with --trainer, or the rasterizer whose API it calls "
                      f"({', '.join(FLAVOURS)}):\n  " + "\n  ".join(
-                         reasons or [f"there is no {GR} in {', '.join(map(str, folders))}"]))
+                         reasons or [f"there is no {GR} in {', '.join(map(str, files))}"]))
 
 
 def _folders(words: Sequence[str]) -> List[Path]:
@@ -120,16 +119,18 @@ def _folders(words: Sequence[str]) -> List[Path]:
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
-def _files(folder: Path, depth: int) -> Dict[str, bytes]:
-    """Returns the files of a checkout like that of 3DGS, else the files that rasterize, `depth` folders deep."""
-    is_checkout = (folder / GR).is_file()
-    paths = [path for pattern in ("*.py", "*/*.py", "*/*/*.py")[:2 if is_checkout else depth]
-             for path in folder.glob(pattern) if path.is_file() and not {"submodules", "site-packages"} & {*path.parts}]
-    files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
-    return {name: data for name, data in files.items() if is_checkout or RASTERIZES.search(data)}
+def _read(folder: Path, everywhere: bool) -> Dict[str, bytes]:
+    """Returns the files of a checkout like that of 3DGS, else, if so asked, all that import a rasterizer."""
+    of_3dgs = (folder / GR).is_file()
+    patterns = ("*.py", "*/*.py", "*/*/*.py")[:2 if of_3dgs else 3 * everywhere]
+    paths = (path for pattern in patterns for path in folder.glob(pattern) if path.is_file())
+    files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths
+             if not {"submodules", "site-packages"} & set(path.parts)}
+    return {name: data for name, data in files.items() if of_3dgs or re.search(
+        rb"^\s*(from|import) (diff_(gauss|surfel)|gsplat\b)", data, re.MULTILINE)}
 
 
-def _cannot_use_sparse_adam(folders: Sequence[Path]) -> bool:
+def _cannot_use_sparse_adam(files: Dict[Path, Dict[str, bytes]]) -> bool:
     """Whether the trainer reads get_features_dc, as 3DGS does where it finds SparseGaussianAdam, and defines none."""
-    text = b"\n".join(next((_files(folder, 0) for folder in folders if (folder / GR).is_file()), {}).values())
+    text = b"\n".join(next((texts for texts in files.values() if GR in texts), {}).values())
     return b".get_features_dc" in text and not re.search(rb"def get_features_dc|\bget_features_dc *=", text)

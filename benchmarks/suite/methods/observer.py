@@ -33,6 +33,7 @@ def main():
     parser.add_argument("--renders")
     parser.add_argument("--stub", default="")
     parser.add_argument("--no-pictures", action="store_true")
+    parser.add_argument("--no-lpips", action="store_true")
     parser.add_argument("--hold-out", action="store_true")
     parser.add_argument("--model-renders", metavar="ATTRIBUTE")
     options = parser.parse_args(words[:split])
@@ -48,6 +49,8 @@ def main():
         import torchvision.utils
 
         torchvision.utils.save_image = lambda *arguments, **keywords: None
+    if options.no_lpips:
+        without_lpips()
     shift_seeds(options.seed)
     views = watch_renderings(options.renders) if options.renders and not options.model_renders else {}
     scenes = watch_scenes(options.hold_out) if options.model_renders else []
@@ -232,6 +235,19 @@ class AbsentFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def exec_module(self, module):
         pass
+
+
+def without_lpips():
+    """A trainer's own LPIPS is NaN, so that nothing is downloaded: the renderings are measured elsewhere."""
+    import torch
+
+    class LPIPS(torch.nn.Module):
+        def forward(self, image, *others, **keywords):
+            return torch.full((1, 1, 1, 1), float("nan"), device=image.device)
+
+    for name in ("lpips", "lpipsPyTorch"):
+        module = sys.modules[name] = types.ModuleType(name)
+        module.LPIPS, module.lpips = lambda *words, **keywords: LPIPS(), LPIPS().forward
 
 
 def stub(name):

@@ -161,6 +161,18 @@ def test_views_are_held_out_and_rendered_by_the_model_itself(tmp_path, monkeypat
     assert np.load(found["a"]["file"]).shape == np.load(found["a"]["truth"]).shape == (3, 2, 3)
 
 
+def test_a_trainer_whose_lpips_has_no_weights_ends(tmp_path):
+    """As HAC and HAC++ call it; where there is no network, the download of weights is an error."""
+    script, record = tmp_path / "train.py", tmp_path / "record.json"
+    script.write_text("import lpips as of_plus, torch\nfrom lpipsPyTorch import lpips\nimage = torch.zeros(3, 2, 2)\n"
+                      "values = [of_plus.LPIPS(net='vgg').to('cpu')(image, image, normalize=False),\n"
+                      "          lpips(image, image, net_type='vgg')]\n"
+                      "assert all(value.detach().mean().double().isnan() for value in values)\n")
+    words = [sys.executable, observer.__file__, record, "--seed", 0, "--iterations", 1, "--no-lpips", "--", script]
+    subprocess.run([str(word) for word in words], check=True)
+    assert shapes.HAC.observed == ("--no-lpips",)
+
+
 def test_what_comes_before_a_rendering_is_a_part_of_its_time(tmp_path, monkeypatch):
     """HAC asks beforehand which anchors are visible. What is rendered for gradients is not kept."""
     slow, view = [], SimpleNamespace(image_name="a", original_image=torch.zeros(3, 2, 3))

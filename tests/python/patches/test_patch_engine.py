@@ -4,6 +4,7 @@ from __future__ import annotations
 import ast
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -244,9 +245,17 @@ def test_a_script_that_cannot_begin_with_an_option_is_named(tmp_path):
 
 
 def test_two_at_once_do_not_share_new_files(tmp_path, monkeypatch):
-    """The second is killed in the middle of a new file, before the first puts its own in place."""
+    """The second is killed in the middle of a new file, before the first puts its own in place.
+
+    Both let be what a third that runs has begun. What one left that runs no more goes.
+    """
     replace = os.replace
     make(tmp_path)
+    with subprocess.Popen(["true"]) as ended:
+        pass
+    of_a_third, left = (tmp_path / f"{engine.UNFINISHED}abc.{number}" for number in (os.getppid(), ended.pid))
+    of_a_third.mkdir()
+    left.mkdir()
 
     def first(*arguments):
         monkeypatch.setattr(os, "replace", replace)
@@ -258,7 +267,7 @@ def test_two_at_once_do_not_share_new_files(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "replace", first)
     patches.apply(tmp_path)
     assert {name: (tmp_path / name).read_text() for name in PATCHED} == PATCHED
-    assert not list(tmp_path.glob(".*"))
+    assert list(tmp_path.glob(".*")) == [of_a_third]
 
 
 def test_a_folder_that_may_not_be_written_is_named_before_anything_is(tmp_path, monkeypatch):

@@ -1,25 +1,30 @@
 """Where a patched trainer's blend mode and background gate come from."""
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections import namedtuple
 from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 
 from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings
 from diff_smoe_rasterization.patches import runtime
 from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED
+from diff_smoe_rasterization.settings import resolve_blend
 
 ALPHA = {"blend_mode": "alpha", "background_gate": None}
 
 
 @pytest.fixture(autouse=True)
-def no_earlier_warning(monkeypatch):
+def a_process_of_its_own(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py"])
     runtime._warn.cache_clear()
     runtime.say.cache_clear()
+    with mock.patch.dict(os.environ):
+        yield
 
 
 def run(mode, gate="", **more):
@@ -48,6 +53,16 @@ def test_the_blend_of_a_run(mode, variable, monkeypatch):
             warnings.simplefilter("error")
             assert runtime.blend_of(dataset) == {"blend_mode": mode, "background_gate": gate}
         assert (dataset.blend_mode, dataset.background_gate) == (mode, gate)  # what is saved of it
+
+
+@pytest.mark.parametrize("mode, gate", [("smoe", 0.25), ("smoe_tn", 0), ("alpha", 1)])
+def test_settings_that_name_no_mode_have_that_of_the_run(mode, gate, monkeypatch):
+    """Somebody may delete the patch's line in the renderer; what stderr says is what is rendered."""
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe_std")
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.5")
+    runtime.blend_of(run(mode, "0.25" if mode == "smoe" else ""))
+    nameless = GaussianRasterizationSettings._field_defaults
+    assert resolve_blend(SimpleNamespace(**nameless)) == (mode, gate)
 
 
 def test_a_gate_that_is_typed_wins(monkeypatch):
