@@ -12,6 +12,7 @@ from checkouts import contents
 from tiny import ARGS, CHECKOUT, GR, MARK, PATCHED, RENDER, RENDERER, TRAIN, make, refused
 
 from diff_smoe_rasterization import patches
+from diff_smoe_rasterization.patches import engine
 
 NOBODY = 65534
 
