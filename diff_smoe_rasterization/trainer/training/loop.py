@@ -131,12 +131,13 @@ class Trainer:
         view = self.scene.train[self.order.next()]
         color = torch.rand(3, device=config.device) if config.random_background else None
         if self._passes is None:
-            passes = DirectPasses if self.direct and not self.strategy.uses_gradients else AutogradPasses
+            passes = DirectPasses if self.direct else AutogradPasses
             self._passes = passes(model, self.optimizer, self.renderer)
         rendering, means2D = self._passes.render(view.camera, color, self.gate() if self.gate else None)
         target = self.target_of(view, color)
         loss, gradient = self.loss_of(view, target, rendering.color.detach())
-        step = Step(self.iteration, view, target, rendering, self._passes.splats, means2D, loss)
+        step = Step(self.iteration, view, target, rendering, self._passes.splats, means2D, loss,
+                    self._passes.add_gradient)
         self.strategy.before_backward(step)
         self._passes.backward(gradient)
         if before_change:

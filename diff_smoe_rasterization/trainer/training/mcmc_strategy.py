@@ -26,8 +26,6 @@ GROWTH_ENDS = 5 / 3  # of densify_until_iter: 25,000
 class MCMCStrategy(Strategy):
     """Relocates dead Gaussians to others in a way that keeps the image, grows to the budget, explores by noise."""
 
-    uses_gradients = True
-
     def __init__(self, context: StrategyContext) -> None:
         super().__init__(context)
         with torch.no_grad():
@@ -36,9 +34,8 @@ class MCMCStrategy(Strategy):
 
     def after_backward(self, step: Step) -> None:
         """Adds the gradients of the two regularisers, which are means over the Gaussians."""
-        raw, (opacities, scales, _) = self.context.model.raw, self.context.model.activated()
-        raw["opacities"].grad += OPACITY_WEIGHT / opacities.numel() * opacities * (1 - opacities)
-        raw["scales"].grad += SCALE_WEIGHT / scales.numel() * scales
+        for name, weight in (("opacities", OPACITY_WEIGHT), ("scales", SCALE_WEIGHT)):
+            step.add_gradient(name, weight / self.context.model.stored[name].numel())
 
     def after_step(self, step: Step) -> None:
         config = self.context.config
@@ -82,7 +79,7 @@ class MCMCStrategy(Strategy):
     def shake(self) -> None:
         """Adds noise to the positions, in the shape of each Gaussian and where it is faint (Eq. 8)."""
         opacities, scales, rotations = self.context.model.activated()
-        means = self.context.model.raw["means3D"]
+        means = self.context.model.stored["means3D"]
         axes = quaternion_to_matrix(rotations) * scales.unsqueeze(1)
         faint = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - opacities))
         noise = faint * (NOISE_RATE * self.context.optimizer.position_rate) * torch.randn_like(means)

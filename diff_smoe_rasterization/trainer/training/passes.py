@@ -2,7 +2,7 @@
 
 Both give the same numbers. `DirectPasses` is for a GPU, where a step is bound by memory traffic and by Python: it steps
 spherical harmonics lazily, makes one pass of activations and Adam, and writes no gradient of what was not seen.
-`AutogradPasses` takes any rasterizer, and leaves every gradient where a strategy can change it.
+`AutogradPasses` takes any rasterizer.
 """
 from __future__ import annotations
 
@@ -60,6 +60,12 @@ class AutogradPasses:
         self._splats = None  # which holds on to memory
         self._color.backward(dL_dcolor)
 
+    @torch.enable_grad()
+    def add_gradient(self, name: str, number: float) -> None:
+        """Adds a number to the gradient by every opacity, scale or rotation (the parameter's name); after backward."""
+        value = self.model.activated()[ACTIVATED.index(name)]
+        value.backward(torch.full_like(value, number))
+
     def update(self) -> None:
         """Steps what has not been replaced since `render`."""
         self.optimizer.step()
@@ -94,7 +100,7 @@ class DirectPasses:
             rotations=self._values[2], **colors)
         lazy.catch_up(self._direct.visible_radii())
         rendering = self._direct.render()
-        self._radii = rendering.radii
+        self._radii = self._stepped = rendering.radii
         return rendering, self._means2D
 
     def splats(self) -> Splats:
@@ -117,6 +123,13 @@ class DirectPasses:
         if self._gate is not None:
             with torch.enable_grad():
                 self._gate.backward(gradients["background_gate"])
+
+    def add_gradient(self, name: str, number: float) -> None:
+        if self._stepped is self._radii:  # rows that were not seen hold anything
+            for gradient in self._gradients.values():
+                gradient.masked_fill_((self._radii <= 0).unsqueeze(1), 0)
+            self._stepped = torch.ones_like(self._radii)
+        self._gradients[name] += number
 
     @torch.no_grad()
     def update(self) -> None:
@@ -143,12 +156,12 @@ class DirectPasses:
             states.append(state)
         _OPS.gaussian_adam(raw, self._values, [self._gradients[name] for name in GEOMETRY],
                            [state["exp_avg"] for state in states], [state["exp_avg_sq"] for state in states],
-                           self._radii, rates, root_scales, beta1, beta2, group["eps"])
+                           self._stepped, rates, root_scales, beta1, beta2, group["eps"])
         self._made_of = [(tensor, tensor._version) for tensor in raw[1:]]
 
     def _step_some(self, same: Set[str]) -> None:
         """Where an opacity reset has replaced a parameter: the others are stepped by the dense optimizer."""
-        unseen = (self._radii <= 0).unsqueeze(1)
+        unseen = (self._stepped <= 0).unsqueeze(1)
         gradients = {name: gradient.masked_fill(unseen, 0) for name, gradient in self._gradients.items()}
         raw = _OPS.activate_backward([self.model.stored[name] for name in ACTIVATED], self._values,
                                      *(gradients[name] for name in ACTIVATED))

@@ -74,6 +74,7 @@ class Step(StepClock):
     splats: Callable[[], Splats]  # of the rendering; before backward
     means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H) where radii > 0
     loss: torch.Tensor
+    add_gradient: Callable[[str, float], None]  # to that by every opacity, scale or rotation; after backward
     batch: int = 1
 
     def seen(self) -> Iterable[Seen]:
@@ -106,8 +107,6 @@ class Strategy:
     Hooks run in this order in each step; rows may be added or removed in the last two (through the optimizer), which
     the last iteration of a run leaves out.
     """
-
-    uses_gradients = False  # whether after_backward reads or changes the .grad of parameters, which else have none
 
     def __init__(self, context: StrategyContext) -> None:
         """May change the first Gaussians; a resumed run replaces them and loads the state."""

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from diff_smoe_rasterization.trainer.errors import ConfigError
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.training.loop import Trainer, train
 from diff_smoe_rasterization.trainer.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
+from diff_smoe_rasterization.trainer.training.passes import AutogradPasses
 
 
 def trainer_of(config, **options):
@@ -226,10 +228,9 @@ def test_mcmc_regularises_opacities_and_scales(tiny_config):
     raw = trainer.model.raw
     expected = (OPACITY_WEIGHT * raw["opacities"].sigmoid().mean() + SCALE_WEIGHT * raw["scales"].exp().mean())
     gradients = torch.autograd.grad(expected, [raw["opacities"], raw["scales"]])
-    for name in ("opacities", "scales"):
-        raw[name].grad = torch.zeros_like(raw[name])
+    passes = AutogradPasses(trainer.model, trainer.optimizer, trainer.renderer)
     with torch.no_grad():
-        trainer.strategy.after_backward(None)
+        trainer.strategy.after_backward(SimpleNamespace(add_gradient=passes.add_gradient))
     torch.testing.assert_close(raw["opacities"].grad, gradients[0])
     torch.testing.assert_close(raw["scales"].grad, gradients[1])
 

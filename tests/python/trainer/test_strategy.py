@@ -56,7 +56,7 @@ def observed_step(context, iteration, gradients, radii=None):
     values = torch.tensor(gradients)
     means2D.grad = torch.stack([0.6 * values, -0.8 * values, torch.full_like(values, 99.0)], dim=1)
     radii = torch.ones(len(gradients), dtype=torch.int32) if radii is None else torch.tensor(radii, dtype=torch.int32)
-    return Step(iteration, None, None, Rendering(torch.zeros(3, 1, 1), radii), None, means2D, torch.zeros(()))
+    return Step(iteration, None, None, Rendering(torch.zeros(3, 1, 1), radii), None, means2D, torch.zeros(()), None)
 
 
 def run(strategy, *arguments, **keywords):
