@@ -78,6 +78,51 @@ TYPED_TEST(GateOfMode, SquaredReachBoundsExactlyThePairsThatCount) {
   expect_squared_reach_is_exact<TypeParam::value>(1e-13);
 }
 
+// The gate by its binary logarithm against the gate by the exponent, at squared distances that are not within `margin`
+// of the reach, where rounding decides. tolerance: of o G, relative.
+template <BlendMode kMode, class S> void expect_log_gate_is_the_gate(S margin, S tolerance) {
+  Random random(3);
+  int counted = 0, cut = 0;
+  for (const S opacity : test_opacities<S>()) {
+    const S least_alpha = S(random.log_uniform(1e-5, 0.1)), dx = S(random.uniform(-9, 9));
+    const S xx = S(random.log_uniform(1e-2, 1)), yy = S(random.log_uniform(1e-2, 1));
+    const Sym2<S> conic = {xx, S(random.uniform(-0.9, 0.9)) * std::sqrt(xx * yy), yy};
+    const S reach = squared_reach(Blend<kMode>::kCut, opacity, least_alpha);
+    const LogGate<S> log_gate(conic, opacity, reach);
+    for (const S dy : {S(-9), S(-2), S(-0.5), S(0), S(1), S(5)}) {
+      const S power = ColumnExponent<S, S>(conic, dx).at(dy);
+      const auto expected = evaluate_gate<kMode>(power, opacity, least_alpha);
+      const auto gate = log_gate.evaluate(log_gate.column(dx).at(dy));
+      if (std::abs(S(-2) * power - reach) < margin) continue;
+      EXPECT_EQ(gate.counts, expected.counts) << "opacity " << opacity << " power " << power << " reach " << reach;
+      (expected.counts ? counted : cut) += 1;
+      if (!expected.counts) continue;
+      EXPECT_NEAR(gate.logit, expected.logit, tolerance * expected.logit);
+      EXPECT_NEAR(gate.alpha, expected.alpha, tolerance * expected.alpha);
+    }
+  }
+  EXPECT_GT(counted, 100);
+  EXPECT_GT(cut, 100);
+}
+
+// Exponents of pairs that count, and their terms, are up to some 30 times the result's last digit; margins as above,
+// and the terms are up to 100.
+TYPED_TEST(GateOfMode, LogGateIsTheGate) {
+  expect_log_gate_is_the_gate<TypeParam::value>(1e-4f, 2e-5f);
+  expect_log_gate_is_the_gate<TypeParam::value>(1e-12, 4e-14);
+}
+
+// Where the form is no ellipse the exponent may be positive: such a pair does not count, and has no infinite gate that
+// matters. Nor does a pair of a Gaussian that reaches no pixel.
+TYPED_TEST(GateOfMode, LogGateLeavesOutPositiveExponents) {
+  const LogGate<double> no_ellipse({0.5, 2.0, 0.5}, 0.9, 11.0);
+  EXPECT_GT((ColumnExponent<double, double>(Sym2<double>{0.5, 2.0, 0.5}, 30.0).at(-30.0)), 0);
+  EXPECT_FALSE(no_ellipse.evaluate(no_ellipse.column(30.0).at(-30.0)).counts);
+  EXPECT_TRUE(no_ellipse.evaluate(no_ellipse.column(0.0).at(0.0)).counts);
+  const LogGate<double> none({0.5, 0.0, 0.5}, 0.9, -1.0);
+  EXPECT_FALSE(none.evaluate(none.column(0.0).at(0.0)).counts);
+}
+
 template <class S> void expect_the_threshold_is_inclusive() {
   const S cut = S(kAlphaCut);
   EXPECT_EQ(squared_reach(Cut::kAlpha, cut, S(0)), 0);

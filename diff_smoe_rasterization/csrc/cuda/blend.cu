@@ -62,16 +62,16 @@ template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
     }
   }
 
-  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged) {
+  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged, const int32_t&) {
     const auto gaussian = staged;
-    const ColumnExponent<S, S> exponent(gaussian.conic, S(tile.x) - gaussian.mean.x);
-    const S dy = S(tile.y) - gaussian.mean.y, least_alpha = cut.of(gaussian.opacity);
+    const auto exponent = gaussian.gate.column(S(tile.x) - gaussian.mean.x);
+    const S dy = S(tile.y) - gaussian.mean.y;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto gate = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
+      const auto gate = gaussian.gate.evaluate(exponent.at(below(dy, k)));
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
       for (int f = 0; f < kSums; ++f) pixels.sums[k][f] = fma(pair.weight, gaussian.features[f], pixels.sums[k][f]);
-      pixels.last[k] = pair.contributes ? gaussian.position + 1 : pixels.last[k];
+      pixels.last[k] = pair.contributes ? gaussian.seen : pixels.last[k];
     }
   }
 
@@ -84,7 +84,6 @@ template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
   const BlendArguments<S>& arguments;
   const WarpTile<S>& tile;
   BlendedPixels<S, kSums>& pixels;
-  AlphaCut<S> cut;
   int32_t next_segment;  // where the next segment begins; beyond the list where it is not noted in segments
 };
 
@@ -102,7 +101,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   }
   using Visitor = BlendVisitor<S, kMode, kSums>;
   const bool segments = Visitor::kInSegments && has_segments(arguments.saved, tile);
-  Visitor visitor = {arguments, tile, blended, config.alpha_cut(), segments ? kSegmentLength : INT32_MAX};
+  Visitor visitor = {arguments, tile, blended, segments ? kSegmentLength : INT32_MAX};
   const unsigned met = walk_tile(stage, {0, tile.source.length, first_feature}, visitor);
   if (Visitor::kInSegments && segments) {
     // Where pixels do not stop, the backward pass walks the whole list.

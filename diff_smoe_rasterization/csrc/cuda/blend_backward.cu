@@ -48,16 +48,17 @@ template <class S> struct ScaledGradients<S, kAnyFeatures> {
 // the other rows hold what an earlier one left; nobody takes their sums. kRecord: numbers of a record.
 template <int kRecord, class Sink>
 __device__ void add_batch(const Sink& sink, const WarpTile<float>& tile, const TensorStage& stage,
-                          const TensorBasis& basis, const StagedGaussian<float, true>* gaussians, int count) {
+                          const TensorBasis& basis, const StagedGaussian<float, true>* gaussians,
+                          const int32_t* numbers, int count) {
   __syncwarp();
   TensorSums sums = sum_pixels(stage, basis, tile.lane);
   const TensorLane at(tile.lane);
-  const StagedPlace<float> place = gaussians[at.row];
-  recentre(sums, {tile.rect.x0 + kWarpTileCentre - place.mean.x, tile.rect.y0 + kWarpTileCentre - place.mean.y},
-           tile.lane);
+  const Vec2<float> mean = gaussians[at.row].mean;
+  const int32_t number = numbers[at.row];
+  recentre(sums, {tile.rect.x0 + kWarpTileCentre - mean.x, tile.rect.y0 + kWarpTileCentre - mean.y}, tile.lane);
   __syncwarp();
   if (at.row >= count || at.column >= kFastFeatures) return;
-  sink.to_record(place.gaussian, kRecord, 2 * at.column, [&](auto add) {
+  sink.to_record(number, kRecord, 2 * at.column, [&](auto add) {
     add(0, sums.moments[0]);
     add(1, sums.moments[1]);
     add(kNumGateMoments - at.column, sums.feature);
@@ -122,25 +123,28 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
 
   __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged) {
+  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged, const int32_t& number) {
     const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
-    const ColumnExponent<S, S> exponent(gaussian.conic, dx);
-    const S least_alpha = cut.of(gaussian.opacity);
+    const auto exponent = gaussian.gate.column(dx);
     Gate<S> gate[kLanePixels];
     bool contributes[kLanePixels], any = false;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      gate[k] = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
-      contributes[k] = gate[k].counts && gaussian.position < pixels.last[k];
+      gate[k] = gaussian.gate.evaluate(exponent.at(below(dy, k)));
+      contributes[k] = gate[k].counts && gaussian.seen <= pixels.last[k];
       any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
     }
     // By tensor cores every Gaussian has its row, also the few that touch no pixel.
     if (!kTensor && !__any_sync(kAllLanes, any)) return;
 
-    const int32_t index = gaussian.gaussian;
-    const S* features = arguments.saved.features + int64_t(index) * feature_stride(num_features());
-    const auto feature = [&](int f) { return kFeatures != kAnyFeatures ? gaussian.features[f] : features[f]; };
+    const auto feature = [&](int f) {
+      if constexpr (kFeatures != kAnyFeatures) {
+        return gaussian.features[f];
+      } else {
+        return arguments.saved.features[int64_t(number) * feature_stride(num_features()) + f];
+      }
+    };
     S weight[kLanePixels], dL_dpower[kLanePixels];
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
@@ -153,31 +157,33 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
       dL_dpower[k] = pair.power;
     }
     if (is_absolute() && (!kTensor || __any_sync(kAllLanes, any))) {
-      add_absolute(dL_dpower, gaussian.conic, dx, dy, index);
+      add_absolute(dL_dpower, gaussian.gate.factors, dx, dy, number);
     }
     if constexpr (kTensor) {
       row->values[tile.lane] = make_float4(dL_dpower[0], weight[0], dL_dpower[1], weight[1]);
       ++row;
     } else {
-      add_by_shuffles(dL_dpower, weight, dx, dy, index);
+      add_by_shuffles(dL_dpower, weight, dx, dy, number);
     }
   }
 
-  __device__ __forceinline__ void end_visits(const StagedGaussian<S, true>* gaussians, int count) {
+  __device__ __forceinline__ void end_visits(const StagedGaussian<S, true>* gaussians, const int32_t* numbers,
+                                             int count) {
     if constexpr (kTensor) {
-      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, gaussians, count);
+      add_batch<kRecord>(sink, tile, tensors.stage, tensors.moment_basis, gaussians, numbers, count);
       row = tensors.stage.rows;
     }
   }
 
-  __device__ __forceinline__ void add_absolute(const S (&dL_dpower)[kLanePixels], const ExponentFactors<S>& conic, S dx,
-                                               S dy, int32_t index) {
+  // factors: times log2(e).
+  __device__ __forceinline__ void add_absolute(const S (&dL_dpower)[kLanePixels], const ExponentFactors<S>& factors,
+                                               S dx, S dy, int32_t index) {
     S sums[kNumAbsoluteSums] = {};
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto by_mean = power_by_mean(conic, dx, below(dy, k));
-      sums[0] += abs(dL_dpower[k] * by_mean.x);
-      sums[1] += abs(dL_dpower[k] * by_mean.y);
+      const auto by_mean = power_by_mean(factors, dx, below(dy, k));
+      sums[0] += abs(dL_dpower[k] * by_mean.x) * S(kLn2);
+      sums[1] += abs(dL_dpower[k] * by_mean.y) * S(kLn2);
     }
     add_values(sink, tile, sums, index, kNumGateMoments + num_features(), kNumAbsoluteSums);
   }
@@ -215,7 +221,6 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
   const WarpTile<S>& tile;
   BackwardPixels<S, kFeatures>& pixels;
   TensorShare tensors;
-  AlphaCut<S> cut;
   TensorRow* row;  // of the tensor stage, for the next Gaussian
 };
 
@@ -333,9 +338,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
 
   TensorStage& tensor_stage = tensor_stages[Visitor::kTensor ? warp : 0];
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
-  Visitor visitor = {
-      arguments,        arguments.sink, tile, pixels, {tensor_stage, moment_basis}, arguments.config.alpha_cut(),
-      tensor_stage.rows};
+  Visitor visitor = {arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, tensor_stage.rows};
   const unsigned met = walk_tile<S>(stages[warp], range, visitor);
   count_pairs(arguments, tile.lane, met);
 }

@@ -40,32 +40,30 @@ template <class S, BlendMode kMode> struct ContributionVisitor {
 
   __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const StagedGaussian<S, false>& staged) {
+  __device__ __forceinline__ void visit(const StagedGaussian<S, false>& staged, const int32_t& number) {
     const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
-    const ColumnExponent<S, S> exponent(gaussian.conic, dx);
-    const S least_alpha = cut.of(gaussian.opacity);
+    const auto exponent = gaussian.gate.column(dx);
     auto sum = no_contribution<S>();
     bool any = false;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
       const S pixel_dy = below(dy, k);
-      const auto gate = evaluate_gate<kMode>(exponent.at(pixel_dy), gaussian.opacity, least_alpha);
+      const auto gate = gaussian.gate.evaluate(exponent.at(pixel_dy));
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
-      const bool contributes = pair.contributes && gaussian.position < pixels.last[k];
+      const bool contributes = pair.contributes && gaussian.seen <= pixels.last[k];
       any |= contributes;
       add_pair(sum, contributes, pixels.weight[k], pair.weight, dx, pixel_dy);
     }
     if (!__any_sync(kAllLanes, any)) return;
     S numbers[kNumContributions] = {sum.pixel_weight, sum.pixels, sum.blend_weight, sum.distance};
     sum_pixels(numbers);
-    if (sum_pixels.holds) add_number(arguments.sums, gaussian.gaussian, sum_pixels.number, numbers[0]);
+    if (sum_pixels.holds) add_number(arguments.sums, number, sum_pixels.number, numbers[0]);
   }
 
   const ContributionArguments<S>& arguments;
   const WarpTile<S>& tile;
   ScoredPixels<S>& pixels;
-  AlphaCut<S> cut;
   TransposedSum<kNumContributions> sum_pixels;
 };
 
@@ -87,8 +85,7 @@ __global__ void __launch_bounds__(kWalkBlock)
     seen = seen > pixels.last[k] ? seen : pixels.last[k];
   }
   using Visitor = ContributionVisitor<S, kMode>;
-  Visitor visitor = {arguments, tile, pixels, arguments.config.alpha_cut(),
-                     TransposedSum<kNumContributions>(tile.lane)};
+  Visitor visitor = {arguments, tile, pixels, TransposedSum<kNumContributions>(tile.lane)};
   walk_tile(stages[threadIdx.x / kWarp], {0, max_over_lanes(seen)}, visitor);
 }
 

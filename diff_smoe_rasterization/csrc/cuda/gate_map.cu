@@ -26,26 +26,24 @@ template <class S, BlendMode kMode> struct GateMapVisitor {
 
   __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const StagedGaussian<S, false>& staged) {
+  __device__ __forceinline__ void visit(const StagedGaussian<S, false>& staged, const int32_t& number) {
     const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
-    const ColumnExponent<S, S> exponent(gaussian.conic, dx);
-    const S least_alpha = cut.of(gaussian.opacity);
+    const auto exponent = gaussian.gate.column(dx);
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto gate = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
+      const auto gate = gaussian.gate.evaluate(exponent.at(below(dy, k)));
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
       pixels.count[k] += pair.contributes;
       if (!pair.contributes || !(pair.weight > pixels.greatest_weight[k])) continue;
       pixels.greatest_weight[k] = pair.weight;
-      pixels.greatest[k] = gaussian.gaussian;
+      pixels.greatest[k] = number;
     }
   }
 
   const BlendArguments<S>& arguments;
   const WarpTile<S>& tile;
   MappedPixels<S>& pixels;
-  AlphaCut<S> cut;
 };
 
 template <class S, BlendMode kMode>
@@ -67,7 +65,7 @@ __global__ void __launch_bounds__(kWalkBlock)
     seen = seen > last ? seen : last;
   }
   using Visitor = GateMapVisitor<S, kMode>;
-  Visitor visitor = {arguments, tile, pixels, arguments.config.alpha_cut()};
+  Visitor visitor = {arguments, tile, pixels};
   walk_tile(stages[threadIdx.x / kWarp], {0, max_over_lanes(seen)}, visitor);
   for (int k = 0; k < kLanePixels; ++k) {
     if (!tile.inside(arguments, k)) continue;

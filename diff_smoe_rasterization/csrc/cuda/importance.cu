@@ -74,27 +74,25 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
 
   __device__ __forceinline__ void begin_batch(int32_t) {}
 
-  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged) {
+  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged, const int32_t& number) {
     const auto gaussian = staged;
     const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
-    const ColumnExponent<S, S> exponent(gaussian.conic, dx);
-    const S least_alpha = cut.of(gaussian.opacity);
+    const auto exponent = gaussian.gate.column(dx);
     Gate<S> gate[kLanePixels];
     bool any = false;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      gate[k] = evaluate_gate<kMode>(exponent.at(below(dy, k)), gaussian.opacity, least_alpha);
-      any |= gate[k].counts && (!Blend<kMode>::kStopsEarly || gaussian.position < pixels.last[k]);
+      gate[k] = gaussian.gate.evaluate(exponent.at(below(dy, k)));
+      any |= gate[k].counts && (!Blend<kMode>::kStopsEarly || gaussian.seen <= pixels.last[k]);
     }
     if (!__any_sync(kAllLanes, any)) return;
 
-    const int32_t index = gaussian.gaussian;
+    const int32_t index = number;
     const S* features = arguments.saved.features + int64_t(index) * feature_stride(arguments.config.num_features());
     auto sum = no_importance<S>();
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto removal =
-          remove_pair<kMode>(pixels.state[k], pixels.end[k], gate[k], gaussian.position < pixels.last[k]);
+      const auto removal = remove_pair<kMode>(pixels.state[k], pixels.end[k], gate[k], gaussian.seen <= pixels.last[k]);
       S squared = S(0);
       for (int c = 0; c < num_channels(); ++c) {
         const S feature = kChannels != kAnyFeatures ? gaussian.features[c] : features[c];
@@ -119,7 +117,6 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
   const ImportanceArguments<S>& arguments;
   const WarpTile<S>& tile;
   WeighedPixels<S, kChannels>& pixels;
-  AlphaCut<S> cut;
   TransposedSum<kNumImportances> sum_pixels;
 };
 
@@ -146,7 +143,7 @@ __global__ void __launch_bounds__(kWalkBlock)
     pixels.channels.begin(arguments, tile, k);
     seen = seen > pixels.last[k] ? seen : pixels.last[k];
   }
-  Visitor visitor = {arguments, tile, pixels, arguments.config.alpha_cut(), TransposedSum<kNumImportances>(tile.lane)};
+  Visitor visitor = {arguments, tile, pixels, TransposedSum<kNumImportances>(tile.lane)};
   const int32_t end = Blend<kMode>::kStopsEarly ? max_over_lanes(seen) : tile.source.length;
   walk_tile(stages[threadIdx.x / kWarp], {0, end}, visitor);
 }

@@ -124,14 +124,10 @@ template <class S> class WarpTile {
 };
 
 // A Gaussian that meets the warp's pixels, as the visitors read it.
-template <class S> struct alignas(16) StagedPlace {
-  Vec2<S> mean;      // pixels
-  int32_t gaussian;  // its number
-  int32_t position;  // of the entry in the list
-};
-template <class S> struct alignas(16) StagedShape : StagedPlace<S> {
-  ExponentFactors<S> conic;  // per px^2
-  S opacity;
+template <class S> struct alignas(16) StagedShape {
+  Vec2<S> mean;     // pixels
+  LogGate<S> gate;  // per px^2
+  int32_t seen;     // entries of the list up to this one, itself too
 };
 template <class S, bool kWithFeatures> struct alignas(16) StagedGaussian : StagedShape<S> {
   S features[kFeatureChunk];
@@ -147,6 +143,7 @@ struct FoundEntry {
 template <class S, class Visitor> struct WarpStage {
   FoundEntry found[kFoundEntries];  // a ring
   StagedGaussian<S, Visitor::kReadsFeatures> gaussians[kWarp];
+  int32_t numbers[kWarp];  // of these Gaussians
 };
 
 // The vertical distance of the lane's pixel k, from that of its first one.
@@ -245,7 +242,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
     *reinterpret_cast<Chunk*>(loaded.staged.features) = *reinterpret_cast<const Chunk*>(features + range.first_feature);
   }
   StagedShape<S>& shape = loaded.staged;
-  shape = {{gaussian.mean, entry.gaussian, entry.position}, ExponentFactors<S>(gaussian.conic), gaussian.opacity};
+  shape = {gaussian.mean, LogGate<S>(gaussian.conic, gaussian.opacity, gaussian.squared_reach), entry.position + 1};
   if (tile.source.marked) return loaded;
   loaded.meets = may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
   if (!tile.source.listed) {
@@ -269,8 +266,9 @@ template <class Visitor> constexpr bool kEndsVisits<Visitor, std::void_t<decltyp
 //   kUnroll                       visits that the compiler may interleave, static
 //   arguments, tile               the rendering, and the warp's place in it
 //   begin_batch(position)         called before the staged entries are visited, whose first one was at `position`
-//   visit(staged)                 one staged entry, for all lanes
-//   end_visits(first, count)      called after up to kVisitsPerCheck visits, of these staged entries; may be left out
+//   visit(staged, number)         one staged entry, for all lanes, and the number of its Gaussian
+//   end_visits(staged, numbers, count)   called after up to kVisitsPerCheck visits, of these staged entries; may be
+//                                 left out
 //   is_done()                     the walk may end; called after end_visits, where the visitor stops early
 template <class S, class Visitor>
 __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, const WalkRange& range, Visitor& visitor) {
@@ -282,7 +280,11 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
   auto next = load_entry<Visitor, S>(visitor, entry, lane < count, range);
   while (count > 0) {
     const unsigned meet = __ballot_sync(kAllLanes, next.meets);
-    if (next.meets) stage.gaussians[__popc(meet & ((1u << lane) - 1))] = next.staged;
+    if (next.meets) {
+      const int slot = __popc(meet & ((1u << lane) - 1));
+      stage.gaussians[slot] = next.staged;
+      stage.numbers[slot] = entry.gaussian;
+    }
     const int32_t first = __shfl_sync(kAllLanes, entry.position, 0);
     const int staged = __popc(meet);
     count = finder.template take<Visitor::kInSegments>(entry);  // waits for the stage too
@@ -292,8 +294,8 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
     for (int j = 0; j < staged; j += kVisitsPerCheck) {
       const int end = min(j + kVisitsPerCheck, staged);
 #pragma unroll(Visitor::kUnroll)
-      for (int i = j; i < end; ++i) visitor.visit(stage.gaussians[i]);
-      if constexpr (kEndsVisits<Visitor>) visitor.end_visits(stage.gaussians + j, end - j);
+      for (int i = j; i < end; ++i) visitor.visit(stage.gaussians[i], stage.numbers[i]);
+      if constexpr (kEndsVisits<Visitor>) visitor.end_visits(stage.gaussians + j, stage.numbers + j, end - j);
       if constexpr (Visitor::kStopsEarly) {
         if (visitor.is_done()) return met - staged + end;
       }

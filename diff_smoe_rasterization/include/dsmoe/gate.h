@@ -30,6 +30,9 @@ template <class Real, class S> struct ColumnExponent {
   DSMOE_HD ColumnExponent(const ExponentFactors<S>& factors, Real dx)
       : constant(Real(factors.xx) * dx * dx), linear(Real(factors.xy) * dx), quadratic(factors.yy) {}
   DSMOE_HD ColumnExponent(const Sym2<S>& conic, Real dx) : ColumnExponent(ExponentFactors<S>(conic), dx) {}
+  // With `offset` added to the exponent.
+  DSMOE_HD ColumnExponent(const ExponentFactors<S>& factors, Real dx, S offset)
+      : constant(fma(Real(factors.xx) * dx, dx, Real(offset))), linear(Real(factors.xy) * dx), quadratic(factors.yy) {}
 
   DSMOE_HD Real at(Real dy) const { return fma(fma(Real(quadratic), dy, linear), dy, constant); }
 };
@@ -75,6 +78,31 @@ template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real 
   }
   return gate;
 }
+
+// A Gaussian as kernels read it for each of its pixels: log2(o G) is one quadratic form, and which pairs count is two
+// comparisons with it.
+template <class S> struct LogGate {
+  ExponentFactors<S> factors;  // times log2(e)
+  S greatest;                  // log2(o)
+  S least;                     // of a pair that counts
+
+  LogGate() = default;
+  DSMOE_HD LogGate(const Sym2<S>& conic, S opacity, S squared_reach)
+      : factors({S(kLog2E) * conic.xx, S(kLog2E) * conic.xy, S(kLog2E) * conic.yy}),
+        greatest(log2(opacity)),
+        least(fma(S(-0.5 * kLog2E), squared_reach, greatest)) {}
+
+  template <class Real> DSMOE_HD ColumnExponent<Real, S> column(Real dx) const { return {factors, dx, greatest}; }
+
+  // Where log_logit is above log2(o) the conic is no ellipse. Such a pair does not count.
+  template <class Real> DSMOE_HD Gate<Real> evaluate(Real log_logit) const {
+    Gate<Real> gate;
+    gate.logit = exp2(log_logit);
+    gate.alpha = clamped(gate.logit);
+    gate.counts = (log_logit >= Real(least)) & (log_logit <= Real(greatest));
+    return gate;
+  }
+};
 
 // Sums over pixels of dL/dpower times 1, d.x, d.y, d.x^2, d.x d.y and d.y^2. The gradients of a Gaussian's shape on the
 // image need nothing else.
