@@ -128,10 +128,11 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda
 
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
-    PairWeight<Real> pair = {select(gate.counts, gate.alpha, Real(Scalar<Real>(0))), gate.counts};
-    if (kTInNumerator && !kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
-    if (kTInNumerator) pair = transmit(state, gate);
-    if (kTInNumerator == kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
+    const Real alpha = select(gate.counts, gate.alpha, Real(Scalar<Real>(0)));
+    if constexpr (!kTInDenominator) state.gate_sum = state.gate_sum + alpha;
+    if constexpr (!kTInNumerator) return {alpha, gate.counts};
+    const auto pair = transmit(state, gate);
+    if constexpr (kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
     return pair;
   }
 
