@@ -7,8 +7,9 @@ namespace dsmoe {
 namespace cpu {
 namespace DSMOE_SIMD {
 
-// Draws a tile. Its list is taken in batches. For each batch every cell has the list of the Gaussians that meet it,
-// and each pack of pixels walks that list with its sums in registers.
+// Draws a tile. Its list is taken in batches. For each batch and each pack of pixels, the alphas of the Gaussians that
+// meet the pack's cell come first, those of smooth cells apart. Then the pack blends them in order, with its sums in
+// registers.
 template <class S, BlendMode kMode, int kFeatures> class TilePainter {
  public:
   using P = Pack<S>;
@@ -72,9 +73,9 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   }
 
  private:
-  using EntryBits = uint32_t;                        // one bit a Gaussian of the batch, the first one's the lowest
+  using EntryBits = uint32_t;                           // one bit a Gaussian of the batch, the first one's the lowest
   static constexpr int kBatch = 8 * sizeof(EntryBits);  // Gaussians: they stay in the first cache
-  static constexpr int kTestEvery = 4;               // pairs, for whether a pack is full; a full one changes no more
+  static constexpr int kTestEvery = 4;                  // pairs, for whether a pack is full; a full one changes no more
 
   DSMOE_HD static EntryBits entries_of(const CellBits* cells, int cell) {
     EntryBits out = 0;

@@ -141,8 +141,8 @@ template <class S> class GaussianList {
   }
 
  private:
-  // Smooth cells lie inside the footprint: each of their pairs counts. The exponent changes by at most `spread` between a
-  // cell's centre and its pixels.
+  // Smooth cells lie inside the footprint: each of their pairs counts. The exponent changes by at most `spread` between
+  // a cell's centre and its pixels.
   DSMOE_HD void find_cells(const ProjectedGaussian<S>& gaussian, ListedGaussian<S>& listed) const {
     using P = Pack<S>;
     const Sym2<S>& conic = gaussian.conic;

@@ -103,8 +103,8 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
   return {select(contributes, gate.alpha * before, Real(S(0))), contributes};
 }
 
-// The reverse of transmit: recovers T in front of the pair and moves the suffix past it. gate: 0 where the pair does not
-// contribute. Then T stays, and so does R where u is a number.
+// The reverse of transmit: T in front of the pair is T + w, and the suffix moves past it. logit, alpha: of the gate, or
+// 0 where the pair does not contribute. Then T stays, and so does R where u is a number.
 template <class Real>
 DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real alpha, Real u) {
   const Real inverse = reciprocal(Real(Scalar<Real>(1)) - alpha);
@@ -130,10 +130,12 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
     const Real alpha = select(gate.counts, gate.alpha, Real(Scalar<Real>(0)));
     if constexpr (!kTInDenominator) state.gate_sum = state.gate_sum + alpha;
-    if constexpr (!kTInNumerator) return {alpha, gate.counts};
-    const auto pair = transmit(state, gate);
-    if constexpr (kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
-    return pair;
+    if constexpr (kTInNumerator) {
+      const auto pair = transmit(state, gate);
+      if (kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
+      return pair;
+    }
+    return {alpha, gate.counts};
   }
 
   template <class Real>
