@@ -212,8 +212,9 @@ template <class S> class GaussianList {
 constexpr int64_t kPrefetchDistance = 8;  // list entries
 
 // A pack of pairs of one Gaussian. at: of the first pixel in a PixelArray.
-template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
+template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
   using P = Pack<S>;
+  static constexpr bool kSmooth = kIsSmooth;  // alpha is not clamped
 
   P dx, dy;  // pixel - mean
   Gate<P> gate;

@@ -104,12 +104,20 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
 }
 
 // The reverse of transmit: T in front of the pair is T + w, and the suffix moves past it. logit, alpha: of the gate, or
-// 0 where the pair does not contribute. Then T stays, and so does R where u is a number.
-template <class Real>
+// 0 where the pair does not contribute. Then T stays, and so does R where u is a number. kClamps: they may differ.
+template <bool kClamps, class Real>
 DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real alpha, Real u) {
-  const Real inverse = reciprocal(Real(Scalar<Real>(1)) - alpha);
-  const Real power = logit * inverse * fma(pixel.transmittance, u, -pixel.suffix);
-  const Real weight = alpha * inverse * pixel.transmittance;
+  const Real rest = Real(Scalar<Real>(1)) - alpha;
+  Real of_logit, odds;  // logit and alpha, over 1 - alpha
+  if constexpr (kClamps) {
+    const Real inverse = reciprocal(rest);
+    of_logit = logit * inverse;
+    odds = alpha * inverse;
+  } else {
+    of_logit = odds = alpha / rest;
+  }
+  const Real power = of_logit * fma(pixel.transmittance, u, -pixel.suffix);
+  const Real weight = odds * pixel.transmittance;
   pixel.transmittance = pixel.transmittance + weight;
   pixel.suffix = fma(weight, u, pixel.suffix);
   return {power, weight};
@@ -138,13 +146,13 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
     return {alpha, gate.counts};
   }
 
-  template <class Real>
+  template <bool kClamps = true, class Real>
   static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
                                               Mask<Real> contributes) {
     const Real zero = Scalar<Real>(0), logit = select(contributes, gate.logit, zero);
     const Real alpha = select(contributes, gate.alpha, zero);
     if constexpr (kTInNumerator) {
-      auto pair = transmit_backward(pixel, logit, alpha, kSuffixAboutBase ? value - pixel.base : value);
+      auto pair = transmit_backward<kClamps>(pixel, logit, alpha, kSuffixAboutBase ? value - pixel.base : value);
       pair.power = select(contributes, pair.power, zero);  // logit is 0 then, but u may be no number
       if (!kTInDenominator) pair.power = pair.power - select(gate.counts, gate.logit * pixel.base, zero);
       return pair;
