@@ -87,7 +87,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     P value = S(0);
     for (int f = 0; f < num_features(); ++f) value = fma(scaled_of(f).load(at), P(features_[f]), value);
     PixelBackward<P> pixel = {transmittance_.load(at), suffix_.load(at), base_.load(at)};
-    const auto pair = Blend<kMode>::template backward<!Pairs::kSmooth>(pixel, gate, value, contributes);
+    const auto pair = Blend<kMode>::backward(pixel, pairs.gate, value, contributes);
     transmittance_.store(at, pixel.transmittance);
     suffix_.store(at, pixel.suffix);
     for (int f = 0; f < num_features(); ++f) {

@@ -212,12 +212,11 @@ template <class S> class GaussianList {
 constexpr int64_t kPrefetchDistance = 8;  // list entries
 
 // A pack of pairs of one Gaussian. at: of the first pixel in a PixelArray.
-template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
+template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
   using P = Pack<S>;
-  static constexpr bool kSmooth = kIsSmooth;  // alpha is not clamped
 
   P dx, dy;  // pixel - mean
-  Gate<P> gate;
+  std::conditional_t<kSmooth, UnclampedGate<P>, Gate<P>> gate;
 
   DSMOE_HD PackPairs(const ListedGaussian<S>& gaussian, const PixelCenters<S>& pixels, int at)
       : dx(P::load(pixels.x + at) - P(gaussian.mean.x)), dy(P::load(pixels.y + at) - P(gaussian.mean.y)) {

@@ -146,13 +146,15 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
     return {alpha, gate.counts};
   }
 
-  template <bool kClamps = true, class Real>
-  static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
+  // AnyGate: Gate or UnclampedGate.
+  template <class Real, class AnyGate>
+  static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const AnyGate& gate, Real value,
                                               Mask<Real> contributes) {
     const Real zero = Scalar<Real>(0), logit = select(contributes, gate.logit, zero);
     const Real alpha = select(contributes, gate.alpha, zero);
     if constexpr (kTInNumerator) {
-      auto pair = transmit_backward<kClamps>(pixel, logit, alpha, kSuffixAboutBase ? value - pixel.base : value);
+      auto pair =
+          transmit_backward<AnyGate::kClamps>(pixel, logit, alpha, kSuffixAboutBase ? value - pixel.base : value);
       pair.power = select(contributes, pair.power, zero);  // logit is 0 then, but u may be no number
       if (!kTInDenominator) pair.power = pair.power - select(gate.counts, gate.logit * pixel.base, zero);
       return pair;
