@@ -8,11 +8,6 @@ struct PackExp {
   // Reads and writes a multiple of 64 bytes; no alignment is asked for.
   void (*in_float)(const float* x, float* result, int count);
   void (*in_double)(const double* x, double* result, int count);
-  // squared_exp, and the greatest |x| that it takes.
-  void (*near_zero_in_float)(const float* x, float* result, int count);
-  void (*near_zero_in_double)(const double* x, double* result, int count);
-  float near_zero_float;
-  double near_zero_double;
 };
 extern const PackExp kBaselinePackExp;
 #if defined(__x86_64__)

@@ -7,27 +7,18 @@
 namespace dsmoe {
 namespace DSMOE_SIMD {
 
-template <class T, bool kSquared> void exp_each(const T* x, T* result, int count) {
+template <class T> void exp_each(const T* x, T* result, int count) {
   using P = Pack<T>;
   alignas(DSMOE_SIMD_BYTES) T lanes[P::kLanes];
   for (int i = 0; i < count; i += P::kLanes) {
     for (int k = 0; k < P::kLanes; ++k) lanes[k] = x[i + k];
-    const P in = P::load(lanes);
-    (kSquared ? squared_exp(in) : exp(in)).store(lanes);
+    exp(P::load(lanes)).store(lanes);
     for (int k = 0; k < P::kLanes; ++k) result[i + k] = lanes[k];
   }
 }
 
 // A constant expression: no code of this instruction set runs before it is known to be there.
-constexpr PackExp pack_exp(const char* name) {
-  return {name,
-          exp_each<float, false>,
-          exp_each<double, false>,
-          exp_each<float, true>,
-          exp_each<double, true>,
-          kNearZero<float>,
-          kNearZero<double>};
-}
+constexpr PackExp pack_exp(const char* name) { return {name, exp_each<float>, exp_each<double>}; }
 
 }  // namespace DSMOE_SIMD
 }  // namespace dsmoe

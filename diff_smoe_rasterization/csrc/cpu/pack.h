@@ -209,22 +209,6 @@ DSMOE_HD Pack<float> exp(Pack<float> x) {
   return p * P(reinterpret_cast<P::Values>(power));
 }
 
-// exp(2 h) for |h| <= kNearZero, as the square of exp(h). float: minimax polynomial of degree 7, relative error 2e-8
-// before rounding, doubled by the square.
-template <class T> constexpr T kNearZero = T(0.34);
-template <> constexpr float kNearZero<float> = 0.69f;
-DSMOE_HD Pack<float> squared_exp(Pack<float> h) {
-  using P = Pack<float>;
-  P p = fma(P(1.9606798e-4f), h, P(1.4108368e-3f));
-  p = fma(p, h, P(8.3362116e-3f));
-  p = fma(p, h, P(4.1661076e-2f));
-  p = fma(p, h, P(1.6666611e-1f));
-  p = fma(p, h, P(5.0000036e-1f));
-  p = fma(p, h, P(1.0f));
-  p = fma(p, h, P(1.0f));
-  return p * p;
-}
-
 // double: Taylor to degree 13, whose remainder is below 5e-18 for |r| <= ln 2 / 2.
 DSMOE_HD Pack<double> exp_of_remainder(Pack<double> r) {
   using P = Pack<double>;
@@ -244,11 +228,6 @@ DSMOE_HD Pack<double> exp_of_remainder(Pack<double> r) {
                                            1.0};
   for (const double c : kInverseFactorials) p = fma(p, r, P(c));
   return p;
-}
-
-DSMOE_HD Pack<double> squared_exp(Pack<double> h) {
-  const Pack<double> p = exp_of_remainder(h);
-  return p * p;
 }
 
 DSMOE_HD Pack<double> exp(Pack<double> x) {

@@ -38,7 +38,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
       const PixelEnd<S> end = {tile.saved.final_transmittance[index], tile.saved.gate_sum[index], background_gate};
       const S* dL_dgate_sum = gradients.dL_dimages.gate_sum;
       auto pixel = begin_backward(end, dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
-      for (int f = 0; f < num_features_; ++f) {
+      for (int f = 0; f < num_features(); ++f) {
         const S* gradient = feature_image(tile.config, gradients.dL_dimages, f, pixels);
         if (gradient == nullptr) continue;
         const S value = feature_image(tile.config, gradients.images, f, pixels)[index];
@@ -73,7 +73,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     Sums sums;
     sums.moments = {zero, zero, zero, zero, zero, zero};
     sums.absolute = {zero, zero};
-    for (int f = 0; f < num_features_; ++f) dL_dfeature(sums, f) = zero;
+    for (int f = 0; f < num_features(); ++f) dL_dfeature(sums, f) = zero;
     return sums;
   }
   DSMOE_HD bool wanted(int at, Mask<P>& not_past) const {
@@ -85,12 +85,12 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     const Gate<P>& gate = pairs.gate;
     const auto contributes = gate.counts & not_past;
     P value = S(0);
-    for (int f = 0; f < num_features_; ++f) value = fma(scaled_of(f).load(at), P(features_[f]), value);
+    for (int f = 0; f < num_features(); ++f) value = fma(scaled_of(f).load(at), P(features_[f]), value);
     PixelBackward<P> pixel = {transmittance_.load(at), suffix_.load(at), base_.load(at)};
-    const auto pair = Blend<kMode>::backward(pixel, gate, value, contributes);
+    const auto pair = Blend<kMode>::backward(pixel, pairs.gate, value, contributes);
     transmittance_.store(at, pixel.transmittance);
     suffix_.store(at, pixel.suffix);
-    for (int f = 0; f < num_features_; ++f) {
+    for (int f = 0; f < num_features(); ++f) {
       dL_dfeature(sums, f) = fma(pair.weight, scaled_of(f).load(at), dL_dfeature(sums, f));
     }
     const P dL_dpower = pair.power;
@@ -118,7 +118,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
     } else {
       out[4] = sum_lanes(m.xy);
       out[5] = sum_lanes(m.yy);
-      for (int f = 0; f < num_features_; ++f) out[kNumGateMoments + f] = sum_lanes(dL_dfeature(sums, f));
+      for (int f = 0; f < num_features(); ++f) out[kNumGateMoments + f] = sum_lanes(dL_dfeature(sums, f));
     }
     if (!absolute_) return;
     out[kNumGateMoments + num_features_] = sum_lanes(sums.absolute.x);
@@ -131,6 +131,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   }
 
  private:
+  DSMOE_HD int num_features() const { return kFeatures != kAnyFeatures ? kFeatures : num_features_; }
   DSMOE_HD PixelArray<S> scaled_of(int f) const { return {scaled_.values + f * kTilePixels}; }
   DSMOE_HD S* record(uint32_t slot) const {
     return dL_dinstances_ + slot * static_cast<int64_t>(record_size(num_features_, absolute_));

@@ -7,8 +7,9 @@ namespace dsmoe {
 namespace cpu {
 namespace DSMOE_SIMD {
 
-// Draws a tile. Its list is taken in batches. For each batch every cell has the list of the Gaussians that meet it,
-// and each pack of pixels walks that list with its sums in registers.
+// Draws a tile. Its list is taken in batches. For each batch and each pack of pixels, the alphas of the Gaussians that
+// meet the pack's cell come first, those of smooth cells apart. Then the pack blends them in order, with its sums in
+// registers.
 template <class S, BlendMode kMode, int kFeatures> class TilePainter {
  public:
   using P = Pack<S>;
@@ -35,16 +36,13 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
     const GaussianList<S> list(tile_, extent_, num_features_);
     int64_t pairs = 0;
     for (int64_t begin = tile_.begin; begin < tile_.end && open_ != 0; begin += kBatch) {
-      for (uint16_t& count : counts_) count = 0;
-      const int64_t end = min(begin + kBatch, tile_.end);
-      for (int64_t i = begin; i < end; ++i) {
-        const auto entry = static_cast<uint16_t>(i - begin);
-        list.load(i, min(i + kPrefetchDistance, tile_.end - 1), batch_[entry]);
-        for (CellBits cells = batch_[entry].met & open_; cells != 0; cells &= cells - 1) {
-          const int cell = __builtin_ctz(cells);
-          met_[cell][counts_[cell]++] = entry;
-        }
+      const int count = static_cast<int>(min<int64_t>(kBatch, tile_.end - begin));
+      for (int k = 0; k < count; ++k) {
+        list.load(begin + k, min(begin + k + kPrefetchDistance, tile_.end - 1), batch_[k]);
+        met_[k] = batch_[k].met;
+        smooth_[k] = batch_[k].smooth;
       }
+      for (int k = count; k < kBatch; ++k) met_[k] = smooth_[k] = 0;
       for (CellBits cells = open_; cells != 0; cells &= cells - 1) {
         pairs += paint_cell(pixels, __builtin_ctz(cells));
       }
@@ -75,39 +73,49 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   }
 
  private:
-  static constexpr int kBatch = 64;     // Gaussians: they and the cells' lists stay in the first cache
-  static constexpr int kTestEvery = 4;  // pairs, for whether a pack is full; a full one changes no more
+  using EntryBits = uint32_t;                           // one bit a Gaussian of the batch, the first one's the lowest
+  static constexpr int kBatch = 8 * sizeof(EntryBits);  // Gaussians: they stay in the first cache
+  static constexpr int kTestEvery = 4;                  // pairs, for whether a pack is full; a full one changes no more
 
-  DSMOE_HD int64_t paint_cell(const PixelCenters<S>& pixels, int cell) {
-    int64_t pairs = 0;
-    bool open = false;
-    for (int part = 0; part < kCellPixels; part += P::kLanes) {
-      pairs += paint_pack(pixels, cell, cell * kCellPixels + part, open);
-    }
-    if (!open) open_ &= ~(CellBits(1) << cell);
-    return pairs;
+  DSMOE_HD static EntryBits entries_of(const CellBits* cells, int cell) {
+    EntryBits out = 0;
+    for (int k = 0; k < kBatch; ++k) out |= (cells[k] >> cell & 1) << k;
+    return out;
   }
 
-  // stays_open: becomes true if the pack's pixels take further pairs.
-  DSMOE_HD int64_t paint_pack(const PixelCenters<S>& pixels, int cell, int at, bool& stays_open) {
+  DSMOE_HD int64_t paint_cell(const PixelCenters<S>& pixels, int cell) {
+    const EntryBits met = entries_of(met_, cell), smooth = entries_of(smooth_, cell);
+    bool open = false;
+    for (int at = cell * kCellPixels; at < (cell + 1) * kCellPixels; at += P::kLanes) {
+      for (EntryBits entries = smooth; entries != 0; entries &= entries - 1) {
+        const int k = __builtin_ctz(entries);
+        PackPairs<kMode, S, true>(batch_[k], pixels, at).gate.alpha.store(alphas_[k]);
+      }
+      for (EntryBits entries = met & ~smooth; entries != 0; entries &= entries - 1) {
+        const int k = __builtin_ctz(entries);
+        const Gate<P> gate = PackPairs<kMode, S, false>(batch_[k], pixels, at).gate;
+        select(gate.counts, gate.alpha, P(S(0))).store(alphas_[k]);
+      }
+      open |= paint_pack(met, at);
+    }
+    if (!open) open_ &= ~(CellBits(1) << cell);
+    return static_cast<int64_t>(__builtin_popcount(met)) * kCellPixels;
+  }
+
+  // Returns whether the pack's pixels take further pairs.
+  DSMOE_HD bool paint_pack(EntryBits entries, int at) {
     PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
     P last = last_.load(at);
     P registers[kFeatures != kAnyFeatures ? kFeatures : 1];
     if (kFeatures != kAnyFeatures) {
       for (int f = 0; f < kFeatures; ++f) registers[f] = sum_of(f).load(at);
     }
-    const uint16_t* const met = met_[cell];
-    const int count = counts_[cell];
     bool open = !Blend<kMode>::kStopsEarly || any(state.is_open());
-    int k = 0;
-    for (; k < count && open; ++k) {
-      const ListedGaussian<S>& gaussian = batch_[met[k]];
-      PairWeight<P> pair;
-      if ((gaussian.smooth >> cell & 1) != 0) {
-        pair = Blend<kMode>::accumulate(state, PackPairs<kMode, S, true>(gaussian, pixels, at).gate);
-      } else {
-        pair = Blend<kMode>::accumulate(state, PackPairs<kMode, S, false>(gaussian, pixels, at).gate);
-      }
+    for (int n = 0; entries != 0 && open; entries &= entries - 1, ++n) {
+      const int k = __builtin_ctz(entries);
+      const ListedGaussian<S>& gaussian = batch_[k];
+      const P alpha = P::load(alphas_[k]);
+      const auto pair = Blend<kMode>::accumulate(state, Gate<P>{alpha, alpha, alpha > P(S(0))});
       for (int f = 0; f < num_features_; ++f) {
         const P feature = gaussian.features[f];
         if (kFeatures != kAnyFeatures) {
@@ -117,7 +125,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
         }
       }
       last = select(pair.contributes, P(gaussian.position + S(1)), last);
-      if (Blend<kMode>::kStopsEarly && k % kTestEvery == 0) open = any(state.is_open());
+      if (Blend<kMode>::kStopsEarly && n % kTestEvery == 0) open = any(state.is_open());
     }
     if (Blend<kMode>::kStopsEarly) open = any(state.is_open());
     transmittance_.store(at, state.transmittance);
@@ -126,8 +134,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
     if (kFeatures != kAnyFeatures) {
       for (int f = 0; f < kFeatures; ++f) sum_of(f).store(at, registers[f]);
     }
-    stays_open |= open;
-    return static_cast<int64_t>(k) * P::kLanes;
+    return open;
   }
 
   DSMOE_HD PixelArray<S> sum_of(int f) const { return {sums_.values + f * kTilePixels}; }
@@ -139,8 +146,8 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   const PixelArray<S> sums_;  // one array a feature
   CellBits open_;             // cells that take further pairs
   ListedGaussian<S> batch_[kBatch];
-  uint16_t counts_[kCells];
-  uint16_t met_[kCells][kBatch];  // entries of the batch
+  alignas(64) CellBits met_[kBatch], smooth_[kBatch];  // of the batch
+  alignas(64) S alphas_[kBatch][P::kLanes];            // of a pack of pixels; 0 where the pair does not count
 };
 
 template <class S, BlendMode kMode, int kFeatures>

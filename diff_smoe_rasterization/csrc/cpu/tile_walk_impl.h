@@ -109,12 +109,10 @@ template <class S> struct ListedGaussian {
   CellBits smooth;    // those of them over which the Gaussian is smooth
   const S* features;  // [F]
 
-  // Of smooth cells: alpha at the centre, half of the exponent's slopes there, and half of the exponent's quadratic
-  // part about it, which is the same in all cells.
+  // Of smooth cells: alpha at the centre, and its factors at the pixels, by the cell's column and by its row.
   alignas(64) S alpha[kCells];
-  alignas(64) S half_slope_x[kCells];
-  alignas(64) S half_slope_y[kCells];
-  alignas(64) S half_bend[kCellPixels];
+  alignas(64) S column_factors[kCellColumns][kCellPixels];
+  alignas(64) S row_factors[kCellColumns][kCellPixels];
 };
 
 // The Gaussians of a tile's list, one after the other.
@@ -143,12 +141,10 @@ template <class S> class GaussianList {
   }
 
  private:
-  // The exponent changes by at most `spread` between a cell's centre and its pixels. Smooth cells have a spread that
-  // squared_exp takes, and lie inside the footprint: each of their pairs counts.
+  // Smooth cells lie inside the footprint: each of their pairs counts. The exponent changes by at most `spread` between
+  // a cell's centre and its pixels.
   DSMOE_HD void find_cells(const ProjectedGaussian<S>& gaussian, ListedGaussian<S>& listed) const {
     using P = Pack<S>;
-    constexpr S kReach = S(kCellSize - 1) / 2;  // from a cell's centre to its outermost pixels
-    constexpr S kLargestSpread = 2 * ::dsmoe::DSMOE_SIMD::kNearZero<S>;
     const Sym2<S>& conic = gaussian.conic;
     const ExponentFactors<S>& factors = listed.exponent;
     const S bend = kReach * kReach * (abs(factors.xy) - factors.xx - factors.yy);
@@ -170,18 +166,42 @@ template <class S> class GaussianList {
       const P power = P(S(0.5)) * fma(slope_x, dx, slope_y * dy);
       const P spread = fma(P(kReach), abs(slope_x) + abs(slope_y), P(bend));
       listed.smooth |= bits_of((spread <= P(kLargestSpread)) & (power - spread >= P(least_power))) << first;
-      (P(gaussian.opacity) * exp(power)).store(listed.alpha + first);
-      (P(S(0.5)) * slope_x).store(listed.half_slope_x + first);
-      (P(S(0.5)) * slope_y).store(listed.half_slope_y + first);
+      power.store(listed.alpha + first);
     }
     listed.smooth &= listed.met;
-    if (listed.smooth == 0) return;
+    if (listed.smooth != 0) find_factors(listed);
+  }
+
+  // At (u, v) from a cell's centre the exponent differs by slope_x u + slope_y v + bend. From cell to cell the slopes
+  // grow by constants, and bend stays. So the factors are products of three exponentials. Next to a smooth cell their
+  // exponents are below 40, by the bounds on spread and bend. listed.alpha: the exponents at the cells' centres.
+  DSMOE_HD void find_factors(ListedGaussian<S>& listed) const {
+    using P = Pack<S>;
+    const ExponentFactors<S>& factors = listed.exponent;
+    const S dx = S(extent_.x0) + kReach - listed.mean.x, dy = S(extent_.y0) + kReach - listed.mean.y;
+    const P slope_x = fma(S(2) * factors.xx, dx, factors.xy * dy);  // of the first cell
+    const P slope_y = fma(S(2) * factors.yy, dy, factors.xy * dx);
+    static_assert(kCells == kCellPixels, "one loop");
     for (int first = 0; first < kCellPixels; first += P::kLanes) {
+      (P(listed.opacity) * exp(P::load(listed.alpha + first))).store(listed.alpha + first);
       const P u = P::load(kSquareOfFour<S>.columns + first) - P(kReach);
       const P v = P::load(kSquareOfFour<S>.rows + first) - P(kReach);
-      (P(S(0.5)) * ColumnExponent<P, S>(factors, u).at(v)).store(listed.half_bend + first);
+      const P bend = ColumnExponent<P, S>(factors, u).at(v);
+      const P by_column = fma(P(S(2 * kCellSize) * factors.xx), u, P(S(kCellSize) * factors.xy) * v);
+      const P by_row = fma(P(S(2 * kCellSize) * factors.yy), v, P(S(kCellSize) * factors.xy) * u);
+      const P column_step = exp(by_column), row_step = exp(by_row);
+      P column = exp(fma(slope_x, u, fma(slope_y, v, bend))), row = S(1);
+      for (int k = 0; k < kCellColumns; ++k) {
+        column.store(listed.column_factors[k] + first);
+        row.store(listed.row_factors[k] + first);
+        column = column * column_step;
+        row = row * row_step;
+      }
     }
   }
+
+  static constexpr S kReach = S(kCellSize - 1) / 2;  // from a cell's centre to its outermost pixels
+  static constexpr S kLargestSpread = S(3);          // a larger one adds few cells and rounding
 
   const Tile<S>& tile_;
   const TileExtent& extent_;
@@ -192,23 +212,19 @@ template <class S> class GaussianList {
 constexpr int64_t kPrefetchDistance = 8;  // list entries
 
 // A pack of pairs of one Gaussian. at: of the first pixel in a PixelArray.
-template <BlendMode kMode, class S, bool kIsSmooth> struct PackPairs {
+template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
   using P = Pack<S>;
-  static constexpr bool kSmooth = kIsSmooth;  // alpha is not clamped
 
   P dx, dy;  // pixel - mean
-  Gate<P> gate;
+  std::conditional_t<kSmooth, UnclampedGate<P>, Gate<P>> gate;
 
   DSMOE_HD PackPairs(const ListedGaussian<S>& gaussian, const PixelCenters<S>& pixels, int at)
       : dx(P::load(pixels.x + at) - P(gaussian.mean.x)), dy(P::load(pixels.y + at) - P(gaussian.mean.y)) {
     if constexpr (kSmooth) {
-      constexpr S kReach = S(kCellSize - 1) / 2;
       const int cell = at / kCellPixels, first = at % kCellPixels;
-      const P u = P::load(kSquareOfFour<S>.columns + first) - P(kReach);
-      const P v = P::load(kSquareOfFour<S>.rows + first) - P(kReach);
-      const P half_change = fma(P(gaussian.half_slope_x[cell]), u,
-                                fma(P(gaussian.half_slope_y[cell]), v, P::load(gaussian.half_bend + first)));
-      gate.logit = gate.alpha = P(gaussian.alpha[cell]) * squared_exp(half_change);
+      const P column = P::load(gaussian.column_factors[cell % kCellColumns] + first);
+      const P row = P::load(gaussian.row_factors[cell / kCellColumns] + first);
+      gate.logit = gate.alpha = P(gaussian.alpha[cell]) * column * row;
       gate.counts = Mask<P>::all();
     } else {
       const P power = ColumnExponent<P, S>(gaussian.exponent, dx).at(dy);

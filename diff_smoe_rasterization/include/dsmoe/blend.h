@@ -103,18 +103,24 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
   return {select(contributes, gate.alpha * before, Real(S(0))), contributes};
 }
 
-// The reverse of transmit: recovers T in front of the pair by division and moves the suffix past it. logit: of the
-// gate, or 0 where the pair does not contribute. Then T stays, since the reciprocal of 1 is 1, and so does R where u is
-// a number.
-template <class Real> DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real u) {
-  using S = Scalar<Real>;
-  const Real alpha = clamped(logit);
-  const Real inverse = reciprocal(Real(S(1)) - alpha);
-  pixel.transmittance = pixel.transmittance * inverse;
-  const Real dL_dalpha = fma(pixel.transmittance, u, -inverse * pixel.suffix);
-  const Real weight = alpha * pixel.transmittance;
+// The reverse of transmit: T in front of the pair is T + w, and the suffix moves past it. logit, alpha: of the gate, or
+// 0 where the pair does not contribute. Then T stays, and so does R where u is a number. kClamps: they may differ.
+template <bool kClamps, class Real>
+DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real alpha, Real u) {
+  const Real rest = Real(Scalar<Real>(1)) - alpha;
+  Real of_logit, odds;  // logit and alpha, over 1 - alpha
+  if constexpr (kClamps) {
+    const Real inverse = reciprocal(rest);
+    of_logit = logit * inverse;
+    odds = alpha * inverse;
+  } else {
+    of_logit = odds = alpha / rest;
+  }
+  const Real power = of_logit * fma(pixel.transmittance, u, -pixel.suffix);
+  const Real weight = odds * pixel.transmittance;
+  pixel.transmittance = pixel.transmittance + weight;
   pixel.suffix = fma(weight, u, pixel.suffix);
-  return {logit * dL_dalpha, weight};
+  return {power, weight};
 }
 
 // The arithmetic of all modes, and the facts that most of them share. kTInNumerator: w_i is alpha_i T_i; else alpha_i.
@@ -130,24 +136,30 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda
 
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
-    PairWeight<Real> pair = {select(gate.counts, gate.alpha, Real(Scalar<Real>(0))), gate.counts};
-    if (kTInNumerator && !kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
-    if (kTInNumerator) pair = transmit(state, gate);
-    if (kTInNumerator == kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
-    return pair;
+    const Real alpha = select(gate.counts, gate.alpha, Real(Scalar<Real>(0)));
+    if constexpr (!kTInDenominator) state.gate_sum = state.gate_sum + alpha;
+    if constexpr (kTInNumerator) {
+      const auto pair = transmit(state, gate);
+      if (kTInDenominator) state.gate_sum = state.gate_sum + pair.weight;
+      return pair;
+    }
+    return {alpha, gate.counts};
   }
 
-  template <class Real>
-  static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const Gate<Real>& gate, Real value,
+  // AnyGate: Gate or UnclampedGate.
+  template <class Real, class AnyGate>
+  static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const AnyGate& gate, Real value,
                                               Mask<Real> contributes) {
     const Real zero = Scalar<Real>(0), logit = select(contributes, gate.logit, zero);
+    const Real alpha = select(contributes, gate.alpha, zero);
     if constexpr (kTInNumerator) {
-      auto pair = transmit_backward(pixel, logit, kSuffixAboutBase ? value - pixel.base : value);
+      auto pair =
+          transmit_backward<AnyGate::kClamps>(pixel, logit, alpha, kSuffixAboutBase ? value - pixel.base : value);
       pair.power = select(contributes, pair.power, zero);  // logit is 0 then, but u may be no number
       if (!kTInDenominator) pair.power = pair.power - select(gate.counts, gate.logit * pixel.base, zero);
       return pair;
     }
-    return {select(contributes, logit * (value - pixel.base), zero), clamped(logit)};
+    return {select(contributes, logit * (value - pixel.base), zero), alpha};
   }
 };
 

@@ -61,7 +61,11 @@ template <class Real> struct Gate {
   Real logit;         // o G, before the clamp
   Real alpha;         // min(0.99, o G)
   Mask<Real> counts;  // the pair takes part
+  static constexpr bool kClamps = true;
 };
+
+// One whose alpha is o G.
+template <class Real> struct UnclampedGate : Gate<Real> { static constexpr bool kClamps = false; };
 
 template <class Real> DSMOE_HD Real clamped(Real logit) { return min(logit, Real(Scalar<Real>(kAlphaMax))); }
 
