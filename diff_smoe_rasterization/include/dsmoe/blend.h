@@ -103,22 +103,23 @@ template <class Real> DSMOE_HD PairWeight<Real> transmit(PixelState<Real>& state
   return {select(contributes, gate.alpha * before, Real(S(0))), contributes};
 }
 
-// The reverse of transmit: T in front of the pair is T + w, and the suffix moves past it. logit, alpha: of the gate, or
-// 0 where the pair does not contribute. Then T stays, and so does R where u is a number. kClamps: they may differ.
+// The reverse of transmit: recovers T in front of the pair and moves the suffix past it. logit: of the gate, or 0 where
+// the pair does not contribute. Then T stays, and so does R where u is a number. kClamps: alpha may be below the logit.
 template <bool kClamps, class Real>
-DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real alpha, Real u) {
-  const Real rest = Real(Scalar<Real>(1)) - alpha;
-  Real of_logit, odds;  // logit and alpha, over 1 - alpha
+DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real logit, Real u) {
+  const Real one = Scalar<Real>(1), rate = fma(pixel.transmittance, u, -pixel.suffix);  // dL/dalpha times 1 - alpha
+  Real power, weight;
   if constexpr (kClamps) {
-    const Real inverse = reciprocal(rest);
-    of_logit = logit * inverse;
-    odds = alpha * inverse;
+    const Real alpha = clamped(logit), inverse = reciprocal(one - alpha);
+    pixel.transmittance = pixel.transmittance * inverse;
+    power = logit * inverse * rate;
+    weight = alpha * pixel.transmittance;
   } else {
-    of_logit = odds = alpha / rest;
+    const Real odds = logit / (one - logit);
+    power = odds * rate;
+    weight = odds * pixel.transmittance;
+    pixel.transmittance = pixel.transmittance + weight;
   }
-  const Real power = of_logit * fma(pixel.transmittance, u, -pixel.suffix);
-  const Real weight = odds * pixel.transmittance;
-  pixel.transmittance = pixel.transmittance + weight;
   pixel.suffix = fma(weight, u, pixel.suffix);
   return {power, weight};
 }
@@ -151,15 +152,13 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>& pixel, const AnyGate& gate, Real value,
                                               Mask<Real> contributes) {
     const Real zero = Scalar<Real>(0), logit = select(contributes, gate.logit, zero);
-    const Real alpha = select(contributes, gate.alpha, zero);
     if constexpr (kTInNumerator) {
-      auto pair =
-          transmit_backward<AnyGate::kClamps>(pixel, logit, alpha, kSuffixAboutBase ? value - pixel.base : value);
+      auto pair = transmit_backward<AnyGate::kClamps>(pixel, logit, kSuffixAboutBase ? value - pixel.base : value);
       pair.power = select(contributes, pair.power, zero);  // logit is 0 then, but u may be no number
       if (!kTInDenominator) pair.power = pair.power - select(gate.counts, gate.logit * pixel.base, zero);
       return pair;
     }
-    return {select(contributes, logit * (value - pixel.base), zero), alpha};
+    return {select(contributes, logit * (value - pixel.base), zero), AnyGate::kClamps ? clamped(logit) : logit};
   }
 };
 
