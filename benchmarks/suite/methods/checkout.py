@@ -194,8 +194,7 @@ class InOneProcess(ThreeDGS):
 class HAC(InOneProcess):
     """HAC and HAC++: train.py trains, encodes, decodes and renders in one process."""
 
-    stubs = ("wandb",)  # it reads its pictures again with torchvision, at the end
-    observed = ("--no-lpips",)
+    stubs = ("wandb", "lpips")  # it reads its pictures again with torchvision, at the end
     of_gaussians = False  # anchors, from which networks make Gaussians
 
     def test_arguments(self) -> List[Any]:

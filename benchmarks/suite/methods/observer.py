@@ -33,7 +33,6 @@ def main():
     parser.add_argument("--renders")
     parser.add_argument("--stub", default="")
     parser.add_argument("--no-pictures", action="store_true")
-    parser.add_argument("--no-lpips", action="store_true")
     parser.add_argument("--hold-out", action="store_true")
     parser.add_argument("--model-renders", metavar="ATTRIBUTE")
     options = parser.parse_args(words[:split])
@@ -43,14 +42,12 @@ def main():
     import torch
 
     for name in filter(None, options.stub.split(",")):  # after torch, as the trainers import them
-        stub(name)
+        without_lpips() if name == "lpips" else stub(name)
     if options.no_pictures:  # what is rendered is kept as floats, and torchvision may be absent
         stub("torchvision")
         import torchvision.utils
 
         torchvision.utils.save_image = lambda *arguments, **keywords: None
-    if options.no_lpips:
-        without_lpips()
     shift_seeds(options.seed)
     views = watch_renderings(options.renders) if options.renders and not options.model_renders else {}
     scenes = watch_scenes(options.hold_out) if options.model_renders else []
@@ -241,13 +238,10 @@ def without_lpips():
     """A trainer's own LPIPS is NaN, so that nothing is downloaded: the renderings are measured elsewhere."""
     import torch
 
-    class LPIPS(torch.nn.Module):
-        def forward(self, image, *others, **keywords):
-            return torch.full((1, 1, 1, 1), float("nan"), device=image.device)
-
+    nan = torch.nn.Module()
+    nan.forward = lambda image, *others, **keywords: torch.full((1, 1, 1, 1), float("nan"), device=image.device)
     for name in ("lpips", "lpipsPyTorch"):
-        module = sys.modules[name] = types.ModuleType(name)
-        module.LPIPS, module.lpips = lambda *words, **keywords: LPIPS(), LPIPS().forward
+        sys.modules[name] = types.SimpleNamespace(LPIPS=lambda *words, **keywords: nan, lpips=nan)
 
 
 def stub(name):
