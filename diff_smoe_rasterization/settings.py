@@ -166,13 +166,20 @@ def _is_tensor(value: Any) -> bool:
     return hasattr(value, "numel")
 
 
+# The blend mode and gate of the training that this process is, ahead of the variables: a patched trainer sets it.
+blend_of_process: Optional[Tuple[str, Optional[float]]] = None
+
+
 def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, BackgroundGate]:
     """Returns the blend mode and the background's gate of a rendering.
 
     `smoe` with the number 1 is `alpha`, bit for bit. Raises ValueError as the two functions above do.
     """
-    mode = resolve_blend_mode(settings.blend_mode)
-    gate = resolve_background_gate(mode, settings.background_gate)
+    mode, gate = settings.blend_mode, settings.background_gate
+    if mode is None and gate is None and blend_of_process is not None:
+        mode, gate = blend_of_process
+    mode = resolve_blend_mode(mode)
+    gate = resolve_background_gate(mode, gate)
     return "alpha" if not _is_tensor(gate) and gate == 1 else mode, gate
 
 

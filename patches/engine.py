@@ -218,5 +218,5 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
                          "the checkout is") from None
     finally:
         for folder in root.glob(UNFINISHED + "*"):  # but those of other processes that still run
-            if folder.suffix[1:] == str(os.getpid()) or not Path("/proc", folder.suffix[1:], "fd").exists():
+            if folder.suffix[1:] == str(os.getpid()) or not os.path.exists(f"/proc/{folder.suffix[1:]}/fd"):
                 shutil.rmtree(folder, ignore_errors=True)

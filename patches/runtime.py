@@ -17,7 +17,6 @@ from diff_smoe_rasterization.settings import BLEND_MODES, resolve_blend_mode
 
 SHIMS, STAND_INS = (Path(__file__).resolve().parent / name for name in ("shims", "stand_ins"))
 OPTIONS = ("blend_mode", "background_gate")
-VARIABLES = (settings.BLEND_MODE_VARIABLE, settings.BACKGROUND_GATE_VARIABLE)
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
 WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
@@ -46,7 +45,7 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
 
     Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args. Without a
     `blend_mode` (a cfg_args of before the patch): "alpha". In `smoe` without a `background_gate`: 0, Eq. 7.
-    From then on both are the process's default, which settings that name none have.
+    From then on a rendering of this process whose settings name no mode has both.
     Says on stderr what they are. Warns, once, where one may not be what was meant.
     Raises ValueError where one is wrong, RuntimeError where the renderer has another rasterizer.
     """
@@ -66,13 +65,12 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
     gate = settings.training_background_gate(mode, None if gate == "" or is_of_smoe else gate)
     say(f"blend mode {mode}" + (f", background gate {gate}" if gate is not None else ""))
     # Rendering without an option never warns: it has what cfg_args records.
-    for option, value, variable in zip(OPTIONS, (mode, gate), VARIABLES):
+    for option, value in zip(OPTIONS, (mode, gate)):
         before = _saved(dataset).get(option)
-        if value is not None:
-            os.environ[variable] = str(value)  # of settings that name none: the patch's line there may be deleted
         if value is not None and before not in (None, value):
             _warn(f"{dataset.model_path}/cfg_args is of a run with {option} {before}, but this one has {value}; a "
                   f"training overwrites it. To go on as before, give --{option} {before}")
+    settings.blend_of_process = mode, gate  # the patch's line in the renderer may be deleted
     dataset.blend_mode, dataset.background_gate = mode, gate
     return {"blend_mode": mode, "background_gate": gate}
 

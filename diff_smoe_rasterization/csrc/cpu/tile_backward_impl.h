@@ -82,12 +82,12 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   }
 
   template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P> not_past, Sums& sums) const {
-    const Gate<P>& gate = pairs.gate;
+    const auto& gate = pairs.gate;
     const auto contributes = gate.counts & not_past;
     P value = S(0);
     for (int f = 0; f < num_features(); ++f) value = fma(scaled_of(f).load(at), P(features_[f]), value);
     PixelBackward<P> pixel = {transmittance_.load(at), suffix_.load(at), base_.load(at)};
-    const auto pair = Blend<kMode>::backward(pixel, pairs.gate, value, contributes);
+    const auto pair = Blend<kMode>::backward(pixel, gate, value, contributes);
     transmittance_.store(at, pixel.transmittance);
     suffix_.store(at, pixel.suffix);
     for (int f = 0; f < num_features(); ++f) {

@@ -84,7 +84,7 @@ template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real 
 }
 
 // A Gaussian as kernels read it for each of its pixels: log2(o G) is one quadratic form, and which pairs count is two
-// comparisons with it.
+// comparisons with it. opacity: above 0, as of every Gaussian that reaches a pixel.
 template <class S> struct LogGate {
   ExponentFactors<S> factors;  // times log2(e)
   S greatest;                  // log2(o)

@@ -1,16 +1,14 @@
 """Where a patched trainer's blend mode and background gate come from."""
 from __future__ import annotations
 
-import os
 import sys
 import warnings
 from collections import namedtuple
 from types import SimpleNamespace
-from unittest import mock
 
 import pytest
 
-from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings
+from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings, settings
 from diff_smoe_rasterization.patches import runtime
 from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED
 from diff_smoe_rasterization.settings import resolve_blend
@@ -23,8 +21,7 @@ def a_process_of_its_own(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py"])
     runtime._warn.cache_clear()
     runtime.say.cache_clear()
-    with mock.patch.dict(os.environ):
-        yield
+    monkeypatch.setattr(settings, "blend_of_process", None)
 
 
 def run(mode, gate="", **more):
@@ -63,6 +60,9 @@ def test_settings_that_name_no_mode_have_that_of_the_run(mode, gate, monkeypatch
     runtime.blend_of(run(mode, "0.25" if mode == "smoe" else ""))
     nameless = GaussianRasterizationSettings._field_defaults
     assert resolve_blend(SimpleNamespace(**nameless)) == (mode, gate)
+    monkeypatch.delenv("DSMOE_BLEND_MODE")
+    monkeypatch.delenv("DSMOE_BACKGROUND_GATE")  # and the next run of the process has the defaults again
+    assert runtime.default_blend()[0] == "alpha" and runtime.blend_of(run("smoe"))["background_gate"] == RECOMMENDED
 
 
 def test_a_gate_that_is_typed_wins(monkeypatch):
