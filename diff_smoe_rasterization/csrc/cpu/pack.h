@@ -195,7 +195,7 @@ DSMOE_HD Pack<float> exp(Pack<float> x) {
   using P = Pack<float>;
   const P kRound = 12582912.0f;  // 1.5 * 2^23
   const P clamped = max(x, P(-80.0f));
-  const P shifted = fma(clamped, P(1.44269504f), kRound);
+  const P shifted = fma(clamped, P(float(kLog2E)), kRound);
   const P n = shifted - kRound;
   P r = fma(n, P(-0.693359375f), clamped);  // ln 2 in two parts: the first times n is exact
   r = fma(n, P(2.12194440e-4f), r);
@@ -234,7 +234,7 @@ DSMOE_HD Pack<double> exp(Pack<double> x) {
   using P = Pack<double>;
   const P kRound = 6755399441055744.0;  // 1.5 * 2^52
   const P clamped = max(x, P(-700.0));
-  const P shifted = fma(clamped, P(1.4426950408889634), kRound);
+  const P shifted = fma(clamped, P(kLog2E), kRound);
   const P n = shifted - kRound;
   P r = fma(n, P(-0.693147180369123816490), clamped);
   r = fma(n, P(-1.90821492927058770002e-10), r);

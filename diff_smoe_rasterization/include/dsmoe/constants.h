@@ -16,8 +16,6 @@ constexpr float kGateSumCut = 1e-30f;          // below it no gate is open: the 
 constexpr float kRadiusRootFloor = 0.1f;       // keeps the larger eigenvalue's root real for round Gaussians
 constexpr float kCompensationFloor = 2.5e-5f;  // antialiasing: the determinant ratio is not taken below this
 
-constexpr double kLog2E = 1.4426950408889634, kLn2 = 0.6931471805599453;
-
 constexpr double kLowPass = 0.3;              // px^2 added to the projected covariance: no splat thinner than a pixel
 constexpr double kFrustumMargin = 1.3;        // the Jacobian is taken at most this many tan(fov / 2) off the axis
 constexpr double kHomogeneousEpsilon = 1e-7;  // added to w before the perspective division

@@ -27,12 +27,14 @@ template <> struct RealTraits<double> {
 template <class Real> using Mask = typename RealTraits<Real>::Mask;
 template <class Real> using Scalar = typename RealTraits<Real>::Scalar;
 
+constexpr double kLog2E = 1.4426950408889634, kLn2 = 0.6931471805599453;
+
 // In kernels, exp, exp2 and reciprocal of a float are the hardware's own. exp2 and reciprocal run once a (Gaussian,
 // pixel) pair; their relative errors are at most 2^-22. That of exp(x) is at most 7.3e-8 |x| more, from x log2(e).
 DSMOE_HD float exp(float x) {
 #if defined(__CUDA_ARCH__)
   float y;
-  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x * 1.4426950408889634f));  // log2(e)
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x * float(kLog2E)));
   return y;
 #else
   return ::expf(x);
