@@ -20,9 +20,9 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
         suffix_(scratch.pixels()),
         base_(scratch.pixels()),
         last_(scratch.pixels()),
-        scaled_{scratch.next},
+        scaled_{scratch.next + kCellPixels},
         dL_dinstances_(gradients.dL_dinstances) {
-    for (int i = 0; i < kTilePixels * (4 + num_features); ++i) transmittance_.values[i] = S(0);
+    for (int i = 0; i < kTilePixels * (4 + num_features) + kCellPixels; ++i) transmittance_.values[i] = S(0);
     for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(1);
   }
 
@@ -144,7 +144,8 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   const int num_features_;
   const bool absolute_;  // false, when compiling, where the number of features is known
   const PixelArray<S> transmittance_, suffix_, base_, last_;
-  const PixelArray<S> scaled_;  // g', one array a feature
+  const PixelArray<S> scaled_;  // g', one array a feature; a cell further on, so that none is 4 KB from transmittance_:
+                                // processors take a load for one of the store just before where the low bits are equal
   S* const dL_dinstances_;
   const S* features_ = nullptr;
   P position_;
