@@ -144,8 +144,8 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   const int num_features_;
   const bool absolute_;  // false, when compiling, where the number of features is known
   const PixelArray<S> transmittance_, suffix_, base_, last_;
-  const PixelArray<S> scaled_;  // g', one array a feature; a cell further on, so that none is 4 KB from transmittance_:
-                                // processors take a load for one of the store just before where the low bits are equal
+  // g', one array a feature, a cell further on: a load may wait for a store just before it that lies 4 KB away.
+  const PixelArray<S> scaled_;
   S* const dL_dinstances_;
   const S* features_ = nullptr;
   P position_;
