@@ -110,7 +110,6 @@ def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
     from diff_smoe_rasterization import GaussianRasterizer
 
     flavour = flavour or os.environ[RASTERIZER_VARIABLE]
-    flavour = "inria" if flavour == "gsplat" else flavour  # gsplat's wrapper of Inria's rasterizer imports that
     module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
     GaussianRasterizer.__init__ = _noting(GaussianRasterizer.__init__)  # type: ignore[method-assign]
     _say_rasterizer(flavour)

@@ -111,7 +111,7 @@ def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
 
 
 OURS = RENDERER.replace("diff_gaussian_rasterization import", "diff_smoe_rasterization.integrations.inria import")
-MS = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
+GOF = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_gof")
 MASKS = "gaussian_renderer/masks.py"
 PYTHON = [*RUN, "--", sys.executable, "train.py"]
 AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
@@ -127,14 +127,14 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
     ({GR: OURS}, PYTHON, "is patched already: run the command itself, with --blend_mode"),
-    # Under --trainer too: Mini-Splatting, and a renderer of no rasterizer at all.
-    ({GR: MS}, PYTHON, "it imports diff_gaussian_rasterization_ms, another rasterizer"),
-    ({GR: RENDERER + MS}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
+    # Under --trainer too: gaussian-opacity-fields, and a renderer of no rasterizer at all.
+    ({GR: GOF}, PYTHON, "it imports diff_gaussian_rasterization_gof, another rasterizer"),
+    ({GR: RENDERER + GOF}, AS_INRIA, "it imports diff_gaussian_rasterization_gof, another"),
     # DepthAwareGS, whose rasterizer has more than images: without it the training would stop when it first asks.
     ({GR: RENDERER + "rasterizer.to(0), rasterizer.apply_weights(1)\n"}, PYTHON, "has a method apply_weights, which"),
     # A second renderer beside the first, by which masks are trained.
-    ({MASKS: MS, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_ms, another rasterizer"),
-    ({MASKS: MS, GR: "from . import masks\n" + RENDERER}, PYTHON, "_ms, another rasterizer"),
+    ({MASKS: GOF, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_gof, another rasterizer"),
+    ({MASKS: GOF, GR: "from . import masks\n" + RENDERER}, PYTHON, "_gof, another rasterizer"),
     ({GR: "from nvdiffrast import rasterize\n"}, AS_INRIA, "nothing imports GaussianRasterizationSettings from")])
 def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_path, dsmoe, monkeypatch):
     monkeypatch.chdir(make(tmp_path, files))
@@ -173,7 +173,8 @@ def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(fl
             run.prepare(*words)
         return
     made, lines = run.prepare(*words)
-    assert made["DSMOE_RASTERIZER"] == flavour and f"{module} will be {flavour} of this package" in lines[0]
+    named = flavour if module == "diff_gaussian_rasterization" else "inria"  # beside another name
+    assert made["DSMOE_RASTERIZER"] == named and f"{module} will be {flavour} of this package" in lines[0]
 
 
 def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(tmp_path, python):
