@@ -28,16 +28,16 @@ def distCUDA2(points: torch.Tensor) -> Union[torch.Tensor, Tuple[torch.Tensor, t
     file = sys._getframe(1).f_code.co_filename
     kinds = _uses_of(file)
     if kinds == {"element"}:
-        raise TypeError(f"{file} takes an element of what distCUDA2 returns; whether that is a point's distance, or the "
-                        "distances beside the neighbours' indices, cannot be told: install the trainer's own simple_knn")
+        raise TypeError(f"{file} takes an element of what distCUDA2 returns; it may be a point's distance, or all "
+                        "distances, beside the neighbours' indices: install the simple_knn that it was written for")
     return (distances, neighbours_of(points, distances)) if "unpacked" in kinds else distances
 
 
 def neighbours_of(points: torch.Tensor, distances: torch.Tensor) -> torch.Tensor:
-    """Returns the indices [N, 3] int32 of the three nearest others, the nearest first. Fewer than four points: ValueError.
+    """Returns the indices [N, 3] int32 of the three nearest others, the nearest first.
 
     distances: of `distCUDA2`. They say how far away the third one can be, so only points in such a slice of the longest
-    axis are looked at.
+    axis are looked at. Raises ValueError for fewer than four points.
     """
     points, count = points.detach(), len(points)
     if count < 4:
@@ -66,7 +66,8 @@ def _uses_of(file: str) -> frozenset:
         return frozenset()
 
     def is_call(node: ast.AST) -> bool:
-        return isinstance(node, ast.Call) and "distCUDA2" in (getattr(node.func, "id", ""), getattr(node.func, "attr", ""))
+        function = getattr(node, "func", None)
+        return "distCUDA2" in (getattr(function, "id", ""), getattr(function, "attr", ""))
 
     def number(node: ast.Subscript) -> object:  # Python 3.8 has one node more around it
         index = getattr(node.slice, "value", None)

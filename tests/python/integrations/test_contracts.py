@@ -270,7 +270,8 @@ def test_scores_are_what_a_removal_changes(mode):
 
 @pytest.mark.parametrize("count, scale", [(90, 0.4), (20, 0.04)])  # some pixels are full; some have nothing
 def test_the_gaussian_of_the_largest_weight_and_where_its_rays_are_deepest(mode, count, scale):
-    scene = random_scene(mode, count, 40, 37, seed=3, degree=1, scale=scale, opacity=(0.3, 0.98))  # at most 0.99: no ties
+    # An alpha is at most 0.99, so opacities above would make ties.
+    scene = random_scene(mode, count, 40, 37, seed=3, degree=1, scale=scale, opacity=(0.3, 0.98))
     scene.inputs["rotations"] = torch.nn.functional.normalize(scene.inputs["rotations"])
     # With a channel for each Gaussian, an image is the map of its weight, divided by what all of a pixel share.
     channels = {**{name: tensor for name, tensor in scene.inputs.items() if name != "shs"},

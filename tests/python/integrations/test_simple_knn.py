@@ -50,7 +50,7 @@ KINDS = {  # what a trainer's file does with the results, and whether there are 
 def test_a_file_that_unpacks_the_results_gets_two(code, tmp_path, monkeypatch):
     (tmp_path / "simple_knn_C.py").write_text("from diff_smoe_rasterization.integrations.simple_knn import distCUDA2\n")
     (tmp_path / "model.py").write_text("import torch\nfrom simple_knn_C import distCUDA2\n"
-                                       f"def kind(points):\n    return distCUDA2(points)\ndef use(points):\n    "
+                                       "def kind(points):\n    return distCUDA2(points)\ndef use(points):\n    "
                                        + code.replace("\n", "\n    ") + "\n")
     monkeypatch.syspath_prepend(tmp_path)
     for name in ("model", "simple_knn_C"):

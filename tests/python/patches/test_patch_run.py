@@ -154,6 +154,7 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
     "lucid_dreamer": ("", "", "image, radii, depth_alpha"),  # no depth: one image has both
     "nearest_points": ("nearest_points=1", "", "image, radii"),
+    "mini_splatting": ("", "", "image, radii, weights, weight_counts, max_count"),
     "light_gaussian": ("f_count=1", "", "counts, score, image, radii"), "depth": ("", "", "image, radii, depth"),
     "absgs": ("", "", "image, radii, gs_w"), "fastgs": ("mult=1, get_flag=1", "dc=1", "image, radii, metric_counts"),
     None: ("", "", "image, radii, normals"), "inria": ("", "", "image, radii")}
@@ -178,14 +179,30 @@ def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(fl
 
 
 def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(tmp_path, python):
-    modules = {contract.module: contract.name for contract in CONTRACTS if contract.name in ("absgs", "fastgs")}
+    modules = {contract.module: contract.name for contract in CONTRACTS
+               if contract.name in ("absgs", "fastgs", "mini_splatting")}
+    modules["diff_gaussian_rasterization"] = "inria"  # beside such a one, as Mini-Splatting's renderer has both
     script = "".join(f"from {module} import GaussianRasterizer, GaussianRasterizationSettings\n"
-                     "print(GaussianRasterizer.__module__)\nGaussianRasterizer(None)\n" for module in modules)
+                     "GaussianRasterizer(None)\n" for module in modules)
     make(tmp_path, {"x.py": script})
     result = python("-m", "diff_smoe_rasterization", *RUN, "--trainer", "absgs", "--", sys.executable, "x.py",
                     cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
-    said = [f"diff_smoe_rasterization.integrations.{flavour}" for flavour in modules.values()]
-    assert (result.status, result.out.splitlines()) == (0, said), result.err
+    assert result.status == 0, result.err
+    said = [line.split()[4] for line in result.err.splitlines() if "the rasterizer is" in line]
+    assert said == list(modules.values()), result.err
+
+
+def test_mini_splatting_has_two_rasterizers_and_a_method(tmp_path, monkeypatch):
+    own = ("    from {0} import GaussianRasterizer\n    draw = GaussianRasterizer(raster_settings=1)\n"
+           "    {1} = draw(means3D=1)\n")
+    both = RENDERER + "def render_1():\n" + own.format("diff_gaussian_rasterization", "image, radii") + \
+        "def render_2():\n" + own.format("diff_gaussian_rasterization_ms", "image, radii, weights, count, max_count")
+    monkeypatch.chdir(make(tmp_path, {GR: both + "    draw.render_depth(means3D=1)\n"}))
+    words = [sys.executable, "train.py"], "smoe", None, environment()
+    assert "diff_gaussian_rasterization_ms will be mini_splatting" in run.prepare(*words)[1][0]
+    make(tmp_path, {GR: both + "    draw.render_normals(means3D=1)\n"})
+    with pytest.raises(patches.PatchError, match="has a method render_normals, which no rasterizer has"):
+        run.prepare(*words)
 
 
 GSPLAT = {  # a gsplat of some lines: its version, and a strategy that has taken its functions by name
