@@ -112,6 +112,7 @@ CONTRACTS = (
     Contract("mini_splatting", "Mini-Splatting", ("color", "radii", "weights", "counts", "largest"),
              methods=("render_depth",), module=RASTERIZER + "_ms",
              other_results=(("color", "radii"),)),  # of Inria's, which its trainer calls too
+    Contract("dngaussian", "DNGaussian (`_depth`)", ("color", "radii", "depth", "alpha"), module=RASTERIZER + "_depth"),
     Contract("gsplat", "gsplat, nerfstudio", ("renders", "alphas", "meta"), module="gsplat"),
 )
 

@@ -144,7 +144,7 @@ def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_pa
 
 CALLS = {  # what a checkout sets, calls with and names the results of, and the rasterizer that it needs
     "mip_splatting": ("kernel_size=1, subpixel_offset=2", "", "image, radii"),
-    "mcmc": ("", "", "image, radii, is_used"),
+    "mcmc": ("", "", "image, radii, is_used"), "dngaussian": ("", "", "image, radii, depth, alpha"),
     "monogs": ("projmatrix_raw=1", "theta=1", "image, radii, depth, opacity"),
     "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
     "feature_3dgs": ("", "semantic_feature=1", "image, feature_map, radii, depth"),
