@@ -1,6 +1,9 @@
 """simple_knn of both kinds: the neighbours' indices against brute force, and which kind a file is written for."""
 from __future__ import annotations
 
+import importlib
+import sys
+
 import pytest
 import torch
 from devices import random_normal
@@ -54,8 +57,8 @@ def test_a_file_that_unpacks_the_results_gets_two(code, tmp_path, monkeypatch):
                                        + code.replace("\n", "\n    ") + "\n")
     monkeypatch.syspath_prepend(tmp_path)
     for name in ("model", "simple_knn_C"):
-        monkeypatch.delitem(__import__("sys").modules, name, raising=False)
-    model = __import__("model")
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    model = importlib.import_module("model")
     points = torch.rand(9, 3)
     if KINDS[code] is None:
         with pytest.raises(TypeError, match="model.py takes an element of what distCUDA2 returns"):
