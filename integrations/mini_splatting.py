@@ -1,8 +1,8 @@
 """The API of Mini-Splatting's rasterizer: scores of each Gaussian beside the image, and `render_depth`.
 
-Which Gaussian has the largest weight in a pixel is found by one more walk over the image, in plain torch. That takes many
-times as long as the rendering. The original's rays of `render_depth` are shifted by 1% of the way to the origin; these
-go through the pixels' centres.
+Which Gaussian has the largest weight in a pixel is found by one more walk over the image, in plain torch. That takes
+many times as long as the rendering. The original's rays of `render_depth` are shifted by 1% of the way to the origin;
+these go through the pixels' centres.
 """
 from __future__ import annotations
 
