@@ -42,10 +42,11 @@ class GaussianRasterizer(_Rasterizer):
         render [C, H, W]. gidx [1, H, W] int32, which Gaussian; 0 where there is none, as are the following three.
         out_pts [3, H, W], the point; rendered_depth [1, H, W], its view z; discriminants [1, H, W], above 0 where the
         ray meets the ellipsoid of 3 sigma. accum_alpha [1, H, W], the share of the pixel that the background has.
-        A Gaussian that is deepest behind the camera is not left out. Raises ValueError without scales and rotations.
+        A Gaussian that is deepest behind the camera is not left out. Raises ValueError without Gaussians, or their
+        scales and rotations.
         """
-        if scales is None or rotations is None:
-            raise ValueError("render_depth needs scales and rotations")
+        if scales is None or rotations is None or not len(scales):
+            raise ValueError("render_depth needs Gaussians with scales and rotations")
         settings = self.raster_settings
         inputs = {"means3D": means3D, "opacities": opacities, "shs": shs, "colors_precomp": colors_precomp,
                   "scales": scales, "rotations": rotations}

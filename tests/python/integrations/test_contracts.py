@@ -309,5 +309,12 @@ def test_the_gaussian_of_the_largest_weight_and_where_its_rays_are_deepest(mode,
     assert within.any() and torch.equal(images["discriminants"][0][shown] > 0, within)
     for name in ("out_pts", "rendered_depth", "discriminants", "gidx"):
         assert not images[name][:, ~shown].any()
-    with pytest.raises(ValueError, match="needs scales and rotations"):
+    with pytest.raises(ValueError, match="needs Gaussians with scales and rotations"):
         mini_splatting.GaussianRasterizer(scene.settings).render_depth(torch.zeros(1, 3), None, torch.ones(1, 1))
+
+
+def test_mini_splatting_without_gaussians_is_the_background():
+    scene = scene_of("smoe").rows(torch.zeros(N, dtype=torch.bool))
+    color, *scores = rendered(mini_splatting, scene)
+    assert torch.equal(color, scene.settings.bg[:, None, None].expand_as(color))
+    assert [len(score) for score in scores] == [0, 0, 0, 0]
