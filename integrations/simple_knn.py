@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import math
 import sys
 from pathlib import Path
 from typing import Tuple, Union
@@ -15,7 +16,7 @@ import torch
 from diff_smoe_rasterization import distCUDA2 as distances_of
 
 __all__ = ["distCUDA2", "neighbours_of"]
-CHUNK = 256  # points that are searched together
+CHUNK = 64  # points that are searched together
 
 
 def distCUDA2(points: torch.Tensor) -> Union[torch.Tensor, Tuple[torch.Tensor, torch.Tensor]]:
@@ -36,25 +37,31 @@ def distCUDA2(points: torch.Tensor) -> Union[torch.Tensor, Tuple[torch.Tensor, t
 def neighbours_of(points: torch.Tensor, distances: torch.Tensor) -> torch.Tensor:
     """Returns the indices [N, 3] int32 of the three nearest others, the nearest first.
 
-    distances: of `distCUDA2`. They say how far away the third one can be, so only points in such a slice of the longest
-    axis are looked at. Raises ValueError for fewer than four points.
+    distances: of `distCUDA2`. They say how far away the third one can be, so only points in such a box are looked at.
+    Raises ValueError for fewer than four points.
     """
     points, count = points.detach(), len(points)
     if count < 4:
         raise ValueError(f"distCUDA2: {count} points have no three neighbours each")
-    axis = int((points.amax(0) - points.amin(0)).argmax())
-    along, order = points[:, axis].contiguous().sort()
+    every = torch.arange(count, device=points.device)
+    cells, order = 1, every
+    for axis in range(3):  # cells of equal numbers of points: slabs along x, in each columns along y, then along z
+        order = _sorted_within(order, points[:, axis], every * cells // count)
+        cells *= math.ceil((count / CHUNK) ** (1 / 3))
     ordered, reach = points[order], (3 * distances[order]).sqrt() * (1 + 1e-5)  # of all rounding
     found = torch.empty(count, 3, dtype=torch.int32, device=points.device)
-    for begin in range(0, count, CHUNK):
-        own = slice(begin, begin + CHUNK)
-        first = int(torch.searchsorted(along, (along[own] - reach[own]).amin()))
-        last = int(torch.searchsorted(along, (along[own] + reach[own]).amax(), right=True))
-        squared = (ordered[own, None] - ordered[None, first:last]).square().sum(2)
-        rows = torch.arange(len(squared), device=points.device)
-        squared[rows, rows + begin - first] = torch.inf
-        found[order[own]] = order[first + squared.topk(3, largest=False).indices].int()
+    for own in every.split(CHUNK):
+        chunk, most = ordered[own], reach[own].amax()
+        near = ((ordered >= chunk.amin(0) - most) & (ordered <= chunk.amax(0) + most)).all(1).nonzero()[:, 0]
+        squared = (chunk[:, None] - ordered[near]).square().sum(2).masked_fill_(near == own[:, None], torch.inf)
+        found[order[own]] = order[near[squared.topk(3, largest=False).indices]].int()
     return found
+
+
+def _sorted_within(order: torch.Tensor, values: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
+    """Returns the order sorted by values in each cell of it; cells ascend."""
+    by_value = values[order].argsort(stable=True)
+    return order[by_value[cells[by_value].argsort(stable=True)]]
 
 
 @functools.lru_cache(maxsize=None)
