@@ -29,6 +29,7 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "n_touched": ("[N] int32, how many pixels blended the Gaussian", "touched"),
     "counts": ("[N] int32, how many pixels blended the Gaussian", "count"),
     "opacity_sums": ("[N], counts times the opacity", "score"),
+    "largest": ("[N], in how many pixels the Gaussian has the largest weight", "max"),
     "metric_counts": ("[N] int32, how many pixels of metric_map blended the Gaussian", "count"),
     "kernel_times": ("[1], NaN: nothing is timed", "time"),
     "mask": ("[1, H, W], zeros", "mask"),
@@ -49,7 +50,7 @@ class Contract(NamedTuple):
     names: Tuple[str, ...] = ()  # that can be imported
     signs: Tuple[str, ...] = ()  # a caller shows one of these (patches/facts.py); none: it needs to show nothing
     module: str = RASTERIZER  # what callers import
-    other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings
+    other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings, or of a rasterizer beside it
     methods: Tuple[str, ...] = ()  # of a rasterizer, beside METHODS
     absolute: int = 0  # columns of means2D behind x and y that get sums of absolute gradients: of both axes, or of each
 
@@ -108,6 +109,10 @@ CONTRACTS = (
     Contract("absgs", "AbsGS", ("color", "radii", "weights"), module=RASTERIZER + "_abs", absolute=2),
     Contract("fastgs", "FastGS", ("color", "radii", "metric_counts"), ("mult", "get_flag", "metric_map"), WITH_DC,
              ("SparseGaussianAdam",), module=RASTERIZER + "_fastgs", absolute=2),
+    Contract("mini_splatting", "Mini-Splatting", ("color", "radii", "weights", "counts", "largest"),
+             methods=("render_depth",), module=RASTERIZER + "_ms",
+             other_results=(("color", "radii"),)),  # of Inria's, which its trainer calls too
+    Contract("dngaussian", "DNGaussian (`_depth`)", ("color", "radii", "depth", "alpha"), module=RASTERIZER + "_depth"),
     Contract("gsplat", "gsplat, nerfstudio", ("renders", "alphas", "meta"), module="gsplat"),
 )
 

@@ -65,8 +65,10 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     folders = _folders(words)
     files = {folder: _read(folder, everywhere=folder == folders[0]) for folder in folders}
     flavour, found, warnings = _flavour(files, trainer)
+    module = contract_of(flavour).module
+    named = flavour if module == RASTERIZER else "inria"  # beside another, such as gsplat's wrapper, stands Inria's
     path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
-    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: flavour,
+    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: named,
                    BACKGROUND_GATE_VARIABLE: "" if gate is None else str(gate), "PYTHONPATH": os.pathsep.join(path),
                    "PYTHONDONTWRITEBYTECODE": "1"}  # else Python leaves __pycache__ in the checkout
     warnings += facts.of_one_name(folders[0])
@@ -75,7 +77,6 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         warnings += [f"{SPARSE_ADAM} is not offered: where it is found, the trainer reads get_features_dc of its model,"
                      " which has none"]
     blend = blend_mode if gate is None else f"{blend_mode}, background gate {gate}"
-    module = contract_of(flavour).module
     return environment, [f"{found}: {module} will be {flavour} of this package, blend mode {blend}; each process that "
                          "imports it says so", *(f"warning: {warning}" for warning in warnings)]
 

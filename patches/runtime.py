@@ -108,9 +108,7 @@ def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
     flavour: the module of integrations, where the name that is imported says it; None: the one that the trainer needs.
     """
     from diff_smoe_rasterization import GaussianRasterizer
-
     flavour = flavour or os.environ[RASTERIZER_VARIABLE]
-    flavour = "inria" if flavour == "gsplat" else flavour  # gsplat's wrapper of Inria's rasterizer imports that
     module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
     GaussianRasterizer.__init__ = _noting(GaussianRasterizer.__init__)  # type: ignore[method-assign]
     _say_rasterizer(flavour)
@@ -125,7 +123,6 @@ def gsplat_of_run() -> None:
     Where gsplat cannot be had, the package has `rasterization` and `rendering.rasterization` alone.
     """
     from diff_smoe_rasterization.integrations import gsplat as ours
-
     if not is_installed("gsplat"):
         sys.modules["gsplat.rendering"] = types.ModuleType("gsplat.rendering")
         for module in ("gsplat", "gsplat.rendering"):
@@ -151,7 +148,6 @@ def gsplat_of_run() -> None:
 def is_installed(module: str) -> bool:
     """Whether a package, with this module of it, can be imported from elsewhere; then it replaces its stand-in."""
     import torch  # noqa: F401  (its libraries are the extensions')
-
     name, path = module.partition(".")[0], sys.path[:]
     ours = sys.modules.pop(name)
     sys.path[:] = [folder for folder in path if Path(folder).resolve() not in (SHIMS, STAND_INS)]

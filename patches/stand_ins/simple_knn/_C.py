@@ -1,1 +1,1 @@
-from diff_smoe_rasterization import distCUDA2  # noqa: F401
+from diff_smoe_rasterization.integrations.simple_knn import distCUDA2  # noqa: F401

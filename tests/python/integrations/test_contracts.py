@@ -9,7 +9,7 @@ from comparison import assert_close
 from devices import random_normal
 from scenes import random_scene
 
-from diff_smoe_rasterization import rasterize, rasterize_with_splats
+from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.integrations import (
     absgs,
     cob_gs,
@@ -21,6 +21,7 @@ from diff_smoe_rasterization.integrations import (
     light_gaussian,
     lucid_dreamer,
     mcmc,
+    mini_splatting,
     mip_splatting,
     monogs,
     nearest_points,
@@ -265,3 +266,55 @@ def test_scores_are_what_a_removal_changes(mode):
     with torch.no_grad():
         without, _, times = rendered(speedy_splat, scene, scores=scores)
     assert torch.equal(without, color) and (1000 / times.item()) != 0  # the trainer divides by its mean
+
+
+@pytest.mark.parametrize("count, scale", [(90, 0.4), (20, 0.04)])  # some pixels are full; some have nothing
+def test_the_gaussian_of_the_largest_weight_and_where_its_rays_are_deepest(mode, count, scale):
+    # An alpha is at most 0.99, so opacities above would make ties.
+    scene = random_scene(mode, count, 40, 37, seed=3, degree=1, scale=scale, opacity=(0.3, 0.98))
+    scene.inputs["rotations"] = torch.nn.functional.normalize(scene.inputs["rotations"])
+    # With a channel for each Gaussian, an image is the map of its weight, divided by what all of a pixel share.
+    channels = {**{name: tensor for name, tensor in scene.inputs.items() if name != "shs"},
+                "colors_precomp": torch.eye(count, dtype=torch.float64)}
+    black = scene.settings._replace(bg=torch.zeros(count, dtype=torch.float64))
+    weight, which = rasterize(settings=black, **channels).color.max(0)
+    shown = weight > 0
+    color, radii, weights, counts, largest = rendered(mini_splatting, scene)
+    rendering, splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)
+    sums = splats.contributions(torch.ones_like(color[0]))
+    assert torch.equal(color, rendering.color) and torch.equal(radii, rendering.radii)
+    assert torch.equal(weights, sums.blend_weights) and torch.equal(counts, sums.pixels)
+    assert torch.equal(largest, torch.bincount(which[shown], minlength=count).double())
+    assert shown.all() == (count == 90)
+
+    images = mini_splatting.GaussianRasterizer(scene.settings).render_depth(**scene.inputs)
+    assert torch.equal(images["render"], color) and torch.equal(images["gidx"][0][shown], which[shown].int())
+    assert_close(images["accum_alpha"], 1 - rendered(depth_alpha, scene)[3], TOLERANCE, "the background's share")
+    points = images["out_pts"][:, shown].T
+    clip = torch.cat([points, torch.ones_like(points[:, :1])], 1) @ scene.settings.projmatrix
+    y, x = shown.nonzero().double().unbind(1)
+    # 1e-6: that scene's projection is rounded to float32.
+    assert_close(((clip[:, 0] / clip[:, 3] + 1) * 40 - 1) / 2, x, 1e-6, "the pixels' x")
+    assert_close(((clip[:, 1] / clip[:, 3] + 1) * 37 - 1) / 2, y, 1e-6, "the pixels' y")
+    assert_close(clip[:, 3], images["rendered_depth"][0][shown], 1e-6, "view z")
+
+    every = reference.Gaussians(scene.inputs["means3D"], None, None, None, None, scene.inputs["scales"],
+                                scene.inputs["rotations"], None)
+    inverse = torch.linalg.inv(reference.covariance3D(every, 1.0))[which[shown]]
+    offset, along = points - scene.inputs["means3D"][which[shown]], points - scene.settings.campos
+    slope = torch.einsum("ni,nij,nj->n", along, inverse, offset)
+    curvature = torch.einsum("ni,nij,nj->n", along, inverse, along)
+    assert (slope.abs() < 1e-9 * curvature).all(), "a step along the ray leads no deeper"
+    within = torch.einsum("ni,nij,nj->n", offset, inverse, offset) < 9
+    assert within.any() and torch.equal(images["discriminants"][0][shown] > 0, within)
+    for name in ("out_pts", "rendered_depth", "discriminants", "gidx"):
+        assert not images[name][:, ~shown].any()
+    with pytest.raises(ValueError, match="needs Gaussians with scales and rotations"):
+        mini_splatting.GaussianRasterizer(scene.settings).render_depth(torch.zeros(1, 3), None, torch.ones(1, 1))
+
+
+def test_mini_splatting_without_gaussians_is_the_background():
+    scene = scene_of("smoe").rows(torch.zeros(N, dtype=torch.bool))
+    color, *scores = rendered(mini_splatting, scene)
+    assert torch.equal(color, scene.settings.bg[:, None, None].expand_as(color))
+    assert [len(score) for score in scores] == [0, 0, 0, 0]

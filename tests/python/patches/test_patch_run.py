@@ -111,7 +111,7 @@ def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
 
 
 OURS = RENDERER.replace("diff_gaussian_rasterization import", "diff_smoe_rasterization.integrations.inria import")
-MS = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
+GOF = RENDERER.replace("diff_gaussian_rasterization", "diff_gaussian_rasterization_gof")
 MASKS = "gaussian_renderer/masks.py"
 PYTHON = [*RUN, "--", sys.executable, "train.py"]
 AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
@@ -127,14 +127,14 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
     ({GR: OURS}, PYTHON, "is patched already: run the command itself, with --blend_mode"),
-    # Under --trainer too: Mini-Splatting, and a renderer of no rasterizer at all.
-    ({GR: MS}, PYTHON, "it imports diff_gaussian_rasterization_ms, another rasterizer"),
-    ({GR: RENDERER + MS}, AS_INRIA, "it imports diff_gaussian_rasterization_ms, another"),
+    # Under --trainer too: gaussian-opacity-fields, and a renderer of no rasterizer at all.
+    ({GR: GOF}, PYTHON, "it imports diff_gaussian_rasterization_gof, another rasterizer"),
+    ({GR: RENDERER + GOF}, AS_INRIA, "it imports diff_gaussian_rasterization_gof, another"),
     # DepthAwareGS, whose rasterizer has more than images: without it the training would stop when it first asks.
     ({GR: RENDERER + "rasterizer.to(0), rasterizer.apply_weights(1)\n"}, PYTHON, "has a method apply_weights, which"),
     # A second renderer beside the first, by which masks are trained.
-    ({MASKS: MS, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_ms, another rasterizer"),
-    ({MASKS: MS, GR: "from . import masks\n" + RENDERER}, PYTHON, "_ms, another rasterizer"),
+    ({MASKS: GOF, "train.py": "from gaussian_renderer.masks import render\n"}, PYTHON, "_gof, another rasterizer"),
+    ({MASKS: GOF, GR: "from . import masks\n" + RENDERER}, PYTHON, "_gof, another rasterizer"),
     ({GR: "from nvdiffrast import rasterize\n"}, AS_INRIA, "nothing imports GaussianRasterizationSettings from")])
 def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_path, dsmoe, monkeypatch):
     monkeypatch.chdir(make(tmp_path, files))
@@ -144,7 +144,7 @@ def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_pa
 
 CALLS = {  # what a checkout sets, calls with and names the results of, and the rasterizer that it needs
     "mip_splatting": ("kernel_size=1, subpixel_offset=2", "", "image, radii"),
-    "mcmc": ("", "", "image, radii, is_used"),
+    "mcmc": ("", "", "image, radii, is_used"), "dngaussian": ("", "", "image, radii, depth, alpha"),
     "monogs": ("projmatrix_raw=1", "theta=1", "image, radii, depth, opacity"),
     "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
     "feature_3dgs": ("", "semantic_feature=1", "image, feature_map, radii, depth"),
@@ -154,6 +154,7 @@ CALLS = {  # what a checkout sets, calls with and names the results of, and the 
     "pixel_gs": ("depth_threshold=1", "", "image, radii, pixels"),
     "lucid_dreamer": ("", "", "image, radii, depth_alpha"),  # no depth: one image has both
     "nearest_points": ("nearest_points=1", "", "image, radii"),
+    "mini_splatting": ("", "", "image, radii, weights, weight_counts, max_count"),
     "light_gaussian": ("f_count=1", "", "counts, score, image, radii"), "depth": ("", "", "image, radii, depth"),
     "absgs": ("", "", "image, radii, gs_w"), "fastgs": ("mult=1, get_flag=1", "dc=1", "image, radii, metric_counts"),
     None: ("", "", "image, radii, normals"), "inria": ("", "", "image, radii")}
@@ -173,18 +174,35 @@ def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(fl
             run.prepare(*words)
         return
     made, lines = run.prepare(*words)
-    assert made["DSMOE_RASTERIZER"] == flavour and f"{module} will be {flavour} of this package" in lines[0]
+    named = flavour if module == "diff_gaussian_rasterization" else "inria"  # beside another name
+    assert made["DSMOE_RASTERIZER"] == named and f"{module} will be {flavour} of this package" in lines[0]
 
 
 def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(tmp_path, python):
-    modules = {contract.module: contract.name for contract in CONTRACTS if contract.name in ("absgs", "fastgs")}
+    modules = {contract.module: contract.name for contract in CONTRACTS
+               if contract.name in ("absgs", "fastgs", "mini_splatting")}
+    modules["diff_gaussian_rasterization"] = "inria"  # beside such a one, as Mini-Splatting's renderer has both
     script = "".join(f"from {module} import GaussianRasterizer, GaussianRasterizationSettings\n"
-                     "print(GaussianRasterizer.__module__)\nGaussianRasterizer(None)\n" for module in modules)
+                     "GaussianRasterizer(None)\n" for module in modules)
     make(tmp_path, {"x.py": script})
     result = python("-m", "diff_smoe_rasterization", *RUN, "--trainer", "absgs", "--", sys.executable, "x.py",
                     cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
-    said = [f"diff_smoe_rasterization.integrations.{flavour}" for flavour in modules.values()]
-    assert (result.status, result.out.splitlines()) == (0, said), result.err
+    assert result.status == 0, result.err
+    said = [line.split()[4] for line in result.err.splitlines() if "the rasterizer is" in line]
+    assert said == list(modules.values()), result.err
+
+
+def test_mini_splatting_has_two_rasterizers_and_a_method(tmp_path, monkeypatch):
+    own = ("    from {0} import GaussianRasterizer\n    draw = GaussianRasterizer(raster_settings=1)\n"
+           "    {1} = draw(means3D=1)\n")
+    both = RENDERER + "def render_1():\n" + own.format("diff_gaussian_rasterization", "image, radii") + \
+        "def render_2():\n" + own.format("diff_gaussian_rasterization_ms", "image, radii, weights, count, max_count")
+    monkeypatch.chdir(make(tmp_path, {GR: both + "    draw.render_depth(means3D=1)\n"}))
+    words = [sys.executable, "train.py"], "smoe", None, environment()
+    assert "diff_gaussian_rasterization_ms will be mini_splatting" in run.prepare(*words)[1][0]
+    make(tmp_path, {GR: both + "    draw.render_normals(means3D=1)\n"})
+    with pytest.raises(patches.PatchError, match="has a method render_normals, which no rasterizer has"):
+        run.prepare(*words)
 
 
 GSPLAT = {  # a gsplat of some lines: its version, and a strategy that has taken its functions by name

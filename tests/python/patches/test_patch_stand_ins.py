@@ -215,8 +215,8 @@ def test_a_script_that_starts_them_has_them(tmp_path):
     (tmp_path / "x.py").write_text(STARTED)
     done = subprocess.run([sys.executable, "x.py", tmp_path / "x.pth"], cwd=tmp_path, capture_output=True, text=True,
                           env={**environment(), "PYTHONPATH": str(PACKAGE_PARENT)})
-    ours = "diff_smoe_rasterization"
-    assert done.returncode == 0 and done.stdout == f"{ours}.neighbors {ours}.integrations.torch_scatter\n", done.stderr
+    ours = "diff_smoe_rasterization.integrations"
+    assert done.returncode == 0 and done.stdout == f"{ours}.simple_knn {ours}.torch_scatter\n", done.stderr
     assert "utils.loss_utils.ssim is not SSIM as it is fused here" in done.stderr
     for name in ("simple_knn", "torch_scatter"):
         assert f"{name} could not be imported: this package's own takes its place" in done.stderr

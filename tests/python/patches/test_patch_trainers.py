@@ -122,9 +122,9 @@ def test_a_fork_that_no_contract_fits_is_patched_with_a_warning_and_one_of_anoth
     assert "--trainer 3dgs-2023: its rasterizer is called with degrees" in note
     private = RENDERER.replace("import math", "from diff_gaussian_rasterization._C import kmeans_cuda\nimport math")
     refused(make(tmp_path / "private", {GR: private}), "it imports diff_gaussian_rasterization._C.kmeans_cuda, which")
-    both = RENDERER + "\n\ndef render_imp():\n    from diff_gaussian_rasterization_ms import GaussianRasterizer\n"
+    both = RENDERER + "\n\ndef render_imp():\n    from diff_gaussian_rasterization_gof import GaussianRasterizer\n"
     beside = {"gaussian_renderer/b.py": both, "train.py": "from gaussian_renderer import b\n" + TRAIN}
-    refused(make(tmp_path / "beside", beside), "it imports diff_gaussian_rasterization_ms, another rasterizer")
-    for trainer in (None, "3dgs-2023"):  # Mini-Splatting
-        refused(make(tmp_path / "both", {GR: both}), "it imports diff_gaussian_rasterization_ms, another rasterizer",
+    refused(make(tmp_path / "beside", beside), "it imports diff_gaussian_rasterization_gof, another rasterizer")
+    for trainer in (None, "3dgs-2023"):  # one beside Inria's, as in gaussian-opacity-fields
+        refused(make(tmp_path / "both", {GR: both}), "it imports diff_gaussian_rasterization_gof, another rasterizer",
                 trainer=trainer)
