@@ -130,8 +130,9 @@ template <int kLength> class WarpRows {
 #pragma unroll
       for (int step = 0; step < (kLength + 3) / 4; ++step) {
         const unsigned place = 4 * (lane_ + step * kWarp), row = place / kDivisor;
+        if (place >= kWarp * kDivisor) continue;
         const unsigned reached = (place + 3) / kDivisor > row ? 3 : 1, hit = marked >> row & reached;
-        if (place >= kWarp * kDivisor || hit == 0) continue;
+        if (hit == 0) continue;
         if (!kExact || hit == reached) {
           visit(float4(), from + 4 * kWarp * step, to + 4 * kWarp * step);
         } else {

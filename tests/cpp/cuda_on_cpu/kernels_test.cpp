@@ -1,0 +1,222 @@
+// The CUDA kernels, run on the CPU by the emulator, against the CPU backend in double.
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "all_modes.h"
+#include "brute_force.h"
+#include "dsmoe/rasterize.h"
+#include "dsmoe/rasterize_cuda.h"
+#include "order.h"
+#include "test_scene.h"
+
+namespace dsmoe {
+namespace {
+
+// What a rendering and its backward pass leave.
+template <class S> struct Results {
+  explicit Results(const Scene<S>& scene)
+      : rendering(scene), weights(scene, 7), gradient(scene), means2D_abs(2 * scene.count, S(NAN)) {}
+
+  Gradients<S> gradients() {
+    Gradients<S> out = {weights.gradients(), gradient.gradients()};
+    out.inputs.means2D_abs = means2D_abs.data();
+    return out;
+  }
+
+  // Every gradient, one behind the other.
+  std::vector<S> all_gradients() {
+    std::vector<S> all = gradient.flat();
+    for (const auto* more : {&gradient.means2D, &means2D_abs}) all.insert(all.end(), more->begin(), more->end());
+    return all;
+  }
+
+  // Calls walk(contribution map, importance map), for sums over the pixels that count.
+  template <class Walk> void weigh(const std::vector<bool>& unsure, Walk walk) {
+    const size_t count = rendering.radii.size();
+    std::vector<S> pixel_weights, unused(2 * count);
+    for (const bool left_out : unsure) pixel_weights.push_back(S(!left_out));
+    std::vector<int32_t> pixels(count);
+    worth.assign(4 * count, S(NAN));
+    const auto sums = [&](int k) { return worth.data() + k * count; };
+    walk(ContributionMap<S>{pixel_weights.data(), {sums(0), pixels.data(), unused.data(), unused.data() + count}},
+         ImportanceMap<S>{
+             rendering.color.data(), pixel_weights.data(), pixel_weights.data(), {sums(1), sums(2), sums(3)}});
+  }
+
+  Rendering<S> rendering;
+  ImageWeights<S> weights;
+  SceneGradient<S> gradient;
+  std::vector<S> means2D_abs, worth;
+};
+
+// Pixels where rounding may turn a decision over show nothing: they get no weight.
+template <class S> void leave_out(ImageWeights<S>& weights, const std::vector<bool>& unsure) {
+  for (auto* image : {&weights.color, &weights.gate_sum, &weights.depth, &weights.inverse_depth}) {
+    for (size_t i = 0; i < image->size(); ++i) (*image)[i] *= S(!unsure[i % unsure.size()]);
+  }
+}
+
+Results<double> on_cpu(const Scene<double>& scene, const std::vector<bool>& unsure) {
+  Results<double> out(scene);
+  leave_out(out.weights, unsure);
+  cpu::Frame<double> frame = {scene.inputs(), scene.camera, scene.raster_config(), out.rendering.images(), {}};
+  cpu::Heap heap;
+  cpu::forward(frame, heap);
+  out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
+    cpu::contributions(frame, contributions), cpu::importance(frame, importance);
+  });
+  cpu::backward(frame, out.gradients());
+  return out;
+}
+
+struct How {
+  bool deterministic = false;
+  int64_t most_instances = kMostInstances;
+  bool overflows = false;  // the lists do not fit their memory
+};
+
+Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& unsure, const How& how) {
+  Results<float> out(scene);
+  leave_out(out.weights, unsure);
+  const Camera<float>& camera = scene.camera;
+  cuda::Frame<float> frame = {scene.inputs(),
+                              {camera.width, camera.height, camera.tan_fov_x, camera.tan_fov_y, camera.near,
+                               camera.view, camera.projection, camera.position},
+                              scene.raster_config(),
+                              out.rendering.images(),
+                              {}};
+  frame.config.most_instances = how.most_instances;
+  cuda::Run run;
+  run.deterministic = how.deterministic;
+  cuda::StreamMemory memory(nullptr);
+  cuda::forward(frame, run, memory);
+  if (how.overflows) {
+    frame.saved.capacity = 1;
+    cuda::bin(frame, {nullptr, &memory});
+    cuda::blend(frame, {nullptr, &memory});
+  }
+  const cuda::Work work = {nullptr, &memory};
+  out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
+    cuda::contributions(frame, contributions, work), cuda::importance(frame, importance, work);
+  });
+  cuda::backward(frame, out.gradients(), run, memory);
+  return out;
+}
+
+// The tolerances of the tests on a GPU (tests/python/cuda/against_cpu.py): a position of some hundred pixels is rounded
+// by 3e-5, which changes the alpha of the smallest splats by 2e-4 of itself, a part of a pixel; in a gradient, sums
+// that cancel multiply 6e-8 by 1e3.
+constexpr double kTolerance = 1e-4;
+
+void expect_close(const std::vector<float>& actual, const std::vector<double>& expected,
+                  const std::vector<bool>& unsure, const std::string& name) {
+  double largest = 0, worst = 0;
+  for (size_t i = 0; i < expected.size(); ++i) {
+    largest = std::max(largest, std::abs(expected[i]));
+    if (unsure[i % unsure.size()]) continue;
+    ASSERT_TRUE(std::isfinite(actual[i])) << name << " " << i;
+    worst = std::max(worst, std::abs(actual[i] - expected[i]));
+  }
+  EXPECT_LE(worst, kTolerance * largest) << name;
+}
+
+// In the 2-norm.
+void expect_near(const std::vector<float>& actual, const std::vector<double>& expected, const char* name) {
+  ASSERT_EQ(actual.size(), expected.size()) << name;
+  double error = 0, norm = 0;
+  for (size_t i = 0; i < actual.size(); ++i) {
+    error += std::pow(actual[i] - expected[i], 2), norm += std::pow(expected[i], 2);
+  }
+  EXPECT_LE(error, kTolerance * kTolerance * norm) << name;
+}
+
+void expect_cpu(const Scene<double>& of, const How& how = {}) {
+  const Scene<float> scene = convert<float>(of);
+  const Scene<double> same = convert<double>(scene);
+  std::vector<bool> unsure;
+  for (const double margin : brute_force(same).margin) unsure.push_back(margin < 3e-5);
+  Results<float> actual = by_kernels(scene, unsure, how);
+  Results<double> expected = on_cpu(same, unsure);
+  EXPECT_EQ(actual.rendering.radii, expected.rendering.radii);
+  expect_close(actual.rendering.color, expected.rendering.color, unsure, "color");
+  expect_close(actual.rendering.gate_sum, expected.rendering.gate_sum, unsure, "gate sum");
+  expect_close(actual.rendering.depth, expected.rendering.depth, unsure, "depth");
+  expect_near(actual.all_gradients(), expected.all_gradients(), "gradients");
+  expect_near(actual.worth, expected.worth, "contributions and importance");
+}
+
+// A scene in all its modes, with and without a gate of the background where the mode has one.
+template <BlendMode kMode> std::vector<Scene<double>> in_mode(Scene<double> scene) {
+  scene.config.mode = kMode;
+  scene.background.back() = 0;
+  std::vector<Scene<double>> scenes = {scene};
+  if (Blend<kMode>::kLearnsGate) scene.background.back() = 0.03, scenes.push_back(scene);
+  return scenes;
+}
+
+// More Gaussians than a warp or a block takes, and an image of several tiles that ends within one.
+Scene<double> crowd() { return make_scene(3, 150, 41, 23); }
+
+Scene<double> with_degree_3(Scene<double> scene, bool dc_apart) {
+  Random random(5);
+  scene.sh_degree = 3;
+  scene.shs = random.uniforms(scene.count * (dc_apart ? 45 : 48));
+  if (dc_apart) scene.dc = random.uniforms(scene.count * 3);
+  return scene;
+}
+
+// One tile whose list has three segments.
+Scene<double> long_list() {
+  Random random(6);
+  Scene<double> scene = make_scene(6, 1300, 16, 12);
+  for (double& x : scene.means3D) x = random.uniform(-0.6, 0.6);
+  for (double& scale : scene.scales) scale = random.uniform(0.2, 0.4);
+  for (double& opacity : scene.opacities) opacity = random.uniform(0.004, 0.02);
+  return scene;
+}
+
+template <class Mode> struct KernelsIn : testing::Test {
+  static void expect(const Scene<double>& scene, const How& how = {}) {
+    for (const Scene<double>& own : in_mode<Mode::value>(scene)) expect_cpu(own, how);
+  }
+};
+TYPED_TEST_SUITE(KernelsIn, AllModes);
+
+TYPED_TEST(KernelsIn, EqualTheCpuWithColoursOfDegree3) {
+  this->expect(with_degree_3(crowd(), false));
+  this->expect(with_degree_3(crowd(), true));
+}
+
+TYPED_TEST(KernelsIn, EqualTheCpuWithOtherColoursAndDepth) {
+  Scene<double> scene = crowd();
+  this->expect(scene);
+  scene.config.depth = true;
+  this->expect(scene);
+}
+
+TYPED_TEST(KernelsIn, EqualTheCpuOnLongLists) { this->expect(long_list()); }
+
+TYPED_TEST(KernelsIn, EqualTheCpuInBands) { this->expect(crowd(), {false, 60}); }
+
+TYPED_TEST(KernelsIn, EqualTheCpuWhereListsDoNotFit) { this->expect(crowd(), {false, kMostInstances, true}); }
+
+TEST(Kernels, GiveTheSameBitsInEveryOrder) {
+  const Scene<float> scene = convert<float>(in_mode<BlendMode::kSmoe>(make_scene(4, 70, 17, 17)).back());
+  const std::vector<bool> all_sure(scene.pixels(), false);
+  Results<float> first = by_kernels(scene, all_sure, {true});
+  for (const auto order : {emulator::Order::kBackward, emulator::Order::kShuffled}) {
+    emulator::order = order;
+    Results<float> other = by_kernels(scene, all_sure, {true});
+    EXPECT_EQ(other.rendering.color, first.rendering.color);
+    EXPECT_EQ(other.all_gradients(), first.all_gradients());
+  }
+  emulator::order = emulator::Order::kForward;
+}
+
+}  // namespace
+}  // namespace dsmoe
