@@ -104,6 +104,7 @@ template <class S, class Visit> void for_each_band(const Frame<S>& frame, const 
     const int64_t tiles = num_band_tiles(part);
     part.saved.tile_offsets = allocate<int64_t>(scratch, tiles + 2);
     part.saved.num_instances = part.saved.tile_offsets + tiles + 1;
+    part.saved.tile_order = allocate<int32_t>(scratch, tiles);
     part.saved.instances = allocate<int32_t>(scratch, part.saved.capacity);
     bin(part, listing);
     visit(part);

@@ -135,7 +135,7 @@ __global__ void __launch_bounds__(kWalkBlock,
     blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
   constexpr int kSums = kFeatures != kAnyFeatures ? kFeatures : kFeatureChunk;
   __shared__ WarpStage<S, BlendVisitor<S, kMode, kSums>> stages[kWarpsPerTile];
-  const WarpTile<S> tile(arguments);
+  const WarpTile<S> tile(arguments, arguments.saved.tile_order[blockIdx.x], threadIdx.x / kWarp);
   if (tile.empty) return;
   auto& stage = stages[threadIdx.x / kWarp];
   if constexpr (kFeatures != kAnyFeatures) {

@@ -320,7 +320,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
     fill_moment_basis(moment_basis);
     __syncthreads();
   }
-  const WarpSegment place = segment_of_warp(arguments.saved, arguments.tiles);
+  const WarpSegment place = segment_of_warp(arguments.saved);
   if (place.tile < 0) return;
   const WarpTile<S> tile(arguments, place.tile, place.quarter);
   const int warp = threadIdx.x / kWarp;

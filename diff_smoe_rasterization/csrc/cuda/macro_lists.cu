@@ -343,6 +343,11 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
   }
 }
 
+// Class 0 has the longest lists.
+__device__ int length_class(int64_t instances) {
+  return kLengthClasses - 1 - static_cast<int>(min<int64_t>(instances / kLengthClass, kLengthClasses - 1));
+}
+
 struct TileOffsetArguments {
   int64_t tiles;           // of the image
   const uint32_t* counts;  // [tiles] instances of each tile
@@ -350,22 +355,30 @@ struct TileOffsetArguments {
   EntryCount entries;      // of macro tiles
   int64_t* offsets;        // [tiles + 1] written
   int64_t* num_instances;  // [1] written; where the entries did not fit, it is their number
+  uint32_t* longer;        // [kLengthClasses] tiles of longer classes are added; zero before
   int32_t* segment_queue;  // its counter is set to 0; or null
 };
 
-// Adds up the tiles before each tile.
+// Adds up the tiles before each tile, and those that come before each class of lengths.
 __global__ void __launch_bounds__(kSortBlock)
     add_up_tiles_kernel(const __grid_constant__ TileOffsetArguments arguments) {
-  __shared__ uint32_t warp_sums[kSortBlock / kWarp];
+  __shared__ uint32_t warp_sums[kSortBlock / kWarp], classes[kLengthClasses];
   __shared__ unsigned long long shared_before;
   __shared__ unsigned shared_block;
   if (threadIdx.x == 0) shared_block = take_block_number(arguments.look_back);
+  if (threadIdx.x < kLengthClasses) classes[threadIdx.x] = 0;
   __syncthreads();
   const unsigned block = shared_block;
   const int64_t tile = int64_t(block) * kSortBlock + threadIdx.x;
   uint32_t total;
   const uint32_t own = tile < arguments.tiles ? arguments.counts[tile] : 0;
-  const uint32_t before = sum_before_thread(own, warp_sums, total);
+  if (tile < arguments.tiles) atomicAdd(&classes[length_class(own)], 1u);
+  const uint32_t before = sum_before_thread(own, warp_sums, total);  // waits for the classes too
+  if (threadIdx.x < kLengthClasses) {
+    uint32_t longer = 0;
+    for (unsigned c = 0; c < threadIdx.x; ++c) longer += classes[c];
+    if (longer > 0) atomicAdd(arguments.longer + threadIdx.x, longer);
+  }
   if (threadIdx.x < kWarp) {
     const unsigned long long before_block = sum_before(arguments.look_back, block, total);
     if (threadIdx.x == 0) shared_before = before_block;
@@ -391,12 +404,19 @@ struct GiveArguments {
   int64_t capacity;              // of instances
   bool marked;                   // instances carry the bits of their tile's squares
   int32_t* instances;            // [capacity] written, by tile, front to back
+  uint32_t* next_of_class;       // [kLengthClasses] the place in the order of its next tile
+  int32_t* tile_order;           // [tiles] written
 };
 
-// Where the instances do not fit, nothing is written, because nobody reads the lists then.
+// Where the instances do not fit, only the order of tiles is written, because nobody reads the lists then.
 __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_constant__ GiveArguments arguments) {
   __shared__ uint32_t counts[kChunk / kWarp][kTilesPerMacro];
   __shared__ unsigned long long begins[kTilesPerMacro];
+  const int num_tiles = arguments.tiles.columns * arguments.tiles.rows;
+  for (int tile = blockIdx.x * kChunk + threadIdx.x; tile < num_tiles; tile += gridDim.x * kChunk) {
+    const int of_length = length_class(arguments.tile_offsets[tile + 1] - arguments.tile_offsets[tile]);
+    arguments.tile_order[atomicAdd(arguments.next_of_class + of_length, 1u)] = tile;
+  }
   if (*arguments.num_instances > arguments.capacity) return;
   const Chunks& chunks = arguments.chunks;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
@@ -472,7 +492,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   // What must be zero, in one piece: the states of the look-backs, each with its counter behind, and the counts.
   const int64_t states = radix_states<Key>(capacity, kMacroBins<Key>);
   const int64_t longs = (list_blocks + 1) + (offset_blocks + 1);
-  const int64_t words = 2 * longs + passes * (kMacroBins<Key> + states + 1) + num_tiles;
+  const int64_t words = 2 * longs + passes * (kMacroBins<Key> + states + 1) + num_tiles + kLengthClasses;
   auto* zeros = reinterpret_cast<uint32_t*>(allocate<unsigned long long>(scratch, (words + 1) / 2));
   check(cudaMemsetAsync(zeros, 0, words * sizeof(*zeros), stream), "listing instances");
   auto* list_states = reinterpret_cast<unsigned long long*>(zeros);
@@ -481,6 +501,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   uint32_t* pass_states = histograms + passes * kMacroBins<Key>;
   uint32_t* pass_counters = pass_states + passes * states;
   uint32_t* tile_counts = pass_counters + passes;
+  uint32_t* longer = tile_counts + num_tiles;
 
   int64_t* num_entries = allocate<int64_t>(scratch, 1);
   ListArguments<S, Key> list = {};
@@ -546,6 +567,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   add.entries = entries;
   add.offsets = saved.tile_offsets;
   add.num_instances = saved.num_instances;
+  add.longer = longer;
   add.segment_queue = saved.segment_queue;
   add_up_tiles_kernel<<<static_cast<unsigned>(offset_blocks), kSortBlock, 0, stream>>>(add);
   DSMOE_CHECK_LAUNCH("add_up_tiles");
@@ -561,6 +583,8 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   give.capacity = saved.capacity;
   give.marked = marks_quarters(frame.inputs.num_gaussians);
   give.instances = saved.instances;
+  give.next_of_class = longer;
+  give.tile_order = saved.tile_order;
   give_to_tiles_kernel<<<resident_blocks(most_chunks), kChunk, 0, stream>>>(give);
   DSMOE_CHECK_LAUNCH("give_to_tiles");
 }

@@ -53,19 +53,23 @@ struct WarpSegment {
   int tile, quarter, segment;
 };
 
-// Whether no warp of the block has work.
-template <class S> __device__ bool is_idle_block(const SavedForward<S>& saved, int tiles) {
-  const int block = blockIdx.x;
-  return block >= tiles && (block - tiles) * kWarpsPerTile >= segment_queue(saved).entries[0].x;
+// The first blocks take the queue, an entry a warp, for nearly all of its segments are whole. Those behind take the first
+// segment of one tile each, the longest lists first.
+template <class S> __device__ int queue_blocks(const SavedForward<S>& saved) {
+  return saved.segments != nullptr ? (segment_queue(saved).entries[0].x + kWarpsPerTile - 1) / kWarpsPerTile : 0;
 }
 
-// The first `tiles` blocks take the first segment of one tile each. Each warp of the later blocks takes one entry of
-// the queue, or tile -1 where none is left.
-template <class S> __device__ WarpSegment segment_of_warp(const SavedForward<S>& saved, int tiles) {
-  const int block = blockIdx.x, warp = threadIdx.x / kWarp;
-  if (block < tiles) return {block, warp, 0};
+// Whether no warp of the block has work.
+template <class S> __device__ bool is_idle_block(const SavedForward<S>& saved, int tiles) {
+  return int(blockIdx.x) >= queue_blocks(saved) + tiles;
+}
+
+// Of a block that is not idle. Tile -1 where the queue has no entry for the warp.
+template <class S> __device__ WarpSegment segment_of_warp(const SavedForward<S>& saved) {
+  const int block = blockIdx.x, warp = threadIdx.x / kWarp, behind = block - queue_blocks(saved);
+  if (behind >= 0) return {saved.tile_order[behind], warp, 0};
   const int2* entries = segment_queue(saved).entries;
-  const int i = (block - tiles) * kWarpsPerTile + warp;
+  const int i = block * kWarpsPerTile + warp;
   if (i >= entries[0].x) return {-1, 0, 0};
   const int2 entry = entries[1 + i];
   return {entry.x / kWarpsPerTile, entry.x % kWarpsPerTile, entry.y};

@@ -59,6 +59,7 @@ template <class S> struct SavedForward {
   int32_t* order = nullptr;                   // [N] Gaussians, nearest first; ~i is for a culled Gaussian i
   int64_t* num_ordered = nullptr;             // [1] entries of order; culled Gaussians have none in a depth order
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
+  int32_t* tile_order = nullptr;              // [tiles] those with the longest lists first
   int64_t* num_instances = nullptr;           // [1] room that the lists need; where they have less, none is listed
   int32_t* instances = nullptr;               // [capacity] Gaussians by tile, front to back
   int64_t capacity = 0;              // 0: no lists are kept. Each pass makes them, for some rows of tiles at a time
@@ -90,6 +91,7 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("features", saved.features, stride < 0 ? -1 : sizes.num_gaussians * stride);
   visit("order", saved.order, sizes.num_gaussians);
   visit("tile_offsets", saved.tile_offsets, sizes.tiles + 3);
+  visit("tile_order", saved.tile_order, sizes.tiles);
   visit("final_transmittance", saved.final_transmittance, sizes.pixels);
   visit("last_contributor", saved.last_contributor, sizes.pixels);
   visit("instances", saved.instances, sizes.capacity);
@@ -206,7 +208,7 @@ template <class S> void sort_by_depth(const Frame<S>& frame, const DepthBits<S>*
 // Fills only frame.saved.num_instances, for a caller that wants exactly as much memory as is needed.
 template <class S> void count_instances(const Frame<S>& frame, const Work& work);
 
-// Fills saved.num_instances, instances and tile_offsets of the frame, and empties segment_queue.
+// Fills saved.num_instances, instances, tile_offsets and tile_order of the frame, and empties segment_queue.
 template <class S> void bin(const Frame<S>& frame, const Work& work);
 
 // Fills frame.images but the radii, and what saved has for each pixel. This pass and those below make the lists, band
