@@ -53,8 +53,8 @@ struct WarpSegment {
   int tile, quarter, segment;
 };
 
-// The first blocks take the queue, an entry a warp, for nearly all of its segments are whole. Those behind take the first
-// segment of one tile each, the longest lists first.
+// The first blocks take the queue, an entry a warp, for nearly all of its segments are whole. Those behind take the
+// first segment of one tile each, the longest lists first.
 template <class S> __device__ int queue_blocks(const SavedForward<S>& saved) {
   return saved.segments != nullptr ? (segment_queue(saved).entries[0].x + kWarpsPerTile - 1) / kWarpsPerTile : 0;
 }

@@ -80,8 +80,8 @@ constexpr unsigned kHistogramBlocks = 4;
 constexpr int kListedPerLane = 4;
 // Entries of a macro tile that one block gives to its tiles.
 constexpr int kChunk = 256;
-// Tiles are walked in the order of their lists' lengths, the longest ones first, so that the last warps to end are those
-// of short lists. It is an order by classes of so many instances; the last class has all that are longer.
+// Tiles are walked in the order of their lists' lengths, the longest ones first, so that the last warps to end are
+// those of short lists. It is an order by classes of so many instances; the last class has all that are longer.
 constexpr int kLengthClass = 64, kLengthClasses = 64;
 // Blocks a multiprocessor of kernels whose blocks take piece after piece: more of them fit none.
 constexpr int kResidentBlocks = 8;
