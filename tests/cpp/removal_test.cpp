@@ -55,7 +55,8 @@ template <BlendMode kMode, class S> void expect_omissions(const Pixel& pixel, do
   for (int i = 0; i < pixel.size(); ++i) {
     const auto removal = remove_pair<kMode>(state, end, gates[i], true);
     const S distance = S(pixel.color[i]) - value;
-    const S change = channel_change<kMode>(removal, distance, front, value, background);
+    const S motion = channel_motion<kMode>(removal, distance, front, value);
+    const S change = removal.left ? removal.scale * motion : background - value;
     front = fma(removal.weight, distance, front);
     EXPECT_TRUE(removal.takes);
     EXPECT_NEAR(removal.share, share_of(kMode, pixel, i), tolerance) << i;
@@ -116,7 +117,7 @@ TEST(Removal, OfAPairThatIsNotThereIsNothing) {
   const Gate<double> absent = {0.7, 0.7, false};
   auto sum = no_importance<double>();
   const double nan = std::numeric_limits<double>::quiet_NaN();
-  add_pair(sum, remove_pair<BlendMode::kSmoe>(state, end, absent, true), nan, nan, nan);
+  add_pair(sum, remove_pair<BlendMode::kSmoe>(state, end, absent, true), nan, nan, nan, nan);
   EXPECT_EQ(sum.share, 0);
   EXPECT_EQ(sum.squared_share, 0);
   EXPECT_EQ(sum.removal_cost, 0);
@@ -126,10 +127,10 @@ TEST(Removal, WeighsItsThreeSums) {
   PixelState<double> state = PixelState<double>::open();
   const Gate<double> gate = {0.5, 0.5, true};
   auto sum = no_importance<double>();
-  add_pair(sum, remove_pair<BlendMode::kAlpha>(state, {0.5, 0.5, 1.0}, gate, true), 9.0, 3.0, 2.0);
+  add_pair(sum, remove_pair<BlendMode::kAlpha>(state, {0.5, 0.5, 1.0}, gate, true), 9.0, 8.0, 3.0, 2.0);
   EXPECT_EQ(sum.share, 1.5);
   EXPECT_EQ(sum.squared_share, 0.5);
-  EXPECT_EQ(sum.removal_cost, 18);
+  EXPECT_EQ(sum.removal_cost, 18);  // alpha / (1 - alpha) is 1
 }
 
 }  // namespace

@@ -26,6 +26,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
         end_gate_sum_(scratch.pixels()),
         weight_(scratch.pixels()),
         share_weight_(scratch.pixels()),
+        alone_(scratch.pixels()),
         channels_{scratch.next},
         out_(out) {
     for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(1);
@@ -42,7 +43,11 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
       end_gate_sum_.pixel(x, y) = tile.saved.gate_sum[index];
       weight_.pixel(x, y) = out_.map.pixel_weights[index];
       share_weight_.pixel(x, y) = out_.map.share_weights[index];
-      for (int c = 0; c < num_channels_; ++c) value_of(c).pixel(x, y) = out_.map.color[c * pixels + index];
+      for (int c = 0; c < num_channels_; ++c) {
+        const S value = out_.map.color[c * pixels + index], distance = background_[c] - value;
+        value_of(c).pixel(x, y) = value;
+        alone_.pixel(x, y) += distance * distance;
+      }
       num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
     });
     return num_seen;
@@ -69,11 +74,11 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
     for (int c = 0; c < num_channels_; ++c) {
       const P value = value_of(c).load(at), distance = P(features_[c]) - value;
       const P front = front_of(c).load(at);
-      const P change = channel_change<kMode>(removal, distance, front, value, P(background_[c]));
-      squared = fma(change, change, squared);
+      const P motion = channel_motion<kMode>(removal, distance, front, value);
+      squared = fma(motion, motion, squared);
       front_of(c).store(at, fma(removal.weight, distance, front));
     }
-    add_pair(sum, removal, squared, share_weight_.load(at), weight_.load(at));
+    add_pair(sum, removal, squared, alone_.load(at), share_weight_.load(at), weight_.load(at));
   }
 
   DSMOE_HD void end(const ListedGaussian<S>& gaussian, const Importance<P>& sum) const {
@@ -88,6 +93,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
   const S* const background_;
   const S background_gate_;
   const PixelArray<S> transmittance_, gate_sum_, last_, end_transmittance_, end_gate_sum_, weight_, share_weight_;
+  const PixelArray<S> alone_;     // |bg - C|^2
   const PixelArray<S> channels_;  // two arrays a channel: C, and A
   const TileImportances<S>& out_;
   const S* features_ = nullptr;

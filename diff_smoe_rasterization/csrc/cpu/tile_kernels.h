@@ -48,7 +48,7 @@ constexpr int record_size(int num_features, bool absolute) {
   return kNumGateMoments + num_features + (absolute ? kNumAbsoluteSums : 0);
 }
 
-constexpr int kImportanceArrays = 7;  // numbers a pixel besides its channels
+constexpr int kImportanceArrays = 8;  // numbers a pixel besides its channels
 
 // Numbers of scratch memory that one tile needs, for any of the kernels.
 inline int64_t tile_scratch_size(int num_features) {

@@ -1,19 +1,25 @@
 // What each Gaussian is worth to an image. The kernel repeats the blend's walk beside the finished pixels. A warp sums
-// over its pixels, then adds the three numbers to those of the Gaussian by atomics.
+// over its pixels, a batch of Gaussians at a time, and adds their numbers by atomics.
 #include "../dispatch.h"
 #include "bands.h"
 #include "dsmoe/params.h"
 #include "dsmoe/removal.h"
 #include "reduce.cuh"
-#include "tile_walk.cuh"
+#include "segments.cuh"
 
 namespace dsmoe {
 namespace cuda {
 namespace {
 
+// Visits that are interleaved where the number of channels is known. And blocks that one multiprocessor then holds at
+// once: 5 x 128 threads leave each thread 96 registers.
+constexpr int kUnrolledVisits = 2;
+constexpr int kBlocks = 5;
+
 template <class S> struct ImportanceArguments : BlendArguments<S> {
   ImportanceMap<S> map;
   S* fronts;  // [C, H, W] the sums A, where the number of channels is not known
+  int tiles;  // of the band
 };
 
 // C and A of one lane's pixels, a channel at a time: in registers where the number of channels is known, else in
@@ -59,14 +65,48 @@ template <class S, int kChannels> struct WeighedPixels {
   PixelEnd<S> end[kLanePixels];
   ChannelSums<S, kChannels> channels;
   S weight[kLanePixels], share_weight[kLanePixels];  // in the caller's maps
+  S alone[kLanePixels];                              // |bg - C|^2
   int32_t last[kLanePixels];                         // entries of the list that the numerator has seen
 };
+
+// The numbers of one Gaussian in shared memory, by lane. Four lanes sum a row. Between its rows lie some numbers, so
+// that lanes of eight rows read from different banks.
+template <class S> struct ImportanceRow {
+  alignas(16) S numbers[kNumImportances][kWarp];
+  S apart[16 / sizeof(S)];
+};
+
+// Sums the rows of up to kVisitsPerCheck Gaussians, and adds them to the sums of these.
+template <class S>
+__device__ void add_rows(const ImportanceSums<S>& sums, const ImportanceRow<S>* rows,
+                         const int32_t* gaussians, int count, int lane) {
+  constexpr int kParts = kWarp / kVisitsPerCheck, kPart = kWarp / kParts;
+  const int g = lane / kParts, part = lane % kParts;
+  S totals[kNumImportances];
+#pragma unroll
+  for (int n = 0; n < kNumImportances; ++n) {
+    S values[kPart];
+#pragma unroll
+    for (int i = 0; i < kPart; ++i) values[i] = rows[g].numbers[n][part * kPart + i];
+#pragma unroll
+    for (int half = kPart / 2; half > 0; half /= 2) {
+#pragma unroll
+      for (int i = 0; i < half; ++i) values[i] += values[i + half];
+    }
+    totals[n] = values[0];
+#pragma unroll
+    for (int step = kParts / 2; step > 0; step /= 2) totals[n] += __shfl_xor_sync(kAllLanes, totals[n], step);
+  }
+  if (g >= count || part >= kNumImportances) return;
+  S* const of_part = part == 0 ? sums.shares : part == 1 ? sums.squared_shares : sums.removal_costs;
+  atomicAdd(of_part + gaussians[g], part == 0 ? totals[0] : part == 1 ? totals[1] : totals[2]);
+}
 
 // Walks front to back, as the blend does.
 template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kInSegments = false;
-  static constexpr int kUnroll = 1;
+  static constexpr int kUnroll = kChannels != kAnyFeatures ? kUnrolledVisits : 1;
 
   __device__ __forceinline__ int num_channels() const {
     return kChannels != kAnyFeatures ? kChannels : arguments.config.num_channels;
@@ -76,61 +116,54 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
 
   __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged, const int32_t& number) {
     const auto gaussian = staged;
-    const S dx = S(tile.x) - gaussian.mean.x, dy = S(tile.y) - gaussian.mean.y;
-    const auto exponent = gaussian.gate.column(dx);
-    Gate<S> gate[kLanePixels];
-    bool any = false;
-#pragma unroll
-    for (int k = 0; k < kLanePixels; ++k) {
-      gate[k] = gaussian.gate.evaluate(exponent.at(below(dy, k)));
-      any |= gate[k].counts && (!Blend<kMode>::kStopsEarly || gaussian.seen <= pixels.last[k]);
-    }
-    if (!__any_sync(kAllLanes, any)) return;
-
+    const auto exponent = gaussian.gate.column(S(tile.x) - gaussian.mean.x);
+    const S dy = S(tile.y) - gaussian.mean.y;
     const int32_t index = number;
     const S* features = arguments.saved.features + int64_t(index) * feature_stride(arguments.config.num_features());
     auto sum = no_importance<S>();
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto removal = remove_pair<kMode>(pixels.state[k], pixels.end[k], gate[k], gaussian.seen <= pixels.last[k]);
+      const auto gate = gaussian.gate.evaluate(exponent.at(below(dy, k)));
+      const auto removal = remove_pair<kMode>(pixels.state[k], pixels.end[k], gate, gaussian.seen <= pixels.last[k]);
       S squared = S(0);
       for (int c = 0; c < num_channels(); ++c) {
         const S feature = kChannels != kAnyFeatures ? gaussian.features[c] : features[c];
         const S value = pixels.channels.value(arguments, tile, k, c), distance = feature - value;
         const S front = pixels.channels.front(arguments, tile, k, c);
-        const S change = channel_change<kMode>(removal, distance, front, value, arguments.config.background[c]);
-        squared = fma(change, change, squared);
+        const S motion = channel_motion<kMode>(removal, distance, front, value);
+        squared = fma(motion, motion, squared);
         pixels.channels.set_front(arguments, tile, k, c, fma(removal.weight, distance, front));
       }
-      add_pair(sum, removal, squared, pixels.share_weight[k], pixels.weight[k]);
+      add_pair(sum, removal, squared, pixels.alone[k], pixels.share_weight[k], pixels.weight[k]);
     }
-    S numbers[kNumImportances] = {sum.share, sum.squared_share, sum.removal_cost};
-    sum_pixels(numbers);
-    if (!sum_pixels.holds) return;
-    const ImportanceSums<S>& sums = arguments.map.sums;
-    S* const of_number = sum_pixels.number == 0   ? sums.shares
-                         : sum_pixels.number == 1 ? sums.squared_shares
-                                                  : sums.removal_costs;
-    atomicAdd(of_number + index, numbers[0]);
+    S* const numbers = row->numbers[0] + tile.lane;
+    numbers[0] = sum.share, numbers[kWarp] = sum.squared_share, numbers[2 * kWarp] = sum.removal_cost;
+    ++row;
+  }
+
+  __device__ __forceinline__ void end_visits(const StagedGaussian<S, true>*, const int32_t* gaussians, int count) {
+    __syncwarp();
+    row -= count;
+    add_rows(arguments.map.sums, row, gaussians, count, tile.lane);
+    __syncwarp();
   }
 
   const ImportanceArguments<S>& arguments;
   const WarpTile<S>& tile;
   WeighedPixels<S, kChannels>& pixels;
-  TransposedSum<kNumImportances> sum_pixels;
+  ImportanceRow<S>* row;  // for the next Gaussian
 };
 
+// Whether a warp may begin at a segment: what lies in front of it is known there by T.
 template <class S, BlendMode kMode, int kChannels>
-__global__ void __launch_bounds__(kWalkBlock)
-    importance_kernel(const __grid_constant__ ImportanceArguments<S> arguments) {
-  using Visitor = ImportanceVisitor<S, kMode, kChannels>;
-  __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
-  const WarpTile<S> tile(arguments);
-  if (tile.empty) return;
+constexpr bool kWeighsSegments = kWalksSegments<S, kChannels>&& Blend<kMode>::kStopsEarly;
 
+// Sets what a warp's pixels start with at the list's begin.
+template <class S, int kChannels>
+__device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& arguments, const WarpTile<S>& tile,
+                                             WeighedPixels<S, kChannels>& pixels) {
   const S background_gate = arguments.config.gate_of_background();
-  WeighedPixels<S, kChannels> pixels;
-  int32_t seen = 0;
+  const int num_channels = kChannels != kAnyFeatures ? kChannels : arguments.config.num_channels;
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
@@ -141,11 +174,71 @@ __global__ void __launch_bounds__(kWalkBlock)
     pixels.share_weight[k] = inside ? arguments.map.share_weights[index] : S(0);
     pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
     pixels.channels.begin(arguments, tile, k);
-    seen = seen > pixels.last[k] ? seen : pixels.last[k];
+    pixels.alone[k] = S(0);
+    for (int c = 0; c < num_channels; ++c) {
+      const S distance = arguments.config.background[c] - pixels.channels.value(arguments, tile, k, c);
+      pixels.alone[k] = fma(distance, distance, pixels.alone[k]);
+    }
   }
-  Visitor visitor = {arguments, tile, pixels, TransposedSum<kNumImportances>(tile.lane)};
-  const int32_t end = Blend<kMode>::kStopsEarly ? max_over_lanes(seen) : tile.source.length;
-  walk_tile(stages[threadIdx.x / kWarp], {0, end}, visitor);
+}
+
+// Moves the pixels to the begin of a segment. A is what all w (c - C) and lambda T (bg - C), which are 0 together, have
+// in front of it.
+template <class S, BlendMode kMode, int kChannels>
+__device__ __forceinline__ void move_to_segment(const ImportanceArguments<S>& arguments, const WarpTile<S>& tile,
+                                                int segment, WeighedPixels<S, kChannels>& pixels) {
+  for (int k = 0; k < kLanePixels; ++k) {
+    if (!tile.inside(arguments, k)) continue;
+    const SegmentPixel<S> begin = segment_pixel(arguments.saved, tile, segment, k);
+    const PixelEnd<S>& end = pixels.end[k];
+    const auto by = feature_end<kMode>(FeatureRule::kBlended, end);
+    pixels.state[k] = {begin.transmittance, S(1) - begin.transmittance};
+    for (int c = 0; c < kChannels; ++c) {
+      const S value = pixels.channels.value(arguments, tile, k, c);
+      const S behind = fma(-value, begin.transmittance - end.transmittance, begin.sums[c]);
+      pixels.channels.set_front(arguments, tile, k, c,
+                                -(behind + by.if_gated(by.weight * (arguments.config.background[c] - value))));
+    }
+  }
+}
+
+template <class S, BlendMode kMode, int kChannels>
+__global__ void __launch_bounds__(kWalkBlock,
+                                  sizeof(S) == 4 && kChannels != kAnyFeatures ? kBlocks : kGeneralWalkBlocks)
+    importance_kernel(const __grid_constant__ ImportanceArguments<S> arguments) {
+  using Visitor = ImportanceVisitor<S, kMode, kChannels>;
+  __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
+  __shared__ ImportanceRow<S> rows[kWarpsPerTile][kVisitsPerCheck];
+  WarpSegment place = {};
+  if constexpr (kWeighsSegments<S, kMode, kChannels>) {
+    if (is_idle_block(arguments.saved, arguments.tiles)) return;
+    place = segment_of_warp(arguments.saved);
+    if (place.tile < 0) return;
+  } else {
+    place = {arguments.saved.tile_order[blockIdx.x], static_cast<int>(threadIdx.x) / kWarp, 0};
+  }
+  const WarpTile<S> tile(arguments, place.tile, place.quarter);
+  if (tile.empty) return;
+
+  WeighedPixels<S, kChannels> pixels;
+  begin_pixels(arguments, tile, pixels);
+  WalkRange range = {0, tile.source.length};
+  if (Blend<kMode>::kStopsEarly) {
+    int32_t seen = 0;
+    for (int k = 0; k < kLanePixels; ++k) seen = seen > pixels.last[k] ? seen : pixels.last[k];
+    range.end = max_over_lanes(seen);
+  }
+  if constexpr (kWeighsSegments<S, kMode, kChannels>) {
+    if (has_segments(arguments.saved, tile)) {
+      range.begin = place.segment * kSegmentLength;
+      range.end = min(range.end, range.begin + kSegmentLength);
+      if (range.begin >= range.end) return;
+      if (place.segment > 0) move_to_segment<S, kMode>(arguments, tile, place.segment, pixels);
+    }
+  }
+  const int warp = threadIdx.x / kWarp;
+  Visitor visitor = {arguments, tile, pixels, rows[warp]};
+  walk_tile(stages[warp], range, visitor);
 }
 
 }  // namespace
@@ -165,10 +258,13 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
     ImportanceArguments<S> arguments{blend_arguments(band, work)};
     arguments.map = map;
     arguments.fronts = fronts;
-    const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
+    arguments.tiles = static_cast<int>(num_band_tiles(band));
     dispatch_blend(frame.config.mode, num_channels, [&](auto mode, auto channels) {
-      importance_kernel<S, decltype(mode)::value, decltype(channels)::value>
-          <<<tiles, kWalkBlock, 0, work.stream>>>(arguments);
+      constexpr BlendMode kMode = decltype(mode)::value;
+      constexpr int kChannels = decltype(channels)::value;
+      const bool segments = kWeighsSegments<S, kMode, kChannels> && band.saved.segments != nullptr;
+      const int64_t blocks = arguments.tiles + (segments ? num_segment_rows(band.saved.capacity) : 0);
+      importance_kernel<S, kMode, kChannels><<<static_cast<unsigned>(blocks), kWalkBlock, 0, work.stream>>>(arguments);
       DSMOE_CHECK_LAUNCH("importance");
     });
   });

@@ -11,6 +11,11 @@
 //
 //   C'_k - C = -((1 + q_k) w_k (c_k - C) + q_k A_k) / D'_k
 //
+// Where the denominator counts weights, (1 + q_k) w_k is q_k T_k with T_k in front of the pair. So all channels share a
+// factor, and its reciprocal needs no other one:
+//
+//   C'_k - C = -alpha_k (T_k (c_k - C) + A_k) / ((1 - alpha_k) D'_k)
+//
 // The ablations divide by sum alpha, of which alpha_k goes; in smoe_std nothing is seen through anything, so q_k is 0.
 // A pixel that no other Gaussian and no background's gate is in shows the background's colour. This is exact but for
 // what lies behind a pixel's early stop, of which nothing is known, and for owners behind a pair that have less than
@@ -34,13 +39,14 @@ template <class Real> DSMOE_HD Importance<Real> no_importance() {
   return {zero, zero, zero};
 }
 
-// A pair's removal; each channel joins through channel_change.
+// A pair's removal. C' - C is `scale` times channel_motion where something is left, and else bg - C.
 template <class Real> struct Removal {
   Mask<Real> takes;  // the pair has a part in the pixel
   Real weight;       // w
   Real share;        // f
-  Real own;          // of c - C in C' - C
-  Real front;        // of A
+  Real scale;        // of all channels
+  Real own;          // of c - C
+  Real front;        // of A: smoe_tn only
   Real value;        // of C: smoe_tn only
   Mask<Real> left;   // something else is in the pixel
 };
@@ -63,47 +69,57 @@ DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>
   constexpr bool kSeesThrough = Blend<kMode>::kNeedsDepthOrder, kCountsWeights = Blend<kMode>::kStopsEarly;
   const Real zero = S(0), one = S(1);
   const auto by = feature_end<kMode>(FeatureRule::kBlended, end);
-  const Real in_front = state.gate_sum;
+  const PixelState<Real> before = state;
   const auto pair = Blend<kMode>::accumulate(state, gate);
   const Mask<Real> blended = pair.contributes & wanted;
   Removal<Real> out;
   out.takes = by.open & (kSeesThrough && !kCountsWeights ? gate.counts : blended);
   out.weight = select(blended, pair.weight, zero);
-  out.share = out.weight / select(by.open, by.denominator, one);
-  const Real odds = kSeesThrough ? select(blended, gate.alpha / (one - gate.alpha), zero) : zero;
+  out.share = out.weight * reciprocal(select(by.open, by.denominator, one));
+  out.front = out.value = zero;
+  const Real rest = one - gate.alpha;
+  if constexpr (!Blend<kMode>::kDivides) {
+    out.left = before.transmittance >= zero;
+    out.own = before.transmittance;
+    out.scale = -gate.alpha * reciprocal(rest);
+    return out;
+  }
   const Real behind = rest_of(end.gate_sum, state.gate_sum) + by.weight;
-  const Real sum = kCountsWeights ? in_front + (one + odds) * behind : in_front + behind;
-  out.left = Blend<kMode>::kDivides ? sum >= Real(S(kGateSumCut)) : sum >= zero;
-  const Real inverse = Blend<kMode>::kDivides ? one / select(out.left, sum, one) : one;
-  out.own = -((one + odds) * out.weight) * inverse;
-  out.front = -odds * inverse;
-  out.value = zero;
-  if constexpr (kSeesThrough && !kCountsWeights) {
-    out.value = fma(odds, end.gate_sum - one, gate.alpha) * inverse;
-  } else {
+  const Real sum = kCountsWeights ? fma(rest, before.gate_sum, behind) : before.gate_sum + behind;
+  out.left = sum >= (kCountsWeights ? Real(S(kGateSumCut)) * rest : Real(S(kGateSumCut)));
+  const Real inverse = reciprocal(select(out.left, sum, one));
+  if constexpr (kCountsWeights) {
     // With nothing behind, what is left is what lies in front, and no digit of it is lost to c - C.
-    out.own = select(behind > zero, out.own, zero);
-    out.front = select(behind > zero, out.front, inverse);
+    const Mask<Real> hides = behind > zero;
+    out.own = select(hides, before.transmittance, zero);
+    out.scale = select(hides, -gate.alpha, rest) * inverse;
+  } else {
+    const Real odds = kSeesThrough ? select(blended, gate.alpha * reciprocal(rest), zero) : zero;
+    out.own = -fma(odds, out.weight, out.weight);
+    out.front = -odds;
+    out.value = kSeesThrough ? fma(odds, end.gate_sum - one, gate.alpha) : zero;
+    out.scale = inverse;
   }
   return out;
 }
 
-// C' - C in one channel. distance: c - C; front: A; value: C.
+// distance: c - C; front: A; value: C; of one channel.
 template <BlendMode kMode, class Real>
-DSMOE_HD Real channel_change(const Removal<Real>& removal, Real distance, Real front, Real value, Real background) {
-  Real change = fma(removal.own, distance, removal.front * front);
-  if (Blend<kMode>::kNeedsDepthOrder && !Blend<kMode>::kStopsEarly) change = fma(removal.value, value, change);
-  return select(removal.left, change, background - value);
+DSMOE_HD Real channel_motion(const Removal<Real>& removal, Real distance, Real front, Real value) {
+  if constexpr (Blend<kMode>::kStopsEarly) return fma(removal.own, distance, front);
+  if constexpr (!Blend<kMode>::kNeedsDepthOrder) return removal.own * distance;
+  return fma(removal.value, value, fma(removal.own, distance, removal.front * front));
 }
 
-// squared_change: |C' - C|^2. share_weight, weight: of the pixel, in maps of the caller's.
+// squared_motion: of all channels. alone: |bg - C|^2. share_weight, weight: of the pixel, in maps of the caller's.
 template <class Real>
-DSMOE_HD void add_pair(Importance<Real>& sum, const Removal<Real>& removal, Real squared_change, Real share_weight,
-                       Real weight) {
-  const Real zero = Scalar<Real>(0);
-  sum.share = sum.share + select(removal.takes, share_weight * removal.share, zero);
-  sum.squared_share = sum.squared_share + select(removal.takes, weight * removal.share * removal.share, zero);
-  sum.removal_cost = sum.removal_cost + select(removal.takes, weight * squared_change, zero);
+DSMOE_HD void add_pair(Importance<Real>& sum, const Removal<Real>& removal, Real squared_motion, Real alone,
+                       Real share_weight, Real weight) {
+  const Real squared_change = select(removal.left, removal.scale * removal.scale * squared_motion, alone);
+  sum.share = select(removal.takes, fma(share_weight, removal.share, sum.share), sum.share);
+  sum.squared_share =
+      select(removal.takes, fma(weight * removal.share, removal.share, sum.squared_share), sum.squared_share);
+  sum.removal_cost = select(removal.takes, fma(weight, squared_change, sum.removal_cost), sum.removal_cost);
 }
 
 }  // namespace dsmoe

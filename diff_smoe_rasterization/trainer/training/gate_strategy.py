@@ -150,7 +150,7 @@ class GateStrategy(SteadyStrategy):
             self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
 
     def _looks(self, step: Step) -> bool:
-        """Whether the next decision looks at this step's view: once, in the last round of the views before it."""
+        """Whether the next decision looks at this step's view: one of each group, in the last round of the views."""
         if step.view.camera.name not in self.sought:
             return False
         removes = self.context.model.num_gaussians > self.context.config.budget
@@ -162,11 +162,11 @@ class GateStrategy(SteadyStrategy):
         """Adds what each Gaussian is worth to one rendering."""
         error = (color.detach() - as_float(target)).square().sum(0)
         mask = view.mask_float()
-        weights = torch.ones_like(error) if mask is None else mask[0]
-        importance = splats.importance(weights, weights * error)
+        importance = splats.importance(*((None, error) if mask is None else (mask[0], mask[0] * error)))
         self.costs += importance.removal_costs
         self.errors += importance.shares
-        self.sought.discard(view.camera.name)
+        group = self.sought.get(view.camera.name)
+        self.sought = {name: other for name, other in self.sought.items() if other != group}
 
     def _look_at_the_rest(self) -> None:
         """Renders what the steps before the decision did not show."""
@@ -180,19 +180,19 @@ class GateStrategy(SteadyStrategy):
         self._forget_looks()
 
     def _forget_looks(self) -> None:
-        """Begins new sums, [N], for the next decision, and chooses its views, evenly spread."""
+        """Begins new sums, [N], for the next decision, which looks at a view of each group of neighbours."""
         self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
         self.errors = torch.zeros_like(self.view_count)  # their squared error where the Gaussian is, by its share
         views = self.context.views
         count = min(self.options.views, len(views))
         first = int(torch.randint(len(views), ()))
-        self.sought = {views[(first + i * len(views) // count) % len(views)].camera.name for i in range(count)}
+        self.sought = {views[(first + i) % len(views)].camera.name: i * count // len(views) for i in range(len(views))}
 
     def state_dict(self) -> Dict[str, Any]:
         return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors,
-                "sought": sorted(self.sought)}
+                "sought": self.sought}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.start, self.costs, self.errors = state["start"], state["costs"], state["errors"]
-        self.sought = set(state["sought"])
+        self.sought = dict(state["sought"])
