@@ -6,7 +6,7 @@ import torch
 from comparison import assert_close
 from devices import random_normal
 from scenes import random_scene, with_gate, with_gates
-from test_cuda_against_cpu import SCENES, selected
+from test_cuda_against_cpu import LONG_LISTS, SCENES, selected
 from test_cuda_graphs import SLEEP, graph_of, list_size, own_width, result_while_busy, scene_of
 
 from diff_smoe_rasterization import Importance, rasterize_with_splats
@@ -49,6 +49,24 @@ def test_float32_is_near_the_cpu(mode, name, gpu):
         # Positions rounded by 3e-5 px change the alpha of the smallest splats by 2e-4 of itself, and a cost goes with
         # its square; a pair within rounding of a threshold may count on one side only.
         assert_close(values, other, 2e-3, field)
+
+
+@with_gate
+@pytest.mark.sanitize
+@pytest.mark.parametrize("name", ["faint", "filling"])
+def test_lists_of_several_segments(mode, name, gpu):
+    """With what is kept for a backward pass each warp has a part of a list; without it, a whole one."""
+    scene = LONG_LISTS[name](mode).to(torch.float32).to(gpu)
+    maps = [values.to(gpu) for values in maps_for(scene.settings)]
+    opacities = scene.inputs["opacities"].requires_grad_()
+    parts = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1].importance(*maps)
+    opacities.requires_grad_(False)
+    whole = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1].importance(*maps)
+    assert (whole.removal_costs > 0).sum() > 2000
+    for field, values, other in zip(Importance._fields, parts, whole):
+        # Sums of 500 weights in front of a segment are rounded otherwise, by some 1e-7 of W, and a cost, which goes
+        # with the square of a difference of such sums, by more of itself.
+        assert_close(values, other, 1e-3, field)
 
 
 @with_gate
