@@ -46,8 +46,8 @@ template <class Real> struct Removal {
   Real share;        // f
   Real scale;        // of all channels
   Real own;          // of c - C
-  Real front;        // of A: smoe_tn only
-  Real value;        // of C: smoe_tn only
+  Real front;        // of A: in the ablations
+  Real value;        // of C: in smoe_tn
   Mask<Real> left;   // something else is in the pixel
 };
 
@@ -88,16 +88,20 @@ DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>
   const Real sum = kCountsWeights ? fma(rest, before.gate_sum, behind) : before.gate_sum + behind;
   out.left = sum >= (kCountsWeights ? Real(S(kGateSumCut)) * rest : Real(S(kGateSumCut)));
   const Real inverse = reciprocal(select(out.left, sum, one));
+  // With nothing behind, what is left is what lies in front, and no digit of it is lost to c - C.
+  const Mask<Real> hides = behind > zero;
   if constexpr (kCountsWeights) {
-    // With nothing behind, what is left is what lies in front, and no digit of it is lost to c - C.
-    const Mask<Real> hides = behind > zero;
     out.own = select(hides, before.transmittance, zero);
     out.scale = select(hides, -gate.alpha, rest) * inverse;
-  } else {
-    const Real odds = kSeesThrough ? select(blended, gate.alpha * reciprocal(rest), zero) : zero;
+  } else if constexpr (kSeesThrough) {
+    const Real odds = select(blended, gate.alpha * reciprocal(rest), zero);
     out.own = -fma(odds, out.weight, out.weight);
     out.front = -odds;
-    out.value = kSeesThrough ? fma(odds, end.gate_sum - one, gate.alpha) : zero;
+    out.value = fma(odds, end.gate_sum - one, gate.alpha);
+    out.scale = inverse;
+  } else {
+    out.own = select(hides, -out.weight, zero);
+    out.front = select(hides, zero, one);
     out.scale = inverse;
   }
   return out;
@@ -107,8 +111,8 @@ DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>
 template <BlendMode kMode, class Real>
 DSMOE_HD Real channel_motion(const Removal<Real>& removal, Real distance, Real front, Real value) {
   if constexpr (Blend<kMode>::kStopsEarly) return fma(removal.own, distance, front);
-  if constexpr (!Blend<kMode>::kNeedsDepthOrder) return removal.own * distance;
-  return fma(removal.value, value, fma(removal.own, distance, removal.front * front));
+  const Real motion = fma(removal.own, distance, removal.front * front);
+  return Blend<kMode>::kNeedsDepthOrder ? fma(removal.value, value, motion) : motion;
 }
 
 // squared_motion: of all channels. alone: |bg - C|^2. share_weight, weight: of the pixel, in maps of the caller's.
