@@ -78,8 +78,8 @@ template <class S> struct ImportanceRow {
 
 // Sums the rows of up to kVisitsPerCheck Gaussians, and adds them to the sums of these.
 template <class S>
-__device__ void add_rows(const ImportanceSums<S>& sums, const ImportanceRow<S>* rows,
-                         const int32_t* gaussians, int count, int lane) {
+__device__ void add_rows(const ImportanceSums<S>& sums, const ImportanceRow<S>* rows, const int32_t* gaussians,
+                         int count, int lane) {
   constexpr int kParts = kWarp / kVisitsPerCheck, kPart = kWarp / kParts;
   const int g = lane / kParts, part = lane % kParts;
   S totals[kNumImportances];

@@ -1,5 +1,5 @@
-// Long lists in segments. The forward pass notes each pixel's state where a segment begins, so that the backward pass
-// can give every segment to a warp of its own. Otherwise the warp with the longest list would decide how long the pass
+// Long lists in segments. The forward pass notes each pixel's state where a segment begins, so that a later pass can
+// give every segment to a warp of its own. Otherwise the warp with the longest list would decide how long the pass
 // takes. (Taming 3DGS, arXiv:2406.15643, notes such states every 32 Gaussians, and gives those to a warp.)
 //
 // Segment s of a tile holds entries [s L, (s + 1) L) of its list, where L is kSegmentLength. A tile's first segment
@@ -48,7 +48,7 @@ template <class S> __device__ SegmentQueue segment_queue(const SavedForward<S>& 
   return {reinterpret_cast<int2*>(saved.segment_queue)};
 }
 
-// What a warp of the backward pass walks: a quarter of a tile, in one segment.
+// What a warp of such a pass walks: a quarter of a tile, in one segment.
 struct WarpSegment {
   int tile, quarter, segment;
 };

@@ -44,8 +44,8 @@ def test_needles_that_pass_by_more_macro_tiles_than_they_meet_tiles(mode, gpu):
 def test_tiles_come_in_the_order_of_their_lists_lengths(mode, fits, gpu):
     """Each tile once, the longest lists first by classes of 64 instances; also where the lists do not fit."""
     # Another size for each case: what an earlier rendering of the size needed decides whether the lists fit.
-    scene = random_scene(mode, 3000, 333 + 16 * fits, 217, scale=0.1, degree=0, dtype=torch.float32).to(gpu)
-    if not fits:  # the next rendering has room for as many as small Gaussians have
+    scene = random_scene(mode, 12_000, 333 + 16 * fits, 217, scale=0.1, degree=0, dtype=torch.float32).to(gpu)
+    if not fits:  # the next rendering has room for as many as small Gaussians have, in steps of 65,536
         op_results(scene.with_inputs(scales=scene.inputs["scales"] * 0.01))
         torch.cuda.synchronize()
     _, saved = op_results(scene)
@@ -53,6 +53,6 @@ def test_tiles_come_in_the_order_of_their_lists_lengths(mode, fits, gpu):
     assert (len(saved["instances"]) >= int(saved["tile_offsets"][-1])) is fits
     assert torch.equal(order.sort().values, torch.arange(len(order), device=gpu))
     if fits:
-        lengths = (offsets[1:] - offsets[:-1])[order]
-        assert lengths.max() > 5 * 64, "few classes"
-        assert (lengths[1:] // 64 <= lengths[:-1] // 64).all()
+        classes = (offsets[1:] - offsets[:-1])[order] // 64
+        assert len(classes.unique()) > 3, "few classes"
+        assert (classes[1:] <= classes[:-1]).all()
