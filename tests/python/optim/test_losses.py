@@ -101,7 +101,8 @@ def test_the_square_stands_in_for_l1(device, dtype):
     assert_close(gradient, expected_gradient, dtype)
 
 
-@pytest.mark.parametrize("function", [l1_ssim_loss_and_gradient, lambda x, y: l2_ssim_loss_and_gradient(x, y, 0.2, 15.0)])
+@pytest.mark.parametrize("function", [l1_ssim_loss_and_gradient,
+                                      lambda x, y: l2_ssim_loss_and_gradient(x, y, 0.2, 15.0)])
 def test_a_target_of_bytes_is_one_of_255ths(device, function):
     image, _ = image_pair((3, 40, 45))
     with on_the_cpu():
