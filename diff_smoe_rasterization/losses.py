@@ -30,6 +30,17 @@ def l1_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor,
     return _OPS.image_loss(image.detach(), target, 1 - lambda_dssim, -lambda_dssim, lambda_dssim, 0, True)
 
 
+def l2_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float,
+                              weight: float) -> Tuple[torch.Tensor, torch.Tensor]:
+    """As `l1_ssim_loss_and_gradient`, with weight times the mean squared error in place of the mean absolute one."""
+    image = image.detach()
+    loss, gradient = _OPS.image_loss(image, target, 0.0, -lambda_dssim, lambda_dssim, 0, True)
+    difference = image - (target if target.is_floating_point() else target.to(image.dtype) / 255)
+    weight *= 1 - lambda_dssim
+    return (loss + weight * difference.square().mean(),
+            gradient.add_(difference, alpha=2 * weight / difference.numel()))
+
+
 def fused_ssim(img1: torch.Tensor, img2: torch.Tensor, padding: str = "same", train: bool = True) -> torch.Tensor:
     """Mean structural similarity (Wang et al. 2004) of images in [0, 1]: 11x11 Gaussian window of sigma 1.5.
 

@@ -80,7 +80,8 @@ class TrainConfig:
     position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
     position_lr_final: float = _recipe(0.0000016, 0.0000064, "last learning rate of positions, times the scene extent")
     position_lr_max_steps: int = _option(30_000, "step at which the last position learning rate is reached")
-    feature_lr: float = _recipe(0.0025, 0.005, "learning rate of base colours; higher SH bands take a 20th of it")
+    feature_lr: float = _recipe(0.0025, 0.005, "learning rate of base colours; higher SH bands take a 20th of it, "
+                                                "with gate a tenth")
     opacity_lr: float = _option(0.05, "learning rate of opacity logits")
     scaling_lr: float = _recipe(0.005, 0.01, "learning rate of log scales")
     rotation_lr: float = _option(0.001, "learning rate of quaternions")

@@ -27,8 +27,13 @@ class GateOptions:
     moves: float = _setting(0.1, lambda x: 0 <= x <= 1, "between 0 and 1")
     # A Gaussian moves where its cost is below this part of the error at its new place.
     worth: float = _setting(0.2, lambda x: 0 <= x < math.inf, "at least 0")
+    # The learning rate of the higher SH bands is so many times that of the recipe.
+    bands: float = _setting(2.0, lambda x: 0 < x < math.inf, "a positive number")
     # Behind the moves all learning rates but the positions' fall to this part of themselves.
     anneal: float = _setting(0.1, lambda x: 0 < x < math.inf, "a positive number")
+    # There too the loss has so many times the squared error in place of the absolute one; 0: it keeps that one. With 15
+    # both pull alike where they differ by 1/30.
+    squares: float = _setting(15.0, lambda x: 0 <= x < math.inf, "at least 0")
 
 
 def parse_gate_options(text: str) -> GateOptions:

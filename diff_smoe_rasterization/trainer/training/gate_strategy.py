@@ -10,6 +10,7 @@ from typing import Any, Dict, Optional, Tuple
 
 import torch
 
+from ...losses import l2_ssim_loss_and_gradient
 from ...splats import Splats
 from ..errors import ConfigError
 from ..gate_options import parse_gate_options
@@ -43,6 +44,8 @@ class GateStrategy(SteadyStrategy):
         config = context.config
         self.options = parse_gate_options(config.strategy_options)
         super().__init__(context)
+        context.optimizer.rates["shs"] *= self.options.bands
+        context.optimizer.scale_other_rates(1.0)
         self.start = context.model.num_gaussians
         until = config.densify_until_iter
         self.growth_ends = round(GROWTH_ENDS * until)
@@ -67,6 +70,11 @@ class GateStrategy(SteadyStrategy):
                               "points reach with one densification each --densification-interval "
                               f"{config.densification_interval} between --densify-from-iter "
                               f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
+
+    def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        if iteration <= self.moves_end or self.options.squares == 0:
+            return super().loss(iteration, image, target)
+        return l2_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim, self.options.squares)
 
     def before_backward(self, step: Step) -> None:
         if self._looks(step):

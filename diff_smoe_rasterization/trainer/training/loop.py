@@ -10,7 +10,6 @@ from typing import Any, Callable, Dict, List, Optional, Tuple, Union
 
 import torch
 
-from ...losses import l1_ssim_loss_and_gradient
 from ..config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
 from ..errors import TrainerError
 from ..model import GaussianModel, GaussianOptimizer
@@ -163,12 +162,11 @@ class Trainer:
 
     def loss_of(self, view: View, target: torch.Tensor, image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
         """The loss of a rendering and its gradient."""
-        config = self.config
         self._report = (image, target, view)
-        if view.mask is None:
-            return l1_ssim_loss_and_gradient(image, target, config.lambda_dssim)
         mask = view.mask_float()
-        loss, gradient = l1_ssim_loss_and_gradient(image * mask, as_float(target) * mask, config.lambda_dssim)
+        if mask is None:
+            return self.strategy.loss(self.iteration, image, target)
+        loss, gradient = self.strategy.loss(self.iteration, image * mask, as_float(target) * mask)
         return loss, gradient * mask
 
     def training_psnr(self) -> float:

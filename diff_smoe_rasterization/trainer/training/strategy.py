@@ -11,6 +11,7 @@ from typing import Any, Callable, Dict, Iterable, List, Optional, Sequence, Tupl
 import torch
 
 from ...gaussians import add_view
+from ...losses import l1_ssim_loss_and_gradient
 from ...settings import Rendering
 from ...splats import Splats
 from ..config import TrainConfig
@@ -111,6 +112,10 @@ class Strategy:
     def __init__(self, context: StrategyContext) -> None:
         """May change the first Gaussians; a resumed run replaces them and loads the state."""
         self.context = context
+
+    def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        """The loss of a rendering, and its gradient by the image."""
+        return l1_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim)
 
     def before_backward(self, step: AnyStep) -> None:
         """The loss is known, its gradients are not."""

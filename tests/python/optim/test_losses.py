@@ -5,7 +5,12 @@ import pytest
 import torch
 from devices import on_the_cpu
 
-from diff_smoe_rasterization.losses import fused_ssim, l1_ssim_loss, l1_ssim_loss_and_gradient
+from diff_smoe_rasterization.losses import (
+    fused_ssim,
+    l1_ssim_loss,
+    l1_ssim_loss_and_gradient,
+    l2_ssim_loss_and_gradient,
+)
 
 
 def direct_ssim(x, y, padding="same"):
@@ -86,13 +91,25 @@ def test_the_loss_mixes_l1_and_dssim(device, dtype, weight):
     assert_close(gradient, expected_gradient, dtype)
 
 
-def test_a_target_of_bytes_is_one_of_255ths(device):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_square_stands_in_for_l1(device, dtype):
+    image, target = image_pair((3, 50, 37))
+    expected, expected_gradient = direct_gradient(
+        lambda x: 0.7 * 4 * (x - target).square().mean() + 0.3 * (1 - direct_ssim(x, target)), image)
+    loss, gradient = l2_ssim_loss_and_gradient(image.to(device, dtype), target.to(device, dtype), 0.3, 4.0)
+    assert_close(loss, expected, dtype)
+    assert_close(gradient, expected_gradient, dtype)
+
+
+@pytest.mark.parametrize("function", [l1_ssim_loss_and_gradient,
+                                      lambda x, y: l2_ssim_loss_and_gradient(x, y, 0.2, 15.0)])
+def test_a_target_of_bytes_is_one_of_255ths(device, function):
     image, _ = image_pair((3, 40, 45))
     with on_the_cpu():
         target = torch.randint(0, 256, (3, 40, 45), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     x = image.to(device, torch.float32)
-    loss, gradient = l1_ssim_loss_and_gradient(x, target.to(device))
-    expected, expected_gradient = l1_ssim_loss_and_gradient(x, target.to(device).float() / 255)
+    loss, gradient = function(x, target.to(device))
+    expected, expected_gradient = function(x, target.to(device).float() / 255)
     torch.testing.assert_close(loss, expected, rtol=1e-6, atol=0.0)
     # A GPU may contract the division into what follows: an ulp of the target, 6e-8, in gradients of 1 / numbers.
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-4, atol=1e-4 / image.numel())

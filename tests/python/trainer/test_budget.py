@@ -10,6 +10,7 @@ import torch
 from test_resume import killed_and_resumed, ply_bytes
 
 from diff_smoe_rasterization import rasterize
+from diff_smoe_rasterization.losses import fused_ssim
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import ConfigError
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
@@ -152,7 +153,7 @@ def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
 
 
 def test_rates_of_gate_fall_behind_the_moves(tiny_config):
-    """The positions' as ever; the others fall to a tenth from step 40 to the last."""
+    """The positions' as ever; the others fall to a tenth from step 40 to the last. The higher bands' is doubled."""
     config = tiny_config.changed(iterations=80, position_lr_max_steps=80, schedule="gate", budget=60)
     rates_alone = {name: getattr(config, name) for name in ("position_lr_init", "position_lr_final", "feature_lr",
                                                             "scaling_lr")}
@@ -166,7 +167,29 @@ def test_rates_of_gate_fall_behind_the_moves(tiny_config):
             trainer.step()
             plain.step()
         ratio = rates(trainer) / rates(plain)
-        torch.testing.assert_close(ratio, torch.tensor([1.0] + [factor] * 5))
+        torch.testing.assert_close(ratio, torch.tensor([1.0, factor, 2 * factor, *[factor] * 3]))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_loss_of_gate_is_of_squares_behind_the_moves(tiny_config, masked):
+    """Until step 40 it is that of 3DGS."""
+    config = tiny_config.changed(iterations=42, schedule="gate", budget=60)
+    scene = load_scene(config, progress=False)
+    if masked:
+        mask = torch.full((1, 24, 32), 51, dtype=torch.uint8)
+        scene = dataclasses.replace(scene, train=[dataclasses.replace(view, mask=mask) for view in scene.train])
+    trainer = Trainer(config, scene)
+    while trainer.iteration < 42:
+        step = trainer.step()
+        if trainer.iteration < 40:
+            continue
+        part = 0.2 if masked else 1.0
+        image, target = part * step.rendering.color.detach(), part * step.view.image_float()
+        error = image - target
+        error = 15 * error.square().mean() if trainer.iteration > 40 else error.abs().mean()
+        expected = 0.8 * error + 0.2 * (1 - fused_ssim(image, target))
+        torch.testing.assert_close(step.loss, expected)  # sums of the same floats in another order
+        assert torch.equal(trainer._report[0], step.rendering.color)
 
 
 def test_removal_keeps_the_costliest(tiny_config, monkeypatch):
@@ -264,7 +287,8 @@ def test_what_cannot_be_is_said(options, words):
     ("removals=0", "removals is 0; it must be at least 1"), ("views=0", "views is 0; it must be at least 1"),
     ("moves=2", "moves is 2; it must be between 0 and 1"), ("moves=nan", "moves is nan; it must be between 0 and 1"),
     ("overshoot=0.5", "overshoot is 0.5; it must be 0 or at least 1"), ("overshoot=inf", "overshoot is inf"),
-    ("worth=-1", "worth is -1; it must be at least 0"), ("anneal=0", "anneal is 0; it must be a positive number")])
+    ("worth=-1", "worth is -1; it must be at least 0"), ("anneal=0", "anneal is 0; it must be a positive number"),
+    ("bands=0", "bands is 0; it must be a positive number"), ("squares=-1", "squares is -1; it must be at least 0")])
 def test_settings_of_gate_are_checked(text, words):
     with pytest.raises(ConfigError, match="--strategy-options: " + words):
         TrainConfig(budget=60, strategy_options=text).validate()

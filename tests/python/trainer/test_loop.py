@@ -12,7 +12,7 @@ from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient as l1_ssim
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.results.rendering import package_rasterizer
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training import loop
+from diff_smoe_rasterization.trainer.training import strategy
 from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
 from diff_smoe_rasterization.trainer.training.strategies import STRATEGIES
 from diff_smoe_rasterization.trainer.training.strategy import Strategy
@@ -98,7 +98,7 @@ def test_random_backgrounds_are_behind_rendering_and_image(tiny_config, scene, m
         backgrounds.append(settings.bg)
         return package_rasterizer()(means3D, opacities, settings, **arguments)
 
-    monkeypatch.setattr(loop, "l1_ssim_loss_and_gradient",
+    monkeypatch.setattr(strategy, "l1_ssim_loss_and_gradient",
                         lambda image, target, weight: targets.append(target) or l1_ssim(image, target, weight))
     scene = transparent_scene(scene)
     trainer = Trainer(tiny_config.changed(blend_mode="alpha", random_background=True), scene, rasterize)
