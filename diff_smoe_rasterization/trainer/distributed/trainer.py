@@ -123,9 +123,8 @@ class BatchTrainer(Trainer):
             elapsed = (synchronised_time(device) - started) / len(some)
             for index, color in colors.items():
                 view = some[index]
-                pair = (color, view.image_float())
-                own.append({"name": view.camera.name, "milliseconds": elapsed * 1000, **(
-                    image_metrics(*pair) if view.mask is None else image_metrics(*pair, view.mask_float()))})
+                own.append({"name": view.camera.name, "milliseconds": elapsed * 1000,
+                            **image_metrics(color, view.image_float(), view.mask_float())})
         by_process = group.gather_objects(own)
         return summary([by_process[index % group.size][index // group.size]  # type: ignore[index]
                         for index in range(len(views))])
