@@ -36,17 +36,8 @@ class BatchTrainer(Trainer):
         return self.divided
 
     @property
-    def leads(self) -> bool:  # type: ignore[override]
-        return self.group.leads
-
-    @property
-    def is_divided(self) -> bool:  # type: ignore[override]
-        return self.group.size > 1
-
-    def meet(self) -> None:
-        self.group.gather_numbers([0], self.config.device)
-
-    checkpoint_device = "cpu"  # of which each process takes its part
+    def checkpoint_device(self) -> str:
+        return "cpu"  # of which each process takes its part
 
     @property
     def num_gaussians(self) -> int:
