@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import glob
 import json
 import os
 from dataclasses import dataclass, field
@@ -202,7 +203,9 @@ class TrainConfig:
         """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
         if not holds_run(folder):
-            raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`")
+            below = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
+            raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"
+                              + (f"; such are {', '.join(below[:3])}" if below else ""))
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)

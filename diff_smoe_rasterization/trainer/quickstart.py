@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import shlex
 import shutil
 import sys
 from typing import Any, Dict, List, Optional
@@ -88,7 +89,7 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
         earlier = _earlier_files(output, of)  # again: another run may have been at work there
         if config is None:
             folder = os.path.join(output, "scene")
-            print(f"making a scene in {folder}")
+            print(f"making a scene in {folder}", flush=True)
             write_record(output, PROGRAM, Record(of, earlier), earlier)  # the scene is its own
             write_synthetic_scene(folder)
             config = choose_options(folder, given)
@@ -112,7 +113,16 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     print(f"\n{len(scene.train)} training and {len(scene.test)} test views; "
           f"results and models: {output}; pictures: {', '.join(pictures)}")
     print(viewer_warning(rows[1]))
+    print(f"to look at it in a browser: {command()} export {shlex.quote(os.path.join(output, MODES[1]))} -o model.html")
     return rows
+
+
+def command() -> str:
+    """What to type for `dsmoe`, of the environment that this process runs in."""
+    beside = os.path.join(os.path.dirname(sys.executable), "dsmoe")
+    if not os.path.isfile(beside):
+        return f"{shlex.quote(sys.executable)} -m {__name__.partition('.')[0]}"
+    return shlex.quote(min(beside, os.path.relpath(beside), key=len))
 
 
 def _earlier_files(output: str, of: str) -> List[str]:
@@ -139,7 +149,7 @@ def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
     chosen = {name: value for name, value in chosen.items() if name not in given}
     if chosen:
         texts = (f"--{name.replace('_', '-')} {value}" for name, value in chosen.items())
-        print(f"chosen for a run of some minutes: {' '.join(texts)}")
+        print(f"chosen for a run of some minutes: {' '.join(texts)}", flush=True)
     base = TrainConfig(scene=folder, blend_mode=MODES[0], checkpoint_every=0)
     return base.changed(**{**chosen, **given}).shortened().changed(**given)
 
