@@ -286,8 +286,19 @@ def _number_or_learned(text: str) -> Union[float, str]:
         raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
 
 
+def _flags(option: dataclasses.Field[Any]) -> Sequence[str]:
+    """How an option is typed; texts have the first of these."""
+    return option.metadata.get("flags", ("--" + option.name.replace("_", "-"),))
+
+
 def _flag(option: dataclasses.Field[Any]) -> str:
-    return "--" + option.name.replace("_", "-")
+    return _flags(option)[0]
+
+
+def flags_text(options: Dict[str, Any]) -> str:
+    """What to type for options by name."""
+    known = {option.name: option for option in dataclasses.fields(TrainConfig)}
+    return " ".join(f"{_flag(known[name])} {value}" for name, value in options.items())
 
 
 _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
@@ -306,7 +317,7 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), def
         if option.metadata.get("positional"):
             parser.add_argument(option.name, metavar=option.name.upper(), help=text)
             continue
-        flags = option.metadata.get("flags", (_flag(option),))
+        flags = _flags(option)
         if option.type == "bool":
             parser.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue

@@ -14,7 +14,7 @@ from typing import Any, Dict, List, Optional
 
 import torch
 
-from .config import TrainConfig, add_arguments
+from .config import TrainConfig, add_arguments, flags_text
 from .errors import TrainerError, in_one_line
 from .inspection import open_renderer, to_image
 from .results.metrics import psnr, quantised
@@ -148,8 +148,7 @@ def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
         chosen["init_points"] = MAX_POINTS
     chosen = {name: value for name, value in chosen.items() if name not in given}
     if chosen:
-        texts = (f"--{name.replace('_', '-')} {value}" for name, value in chosen.items())
-        print(f"chosen for a run of some minutes: {' '.join(texts)}", flush=True)
+        print(f"chosen for a run of some minutes: {flags_text(chosen)}", flush=True)
     base = TrainConfig(scene=folder, blend_mode=MODES[0], checkpoint_every=0)
     return base.changed(**{**chosen, **given}).shortened().changed(**given)
 

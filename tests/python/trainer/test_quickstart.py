@@ -76,7 +76,7 @@ def test_what_it_chose_is_said_before_it_trains(tiny_scene, monkeypatch):
     pipe = io.BytesIO()
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(pipe))
     quickstart.choose_options(tiny_scene, {})
-    assert pipe.getvalue().startswith(b"chosen for a run of some minutes: --iterations 2000 ")
+    assert pipe.getvalue().startswith(b"chosen for a run of some minutes: --iterations 2000 --strategy steady ")
 
 
 def test_another_scene_is_refused_and_no_picture_is_stale(tiny_scene, output, tmp_path, capsys):
