@@ -203,9 +203,9 @@ class TrainConfig:
         """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
         if not holds_run(folder):
-            below = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
+            runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
             raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"
-                              + (f"; such are {', '.join(below[:3])}" if below else ""))
+                              + (f"; such are {', '.join(runs[:3])}" if runs else ""))
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)
@@ -256,8 +256,9 @@ class TrainConfig:
 
 def _recipe_of(schedule: str) -> Dict[str, Any]:
     """What a strategy sets of the recipe, by option, where strategies differ."""
-    of = "gate" if schedule == "gate" else "published"
-    return {option.name: option.metadata[of] for option in dataclasses.fields(TrainConfig) if of in option.metadata}
+    recipe = "gate" if schedule == "gate" else "published"
+    return {option.name: option.metadata[recipe] for option in dataclasses.fields(TrainConfig)
+            if recipe in option.metadata}
 
 
 def holds_run(folder: str) -> bool:
@@ -272,8 +273,8 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     for one that the mode does not know.
     """
     if blend_mode != "smoe":
-        own = float(resolve_background_gate(blend_mode, None))
-        return own if asked in (None, own) else float(resolve_background_gate(blend_mode, asked))
+        fixed = float(resolve_background_gate(blend_mode, None))
+        return fixed if asked in (None, fixed) else float(resolve_background_gate(blend_mode, asked))
     if asked == LEARNED or asked is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
         return LEARNED
     return float(resolve_background_gate(blend_mode, asked))

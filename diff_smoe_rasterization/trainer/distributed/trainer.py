@@ -103,7 +103,7 @@ class BatchTrainer(Trainer):
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views, each in one of the processes; a time of a view is that of all by their number."""
         group, device, views = self.group, self.config.device, self.scene.test
-        own: List[Dict[str, Any]] = []
+        measured: List[Dict[str, Any]] = []
         for begin in progress_bar(range(0, len(views), group.size), desc="evaluation", unit="view",
                                   disable=not progress, leave=False):
             some = views[begin:begin + group.size]
@@ -114,9 +114,9 @@ class BatchTrainer(Trainer):
             elapsed = (synchronised_time(device) - started) / len(some)
             for index, color in colors.items():
                 view = some[index]
-                own.append({"name": view.camera.name, "milliseconds": elapsed * 1000,
-                            **image_metrics(color, view.image_float(), view.mask_float())})
-        by_process = group.gather_objects(own)
+                measured.append({"name": view.camera.name, "milliseconds": elapsed * 1000,
+                                 **image_metrics(color, view.image_float(), view.mask_float())})
+        by_process = group.gather_objects(measured)
         return summary([by_process[index % group.size][index // group.size]  # type: ignore[index]
                         for index in range(len(views))])
 
