@@ -113,13 +113,13 @@ class _Rasterize(torch.autograd.Function):
     backward = staticmethod(backward if _CAN_REGISTER else torch.autograd.function.once_differentiable(backward))
 
 
-def rasterize_op(inputs, options):
+def rasterize_op(function, inputs, options):
     """Calls the op `rasterize` differentiably. Returns the images of IMAGES, and the list of what it saved.
 
-    inputs: a tensor or None for each of INPUTS. options: a value for each of OPTIONS; the last, `for_backward`, is left
-    out.
+    function: the one that the caller called, which errors name. inputs: a tensor or None for each of INPUTS. options: a
+    value for each of OPTIONS; the last, `for_backward`, is left out.
     """
-    refuse_forward_mode("rasterize", inputs)
+    refuse_forward_mode(function, inputs)
     if _CAN_REGISTER and torch.compiler.is_compiling():
         return _OPS.rasterize(*inputs, *options, torch.is_grad_enabled())
     if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs):
@@ -156,20 +156,23 @@ def _fake_project(*arguments):
             _fake_radii(means3D))
 
 
-def _fake_project_backward(records, dL_ddepths, inputs, present, *others):
-    given = iter(inputs)
-    all_inputs = [next(given) if here else None for here in present]
-    return [tensor.new_empty(tensor.shape) for tensor, want in zip(all_inputs, others[-1]) if want]
-
-
 def _fake_radii(means3D, *others):
     return means3D.new_empty((means3D.shape[0],), dtype=torch.int32)
 
 
-def _fake_rasterize_backward(dL_dcolor, dL_dgate_sum, dL_ddepth, dL_dinverse_depth, inputs, present, *others):
+def _fake_gradients(inputs, present, wanted):
+    """Returns tensors of the shapes of the gradients by those inputs that are wanted."""
     given = iter(inputs)
     all_inputs = [next(given) if here else None for here in present]
-    return [tensor.new_empty(tensor.shape) for tensor, want in zip(all_inputs, others[-1]) if want]
+    return [tensor.new_empty(tensor.shape) for tensor, want in zip(all_inputs, wanted) if want]
+
+
+def _fake_rasterize_backward(dL_dcolor, dL_dgate_sum, dL_ddepth, dL_dinverse_depth, inputs, present, *others):
+    return _fake_gradients(inputs, present, others[-1])
+
+
+def _fake_project_backward(records, dL_ddepths, inputs, present, *others):
+    return _fake_gradients(inputs, present, others[-1])
 
 
 def _fake_mark_visible(positions, viewmatrix, near):

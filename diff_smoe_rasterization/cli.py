@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 
 from ._version import __version__
-from .patches import PatchError
+from .patches import TRAINERS, PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.config import (
     PRINCIPAL_POINTS,
@@ -113,9 +113,8 @@ def build_parser() -> argparse.ArgumentParser:
     view.set_defaults(run=_view)
 
     patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
-                                description="Patches a checkout of 3DGS (2023, 2024), c3dgs, Taming 3DGS, "
-                                            "Scaffold-GS, HAC or HAC++, which then knows the options --blend_mode "
-                                            "and --background_gate.")
+                                description="Patches a checkout of a public trainer, which then knows the options "
+                                            f"--blend_mode and --background_gate: {', '.join(TRAINERS)}.")
     _add_patch_arguments(patch)
 
     run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
@@ -202,7 +201,7 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
 def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
     actions = patch.add_subparsers(dest="action", required=True, metavar="ACTION")
     for name, text in (("apply", "patch the checkout; each line of the patch says so"),
-                       ("check", "say whether it is patchable, patched, half-patched, drifted or unknown"),
+                       ("check", "say whether it is patchable, and what is patched of it"),
                        ("diff", "show what the patch changes, and write nothing"),
                        ("revert", "take the patch out of every file, byte for byte")):
         action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")

@@ -5,8 +5,8 @@ from typing import Dict, Optional, Sequence
 
 import torch
 
+from .arguments import as_rendering, op_arguments
 from .autograd import IMAGES, INPUTS, refuse_forward_mode
-from .rasterizer import _arguments, _rendering
 from .settings import GaussianRasterizationSettings, Rendering
 from .splats import Splats
 
@@ -28,10 +28,10 @@ class DirectRendering:
                  shs: Optional[torch.Tensor] = None, colors_precomp: Optional[torch.Tensor] = None,
                  scales: Optional[torch.Tensor] = None, rotations: Optional[torch.Tensor] = None,
                  cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> None:
-        self._inputs, self._options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc,
-                                                 shs=shs, colors_precomp=colors_precomp, scales=scales,
-                                                 rotations=rotations, cov3D_precomp=cov3D_precomp)
-        refuse_forward_mode("rasterize", self._inputs)
+        self._inputs, self._options = op_arguments(
+            "DirectRendering", settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
+            colors_precomp=colors_precomp, scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp)
+        refuse_forward_mode("DirectRendering", self._inputs)
         self._outputs = outputs
 
     @torch.no_grad()
@@ -49,7 +49,7 @@ class DirectRendering:
     def render(self) -> Rendering:
         """The images, without gradient. They must not be changed before `backward`."""
         *self._images, self._saved = _OPS.rasterize(*self._inputs, *self._options, True)
-        return _rendering(self._images, self._outputs)
+        return as_rendering(self._images, self._outputs)
 
     def splats(self) -> Splats:
         """What `rasterize_with_splats` returns beside the images, after `render`."""

@@ -12,8 +12,8 @@ from typing import Any, List, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 
+from .arguments import as_rendering, op_arguments, op_options, tensor_checks
 from .autograd import INPUTS, refuse_forward_mode
-from .rasterizer import _arguments, _checks, _options, _rendering
 from .settings import OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -77,9 +77,9 @@ def project_gaussians(means3D: torch.Tensor, opacities: torch.Tensor, settings: 
 
     Gradients reach every tensor, but settings.bg and settings.background_gate, which belong to the second half.
     """
-    inputs, options = _arguments(settings, outputs, means3D, opacities, means2D=means2D, dc=dc, shs=shs,
-                                 colors_precomp=colors_precomp, scales=scales, rotations=rotations,
-                                 cov3D_precomp=cov3D_precomp)
+    inputs, options = op_arguments("project_gaussians", settings, outputs, means3D, opacities, means2D=means2D, dc=dc,
+                                   shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
+                                   cov3D_precomp=cov3D_precomp)
     refuse_forward_mode("project_gaussians", inputs)
     if _wants_gradient(inputs):
         return Footprints(*_Project.apply((*options, True), *inputs))
@@ -89,7 +89,7 @@ def project_gaussians(means3D: torch.Tensor, opacities: torch.Tensor, settings: 
 def projection_arguments(settings: GaussianRasterizationSettings, means3D: torch.Tensor, opacities: torch.Tensor,
                          **tensors: Optional[torch.Tensor]) -> Tuple[List[Optional[torch.Tensor]], List[Any]]:
     """The tensors and the options of the op `project`, all but the last option. The arguments of the function."""
-    return _arguments(settings, (), means3D, opacities, **tensors)
+    return op_arguments("project_gaussians", settings, (), means3D, opacities, **tensors)
 
 
 def blend_op_arguments(footprints: Footprints, settings: GaussianRasterizationSettings,
@@ -98,11 +98,11 @@ def blend_op_arguments(footprints: Footprints, settings: GaussianRasterizationSe
     if not set(OUTPUTS).issuperset(outputs):
         raise ValueError(f"blend_footprints: outputs is {tuple(outputs)}; it may hold {', '.join(OUTPUTS)}")
     blend_mode, gate = resolve_blend(settings)
-    required, _ = _checks("blend_footprints", "gates", footprints.gates)
+    required, _ = tensor_checks("blend_footprints", "gates", footprints.gates)
     learned = isinstance(gate, torch.Tensor)
     tensors = [footprints.gates, required("features", footprints.features), required("radii", footprints.radii),
                required("bg", settings.bg), required("background_gate", gate) if learned else None]
-    return tensors, _options(settings, outputs, blend_mode, 0.0 if learned else gate)
+    return tensors, op_options(settings, outputs, blend_mode, 0.0 if learned else gate)
 
 
 def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSettings,
@@ -120,7 +120,7 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
     else:
         images = _OPS.blend(*tensors, *options, False)[:-1]
     color, gate_sum, depth, inverse_depth = images
-    return _rendering((color, footprints.radii, gate_sum, depth, inverse_depth), outputs)
+    return as_rendering((color, footprints.radii, gate_sum, depth, inverse_depth), outputs)
 
 
 def _wants_gradient(tensors: Sequence[Optional[torch.Tensor]]) -> bool:

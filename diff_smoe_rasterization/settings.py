@@ -27,7 +27,7 @@ smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               wh
 At 0, the default, this is Eq. 7, and the background is seen where no gate is open; at 1 it is alpha blending.
 """
 
-_OWN_BACKGROUND_GATES = {"alpha": 1.0, "smoe": None, "smoe_tn": 0.0, "smoe_std": 0.0}
+_FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_tn": 0.0, "smoe_std": 0.0}
 """The background's gate that a blend mode has by itself. None: the caller gives it."""
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
@@ -138,10 +138,10 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor of not one element, and
     for a value in a mode that knows none.
     """
-    own = _OWN_BACKGROUND_GATES.get(blend_mode, 0.0)
-    if own is not None:
-        if background_gate is None or (own == 1 and not _is_tensor(background_gate) and background_gate == own):
-            return own
+    fixed = _FIXED_GATES.get(blend_mode, 0.0)
+    if fixed is not None:
+        if background_gate is None or (fixed == 1 and not _is_tensor(background_gate) and background_gate == fixed):
+            return fixed
         raise ValueError(f"background_gate is given, but blend_mode is {blend_mode!r}; only 'smoe' knows it")
     source = "background_gate"
     if background_gate is None:
@@ -189,7 +189,7 @@ def training_background_gate(blend_mode: str, background_gate: Optional[float] =
     In `smoe` that is the given value, else the environment variable DSMOE_BACKGROUND_GATE, else the recommended one.
     Raises ValueError as `resolve_background_gate` does.
     """
-    takes_gate = _OWN_BACKGROUND_GATES.get(blend_mode, 0.0) is None
+    takes_gate = _FIXED_GATES.get(blend_mode, 0.0) is None
     if takes_gate and background_gate is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
         background_gate = RECOMMENDED_BACKGROUND_GATE
     gate = resolve_background_gate(blend_mode, background_gate)

@@ -123,8 +123,8 @@ def classes_of(contract: str, module: str, renderer: Optional[Renderer] = None) 
     where `results_of` does not do.
     """
     entry = contract_of(contract)
-    own = [name for name in entry.settings if name not in Settings._fields]
-    settings_class = settings_with(own, module) if own else Settings
+    new_settings = [name for name in entry.settings if name not in Settings._fields]
+    settings_class = settings_with(new_settings, module) if new_settings else Settings
     renamed = {"shs": "sh", "cov3D_precomp": "cov3Ds_precomp"}
     further = [name for name in entry.arguments if name not in ("means3D", "means2D", "opacities")]
     place = further.index("scales")

@@ -9,7 +9,7 @@ import weakref
 import torch
 
 from diff_smoe_rasterization import GaussianRasterizer, rasterize_gaussians
-from diff_smoe_rasterization.rasterizer import _checks
+from diff_smoe_rasterization.arguments import tensor_checks
 
 from ._rasterizer import settings_with
 
@@ -51,7 +51,7 @@ def rasterize_gaussians_indexed(means3D, means2D, sh, sh_indices, g_indices, col
     Returns: color [C, H, W], radii [N] int32. Gradients equal bit for bit from run to run where those of `rasterize`
     do.
     """
-    required, _ = _checks("rasterize_gaussians_indexed", "means3D", means3D)
+    required, _ = tensor_checks("rasterize_gaussians_indexed", "means3D", means3D)
     count = len(means3D)
 
     def rows(name, codebook, index_name, indices):

@@ -30,7 +30,7 @@ class Plan(NamedTuple):
     """What `apply` would do, and why it would not. Files are by name, relative to the checkout."""
 
     root: Path
-    state: str  # unknown, patchable, patched, half-patched or drifted
+    state: str  # unknown, unpatchable, patchable, patched, half-patched or drifted
     trainer: Optional[str]
     reasons: Sequence[str]  # of the state, as lines
     applied: Sequence[str] = ()  # of OPTIONS, those that the files on disk are patched with
@@ -43,7 +43,7 @@ class Plan(NamedTuple):
 
     def possible(self) -> Plan:
         """Returns the plan. Raises PatchError where the checkout cannot be patched."""
-        if self.state in ("unknown", "drifted"):
+        if self.state in ("unknown", "unpatchable", "drifted"):
             trainer = f" ({self.trainer})" if self.trainer else ""
             raise PatchError("\n  ".join([f"the checkout is {self.state}{trainer}:", *self.reasons]))
         return self
@@ -55,9 +55,8 @@ class Patched:
     def __init__(self, before: Mapping[str, bytes], trainer: Trainer, options: Sequence[str]) -> None:
         self.before, self.after = before, dict(before)
         self.rules: Dict[str, List[str]] = {}  # of each file
-        # Why it cannot be patched.
         self.problems = [f"{name}: {leftover(data)}; change that line, by which `revert` takes a patch out"
-                         for name, data in before.items() if leftover(data)]
+                         for name, data in before.items() if leftover(data)]  # why it cannot be patched
         self.notes: List[str] = []
         for rule in rules_of(trainer):
             why = self.apply(rule.file, rule.name, rule.edit)
@@ -65,7 +64,7 @@ class Patched:
         for name, data in before.items():  # a script of the user's must not get another rasterizer
             if name != GR and RASTERIZER.encode() in data and not name.startswith("submodules/"):
                 self.apply(name, "import-rasterizer", partial(import_rasterizer, trainer=trainer))
-                self.notes += [f"{name}: {note}" for note in self.left(name, trainer)]
+                self.notes += [f"{name}: {note}" for note in self.notes_on(name, trainer)]
         for option in options:
             for name, data in before.items():
                 if "/" not in name and b"__main__" in data:
@@ -90,9 +89,10 @@ class Patched:
         self.rules.setdefault(name, []).append(rule)
         return ""
 
-    def left(self, name: str, trainer: Trainer) -> List[str]:
-        """What a script does without the blend mode that the trainer has."""
-        kept = re.search(rf"(?m)^[ \t]*((from|import) {RASTERIZER}\b.*)".encode(), self.after[name])
+    def notes_on(self, name: str, trainer: Trainer) -> List[str]:
+        """What a script does without the blend mode that the trainer has; it can do without what it tries to import."""
+        needed = re.sub(rb"(?m)^([ \t]*)try:\s*\n(\1[ \t]+from .*\n)+(?=\1except)", b"", self.after[name])
+        kept = re.search(rf"(?m)^[ \t]*((from|import) {RASTERIZER}\b.*)".encode(), needed)
         if kept:
             return [f"`{kept[1].decode(errors='replace').strip()}` is the original rasterizer, which no rule changes "
                     f"there; this package's is `from {INTEGRATIONS}.{trainer.flavour} import ...`"]
@@ -127,8 +127,8 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     as_it_was = (patched if options == applied else Patched(before, chosen, applied)).after
     wrong = [f"{name}: is not as this version patches it: `apply` finishes the patch, `revert` takes it back"
              for name, data in now.items() if data != as_it_was[name]]
-    state, reasons = (("drifted", patched.problems) if patched.problems else ("patched", []) if not wrong else
-                      ("patchable", []) if now == before else ("half-patched", wrong))
+    state, reasons = (("unpatchable" if now == before else "drifted", patched.problems) if patched.problems else
+                      ("patched", []) if not wrong else ("patchable", []) if now == before else ("half-patched", wrong))
     patched.notes += facts.of_one_name(root)
     if trainer and not (known and known.flavour == chosen.flavour):
         reason = f"by what it imports and calls it is {known.name}, which has another API" if known else reason

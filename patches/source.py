@@ -34,7 +34,7 @@ def tree_of(data: bytes) -> ast.Module:
             warnings.simplefilter("ignore")  # such as of invalid escapes in a string
             return ast.parse(data)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        raise PatchError(f"is not Python that can be parsed: {error}") from None
+        raise PatchError(f"is not Python that can be parsed: {str(error).replace('<unknown>, ', '')}") from None
 
 
 def unpatched(data: bytes) -> bytes:

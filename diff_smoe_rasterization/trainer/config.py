@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import glob
 import json
 import os
 from dataclasses import dataclass, field
@@ -203,7 +204,9 @@ class TrainConfig:
         """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
         if not holds_run(folder):
-            raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`")
+            runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
+            raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"
+                              + (f"; such are {', '.join(runs[:3])}" if runs else ""))
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)
@@ -254,8 +257,9 @@ class TrainConfig:
 
 def _recipe_of(schedule: str) -> Dict[str, Any]:
     """What a strategy sets of the recipe, by option, where strategies differ."""
-    of = "gate" if schedule == "gate" else "published"
-    return {option.name: option.metadata[of] for option in dataclasses.fields(TrainConfig) if of in option.metadata}
+    recipe = "gate" if schedule == "gate" else "published"
+    return {option.name: option.metadata[recipe] for option in dataclasses.fields(TrainConfig)
+            if recipe in option.metadata}
 
 
 def holds_run(folder: str) -> bool:
@@ -270,8 +274,8 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     for one that the mode does not know.
     """
     if blend_mode != "smoe":
-        own = float(resolve_background_gate(blend_mode, None))
-        return own if asked in (None, own) else float(resolve_background_gate(blend_mode, asked))
+        fixed = float(resolve_background_gate(blend_mode, None))
+        return fixed if asked in (None, fixed) else float(resolve_background_gate(blend_mode, asked))
     if asked == LEARNED or asked is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
         return LEARNED
     return float(resolve_background_gate(blend_mode, asked))
@@ -284,8 +288,19 @@ def _number_or_learned(text: str) -> Union[float, str]:
         raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
 
 
+def _flags(option: dataclasses.Field[Any]) -> Sequence[str]:
+    """How an option is typed; texts have the first of these."""
+    return option.metadata.get("flags", ("--" + option.name.replace("_", "-"),))
+
+
 def _flag(option: dataclasses.Field[Any]) -> str:
-    return "--" + option.name.replace("_", "-")
+    return _flags(option)[0]
+
+
+def flags_text(options: Dict[str, Any]) -> str:
+    """What to type for options by name."""
+    known = {option.name: option for option in dataclasses.fields(TrainConfig)}
+    return " ".join(f"{_flag(known[name])} {value}" for name, value in options.items())
 
 
 _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
@@ -304,7 +319,7 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), def
         if option.metadata.get("positional"):
             parser.add_argument(option.name, metavar=option.name.upper(), help=text)
             continue
-        flags = option.metadata.get("flags", (_flag(option),))
+        flags = _flags(option)
         if option.type == "bool":
             parser.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue

@@ -118,33 +118,33 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     return write_images(renderer, cameras, folder, said_of_images(config, ply, renderer), outputs)
 
 
-def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, of: str,
+def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, subject: str,
                  outputs: Sequence[str] = ()) -> List[str]:
     """Writes a PNG per camera into `folder`; returns the paths.
 
-    of: what they show, for the folder's record: images of something else are removed. folder and outputs are as in
+    subject: what they show, for the folder's record: images of something else are removed. folder and outputs are as in
     `render_images`. Raises TrainerError.
     """
-    beside = {"depth": ".depth.npy", "alpha": ".alpha.png"}
+    endings = {"depth": ".depth.npy", "alpha": ".alpha.png"}
     stems = file_names([camera.name for camera in cameras])
-    written = [stem + ending for stem in stems for ending in (".png", *map(beside.get, outputs))]
+    written = [stem + ending for stem in stems for ending in (".png", *map(endings.get, outputs))]
     if len({*written}) < len(written):
-        raise TrainerError(f"{of}: names of cameras differ only by {' or '.join(beside.values())}; rename one")
+        raise TrainerError(f"{subject}: names of cameras differ only by {' or '.join(endings.values())}; rename one")
     own_record(folder, RENDER)  # refused before the folder is made
     make_folder(folder)
     with only_one(folder), torch.no_grad():
         earlier = own_record(folder, RENDER)
-        kept = earlier.files if of == earlier.of else []  # those of another split
-        write_record(folder, RENDER, Record(of, sorted({*kept, *written})), earlier.files)
+        kept = earlier.files if subject == earlier.subject else []  # those of another split
+        write_record(folder, RENDER, Record(subject, sorted({*kept, *written})), earlier.files)
         remove_files(folder, written)  # a link in their place would be followed
         paths = [os.path.join(folder, stem) for stem in stems]
         for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
             rendering = renderer(camera, outputs=tuple(outputs))
             to_image(rendering.color).save(path + ".png")
             if rendering.depth is not None:
-                np.save(path + beside["depth"], rendering.depth[0].cpu().numpy())
+                np.save(path + endings["depth"], rendering.depth[0].cpu().numpy())
             if rendering.alpha is not None:
-                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path + beside["alpha"])
+                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path + endings["alpha"])
     return [path + ".png" for path in paths]
 
 

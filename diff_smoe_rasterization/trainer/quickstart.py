@@ -7,13 +7,14 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import shlex
 import shutil
 import sys
 from typing import Any, Dict, List, Optional
 
 import torch
 
-from .config import TrainConfig, add_arguments
+from .config import TrainConfig, add_arguments, flags_text
 from .errors import TrainerError, in_one_line
 from .inspection import open_renderer, to_image
 from .results.metrics import psnr, quantised
@@ -81,15 +82,15 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     given = {name: value for name, value in vars(arguments).items() if name not in ("scene", "output", "quiet")}
     output, progress = arguments.output, not arguments.quiet
     config = choose_options(arguments.scene, given) if arguments.scene else None
-    of = os.path.abspath(arguments.scene) if arguments.scene else MADE_UP
-    _earlier_files(output, of)
+    subject = os.path.abspath(arguments.scene) if arguments.scene else MADE_UP
+    _earlier_files(output, subject)
     make_folder(output)  # a folder that cannot be made is told before images are read
     with only_one(output):
-        earlier = _earlier_files(output, of)  # again: another run may have been at work there
+        earlier = _earlier_files(output, subject)  # again: another run may have been at work there
         if config is None:
             folder = os.path.join(output, "scene")
-            print(f"making a scene in {folder}")
-            write_record(output, PROGRAM, Record(of, earlier), earlier)  # the scene is its own
+            print(f"making a scene in {folder}", flush=True)
+            write_record(output, PROGRAM, Record(subject, earlier), earlier)  # the scene is its own
             write_synthetic_scene(folder)
             config = choose_options(folder, given)
         check_device(config.device)
@@ -97,7 +98,7 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
         scene = load_scene(config, progress)
         views = shown_views(scene)
         files = [RESULTS_NAME, *(mode + ".ply" for mode in MODES), *views]
-        write_record(output, PROGRAM, Record(of, files), earlier)
+        write_record(output, PROGRAM, Record(subject, files), earlier)
         remove_files(output, files)
         rows = []
         for mode in MODES:
@@ -112,14 +113,23 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     print(f"\n{len(scene.train)} training and {len(scene.test)} test views; "
           f"results and models: {output}; pictures: {', '.join(pictures)}")
     print(viewer_warning(rows[1]))
+    print(f"to look at it in a browser: {command()} export {shlex.quote(os.path.join(output, MODES[1]))} -o model.html")
     return rows
 
 
-def _earlier_files(output: str, of: str) -> List[str]:
+def command() -> str:
+    """What to type for `dsmoe`, of the environment that this process runs in."""
+    script = os.path.join(os.path.dirname(sys.executable), "dsmoe")
+    if not os.path.isfile(script):
+        return f"{shlex.quote(sys.executable)} -m {__name__.partition('.')[0]}"
+    return shlex.quote(min(script, os.path.relpath(script), key=len))
+
+
+def _earlier_files(output: str, subject: str) -> List[str]:
     """What an earlier comparison on the same scene has written. Raises TrainerError where `output` holds another's."""
     record = own_record(output, PROGRAM)
-    if record.of not in ("", of):
-        raise TrainerError(f"{output} holds the models and pictures of another scene, {record.of}; choose another "
+    if record.subject not in ("", subject):
+        raise TrainerError(f"{output} holds the models and pictures of another scene, {record.subject}; choose another "
                            "folder with -o, or remove it")
     return record.files
 
@@ -138,8 +148,7 @@ def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
         chosen["init_points"] = MAX_POINTS
     chosen = {name: value for name, value in chosen.items() if name not in given}
     if chosen:
-        texts = (f"--{name.replace('_', '-')} {value}" for name, value in chosen.items())
-        print(f"chosen for a run of some minutes: {' '.join(texts)}")
+        print(f"chosen for a run of some minutes: {flags_text(chosen)}", flush=True)
     base = TrainConfig(scene=folder, blend_mode=MODES[0], checkpoint_every=0)
     return base.changed(**{**chosen, **given}).shortened().changed(**given)
 

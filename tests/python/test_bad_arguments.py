@@ -7,7 +7,14 @@ import pytest
 import torch
 from scenes import camera_settings, random_scene
 
-from diff_smoe_rasterization import GaussianRasterizer, rasterize
+from diff_smoe_rasterization import (
+    DirectRendering,
+    GaussianRasterizer,
+    project_gaussians,
+    rasterize,
+    rasterize_with_splats,
+    visible_radii,
+)
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -189,3 +196,15 @@ def test_prefiltered_with_a_culled_point_is_an_ordinary_error(mode):
     camera = camera_settings(20, 18, position=(0.0, 0.0, -30.0), degree=1, dtype=torch.float32, blend_mode=mode)
     far = scene._replace(settings=camera._replace(prefiltered=True))
     assert render(far).radii.any()
+
+
+@pytest.mark.parametrize("function", [rasterize, rasterize_with_splats, visible_radii, project_gaussians,
+                                      DirectRendering])
+@pytest.mark.parametrize("name", ["means3D", "scales"])
+def test_an_error_names_the_function_that_was_called(function, name):
+    scene = scene_of()
+    inputs = {**scene.inputs, name: [[0.1, 0.1, 0.1]]}
+    if function is visible_radii:
+        inputs = {name: inputs[name] for name in ("means3D", "scales", "rotations")}
+    with pytest.raises(TypeError, match=rf"^{function.__name__}: {name} is of type list; it must be a torch.Tensor$"):
+        function(settings=scene.settings, **inputs)

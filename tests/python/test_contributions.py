@@ -268,5 +268,5 @@ def test_arguments_that_rasterize_refuses_are_refused():
     scene = random_scene("smoe", 30, 50, 37)
     with pytest.raises(ValueError, match="rasterize: opacities has shape"):
         splats_of(scene.with_inputs(opacities=torch.ones(29, 1, dtype=torch.float64)))
-    with pytest.raises(ValueError, match="rasterize: outputs is"):
+    with pytest.raises(ValueError, match="rasterize_with_splats: outputs is"):
         splats_of(scene, outputs=("normals",))

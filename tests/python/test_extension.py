@@ -19,7 +19,7 @@ from scenes import op_arguments, op_results, random_scene, with_gate
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.extension import _C
-from diff_smoe_rasterization.settings import _OWN_BACKGROUND_GATES, BLEND_MODES, OUTPUTS, GaussianRasterizationSettings
+from diff_smoe_rasterization.settings import _FIXED_GATES, BLEND_MODES, OUTPUTS, GaussianRasterizationSettings
 
 WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
 DIFFERENTIABLE = ("color", "gate_sum", "depth", "inverse_depth")  # images of the op
@@ -139,7 +139,7 @@ def test_the_settings_and_the_op_have_the_same_fields():
 def test_the_blend_modes_have_the_numbers_and_the_background_gates_of_the_core():
     modes = diff_smoe_rasterization.extension._C.blend_modes
     assert {name: facts["number"] for name, facts in modes.items()} == {mode: i for i, mode in enumerate(BLEND_MODES)}
-    assert {name: facts["background_gate"] for name, facts in modes.items()} == _OWN_BACKGROUND_GATES
+    assert {name: facts["background_gate"] for name, facts in modes.items()} == _FIXED_GATES
 
 
 @on_every_device

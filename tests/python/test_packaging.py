@@ -170,6 +170,14 @@ def test_quickstart_builds_no_kernels_where_there_is_no_gpu_unless_asked(tmp_pat
     assert said.split() == ["0", "1", "auto"]
 
 
+def test_quickstart_knows_before_it_builds_that_there_is_no_such_scene(tmp_path):
+    run = subprocess.run([str(ROOT / "quickstart"), "garden", "--iterations", "10"], cwd=str(tmp_path),
+                         env={**os.environ, "DSMOE_VENV": "venv"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                         universal_newlines=True)
+    assert (run.returncode, run.stdout, run.stderr) == (1, "", "error: scene garden: no such folder\n")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_long_step_says_how_many_files_are_compiled(tmp_path):
     said = environment_sh(tmp_path, """
         sleep() { command sleep 0.02; }  # in place of a minute

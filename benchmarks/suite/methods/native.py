@@ -40,7 +40,7 @@ def run_native(cell: Dict[str, Any], output: str) -> Outcome:
     measures = Measures(config.device, cell["protocol"]["lpips"])  # after the peak, of which its networks are no part
     ply, history = model_path(folder, config.iterations), os.path.join(folder, HISTORY_NAME)
     renderer = open_renderer(config, ply, config.blend_mode, config.device)
-    evaluation = evaluate(renderer, scene.test, config.device, measure=measures)
+    evaluation = evaluate(renderer, scene.test, config.device, measure=measures, passes=1)  # as in checkouts
     renders = {}
     with torch.no_grad():
         for index in evenly_spaced(len(scene.test), cell["images"]):

@@ -56,22 +56,22 @@ class DividedShards(Shards):
     def num_gaussians(self) -> int:
         return sum(self.counts)
 
-    def total(self, own: int) -> int:
-        return sum(self._counts_of(own))
+    def total(self, count: int) -> int:
+        return sum(self._counts_of(count))
 
-    def _counts_of(self, own: int) -> List[int]:
+    def _counts_of(self, count: int) -> List[int]:
         device = str(self.model.raw["means3D"].device)
-        return [numbers[0] for numbers in self.group.gather_numbers([own], device)]
+        return [numbers[0] for numbers in self.group.gather_numbers([count], device)]
 
     def over_all(self, function: Callable[[torch.Tensor], torch.Tensor], values: torch.Tensor) -> torch.Tensor:
         every = function(self.group.all_rows(values, self.counts))
         begin = sum(self.counts[:self.group.rank])
         return every[begin:begin + len(values)]
 
-    def draw(self, function: Callable[[int], torch.Tensor], own: int) -> torch.Tensor:
-        counts = self._counts_of(own)
+    def draw(self, function: Callable[[int], torch.Tensor], count: int) -> torch.Tensor:
+        counts = self._counts_of(count)
         begin = sum(counts[:self.group.rank])
-        return function(sum(counts))[:, begin:begin + own]
+        return function(sum(counts))[:, begin:begin + count]
 
     def settle(self, kinds: torch.Tensor) -> None:
         own = torch.bincount(kinds, minlength=KINDS)

@@ -36,17 +36,8 @@ class BatchTrainer(Trainer):
         return self.divided
 
     @property
-    def leads(self) -> bool:  # type: ignore[override]
-        return self.group.leads
-
-    @property
-    def is_divided(self) -> bool:  # type: ignore[override]
-        return self.group.size > 1
-
-    def meet(self) -> None:
-        self.group.gather_numbers([0], self.config.device)
-
-    checkpoint_device = "cpu"  # of which each process takes its part
+    def checkpoint_device(self) -> str:
+        return "cpu"  # of which each process takes its part
 
     @property
     def num_gaussians(self) -> int:
@@ -112,7 +103,7 @@ class BatchTrainer(Trainer):
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views, each in one of the processes; a time of a view is that of all by their number."""
         group, device, views = self.group, self.config.device, self.scene.test
-        own: List[Dict[str, Any]] = []
+        measured: List[Dict[str, Any]] = []
         for begin in progress_bar(range(0, len(views), group.size), desc="evaluation", unit="view",
                                   disable=not progress, leave=False):
             some = views[begin:begin + group.size]
@@ -123,10 +114,9 @@ class BatchTrainer(Trainer):
             elapsed = (synchronised_time(device) - started) / len(some)
             for index, color in colors.items():
                 view = some[index]
-                pair = (color, view.image_float())
-                own.append({"name": view.camera.name, "milliseconds": elapsed * 1000, **(
-                    image_metrics(*pair) if view.mask is None else image_metrics(*pair, view.mask_float()))})
-        by_process = group.gather_objects(own)
+                measured.append({"name": view.camera.name, "milliseconds": elapsed * 1000,
+                                 **image_metrics(color, view.image_float(), view.mask_float())})
+        by_process = group.gather_objects(measured)
         return summary([by_process[index % group.size][index // group.size]  # type: ignore[index]
                         for index in range(len(views))])
 

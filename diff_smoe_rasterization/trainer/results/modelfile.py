@@ -85,12 +85,12 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
     A file that records `smoe` and no gate is an older one, trained with 0. Raises TrainerError.
     """
     if blend_mode != "smoe":
-        own = float(resolve_background_gate(blend_mode, None))
+        fixed = float(resolve_background_gate(blend_mode, None))
         for said in (recorded.background_gate, asked):
-            if said not in (None, own):
+            if said not in (None, fixed):
                 raise TrainerError(f"{path}: the background gate is {said!r}; in the blend mode {blend_mode} it is "
-                                   f"{own:g}")
-        return own
+                                   f"{fixed:g}")
+        return fixed
     gate = recorded.background_gate
     if gate is None and recorded.blend_mode is not None:
         gate = 0.0

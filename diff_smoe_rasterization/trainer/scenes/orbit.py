@@ -63,9 +63,9 @@ def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
     # Sum of (I - d d^T)(p - c) over the axes is 0.
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
-    left = across.sum(axis=0)
-    if np.linalg.cond(left) < 1e4:
-        target = np.linalg.solve(left, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+    matrix = across.sum(axis=0)
+    if np.linalg.cond(matrix) < 1e4:
+        target = np.linalg.solve(matrix, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
     else:
         spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
         target = centers.mean(axis=0) + forwards.mean(axis=0) * 2 * (spread or 1.0)

@@ -85,8 +85,8 @@ class DistributedGroup(Group):
         out = torch.empty((sum(counts) if self.leads else 0, *rows.shape[1:]), dtype=rows.dtype)
         parts = out.split(list(counts)) if self.leads else []
         for rank, count in enumerate(counts):  # one by one, so that the first process's device has one part at a time
-            sent = [count if self.rank == rank and to == 0 else 0 for to in range(self.size)]
-            received = [count if self.leads and of == rank else 0 for of in range(self.size)]
+            sent = [count if self.rank == rank and receiver == 0 else 0 for receiver in range(self.size)]
+            received = [count if self.leads and sender == rank else 0 for sender in range(self.size)]
             arrived = self.exchange(rows if self.rank == rank else rows[:0], sent, received)
             if self.leads:
                 parts[rank].copy_(arrived)

@@ -26,7 +26,7 @@ RECORD_NAME = ".dsmoe.json"
 class Record(NamedTuple):
     """What a command says of the files that it wrote into a folder."""
 
-    of: str  # what they show, such as a scene's folder
+    subject: str  # what they show, such as a scene's folder
     files: List[str]  # their paths in the folder
 
 
@@ -115,7 +115,8 @@ def write_record(folder: str, command: str, record: Record, earlier: Collection[
             raise TrainerError(f"{os.path.join(folder, name)} is there, and nothing says that {command} wrote it; "
                                "move it, or choose another folder with -o")
     remove_files(folder, {*earlier} - {*record.files})
-    write_json_atomically(os.path.join(folder, RECORD_NAME), {"command": command, **record._asdict()})
+    write_json_atomically(os.path.join(folder, RECORD_NAME),
+                          {"command": command, "of": record.subject, "files": record.files})
 
 
 def remove_files(folder: str, names: Collection[str]) -> None:

@@ -36,7 +36,7 @@ from .passes import AutogradPasses, DirectPasses
 from .randomness import random_state, restore_random_state, seed_everything
 from .shards import Shards
 from .strategies import STRATEGIES
-from .strategy import AnyStep, Step, StrategyContext
+from .strategy import AnyStep, Step, StrategyContext, is_due
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
 LOSS_NAME = "loss.png"
@@ -61,6 +61,8 @@ def check_device(device: str) -> None:
 
 class Trainer:
     """A training run over a loaded scene; `step` is one iteration of 3DGS."""
+
+    group = ALONE  # the processes that train together
 
     def __init__(self, config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None) -> None:
         """rasterize: a function with the signature of the package's `rasterize`, which is the default."""
@@ -90,11 +92,19 @@ class Trainer:
         """Which of the Gaussians this process has; may take the others from the model."""
         return Shards()
 
-    leads = True  # whether this process prints and writes
-    is_divided = False  # whether several processes train together
+    @property
+    def leads(self) -> bool:
+        """Whether this process prints and writes."""
+        return self.group.leads
+
+    @property
+    def is_divided(self) -> bool:
+        """Whether several processes train together."""
+        return self.group.size > 1
 
     def meet(self) -> None:
         """Waits for the other processes."""
+        self.group.gather_numbers([0], self.config.device)
 
     @property
     def checkpoint_device(self) -> str:
@@ -260,23 +270,34 @@ class Run:
             trainer.watch.start()
             ends = trainer.iteration >= config.iterations
             while not ends:
-                following = trainer.iteration + config.batch
-                evaluates = following < config.iterations and _is_due(following, config.eval_every, config.batch)
-                step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
-                bar.update(config.batch)
-                last = trainer.iteration == config.iterations
-                if last or step.due(PROGRESS_EVERY[config.device]):
-                    self.losses.append((trainer.iteration, _check_loss(step)))
-                    self._show(bar, self.losses[-1][1])
-                ends = trainer.iteration >= config.iterations or trainer.stops()
-                if ends or _is_due(trainer.iteration, config.checkpoint_every, config.batch):
-                    trainer.watch.stop()
-                    _check_loss(step)
-                    self.save_checkpoint()
-                    trainer.watch.start()
+                ends = self._step(bar)
             trainer.watch.stop()
         if trainer.stops():  # in all processes or in none
             raise interrupt.asked or KeyboardInterrupt
+        return self._write_results()
+
+    def _step(self, bar: Any) -> bool:
+        """One step, and what comes with it: an evaluation, a look at the loss, a checkpoint. Whether the run ends."""
+        trainer, config = self.trainer, self.trainer.config
+        following = trainer.iteration + config.batch
+        evaluates = following < config.iterations and is_due(following, config.eval_every, config.batch)
+        step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
+        bar.update(config.batch)
+        last = trainer.iteration >= config.iterations
+        if last or step.due(PROGRESS_EVERY[config.device]):
+            self.losses.append((trainer.iteration, _check_loss(step)))
+            self._show(bar, self.losses[-1][1])
+        ends = last or trainer.stops()
+        if ends or step.due(config.checkpoint_every):
+            trainer.watch.stop()
+            _check_loss(step)
+            self.save_checkpoint()
+            trainer.watch.start()
+        return ends
+
+    def _write_results(self) -> Dict[str, Any]:
+        """Evaluates the trained model, writes it and the results; returns the row."""
+        trainer, config = self.trainer, self.trainer.config
         gate, model = trainer.background_gate, trainer.whole_model()
         if trainer.leads:
             save_model(model_path(config.output, trainer.iteration), model, str(config.blend_mode), gate)
@@ -333,11 +354,6 @@ def _check_loss(step: AnyStep) -> float:
     if not math.isfinite(loss):
         raise TrainerError(f"iteration {step.iteration}: the loss is {loss}; lower the learning rates")
     return loss
-
-
-def _is_due(iteration: int, interval: int, batch: int) -> bool:
-    """Whether a multiple of the interval is among the `batch` iterations up to this one."""
-    return interval > 0 and iteration // interval > (iteration - batch) // interval
 
 
 def _model_name(iterations: int) -> str:

@@ -11,19 +11,19 @@ class ViewOrder:
     def __init__(self, count: int, seed: int) -> None:
         self.count = count
         self.random = random.Random(seed)
-        self.left: List[int] = []
+        self.remaining: List[int] = []
 
     def next(self) -> int:
         """The next view; each is seen once before any is seen again."""
-        if not self.left:
-            self.left = list(range(self.count))
-            self.random.shuffle(self.left)
-        return self.left.pop()
+        if not self.remaining:
+            self.remaining = list(range(self.count))
+            self.random.shuffle(self.remaining)
+        return self.remaining.pop()
 
     def state_dict(self) -> Dict[str, Any]:
-        return {"left": list(self.left), "random": self.random.getstate()}
+        return {"left": list(self.remaining), "random": self.random.getstate()}
 
     def load_state_dict(self, state: Dict[str, Any]) -> None:
         version, numbers, gauss = state["random"]
-        self.left = list(state["left"])
+        self.remaining = list(state["left"])
         self.random.setstate((version, tuple(numbers), gauss))

@@ -12,17 +12,17 @@ class Shards:
     The Gaussians have one order, that of one process; each has a run of it.
     """
 
-    def total(self, own: int) -> int:
+    def total(self, count: int) -> int:
         """How many things all processes have together."""
-        return own
+        return count
 
     def over_all(self, function: Callable[[torch.Tensor], torch.Tensor], values: torch.Tensor) -> torch.Tensor:
         """This process's rows of function(values of all processes), which keeps their number. values: [N, ...]."""
         return function(values)
 
-    def draw(self, function: Callable[[int], torch.Tensor], own: int) -> torch.Tensor:
-        """This process's part of what function(count) draws for the things of all: [K, count, ...] -> [K, own, ...]."""
-        return function(own)
+    def draw(self, function: Callable[[int], torch.Tensor], count: int) -> torch.Tensor:
+        """This process's part of what function(total) draws for all things: [K, total, ...] -> [K, count, ...]."""
+        return function(count)
 
     def settle(self, kinds: torch.Tensor) -> None:
         """Puts the Gaussians in order once some were added or removed: by kind, within a kind as they lie.

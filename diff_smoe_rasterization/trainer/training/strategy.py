@@ -49,6 +49,11 @@ Seen = Tuple[torch.Tensor, torch.Tensor]
 """Of one view dL/dpixel times (0.5 W, 0.5 H), [N, 3], and the radii [N] int32."""
 
 
+def is_due(iteration: int, interval: int, batch: int = 1) -> bool:
+    """Whether a multiple of the interval is among the `batch` iterations up to this one; an interval of 0 has none."""
+    return interval > 0 and iteration // interval > (iteration - batch) // interval
+
+
 class StepClock:
     """When a step is. Iterations count views, from 1; a step has `batch` of them, of which `iteration` is the last."""
 
@@ -57,7 +62,7 @@ class StepClock:
 
     def due(self, interval: int) -> bool:
         """Whether a multiple of the interval is among the step's iterations."""
-        return self.iteration // interval > (self.iteration - self.batch) // interval
+        return is_due(self.iteration, interval, self.batch)
 
     def reaches(self, iteration: int) -> bool:
         """Whether that one is among the step's iterations."""

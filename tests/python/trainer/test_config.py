@@ -108,7 +108,7 @@ def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypa
     ("densify_grad_threshold", 0.0, "--densify-grad-threshold is 0.0"),
     ("position_lr_final", float("nan"), "--position-lr-final is nan"),
     ("checkpoint_every", -1, "--checkpoint-every is -1"),
-    ("schedule", "fast", "--schedule is 'fast'; it must be one of 3dgs, steady, gate, mcmc"),
+    ("schedule", "fast", "--strategy is 'fast'; it must be one of 3dgs, steady, gate, mcmc"),
     ("device", "tpu", "--device is 'tpu'"),
 ])
 def test_bad_values_name_the_option(option, value, words):

@@ -217,6 +217,22 @@ def test_evaluation_counts_every_view_once(tiny_config, scene):
     assert evaluation.fps == pytest.approx(2 / seconds, rel=1e-9)
 
 
+def test_a_disturbed_rendering_does_not_count(tiny_config, scene, monkeypatch):
+    """The clock says 10 ms for each timed rendering, but 990 ms for the second one, which the median leaves out."""
+    times = iter([0.0, 0.01, 1.0, 1.99, *(2 + 0.01 * (i % 2) for i in range(16))])
+    monkeypatch.setattr("diff_smoe_rasterization.trainer.results.evaluation.synchronised_time", lambda _: next(times))
+    evaluation = Trainer(tiny_config, scene).evaluate()
+    assert [row["milliseconds"] for row in evaluation.per_view] == pytest.approx([10, 10], rel=1e-9)
+    assert evaluation.fps == pytest.approx(100, rel=1e-9)
+    assert next(times, None) is None  # two views, five passes
+
+
+def test_a_long_evaluation_has_one_pass(tiny_config, scene, monkeypatch):
+    times = iter([0.0, 1.0, 1.0, 2.0])
+    monkeypatch.setattr("diff_smoe_rasterization.trainer.results.evaluation.synchronised_time", lambda _: next(times))
+    assert Trainer(tiny_config, scene).evaluate().fps == 1
+
+
 def test_evaluation_leaves_training_alone(tiny_config, scene):
     trainer, twin = Trainer(tiny_config, scene), Trainer(tiny_config, scene)
     trainer.evaluate()

@@ -1,14 +1,18 @@
 """The comparison of both blends on a tiny scene: table, pictures, models and rows."""
 from __future__ import annotations
 
+import io
 import json
+import shlex
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from diff_smoe_rasterization import io
+from diff_smoe_rasterization import cli
+from diff_smoe_rasterization.io import read_gaussians
 from diff_smoe_rasterization.trainer import quickstart
 from diff_smoe_rasterization.trainer.results.pictures import busiest_window, comparison, evenly_spaced
 from diff_smoe_rasterization.trainer.system import files
@@ -34,7 +38,7 @@ def test_both_modes_are_trained_with_the_same_settings(output):
 
 def test_the_models_record_their_modes(output):
     for mode in ("alpha", "smoe"):
-        model = io.read_gaussians(str(output / f"{mode}.ply"))
+        model = read_gaussians(str(output / f"{mode}.ply"))
         assert model.blend_mode == mode
         assert model.background_gate is None if mode == "alpha" else 0.03 < model.background_gate < 1
 
@@ -52,6 +56,27 @@ def test_the_table_and_a_second_run(tiny_scene, output, capsys):
     for word in ("PSNR", "SSIM", "#Gaussians", "train [s]", "FPS", "\nalpha ", "\nsmoe 0.",
                  "compare_view_000.png", "note: the smoe .ply holds gates; viewers"):
         assert word in text
+
+
+def test_the_last_line_is_a_command(output, tiny_scene, tmp_path, capsys):
+    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "10", "--quiet"]) == 0
+    said = capsys.readouterr().out.splitlines()[-1].partition("browser: ")[2]
+    page = tmp_path / "model.html"
+    subprocess.run([*shlex.split(said)[:-1], str(page)], check=True, stdout=subprocess.DEVNULL)
+    assert page.stat().st_size > 10_000
+
+
+def test_a_folder_of_runs_is_no_run_and_names_them(output, capsys):
+    assert cli.main(["export", str(output)]) == 1
+    assert capsys.readouterr().err.endswith(f"; such are {output / 'alpha'}, {output / 'smoe'}\n")
+
+
+def test_what_it_chose_is_said_before_it_trains(tiny_scene, monkeypatch):
+    """A pipe's writer keeps what is printed until it is told."""
+    pipe = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(pipe))
+    quickstart.choose_options(tiny_scene, {})
+    assert pipe.getvalue().startswith(b"chosen for a run of some minutes: --iterations 2000 --strategy steady ")
 
 
 def test_another_scene_is_refused_and_no_picture_is_stale(tiny_scene, output, tmp_path, capsys):
