@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import camera_settings, random_scene
 
-from diff_smoe_rasterization import GaussianRasterizer, rasterize
+from diff_smoe_rasterization import GaussianRasterizer, project_gaussians, rasterize, visible_radii
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -127,6 +127,27 @@ def test_something_that_is_no_tensor():
 def test_settings_out_of_range_are_named(field, value):
     with pytest.raises(ValueError, match=rf"{field}.*{value:g}"):
         render(scene_of().with_settings(**{field: value}))
+
+
+@pytest.mark.parametrize("field, value, problem", [
+    ("scale_modifier", -1.0, "scale_modifier is -1; it must be 0 or more and finite"),
+    ("near", float("inf"), "near is inf; it must be 0 or more and finite"),
+    ("alpha_min", -0.5, "alpha_min is -0.5; it must be 0 or more and finite"),
+    ("low_pass", float("nan"), "low_pass is nan; it must be 0 or more and finite"),
+    ("tanfovx", 0.0, "tanfovx is 0; it must be positive and finite")])
+def test_the_op_that_was_called_is_named(field, value, problem):
+    scene = scene_of().with_settings(**{field: value})
+    shape = {name: scene.inputs[name] for name in ("means3D", "scales", "rotations")}
+    for function, name, inputs in ((rasterize, "rasterize", scene.inputs), (project_gaussians, "project", scene.inputs),
+                                   (visible_radii, "radii", shape)):
+        with pytest.raises(ValueError, match=f"^{name}: {problem}"):
+            function(settings=scene.settings, **inputs)
+
+
+@pytest.mark.parametrize("sh_degree", [2 ** 32, -(2 ** 32)])
+def test_a_degree_that_fits_no_int_is_refused(sh_degree):
+    with pytest.raises(ValueError, match="sh_degree is -?2147483"):
+        render(scene_of().with_settings(sh_degree=sh_degree))
 
 
 @pytest.mark.parametrize("width, height", [(2 ** 31, 16), (16, 2 ** 31), (2 ** 20, 2 ** 20), (2 ** 63, 1)])
