@@ -53,8 +53,9 @@ template <class Frame> void refuse_frame(const char* function, const Frame& fram
   if (kOnHost<Frame> || config.background_gate_at == nullptr) {
     refuse_negative(function, "background_gate", config.gate_of_background());
   }
-  if (config.most_instances < 1)
+  if (config.most_instances < 1) {
     refuse(function, "most_instances is ", config.most_instances, "; it must be 1 or more");
+  }
 }
 
 inline void refuse_unless_one(const char* function, bool first, bool second, const char* names) {
