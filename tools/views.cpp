@@ -48,39 +48,6 @@ View resized(const View& view, int width, int height) {
   return out;
 }
 
-Camera<float> camera_of(const View& view) {
-  Camera<float> camera;
-  camera.width = view.width, camera.height = view.height;
-  camera.tan_fov_x = static_cast<float>(view.width / (2 * view.fx));
-  camera.tan_fov_y = static_cast<float>(view.height / (2 * view.fy));
-  // World to view, and view to clip: pixel fx X / Z + cx is NDC x = 2 (fx / width X / Z + cx / width) - 1. Nothing
-  // reads clip z, as culling is by view depth.
-  const double clip[4][4] = {{2 * view.fx / view.width, 0, 2 * view.cx / view.width - 1, 0},
-                             {0, 2 * view.fy / view.height, 2 * view.cy / view.height - 1, 0},
-                             {0, 0, 1, 0},
-                             {0, 0, 1, 0}};
-  double matrix[4][4] = {};
-  for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 3; ++column) matrix[row][column] = view.rotation[3 * row + column];
-    matrix[row][3] = view.translation[row];
-  }
-  matrix[3][3] = 1;
-  for (int row = 0; row < 4; ++row) {
-    for (int column = 0; column < 4; ++column) {
-      double product = 0;
-      for (int k = 0; k < 4; ++k) product += clip[row][k] * matrix[k][column];
-      camera.view[4 * column + row] = static_cast<float>(matrix[row][column]);  // transposed, as camera.h says
-      camera.projection[4 * column + row] = static_cast<float>(product);
-    }
-  }
-  for (int axis = 0; axis < 3; ++axis) {
-    double centre = 0;
-    for (int row = 0; row < 3; ++row) centre -= matrix[row][axis] * matrix[row][3];
-    camera.position[axis] = static_cast<float>(centre);
-  }
-  return camera;
-}
-
 std::vector<View> read_views(const std::string& path, ImageSize size) {
   if (std::filesystem::is_directory(path)) {
     const std::string folder = io::find_colmap_folder(path);

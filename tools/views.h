@@ -11,21 +11,12 @@
 
 namespace dsmoe::tools {
 
-/// A pinhole camera; view axes are x right, y down, z forward. The centre of the top left pixel is (0.5, 0.5).
-struct View {
+struct View : Pinhole {
   std::string name;
-  int width = 0, height = 0;               // pixels
-  double fx = 0, fy = 0;                   // pixels
-  double cx = 0, cy = 0;                   // principal point, pixels
-  std::array<double, 9> rotation = {};     // [3, 3] world to view, by rows
-  std::array<double, 3> translation = {};  // x_view = rotation x_world + translation
 };
 
 /// The same view at another image size; intrinsics scale with the axes.
 View resized(const View& view, int width, int height);
-
-/// The camera that the rasterizer takes.
-Camera<float> camera_of(const View& view);
 
 /// Of images whose file does not say it; 0: not known.
 struct ImageSize {

@@ -133,5 +133,56 @@ TEST(ProjectToPixel, BackwardIsTheDerivative) {
   expect_gradient(actual, loss, x);
 }
 
+// ---- Pinhole cameras ----
+
+// Turned about a skew axis, with focal lengths and a principal point that differ by axis.
+Pinhole skew_pinhole() {
+  Pinhole of;
+  of.width = 1280, of.height = 720;
+  of.fx = 900, of.fy = 800, of.cx = 600, of.cy = 400;
+  of.rotation = {2 / 3.0, -1 / 3.0, 2 / 3.0, 2 / 3.0, 2 / 3.0, -1 / 3.0, -1 / 3.0, 2 / 3.0, 2 / 3.0};
+  of.translation = {0.1, -0.2, 3};
+  return of;
+}
+
+TEST(PinholeCamera, SeesAPointWhereItsNumbersSay) {
+  const Pinhole of = skew_pinhole();
+  const Vec3<double> p = {0.2, -0.1, 0.3};
+  double expected[3];
+  for (int row = 0; row < 3; ++row) {
+    const double* r = &of.rotation[3 * row];
+    expected[row] = r[0] * p.x + r[1] * p.y + r[2] * p.z + of.translation[row];
+  }
+  const auto camera = pinhole_camera<double>(of);
+  EXPECT_EQ(camera.width, 1280);
+  EXPECT_EQ(camera.height, 720);
+  EXPECT_EQ(camera.tan_fov_x, 1280 / (2 * 900.0));
+  EXPECT_EQ(camera.tan_fov_y, 720 / (2 * 800.0));
+  const Vec3<double> actual = transform_point(camera.view, p);
+  EXPECT_NEAR(actual.x, expected[0], 1e-15);  // sums of four terms below 4
+  EXPECT_NEAR(actual.y, expected[1], 1e-15);
+  EXPECT_NEAR(actual.z, expected[2], 2e-15);
+  // The rasterizer's pixel centres are whole numbers, a pinhole's lie half a pixel further. The rasterizer adds 1e-7 to
+  // w, which is 3: 3e-8 of at most 200 pixels from the axis.
+  const Vec2<double> pixel = project_to_pixel(camera, p);
+  EXPECT_NEAR(pixel.x, 900 * expected[0] / expected[2] + 600 - 0.5, 1e-5);
+  EXPECT_NEAR(pixel.y, 800 * expected[1] / expected[2] + 400 - 0.5, 1e-5);
+  const Vec3<double> origin =
+      transform_point(camera.view, {camera.position[0], camera.position[1], camera.position[2]});
+  EXPECT_NEAR(origin.x, 0, 2e-15);
+  EXPECT_NEAR(origin.y, 0, 2e-15);
+  EXPECT_NEAR(origin.z, 0, 2e-15);
+}
+
+TEST(PinholeCamera, InFloatIsTheRoundedOne) {
+  const auto wide = pinhole_camera<double>(skew_pinhole());
+  const auto narrow = pinhole_camera<float>(skew_pinhole());
+  for (int i = 0; i < 16; ++i) {
+    EXPECT_EQ(narrow.view[i], float(wide.view[i]));
+    EXPECT_EQ(narrow.projection[i], float(wide.projection[i]));
+  }
+  for (int i = 0; i < 3; ++i) EXPECT_EQ(narrow.position[i], float(wide.position[i]));
+}
+
 }  // namespace
 }  // namespace dsmoe

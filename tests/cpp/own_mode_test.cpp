@@ -1,4 +1,4 @@
-// A blend mode of the test's own, for what a new mode needs: nothing but its policy.
+// A blend mode of the test's own, for what a new mode needs: nothing but its policy. It is written as in blend.h.
 #include <gtest/gtest.h>
 
 #include <vector>
@@ -17,13 +17,18 @@ namespace dsmoe {
 constexpr auto kMean = static_cast<BlendMode>(BlendModes::kSize);
 
 template <> struct Blend<kMean> : GateBlend<false, false> {
-  template <class Real> static PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
+  static constexpr const char* kName = "mean";
+  static constexpr Law kLaw = Law::kOther;
+
+  template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
     const Real weight = select(gate.counts, Real(Scalar<Real>(1)), Real(Scalar<Real>(0)));
     state.gate_sum = state.gate_sum + weight;
     return {weight, gate.counts};
   }
-  template <class Real>
-  static PairGradient<Real> backward(PixelBackward<Real>&, const Gate<Real>&, Real, Mask<Real> contributes) {
+
+  // No weight depends on a gate, so dL/dpower is 0.
+  template <class Real, class AnyGate>
+  static DSMOE_HD PairGradient<Real> backward(PixelBackward<Real>&, const AnyGate&, Real, Mask<Real> contributes) {
     const Real zero = Scalar<Real>(0), one = Scalar<Real>(1);
     return {zero, select(contributes, one, zero)};
   }

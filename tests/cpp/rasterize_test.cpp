@@ -88,7 +88,8 @@ TYPED_TEST(RasterizeIn, EqualsBruteForceWithAnyNumberOfChannels) {
     Scene<double> scene = in_mode(make_scene(3, 60, 37, 29), TypeParam::value);
     scene.shs.clear();
     scene.colors_precomp = Random(4).uniforms(60 * channels);
-    scene.background = Random(5).uniforms(channels + 1);
+    scene.background = Random(5).uniforms(channels);
+    scene.background.push_back(0.15);
     scene.config.num_channels = channels;
     scene.config.depth = channels == 2;  // three features, of which one is no colour
     expect_brute_force(scene);

@@ -4,6 +4,7 @@
 #include <memory>
 #include <vector>
 
+#include "../refuse.h"
 #include "bands.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
@@ -142,6 +143,7 @@ void project_all_backward(const Frame<S>& frame, const GaussianGradients<S>& gra
 }  // namespace
 
 template <class S> void backward(const Frame<S>& frame, const Gradients<S>& wanted, StageTimes* times) {
+  refuse_backward("cpu::backward", frame, wanted.images, saved_sizes(frame));
   const auto records = walk_tiles(frame, wanted, times);
   project_all_backward(frame, wanted.inputs, times,
                        [&] { return RecordSums<S>(frame, records, wanted.inputs.means2D_abs); });
@@ -150,6 +152,7 @@ template <class S> void backward(const Frame<S>& frame, const Gradients<S>& want
 template <class S>
 void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradients,
                                const FootprintGradients<S>& footprints, StageTimes* times) {
+  refuse_blend_backward("cpu::blend_footprints_backward", frame, gradients.images, footprints, saved_sizes(frame));
   const auto records = walk_tiles(frame, gradients, times);
   const Stopwatch stopwatch(times, &StageTimes::blend_backward);
   const int num_features = frame.config.num_features(), size = kNumGateGradients + num_features;
@@ -171,6 +174,7 @@ void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradie
 template <class S>
 void project_backward(const Frame<S>& frame, const FootprintGradients<S>& footprints,
                       const GaussianGradients<S>& gradients, StageTimes* times) {
+  refuse_project_backward("cpu::project_backward", frame, footprints);
   const int num_features = frame.config.num_features();
   project_all_backward(frame, gradients, times, [&] {
     return [&](int64_t i, PixelSums<S>& sums) {

@@ -65,21 +65,14 @@ inline std::vector<TileBand> cut_into_bands(const std::vector<int64_t>& rows, in
 // with a frame for each, from top to bottom.
 template <class S, class Visit> void for_each_band(const Frame<S>& frame, StageTimes* times, Visit visit) {
   if (!is_banded(frame)) return visit(frame);
-  const int64_t num_gaussians = frame.inputs.num_gaussians;
   for (const TileBand& band : cut_into_bands(count_rows(frame), frame.config.most_instances)) {
+    std::vector<int64_t> offsets(frame.inputs.num_gaussians + 1);
+    std::vector<int64_t> tile_offsets(band_tiles(TileGrid(frame.camera.width, frame.camera.height), band) + 1);
     Frame<S> part = frame;
     part.saved.band = band;
-    std::vector<int64_t> offsets(num_gaussians + 1);
-    for (int64_t i = 0; i < num_gaussians; ++i) {
-      offsets[i + 1] = offsets[i];
-      if (frame.images.radii[i] == 0) continue;
-      for_each_tile_row(frame.saved.projected[i], bounds_in(part, i),
-                        [&](int x0, int x1, int) { offsets[i + 1] += x1 - x0; });
-    }
-    std::vector<int64_t> tile_offsets(band_tiles(TileGrid(frame.camera.width, frame.camera.height), band) + 1);
-    const std::unique_ptr<TileInstance[]> instances(new TileInstance[offsets[num_gaussians]]);
     part.saved.instance_offsets = offsets.data();
     part.saved.tile_offsets = tile_offsets.data();
+    const std::unique_ptr<TileInstance[]> instances(new TileInstance[count_instances(part, times)]);
     part.saved.instances = instances.get();
     bin(part, times);
     visit(part);

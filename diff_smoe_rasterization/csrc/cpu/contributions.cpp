@@ -1,4 +1,5 @@
 // What each Gaussian gives to the pixels of an image.
+#include "../refuse.h"
 #include "dsmoe/contribution.h"
 #include "dsmoe/rasterize.h"
 #include "instance_sums.h"
@@ -8,6 +9,7 @@ namespace dsmoe {
 namespace cpu {
 
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map) {
+  refuse_contributions("cpu::contributions", frame, map);
   const ContributionSums<S>& sums = map.sums;
   const auto& kernels = tile_kernels<S>();
   const auto totals = sum_instances<Contribution>(

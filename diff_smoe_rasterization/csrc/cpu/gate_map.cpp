@@ -1,4 +1,5 @@
 // Which Gaussian has the greatest gate in each pixel.
+#include "../refuse.h"
 #include "bands.h"
 #include "dsmoe/rasterize.h"
 #include "tile_kernels.h"
@@ -8,6 +9,7 @@ namespace dsmoe {
 namespace cpu {
 
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map) {
+  refuse_gate_map("cpu::gate_map", frame, map);
   const auto& kernels = tile_kernels<S>();
   for_each_band(frame, nullptr, [&](const Frame<S>& band) {
     for_each_tile(frame.config, band.saved, frame.camera.width, frame.camera.height, 0,

@@ -1,4 +1,5 @@
 // What each Gaussian is worth to an image.
+#include "../refuse.h"
 #include "dsmoe/rasterize.h"
 #include "dsmoe/removal.h"
 #include "instance_sums.h"
@@ -8,6 +9,7 @@ namespace dsmoe {
 namespace cpu {
 
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map) {
+  refuse_importance("cpu::importance", frame, map);
   const ImportanceSums<S>& sums = map.sums;
   const auto& kernels = tile_kernels<S>();
   const auto totals = sum_instances<Importance>(

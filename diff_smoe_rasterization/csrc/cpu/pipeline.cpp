@@ -1,4 +1,5 @@
 // The order of the stages, and the memory between them.
+#include "../refuse.h"
 #include "dsmoe/rasterize.h"
 
 namespace dsmoe {
@@ -11,13 +12,18 @@ void draw(Frame<S>& frame, SavedSizes sizes, int64_t num_instances, Allocator& m
   const bool fit = num_instances <= frame.config.most_instances;
   sizes.num_instances = fit ? num_instances : 0;
   allocate_saved(frame.saved, sizes, memory);
-  fit ? bin(frame, times) : void(frame.saved.instances = nullptr);
+  if (fit) {
+    bin(frame, times);
+  } else {
+    frame.saved.instances = nullptr;
+  }
   blend(frame, times);
 }
 
 }  // namespace
 
 template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* times) {
+  refuse_forward("cpu::forward", frame);
   SavedSizes sizes = saved_sizes(frame);
   frame.saved = {};
   frame.saved.gate_sum = frame.images.gate_sum;
@@ -26,6 +32,7 @@ template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* 
 }
 
 template <class S> void blend_footprints(Frame<S>& frame, Allocator& memory, StageTimes* times) {
+  refuse_blend_footprints("cpu::blend_footprints", frame);
   SavedSizes sizes = saved_sizes(frame);
   const SavedForward<S> given = frame.saved;
   frame.saved = {};
@@ -36,6 +43,7 @@ template <class S> void blend_footprints(Frame<S>& frame, Allocator& memory, Sta
 }
 
 template <class S> void radii(const Frame<S>& frame, Scratch& scratch) {
+  refuse_radii("cpu::radii", frame);
   const int64_t count = frame.inputs.num_gaussians;
   Frame<S> projected = frame;
   const auto allocate = [&](auto*& pointer, int64_t size) {

@@ -1,6 +1,7 @@
 // Stage 1: every Gaussian to the image plane, and how many tiles each meets.
 #include <algorithm>
 
+#include "../refuse.h"
 #include "bands.h"
 #include "dsmoe/arrays.h"
 #include "dsmoe/rasterize.h"
@@ -30,6 +31,7 @@ int64_t sum_counts(int64_t* instance_offsets, int64_t num_gaussians) {
 }  // namespace
 
 template <class S> int64_t project(const Frame<S>& frame, StageTimes* times) {
+  refuse_project("cpu::project", frame);
   const GaussianInputs<S>& inputs = frame.inputs;
   const Camera<S>& camera = frame.camera;
   const RasterConfig<S>& config = frame.config;
@@ -69,12 +71,14 @@ template <class S> int64_t count_instances(const Frame<S>& frame, StageTimes* ti
 }
 
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible) {
+  refuse_mark_visible("cpu::mark_visible", frame, visible);
   for (int64_t i = 0; i < frame.inputs.num_gaussians; ++i) {
     visible[i] = transform_point(frame.camera.view, load3(frame.inputs.means3D + 3 * i)).z > frame.camera.near;
   }
 }
 
 template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int num_channels) {
+  refuse_inputs("cpu::first_non_finite", inputs, num_channels);
   for (int64_t i = 0; i < inputs.num_gaussians; ++i) {
     if (!is_finite(load_gaussian(inputs, i)) || !is_finite(colors_of(inputs, num_channels, i), num_channels)) return i;
   }

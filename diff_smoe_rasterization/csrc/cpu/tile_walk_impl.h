@@ -236,12 +236,12 @@ template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
 // Visits the pairs of the list entries [begin, end), and returns how many pairs it visited. A visitor has:
 //   kMode, kBackToFront   how pairs are cut, and the direction
 //   expect(slot)          the slot of a Gaussian that will soon come
-//   begin(gaussian)       returns the sums of a Gaussian, in registers; then, for each pack of pixels that the
-//   footprint
-//                         may meet:
-//     wanted(at, pixels)  whether pairs of the pack are wanted, and of which pixels; at: of the first in a PixelArray
-//     take(at, pairs, pixels, sums)   a pack of pairs
+//   begin(gaussian)       returns the sums of a Gaussian, in registers
+//   wanted(at, pixels)    whether pairs of a pack are wanted, and of which pixels; at: of the first in a PixelArray
+//   take(at, pairs, pixels, sums)   a pack of pairs
 //   end(gaussian, sums)
+// Between `begin` and `end`, `wanted` is asked of each pack that the footprint may meet. Where it says so, `take`
+// follows.
 template <class S, class Visitor>
 DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int num_features, Visitor& visitor) {
   const TileExtent extent(tile);

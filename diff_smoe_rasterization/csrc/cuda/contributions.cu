@@ -1,6 +1,7 @@
 // Sums over the pixels of each Gaussian. The kernel repeats the blend's walk, without features. A warp sums over its
 // pixels, then adds the four numbers to those of the Gaussian by atomics.
 #include "../dispatch.h"
+#include "../refuse.h"
 #include "bands.h"
 #include "dsmoe/contribution.h"
 #include "dsmoe/params.h"
@@ -92,6 +93,7 @@ __global__ void __launch_bounds__(kWalkBlock)
 }  // namespace
 
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work) {
+  refuse_contributions("cuda::contributions", frame, map);
   const int64_t num_gaussians = frame.inputs.num_gaussians;
   const RasterConfig<S>& config = frame.config;
   const ContributionSums<S>& sums = map.sums;

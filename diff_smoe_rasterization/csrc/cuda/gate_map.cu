@@ -1,6 +1,7 @@
 // Which Gaussian has the greatest gate in each pixel. The kernel repeats the blend's walk, without features; each lane
 // keeps the greatest weight of its own pixels.
 #include "../dispatch.h"
+#include "../refuse.h"
 #include "bands.h"
 #include "dsmoe/params.h"
 #include "reduce.cuh"
@@ -78,6 +79,7 @@ __global__ void __launch_bounds__(kWalkBlock)
 }  // namespace
 
 template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, const Work& work) {
+  refuse_gate_map("cuda::gate_map", frame, map);
   for_each_band(frame, work, [&](const Frame<S>& band) {
     const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
     dispatch_blend(frame.config.mode, kAnyFeatures, [&](auto mode, auto) {

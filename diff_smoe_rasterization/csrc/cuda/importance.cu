@@ -1,6 +1,7 @@
 // What each Gaussian is worth to an image. The kernel repeats the blend's walk beside the finished pixels. A warp sums
 // over its pixels, a batch of Gaussians at a time, and adds their numbers by atomics.
 #include "../dispatch.h"
+#include "../refuse.h"
 #include "bands.h"
 #include "dsmoe/params.h"
 #include "dsmoe/removal.h"
@@ -244,6 +245,7 @@ __global__ void __launch_bounds__(kWalkBlock,
 }  // namespace
 
 template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>& map, const Work& work) {
+  refuse_importance("cuda::importance", frame, map);
   const int64_t num_gaussians = frame.inputs.num_gaussians;
   const int width = frame.camera.width, height = frame.camera.height;
   if (num_gaussians == 0) return;

@@ -2,6 +2,7 @@
 // correctness (rasterize_cuda.h). So only the first call of a kind waits for the number of instances.
 #include <algorithm>
 
+#include "../refuse.h"
 #include "capacity.h"
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
@@ -102,6 +103,7 @@ template <class S> S* begin_records(const Frame<S>& frame, S* given, const Run& 
 }  // namespace
 
 template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memory) {
+  refuse_forward("cuda::forward", frame);
   EventClock clock(run.times, run.stream);
   frame.saved = {};
   const SavedSizes sizes = begin_saved(frame, run, memory);
@@ -112,6 +114,7 @@ template <class S> void forward(Frame<S>& frame, const Run& run, Allocator& memo
 }
 
 template <class S> void project_footprints(const Frame<S>& frame, const Run& run, Allocator& memory) {
+  refuse_project("cuda::project_footprints", frame);
   EventClock clock(run.times, run.stream);
   project<S>(frame, nullptr, {run.stream, &memory});
   clock.end(&StageTimes::project);
@@ -120,6 +123,7 @@ template <class S> void project_footprints(const Frame<S>& frame, const Run& run
 }
 
 template <class S> void blend_footprints(Frame<S>& frame, const Run& run, Allocator& memory) {
+  refuse_blend_footprints("cuda::blend_footprints", frame);
   EventClock clock(run.times, run.stream);
   const SavedForward<S> given = frame.saved;
   frame.saved = {};
@@ -132,6 +136,7 @@ template <class S> void blend_footprints(Frame<S>& frame, const Run& run, Alloca
 
 template <class S>
 void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& run, Allocator& memory) {
+  refuse_backward("cuda::backward", frame, gradients.images, saved_sizes(frame, run));
   Work work = {run.stream, &memory};
   if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);
   EventClock clock(run.times, run.stream);
@@ -151,6 +156,8 @@ void backward(const Frame<S>& frame, const Gradients<S>& gradients, const Run& r
 template <class S>
 void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradients,
                                const FootprintGradients<S>& footprints, const Run& run, Allocator& memory) {
+  refuse_blend_backward("cuda::blend_footprints_backward", frame, gradients.images, footprints,
+                        saved_sizes(frame, run));
   Work work = {run.stream, &memory};
   if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);
   EventClock clock(run.times, run.stream);
@@ -169,6 +176,7 @@ void blend_footprints_backward(const Frame<S>& frame, const Gradients<S>& gradie
 template <class S>
 void project_footprints_backward(const Frame<S>& frame, const FootprintGradients<S>& footprints,
                                  const GaussianGradients<S>& gradients, const Run& run, Allocator& memory) {
+  refuse_project_backward("cuda::project_footprints_backward", frame, footprints);
   EventClock clock(run.times, run.stream);
   BackwardPass<S> pass;
   pass.gradients.inputs = gradients;
@@ -182,6 +190,7 @@ void project_footprints_backward(const Frame<S>& frame, const FootprintGradients
 }
 
 template <class S> void radii(const Frame<S>& frame, const Run& run, Allocator& memory) {
+  refuse_radii("cuda::radii", frame);
   if (frame.config.num_features() <= kMostHeldFeatures) return project_radii(frame, {run.stream});
   const int64_t count = frame.inputs.num_gaussians;
   Frame<S> projected = frame;

@@ -1,5 +1,6 @@
 // Stage 1: every Gaussian to the image plane.
 #include "../dispatch.h"
+#include "../refuse.h"
 #include "dsmoe/project.h"
 #include "sh_rows.cuh"
 
@@ -225,6 +226,7 @@ template <class S> void project_radii(const Frame<S>& frame, const Work& work) {
 }
 
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible, const Work& work) {
+  refuse_mark_visible("cuda::mark_visible", frame, visible);
   VisibleArguments<S> arguments = {};
   arguments.num_gaussians = frame.inputs.num_gaussians;
   arguments.means3D = frame.inputs.means3D;

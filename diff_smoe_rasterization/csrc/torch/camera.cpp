@@ -1,14 +1,11 @@
-// From a calibrated pinhole camera to the settings of a rendering, as camera.py does it for Python.
+// From a calibrated pinhole camera to the settings of a rendering, as camera.py does it for Python. The matrices are
+// those of `pinhole_camera` (camera.h). Here tensors make them, through which gradients reach K, R and t.
+#include "dsmoe/camera.h"
+
 #include "check_tensor.h"
 #include "dsmoe/torch.h"
 
 namespace dsmoe {
-namespace {
-
-// Clip range of the projection matrix. Nothing reads clip z (culling uses view depth), so it only has to be finite.
-constexpr double kClipNear = 0.01, kClipFar = 100;
-
-}  // namespace
 
 GaussianRasterizationSettings settings_from_camera(const at::Tensor& K, const at::Tensor& R, const at::Tensor& t,
                                                    int64_t width, int64_t height, const at::Tensor& bg,
@@ -30,8 +27,6 @@ GaussianRasterizationSettings settings_from_camera(const at::Tensor& K, const at
   const at::Tensor last = identity.new_zeros({1, 4});
   last[0][3].fill_(1);
   const at::Tensor view = at::cat({at::cat({rotation, translation.unsqueeze(1)}, 1), last}, 0);
-  // The rasterizer puts NDC x at pixel index ((x + 1) width - 1) / 2, so that a point at fx X/Z + cx (COLMAP's
-  // coordinates, half a pixel above the index) needs x = 2 fx/width X/Z + 2 cx/width - 1; y likewise.
   const at::Tensor size = identity.new_ones({2, 1}), centre = identity.new_zeros({1, 3});
   size[0].fill_(static_cast<double>(width));
   size[1].fill_(static_cast<double>(height));

@@ -5,83 +5,40 @@
 #include <sstream>
 #include <vector>
 
-#include "dsmoe/sh.h"
-
 namespace dsmoe {
 namespace binding {
 namespace {
 
-void check_shape(Input input, const Inputs& inputs, const Shape& shape) {
-  if (inputs[input].defined()) check_shape("rasterize", kInputNames[input], inputs[input], shape);
+void check_shape(const char* function, Input input, const Inputs& inputs, const Shape& shape) {
+  if (inputs[input].defined()) check_shape(function, kInputNames[input], inputs[input], shape);
 }
 
-void check_either(bool first, bool second, const char* names) {
-  TORCH_CHECK_VALUE(first != second, "rasterize: ", first ? "both" : "neither", " of ", names, first ? " are" : " is",
-                    " given; exactly one of the two must be");
-}
-
-void check_present(const Inputs& inputs) {
-  check_either(inputs[kShs].defined() || inputs[kDc].defined(), inputs[kColorsPrecomp].defined(),
-               "shs (or dc) and colors_precomp");
-  const bool scales = inputs[kScales].defined(), rotations = inputs[kRotations].defined();
-  check_either(scales || rotations, inputs[kCov3DPrecomp].defined(), "scales with rotations, and cov3D_precomp,");
-  TORCH_CHECK_VALUE(scales == rotations,
-                    "rasterize: ", scales ? "scales is given without rotations" : "rotations is given without scales",
-                    "; the covariance needs both");
-}
-
-void check_not_negative(const char* function, const char* name, double value) {
-  TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0, function, ": ", name, " is ", value,
-                    "; it must be 0 or more and finite");
-}
-
-// On the CPU its value too; on a GPU the host would have to wait for it.
 void check_background_gate(const char* function, const at::Tensor& gate) {
-  if (!gate.defined()) return;
-  TORCH_CHECK_VALUE(gate.numel() == 1, function, ": background_gate has shape ", gate.sizes(),
+  TORCH_CHECK_VALUE(!gate.defined() || gate.numel() == 1, function, ": background_gate has shape ", gate.sizes(),
                     "; it must have one element");
-  if (gate.is_cpu()) check_not_negative(function, "background_gate", gate.item<double>());
 }
 
-void check_shapes(const Inputs& inputs) {
-  check_shape(kMeans3D, inputs, {"N", 3});
+void check_shapes(const char* function, const Inputs& inputs) {
+  check_shape(function, kMeans3D, inputs, {"N", 3});
   const int64_t count = num_gaussians(inputs);
   const at::Tensor& opacities = inputs[kOpacities];
-  TORCH_CHECK_VALUE(matches(opacities, {count}) || matches(opacities, {count, 1}), "rasterize: opacities has shape ",
+  TORCH_CHECK_VALUE(matches(opacities, {count}) || matches(opacities, {count, 1}), function, ": opacities has shape ",
                     opacities.sizes(), "; it must be [", count, ", 1] or [", count, "]");
-  check_shape(kMeans2D, inputs, {count, 3});
-  check_shape(kMeans2DAbs, inputs, {count, 2});
-  check_shape(kDc, inputs, {count, 1, 3});
-  check_shape(kShs, inputs, {count, "K", 3});
-  check_shape(kColorsPrecomp, inputs, {count, "C"});
-  TORCH_CHECK_VALUE(num_channels(inputs) > 0, "rasterize: colors_precomp has shape ", inputs[kColorsPrecomp].sizes(),
+  check_shape(function, kMeans2D, inputs, {count, 3});
+  check_shape(function, kMeans2DAbs, inputs, {count, 2});
+  check_shape(function, kDc, inputs, {count, 1, 3});
+  check_shape(function, kShs, inputs, {count, "K", 3});
+  check_shape(function, kColorsPrecomp, inputs, {count, "C"});
+  TORCH_CHECK_VALUE(num_channels(inputs) > 0, function, ": colors_precomp has shape ", inputs[kColorsPrecomp].sizes(),
                     "; a colour has one channel or more");
-  check_shape(kScales, inputs, {count, 3});
-  check_shape(kRotations, inputs, {count, 4});
-  check_shape(kCov3DPrecomp, inputs, {count, 6});
-  check_shape(kBackground, inputs, {num_channels(inputs)});
-  check_shape(kViewMatrix, inputs, {4, 4});
-  check_shape(kProjMatrix, inputs, {4, 4});
-  check_shape(kCampos, inputs, {3});
-  check_background_gate("rasterize", inputs[kBackgroundGate]);
-  TORCH_CHECK_VALUE(count <= INT_MAX, "rasterize: means3D has ", count, " Gaussians; the most is ", INT_MAX);
-}
-
-void check_sh_degree(const Inputs& inputs, int64_t degree) {
-  if (inputs[kColorsPrecomp].defined()) return;
-  TORCH_CHECK_VALUE(0 <= degree && degree <= kMaxShDegree, "rasterize: sh_degree is ", degree, "; it must be 0 to ",
-                    kMaxShDegree);
-  const int64_t held = (inputs[kShs].defined() ? inputs[kShs].size(1) : 0) + (inputs[kDc].defined() ? 1 : 0);
-  const int64_t needed = sh_coefficients(static_cast<int>(degree));
-  const Input last = inputs[kShs].defined() ? kShs : kDc;
-  TORCH_CHECK_VALUE(held >= needed, "rasterize: ", kInputNames[last], " has shape ", inputs[last].sizes(),
-                    inputs[kShs].defined() && inputs[kDc].defined() ? " besides dc" : "", "; sh_degree ", degree,
-                    " needs ", needed, " coefficients a Gaussian, not ", held);
-}
-
-void check_blend_mode(const char* function, int64_t blend_mode) {
-  TORCH_CHECK_VALUE(0 <= blend_mode && blend_mode < BlendModes::kSize, function, ": blend_mode is ", blend_mode,
-                    "; it must be 0 to ", BlendModes::kSize - 1);
+  check_shape(function, kScales, inputs, {count, 3});
+  check_shape(function, kRotations, inputs, {count, 4});
+  check_shape(function, kCov3DPrecomp, inputs, {count, 6});
+  check_shape(function, kBackground, inputs, {num_channels(inputs)});
+  check_shape(function, kViewMatrix, inputs, {4, 4});
+  check_shape(function, kProjMatrix, inputs, {4, 4});
+  check_shape(function, kCampos, inputs, {3});
+  check_background_gate(function, inputs[kBackgroundGate]);
 }
 
 void check_options(const char* function, const Options& options) {
@@ -96,33 +53,24 @@ void check_options(const char* function, const Options& options) {
   };
   check_positive("tanfovx", options.tanfovx);
   check_positive("tanfovy", options.tanfovy);
-  check_not_negative(function, "scale_modifier", options.scale_modifier);
-  check_not_negative(function, "near", options.near);
-  check_not_negative(function, "alpha_min", options.alpha_min);
-  check_not_negative(function, "low_pass", options.low_pass);
-  check_not_negative(function, "background_gate", options.fixed_background_gate);
-  check_blend_mode(function, options.blend_mode);
 }
 
 }  // namespace
 
-void check_arguments(const Inputs& inputs, const Options& options) {
-  check_real("rasterize", "means3D", inputs[kMeans3D]);
+void check_arguments(const char* function, const Inputs& inputs, const Options& options) {
+  check_real(function, "means3D", inputs[kMeans3D]);
   for (int i = 0; i < kNumInputs; ++i) {
     if (!inputs[i].defined()) continue;
-    check_like("rasterize", kInputNames[i], inputs[i], "means3D", inputs[kMeans3D]);
-    refuse_tangent("rasterize", inputs[i]);
+    check_like(function, kInputNames[i], inputs[i], "means3D", inputs[kMeans3D]);
+    refuse_tangent(function, inputs[i]);
   }
-  check_options("rasterize", options);
-  check_present(inputs);
-  check_shapes(inputs);
-  check_sh_degree(inputs, options.sh_degree);
+  check_options(function, options);
+  check_shapes(function, inputs);
 }
 
-void check_backward_arguments(const Inputs& inputs, const Options& options, const Images& images,
+void check_backward_arguments(const char* function, const Inputs& inputs, const Options& options, const Images& images,
                               const Images& image_gradients, const InputMask& wanted) {
-  const char* function = "rasterize_backward";
-  check_arguments(inputs, options);
+  check_arguments(function, inputs, options);
   const at::Tensor& like = inputs[kMeans3D];
   for (int i = 0; i < kNumImages; ++i) {
     const auto shape = image_shape(static_cast<Image>(i), image_sizes(inputs), options);
@@ -145,7 +93,6 @@ void check_footprints(const char* function, const Footprints& of, const Options&
   check_real(function, "gates", of.gates);
   check_shape(function, "gates", of.gates, {"N", kProjectedGaussianSize});
   const int64_t count = of.gates.size(0), extra = options.depth + options.inverse_depth;
-  TORCH_CHECK_VALUE(count <= INT_MAX, function, ": gates has ", count, " footprints; the most is ", INT_MAX);
   check_like(function, "bg", of.background, "gates", of.gates);
   check_shape(function, "bg", of.background, {"C"});
   TORCH_CHECK_VALUE(of.background.numel() > 0, function, ": bg has shape ", of.background.sizes(),
@@ -163,9 +110,8 @@ void check_footprints(const char* function, const Footprints& of, const Options&
   for (const at::Tensor& tensor : {of.gates, of.features, of.background}) refuse_tangent(function, tensor);
 }
 
-void check_blend_backward_arguments(const Images& images, const Images& image_gradients, const ImageSizes& sizes,
-                                    const at::Tensor& like, const Options& options) {
-  const char* function = "blend_backward";
+void check_blend_backward_arguments(const char* function, const Images& images, const Images& image_gradients,
+                                    const ImageSizes& sizes, const at::Tensor& like, const Options& options) {
   for (Image image : kDifferentiable) {
     const auto shape = image_shape(image, sizes, options);
     check_result(function, kImageNames[image], images[image], shape, like.scalar_type(), like.device());
@@ -176,9 +122,9 @@ void check_blend_backward_arguments(const Images& images, const Images& image_gr
   }
 }
 
-void check_footprint_gradients(const at::Tensor& records, const at::Tensor& dL_ddepths, const at::Tensor& features,
-                               const at::Tensor& radii, const Inputs& inputs, const Options& options) {
-  const char* function = "project_backward";
+void check_footprint_gradients(const char* function, const at::Tensor& records, const at::Tensor& dL_ddepths,
+                               const at::Tensor& features, const at::Tensor& radii, const Inputs& inputs,
+                               const Options& options) {
   const at::Tensor& like = inputs[kMeans3D];
   const int64_t count = num_gaussians(inputs);
   const int64_t num_features = num_channels(inputs) + options.depth + options.inverse_depth;
@@ -230,7 +176,7 @@ void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix) 
   check_shape("markVisible", "viewmatrix", viewmatrix, {4, 4});
 }
 
-void refuse_non_finite(const Inputs& inputs) {
+void refuse_non_finite(const char* function, const Inputs& inputs) {
   at::Tensor finite = at::ones({num_gaussians(inputs)}, inputs[kMeans3D].options().dtype(at::kBool));
   const auto is_read = [&](int i) { return i != kMeans2D && inputs[i].defined() && inputs[i].numel() > 0; };
   for (int i = kMeans3D; i <= kCov3DPrecomp; ++i) {
@@ -240,16 +186,16 @@ void refuse_non_finite(const Inputs& inputs) {
   if (indices.numel() == 0) return;
   const int64_t index = indices[0][0].item<int64_t>();
   for (int i = kMeans3D; i <= kCov3DPrecomp; ++i) {
-    TORCH_CHECK_VALUE(!is_read(i) || at::isfinite(inputs[i][index]).all().item<bool>(), "rasterize: ", kInputNames[i],
+    TORCH_CHECK_VALUE(!is_read(i) || at::isfinite(inputs[i][index]).all().item<bool>(), function, ": ", kInputNames[i],
                       "[", index, "] is not finite (strict=True)");
   }
 }
 
-void refuse_culled(const Inputs& inputs, const at::Tensor& visible) {
+void refuse_culled(const char* function, const Inputs& inputs, const at::Tensor& visible) {
   const at::Tensor culled = at::logical_not(visible).logical_and(at::isfinite(inputs[kMeans3D]).all(1)).nonzero();
   if (culled.numel() == 0) return;
   const int64_t index = culled[0][0].item<int64_t>();
-  TORCH_CHECK_VALUE(false, "rasterize: prefiltered is set, but means3D[", index, "] is not beyond the near plane");
+  TORCH_CHECK_VALUE(false, function, ": prefiltered is set, but means3D[", index, "] is not beyond the near plane");
 }
 
 void refuse_nan(const std::string& what, const at::Tensor& tensor) {

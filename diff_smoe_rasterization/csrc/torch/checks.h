@@ -1,5 +1,6 @@
-// What the ops refuse. Errors name the function, the argument, what it is and what it must be. They are ValueError for
-// shapes and values, TypeError for types and devices. Python does not repeat these checks.
+// What the ops refuse besides what the core does (refuse.h). Errors name the function, the argument, what it is and
+// what it must be. They are ValueError for shapes and values, TypeError for types and devices. Python does not repeat
+// these checks.
 #pragma once
 
 #include <cstring>
@@ -14,10 +15,10 @@ namespace dsmoe {
 namespace binding {
 
 // Tensors and numbers of one rendering, before any memory is read.
-void check_arguments(const Inputs& inputs, const Options& options);
+void check_arguments(const char* function, const Inputs& inputs, const Options& options);
 
 // The backward op's own arguments, since it can be called directly.
-void check_backward_arguments(const Inputs& inputs, const Options& options, const Images& images,
+void check_backward_arguments(const char* function, const Inputs& inputs, const Options& options, const Images& images,
                               const Images& image_gradients, const InputMask& wanted);
 
 // What the op `blend` takes of the Gaussians, and the background.
@@ -28,10 +29,11 @@ struct Footprints {
 void check_footprints(const char* function, const Footprints& of, const Options& options);
 
 // The backward ops' own arguments.
-void check_blend_backward_arguments(const Images& images, const Images& image_gradients, const ImageSizes& sizes,
-                                    const at::Tensor& like, const Options& options);
-void check_footprint_gradients(const at::Tensor& records, const at::Tensor& dL_ddepths, const at::Tensor& features,
-                               const at::Tensor& radii, const Inputs& inputs, const Options& options);
+void check_blend_backward_arguments(const char* function, const Images& images, const Images& image_gradients,
+                                    const ImageSizes& sizes, const at::Tensor& like, const Options& options);
+void check_footprint_gradients(const char* function, const at::Tensor& records, const at::Tensor& dL_ddepths,
+                               const at::Tensor& features, const at::Tensor& radii, const Inputs& inputs,
+                               const Options& options);
 
 // Those of an op that goes over what a rendering saved.
 void check_contribution_arguments(const char* function, const at::Tensor& pixel_weights, const at::Tensor& radii,
@@ -79,10 +81,10 @@ template <class SavedForward> int64_t saved_length(const Saved& tensors, SavedFo
 void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix);
 
 // Under `strict`: raises for the first Gaussian that has an attribute that is not finite. Waits for the device.
-void refuse_non_finite(const Inputs& inputs);
+void refuse_non_finite(const char* function, const Inputs& inputs);
 
 // Under `prefiltered`: raises for a Gaussian that is not visible [N], unless its position is not finite.
-void refuse_culled(const Inputs& inputs, const at::Tensor& visible);
+void refuse_culled(const char* function, const Inputs& inputs, const at::Tensor& visible);
 
 // Under `debug`: raises where a tensor holds NaN, naming it and the index. `what` begins with the function's name.
 void refuse_nan(const std::string& what, const at::Tensor& tensor);

@@ -65,39 +65,48 @@ class Arguments {
   size_t begin_, next_;
 };
 
-// What does not fit is a RuntimeError in Python; the core's own exception would be an OverflowError.
-template <class Function> void dispatch(const at::Tensor& like, Function function) {
+// Calls body(S()) with the type of `like`. What the core refuses is a ValueError, which names the op in place of the
+// core's function. What does not fit is a RuntimeError in Python; the core's own exception would be an OverflowError.
+template <class Body> void dispatch(const char* function, const at::Tensor& like, Body body) {
   try {
-    AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "diff_smoe_rasterization", [&] { function(scalar_t()); });
+    AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "diff_smoe_rasterization", [&] { body(scalar_t()); });
+  } catch (const std::invalid_argument& error) {
+    const std::string message = error.what();
+    TORCH_CHECK_VALUE(false, function, message.substr(message.find(": ")));
   } catch (const std::overflow_error& error) {
     TORCH_CHECK(false, error.what());
   }
 }
 
-// What `rasterize` and `radii` ask of the values of their arguments. Returns them dense.
-template <class Backend> Inputs checked(const Inputs& inputs, const Options& options) {
+// What an op that projects asks of the values of its arguments. Returns them dense.
+template <class Backend> Inputs checked(const char* function, const Inputs& inputs, const Options& options) {
   if (options.debug) {
     for (int i = kBackground; i <= kBackgroundGate; ++i) {
-      refuse_nan(std::string("rasterize: ") + kInputNames[i], inputs[i]);
+      refuse_nan(std::string(function) + ": " + kInputNames[i], inputs[i]);
     }
   }
   const Inputs dense = contiguous(inputs);
-  if (options.strict) refuse_non_finite(dense);
+  if (options.strict) refuse_non_finite(function, dense);
   if (options.prefiltered) {
-    refuse_culled(dense, Backend::visible(dense[kMeans3D], dense[kViewMatrix], options.near));
+    refuse_culled(function, dense, Backend::visible(function, dense[kMeans3D], dense[kViewMatrix], options.near));
   }
   return dense;
 }
 
-// A call of `rasterize` or `radii`: its arguments, checked, and the device that they are on.
+// A call of `rasterize`, `radii` or `project`: its arguments, checked, and the device that they are on.
 template <class Backend> struct RenderingCall {
-  RenderingCall(const c10::OperatorHandle& op, torch::jit::Stack& stack)
-      : arguments(op, stack),
+  RenderingCall(const char* function, const c10::OperatorHandle& op, torch::jit::Stack& stack)
+      : function(function),
+        arguments(op, stack),
         given(arguments.read<Inputs>()),
         options(arguments.read<Options>()),
         guard(checked_device()),
-        inputs(checked<Backend>(given, options)) {}
+        inputs(checked<Backend>(function, given, options)) {}
 
+  // Calls body(S()).
+  template <class Body> void run(Body body) const { dispatch(function, inputs[kMeans3D], body); }
+
+  const char* const function;
   Arguments arguments;
   const Inputs given;
   const Options options;
@@ -106,19 +115,18 @@ template <class Backend> struct RenderingCall {
 
  private:
   at::Device checked_device() const {
-    check_arguments(given, options);
+    check_arguments(function, given, options);
     return given[kMeans3D].device();
   }
 };
 
 template <class Backend> void rasterize(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
-  RenderingCall<Backend> call(op, *stack);
+  RenderingCall<Backend> call("rasterize", op, *stack);
   const Inputs& inputs = call.inputs;
   const Options& options = call.options;
   const Images images = allocate_images(inputs[kMeans3D], image_sizes(inputs), options);
   TensorMemory memory(inputs[kMeans3D]);
-  dispatch(inputs[kMeans3D],
-           [&](auto zero) { Backend::template forward<decltype(zero)>(inputs, options, images, memory); });
+  call.run([&](auto zero) { Backend::template forward<decltype(zero)>(inputs, options, images, memory); });
   if (options.debug) {
     for (Image image : kDifferentiable) refuse_nan(std::string("rasterize: ") + kImageNames[image], images[image]);
   }
@@ -127,28 +135,38 @@ template <class Backend> void rasterize(const c10::OperatorHandle& op, torch::ji
 }
 
 template <class Backend> void radii(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
-  RenderingCall<Backend> call(op, *stack);
+  RenderingCall<Backend> call("radii", op, *stack);
   const Inputs& inputs = call.inputs;
   const Options& options = call.options;
   Images images;
   images[kRadii] = at::empty({num_gaussians(inputs)}, inputs[kMeans3D].options().dtype(at::kInt));
   TensorMemory memory(inputs[kMeans3D]);
-  dispatch(inputs[kMeans3D],
-           [&](auto zero) { Backend::template radii<decltype(zero)>(inputs, options, images, memory); });
+  call.run([&](auto zero) { Backend::template radii<decltype(zero)>(inputs, options, images, memory); });
   call.arguments.give_back(images[kRadii]);
 }
 
-inline void check_length(const char* name, size_t length, size_t expected) {
-  TORCH_CHECK_VALUE(length == expected, "rasterize_backward: ", name, " has length ", length, "; it must be ",
-                    expected);
+inline void check_length(const char* function, const char* name, size_t length, size_t expected) {
+  TORCH_CHECK_VALUE(length == expected, function, ": ", name, " has length ", length, "; it must be ", expected);
 }
 
-// The inputs in their places; `list` holds those that are present.
-inline Inputs spread(const std::vector<at::Tensor>& list, const std::vector<bool>& present) {
-  check_length("present", present.size(), kNumInputs);
-  check_length("inputs", list.size(), std::count(present.begin(), present.end(), true));
+// Reads the gradients by the images, and makes them dense.
+inline Images read_image_gradients(Arguments& arguments) {
+  Images gradients;
+  for (Image image : kDifferentiable) {
+    arguments.read(gradients[image]);
+    if (gradients[image].defined()) gradients[image] = gradients[image].contiguous();
+  }
+  return gradients;
+}
+
+// Reads the inputs to their places: a list of those that are present, and which these are.
+inline Inputs read_present(const char* function, Arguments& arguments) {
+  const auto list = arguments.read<std::vector<at::Tensor>>();
+  const auto present = arguments.read<std::vector<bool>>();
+  check_length(function, "present", present.size(), kNumInputs);
+  check_length(function, "inputs", list.size(), std::count(present.begin(), present.end(), true));
   for (Input i : {kMeans3D, kOpacities, kBackground, kViewMatrix, kProjMatrix, kCampos}) {
-    TORCH_CHECK_VALUE(present[i], "rasterize_backward: ", kInputNames[i], " is absent; it must be given");
+    TORCH_CHECK_VALUE(present[i], function, ": ", kInputNames[i], " is absent; it must be given");
   }
   Inputs inputs;
   auto next = list.begin();
@@ -158,10 +176,19 @@ inline Inputs spread(const std::vector<at::Tensor>& list, const std::vector<bool
   return inputs;
 }
 
+// Reads of which inputs the gradients are wanted.
+inline InputMask read_wanted(const char* function, Arguments& arguments) {
+  const auto list = arguments.read<std::vector<bool>>();
+  check_length(function, "wanted", list.size(), kNumInputs);
+  InputMask wanted;
+  std::copy(list.begin(), list.end(), wanted.begin());
+  return wanted;
+}
+
 // The gradients that the caller has memory for, spread over the inputs that want one.
-inline Inputs given_gradients(const Inputs& inputs, const InputMask& wanted, const std::vector<at::Tensor>& list) {
-  const char* function = "rasterize_backward_seen";
-  check_length("gradients", list.size(), std::count(wanted.begin(), wanted.end(), true));
+inline Inputs given_gradients(const char* function, const Inputs& inputs, const InputMask& wanted,
+                              const std::vector<at::Tensor>& list) {
+  check_length(function, "gradients", list.size(), std::count(wanted.begin(), wanted.end(), true));
   Inputs gradients;
   auto next = list.begin();
   for (int i = 0; i < kNumInputs; ++i) {
@@ -177,40 +204,33 @@ inline Inputs given_gradients(const Inputs& inputs, const InputMask& wanted, con
 
 // kSeen: into the caller's memory, and only rows of Gaussians that were seen.
 template <class Backend, bool kSeen> void rasterize_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  const char* function = kSeen ? "rasterize_backward_seen" : "rasterize_backward";
   Arguments arguments(op, *stack);
-  Images image_gradients, images;
-  for (Image image : kDifferentiable) {
-    arguments.read(image_gradients[image]);
-    if (image_gradients[image].defined()) image_gradients[image] = image_gradients[image].contiguous();
-  }
-  const auto input_list = arguments.read<std::vector<at::Tensor>>();
-  const auto present = arguments.read<std::vector<bool>>();
+  const Images image_gradients = read_image_gradients(arguments);
+  const Inputs given = read_present(function, arguments);
   const auto image_list = arguments.read<std::vector<at::Tensor>>();
   const auto saved = arguments.read<Saved>();
   const auto options = arguments.read<Options>();
-  const auto wanted_list = arguments.read<std::vector<bool>>();
-  const Inputs given = spread(input_list, present);
-  check_length("images", image_list.size(), kNumImages);
-  check_length("wanted", wanted_list.size(), kNumInputs);
-  InputMask wanted;
+  const InputMask wanted = read_wanted(function, arguments);
+  check_length(function, "images", image_list.size(), kNumImages);
+  Images images;
   std::copy(image_list.begin(), image_list.end(), images.begin());
-  std::copy(wanted_list.begin(), wanted_list.end(), wanted.begin());
 
-  check_backward_arguments(given, options, images, image_gradients, wanted);
+  check_backward_arguments(function, given, options, images, image_gradients, wanted);
   const typename Backend::Guard guard(given[kMeans3D].device());
   if (options.debug) {
     for (Image image : kDifferentiable) {
-      refuse_nan(std::string("rasterize_backward: dL_d") + kImageNames[image], image_gradients[image]);
+      refuse_nan(std::string(function) + ": dL_d" + kImageNames[image], image_gradients[image]);
     }
   }
   const Inputs inputs = contiguous(given);
   Inputs gradients;
   if constexpr (kSeen) {
-    gradients = given_gradients(given, wanted, arguments.read<std::vector<at::Tensor>>());
+    gradients = given_gradients(function, given, wanted, arguments.read<std::vector<at::Tensor>>());
   } else {
     gradients = allocate_gradients(inputs, wanted);
   }
-  dispatch(inputs[kMeans3D], [&](auto zero) {
+  dispatch(function, inputs[kMeans3D], [&](auto zero) {
     Backend::template backward<decltype(zero)>(inputs, options, images, saved, image_gradients, gradients, kSeen);
   });
   if constexpr (kSeen) {
@@ -222,7 +242,7 @@ template <class Backend, bool kSeen> void rasterize_backward(const c10::Operator
   std::vector<at::Tensor> results;
   for (int i = 0; i < kNumInputs; ++i) {
     if (!wanted[i]) continue;
-    if (options.debug) refuse_nan(std::string("rasterize_backward: the gradient of ") + kInputNames[i], gradients[i]);
+    if (options.debug) refuse_nan(std::string(function) + ": the gradient of " + kInputNames[i], gradients[i]);
     results.push_back(gradients[i]);
   }
   arguments.give_back(std::move(results));
@@ -238,7 +258,7 @@ inline at::Tensor padded(const at::Tensor& rows, int64_t columns) {
 }
 
 template <class Backend> void project(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
-  RenderingCall<Backend> call(op, *stack);
+  RenderingCall<Backend> call("project", op, *stack);
   const Inputs& inputs = call.inputs;
   const at::TensorOptions like = inputs[kMeans3D].options();
   const int64_t count = num_gaussians(inputs);
@@ -248,7 +268,7 @@ template <class Backend> void project(const c10::OperatorHandle& op, torch::jit:
   Images images;
   images[kRadii] = at::empty({count}, like.dtype(at::kInt));
   TensorMemory memory(gates);
-  dispatch(gates, [&](auto zero) {
+  call.run([&](auto zero) {
     Backend::template project<decltype(zero)>(inputs, call.options, images, gates, features, memory);
   });
   call.arguments.give_back(gates, features.narrow(1, 0, num_features), images[kRadii]);
@@ -271,25 +291,22 @@ template <class Backend> void blend(const c10::OperatorHandle& op, torch::jit::S
   images[kRadii] = of.radii;
   TensorMemory memory(of.gates);
   memory.give(0, of.gates), memory.give(1, of.features.view(-1));
-  dispatch(of.gates, [&](auto zero) { Backend::template blend<decltype(zero)>(of, options, images, memory); });
+  dispatch("blend", of.gates, [&](auto zero) { Backend::template blend<decltype(zero)>(of, options, images, memory); });
   arguments.give_back(images[kColor], images[kGateSum], images[kDepth], images[kInverseDepth], memory.take_saved());
 }
 
 template <class Backend> void blend_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  const char* function = "blend_backward";
   Arguments arguments(op, *stack);
-  Images image_gradients, images;
-  for (Image image : kDifferentiable) {
-    arguments.read(image_gradients[image]);
-    if (image_gradients[image].defined()) image_gradients[image] = image_gradients[image].contiguous();
-  }
+  const Images image_gradients = read_image_gradients(arguments);
   const auto image_list = arguments.read<std::vector<at::Tensor>>();
   const auto saved = arguments.read<Saved>();
   Footprints of;
   for (auto* tensor : {&of.radii, &of.background, &of.background_gate}) arguments.read(*tensor);
   const auto options = arguments.read<Options>();
   const auto wants_background = arguments.read<bool>();
-  check_length("images", image_list.size(), kDifferentiable.size());
-  TORCH_CHECK_VALUE(saved.size() > 1, "blend_backward: saved has length ", saved.size(),
+  check_length(function, "images", image_list.size(), kDifferentiable.size());
+  TORCH_CHECK_VALUE(saved.size() > 1, function, ": saved has length ", saved.size(),
                     "; it must be what blend returned");
   const int64_t num_features = of.background.numel() + options.depth + options.inverse_depth;
   const int64_t columns = Backend::feature_columns(num_features);
@@ -297,16 +314,17 @@ template <class Backend> void blend_backward(const c10::OperatorHandle& op, torc
   if (of.gates.dim() == 2 && of.features.numel() == of.gates.size(0) * columns) {
     of.features = of.features.view({of.gates.size(0), columns}).narrow(1, 0, num_features);
   }
-  check_footprints("blend_backward", of, options);
+  check_footprints(function, of, options);
   const ImageSizes sizes = {of.gates.size(0), of.background.numel()};
+  Images images;
   for (size_t i = 0; i < image_list.size(); ++i) images[kDifferentiable[i]] = image_list[i];
-  check_blend_backward_arguments(images, image_gradients, sizes, of.gates, options);
+  check_blend_backward_arguments(function, images, image_gradients, sizes, of.gates, options);
   const typename Backend::Guard guard(of.gates.device());
   images[kRadii] = of.radii = of.radii.contiguous();
   of.background = of.background.contiguous();
   const at::Tensor records = at::empty({sizes.num_gaussians, kNumGateGradients + num_features}, of.gates.options());
   const at::Tensor background = at::empty({wants_background ? sizes.num_channels + 1 : 0}, of.gates.options());
-  dispatch(of.gates, [&](auto zero) {
+  dispatch(function, of.gates, [&](auto zero) {
     Backend::template blend_backward<decltype(zero)>(of, options, images, saved, image_gradients, records, background);
   });
   const int64_t channels = wants_background ? sizes.num_channels : 0;
@@ -315,31 +333,27 @@ template <class Backend> void blend_backward(const c10::OperatorHandle& op, torc
 }
 
 template <class Backend> void project_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
+  const char* function = "project_backward";
   Arguments arguments(op, *stack);
   const auto records = arguments.read<at::Tensor>().contiguous();
   at::Tensor dL_ddepths = arguments.read<at::Tensor>();
-  const auto input_list = arguments.read<std::vector<at::Tensor>>();
-  const auto present = arguments.read<std::vector<bool>>();
+  const Inputs given = read_present(function, arguments);
   at::Tensor features = arguments.read<at::Tensor>();
   const auto radii = arguments.read<at::Tensor>();
   const auto options = arguments.read<Options>();
-  const auto wanted_list = arguments.read<std::vector<bool>>();
-  const Inputs given = spread(input_list, present);
-  check_length("wanted", wanted_list.size(), kNumInputs);
-  InputMask wanted;
-  std::copy(wanted_list.begin(), wanted_list.end(), wanted.begin());
-  check_arguments(given, options);
-  check_footprint_gradients(records, dL_ddepths, features, radii, given, options);
+  const InputMask wanted = read_wanted(function, arguments);
+  check_arguments(function, given, options);
+  check_footprint_gradients(function, records, dL_ddepths, features, radii, given, options);
   for (int i = 0; i < kNumInputs; ++i) {
     TORCH_CHECK_VALUE(
-        !wanted[i] || (given[i].defined() && i != kBackground && i != kBackgroundGate && i != kMeans2DAbs),
-        "project_backward: the gradient of ", kInputNames[i], " is wanted, but no footprint depends on it");
+        !wanted[i] || (given[i].defined() && i != kBackground && i != kBackgroundGate && i != kMeans2DAbs), function,
+        ": the gradient of ", kInputNames[i], " is wanted, but no footprint depends on it");
   }
   const typename Backend::Guard guard(given[kMeans3D].device());
   features = padded(features, Backend::feature_columns(features.size(1)));
   if (dL_ddepths.defined()) dL_ddepths = dL_ddepths.contiguous();
   const Inputs inputs = contiguous(given), gradients = allocate_gradients(inputs, wanted);
-  dispatch(records, [&](auto zero) {
+  dispatch(function, records, [&](auto zero) {
     Backend::template project_backward<decltype(zero)>(inputs, options, features, radii, records, dL_ddepths,
                                                        gradients);
   });
@@ -362,7 +376,7 @@ template <class Backend> void contributions(const c10::OperatorHandle& op, torch
   const auto real = [&] { return at::empty({radii.numel()}, pixel_weights.options()); };
   const at::Tensor weights = real(), pixels = at::empty_like(radii), blend_weights = real(), distances = real();
   const at::Tensor map = pixel_weights.contiguous();
-  dispatch(map, [&](auto zero) {
+  dispatch("contributions", map, [&](auto zero) {
     using S = decltype(zero);
     ContributionSums<S> sums;
     sums.pixel_weights = mutable_data<S>(weights);
@@ -393,7 +407,7 @@ template <class Backend> void importance(const c10::OperatorHandle& op, torch::j
   for (auto* image : {&images.share_weights, &images.color, &images.gate_sum, &images.background}) {
     *image = image->contiguous();
   }
-  dispatch(weights, [&](auto zero) {
+  dispatch("importance", weights, [&](auto zero) {
     using S = decltype(zero);
     RasterConfig<S> config = blend_config<S>(background_gate, options);
     config.num_channels = static_cast<int>(images.color.size(0));
@@ -431,7 +445,7 @@ template <class Backend>
 at::Tensor mark_visible(const at::Tensor& positions, const at::Tensor& viewmatrix, double near) {
   const typename Backend::Guard guard(positions.device());
   check_positions(positions, viewmatrix);
-  return Backend::visible(positions.contiguous(), viewmatrix.contiguous(), near);
+  return Backend::visible("mark_visible", positions.contiguous(), viewmatrix.contiguous(), near);
 }
 
 template <class Backend> void register_ops(torch::Library& m) {

@@ -13,7 +13,8 @@ struct Cpu {
     explicit Guard(at::Device) {}
   };
 
-  template <class S> static cpu::Frame<S> frame(const Inputs& inputs, const Options& options, const Images& images) {
+  template <class S>
+  static cpu::Frame<S> frame_of_gaussians(const Inputs& inputs, const Options& options, const Images& images) {
     cpu::Frame<S> frame;
     fill_frame<S>(frame, inputs, options);
     std::copy_n(data<S>(inputs[kViewMatrix]), 16, frame.camera.view);
@@ -26,14 +27,14 @@ struct Cpu {
 
   template <class S>
   static void forward(const Inputs& inputs, const Options& options, const Images& images, Allocator& memory) {
-    auto own = frame<S>(inputs, options, images);
+    auto own = frame_of_gaussians<S>(inputs, options, images);
     StageRecorder recorder(Pass::kForward);
     cpu::forward(own, memory, recorder.times());
   }
 
   template <class S>
   static void radii(const Inputs& inputs, const Options& options, const Images& images, Allocator& memory) {
-    cpu::radii(frame<S>(inputs, options, images), memory);
+    cpu::radii(frame_of_gaussians<S>(inputs, options, images), memory);
   }
 
   static int64_t feature_columns(int64_t num_features) { return num_features; }
@@ -41,7 +42,7 @@ struct Cpu {
   template <class S>
   static void project(const Inputs& inputs, const Options& options, const Images& images, const at::Tensor& gates,
                       const at::Tensor& features, Allocator&) {
-    auto own = frame<S>(inputs, options, images);
+    auto own = frame_of_gaussians<S>(inputs, options, images);
     own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(gates));
     own.saved.features = mutable_data<S>(features);
     StageRecorder recorder(Pass::kForward);
@@ -49,7 +50,8 @@ struct Cpu {
   }
 
   // The frame of some footprints, nothing saved yet.
-  template <class S> static cpu::Frame<S> frame(const Footprints& of, const Options& options, const Images& images) {
+  template <class S>
+  static cpu::Frame<S> frame_of_footprints(const Footprints& of, const Options& options, const Images& images) {
     cpu::Frame<S> frame;
     frame.inputs.num_gaussians = of.gates.size(0);
     frame.config = footprint_config<S>(of.background, of.background_gate, options);
@@ -61,7 +63,7 @@ struct Cpu {
 
   template <class S>
   static void blend(const Footprints& of, const Options& options, const Images& images, Allocator& memory) {
-    auto own = frame<S>(of, options, images);
+    auto own = frame_of_footprints<S>(of, options, images);
     own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(of.gates.data_ptr<S>());
     own.saved.features = of.features.data_ptr<S>();
     StageRecorder recorder(Pass::kForward);
@@ -72,7 +74,7 @@ struct Cpu {
   static void blend_backward(const Footprints& of, const Options& options, const Images& images, const Saved& saved,
                              const Images& image_gradient_tensors, const at::Tensor& records,
                              const at::Tensor& background) {
-    auto own = frame<S>(of, options, images);
+    auto own = frame_of_footprints<S>(of, options, images);
     own.saved = unpack<S>("blend_backward", saved, cpu::saved_sizes(own), of.gates.device());
     own.saved.gate_sum = own.images.gate_sum;
     cpu::Gradients<S> gradients;
@@ -86,7 +88,7 @@ struct Cpu {
   static void project_backward(const Inputs& inputs, const Options& options, const at::Tensor& features,
                                const at::Tensor& radii, const at::Tensor& records, const at::Tensor& dL_ddepths,
                                const Inputs& gradient_tensors) {
-    auto own = frame<S>(inputs, options, Images());
+    auto own = frame_of_gaussians<S>(inputs, options, Images());
     own.saved.features = mutable_data<S>(features);
     own.images.radii = mutable_data<int32_t>(radii);
     cpu::Gradients<S> gradients;
@@ -110,8 +112,9 @@ struct Cpu {
   template <class S>
   static void backward(const Inputs& inputs, const Options& options, const Images& images, const Saved& saved,
                        const Images& image_gradient_tensors, const Inputs& gradient_tensors, bool seen_only) {
-    auto own = frame<S>(inputs, options, images);
-    own.saved = unpack<S>("rasterize_backward", saved, cpu::saved_sizes(own), inputs[kMeans3D].device());
+    auto own = frame_of_gaussians<S>(inputs, options, images);
+    const char* function = seen_only ? "rasterize_backward_seen" : "rasterize_backward";
+    own.saved = unpack<S>(function, saved, cpu::saved_sizes(own), inputs[kMeans3D].device());
     own.saved.gate_sum = own.images.gate_sum;
     cpu::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
@@ -123,7 +126,8 @@ struct Cpu {
 
   // The frame of a rendering that is walked again, what it saved not yet in it.
   template <class S>
-  static cpu::Frame<S> frame(const at::Tensor& radii, const RasterConfig<S>& config, const Options& options) {
+  static cpu::Frame<S> frame_of_rendering(const at::Tensor& radii, const RasterConfig<S>& config,
+                                          const Options& options) {
     cpu::Frame<S> frame;
     frame.inputs.num_gaussians = radii.numel();
     frame.config = config;
@@ -136,7 +140,7 @@ struct Cpu {
   template <class S>
   static void contributions(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
                             const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
-    auto own = frame<S>(radii, config, options);
+    auto own = frame_of_rendering<S>(radii, config, options);
     SavedSizes sizes = cpu::saved_sizes(own);
     sizes.num_features = -1;
     own.saved = unpack<S>("contributions", saved, sizes, radii.device());
@@ -146,7 +150,7 @@ struct Cpu {
   template <class S>
   static void importance(const at::Tensor& gate_sum, const at::Tensor& radii, const Saved& saved,
                          const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
-    auto own = frame<S>(radii, config, options);
+    auto own = frame_of_rendering<S>(radii, config, options);
     own.saved = unpack<S>("importance", saved, cpu::saved_sizes(own), radii.device());
     own.saved.gate_sum = mutable_data<S>(gate_sum);
     cpu::importance(own, map);
@@ -158,9 +162,9 @@ struct Cpu {
     return at::cat({gates.index_select(0, visible), features.index_select(0, visible), seen}, 1);
   }
 
-  static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {
+  static at::Tensor visible(const char* function, const at::Tensor& positions, const at::Tensor& view, double near) {
     const at::Tensor visible = at::empty({positions.size(0)}, at::kBool);
-    dispatch(positions, [&](auto zero) {
+    dispatch(function, positions, [&](auto zero) {
       using S = decltype(zero);
       cpu::Frame<S> frame;
       frame.inputs.num_gaussians = positions.size(0);

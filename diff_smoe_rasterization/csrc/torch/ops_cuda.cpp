@@ -13,7 +13,8 @@ namespace {
 struct Cuda {
   using Guard = c10::cuda::CUDAGuard;
 
-  template <class S> static cuda::Frame<S> frame(const Inputs& inputs, const Options& options, const Images& images) {
+  template <class S>
+  static cuda::Frame<S> frame_of_gaussians(const Inputs& inputs, const Options& options, const Images& images) {
     cuda::Frame<S> frame;
     fill_frame<S>(frame, inputs, options);
     frame.camera.view = data<S>(inputs[kViewMatrix]);
@@ -34,14 +35,14 @@ struct Cuda {
 
   template <class S>
   static void forward(const Inputs& inputs, const Options& options, const Images& images, Allocator& memory) {
-    auto own = frame<S>(inputs, options, images);
+    auto own = frame_of_gaussians<S>(inputs, options, images);
     StageRecorder recorder(Pass::kForward);
     cuda::forward(own, run(options, recorder.times()), memory);
   }
 
   template <class S>
   static void radii(const Inputs& inputs, const Options& options, const Images& images, Allocator& memory) {
-    cuda::radii(frame<S>(inputs, options, images), run(options, nullptr), memory);
+    cuda::radii(frame_of_gaussians<S>(inputs, options, images), run(options, nullptr), memory);
   }
 
   static int64_t feature_columns(int64_t num_features) { return cuda::feature_stride(static_cast<int>(num_features)); }
@@ -49,7 +50,7 @@ struct Cuda {
   template <class S>
   static void project(const Inputs& inputs, const Options& options, const Images& images, const at::Tensor& gates,
                       const at::Tensor& features, Allocator& memory) {
-    auto own = frame<S>(inputs, options, images);
+    auto own = frame_of_gaussians<S>(inputs, options, images);
     own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(gates));
     own.saved.features = mutable_data<S>(features);
     StageRecorder recorder(Pass::kForward);
@@ -57,7 +58,8 @@ struct Cuda {
   }
 
   // The frame of some footprints, nothing saved yet.
-  template <class S> static cuda::Frame<S> frame(const Footprints& of, const Options& options, const Images& images) {
+  template <class S>
+  static cuda::Frame<S> frame_of_footprints(const Footprints& of, const Options& options, const Images& images) {
     cuda::Frame<S> frame;
     frame.inputs.num_gaussians = of.gates.size(0);
     frame.config = footprint_config<S>(of.background, of.background_gate, options);
@@ -68,7 +70,7 @@ struct Cuda {
 
   template <class S>
   static void blend(const Footprints& of, const Options& options, const Images& images, Allocator& memory) {
-    auto own = frame<S>(of, options, images);
+    auto own = frame_of_footprints<S>(of, options, images);
     own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(of.gates.data_ptr<S>());
     own.saved.features = of.features.data_ptr<S>();
     StageRecorder recorder(Pass::kForward);
@@ -79,7 +81,7 @@ struct Cuda {
   static void blend_backward(const Footprints& of, const Options& options, const Images& images, const Saved& saved,
                              const Images& image_gradient_tensors, const at::Tensor& records,
                              const at::Tensor& background) {
-    auto own = frame<S>(of, options, images);
+    auto own = frame_of_footprints<S>(of, options, images);
     StageRecorder recorder(Pass::kBackward);
     const cuda::Run how = run(options, recorder.times());
     own.saved = unpack<S>("blend_backward", saved, cuda::saved_sizes(own, how), of.gates.device());
@@ -95,7 +97,7 @@ struct Cuda {
   static void project_backward(const Inputs& inputs, const Options& options, const at::Tensor& features,
                                const at::Tensor& radii, const at::Tensor& records, const at::Tensor& dL_ddepths,
                                const Inputs& gradient_tensors) {
-    auto own = frame<S>(inputs, options, Images());
+    auto own = frame_of_gaussians<S>(inputs, options, Images());
     own.saved.features = mutable_data<S>(features);
     own.images.radii = mutable_data<int32_t>(radii);
     StageRecorder recorder(Pass::kBackward);
@@ -123,10 +125,11 @@ struct Cuda {
   template <class S>
   static void backward(const Inputs& inputs, const Options& options, const Images& images, const Saved& saved,
                        const Images& image_gradient_tensors, const Inputs& gradient_tensors, bool seen_only) {
-    auto own = frame<S>(inputs, options, images);
+    auto own = frame_of_gaussians<S>(inputs, options, images);
     StageRecorder recorder(Pass::kBackward);
     const cuda::Run how = run(options, recorder.times());
-    own.saved = unpack<S>("rasterize_backward", saved, cuda::saved_sizes(own, how), inputs[kMeans3D].device());
+    const char* function = seen_only ? "rasterize_backward_seen" : "rasterize_backward";
+    own.saved = unpack<S>(function, saved, cuda::saved_sizes(own, how), inputs[kMeans3D].device());
     own.saved.gate_sum = own.images.gate_sum;
     cuda::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
@@ -137,7 +140,8 @@ struct Cuda {
 
   // The frame of a rendering that is walked again, what it saved not yet in it.
   template <class S>
-  static cuda::Frame<S> frame(const at::Tensor& radii, const RasterConfig<S>& config, const Options& options) {
+  static cuda::Frame<S> frame_of_rendering(const at::Tensor& radii, const RasterConfig<S>& config,
+                                           const Options& options) {
     cuda::Frame<S> frame;
     frame.inputs.num_gaussians = radii.numel();
     frame.config = config;
@@ -149,7 +153,7 @@ struct Cuda {
   template <class S>
   static void contributions(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
                             const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
-    auto own = frame<S>(radii, config, options);
+    auto own = frame_of_rendering<S>(radii, config, options);
     const cuda::Run how = run(options, nullptr);
     auto sizes = cuda::saved_sizes(own, how);
     sizes.num_features = -1;
@@ -161,7 +165,7 @@ struct Cuda {
   template <class S>
   static void importance(const at::Tensor& gate_sum, const at::Tensor& radii, const Saved& saved,
                          const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
-    auto own = frame<S>(radii, config, options);
+    auto own = frame_of_rendering<S>(radii, config, options);
     const cuda::Run how = run(options, nullptr);
     own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
     own.saved.gate_sum = mutable_data<S>(gate_sum);
@@ -188,9 +192,9 @@ struct Cuda {
     return out;
   }
 
-  static at::Tensor visible(const at::Tensor& positions, const at::Tensor& view, double near) {
+  static at::Tensor visible(const char* function, const at::Tensor& positions, const at::Tensor& view, double near) {
     const at::Tensor visible = at::empty({positions.size(0)}, positions.options().dtype(at::kBool));
-    dispatch(positions, [&](auto zero) {
+    dispatch(function, positions, [&](auto zero) {
       using S = decltype(zero);
       cuda::Frame<S> frame;
       frame.inputs.num_gaussians = positions.size(0);

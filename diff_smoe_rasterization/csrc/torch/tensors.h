@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <array>
+#include <limits>
 #include <utility>
 #include <vector>
 
@@ -113,6 +114,12 @@ template <class S> S* mutable_data(const at::Tensor& tensor) {
   return tensor.defined() && tensor.numel() > 0 ? tensor.data_ptr<S>() : nullptr;
 }
 
+// A number that the core checks: one that fits no int must not become one that does.
+inline int to_int(int64_t value) {
+  using Limits = std::numeric_limits<int>;
+  return static_cast<int>(std::clamp<int64_t>(value, Limits::min(), Limits::max()));
+}
+
 template <class S> GaussianInputs<S> gaussian_inputs(const Inputs& inputs, const Options& options) {
   GaussianInputs<S> out;
   out.num_gaussians = num_gaussians(inputs);
@@ -124,15 +131,15 @@ template <class S> GaussianInputs<S> gaussian_inputs(const Inputs& inputs, const
   out.colors_precomp = data<S>(inputs[kColorsPrecomp]);
   out.dc = data<S>(inputs[kDc]);
   out.shs = data<S>(inputs[kShs]);
-  out.num_sh = inputs[kShs].defined() ? static_cast<int>(inputs[kShs].size(1)) : 0;
-  out.sh_degree = static_cast<int>(options.sh_degree);
+  out.num_sh = inputs[kShs].defined() ? to_int(inputs[kShs].size(1)) : 0;
+  out.sh_degree = to_int(options.sh_degree);
   return out;
 }
 
 // What decides which pairs count and how they are blended.
 template <class S> RasterConfig<S> blend_config(const at::Tensor& background_gate, const Options& options) {
   RasterConfig<S> out;
-  out.mode = static_cast<BlendMode>(options.blend_mode);
+  out.mode = static_cast<BlendMode>(to_int(options.blend_mode));
   out.background_gate = static_cast<S>(options.fixed_background_gate);
   out.background_gate_at = data<S>(background_gate);
   out.alpha_min = static_cast<float>(options.alpha_min);  // thresholds are float32 values in every scalar type

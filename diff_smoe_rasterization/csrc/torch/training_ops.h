@@ -62,40 +62,35 @@ template <class Backend>
 void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList moments, at::TensorList squares,
           at::ArrayRef<double> rates, at::ArrayRef<double> root_scales, double beta1, double beta2, double epsilon,
           const OptionalTensor& visible) {
+  const char* function = "adam";
   const size_t count = parameters.size();
   for (size_t length : {gradients.size(), moments.size(), squares.size(), rates.size(), root_scales.size()}) {
-    TORCH_CHECK_VALUE(length == count, "adam: lists of ", count, " and of ", length,
+    TORCH_CHECK_VALUE(length == count, function, ": lists of ", count, " and of ", length,
                       " items are given; all must have the length of parameters");
   }
   if (count == 0) return;
   const at::Tensor& first = parameters[0];
-  check_real("adam", "parameters[0]", first);
+  check_real(function, "parameters[0]", first);
+  check_like_parameters(function, "parameters", parameters, parameters);
+  check_like_parameters(function, "moments", moments, parameters);
+  check_like_parameters(function, "squares", squares, parameters);
   const c10::DeviceGuard guard(first.device());
 
   at::Tensor flags;
   if (visible.has_value()) {
     flags = visible->contiguous();
-    check_type("adam", "visible", flags, at::kBool);
-    check_shape("adam", "visible", flags, {"N"});
-    check_device("adam", "visible", flags, "parameters[0]", first);
+    check_type(function, "visible", flags, at::kBool);
+    check_shape(function, "visible", flags, {"N"});
+    check_device(function, "visible", flags, "parameters[0]", first);
   }
 
   std::vector<at::Tensor> dense_gradients;
   for (size_t i = 0; i < count; ++i) {
-    const auto name = [i](const char* list) { return std::string(list) + "[" + std::to_string(i) + "]"; };
-    const auto check_like_parameter = [&](const char* list, const at::Tensor& tensor) {
-      check_same_shape("adam", name(list).c_str(), tensor, name("parameters").c_str(), parameters[i]);
-      check_like("adam", name(list).c_str(), tensor, "parameters[0]", first);
-    };
-    check_like_parameter("parameters", parameters[i]);
-    check_like_parameter("gradients", gradients[i]);
-    check_like_parameter("moments", moments[i]);
-    check_like_parameter("squares", squares[i]);
-    check_contiguous("adam", name("parameters").c_str(), parameters[i]);
-    check_contiguous("adam", name("moments").c_str(), moments[i]);
-    check_contiguous("adam", name("squares").c_str(), squares[i]);
-    TORCH_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)),
-                      "adam: ", name("parameters"), " has shape ", parameters[i].sizes(), "; visible has ",
+    const std::string name = item_name("gradients", i), parameter = item_name("parameters", i);
+    check_same_shape(function, name.c_str(), gradients[i], parameter.c_str(), parameters[i]);
+    check_like(function, name.c_str(), gradients[i], "parameters[0]", first);
+    TORCH_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)), function,
+                      ": ", parameter, " has shape ", parameters[i].sizes(), "; visible has ",
                       flags.defined() ? flags.size(0) : 0, " rows, and so must every parameter");
     dense_gradients.push_back(gradients[i].contiguous());
   }

@@ -124,6 +124,12 @@ DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real l
   return {power, weight};
 }
 
+// What a pixel sums. Each mode states its own as kLaw, so that algebra which holds for one law can assert it.
+enum class Law {
+  kGates,  // what GateBlend's parameters say
+  kOther,  // the mode has an `accumulate` of its own
+};
+
 // The arithmetic of all modes, and the facts that most of them share. kTInNumerator: w_i is alpha_i T_i; else alpha_i.
 // kTInDenominator: the denominator sums w_i; else alpha_i of every pair that counts, even behind a full pixel.
 template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
@@ -164,6 +170,7 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
 
 template <> struct Blend<BlendMode::kAlpha> : GateBlend<true, true> {
   static constexpr const char* kName = "alpha";
+  static constexpr Law kLaw = Law::kGates;
   static constexpr Cut kCut = Cut::kAlpha;
   static constexpr bool kWithinRadius = true, kDivides = false;
   template <class S> static DSMOE_HD S background_gate(S) { return S(1); }
@@ -171,16 +178,19 @@ template <> struct Blend<BlendMode::kAlpha> : GateBlend<true, true> {
 
 template <> struct Blend<BlendMode::kSmoe> : GateBlend<true, true> {
   static constexpr const char* kName = "smoe";
+  static constexpr Law kLaw = Law::kGates;
   static constexpr bool kLearnsGate = true;
   template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
 
 template <> struct Blend<BlendMode::kSmoeTn> : GateBlend<true, false> {
   static constexpr const char* kName = "smoe_tn";
+  static constexpr Law kLaw = Law::kGates;
 };
 
 template <> struct Blend<BlendMode::kSmoeStd> : GateBlend<false, false> {
   static constexpr const char* kName = "smoe_std";
+  static constexpr Law kLaw = Law::kGates;
 };
 
 // Facts of a mode that is known at run time.
@@ -202,7 +212,9 @@ DSMOE_HD constexpr bool within_radius(BlendMode mode) {
 template <BlendMode kMode, class Real>
 DSMOE_HD void resume_backward(PixelBackward<Real>& pixel, Real transmittance, Real behind) {
   pixel.suffix = pixel.suffix + behind;
-  if (Blend<kMode>::kSuffixAboutBase) {
+  if constexpr (Blend<kMode>::kSuffixAboutBase) {
+    static_assert(Blend<kMode>::kLaw == Law::kGates && Blend<kMode>::kNeedsDepthOrder,
+                  "the sum of w is taken from T: this is right where w_i is alpha_i T_i only");
     pixel.suffix = pixel.suffix - pixel.base * (transmittance - pixel.transmittance);
   }
   pixel.transmittance = transmittance;

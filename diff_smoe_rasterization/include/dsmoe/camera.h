@@ -1,6 +1,8 @@
 // The camera: from world points to view space and to pixels. Each backward function stands below its forward.
 #pragma once
 
+#include <array>
+
 #include "dsmoe/constants.h"
 #include "dsmoe/vec.h"
 
@@ -16,6 +18,49 @@ template <class S> struct Camera {
   S position[3] = {};              // world
   S near = S(0.2);                 // view depth; nearer Gaussians are culled
 };
+
+// A calibrated pinhole camera. View axes are x right, y down, z forward. The centre of the top left pixel is
+// (0.5, 0.5), as in COLMAP.
+struct Pinhole {
+  int width = 0, height = 0;               // pixels
+  double fx = 0, fy = 0;                   // focal lengths, pixels
+  double cx = 0, cy = 0;                   // principal point, pixels
+  std::array<double, 9> rotation = {};     // [3, 3] world to view, by rows
+  std::array<double, 3> translation = {};  // x_view = rotation x_world + translation
+};
+
+// Clip range of a pinhole camera's projection. Nothing reads clip z, as culling is by view depth: it only is finite.
+constexpr double kClipNear = 0.01, kClipFar = 100;
+
+// The camera that the rasterizer takes. `near` is the caller's.
+template <class S> Camera<S> pinhole_camera(const Pinhole& of) {
+  Camera<S> camera;
+  camera.width = of.width, camera.height = of.height;
+  camera.tan_fov_x = S(of.width / (2 * of.fx)), camera.tan_fov_y = S(of.height / (2 * of.fy));
+  // project_to_pixel puts NDC x at the pixel index ((x + 1) width - 1) / 2. A point at fx X / Z + cx, half a pixel
+  // above its index, therefore has x = 2 fx / width X / Z + 2 cx / width - 1.
+  constexpr double kDepth = kClipFar / (kClipFar - kClipNear);
+  const double clip[4][4] = {{2 * of.fx / of.width, 0, 2 * of.cx / of.width - 1, 0},
+                             {0, 2 * of.fy / of.height, 2 * of.cy / of.height - 1, 0},
+                             {0, 0, kDepth, -kClipNear * kDepth},
+                             {0, 0, 1, 0}};
+  const std::array<double, 9>& r = of.rotation;
+  const std::array<double, 3>& t = of.translation;
+  const double view[4][4] = {
+      {r[0], r[1], r[2], t[0]}, {r[3], r[4], r[5], t[1]}, {r[6], r[7], r[8], t[2]}, {0, 0, 0, 1}};
+  for (int row = 0; row < 4; ++row) {
+    for (int column = 0; column < 4; ++column) {
+      double product = 0;
+      for (int k = 0; k < 4; ++k) product += clip[row][k] * view[k][column];
+      camera.view[4 * column + row] = S(view[row][column]);
+      camera.projection[4 * column + row] = S(product);
+    }
+  }
+  for (int axis = 0; axis < 3; ++axis) {
+    camera.position[axis] = S(-(r[axis] * t[0] + r[3 + axis] * t[1] + r[6 + axis] * t[2]));
+  }
+  return camera;
+}
 
 // What one Gaussian adds to the gradient of its camera: vectors, from which CameraGradient makes the matrices.
 template <class S> struct CameraShare {

@@ -1,5 +1,8 @@
 // What goes in and out of the rasterizer, as plain structs of pointers. Every array is dense and row-major; N is the
 // number of Gaussians, F the number of features (colour channels, then z and 1/z on request), I of tile instances.
+//
+// A pointer may be null where its comment or that of its struct says so, and where its array has no elements. No other
+// may: the passes of rasterize.h and rasterize_cuda.h refuse it.
 #pragma once
 
 #include <cstdint>
@@ -31,14 +34,14 @@ template <class S> struct GaussianInputs {
   int64_t num_gaussians = 0;
   const S* means3D = nullptr;         // [N, 3] world
   const S* opacities = nullptr;       // [N] may exceed 1
-  const S* scales = nullptr;          // [N, 3] with rotations, or null
-  const S* rotations = nullptr;       // [N, 4] (w, x, y, z), used as given
+  const S* scales = nullptr;          // [N, 3], null with cov3D_precomp
+  const S* rotations = nullptr;       // [N, 4] (w, x, y, z), used as given; null with cov3D_precomp
   const S* cov3D_precomp = nullptr;   // [N, 6] (xx, xy, xz, yy, yz, zz), or null
-  const S* colors_precomp = nullptr;  // [N, C], or null
+  const S* colors_precomp = nullptr;  // [N, C], null with shs or dc
   const S* dc = nullptr;              // [N, 3] degree 0, or null where shs holds it
-  const S* shs = nullptr;             // [N, K, 3], or null
+  const S* shs = nullptr;             // [N, K, 3]; null with colors_precomp, and where dc has all there is
   int num_sh = 0;                     // K
-  int sh_degree = 0;                  // active degree
+  int sh_degree = 0;                  // active degree, 0 to 3; dc and shs have (degree + 1)^2 coefficients or more
 };
 
 template <class S> struct RasterConfig {
@@ -48,7 +51,7 @@ template <class S> struct RasterConfig {
   S scale_modifier = 1;
   S low_pass = S(kLowPass);               // px^2 added to the projected variances
   S alpha_min = 0;                        // SMoE modes: also skip alpha below this
-  S background_gate = 0;                  // lambda of kSmoe; 1 is kAlpha, but for rounding and the cuts
+  S background_gate = 0;                  // lambda of kSmoe, 0 or more; 1 is kAlpha, but for rounding and the cuts
   const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
   bool antialiasing = false;
   bool clamp_color = true;  // colours from shs are at least 0
@@ -116,8 +119,8 @@ struct StageTimes {
 
 template <class S> struct ImageOutputs {
   S* color = nullptr;          // [C, H, W]
-  S* depth = nullptr;          // [H, W], or null
-  S* inverse_depth = nullptr;  // [H, W], or null
+  S* depth = nullptr;          // [H, W], or null where the config does not ask for it
+  S* inverse_depth = nullptr;  // [H, W], likewise
   int32_t* radii = nullptr;    // [N] pixels
   S* gate_sum = nullptr;       // [H, W] the alpha image
 };

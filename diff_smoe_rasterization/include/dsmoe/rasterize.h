@@ -15,6 +15,9 @@
 // The stages that all these run are declared below in their order. They can be called one by one. Then the caller
 // allocates what `saved` points to.
 //
+// Null pointers and numbers out of range are a std::invalid_argument, which names them and what would be right. The
+// stages `count_instances`, `bin` and `blend` do not look.
+//
 // Results do not depend on config.num_threads, bit for bit.
 #pragma once
 

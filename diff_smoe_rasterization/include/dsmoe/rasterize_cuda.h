@@ -15,7 +15,9 @@
 // depth order itself instead of the tile lists. So the host never has to wait, and a captured graph stays right when
 // its inputs change.
 //
-// Errors are std::runtime_error: a launch that failed, and why.
+// A launch that failed is a std::runtime_error that says why. Null pointers and numbers out of range are a
+// std::invalid_argument, which names them and what would be right. Of the stages only `contributions`, `importance`,
+// `gate_map` and `mark_visible` look.
 #pragma once
 
 #include <cstddef>

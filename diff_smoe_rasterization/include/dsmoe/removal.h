@@ -65,6 +65,7 @@ template <class Real> DSMOE_HD Real rest_of(Real total, Real part) {
 template <BlendMode kMode, class Real>
 DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>& end, const Gate<Real>& gate,
                                    Mask<Real> wanted) {
+  static_assert(Blend<kMode>::kLaw == Law::kGates, "another law needs its own C' - C, derived as at the top");
   using S = Scalar<Real>;
   constexpr bool kSeesThrough = Blend<kMode>::kNeedsDepthOrder, kCountsWeights = Blend<kMode>::kStopsEarly;
   const Real zero = S(0), one = S(1);

@@ -265,6 +265,27 @@ TEST(Torch, SettingsOfACameraPutAGaussianWhereItIs) {
       [&] { dsmoe::settings_from_camera(K, 2 * at::eye(3, at::kDouble), t, 48, 32, at::zeros({3})); }, "R must be a");
 }
 
+TEST(Torch, SettingsOfACameraHaveTheCoresMatrices) {
+  const at::Tensor K = at::zeros({3, 3}, at::kDouble), R = at::zeros({3, 3}, at::kDouble);
+  K[0][0].fill_(40), K[1][1].fill_(50), K[0][2].fill_(20.5), K[1][2].fill_(12.5), K[2][2].fill_(1);
+  R[0][1].fill_(1), R[1][2].fill_(1), R[2][0].fill_(1);
+  const at::Tensor t = at::arange(1, 4, at::kDouble);
+  const auto settings = dsmoe::settings_from_camera(K, R, t, 48, 32, at::zeros({3}, at::kDouble), 0);
+  dsmoe::Pinhole pinhole;
+  pinhole.width = 48, pinhole.height = 32;
+  pinhole.fx = 40, pinhole.fy = 50, pinhole.cx = 20.5, pinhole.cy = 12.5;
+  pinhole.rotation = {0, 1, 0, 0, 0, 1, 1, 0, 0};
+  pinhole.translation = {1, 2, 3};
+  const auto camera = dsmoe::pinhole_camera<double>(pinhole);
+  EXPECT_EQ(settings.tanfovx, camera.tan_fov_x);
+  EXPECT_EQ(settings.tanfovy, camera.tan_fov_y);
+  for (int i = 0; i < 16; ++i) {
+    EXPECT_EQ(settings.viewmatrix.flatten()[i].item<double>(), camera.view[i]) << i;
+    EXPECT_NEAR(settings.projmatrix.flatten()[i].item<double>(), camera.projection[i], 1e-14) << i;  // below 8
+  }
+  for (int i = 0; i < 3; ++i) EXPECT_EQ(settings.campos[i].item<double>(), camera.position[i]) << i;
+}
+
 TEST(Training, ActivationsAreTorchs) {
   const at::Tensor raw[] = {at::randn({9, 1}, at::kDouble), at::randn({9, 3}, at::kDouble),
                             at::randn({9, 4}, at::kDouble)};

@@ -115,28 +115,6 @@ TEST(JsonViews, SayThatThisBuildHasNone) {
 }
 #endif
 
-TEST(View, HasTheMatricesOfItsNumbers) {
-  const Orbit orbit;
-  View view = orbit_views(orbit)[17];
-  view.fx = 900, view.fy = 800, view.cx = 600, view.cy = 400;
-  const Camera<float> camera = camera_of(view);
-  const std::array<double, 3> point = {0.2, -0.1, 0.3};
-  const std::array<double, 3> expected = seen(view, point);
-  const Vec3<float> p = {0.2f, -0.1f, 0.3f};
-  const Vec3<float> actual = transform_point(camera.view, p);
-  // All of float32's numbers here are below 2, those in pixels below 1000.
-  EXPECT_NEAR(actual.x, expected[0], 1e-6);
-  EXPECT_NEAR(actual.y, expected[1], 1e-6);
-  EXPECT_NEAR(actual.z, expected[2], 1e-6);
-  // The rasterizer's pixel centres are whole numbers, a View's lie half a pixel further.
-  const Vec2<float> pixel = project_to_pixel(camera, p);
-  EXPECT_NEAR(pixel.x, 900 * expected[0] / expected[2] + 600 - 0.5, 1e-3);
-  EXPECT_NEAR(pixel.y, 800 * expected[1] / expected[2] + 400 - 0.5, 1e-3);
-  EXPECT_NEAR(camera.tan_fov_x, 1280 / (2 * 900.0), 1e-6);
-  const std::array<double, 3> centre = seen(view, {camera.position[0], camera.position[1], camera.position[2]});
-  for (const double x : centre) EXPECT_NEAR(x, 0, 1e-6);
-}
-
 TEST(View, KeepsWhatItShowsAtAnotherSize) {
   const View view = orbit_views({})[0];
   const View half = resized(view, view.width / 2, view.height / 4);

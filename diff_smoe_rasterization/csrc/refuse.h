@@ -1,0 +1,256 @@
+// What the passes of both backends refuse: comparisons on the host, a few a call. Messages have one form: "function:
+// name is this; it must be that". A pointer is only compared with null; an array without elements may be null.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+#include <sstream>
+#include <stdexcept>
+#include <type_traits>
+
+#include "dsmoe/params.h"
+#include "dsmoe/sh.h"
+
+namespace dsmoe {
+
+template <class... Parts> [[noreturn]] void refuse(const char* function, const Parts&... parts) {
+  std::ostringstream message;
+  message << function << ": ";
+  (message << ... << parts);
+  throw std::invalid_argument(message.str());
+}
+
+// size: 0 where the array has no elements.
+inline void refuse_null(const char* function, const char* name, const void* array, const char* shape, int64_t size) {
+  if (array == nullptr && size > 0) refuse(function, name, " is null; it must point to an array ", shape);
+}
+
+template <class S> void refuse_negative(const char* function, const char* name, S value) {
+  if (value >= S(0) && value <= std::numeric_limits<S>::max()) return;
+  refuse(function, name, " is ", value, "; it must be 0 or more and finite");
+}
+
+// Whether the host may read what the pointers of a frame point to: where the camera holds its matrices.
+template <class Frame> constexpr bool kOnHost = !std::is_pointer_v<decltype(Frame::camera.view)>;
+
+// What every pass reads: the sizes, and what decides which pairs count.
+template <class Frame> void refuse_frame(const char* function, const Frame& frame) {
+  constexpr int64_t kMostGaussians = std::numeric_limits<int32_t>::max();
+  const auto& config = frame.config;
+  const int64_t count = frame.inputs.num_gaussians;
+  const int mode = static_cast<int>(config.mode);
+  if (count < 0 || count > kMostGaussians) {
+    refuse(function, "num_gaussians is ", count, "; it must be 0 to ", kMostGaussians);
+  }
+  if (frame.camera.width < 1 || frame.camera.height < 1) {
+    refuse(function, "width x height is ", frame.camera.width, " x ", frame.camera.height, "; both must be positive");
+  }
+  if (mode < 0 || mode >= BlendModes::kSize) {
+    refuse(function, "blend_mode is ", mode, "; it must be 0 to ", BlendModes::kSize - 1);
+  }
+  if (config.num_channels < 1) refuse(function, "num_channels is ", config.num_channels, "; it must be 1 or more");
+  refuse_negative(function, "alpha_min", config.alpha_min);
+  if (kOnHost<Frame> || config.background_gate_at == nullptr) {
+    refuse_negative(function, "background_gate", config.gate_of_background());
+  }
+  if (config.most_instances < 1) {
+    refuse(function, "most_instances is ", config.most_instances, "; it must be 1 or more");
+  }
+}
+
+inline void refuse_unless_one(const char* function, bool first, bool second, const char* names) {
+  if (first != second) return;
+  refuse(function, first ? "both" : "neither", " of ", names, first ? " are" : " is",
+         " given; exactly one of the two must be");
+}
+
+// Gaussians that do not say what a projection needs.
+template <class S> void refuse_inputs(const char* function, const GaussianInputs<S>& inputs, int num_channels) {
+  const int64_t count = inputs.num_gaussians;
+  if (count == 0) return;
+  refuse_null(function, "means3D", inputs.means3D, "[N, 3]", count);
+  refuse_null(function, "opacities", inputs.opacities, "[N]", count);
+  const bool dc = inputs.dc != nullptr, shs = inputs.shs != nullptr;
+  const bool scales = inputs.scales != nullptr, rotations = inputs.rotations != nullptr;
+  refuse_unless_one(function, shs || dc, inputs.colors_precomp != nullptr, "shs (or dc) and colors_precomp");
+  refuse_unless_one(function, scales || rotations, inputs.cov3D_precomp != nullptr,
+                    "scales with rotations, and cov3D_precomp,");
+  if (scales != rotations) {
+    refuse(function, scales ? "scales is given without rotations" : "rotations is given without scales",
+           "; the covariance needs both");
+  }
+  if (!shs && !dc) return;
+  if (num_channels != 3) refuse(function, "num_channels is ", num_channels, "; colours from shs have 3");
+  if (inputs.sh_degree < 0 || inputs.sh_degree > kMaxShDegree) {
+    refuse(function, "sh_degree is ", inputs.sh_degree, "; it must be 0 to ", kMaxShDegree);
+  }
+  const int in_shs = shs ? inputs.num_sh : 0, held = in_shs + dc, needed = sh_coefficients(inputs.sh_degree);
+  if (in_shs < 0 || held < needed) {
+    refuse(function, "shs has shape [", count, ", ", in_shs, ", 3]", dc ? " besides dc" : "", "; sh_degree ",
+           inputs.sh_degree, " needs ", needed, " coefficients a Gaussian, not ", held);
+  }
+}
+
+template <class Frame> void refuse_projection(const char* function, const Frame& frame) {
+  const auto& camera = frame.camera;
+  using S = std::remove_const_t<decltype(camera.near)>;
+  refuse_frame(function, frame);
+  refuse_inputs(function, frame.inputs, frame.config.num_channels);
+  for (const S tan_fov : {camera.tan_fov_x, camera.tan_fov_y}) {
+    if (tan_fov > S(0) && tan_fov <= std::numeric_limits<S>::max()) continue;
+    refuse(function, "tan_fov_x and tan_fov_y are ", camera.tan_fov_x, " and ", camera.tan_fov_y,
+           "; both must be positive and finite");
+  }
+  refuse_negative(function, "near", camera.near);
+  refuse_negative(function, "scale_modifier", frame.config.scale_modifier);
+  refuse_negative(function, "low_pass", frame.config.low_pass);
+  if constexpr (!kOnHost<Frame>) {
+    refuse_null(function, "camera.view", camera.view, "[4, 4]", 1);
+    refuse_null(function, "camera.projection", camera.projection, "[4, 4]", 1);
+    refuse_null(function, "camera.position", camera.position, "[3]", 1);
+  }
+}
+
+template <class Frame> void refuse_radii(const char* function, const Frame& frame) {
+  refuse_projection(function, frame);
+  refuse_null(function, "images.radii", frame.images.radii, "[N]", frame.inputs.num_gaussians);
+}
+
+template <class Frame> void refuse_images(const char* function, const Frame& frame) {
+  const auto& images = frame.images;
+  refuse_null(function, "background", frame.config.background, "[C]", 1);
+  refuse_null(function, "images.color", images.color, "[C, H, W]", 1);
+  refuse_null(function, "images.gate_sum", images.gate_sum, "[H, W]", 1);
+  refuse_null(function, "images.depth", images.depth, "[H, W], as config.depth is set", frame.config.depth);
+  refuse_null(function, "images.inverse_depth", images.inverse_depth, "[H, W], as config.inverse_depth is set",
+              frame.config.inverse_depth);
+  refuse_null(function, "images.radii", images.radii, "[N]", frame.inputs.num_gaussians);
+}
+
+template <class Frame> void refuse_forward(const char* function, const Frame& frame) {
+  refuse_projection(function, frame);
+  refuse_images(function, frame);
+}
+
+// Footprints that have no place, or are not there.
+template <class Frame> void refuse_footprints(const char* function, const Frame& frame) {
+  const int64_t count = frame.inputs.num_gaussians;
+  refuse_null(function, "saved.projected", frame.saved.projected, "[N]", count);
+  refuse_null(function, "saved.features", frame.saved.features, "[N, F]", count);
+}
+
+template <class Frame> void refuse_project(const char* function, const Frame& frame) {
+  refuse_radii(function, frame);
+  refuse_footprints(function, frame);
+}
+
+template <class Frame> void refuse_blend_footprints(const char* function, const Frame& frame) {
+  refuse_frame(function, frame);
+  refuse_footprints(function, frame);
+  refuse_images(function, frame);
+}
+
+// A rendering that is not as the forward pass left it. sizes: of its arrays.
+template <class Frame, class Sizes>
+void refuse_rendering(const char* function, const Frame& frame, const Sizes& sizes) {
+  auto saved = frame.saved;
+  const auto refuse_missing = [&](const char* name, const void* array, int64_t size) {
+    if (array == nullptr && size > 0) {
+      refuse(function, "saved.", name, " is null; the frame must be as the forward pass left it");
+    }
+  };
+  for_each_array(saved, sizes, refuse_missing);
+  refuse_missing("gate_sum", saved.gate_sum, 1);
+  refuse_null(function, "background", frame.config.background, "[C]", 1);
+  refuse_null(function, "images.radii", frame.images.radii, "[N]", frame.inputs.num_gaussians);
+}
+
+// Gradients by images that are not there.
+template <class Frame, class S>
+void refuse_gradients(const char* function, const Frame& frame, const ImageGradients<S>& gradients) {
+  const auto& config = frame.config;
+  const auto& images = frame.images;
+  refuse_null(function, "images.color", images.color, "[C, H, W], as its gradient is given",
+              gradients.color != nullptr);
+  refuse_null(function, "images.depth", images.depth, "[H, W], as its gradient is given",
+              config.depth && gradients.depth != nullptr);
+  refuse_null(function, "images.inverse_depth", images.inverse_depth, "[H, W], as its gradient is given",
+              config.inverse_depth && gradients.inverse_depth != nullptr);
+}
+
+template <class Frame, class S, class Sizes>
+void refuse_backward(const char* function, const Frame& frame, const ImageGradients<S>& gradients, const Sizes& sizes) {
+  refuse_projection(function, frame);
+  refuse_rendering(function, frame, sizes);
+  refuse_gradients(function, frame, gradients);
+}
+
+template <class Frame, class S, class Sizes>
+void refuse_blend_backward(const char* function, const Frame& frame, const ImageGradients<S>& gradients,
+                           const FootprintGradients<S>& footprints, const Sizes& sizes) {
+  refuse_frame(function, frame);
+  refuse_rendering(function, frame, sizes);
+  refuse_gradients(function, frame, gradients);
+  refuse_null(function, "records", footprints.records, "[N, 6 + F]", frame.inputs.num_gaussians);
+}
+
+template <class Frame, class S>
+void refuse_project_backward(const char* function, const Frame& frame, const FootprintGradients<S>& footprints) {
+  const int64_t count = frame.inputs.num_gaussians;
+  refuse_radii(function, frame);
+  refuse_null(function, "saved.features", frame.saved.features, "[N, F]", count);
+  refuse_null(function, "records", footprints.records, "[N, 6 + F]", count);
+}
+
+// A rendering whose lists cannot be walked.
+template <class Frame> void refuse_walk(const char* function, const Frame& frame) {
+  const int64_t count = frame.inputs.num_gaussians;
+  refuse_frame(function, frame);
+  refuse_null(function, "saved.projected", frame.saved.projected, "[N]", count);
+  refuse_null(function, "saved.tile_offsets", frame.saved.tile_offsets, "[tiles + 1]", 1);
+  refuse_null(function, "saved.last_contributor", frame.saved.last_contributor, "[H, W]", 1);
+  const bool reads_radii = !kOnHost<Frame> || frame.saved.instances == nullptr;
+  refuse_null(function, "images.radii", frame.images.radii, "[N]", reads_radii ? count : 0);
+}
+
+template <class Frame, class S>
+void refuse_contributions(const char* function, const Frame& frame, const ContributionMap<S>& map) {
+  const int64_t count = frame.inputs.num_gaussians;
+  refuse_walk(function, frame);
+  refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
+  refuse_null(function, "sums.pixel_weights", map.sums.pixel_weights, "[N]", count);
+  refuse_null(function, "sums.pixels", map.sums.pixels, "[N]", count);
+  refuse_null(function, "sums.blend_weights", map.sums.blend_weights, "[N]", count);
+  refuse_null(function, "sums.distances", map.sums.distances, "[N]", count);
+}
+
+template <class Frame, class S>
+void refuse_importance(const char* function, const Frame& frame, const ImportanceMap<S>& map) {
+  const int64_t count = frame.inputs.num_gaussians;
+  refuse_walk(function, frame);
+  refuse_footprints(function, frame);
+  refuse_null(function, "background", frame.config.background, "[C]", 1);
+  refuse_null(function, "saved.final_transmittance", frame.saved.final_transmittance, "[H, W]", 1);
+  refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", 1);
+  refuse_null(function, "color", map.color, "[C, H, W]", 1);
+  refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
+  refuse_null(function, "share_weights", map.share_weights, "[H, W]", 1);
+  refuse_null(function, "sums.shares", map.sums.shares, "[N]", count);
+  refuse_null(function, "sums.squared_shares", map.sums.squared_shares, "[N]", count);
+  refuse_null(function, "sums.removal_costs", map.sums.removal_costs, "[N]", count);
+}
+
+template <class Frame> void refuse_gate_map(const char* function, const Frame& frame, const GateMap& map) {
+  refuse_walk(function, frame);
+  refuse_null(function, "gaussians", map.gaussians, "[H, W]", 1);
+  refuse_null(function, "counts", map.counts, "[H, W]", 1);
+}
+
+template <class Frame> void refuse_mark_visible(const char* function, const Frame& frame, const bool* visible) {
+  const int64_t count = frame.inputs.num_gaussians;
+  refuse_null(function, "means3D", frame.inputs.means3D, "[N, 3]", count);
+  refuse_null(function, "camera.view", frame.camera.view, "[4, 4]", count);
+  refuse_null(function, "visible", visible, "[N]", count);
+}
+
+}  // namespace dsmoe

@@ -1,0 +1,221 @@
+// What the passes refuse, and what their messages say.
+#include "refuse.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <functional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "dsmoe/rasterize_cuda.h"
+#include "test_scene.h"
+
+namespace dsmoe {
+namespace {
+
+void expect_refusal(const std::function<void()>& call, const std::string& message) {
+  try {
+    call();
+    ADD_FAILURE() << "nothing was thrown; expected: " << message;
+  } catch (const std::invalid_argument& error) {
+    EXPECT_EQ(error.what(), message);
+  }
+}
+
+Scene<float> scene_with_depths() {
+  Scene<float> scene = convert<float>(make_scene(1, 20, 37, 29));
+  scene.config.depth = scene.config.inverse_depth = true;
+  return scene;
+}
+
+template <class Frame> struct Case {
+  std::function<void(Frame&)> spoil;
+  const char* problem;
+};
+
+// What is wrong with a rendering before it begins; pointers of both backends.
+template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
+  static const float number = 1;
+  return {
+      {[](auto& f) { f.inputs.num_gaussians = -1; }, "num_gaussians is -1; it must be 0 to 2147483647"},
+      {[](auto& f) { f.camera.width = 0; }, "width x height is 0 x 29; both must be positive"},
+      {[](auto& f) { f.camera.height = -4; }, "width x height is 37 x -4; both must be positive"},
+      {[](auto& f) { f.config.mode = static_cast<BlendMode>(4); }, "blend_mode is 4; it must be 0 to 3"},
+      {[](auto& f) { f.config.mode = static_cast<BlendMode>(-1); }, "blend_mode is -1; it must be 0 to 3"},
+      {[](auto& f) { f.config.num_channels = 0; }, "num_channels is 0; it must be 1 or more"},
+      {[](auto& f) { f.config.alpha_min = -0.5f; }, "alpha_min is -0.5; it must be 0 or more and finite"},
+      {[](auto& f) { f.config.background_gate_at = nullptr, f.config.background_gate = -0.1f; },
+       "background_gate is -0.1; it must be 0 or more and finite"},
+      {[](auto& f) { f.config.most_instances = 0; }, "most_instances is 0; it must be 1 or more"},
+      {[](auto& f) { f.inputs.means3D = nullptr; }, "means3D is null; it must point to an array [N, 3]"},
+      {[](auto& f) { f.inputs.opacities = nullptr; }, "opacities is null; it must point to an array [N]"},
+      {[](auto& f) { f.inputs.shs = nullptr; },
+       "neither of shs (or dc) and colors_precomp is given; exactly one of the two must be"},
+      {[](auto& f) { f.inputs.colors_precomp = &number; },
+       "both of shs (or dc) and colors_precomp are given; exactly one of the two must be"},
+      {[](auto& f) { f.inputs.scales = f.inputs.rotations = nullptr; },
+       "neither of scales with rotations, and cov3D_precomp, is given; exactly one of the two must be"},
+      {[](auto& f) { f.inputs.cov3D_precomp = &number; },
+       "both of scales with rotations, and cov3D_precomp, are given; exactly one of the two must be"},
+      {[](auto& f) { f.inputs.rotations = nullptr; }, "scales is given without rotations; the covariance needs both"},
+      {[](auto& f) { f.inputs.scales = nullptr; }, "rotations is given without scales; the covariance needs both"},
+      {[](auto& f) { f.config.num_channels = 4; }, "num_channels is 4; colours from shs have 3"},
+      {[](auto& f) { f.inputs.sh_degree = 4; }, "sh_degree is 4; it must be 0 to 3"},
+      {[](auto& f) { f.inputs.sh_degree = -1; }, "sh_degree is -1; it must be 0 to 3"},
+      {[](auto& f) { f.inputs.sh_degree = 2; },
+       "shs has shape [20, 4, 3]; sh_degree 2 needs 9 coefficients a Gaussian, not 4"},
+      {[](auto& f) { f.inputs.dc = &number, f.inputs.num_sh = 2; },
+       "shs has shape [20, 2, 3] besides dc; sh_degree 1 needs 4 coefficients a Gaussian, not 3"},
+      {[](auto& f) { f.camera.tan_fov_y = 0; },
+       "tan_fov_x and tan_fov_y are 0.6 and 0; both must be positive and finite"},
+      {[](auto& f) { f.camera.near = NAN; }, "near is nan; it must be 0 or more and finite"},
+      {[](auto& f) { f.config.scale_modifier = -2; }, "scale_modifier is -2; it must be 0 or more and finite"},
+      {[](auto& f) { f.config.low_pass = HUGE_VALF; }, "low_pass is inf; it must be 0 or more and finite"},
+      {[](auto& f) { f.config.background = nullptr; }, "background is null; it must point to an array [C]"},
+      {[](auto& f) { f.images.color = nullptr; }, "images.color is null; it must point to an array [C, H, W]"},
+      {[](auto& f) { f.images.gate_sum = nullptr; }, "images.gate_sum is null; it must point to an array [H, W]"},
+      {[](auto& f) { f.images.depth = nullptr; },
+       "images.depth is null; it must point to an array [H, W], as config.depth is set"},
+      {[](auto& f) { f.images.inverse_depth = nullptr; },
+       "images.inverse_depth is null; it must point to an array [H, W], as config.inverse_depth is set"},
+      {[](auto& f) { f.images.radii = nullptr; }, "images.radii is null; it must point to an array [N]"}};
+}
+
+TEST(Refuse, AForwardPassOnTheCpuNamesWhatIsWrong) {
+  using Frame = cpu::Frame<float>;
+  const Scene<float> scene = scene_with_depths();
+  Rendering<float> rendering(scene);
+  auto cases = cases_of_forward<Frame>();
+  const float negative = -1;
+  cases.push_back({[&](Frame& f) { f.config.background_gate_at = &negative; },
+                   "background_gate is -1; it must be 0 or more and finite"});
+  for (const auto& c : cases) {
+    Frame frame = frame_of(scene, rendering);
+    c.spoil(frame);
+    cpu::Heap heap;
+    expect_refusal([&] { cpu::forward(frame, heap); }, std::string("cpu::forward: ") + c.problem);
+  }
+}
+
+TEST(Refuse, AFrameOfDevicePointersIsHeldToTheSame) {
+  using Frame = cuda::Frame<float>;
+  const Scene<float> scene = scene_with_depths();
+  Rendering<float> rendering(scene);
+  auto cases = cases_of_forward<Frame>();
+  cases.push_back({[](Frame& f) { f.camera.view = nullptr; }, "camera.view is null; it must point to an array [4, 4]"});
+  cases.push_back(
+      {[](Frame& f) { f.camera.projection = nullptr; }, "camera.projection is null; it must point to an array [4, 4]"});
+  cases.push_back(
+      {[](Frame& f) { f.camera.position = nullptr; }, "camera.position is null; it must point to an array [3]"});
+  Frame good;
+  good.inputs = scene.inputs(), good.config = scene.raster_config(), good.images = rendering.images();
+  good.config.background_gate_at = reinterpret_cast<const float*>(8);  // of the device: the host must not read it
+  good.camera.width = 37, good.camera.height = 29;
+  good.camera.tan_fov_x = good.camera.tan_fov_y = 0.6f;
+  good.camera.view = scene.camera.view, good.camera.projection = scene.camera.projection;
+  good.camera.position = scene.camera.position;
+  EXPECT_NO_THROW(refuse_forward("cuda::forward", good));
+  for (const auto& c : cases) {
+    Frame frame = good;
+    c.spoil(frame);
+    expect_refusal([&] { refuse_forward("cuda::forward", frame); }, std::string("cuda::forward: ") + c.problem);
+  }
+}
+
+TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
+  using Frame = cpu::Frame<float>;
+  const Scene<float> scene = scene_with_depths();
+  Rendering<float> rendering = render(scene);
+  const ImageWeights<float> weights(scene, 2);
+  std::vector<float> records(scene.count * (kNumGateGradients + 5)), numbers(scene.pixels() * 3 + scene.count);
+  std::vector<int32_t> integers(scene.pixels() + scene.count);
+  const FootprintGradients<float> given = {records.data(), nullptr};
+  const ContributionMap<float> sums = {numbers.data(),
+                                       {numbers.data(), integers.data(), numbers.data(), numbers.data()}};
+  const ImportanceMap<float> worth = {
+      numbers.data(), numbers.data(), numbers.data(), {numbers.data(), numbers.data(), numbers.data()}};
+  const GateMap gates = {integers.data(), integers.data()};
+  bool visible[20];
+  cpu::Heap heap;
+  const auto forget = [](auto value, auto member) {
+    value.*member = nullptr;
+    return value;
+  };
+  struct {
+    std::function<void(Frame&)> call;
+    const char* message;
+  } const cases[] = {
+      {[&](Frame& f) { f.saved.features = nullptr, cpu::project(f); },
+       "cpu::project: saved.features is null; it must point to an array [N, F]"},
+      {[&](Frame& f) { f.images.radii = nullptr, cpu::radii(f, heap); },
+       "cpu::radii: images.radii is null; it must point to an array [N]"},
+      {[&](Frame& f) { f.saved.projected = nullptr, cpu::blend_footprints(f, heap); },
+       "cpu::blend_footprints: saved.projected is null; it must point to an array [N]"},
+      {[&](Frame& f) {
+         f.saved.tile_offsets = nullptr, cpu::backward(f, {weights.gradients(), {}});
+       },
+       "cpu::backward: saved.tile_offsets is null; the frame must be as the forward pass left it"},
+      {[&](Frame& f) {
+         f.saved.gate_sum = nullptr, cpu::backward(f, {weights.gradients(), {}});
+       },
+       "cpu::backward: saved.gate_sum is null; the frame must be as the forward pass left it"},
+      {[&](Frame& f) {
+         f.images.color = nullptr, cpu::backward(f, {weights.gradients(), {}});
+       },
+       "cpu::backward: images.color is null; it must point to an array [C, H, W], as its gradient is given"},
+      {[&](Frame& f) {
+         f.images.depth = nullptr, cpu::backward(f, {weights.gradients(), {}});
+       },
+       "cpu::backward: images.depth is null; it must point to an array [H, W], as its gradient is given"},
+      {[&](Frame& f) {
+         cpu::blend_footprints_backward(f, {weights.gradients(), {}}, {});
+       },
+       "cpu::blend_footprints_backward: records is null; it must point to an array [N, 6 + F]"},
+      {[&](Frame& f) { cpu::project_backward(f, {}, {}); },
+       "cpu::project_backward: records is null; it must point to an array [N, 6 + F]"},
+      {[&](Frame& f) { f.saved.features = nullptr, cpu::project_backward(f, given, {}); },
+       "cpu::project_backward: saved.features is null; it must point to an array [N, F]"},
+      {[&](Frame& f) { cpu::contributions(f, forget(sums, &ContributionMap<float>::pixel_weights)); },
+       "cpu::contributions: pixel_weights is null; it must point to an array [H, W]"},
+      {[&](Frame& f) { f.saved.last_contributor = nullptr, cpu::contributions(f, sums); },
+       "cpu::contributions: saved.last_contributor is null; it must point to an array [H, W]"},
+      {[&](Frame& f) { cpu::importance(f, forget(worth, &ImportanceMap<float>::color)); },
+       "cpu::importance: color is null; it must point to an array [C, H, W]"},
+      {[&](Frame& f) { cpu::gate_map(f, forget(gates, &GateMap::counts)); },
+       "cpu::gate_map: counts is null; it must point to an array [H, W]"},
+      {[&](Frame& f) { f.inputs.means3D = nullptr, cpu::mark_visible(f, visible); },
+       "cpu::mark_visible: means3D is null; it must point to an array [N, 3]"},
+      {[&](Frame& f) { f.inputs.opacities = nullptr, cpu::first_non_finite(f.inputs, 3); },
+       "cpu::first_non_finite: opacities is null; it must point to an array [N]"}};
+  for (const auto& c : cases) {
+    Frame frame = frame_of(scene, rendering);
+    expect_refusal([&] { c.call(frame); }, c.message);
+  }
+}
+
+TEST(Refuse, WhatMayBeNullIsNotRefused) {
+  Scene<float> scene = convert<float>(make_scene(2, 20, 37, 29));
+  Rendering<float> rendering(scene);
+  cpu::Frame<float> frame = frame_of(scene, rendering);
+  cpu::Heap heap;
+  EXPECT_NO_THROW(cpu::forward(frame, heap));
+  EXPECT_NO_THROW(cpu::backward(frame, {}));
+  frame.images.color = nullptr;  // no gradient by the colour is given
+  EXPECT_NO_THROW(cpu::backward(frame, {}));
+
+  Scene<float> nothing = scene;
+  nothing.count = 0;
+  for (auto* values : {&nothing.means3D, &nothing.opacities, &nothing.scales, &nothing.rotations, &nothing.shs}) {
+    values->clear();
+  }
+  Rendering<float> empty(nothing);
+  frame = frame_of(nothing, empty);
+  frame.images.radii = nullptr;
+  EXPECT_NO_THROW(cpu::forward(frame, heap));
+  EXPECT_NO_THROW(cpu::backward(frame, {}));
+}
+
+}  // namespace
+}  // namespace dsmoe
