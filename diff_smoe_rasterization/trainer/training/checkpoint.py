@@ -16,7 +16,7 @@ CHECKPOINT_NAME = "checkpoint.pt"
 TENSOR = "__tensor__"  # marks where a tensor was
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
-FORMAT = 3  # raised when the content changes so that older files cannot be resumed
+FORMAT = 4  # raised when the content changes so that older files cannot be resumed
 
 
 def save_checkpoint(path: str, state: Dict[str, Any]) -> None:
@@ -37,7 +37,7 @@ def load_checkpoint(path: str, device: str) -> Dict[str, Any]:
                 raise zipfile.BadZipFile
         content = torch.load(path, map_location=device, weights_only=True)
         if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise TrainerError(f"{path}: a checkpoint of another version; it cannot be resumed")
+            raise TrainerError(f"{path}: a checkpoint of another version; finish the run with that one, or begin anew")
         return _with_tensors(json.loads(content["plain"]), content["tensors"])
 
 
