@@ -96,8 +96,8 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
   using S = std::remove_const_t<decltype(camera.near)>;
   refuse_frame(function, frame);
   refuse_inputs(function, frame.inputs, frame.config.num_channels);
-  for (const S tan_fov : {camera.tan_fov_x, camera.tan_fov_y}) {
-    if (tan_fov > S(0) && tan_fov <= std::numeric_limits<S>::max()) continue;
+  const auto is_field_of_view = [](S tangent) { return tangent > S(0) && tangent <= std::numeric_limits<S>::max(); };
+  if (!is_field_of_view(camera.tan_fov_x) || !is_field_of_view(camera.tan_fov_y)) {
     refuse(function, "tan_fov_x and tan_fov_y are ", camera.tan_fov_x, " and ", camera.tan_fov_y,
            "; both must be positive and finite");
   }

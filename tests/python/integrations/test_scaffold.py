@@ -105,5 +105,5 @@ def test_the_shape_is_given_once():
     covariance = torch.ones(12, 6, dtype=torch.float64)
     for shape in ({}, {"scales": scene.inputs["scales"]},
                   {**shape_of(scene, "scales", "rotations"), "cov3D_precomp": covariance}):
-        with pytest.raises(ValueError, match="rasterize: .*scales"):
+        with pytest.raises(ValueError, match="radii: .*scales"):
             rasterizer.visible_filter(means3D, **shape)
