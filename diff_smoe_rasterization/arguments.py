@@ -55,6 +55,7 @@ def tensor_checks(function, first_name, first):
     """Returns functions that pass a required and an optional tensor on, and refuse what torch cannot dispatch.
 
     Those are values that are no tensors and tensors on different devices; the ops refuse wrong shapes and types.
+    function: the one that errors name. first: the tensor on whose device all others have to be.
     """
     def required(name, value):
         if not isinstance(value, torch.Tensor):

@@ -37,7 +37,8 @@ def load_checkpoint(path: str, device: str) -> Dict[str, Any]:
                 raise zipfile.BadZipFile
         content = torch.load(path, map_location=device, weights_only=True)
         if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise TrainerError(f"{path}: a checkpoint of another version; finish the run with that one, or begin anew")
+            raise TrainerError(f"{path}: a checkpoint of another version; finish the run with that version, or "
+                               "begin anew with --overwrite")
         return _with_tensors(json.loads(content["plain"]), content["tensors"])
 
 

@@ -170,7 +170,8 @@ class GateStrategy(SteadyStrategy):
         """Adds what each Gaussian is worth to one rendering."""
         error = (color.detach() - as_float(target)).square().sum(0)
         mask = view.mask_float()
-        importance = splats.importance(*((None, error) if mask is None else (mask[0], mask[0] * error)))
+        weights = None if mask is None else mask[0]
+        importance = splats.importance(weights, error if weights is None else weights * error)
         self.costs += importance.removal_costs
         self.errors += importance.shares
         group = self.sought.get(view.camera.name)
@@ -194,6 +195,7 @@ class GateStrategy(SteadyStrategy):
         views = self.context.views
         count = min(self.options.views, len(views))
         first = int(torch.randint(len(views), ()))
+        # The group of each view, by name. A look at a view takes out its group.
         self.sought = {views[(first + i) % len(views)].camera.name: i * count // len(views) for i in range(len(views))}
 
     def state_dict(self) -> Dict[str, Any]:

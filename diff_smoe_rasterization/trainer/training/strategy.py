@@ -119,7 +119,7 @@ class Strategy:
         self.context = context
 
     def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-        """The loss of a rendering, and its gradient by the image."""
+        """The loss of a rendering [3, H, W], and its gradient by it. target: floats, or bytes of 255ths."""
         return l1_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim)
 
     def before_backward(self, step: AnyStep) -> None:

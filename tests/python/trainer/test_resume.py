@@ -326,7 +326,7 @@ def test_a_damaged_checkpoint_is_named(tiny_config, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "SAFE_LOAD", False)
     refused("remove it.*load no stranger")
     torch.save({"format": -1}, path)
-    refused("another version")
+    refused("another version; finish the run with that version, or begin anew with --overwrite")
     tiny_config.save(tiny_config.output)
     save_checkpoint(os.path.join(tiny_config.output, "checkpoint.pt"), {"config": {}})
     with pytest.raises(TrainerError, match="checkpoint.pt: not a readable checkpoint"):
