@@ -124,6 +124,24 @@ def test_a_decision_looks_once_at_each_of_its_views(tiny_config, monkeypatch):
     assert len(log) > len(decisions), "some by the steps' own renderings"
 
 
+def test_a_decision_looks_at_the_first_of_each_group_of_neighbours(tiny_config):
+    """Views of a circle, from a random one on, in four groups: only the first view that is looked at counts."""
+    strategy = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options="views=4").strategy
+    views, beginnings = strategy.context.views, set()
+    for _ in range(30):
+        strategy._forget_looks()
+        groups = [strategy.sought[view.camera.name] for view in views]
+        first = next(i for i in range(len(views)) if groups[i] == 0 and groups[i - 1] != 0)
+        beginnings.add(first)
+        in_order = groups[first:] + groups[:first]
+        sizes = [in_order.count(group) for group in range(4)]
+        assert in_order == sorted(in_order) and max(sizes) - min(sizes) <= 1 < max(sizes)
+        splats = SimpleNamespace(importance=lambda *_: SimpleNamespace(removal_costs=0, shares=0))
+        strategy._look(views[first], views[first].image, views[first].image_float(), splats)
+        assert strategy.sought == {view.camera.name: group for view, group in zip(views, groups) if group}
+    assert len(beginnings) > 2
+
+
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
     """The cost of a Gaussian, and all errors together, against renderings of all training views."""
