@@ -251,7 +251,7 @@ class TrainConfig:
         for option in dataclasses.fields(self):
             mine, theirs = getattr(self, option.name), getattr(later, option.name)
             if option.name not in harmless and mine != theirs:
-                texts.append(f"{_flag(option)} is {mine!r} here and {theirs!r} there")
+                texts.append(f"{_flag(option)} is {mine!r}, not {theirs!r}")
         return texts
 
 

@@ -215,7 +215,7 @@ class Trainer:
         if differences:
             raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
         for name, here in scene_fingerprint(self.scene).items():
-            there = state["scene"].get(name, 0)  # an earlier version knew no masks
+            there = state["scene"][name]
             if here != there:
                 raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
                                    f"and {here} in {self.config.scene}")
@@ -250,7 +250,7 @@ class Run:
             state = load_checkpoint(path, self.trainer.checkpoint_device)
             self.trainer.load_state_dict(state)
             self.history = list(state["history"])
-            self.losses = [(int(iteration), float(loss)) for iteration, loss in state.get("losses", [])]
+            self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations and self.trainer.leads:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "

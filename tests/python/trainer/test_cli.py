@@ -395,7 +395,7 @@ def test_resume_of_a_folder_alone_has_the_options_of_the_run(trained, tmp_path, 
     assert main(["train", "--quiet", *words, output]) == 0
     with open(ply_of(output), "rb") as mine, open(ply_of(trained), "rb") as theirs:
         assert mine.read() == theirs.read()
-    assert "--seed is 0 here and 7 there" in fails(capsys, "train", *words, output, "--seed", "7")
+    assert "--seed is 0, not 7" in fails(capsys, "train", *words, output, "--seed", "7")
     assert "config.json" in fails(capsys, "train", *words, str(tmp_path / "none"))
     with pytest.raises(SystemExit):
         main(["train", "-o", output])
@@ -423,7 +423,7 @@ def test_more_iterations_extend_a_run(trained, scene, tmp_path, capsys, monkeypa
     assert models[0] == models[1] != models[2], "what had ended had left out its last step"
     assert os.path.isfile(ply_of(ended))
     text = fails(capsys, "train", "--resume", "-o", ended, "--iterations", "12")
-    assert "--iterations is 20 here and 12 there" in text
+    assert "--iterations is 20, not 12" in text
     assert main(["train", scene, "-o", ended, *SMOE, "--overwrite"]) == 0
     assert os.listdir(os.path.join(ended, "point_cloud")) == ["iteration_12"], "nothing of the old run outlives it"
 

@@ -154,7 +154,7 @@ def test_differences_ignore_where_and_when_things_are_written():
     one = TrainConfig(scene="a", output="b", seed=1, checkpoint_every=5)
     assert one.differences(TrainConfig(scene="c", output="d", seed=1, eval_every=7)) == []
     texts = one.differences(TrainConfig(seed=2, blend_mode="smoe"))
-    assert len(texts) == 3 and any("--seed is 1 here and 2 there" in text for text in texts)
+    assert len(texts) == 3 and any("--seed is 1, not 2" in text for text in texts)
 
 
 def test_shortened_keeps_the_shares_of_the_recipe():

@@ -76,18 +76,6 @@ def test_a_learned_gate_and_random_backgrounds_resume_bit_for_bit(tiny_config, t
     assert (resumed["psnr"], resumed["background_gate"]) == (row["psnr"], row["background_gate"])
 
 
-def test_a_checkpoint_of_a_version_without_gate_and_masks_is_one_of_the_paper(tiny_config):
-    config = tiny_config.changed(background_gate=0.0, iterations=2)
-    row = train(config, progress=False)
-    path = os.path.join(config.output, "checkpoint.pt")
-    state = load_checkpoint(path, "cpu")
-    del state["gate"], state["scene"]["number of masks"], state["config"]["background_gate"]
-    save_checkpoint(path, state)
-    assert train(config, resume=True, progress=False)["psnr"] == row["psnr"]
-    with pytest.raises(TrainerError, match="--background-gate is 0.0 .* 0.05"):
-        train(config.changed(background_gate=0.05), resume=True, progress=False)
-
-
 def test_resume_before_the_first_checkpoint_starts_anew(tiny_config, tmp_path, monkeypatch, capsys):
     straight = dataclasses.replace(tiny_config, output=str(tmp_path / "straight"))
     train(straight, progress=False)
@@ -209,7 +197,7 @@ def test_a_killed_overwriting_run_leaves_nothing_of_the_old_one(tiny_config, mon
 
 def test_other_options_cannot_be_resumed(tiny_config):
     train(tiny_config, progress=False)
-    with pytest.raises(TrainerError, match="--seed is 0 .* 1 "):
+    with pytest.raises(TrainerError, match="--seed is 0, not 1$"):
         train(dataclasses.replace(tiny_config, seed=1), resume=True, progress=False)
     with pytest.raises(TrainerError, match="--blend-mode"):
         train(tiny_config.changed(blend_mode="alpha"), resume=True, progress=False)
