@@ -44,7 +44,7 @@ def parse_gate_options(text: str) -> GateOptions:
     known = {option.name: option for option in dataclasses.fields(GateOptions)}
     values = {}
     for part in filter(None, text.split(",")):
-        name, _, value = part.partition("=")
+        name, _, value = part.strip().partition("=")
         if name not in known:
             raise ConfigError(f"--strategy-options: {name!r} is unknown; it may name {', '.join(known)}")
         try:
@@ -55,3 +55,8 @@ def parse_gate_options(text: str) -> GateOptions:
             raise ConfigError(f"--strategy-options: {name} is {value}; it must be "
                               f"{known[name].metadata['requirement']}")
     return GateOptions(**values)
+
+
+def gate_settings(options: GateOptions) -> str:
+    """All settings, as `parse_gate_options` takes them."""
+    return ",".join(f"{name}={value:g}" for name, value in dataclasses.asdict(options).items())

@@ -148,6 +148,11 @@ class GaussianOptimizer:
         """The learning rate of positions in this step, world units."""
         return self.group("means3D")["lr"]
 
+    def scale_rate(self, name: str, factor: float) -> None:
+        """Multiplies what the options say of one learning rate, which is not the positions'."""
+        self.rates[name] *= factor
+        self.group(name)["lr"] = self.rates[name]
+
     def scale_other_rates(self, factor: float) -> None:
         """Sets the learning rates of all but the positions to a part of what the options say."""
         for name in PARAMETERS[1:]:

@@ -7,6 +7,7 @@ from typing import Any, Dict, List, Optional, Union
 
 from ..config import LEARNED, TrainConfig
 from ..errors import TrainerError
+from ..gate_options import gate_settings, parse_gate_options
 from ..scenes.images import DOWNSCALER
 from ..scenes.scene import Scene
 from ..system.environment import machine, versions
@@ -34,8 +35,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["deterministic"] = True
     if config.budget:
         unusual["budget"] = config.budget
-    if config.strategy_options:
-        unusual["strategy_options"] = config.strategy_options
+    if config.schedule == "gate":  # with the defaults of this version
+        unusual["strategy_options"] = gate_settings(parse_gate_options(config.strategy_options))
     if config.random_background:
         unusual["random_background"] = True
     if views[0].mask is not None:

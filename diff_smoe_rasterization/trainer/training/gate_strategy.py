@@ -44,8 +44,7 @@ class GateStrategy(SteadyStrategy):
         config = context.config
         self.options = parse_gate_options(config.strategy_options)
         super().__init__(context)
-        context.optimizer.rates["shs"] *= self.options.bands
-        context.optimizer.scale_other_rates(1.0)
+        context.optimizer.scale_rate("shs", self.options.bands)
         self.start = context.model.num_gaussians
         until = config.densify_until_iter
         self.growth_ends = round(GROWTH_ENDS * until)

@@ -13,6 +13,7 @@ from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.losses import fused_ssim
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import ConfigError
+from diff_smoe_rasterization.trainer.gate_options import gate_settings, parse_gate_options
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.training.loop import Trainer, train
 from diff_smoe_rasterization.trainer.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
@@ -91,6 +92,8 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, kille
     (_, row), _ = killed_and_resumed(tiny_config, tmp_path, killed_at, schedule=schedule, budget=120,
                                      densification_interval=4, strategy_options=settings)
     assert row["num_gaussians"] == 120
+    recorded = row["protocol"].get("strategy_options")
+    assert recorded is None if schedule == "mcmc" else (settings or "removals=16,views=96") in recorded
 
 
 def looking(trainer, monkeypatch):
@@ -313,7 +316,9 @@ def test_settings_of_gate_are_checked(text, words):
 
 
 def test_settings_of_gate_are_of_gate_only():
-    assert TrainConfig(budget=60, strategy_options="overshoot=0,moves=0,worth=0,removals=1,views=1").validate()
+    text = "overshoot=0,removals=1,views=1,moves=0,worth=0,bands=1,anneal=0.5,squares=0"
+    assert TrainConfig(budget=60, strategy_options=text.replace(",", ", ")).validate()
+    assert gate_settings(parse_gate_options(text)) == text
     with pytest.raises(ConfigError, match="--strategy-options is 'views=3'; it must be left out with --strategy mcmc"):
         TrainConfig(budget=60, schedule="mcmc", strategy_options="views=3").validate()
     config = TrainConfig(budget=60, strategy_options="views=3")
