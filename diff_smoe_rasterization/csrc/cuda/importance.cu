@@ -131,8 +131,8 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
         const S feature = kChannels != kAnyFeatures ? gaussian.features[c] : features[c];
         const S value = pixels.channels.value(arguments, tile, k, c), distance = feature - value;
         const S front = pixels.channels.front(arguments, tile, k, c);
-        const S motion = channel_motion<kMode>(removal, distance, front, value);
-        squared = fma(motion, motion, squared);
+        const S change = channel_change<kMode>(removal, distance, front, value);
+        squared = fma(change, change, squared);
         pixels.channels.set_front(arguments, tile, k, c, fma(removal.weight, distance, front));
       }
       add_pair(sum, removal, squared, pixels.alone[k], pixels.share_weight[k], pixels.weight[k]);
