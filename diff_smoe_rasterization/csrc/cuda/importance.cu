@@ -155,7 +155,8 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
   ImportanceRow<S>* row;  // for the next Gaussian
 };
 
-// Whether a warp may begin at a segment: what lies in front of it is known there by T.
+// Whether a warp may begin at a segment: what lies in front of it is known there by T. But W = 1 - T loses its digits
+// where it is small, and with it the cost of a pair that nothing is behind.
 template <class S, BlendMode kMode, int kChannels>
 constexpr bool kWeighsSegments = kWalksSegments<S, kChannels>&& Blend<kMode>::kStopsEarly;
 
