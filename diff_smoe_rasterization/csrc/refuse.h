@@ -33,6 +33,9 @@ template <class S> void refuse_negative(const char* function, const char* name, 
 // Whether the host may read what the pointers of a frame point to: where the camera holds its matrices.
 template <class Frame> constexpr bool kOnHost = !std::is_pointer_v<decltype(Frame::camera.view)>;
 
+// The shape of saved.features.
+template <class Frame> constexpr const char* kFeatureShape = kOnHost<Frame> ? "[N, F]" : "[N, feature_stride(F)]";
+
 // What every pass reads: the sizes, and what decides which pairs count.
 template <class Frame> void refuse_frame(const char* function, const Frame& frame) {
   constexpr int64_t kMostGaussians = std::numeric_limits<int32_t>::max();
@@ -136,7 +139,7 @@ template <class Frame> void refuse_forward(const char* function, const Frame& fr
 template <class Frame> void refuse_footprints(const char* function, const Frame& frame) {
   const int64_t count = frame.inputs.num_gaussians;
   refuse_null(function, "saved.projected", frame.saved.projected, "[N]", count);
-  refuse_null(function, "saved.features", frame.saved.features, "[N, F]", count);
+  refuse_null(function, "saved.features", frame.saved.features, kFeatureShape<Frame>, count);
 }
 
 template <class Frame> void refuse_project(const char* function, const Frame& frame) {
@@ -198,8 +201,16 @@ template <class Frame, class S>
 void refuse_project_backward(const char* function, const Frame& frame, const FootprintGradients<S>& footprints) {
   const int64_t count = frame.inputs.num_gaussians;
   refuse_radii(function, frame);
-  refuse_null(function, "saved.features", frame.saved.features, "[N, F]", count);
+  refuse_null(function, "saved.features", frame.saved.features, kFeatureShape<Frame>, count);
   refuse_null(function, "records", footprints.records, "[N, 6 + F]", count);
+}
+
+// Sums by instance that have no place.
+template <class Frame> void refuse_instance_sums(const char* function, const Frame& frame) {
+  if constexpr (kOnHost<Frame>) {
+    refuse_null(function, "saved.instance_offsets", frame.saved.instance_offsets, "[N + 1]",
+                frame.saved.instances != nullptr);
+  }
 }
 
 // A rendering whose lists cannot be walked.
@@ -209,7 +220,17 @@ template <class Frame> void refuse_walk(const char* function, const Frame& frame
   refuse_null(function, "saved.projected", frame.saved.projected, "[N]", count);
   refuse_null(function, "saved.tile_offsets", frame.saved.tile_offsets, "[tiles + 1]", 1);
   refuse_null(function, "saved.last_contributor", frame.saved.last_contributor, "[H, W]", 1);
-  const bool reads_radii = !kOnHost<Frame> || frame.saved.instances == nullptr;
+  bool reads_radii = true;
+  if constexpr (kOnHost<Frame>) {
+    reads_radii = frame.saved.instances == nullptr;
+  } else {
+    const bool listed = frame.saved.capacity > 0;
+    refuse_null(function, "saved.order", frame.saved.order, "[N]", count);
+    refuse_null(function, "saved.num_ordered", frame.saved.num_ordered, "[1]", 1);
+    refuse_null(function, "saved.num_instances", frame.saved.num_instances, "[1]", listed);
+    refuse_null(function, "saved.instances", frame.saved.instances, "[capacity]", listed);
+    refuse_null(function, "saved.tile_order", frame.saved.tile_order, "[tiles]", listed);
+  }
   refuse_null(function, "images.radii", frame.images.radii, "[N]", reads_radii ? count : 0);
 }
 
@@ -217,6 +238,7 @@ template <class Frame, class S>
 void refuse_contributions(const char* function, const Frame& frame, const ContributionMap<S>& map) {
   const int64_t count = frame.inputs.num_gaussians;
   refuse_walk(function, frame);
+  refuse_instance_sums(function, frame);
   refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
   refuse_null(function, "sums.pixel_weights", map.sums.pixel_weights, "[N]", count);
   refuse_null(function, "sums.pixels", map.sums.pixels, "[N]", count);
@@ -228,6 +250,7 @@ template <class Frame, class S>
 void refuse_importance(const char* function, const Frame& frame, const ImportanceMap<S>& map) {
   const int64_t count = frame.inputs.num_gaussians;
   refuse_walk(function, frame);
+  refuse_instance_sums(function, frame);
   refuse_footprints(function, frame);
   refuse_null(function, "background", frame.config.background, "[C]", 1);
   refuse_null(function, "saved.final_transmittance", frame.saved.final_transmittance, "[H, W]", 1);

@@ -32,18 +32,19 @@ Scene<float> scene_with_depths() {
 
 template <class Frame> struct Case {
   std::function<void(Frame&)> spoil;
-  const char* problem;
+  std::string problem;
 };
 
 // What is wrong with a rendering before it begins; pointers of both backends.
 template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
   static const float number = 1;
+  const std::string last_mode = std::to_string(BlendModes::kSize - 1);
   return {
       {[](auto& f) { f.inputs.num_gaussians = -1; }, "num_gaussians is -1; it must be 0 to 2147483647"},
       {[](auto& f) { f.camera.width = 0; }, "width x height is 0 x 29; both must be positive"},
       {[](auto& f) { f.camera.height = -4; }, "width x height is 37 x -4; both must be positive"},
-      {[](auto& f) { f.config.mode = static_cast<BlendMode>(4); }, "blend_mode is 4; it must be 0 to 3"},
-      {[](auto& f) { f.config.mode = static_cast<BlendMode>(-1); }, "blend_mode is -1; it must be 0 to 3"},
+      {[](auto& f) { f.config.mode = static_cast<BlendMode>(99); }, "blend_mode is 99; it must be 0 to " + last_mode},
+      {[](auto& f) { f.config.mode = static_cast<BlendMode>(-1); }, "blend_mode is -1; it must be 0 to " + last_mode},
       {[](auto& f) { f.config.num_channels = 0; }, "num_channels is 0; it must be 1 or more"},
       {[](auto& f) { f.config.alpha_min = -0.5f; }, "alpha_min is -0.5; it must be 0 or more and finite"},
       {[](auto& f) { f.config.background_gate_at = nullptr, f.config.background_gate = -0.1f; },
@@ -95,7 +96,7 @@ TEST(Refuse, AForwardPassOnTheCpuNamesWhatIsWrong) {
     Frame frame = frame_of(scene, rendering);
     c.spoil(frame);
     cpu::Heap heap;
-    expect_refusal([&] { cpu::forward(frame, heap); }, std::string("cpu::forward: ") + c.problem);
+    expect_refusal([&] { cpu::forward(frame, heap); }, "cpu::forward: " + c.problem);
   }
 }
 
@@ -120,8 +121,13 @@ TEST(Refuse, AFrameOfDevicePointersIsHeldToTheSame) {
   for (const auto& c : cases) {
     Frame frame = good;
     c.spoil(frame);
-    expect_refusal([&] { refuse_forward("cuda::forward", frame); }, std::string("cuda::forward: ") + c.problem);
+    expect_refusal([&] { refuse_forward("cuda::forward", frame); }, "cuda::forward: " + c.problem);
   }
+  expect_refusal([&] { refuse_project("cuda::project_footprints", good); },
+                 "cuda::project_footprints: saved.projected is null; it must point to an array [N]");
+  good.saved.projected = reinterpret_cast<ProjectedGaussian<float>*>(16);
+  expect_refusal([&] { refuse_project("cuda::project_footprints", good); },
+                 "cuda::project_footprints: saved.features is null; it must point to an array [N, feature_stride(F)]");
 }
 
 TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
@@ -181,6 +187,8 @@ TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
        "cpu::contributions: pixel_weights is null; it must point to an array [H, W]"},
       {[&](Frame& f) { f.saved.last_contributor = nullptr, cpu::contributions(f, sums); },
        "cpu::contributions: saved.last_contributor is null; it must point to an array [H, W]"},
+      {[&](Frame& f) { f.saved.instance_offsets = nullptr, cpu::contributions(f, sums); },
+       "cpu::contributions: saved.instance_offsets is null; it must point to an array [N + 1]"},
       {[&](Frame& f) { cpu::importance(f, forget(worth, &ImportanceMap<float>::color)); },
        "cpu::importance: color is null; it must point to an array [C, H, W]"},
       {[&](Frame& f) { cpu::gate_map(f, forget(gates, &GateMap::counts)); },

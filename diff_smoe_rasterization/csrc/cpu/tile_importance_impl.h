@@ -74,8 +74,8 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
     for (int c = 0; c < num_channels_; ++c) {
       const P value = value_of(c).load(at), distance = P(features_[c]) - value;
       const P front = front_of(c).load(at);
-      const P motion = channel_motion<kMode>(removal, distance, front, value);
-      squared = fma(motion, motion, squared);
+      const P change = channel_change<kMode>(removal, distance, front, value);
+      squared = fma(change, change, squared);
       front_of(c).store(at, fma(removal.weight, distance, front));
     }
     add_pair(sum, removal, squared, alone_.load(at), share_weight_.load(at), weight_.load(at));

@@ -131,8 +131,8 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
         const S feature = kChannels != kAnyFeatures ? gaussian.features[c] : features[c];
         const S value = pixels.channels.value(arguments, tile, k, c), distance = feature - value;
         const S front = pixels.channels.front(arguments, tile, k, c);
-        const S motion = channel_motion<kMode>(removal, distance, front, value);
-        squared = fma(motion, motion, squared);
+        const S change = channel_change<kMode>(removal, distance, front, value);
+        squared = fma(change, change, squared);
         pixels.channels.set_front(arguments, tile, k, c, fma(removal.weight, distance, front));
       }
       add_pair(sum, removal, squared, pixels.alone[k], pixels.share_weight[k], pixels.weight[k]);
@@ -155,7 +155,8 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
   ImportanceRow<S>* row;  // for the next Gaussian
 };
 
-// Whether a warp may begin at a segment: what lies in front of it is known there by T.
+// Whether a warp may begin at a segment: what lies in front of it is known there by T. But W = 1 - T loses its digits
+// where it is small, and with it the cost of a pair that nothing is behind.
 template <class S, BlendMode kMode, int kChannels>
 constexpr bool kWeighsSegments = kWalksSegments<S, kChannels>&& Blend<kMode>::kStopsEarly;
 

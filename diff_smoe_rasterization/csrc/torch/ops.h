@@ -66,13 +66,15 @@ class Arguments {
 };
 
 // Calls body(S()) with the type of `like`. What the core refuses is a ValueError, which names the op in place of the
-// core's function. What does not fit is a RuntimeError in Python; the core's own exception would be an OverflowError.
+// core's function, if that is named. What does not fit is a RuntimeError in Python; the core's own exception would be
+// an OverflowError.
 template <class Body> void dispatch(const char* function, const at::Tensor& like, Body body) {
   try {
     AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "diff_smoe_rasterization", [&] { body(scalar_t()); });
   } catch (const std::invalid_argument& error) {
     const std::string message = error.what();
-    TORCH_CHECK_VALUE(false, function, message.substr(message.find(": ")));
+    const size_t colon = message.find(": ");
+    TORCH_CHECK_VALUE(false, function, colon == std::string::npos ? ": " + message : message.substr(colon));
   } catch (const std::overflow_error& error) {
     TORCH_CHECK(false, error.what());
   }

@@ -39,7 +39,7 @@ template <class Real> DSMOE_HD Importance<Real> no_importance() {
   return {zero, zero, zero};
 }
 
-// A pair's removal. C' - C is `scale` times channel_motion where something is left, and else bg - C.
+// A pair's removal. C' - C is channel_change where something is left, and else bg - C.
 template <class Real> struct Removal {
   Mask<Real> takes;  // the pair has a part in the pixel
   Real weight;       // w
@@ -108,19 +108,21 @@ DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>
   return out;
 }
 
-// distance: c - C; front: A; value: C; of one channel.
+// distance: c - C; front: A; value: C; of one channel. The scale joins before anything is squared: it is up to 1e30,
+// for a sum that is as small.
 template <BlendMode kMode, class Real>
-DSMOE_HD Real channel_motion(const Removal<Real>& removal, Real distance, Real front, Real value) {
-  if constexpr (Blend<kMode>::kStopsEarly) return fma(removal.own, distance, front);
+DSMOE_HD Real channel_change(const Removal<Real>& removal, Real distance, Real front, Real value) {
+  if constexpr (Blend<kMode>::kStopsEarly) return removal.scale * fma(removal.own, distance, front);
   const Real motion = fma(removal.own, distance, removal.front * front);
-  return Blend<kMode>::kNeedsDepthOrder ? fma(removal.value, value, motion) : motion;
+  return removal.scale * (Blend<kMode>::kNeedsDepthOrder ? fma(removal.value, value, motion) : motion);
 }
 
-// squared_motion: of all channels. alone: |bg - C|^2. share_weight, weight: of the pixel, in maps of the caller's.
+// squared: C' - C where something is left, of all channels. alone: |bg - C|^2. share_weight, weight: of the pixel, in
+// maps of the caller's.
 template <class Real>
-DSMOE_HD void add_pair(Importance<Real>& sum, const Removal<Real>& removal, Real squared_motion, Real alone,
-                       Real share_weight, Real weight) {
-  const Real squared_change = select(removal.left, removal.scale * removal.scale * squared_motion, alone);
+DSMOE_HD void add_pair(Importance<Real>& sum, const Removal<Real>& removal, Real squared, Real alone, Real share_weight,
+                       Real weight) {
+  const Real squared_change = select(removal.left, squared, alone);
   sum.share = select(removal.takes, fma(share_weight, removal.share, sum.share), sum.share);
   sum.squared_share =
       select(removal.takes, fma(weight * removal.share, removal.share, sum.squared_share), sum.squared_share);

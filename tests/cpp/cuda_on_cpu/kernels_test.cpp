@@ -229,6 +229,14 @@ TYPED_TEST(KernelsIn, EqualTheCpuInBands) { this->expect(crowd(), {false, 60}); 
 
 TYPED_TEST(KernelsIn, EqualTheCpuWhereListsDoNotFit) { this->expect(crowd(), {false, kMostInstances, true}); }
 
+TYPED_TEST(KernelsIn, EqualTheCpuWhereLittleIsSeen) {
+  this->expect(make_scene(8, 3, 1, 1));
+  Scene<double> unseen = make_scene(8, 5, 33, 17);  // tiles of one row and one column of pixels, and no list
+  for (int64_t i = 0; i < unseen.count; ++i) unseen.means3D[3 * i + 2] = -9;
+  this->expect(unseen);
+  this->expect(make_scene(8, 0, 33, 17));
+}
+
 TEST(Kernels, GiveTheSameBitsInEveryOrder) {
   const Scene<float> scene = convert<float>(in_mode<BlendMode::kSmoe>(make_scene(4, 70, 17, 17)).back());
   const std::vector<bool> all_sure(scene.pixels(), false);
