@@ -155,10 +155,16 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
   ImportanceRow<S>* row;  // for the next Gaussian
 };
 
-// Whether a warp may begin at a segment: what lies in front of it is known there by T. But W = 1 - T loses its digits
-// where it is small, and with it the cost of a pair that nothing is behind.
+// Whether a warp may begin at a segment: what lies in front of it is known there by T.
 template <class S, BlendMode kMode, int kChannels>
 constexpr bool kWeighsSegments = kWalksSegments<S, kChannels>&& Blend<kMode>::kStopsEarly;
+
+// Whether T tells enough of what lies in front of a segment. W = 1 - T loses digits where it is small, and so does D,
+// unless a gate of the background is in it: behind 1,300 opacities of 2e-5 to 5e-5 the norm of the costs is off by
+// 4.4e-4 at the gate 0, by 1.2e-4 at 0.03.
+template <BlendMode kMode, class Config> __device__ bool knows_front(const Config& config) {
+  return !Blend<kMode>::kDivides || config.gate_of_background() >= 0.01f;
+}
 
 // Sets what a warp's pixels start with at the list's begin.
 template <class S, int kChannels>
@@ -231,7 +237,9 @@ __global__ void __launch_bounds__(kWalkBlock,
     range.end = max_over_lanes(seen);
   }
   if constexpr (kWeighsSegments<S, kMode, kChannels>) {
-    if (has_segments(arguments.saved, tile)) {
+    if (!knows_front<kMode>(arguments.config)) {
+      if (place.segment > 0) return;
+    } else if (has_segments(arguments.saved, tile)) {
       range.begin = place.segment * kSegmentLength;
       range.end = min(range.end, range.begin + kSegmentLength);
       if (range.begin >= range.end) return;

@@ -204,6 +204,18 @@ Scene<double> long_lists() {
   return scene;
 }
 
+// A wall behind a list's first segment, in which W stays small.
+Scene<double> wall_behind_a_veil() {
+  Scene<double> scene = long_lists();
+  Random random(9);
+  for (double& opacity : scene.opacities) opacity = random.uniform(1e-4, 2e-4);
+  const int64_t wall = scene.count - 1;
+  scene.means3D[3 * wall + 2] += 5;
+  for (int axis = 0; axis < 3; ++axis) scene.scales[3 * wall + axis] = 2;
+  scene.opacities[wall] = 0.9;
+  return scene;
+}
+
 template <class Mode> struct KernelsIn : testing::Test {
   static void expect(const Scene<double>& scene, const How& how = {}) {
     for (const Scene<double>& own : in_mode<Mode::value>(scene)) expect_cpu(own, how);
@@ -224,6 +236,8 @@ TYPED_TEST(KernelsIn, EqualTheCpuWithOtherColoursAndDepth) {
 }
 
 TYPED_TEST(KernelsIn, EqualTheCpuOnLongLists) { this->expect(long_lists()); }
+
+TYPED_TEST(KernelsIn, EqualTheCpuBehindAVeil) { this->expect(wall_behind_a_veil()); }
 
 TYPED_TEST(KernelsIn, EqualTheCpuInBands) { this->expect(crowd(), {false, 60}); }
 
