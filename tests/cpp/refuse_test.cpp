@@ -149,6 +149,7 @@ TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
     value.*member = nullptr;
     return value;
   };
+  const auto backward = [&](Frame& f) { cpu::backward(f, {weights.gradients(), {}}); };
   struct {
     std::function<void(Frame&)> call;
     const char* message;
@@ -159,21 +160,13 @@ TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
        "cpu::radii: images.radii is null; it must point to an array [N]"},
       {[&](Frame& f) { f.saved.projected = nullptr, cpu::blend_footprints(f, heap); },
        "cpu::blend_footprints: saved.projected is null; it must point to an array [N]"},
-      {[&](Frame& f) {
-         f.saved.tile_offsets = nullptr, cpu::backward(f, {weights.gradients(), {}});
-       },
+      {[&](Frame& f) { f.saved.tile_offsets = nullptr, backward(f); },
        "cpu::backward: saved.tile_offsets is null; the frame must be as the forward pass left it"},
-      {[&](Frame& f) {
-         f.saved.gate_sum = nullptr, cpu::backward(f, {weights.gradients(), {}});
-       },
+      {[&](Frame& f) { f.saved.gate_sum = nullptr, backward(f); },
        "cpu::backward: saved.gate_sum is null; the frame must be as the forward pass left it"},
-      {[&](Frame& f) {
-         f.images.color = nullptr, cpu::backward(f, {weights.gradients(), {}});
-       },
+      {[&](Frame& f) { f.images.color = nullptr, backward(f); },
        "cpu::backward: images.color is null; it must point to an array [C, H, W], as its gradient is given"},
-      {[&](Frame& f) {
-         f.images.depth = nullptr, cpu::backward(f, {weights.gradients(), {}});
-       },
+      {[&](Frame& f) { f.images.depth = nullptr, backward(f); },
        "cpu::backward: images.depth is null; it must point to an array [H, W], as its gradient is given"},
       {[&](Frame& f) {
          cpu::blend_footprints_backward(f, {weights.gradients(), {}}, {});
