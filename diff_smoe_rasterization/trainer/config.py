@@ -92,8 +92,8 @@ class TrainConfig:
     percent_dense: float = _option(
         0.01, "largest scale, as a part of the scene extent, that is cloned; larger ones are split")
     densify_from_iter: int = _option(500, "densification starts after this step")
-    densify_until_iter: int = _recipe(
-        15_000, 18_000, "densification stops before this step; with gate, which it scales, the last removal")
+    densify_until_iter: int = _option(
+        15_000, "densification stops before this step; all milestones of gate are parts of it")
     densification_interval: int = _option(100, "steps between two densifications")
     opacity_reset_interval: int = _option(3000, "steps between two opacity resets")
 

@@ -22,7 +22,7 @@ class GateOptions:
     # Steps down to the budget.
     removals: int = _setting(16, lambda x: x >= 1, "at least 1")
     # Training views that a decision looks at.
-    views: int = _setting(96, lambda x: x >= 1, "at least 1")
+    views: int = _setting(80, lambda x: x >= 1, "at least 1")
     # The most Gaussians that move at a time, as a part of all; 0: none.
     moves: float = _setting(0.1, lambda x: 0 <= x <= 1, "between 0 and 1")
     # A Gaussian moves where its cost is below this part of the error at its new place.
@@ -31,9 +31,9 @@ class GateOptions:
     bands: float = _setting(2.0, lambda x: 0 < x < math.inf, "a positive number")
     # Behind the moves all learning rates but the positions' fall to this part of themselves.
     anneal: float = _setting(0.1, lambda x: 0 < x < math.inf, "a positive number")
-    # There too the loss has so many times the squared error in place of the absolute one; 0: it keeps that one. With 15
-    # both pull alike where they differ by 1/30.
-    squares: float = _setting(15.0, lambda x: 0 <= x < math.inf, "at least 0")
+    # There too the loss has so many times the squared error in place of the absolute one; 0: it keeps that one. With 30
+    # both pull alike where they differ by 1/60.
+    squares: float = _setting(30.0, lambda x: 0 <= x < math.inf, "at least 0")
 
 
 def parse_gate_options(text: str) -> GateOptions:

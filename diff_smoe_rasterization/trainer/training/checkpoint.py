@@ -16,7 +16,7 @@ CHECKPOINT_NAME = "checkpoint.pt"
 TENSOR = "__tensor__"  # marks where a tensor was
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)
-FORMAT = 4  # raised when the content changes so that older files cannot be resumed
+FORMAT = 5  # raised when the content changes so that older files cannot be resumed
 
 
 def save_checkpoint(path: str, state: Dict[str, Any]) -> None:

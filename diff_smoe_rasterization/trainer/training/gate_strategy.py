@@ -19,8 +19,8 @@ from ..scenes.images import View, as_float
 from .drawing import draw
 from .strategy import SteadyStrategy, Step, StrategyContext
 
-# Milestones, as parts of densify_until_iter (18,000): growth ends at 9,600, sixteen removals are at 9,840 to 16,590,
-# moves are every 600 until 24,000.
+# Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, sixteen removals are at 8,200 to 13,825,
+# moves are every 500 until 20,000.
 GROWTH_ENDS = 8 / 15
 REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
 MOVES_END = 4 / 3
