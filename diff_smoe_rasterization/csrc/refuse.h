@@ -70,7 +70,6 @@ inline void refuse_unless_one(const char* function, bool first, bool second, con
 // Gaussians that do not say what a projection needs.
 template <class S> void refuse_inputs(const char* function, const GaussianInputs<S>& inputs, int num_channels) {
   const int64_t count = inputs.num_gaussians;
-  if (count == 0) return;
   refuse_null(function, "means3D", inputs.means3D, "[N, 3]", count);
   refuse_null(function, "opacities", inputs.opacities, "[N]", count);
   const bool dc = inputs.dc != nullptr, shs = inputs.shs != nullptr;
@@ -98,7 +97,8 @@ template <class Frame> void refuse_projection(const char* function, const Frame&
   const auto& camera = frame.camera;
   using S = std::remove_const_t<decltype(camera.near)>;
   refuse_frame(function, frame);
-  refuse_inputs(function, frame.inputs, frame.config.num_channels);
+  // Of arrays without elements a null pointer does not say whether they are given.
+  if (frame.inputs.num_gaussians > 0) refuse_inputs(function, frame.inputs, frame.config.num_channels);
   const auto is_field_of_view = [](S tangent) { return tangent > S(0) && tangent <= std::numeric_limits<S>::max(); };
   if (!is_field_of_view(camera.tan_fov_x) || !is_field_of_view(camera.tan_fov_y)) {
     refuse(function, "tan_fov_x and tan_fov_y are ", camera.tan_fov_x, " and ", camera.tan_fov_y,
