@@ -10,12 +10,13 @@ from typing import Any, Dict, Optional, Tuple
 
 import torch
 
+from ...images import as_float
 from ...losses import l2_ssim_loss_and_gradient
 from ...splats import Splats
 from ..errors import ConfigError
 from ..gate_options import parse_gate_options
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
-from ..scenes.images import View, as_float
+from ..scenes.images import View
 from .drawing import draw
 from .strategy import SteadyStrategy, Step, StrategyContext
 
