@@ -67,7 +67,7 @@ void check_without_gaussians(const char* function, const Inputs& inputs, const O
   given.num_sh = given.shs ? to_int(inputs[kShs].size(1)) : 0;
   given.sh_degree = to_int(options.sh_degree);
   try {
-    refuse_inputs(function, given, static_cast<int>(num_channels(inputs)));
+    refuse_given(function, given, static_cast<int>(num_channels(inputs)));
   } catch (const std::invalid_argument& error) {
     TORCH_CHECK_VALUE(false, error.what());
   }
