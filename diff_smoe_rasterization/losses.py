@@ -7,6 +7,7 @@ import torch
 
 from .autograd import refuse_forward_mode
 from .extension import _C  # noqa: F401  (loading it registers the ops)
+from .images import as_float
 
 _OPS = torch.ops.diff_smoe_rasterization
 _WINDOW_RADIUS = 5  # pixels; of the 11x11 window
@@ -35,7 +36,7 @@ def l2_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor, lambda_
     """As `l1_ssim_loss_and_gradient`, with weight times the mean squared error in place of the mean absolute one."""
     image = image.detach()
     loss, gradient = _OPS.image_loss(image, target, 0.0, -lambda_dssim, lambda_dssim, 0, True)
-    difference = image - (target if target.is_floating_point() else target.to(image.dtype) / 255)
+    difference = image - as_float(target, image.dtype)
     weight *= 1 - lambda_dssim
     return (loss + weight * difference.square().mean(),
             gradient.add_(difference, alpha=2 * weight / difference.numel()))

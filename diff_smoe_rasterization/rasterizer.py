@@ -34,7 +34,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
         outputs: names out of OUTPUTS, images to return beside the colour.
         means2D_abs: [N, 2], of which only the gradient is of use: the sum over pixels of the absolute values of
             dL/d(pixel), each axis apart, times (width / 2, height / 2). Without it nothing is summed.
-    All tensors have one type, float32 or float64, and one device. Absent is None, or any tensor without elements.
+    All tensors have one type, float32 or float64, and one device. Absent is None, or any tensor without elements;
+    where N is 0, None or one of shape [0].
 
     Returns: Rendering. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
     Raises:

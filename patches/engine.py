@@ -57,7 +57,8 @@ class Patched:
         self.rules: Dict[str, List[str]] = {}  # of each file
         self.problems = [f"{name}: {leftover(data)}; change that line, by which `revert` takes a patch out"
                          for name, data in before.items() if leftover(data)]  # why it cannot be patched
-        self.notes: List[str] = []
+        scripts = [name for name, data in before.items() if "/" not in name and b"__main__" in data]
+        self.notes = [f"--{one}: fits no script: no .py beside train.py has __main__" for one in options if not scripts]
         for rule in rules_of(trainer):
             why = self.apply(rule.file, rule.name, rule.edit)
             self.problems += [f"{rule.file}: rule {rule.name}: {why}; right would be {rule.says}"] if why else []
@@ -67,7 +68,7 @@ class Patched:
                 self.notes += [f"{name}: {note}" for note in self.notes_on(name, trainer)]
         for option in options:
             for name, data in before.items():
-                if "/" not in name and b"__main__" in data:
+                if name in scripts:
                     why = self.apply(name, option, partial(start, option=option))
                     self.notes += [f"{name}: does not begin with {option}.start(): {why}"] if why else []
                 elif name.startswith("submodules/") and STANDARD in data and option == "modernise":

@@ -27,8 +27,7 @@ def rules_of(trainer: Trainer) -> List[Rule]:
     """The rules of a trainer; each has to match."""
     return [
         Rule("import-rasterizer", GR, f"`from {RASTERIZER} import ...`", partial(import_rasterizer, trainer=trainer)),
-        Rule("settings-blend-mode", GR, f"a call of {SETTINGS} by keyword, with `debug=pipe.debug`",
-             settings_blend),
+        Rule("settings-blend-mode", GR, f"a call of {SETTINGS} by keyword, with `debug=pipe.debug`", settings_blend),
         # Of the groups of options only ModelParams is saved in cfg_args.
         Rule("model-parameter", ARGUMENTS, "a class ModelParams whose __init__ has the statement "
              "`super().__init__(...)`", model_options),

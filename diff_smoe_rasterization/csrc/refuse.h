@@ -67,12 +67,8 @@ inline void refuse_unless_one(const char* function, bool first, bool second, con
          " given; exactly one of the two must be");
 }
 
-// Gaussians that do not say what a projection needs.
-template <class S> void refuse_inputs(const char* function, const GaussianInputs<S>& inputs, int num_channels) {
-  const int64_t count = inputs.num_gaussians;
-  if (count == 0) return;
-  refuse_null(function, "means3D", inputs.means3D, "[N, 3]", count);
-  refuse_null(function, "opacities", inputs.opacities, "[N]", count);
+// Colours and covariances that are not given, given twice, or too short.
+template <class S> void refuse_given(const char* function, const GaussianInputs<S>& inputs, int num_channels) {
   const bool dc = inputs.dc != nullptr, shs = inputs.shs != nullptr;
   const bool scales = inputs.scales != nullptr, rotations = inputs.rotations != nullptr;
   refuse_unless_one(function, shs || dc, inputs.colors_precomp != nullptr, "shs (or dc) and colors_precomp");
@@ -89,9 +85,17 @@ template <class S> void refuse_inputs(const char* function, const GaussianInputs
   }
   const int in_shs = shs ? inputs.num_sh : 0, held = in_shs + dc, needed = sh_coefficients(inputs.sh_degree);
   if (in_shs < 0 || held < needed) {
-    refuse(function, "shs has shape [", count, ", ", in_shs, ", 3]", dc ? " besides dc" : "", "; sh_degree ",
-           inputs.sh_degree, " needs ", needed, " coefficients a Gaussian, not ", held);
+    refuse(function, "shs has shape [", inputs.num_gaussians, ", ", in_shs, ", 3]", dc ? " besides dc" : "",
+           "; sh_degree ", inputs.sh_degree, " needs ", needed, " coefficients a Gaussian, not ", held);
   }
+}
+
+// Gaussians that do not say what a projection needs. Where there are none, null does not tell what is given.
+template <class S> void refuse_inputs(const char* function, const GaussianInputs<S>& inputs, int num_channels) {
+  if (inputs.num_gaussians == 0) return;
+  refuse_null(function, "means3D", inputs.means3D, "[N, 3]", 1);
+  refuse_null(function, "opacities", inputs.opacities, "[N]", 1);
+  refuse_given(function, inputs, num_channels);
 }
 
 template <class Frame> void refuse_projection(const char* function, const Frame& frame) {

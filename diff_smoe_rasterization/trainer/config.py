@@ -11,7 +11,7 @@ from typing import Any, Dict, List, Optional, Sequence, Union
 
 from ..settings import BACKGROUND_GATE_VARIABLE, BLEND_MODES, resolve_background_gate, resolve_blend_mode
 from .errors import ConfigError
-from .gate_options import parse_gate_options
+from .gate_options import GateOptions, parse_gate_options
 from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
@@ -129,7 +129,7 @@ class TrainConfig:
         needs_budget = self.schedule in ("gate", "mcmc")
         self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.schedule}")
         if self.schedule == "gate":
-            parse_gate_options(self.strategy_options)
+            self.gate_options()
             self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy gate")
             self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter "
                           "with --strategy gate, whose removals end there; --scale-recipe shortens all of it")
@@ -147,6 +147,10 @@ class TrainConfig:
         for name in ("densify_from_iter", "densify_until_iter", "eval_every", "checkpoint_every"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         return self
+
+    def gate_options(self) -> GateOptions:
+        """The settings of the strategy `gate`. Raises ConfigError."""
+        return parse_gate_options(self.strategy_options)
 
     @property
     def most_points(self) -> int:

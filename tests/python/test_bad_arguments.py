@@ -154,21 +154,32 @@ def test_images_that_no_machine_can_hold(mode, width, height):
     (None, ("scales", "rotations"), ("scales", "rotations", "cov3D_precomp")),
 ])
 @pytest.mark.parametrize("absent", ["left_out", "none", "empty"])
-def test_both_or_neither_of_two_alternatives(extra, missing, words, absent):
-    scene = scene_of()
+@pytest.mark.parametrize("count", [COUNT, 0])
+def test_both_or_neither_of_two_alternatives(extra, missing, words, absent, count):
+    scene = scene_of().rows(slice(0, count))
     inputs = dict(scene.inputs)
     for name in missing:
         del inputs[name]
         if absent != "left_out":
             inputs[name] = None if absent == "none" else torch.Tensor([])
     if extra is not None:
-        inputs[extra] = torch.rand(COUNT, 3 if extra == "colors_precomp" else 6)
+        inputs[extra] = torch.rand(count, 3 if extra == "colors_precomp" else 6)
     with pytest.raises(Exception) as error:
         rasterize(settings=scene.settings, **inputs)
     assert all(word in str(error.value) for word in words), str(error.value)
     with pytest.raises(Exception) as error:
         GaussianRasterizer(raster_settings=scene.settings)(**inputs)
     assert all(word in str(error.value) for word in words), str(error.value)
+
+
+@pytest.mark.parametrize("changed, message", [
+    (dict(shs=torch.zeros(0, 3, 3)), r"shs has shape \[0, 3, 3\]; sh_degree 1 needs 4 coefficients a Gaussian, not 3"),
+    (dict(shs=None, dc=torch.zeros(0, 1, 3)), "sh_degree 1 needs 4 coefficients a Gaussian, not 1")])
+def test_coefficients_that_do_not_suffice_are_named_without_gaussians_too(changed, message):
+    scene = scene_of().rows(slice(0, 0))
+    with pytest.raises(ValueError, match=message):
+        render(scene.with_inputs(**{name: tensor if tensor is None else tensor.to(scene.inputs["means3D"])
+                                    for name, tensor in changed.items()}))
 
 
 @pytest.mark.parametrize("missing", ["means3D", "opacities"])

@@ -56,9 +56,9 @@ class Setting(NamedTuple):
 
     def amount(self) -> str:
         """What is varied along a curve."""
-        if self.budget is not None:
-            return f"{self.budget:,} Gaussians"
-        return DASH if self.threshold is None else f"{self.threshold:g}"
+        words = [] if self.budget is None else [f"{self.budget:,} Gaussians"]
+        words += [] if self.threshold is None else [f"{self.threshold:g}"]
+        return " at ".join(words) or DASH
 
     def order(self) -> Tuple:
         """A sort key: methods as one list, thresholds from sparse to dense, alpha before the gated modes."""

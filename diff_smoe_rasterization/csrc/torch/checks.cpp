@@ -5,6 +5,8 @@
 #include <sstream>
 #include <vector>
 
+#include "../refuse.h"
+
 namespace dsmoe {
 namespace binding {
 namespace {
@@ -55,6 +57,22 @@ void check_options(const char* function, const Options& options) {
   check_positive("tanfovy", options.tanfovy);
 }
 
+// What the core refuses of Gaussians, asked here where there are none: their arrays are null to it, given or not.
+void check_without_gaussians(const char* function, const Inputs& inputs, const Options& options) {
+  const float element = 0;
+  const auto array = [&](Input input) { return inputs[input].defined() ? &element : nullptr; };
+  GaussianInputs<float> given;
+  given.scales = array(kScales), given.rotations = array(kRotations), given.cov3D_precomp = array(kCov3DPrecomp);
+  given.dc = array(kDc), given.shs = array(kShs), given.colors_precomp = array(kColorsPrecomp);
+  given.num_sh = given.shs ? to_int(inputs[kShs].size(1)) : 0;
+  given.sh_degree = to_int(options.sh_degree);
+  try {
+    refuse_given(function, given, static_cast<int>(num_channels(inputs)));
+  } catch (const std::invalid_argument& error) {
+    TORCH_CHECK_VALUE(false, error.what());
+  }
+}
+
 }  // namespace
 
 void check_arguments(const char* function, const Inputs& inputs, const Options& options) {
@@ -66,6 +84,7 @@ void check_arguments(const char* function, const Inputs& inputs, const Options& 
   }
   check_options(function, options);
   check_shapes(function, inputs);
+  if (num_gaussians(inputs) == 0) check_without_gaussians(function, inputs, options);
 }
 
 void check_backward_arguments(const char* function, const Inputs& inputs, const Options& options, const Images& images,

@@ -1,14 +1,15 @@
 """Training on batches of views, on one process or with the Gaussians divided over several."""
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, List, Optional
+import statistics
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
 from ..config import BATCHED, TrainConfig
 from ..errors import ConfigError
 from ..model import GaussianModel
-from ..results.evaluation import Evaluation, summary
+from ..results.evaluation import PASSES, SECONDS, WARM_UP_VIEWS, Evaluation, summary
 from ..results.metrics import image_metrics
 from ..scenes.images import View
 from ..scenes.scene import Scene
@@ -104,18 +105,33 @@ class BatchTrainer(Trainer):
         """Renders the test views, each in one of the processes; a time of a view is that of all by their number."""
         group, device, views = self.group, self.config.device, self.scene.test
         measured: List[Dict[str, Any]] = []
-        for begin in progress_bar(range(0, len(views), group.size), desc="evaluation", unit="view",
-                                  disable=not progress, leave=False):
-            some = views[begin:begin + group.size]
+        batches = [views[begin:begin + group.size] for begin in range(0, len(views), group.size)]
+        seconds: List[List[float]] = []  # of each batch, in each pass, as `evaluate` has them
+
+        def timed(some: Sequence[View]) -> Tuple[Dict[int, torch.Tensor], float]:
             settings = [self.renderer.settings_of(view.camera) for view in some]
             started = synchronised_time(device)
             batch = Batch(group, self.model, settings)
             colors = {view: batch.draw(view, settings[view], for_backward=False).color for view in batch.own_views}
-            elapsed = (synchronised_time(device) - started) / len(some)
-            for index, color in colors.items():
-                view = some[index]
-                measured.append({"name": view.camera.name, "milliseconds": elapsed * 1000,
-                                 **image_metrics(color, view.image_float(), view.mask_float())})
+            return colors, synchronised_time(device) - started
+
+        for some in batches[:WARM_UP_VIEWS]:
+            timed(some)
+        for some in progress_bar(batches, desc="evaluation", unit="view", disable=not progress, leave=False):
+            colors, elapsed = timed(some)
+            seconds.append([elapsed])
+            measured += [{"name": some[index].camera.name, "batch": len(seconds) - 1,
+                          **image_metrics(color, some[index].image_float(), some[index].mask_float())}
+                         for index, color in colors.items()]
+        for _ in range(PASSES - 1):
+            milliseconds = group.gather_numbers([round(1000 * sum(map(sum, seconds)))], device)
+            if max(milliseconds)[0] >= 1000 * SECONDS:  # all processes decide alike
+                break
+            for some, times in zip(batches, seconds):
+                times.append(timed(some)[1])
+        for row in measured:
+            number = row.pop("batch")
+            row["milliseconds"] = 1000 * statistics.median(seconds[number]) / len(batches[number])
         by_process = group.gather_objects(measured)
         return summary([by_process[index % group.size][index // group.size]  # type: ignore[index]
                         for index in range(len(views))])

@@ -7,7 +7,7 @@ from typing import Any, Dict, List, Optional, Union
 
 from ..config import LEARNED, TrainConfig
 from ..errors import TrainerError
-from ..gate_options import gate_settings, parse_gate_options
+from ..gate_options import gate_settings
 from ..scenes.images import DOWNSCALER
 from ..scenes.scene import Scene
 from ..system.environment import machine, versions
@@ -36,7 +36,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     if config.budget:
         unusual["budget"] = config.budget
     if config.schedule == "gate":  # with the defaults of this version
-        unusual["strategy_options"] = gate_settings(parse_gate_options(config.strategy_options))
+        unusual["strategy_options"] = gate_settings(config.gate_options())
     if config.random_background:
         unusual["random_background"] = True
     if views[0].mask is not None:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from ...images import as_float
 from ..config import TrainConfig
 from ..errors import SceneError
 from ..system.progress import progress_bar
@@ -53,11 +54,6 @@ class View:
         planes = {name: getattr(self, name) for name in ("image", "opacity", "mask")}
         return dataclasses.replace(self, **{name: plane.to(device) for name, plane in planes.items()
                                             if plane is not None})
-
-
-def as_float(image: torch.Tensor) -> torch.Tensor:
-    """An image of bytes in [0, 1]; floats as they are."""
-    return image if image.is_floating_point() else image.float() / 255
 
 
 def target_size(width: int, height: int, resolution: int) -> Tuple[int, int]:

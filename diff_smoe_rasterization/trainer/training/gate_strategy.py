@@ -10,12 +10,12 @@ from typing import Any, Dict, Optional, Tuple
 
 import torch
 
+from ...images import as_float
 from ...losses import l2_ssim_loss_and_gradient
 from ...splats import Splats
 from ..errors import ConfigError
-from ..gate_options import parse_gate_options
 from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
-from ..scenes.images import View, as_float
+from ..scenes.images import View
 from .drawing import draw
 from .strategy import SteadyStrategy, Step, StrategyContext
 
@@ -42,7 +42,7 @@ class GateStrategy(SteadyStrategy):
 
     def __init__(self, context: StrategyContext) -> None:
         config = context.config
-        self.options = parse_gate_options(config.strategy_options)
+        self.options = config.gate_options()
         super().__init__(context)
         context.optimizer.scale_rate("shs", self.options.bands)
         self.start = context.model.num_gaussians

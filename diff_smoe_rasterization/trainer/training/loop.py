@@ -10,6 +10,7 @@ from typing import Any, Callable, Dict, List, Optional, Tuple, Union
 
 import torch
 
+from ...images import as_float
 from ..config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
 from ..errors import TrainerError
 from ..model import GaussianModel, GaussianOptimizer
@@ -20,7 +21,7 @@ from ..results.pictures import loss_plot
 from ..results.rendering import Rasterize, Renderer, background_color
 from ..results.rows import RESULTS_NAME, result_row, write_results
 from ..results.scalars import Scalars, scalar_files
-from ..scenes.images import View, as_float
+from ..scenes.images import View
 from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
 from ..system.environment import extension_info
 from ..system.files import is_file, write_atomically, write_json_atomically

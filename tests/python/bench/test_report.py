@@ -41,6 +41,8 @@ def test_a_cell_is_the_mean_over_seeds_with_its_spread():
     assert (averaged["source"], float(averaged["PSNR [dB]"]), float(averaged["PSNR [dB] sd"])) == ("ours", 24, 1)
     assert single["PSNR [dB] sd"] == ""
     assert shown(table_of(entries[:1], "cells"), "PSNR [dB]") == ["23.00"]  # one seed has no spread
+    table = table_of([row(budget=40), row(budget=40, threshold=0.001)], "cells")
+    assert [line.labels[2] for line in table.rows] == ["40 Gaussians at 0.005", "40 Gaussians at 0.001"]
     with pytest.raises(ReportError, match="same setting, scene and seed 0"):
         table_of([row(), {**row(), "cell": "again"}], "cells")
 

@@ -105,7 +105,7 @@ def test_two_more_columns_of_means2d(mode, module, third):
     assert_close(points.grad[:, :2], signed.grad[:, :2], TOLERANCE, "the first columns")
     if third:
         splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1]
-        assert_close(sums, getattr(splats.contributions(torch.ones_like(color[0]).detach()), third), 1e-15, third)
+        assert_close(sums, getattr(splats.contributions(torch.ones_like(color[0]).detach()), third), TOLERANCE, third)
     with torch.no_grad():  # as trainers render test views
         assert_close(rendered(module, scene, means2D=points + 0)[0], color, TOLERANCE, "color")
 
@@ -283,7 +283,8 @@ def test_the_gaussian_of_the_largest_weight_and_where_its_rays_are_deepest(mode,
     rendering, splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)
     sums = splats.contributions(torch.ones_like(color[0]))
     assert torch.equal(color, rendering.color) and torch.equal(radii, rendering.radii)
-    assert torch.equal(weights, sums.blend_weights) and torch.equal(counts, sums.pixels)
+    assert_close(weights, sums.blend_weights, TOLERANCE, "weights")  # CUDA adds a sum in another order each time
+    assert torch.equal(counts, sums.pixels)
     assert torch.equal(largest, torch.bincount(which[shown], minlength=count).double())
     assert shown.all() == (count == 90)
 

@@ -243,6 +243,8 @@ def test_a_script_that_cannot_begin_with_an_option_is_named(tmp_path):
     notes = patches.apply(make(tmp_path, texts), modernise=True).notes
     assert [note.partition(": ")[0] for note in notes] == sorted(texts)
     assert all("does not begin with modernise.start()" in note for note in notes)
+    make(tmp_path / "none")
+    assert "--fuse: fits no script: no .py beside train.py" in patches.apply(tmp_path / "none", fuse=True).notes[0]
 
 
 def test_two_at_once_do_not_share_new_files(tmp_path, monkeypatch):

@@ -211,8 +211,7 @@ GSPLAT = {  # a gsplat of some lines: its version, and a strategy that has taken
                           "__version__ = '{version}'\n",
     "gsplat/rendering.py": "def rasterization(*a, **k): raise SystemExit('theirs')\n",
     "gsplat/relocation.py": "compute_relocation = 'theirs'\n",
-    "gsplat/cuda.py": "quat_scale_to_covar_preci = 'theirs'\n",
-    "gsplat/strategy/__init__.py": "from . import ops\n",
+    "gsplat/cuda.py": "quat_scale_to_covar_preci = 'theirs'\n", "gsplat/strategy/__init__.py": "from . import ops\n",
     "gsplat/strategy/ops.py": "from gsplat import quat_scale_to_covar_preci\n"
                               "from gsplat.relocation import compute_relocation\n"}
 CALL_GSPLAT = """import torch
