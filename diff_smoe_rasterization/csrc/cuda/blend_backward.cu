@@ -286,7 +286,8 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
     for (int k = 0; k < kLanePixels; ++k) seen = seen > pixels.last[k] ? seen : pixels.last[k];
     range.end = max_over_lanes(seen);
   }
-  if (kWalksSegments<S, kFeatures> && has_segments(arguments.saved, tile)) {
+  if constexpr (kWalksSegments<S, kMode, kFeatures>) {
+    if (!has_segments(arguments.saved, tile)) return range;
     range.begin = segment * kSegmentLength;
     if (range.begin >= range.end) return range;
     const int segments = (range.end + kSegmentLength - 1) / kSegmentLength;
