@@ -180,7 +180,7 @@ def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, Backgro
         mode, gate = blend_of_process
     mode = resolve_blend_mode(mode)
     gate = resolve_background_gate(mode, gate)
-    return "alpha" if not _is_tensor(gate) and gate == 1 else mode, gate
+    return "alpha" if mode == "smoe" and not _is_tensor(gate) and gate == 1 else mode, gate
 
 
 def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:

@@ -248,8 +248,8 @@ void refuse_contributions(const char* function, const Frame& frame, const Contri
 }
 
 // A mode of which no removal is known.
-inline void refuse_unremovable(const char* function, BlendMode mode) {
-  BlendModes::for_each([&](auto of) {
+template <class Modes = BlendModes> void refuse_unremovable(const char* function, BlendMode mode) {
+  Modes::for_each([&](auto of) {
     constexpr BlendMode kMode = decltype(of)::value;
     if (kMode != mode || kRemovable<kMode>) return;
     refuse(function, "blend_mode is ", Blend<kMode>::kName, "; it must be one whose law dsmoe/removal.h knows");

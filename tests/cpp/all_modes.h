@@ -14,19 +14,21 @@ namespace dsmoe {
 template <class Tuple> struct TypesOf;
 template <class... Modes> struct TypesOf<std::tuple<Modes...>> { using Type = testing::Types<Modes...>; };
 
+template <BlendMode kMode>
+constexpr bool kDividesByGates = Blend<kMode>::kDivides ? Blend<kMode>::kLaw == Law::kGates : false;
+
 template <BlendMode kMode, bool kIf>
 using ModeIf = std::conditional_t<kIf, std::tuple<ModeConstant<kMode>>, std::tuple<>>;
 
 template <class List> struct TypesOfModes;
 template <BlendMode... kModes> struct TypesOfModes<ModeList<kModes...>> {
   using All = testing::Types<ModeConstant<kModes>...>;
-  using Gated = typename TypesOf<decltype(std::tuple_cat(
-      ModeIf<kModes, Blend<kModes>::kDivides && Blend<kModes>::kLaw == Law::kGates>{}...))>::Type;
+  using Gated = typename TypesOf<decltype(std::tuple_cat(ModeIf<kModes, kDividesByGates<kModes>>{}...))>::Type;
   using Resuming = typename TypesOf<decltype(std::tuple_cat(ModeIf<kModes, kResumes<kModes>>{}...))>::Type;
   using Removable = typename TypesOf<decltype(std::tuple_cat(ModeIf<kModes, kRemovable<kModes>>{}...))>::Type;
 };
 using AllModes = TypesOfModes<BlendModes>::All;
-using GatedModes = TypesOfModes<BlendModes>::Gated;  // divided by sums of alpha or alpha T
+using GatedModes = TypesOfModes<BlendModes>::Gated;
 using ResumingModes = TypesOfModes<BlendModes>::Resuming;
 using RemovableModes = TypesOfModes<BlendModes>::Removable;
 

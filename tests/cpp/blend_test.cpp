@@ -39,9 +39,12 @@ struct Terms {
 Terms terms_of(BlendMode mode, double alpha, double t, bool full) {
   switch (mode) {
     case BlendMode::kAlpha:
-    case BlendMode::kSmoe: return full ? Terms{0, 0} : Terms{alpha * t, alpha * t};
-    case BlendMode::kSmoeTn: return {full ? 0 : alpha * t, alpha};
-    case BlendMode::kSmoeStd: return {alpha, alpha};
+    case BlendMode::kSmoe:
+      return full ? Terms{0, 0} : Terms{alpha * t, alpha * t};
+    case BlendMode::kSmoeTn:
+      return {full ? 0 : alpha * t, alpha};
+    case BlendMode::kSmoeStd:
+      return {alpha, alpha};
   }
   ADD_FAILURE() << "mode " << static_cast<int>(mode) << " has no equation here";
   return {NAN, NAN};

@@ -8,6 +8,7 @@ import pytest
 import torch
 from devices import default_device, random_normal
 
+from diff_smoe_rasterization.extension import _C
 from diff_smoe_rasterization.settings import BLEND_MODES, GaussianRasterizationSettings, resolve_background_gate
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
@@ -15,6 +16,9 @@ BACKGROUND_GATES = {"smoe_gate": 0.05, "smoe_learned_gate": torch.tensor(0.25, d
 """Further modes of the tests: `smoe` with these background gates, a number and a tensor."""
 with_gate = pytest.mark.parametrize("mode", BLEND_MODES + ("smoe_learned_gate",))
 with_gates = pytest.mark.parametrize("mode", BLEND_MODES + tuple(BACKGROUND_GATES))
+REMOVABLE_MODES = tuple(mode for mode in BLEND_MODES if _C.blend_modes[mode]["removable"])
+"""Those that `importance` takes."""
+with_removal = pytest.mark.parametrize("mode", REMOVABLE_MODES + ("smoe_learned_gate",))
 
 
 def gate_of(mode):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import gradients, op_arguments, op_results, random_scene
+from scenes import REMOVABLE_MODES, gradients, op_arguments, op_results, random_scene
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
@@ -127,6 +127,7 @@ def test_opcheck_of_importance(mode):
     torch.library.opcheck(op, arguments, **parts)
 
 
+@pytest.mark.parametrize("mode", REMOVABLE_MODES)
 def test_compiled_contributions_equal_eager(mode):
     def score(settings, pixel_weights, **inputs):
         rendering, splats = diff_smoe_rasterization.rasterize_with_splats(settings=settings, **inputs)

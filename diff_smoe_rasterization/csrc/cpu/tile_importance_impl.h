@@ -113,7 +113,8 @@ template <class S> int64_t importance(const Tile<S>& tile, const TileImportances
   int64_t pairs = 0;
   dispatch_blend(tile.config.mode, tile.config.num_channels, [&](auto mode, auto channels) {
     constexpr BlendMode kMode = decltype(mode)::value;
-    if constexpr (kRemovable<kMode>) pairs = importance_of_tile<S, kMode, decltype(channels)::value>(tile, out, scratch);
+    constexpr int kChannels = decltype(channels)::value;
+    if constexpr (kRemovable<kMode>) pairs = importance_of_tile<S, kMode, kChannels>(tile, out, scratch);
   });
   return pairs;
 }

@@ -276,7 +276,8 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
       if constexpr (kRemovable<kMode>) {
         const bool segments = kWeighsSegments<S, kMode, kChannels> && band.saved.segments != nullptr;
         const int64_t blocks = arguments.tiles + (segments ? num_segment_rows(band.saved.capacity) : 0);
-        importance_kernel<S, kMode, kChannels><<<static_cast<unsigned>(blocks), kWalkBlock, 0, work.stream>>>(arguments);
+        importance_kernel<S, kMode, kChannels>
+            <<<static_cast<unsigned>(blocks), kWalkBlock, 0, work.stream>>>(arguments);
         DSMOE_CHECK_LAUNCH("importance");
       }
     });

@@ -72,10 +72,9 @@ py::dict blend_modes() {
     using Policy = dsmoe::Blend<decltype(mode)::value>;
     py::object gate = py::none();
     if (!Policy::kLearnsGate) gate = py::float_(Policy::background_gate(0.0));
-    modes[Policy::kName] = py::dict("number"_a = static_cast<int>(decltype(mode)::value),
-                                    "divides"_a = Policy::kDivides,
-                                    "removable"_a = dsmoe::kRemovable<decltype(mode)::value>,
-                                    "background_gate"_a = gate);
+    modes[Policy::kName] =
+        py::dict("number"_a = static_cast<int>(decltype(mode)::value), "divides"_a = Policy::kDivides,
+                 "removable"_a = dsmoe::kRemovable<decltype(mode)::value>, "background_gate"_a = gate);
   });
   return modes;
 }

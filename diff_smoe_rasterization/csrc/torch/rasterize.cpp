@@ -46,21 +46,23 @@ Given::Given(const Settings& settings, const RasterizeArguments& arguments) : Se
 
 void Given::resolve_blend() {
   blend_mode = -1;
+  bool learns_gate = false;
   std::string names;
   BlendModes::for_each([&](auto mode) {
-    const std::string name = Blend<decltype(mode)::value>::kName;
-    names += (names.empty() ? "" : ", ") + name;
-    if (Settings::blend_mode == name) blend_mode = static_cast<int64_t>(mode());
+    using Policy = Blend<decltype(mode)::value>;
+    names += (names.empty() ? "" : ", ") + std::string(Policy::kName);
+    if (Settings::blend_mode != Policy::kName) return;
+    blend_mode = static_cast<int64_t>(mode());
+    learns_gate = Policy::kLearnsGate;
+    fixed_background_gate = Policy::background_gate(0.0);
   });
   TORCH_CHECK_VALUE(blend_mode >= 0, "rasterize: blend_mode is '", Settings::blend_mode, "'; it must be one of ",
                     names);
-  const auto alpha = static_cast<int64_t>(BlendMode::kAlpha), smoe = static_cast<int64_t>(BlendMode::kSmoe);
   const std::optional<BackgroundGate>& gate = Settings::background_gate;
   const bool is_one = gate && !gate->tensor.defined() && gate->number == 1;
-  fixed_background_gate = blend_mode == alpha ? 1 : 0;
-  if (!gate || (blend_mode == alpha && is_one)) return;
-  TORCH_CHECK_VALUE(blend_mode == smoe, "rasterize: background_gate is given, but blend_mode is '",
-                    Settings::blend_mode, "'; only 'smoe' knows it");
+  if (!gate || (!learns_gate && fixed_background_gate == 1 && is_one)) return;
+  TORCH_CHECK_VALUE(learns_gate, "rasterize: background_gate is given, but blend_mode is '", Settings::blend_mode,
+                    "'; only 'smoe' knows it");
   if (gate->tensor.defined()) {
     background_gate = gate->tensor;
     return;
@@ -68,7 +70,9 @@ void Given::resolve_blend() {
   TORCH_CHECK_VALUE(0 <= gate->number && gate->number <= kMaxBackgroundGate, "rasterize: background_gate is ",
                     gate->number, "; it must be a number, 0 or more and at most ", kMaxBackgroundGate);
   fixed_background_gate = gate->number;
-  if (is_one) blend_mode = alpha;
+  if (is_one && Settings::blend_mode == Blend<BlendMode::kSmoe>::kName) {
+    blend_mode = static_cast<int64_t>(BlendMode::kAlpha);
+  }
 }
 
 // The op's tensors in their order; absent ones are undefined.

@@ -124,8 +124,8 @@ DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real l
   return {power, weight};
 }
 
-// What a pixel sums. Each mode states its own as kLaw. Algebra that holds for the gates' law alone asks for it: a mode of
-// another law has no importance (kRemovable), and its backward pass walks long lists whole (kResumes).
+// What a pixel sums. Each mode states its own as kLaw. Algebra that holds for the gates' law alone asks for it: a mode
+// of another law has no importance (kRemovable), and its backward pass walks long lists whole (kResumes).
 enum class Law {
   kGates,  // what GateBlend's parameters say
   kOther,  // the mode has an `accumulate` and a `backward` of its own
@@ -138,7 +138,7 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   static constexpr bool kWithinRadius = false;               // pairs outside the tiles of the 3-sigma square do not
   static constexpr bool kNeedsDepthOrder = kTInNumerator;    // pairs are taken front to back
   static constexpr bool kStopsEarly = kTInDenominator;       // once full, a pixel is done
-  static constexpr bool kSuffixAboutBase = kTInDenominator;  // u_i = g'.c_i - b, and b is read nowhere else; else g'.c_i
+  static constexpr bool kSuffixAboutBase = kTInDenominator;  // u_i = g'.c_i - b, b in nothing else; else g'.c_i
   static constexpr bool kDivides = true;                     // a pixel is divided by D; else D is 1
   static constexpr bool kLearnsGate = false;                 // the caller gives lambda, and may learn it
   template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda

@@ -21,7 +21,11 @@ namespace {
 // What a rendering and its backward pass leave.
 template <class S> struct Results {
   explicit Results(const Scene<S>& scene)
-      : mode(scene.config.mode), rendering(scene), weights(scene, 7), gradient(scene), means2D_abs(2 * scene.count, S(NAN)) {}
+      : mode(scene.config.mode),
+        rendering(scene),
+        weights(scene, 7),
+        gradient(scene),
+        means2D_abs(2 * scene.count, S(NAN)) {}
 
   Gradients<S> gradients() {
     Gradients<S> out = {weights.gradients(), gradient.gradients()};
