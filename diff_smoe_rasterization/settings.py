@@ -110,8 +110,9 @@ class Importance(NamedTuple):
     removal_costs: torch.Tensor  # [N] sum e |C' - C|^2, over all channels; C' is the pixel without the Gaussian
 
 
-OUTPUTS = ("alpha", "depth", "inverse_depth")
-"""The optional outputs of `rasterize`."""
+FEATURE_OUTPUTS = ("depth", "inverse_depth")  # images of the op on request, in its order
+OUTPUTS = ("alpha", *FEATURE_OUTPUTS)
+"""The optional outputs of `rasterize`, in the order of `Rendering`."""
 
 
 def resolve_blend_mode(blend_mode: Optional[str]) -> str:

@@ -28,7 +28,10 @@ struct Given : GaussianRasterizationSettings {
   int64_t blend_mode = 0;
   double fixed_background_gate = 0;
   at::Tensor background_gate;
-  bool depth = false, inverse_depth = false, for_backward = false;
+#define DSMOE_FLAG(enumerator, name) bool name = false;
+  DSMOE_FEATURE_IMAGES(DSMOE_FLAG)
+#undef DSMOE_FLAG
+  bool for_backward = false;
 
  private:
   void resolve_blend();
@@ -37,10 +40,15 @@ struct Given : GaussianRasterizationSettings {
 Given::Given(const Settings& settings, const RasterizeArguments& arguments) : Settings(settings) {
   resolve_blend();
   for (const std::string& name : arguments.outputs) {
-    TORCH_CHECK_VALUE(name == "alpha" || name == "depth" || name == "inverse_depth", "rasterize: outputs holds '", name,
-                      "'; it may hold alpha, depth, inverse_depth");
-    depth |= name == "depth";
-    inverse_depth |= name == "inverse_depth";
+    bool known = name == "alpha";
+    std::string names = "alpha";
+#define DSMOE_ASK(enumerator, field) \
+  field |= name == #field;           \
+  known |= name == #field;           \
+  names += ", " #field;
+    DSMOE_FEATURE_IMAGES(DSMOE_ASK)
+#undef DSMOE_ASK
+    TORCH_CHECK_VALUE(known, "rasterize: outputs holds '", name, "'; it may hold ", names);
   }
 }
 
