@@ -6,6 +6,12 @@
 namespace dsmoe {
 namespace {
 
+TEST(BlendModeOf, FindsEveryModeByItsName) {
+  BlendModes::for_each([](auto mode) { EXPECT_EQ(blend_mode_of(Blend<decltype(mode)::value>::kName), mode()); });
+  EXPECT_FALSE(blend_mode_of("Smoe"));
+  EXPECT_FALSE(blend_mode_of(""));
+}
+
 TEST(ProjectedGaussian, IsAsManyNumbersAsItsConstantSays) {
   // Bindings allocate it as an array of numbers.
   EXPECT_EQ(sizeof(ProjectedGaussian<float>), kProjectedGaussianSize * sizeof(float));

@@ -7,6 +7,8 @@
 
 #include <cstdint>
 #include <limits>
+#include <optional>
+#include <string_view>
 
 #include "dsmoe/project.h"
 
@@ -28,6 +30,15 @@ struct TileBand {
 // How many tiles a band has.
 inline int64_t band_tiles(const TileGrid& grid, const TileBand& band) {
   return static_cast<int64_t>(grid.columns) * (min(band.end, grid.rows) - band.begin);
+}
+
+// The mode that files and settings name so; absent where no mode has the name.
+inline std::optional<BlendMode> blend_mode_of(std::string_view name) {
+  std::optional<BlendMode> found;
+  BlendModes::for_each([&](auto mode) {
+    if (name == Blend<decltype(mode)::value>::kName) found = mode();
+  });
+  return found;
 }
 
 template <class S> struct GaussianInputs {
