@@ -6,6 +6,16 @@
 namespace dsmoe {
 namespace {
 
+TEST(RasterConfig, CountsItsFurtherFeatures) {
+  RasterConfig<float> config;
+  config.num_channels = 5;
+  EXPECT_EQ(config.num_features(), 5);
+  config.depth = config.inverse_depth = true;
+  EXPECT_EQ(config.num_features(), 5 + kMostFurtherFeatures);
+  config.leave_out_further_features();
+  EXPECT_EQ(config.num_features(), 5);
+}
+
 TEST(BlendModeOf, FindsEveryModeByItsName) {
   BlendModes::for_each([](auto mode) { EXPECT_EQ(blend_mode_of(Blend<decltype(mode)::value>::kName), mode()); });
   EXPECT_FALSE(blend_mode_of("Smoe"));

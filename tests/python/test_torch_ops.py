@@ -12,7 +12,7 @@ from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
 # torch.compile of 2.4.1 breaks the graph where the package looks at its arguments; 2.11 and 2.15 do not.
 WHOLE = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)
-NUM_IMAGES = 5  # results of the op that are the caller's: color, radii, gate_sum, depth, inverse_depth
+NUM_IMAGES = 2 + len(OUTPUTS)  # results of the op that are the caller's: color and radii too
 
 pytestmark = [
     pytest.mark.usefixtures("device"),

@@ -42,6 +42,8 @@ constexpr std::array<Image, kNumImages - 1> all_but_radii() {
   return images;
 }
 constexpr auto kDifferentiable = all_but_radii();
+static_assert(kNumImages == kDepth + kMostFurtherFeatures,
+              "params.h: kMostFurtherFeatures counts DSMOE_FEATURE_IMAGES");
 constexpr std::array kAllImages = {
 #define DSMOE_LISTED(enumerator, name) enumerator,
     DSMOE_IMAGES(DSMOE_LISTED)

@@ -1,10 +1,9 @@
 // dsmoe/torch_training.h: the trainers' ops with their gradients for C++.
 #include <torch/csrc/autograd/custom_function.h>
 
-#include <cmath>
-
 #include "call_op.h"
 #include "check_tensor.h"
+#include "dsmoe/adam.h"
 #include "dsmoe/torch_training.h"
 #include "tensors.h"
 

@@ -55,6 +55,9 @@ template <class S> struct GaussianInputs {
   int sh_degree = 0;                  // active degree, 0 to 3; dc and shs have (degree + 1)^2 coefficients or more
 };
 
+// Features that may follow the colour's channels: the flags of RasterConfig that its num_features counts.
+constexpr int kMostFurtherFeatures = 2;
+
 template <class S> struct RasterConfig {
   BlendMode mode = BlendMode::kAlpha;
   int num_channels = 3;           // C
@@ -79,6 +82,7 @@ template <class S> struct RasterConfig {
     return {mode, scale_modifier, alpha_cut(), low_pass, antialiasing, inverse_depth};
   }
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
+  DSMOE_HD void leave_out_further_features() { depth = inverse_depth = false; }
 };
 
 // One (Gaussian, tile) pair, in a tile's list from front to back.
