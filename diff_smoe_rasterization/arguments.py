@@ -5,7 +5,7 @@ import torch
 
 from .autograd import INPUTS, OPTIONS
 from .extension import BACKENDS, build_info
-from .settings import BLEND_MODES, OUTPUTS, Rendering, resolve_blend
+from .settings import BLEND_MODES, FEATURE_OUTPUTS, OUTPUTS, Rendering, resolve_blend
 
 
 def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
@@ -35,7 +35,7 @@ def op_options(settings, outputs, blend_mode, fixed_gate):
     """Returns the options of a rendering in the order of the op, all but the last one."""
     options = [kind(getattr(settings, name)) for name, kind in _SETTING_OPTIONS]
     computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
-                "depth": "depth" in outputs, "inverse_depth": "inverse_depth" in outputs}
+                **{name: name in outputs for name in FEATURE_OUTPUTS}}
     for name, place in _COMPUTED_OPTIONS.items():
         options.insert(place, computed[name])
     return options
@@ -47,7 +47,7 @@ _OUTPUTS = frozenset(OUTPUTS)
 # for_backward, which is the last one.
 assert list(OPTIONS)[-1] == "for_backward"
 _COMPUTED_OPTIONS = {name: place for place, name in enumerate(OPTIONS)
-                     if name in ("fixed_background_gate", "blend_mode", "depth", "inverse_depth")}
+                     if name in ("fixed_background_gate", "blend_mode", *FEATURE_OUTPUTS)}
 _SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
 
 
@@ -88,7 +88,5 @@ def without_batch(tensor, dim):
 
 def as_rendering(images, outputs):
     """Returns the op's images under their names."""
-    color, radii, gate_sum, depth, inverse_depth = images
-    return Rendering(color, radii, alpha=gate_sum if "alpha" in outputs else None,
-                     depth=depth if "depth" in outputs else None,
-                     inverse_depth=inverse_depth if "inverse_depth" in outputs else None)
+    color, radii, *optional = images
+    return Rendering(color, radii, *(image if name in outputs else None for name, image in zip(OUTPUTS, optional)))

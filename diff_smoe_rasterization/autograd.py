@@ -12,6 +12,7 @@ import torch
 from torch.autograd import forward_ad
 
 from .extension import _C  # loading it registers the ops
+from .settings import FEATURE_OUTPUTS
 
 _OPS = torch.ops.diff_smoe_rasterization
 _CAN_REGISTER = hasattr(torch.library, "register_autograd")
@@ -136,7 +137,7 @@ def _fake_rasterize(*arguments):
     shapes = {"color": (3 if colors is None else colors.shape[1], height, width), "radii": (count,)}
     images = []
     for name in IMAGES:
-        wanted = given.get(name, True)  # the options say so of depth and inverse_depth
+        wanted = given.get(name, True)  # the options say so of FEATURE_OUTPUTS
         shape = shapes.get(name, (1, height, width)) if wanted else (0,)
         images.append(means3D.new_empty(shape, dtype=torch.int32 if name == "radii" else means3D.dtype))
     saved = []
@@ -150,7 +151,7 @@ def _fake_rasterize(*arguments):
 def _fake_project(*arguments):
     given = dict(zip((*INPUTS, *OPTIONS), arguments))
     means3D, colors = given["means3D"], given["colors_precomp"]
-    features = (3 if colors is None else colors.shape[1]) + int(given["depth"]) + int(given["inverse_depth"])
+    features = (3 if colors is None else colors.shape[1]) + sum(given[name] for name in FEATURE_OUTPUTS)
     stored = (features + 3) // 4 * 4 if means3D.device.type == "cuda" else features  # rows of vectors
     return (means3D.new_empty((means3D.shape[0], 8)), means3D.new_empty((means3D.shape[0], stored))[:, :features],
             _fake_radii(means3D))
@@ -167,8 +168,9 @@ def _fake_gradients(inputs, present, wanted):
     return [tensor.new_empty(tensor.shape) for tensor, want in zip(all_inputs, wanted) if want]
 
 
-def _fake_rasterize_backward(dL_dcolor, dL_dgate_sum, dL_ddepth, dL_dinverse_depth, inputs, present, *others):
-    return _fake_gradients(inputs, present, others[-1])
+def _fake_rasterize_backward(*arguments):
+    inputs, present = arguments[_NUM_IMAGES - 1:_NUM_IMAGES + 1]  # behind the gradients by the images
+    return _fake_gradients(inputs, present, arguments[-1])
 
 
 def _fake_project_backward(records, dL_ddepths, inputs, present, *others):

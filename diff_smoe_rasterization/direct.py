@@ -7,13 +7,13 @@ import torch
 
 from .arguments import as_rendering, op_arguments
 from .autograd import IMAGES, INPUTS, refuse_forward_mode
-from .settings import GaussianRasterizationSettings, Rendering
+from .settings import FEATURE_OUTPUTS, GaussianRasterizationSettings, Rendering
 from .splats import Splats
 
 _OPS = torch.ops.diff_smoe_rasterization
 _COLORS, _BACKGROUND, _OPACITIES = INPUTS.index("colors_precomp"), INPUTS.index("bg"), INPUTS.index("opacities")
 _ABSENT = [INPUTS.index(name) for name in ("means2D", "dc", "shs", "background_gate")]
-_GRADIENTS = {"color": "color", "alpha": "gate_sum", "depth": "depth", "inverse_depth": "inverse_depth"}
+_GRADIENTS = {"color": "color", "alpha": "gate_sum", **{name: name for name in FEATURE_OUTPUTS}}
 
 
 class DirectRendering:

@@ -119,8 +119,8 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
         images = _Blend.apply((*options, True), *tensors)
     else:
         images = _OPS.blend(*tensors, *options, False)[:-1]
-    color, gate_sum, depth, inverse_depth = images
-    return as_rendering((color, footprints.radii, gate_sum, depth, inverse_depth), outputs)
+    color, *optional = images
+    return as_rendering((color, footprints.radii, *optional), outputs)
 
 
 def _wants_gradient(tensors: Sequence[Optional[torch.Tensor]]) -> bool:

@@ -110,8 +110,9 @@ class Importance(NamedTuple):
     removal_costs: torch.Tensor  # [N] sum e |C' - C|^2, over all channels; C' is the pixel without the Gaussian
 
 
-OUTPUTS = ("alpha", "depth", "inverse_depth")
-"""The optional outputs of `rasterize`."""
+FEATURE_OUTPUTS = ("depth", "inverse_depth")  # images of the op on request, in its order
+OUTPUTS = ("alpha", *FEATURE_OUTPUTS)
+"""The optional outputs of `rasterize`, in the order of `Rendering`."""
 
 
 def resolve_blend_mode(blend_mode: Optional[str]) -> str:
@@ -180,7 +181,7 @@ def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, Backgro
         mode, gate = blend_of_process
     mode = resolve_blend_mode(mode)
     gate = resolve_background_gate(mode, gate)
-    return "alpha" if not _is_tensor(gate) and gate == 1 else mode, gate
+    return "alpha" if mode == "smoe" and not _is_tensor(gate) and gate == 1 else mode, gate
 
 
 def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:

@@ -9,6 +9,7 @@
 #include <type_traits>
 
 #include "dsmoe/params.h"
+#include "dsmoe/removal.h"
 #include "dsmoe/sh.h"
 
 namespace dsmoe {
@@ -250,10 +251,20 @@ void refuse_contributions(const char* function, const Frame& frame, const Contri
   refuse_null(function, "sums.distances", map.sums.distances, "[N]", count);
 }
 
+// A mode of which no removal is known.
+template <class Modes = BlendModes> void refuse_unremovable(const char* function, BlendMode mode) {
+  Modes::for_each([&](auto of) {
+    constexpr BlendMode kMode = decltype(of)::value;
+    if (kMode != mode || kRemovable<kMode>) return;
+    refuse(function, "blend_mode is ", Blend<kMode>::kName, "; it must be one whose law dsmoe/removal.h knows");
+  });
+}
+
 template <class Frame, class S>
 void refuse_importance(const char* function, const Frame& frame, const ImportanceMap<S>& map) {
   const int64_t count = frame.inputs.num_gaussians;
   refuse_walk(function, frame);
+  refuse_unremovable(function, frame.config.mode);
   refuse_instance_sums(function, frame);
   refuse_footprints(function, frame);
   refuse_null(function, "background", frame.config.background, "[C]", 1);

@@ -12,6 +12,19 @@ constexpr double kRounding = 1e-14;  // few roundings of numbers near 1
 
 AdamConstants<double> constants(double epsilon) { return {0.9, 0.999, 1 - 0.9, 1 - 0.999, epsilon}; }
 
+TEST(Adam, ItsConstantsAreRoundedFromDouble) {
+  const auto narrow = adam_constants<float>(0.9, 0.999, 1e-8);
+  EXPECT_FLOAT_EQ(narrow.one_minus_beta2, 1e-3f);  // 1 - 0.999f is 5e-5 off
+  EXPECT_FLOAT_EQ(narrow.one_minus_beta1, 0.1f);
+  for (const int64_t t : {1, 7, 1000}) {
+    double beta1_t = 1, beta2_t = 1;
+    for (int64_t i = 0; i < t; ++i) beta1_t *= 0.9, beta2_t *= 0.999;
+    const auto rates = adam_rates<double>(0.25, t);
+    EXPECT_NEAR(rates.rate, 0.25 / (1 - beta1_t), kRounding);
+    EXPECT_NEAR(rates.root_scale * std::sqrt(1 - beta2_t), 1, 1e-12);  // 1 - beta2 cancels three digits
+  }
+}
+
 // Rates of step t with the moments corrected for their start at zero.
 AdamRates<double> corrected(double rate, int t) {
   return {rate / (1 - std::pow(0.9, t)), 1 / std::sqrt(1 - std::pow(0.999, t))};

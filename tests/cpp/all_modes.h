@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "dispatch.h"
+#include "dsmoe/removal.h"
 
 namespace dsmoe {
 
@@ -14,15 +15,28 @@ template <class Tuple> struct TypesOf;
 template <class... Modes> struct TypesOf<std::tuple<Modes...>> { using Type = testing::Types<Modes...>; };
 
 template <BlendMode kMode>
-using IfDividing = std::conditional_t<Blend<kMode>::kDivides, std::tuple<ModeConstant<kMode>>, std::tuple<>>;
+constexpr bool kDividesByGates = Blend<kMode>::kDivides ? Blend<kMode>::kLaw == Law::kGates : false;
+
+template <BlendMode kMode, bool kIf>
+using ModeIf = std::conditional_t<kIf, std::tuple<ModeConstant<kMode>>, std::tuple<>>;
 
 template <class List> struct TypesOfModes;
 template <BlendMode... kModes> struct TypesOfModes<ModeList<kModes...>> {
   using All = testing::Types<ModeConstant<kModes>...>;
-  using Dividing = typename TypesOf<decltype(std::tuple_cat(IfDividing<kModes>{}...))>::Type;
+  using Gated = typename TypesOf<decltype(std::tuple_cat(ModeIf<kModes, kDividesByGates<kModes>>{}...))>::Type;
+  using Resuming = typename TypesOf<decltype(std::tuple_cat(ModeIf<kModes, kResumes<kModes>>{}...))>::Type;
+  using Removable = typename TypesOf<decltype(std::tuple_cat(ModeIf<kModes, kRemovable<kModes>>{}...))>::Type;
 };
 using AllModes = TypesOfModes<BlendModes>::All;
-using GatedModes = TypesOfModes<BlendModes>::Dividing;
+using GatedModes = TypesOfModes<BlendModes>::Gated;
+using ResumingModes = TypesOfModes<BlendModes>::Resuming;
+using RemovableModes = TypesOfModes<BlendModes>::Removable;
+
+inline bool is_removable(BlendMode mode) {
+  bool removable = false;
+  BlendModes::for_each([&](auto of) { removable |= of() == mode && kRemovable<decltype(of)::value>; });
+  return removable;
+}
 
 inline std::vector<BlendMode> all_modes() {
   std::vector<BlendMode> modes;

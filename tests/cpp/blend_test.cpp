@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <limits>
 #include <vector>
 
 #include "all_modes.h"
@@ -29,27 +30,44 @@ struct Finished {
   int last = 0;  // one past the last pair of the numerator
 };
 
-// Equations 3, 6, 7 and 8 with the sums as the paper writes them, 7 with the background as one more expert. stop: the
-// pair before which the numerator ends.
+// What a pair adds to the sums of a mode: Equations 3, 7, 8 and 6.
+struct Terms {
+  double numerator, denominator;
+};
+
+// t: the transmittance in front of the pair. full: the pixel takes no more pairs.
+Terms terms_of(BlendMode mode, double alpha, double t, bool full) {
+  switch (mode) {
+    case BlendMode::kAlpha:
+    case BlendMode::kSmoe:
+      return full ? Terms{0, 0} : Terms{alpha * t, alpha * t};
+    case BlendMode::kSmoeTn:
+      return {full ? 0 : alpha * t, alpha};
+    case BlendMode::kSmoeStd:
+      return {alpha, alpha};
+  }
+  ADD_FAILURE() << "mode " << static_cast<int>(mode) << " has no equation here";
+  return {NAN, NAN};
+}
+
+// The sums as the paper writes them, of Equation 7 with the background as one more expert. stop: the pair before which
+// the numerator ends.
 Finished paper(BlendMode mode, const Pixel& pixel, int stop) {
   Finished out;
-  double sum_color = 0, sum_z = 0, sum_inverse_z = 0, sum_alpha_t = 0, sum_alpha = 0;
+  double sum_color = 0, sum_z = 0, sum_inverse_z = 0;
   for (int i = 0; i < pixel.size(); ++i) {
     if (!pixel.counts[i]) continue;
-    sum_alpha += pixel.alpha[i];
-    if (i >= stop && mode != BlendMode::kSmoeStd) continue;
     double t = 1;
     for (int j = 0; j < i; ++j) t *= pixel.counts[j] ? 1 - pixel.alpha[j] : 1;
-    const double w = mode == BlendMode::kSmoeStd ? pixel.alpha[i] : pixel.alpha[i] * t;
-    sum_alpha_t += pixel.alpha[i] * t;
-    sum_color += w * pixel.color[i];
-    sum_z += w * pixel.depth[i];
-    sum_inverse_z += w * pixel.inverse_depth[i];
+    const auto terms = terms_of(mode, pixel.alpha[i], t, i >= stop);
+    out.gate_sum += terms.denominator;
+    if (i >= stop && terms.numerator == 0) continue;
+    sum_color += terms.numerator * pixel.color[i];
+    sum_z += terms.numerator * pixel.depth[i];
+    sum_inverse_z += terms.numerator * pixel.inverse_depth[i];
     out.transmittance = t * (1 - pixel.alpha[i]);
     out.last = i + 1;
   }
-  const bool divide_by_alpha_t = mode == BlendMode::kAlpha || mode == BlendMode::kSmoe;
-  out.gate_sum = divide_by_alpha_t ? sum_alpha_t : sum_alpha;
   const bool gated = out.gate_sum >= static_cast<double>(1e-30f);
   out.depth = gated ? sum_z / out.gate_sum : 0;
   const double of_background = pixel.background_gate * out.transmittance;
@@ -86,7 +104,9 @@ template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
   Real color = 0, depth = 0, inverse_depth = 0;
   Finished out;
   for (int i = 0; i < pixel.size(); ++i) {
-    const auto pair = Blend<kMode>::accumulate(state, gate_of<Real>(pixel, i));
+    auto gate = gate_of<Real>(pixel, i);
+    gate.logit = std::numeric_limits<Real>::quiet_NaN();  // not every walk has one
+    const auto pair = Blend<kMode>::accumulate(state, gate);
     color += pair.weight * Real(pixel.color[i]);
     depth += pair.weight * Real(pixel.depth[i]);
     inverse_depth += pair.weight * Real(pixel.inverse_depth[i]);
@@ -139,6 +159,8 @@ template <class Mode> struct BlendOf : testing::Test {};
 TYPED_TEST_SUITE(BlendOf, AllModes);
 template <class Mode> struct GatedBlendOf : testing::Test {};
 TYPED_TEST_SUITE(GatedBlendOf, GatedModes);
+template <class Mode> struct ResumingBlendOf : testing::Test {};
+TYPED_TEST_SUITE(ResumingBlendOf, ResumingModes);
 
 template <BlendMode kMode, class Real> void expect_the_papers_sums(const Pixel& pixel, double tolerance) {
   const Finished expected = paper(kMode, pixel, paper_stop<Real>(pixel));
@@ -245,11 +267,13 @@ template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel
   out.background_gate = by_color.background_gate + by_depth.background_gate + by_inverse_depth.background_gate;
   out.power = out.color = out.depth = out.inverse_depth = Vector(pixel.size());
   for (int i = pixel.size() - 1; i >= 0; --i) {
-    if (i == middle - 1) {
-      Pixel front = pixel;
-      front.alpha.resize(middle);
-      constants = start;
-      resume_backward<kMode>(constants, Real(blended<kMode, Real>(front).transmittance), behind);
+    if constexpr (kResumes<kMode>) {
+      if (i == middle - 1) {
+        Pixel front = pixel;
+        front.alpha.resize(middle);
+        constants = start;
+        resume_backward<kMode>(constants, Real(blended<kMode, Real>(front).transmittance), behind);
+      }
     }
     const Real value =
         color * Real(pixel.color[i]) + depth * Real(pixel.depth[i]) + inverse_depth * Real(pixel.inverse_depth[i]);
@@ -332,7 +356,7 @@ TYPED_TEST(BlendOf, BackwardIsTheDerivativeBehindAFullPixel) {
   }
 }
 
-TYPED_TEST(BlendOf, ResumedInTheMiddleItHasTheSameDerivative) {
+TYPED_TEST(ResumingBlendOf, InTheMiddleItHasTheSameDerivative) {
   Random random(4);
   for (const Pixel& pixel : {differentiable_pixel(random, 0.3), saturated_pixel()}) {
     const Weights g = {random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1)};
@@ -342,6 +366,18 @@ TYPED_TEST(BlendOf, ResumedInTheMiddleItHasTheSameDerivative) {
       expect_near_all(flat(pixel, backward<TypeParam::value, double>(pixel, g, middle)), whole, 1e-12);
     }
   }
+}
+
+// CUDA's walk puts b into the value, once a pixel.
+TYPED_TEST(BlendOf, ReadsTheBaseInNothingButTheSuffixAboutIt) {
+  if (!Blend<TypeParam::value>::kSuffixAboutBase) return;
+  const Gate<double> gate = {0.3, 0.3, true};
+  PixelBackward<double> apart = {0.5, 0.2, 0.75}, together = {0.5, 0.2, 0};
+  const auto expected = Blend<TypeParam::value>::backward(apart, gate, 0.5, true);
+  const auto actual = Blend<TypeParam::value>::backward(together, gate, 0.5 - 0.75, true);
+  EXPECT_EQ(actual.power, expected.power);
+  EXPECT_EQ(actual.weight, expected.weight);
+  EXPECT_EQ(together.suffix, apart.suffix);
 }
 
 TYPED_TEST(BlendOf, EachOutputAloneHasItsOwnDerivative) {

@@ -170,12 +170,15 @@ TYPED_TEST(GateOfMode, GateCutOffIsOnTheKernelAndAlphaCutOffOnTheAlpha) {
 TYPED_TEST(GateOfMode, ClampPassesTheGradientStraightThrough) {
   for (const double opacity : {0.3, 0.99, 1.0, 4.0}) {
     const auto gate = evaluate_gate<TypeParam::value>(-0.1, opacity, 0.0);
-    const double dL_dalpha = -1.3;  // g'.c of a pixel's only pair
-    PixelBackward<double> pixel = {1 - gate.alpha, 0, 0};
-    const auto pair = Blend<TypeParam::value>::backward(pixel, gate, dL_dalpha, true);
-    const double expected = opacity * std::exp(-0.1) * dL_dalpha;  // as if alpha were o G
-    // 1 - alpha is rounded, and T in front of the pair is a quotient by it.
-    EXPECT_NEAR(pair.power, expected, 1e-13);
+    const double value = -1.3;  // g'.c
+    PixelBackward<double> pixel = {1 - gate.alpha, 0.2, 0.1}, same = pixel;
+    const auto pair = Blend<TypeParam::value>::backward(pixel, gate, value, true);
+    const Gate<double> of_alpha = {gate.alpha, gate.alpha, true};
+    const auto unclamped = Blend<TypeParam::value>::backward(same, of_alpha, value, true);
+    EXPECT_NE(unclamped.power, 0);
+    // dL/dalpha is that of alpha, and dL/dpower is o G times that. Some roundings of numbers up to 4 x 1.3 / 0.01.
+    EXPECT_NEAR(pair.power, opacity * std::exp(-0.1) / gate.alpha * unclamped.power, 1e-12);
+    EXPECT_EQ(pair.weight, unclamped.weight);
   }
 }
 

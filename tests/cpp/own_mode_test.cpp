@@ -4,6 +4,8 @@
 #include <vector>
 
 #include "cpu/tile_loop.h"
+#include "dsmoe/removal.h"
+#include "refuse.h"
 #include "test_scene.h"
 
 #define DSMOE_SIMD own_mode  // any machine's packs, and symbols of their own
@@ -35,6 +37,18 @@ template <> struct Blend<kMean> : GateBlend<false, false> {
 };
 
 namespace {
+
+// What the gates' law says of sums does not hold here, and nothing builds on it.
+static_assert(!kResumes<kMean> && !kRemovable<kMean>);
+TEST(OwnMode, HasNoImportance) {
+  EXPECT_NO_THROW(refuse_unremovable("importance", BlendMode::kSmoe));
+  try {
+    refuse_unremovable<ModeList<kMean>>("importance", kMean);
+    FAIL() << "no refusal";
+  } catch (const std::invalid_argument& error) {
+    EXPECT_STREQ(error.what(), "importance: blend_mode is mean; it must be one whose law dsmoe/removal.h knows");
+  }
+}
 
 TEST(OwnMode, IsDrawnAndDifferentiatedByTheWalk) {
   Scene<double> scene = make_scene(1, 60, 37, 29);

@@ -6,6 +6,22 @@
 namespace dsmoe {
 namespace {
 
+TEST(RasterConfig, CountsItsFurtherFeatures) {
+  RasterConfig<float> config;
+  config.num_channels = 5;
+  EXPECT_EQ(config.num_features(), 5);
+  config.depth = config.inverse_depth = true;
+  EXPECT_EQ(config.num_features(), 5 + kMostFurtherFeatures);
+  config.leave_out_further_features();
+  EXPECT_EQ(config.num_features(), 5);
+}
+
+TEST(BlendModeOf, FindsEveryModeByItsName) {
+  BlendModes::for_each([](auto mode) { EXPECT_EQ(blend_mode_of(Blend<decltype(mode)::value>::kName), mode()); });
+  EXPECT_FALSE(blend_mode_of("Smoe"));
+  EXPECT_FALSE(blend_mode_of(""));
+}
+
 TEST(ProjectedGaussian, IsAsManyNumbersAsItsConstantSays) {
   // Bindings allocate it as an array of numbers.
   EXPECT_EQ(sizeof(ProjectedGaussian<float>), kProjectedGaussianSize * sizeof(float));

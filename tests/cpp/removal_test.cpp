@@ -79,7 +79,7 @@ Pixel layers(double opacity) {
 }
 
 template <class Mode> struct RemovalIn : testing::Test {};
-TYPED_TEST_SUITE(RemovalIn, AllModes);
+TYPED_TEST_SUITE(RemovalIn, RemovableModes);
 
 TYPED_TEST(RemovalIn, EqualsTheSumsOverTheOthers) {
   constexpr BlendMode kMode = TypeParam::value;

@@ -8,13 +8,22 @@ import pytest
 import torch
 from devices import default_device, random_normal
 
-from diff_smoe_rasterization.settings import BLEND_MODES, GaussianRasterizationSettings, resolve_background_gate
+from diff_smoe_rasterization.extension import _C
+from diff_smoe_rasterization.settings import (
+    BLEND_MODES,
+    FEATURE_OUTPUTS,
+    GaussianRasterizationSettings,
+    resolve_background_gate,
+)
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
 BACKGROUND_GATES = {"smoe_gate": 0.05, "smoe_learned_gate": torch.tensor(0.25, device="cpu")}
 """Further modes of the tests: `smoe` with these background gates, a number and a tensor."""
 with_gate = pytest.mark.parametrize("mode", BLEND_MODES + ("smoe_learned_gate",))
 with_gates = pytest.mark.parametrize("mode", BLEND_MODES + tuple(BACKGROUND_GATES))
+REMOVABLE_MODES = tuple(mode for mode in BLEND_MODES if _C.blend_modes[mode]["removable"])
+"""Those that `importance` takes."""
+with_removal = pytest.mark.parametrize("mode", REMOVABLE_MODES + ("smoe_learned_gate",))
 
 
 def gate_of(mode):
@@ -168,7 +177,8 @@ def op_arguments(scene, op="rasterize", **others):
     mode = scene.settings.blend_mode
     gate = resolve_background_gate(mode, scene.settings.background_gate)
     learned = isinstance(gate, torch.Tensor)
-    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode), "depth": True, "inverse_depth": True,
+    values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode),
+              **dict.fromkeys(FEATURE_OUTPUTS, True),
               "background_gate": gate if learned else None, "fixed_background_gate": 0.0 if learned else gate,
               "for_backward": True, **scene.inputs, **others}
     schema = getattr(torch.ops.diff_smoe_rasterization, op).default._schema

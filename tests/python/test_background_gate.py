@@ -16,6 +16,7 @@ from devices import random_normal
 from scenes import Scene, gradients, random_scene
 
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
+from diff_smoe_rasterization import settings as settings_module
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -296,6 +297,14 @@ def test_a_gate_that_cannot_be_is_named(function, mode, gate):
     scene = random_scene(mode, 5, 20, 18, background_gate=gate)
     with pytest.raises(ValueError, match=r"background_gate .*(must|only 'smoe')"):
         function(settings=scene.settings, **scene.inputs)
+
+
+def test_a_mode_with_a_gate_of_one_is_no_alpha(monkeypatch):
+    """Of a mode that the core may get: only `smoe` is `alpha` at 1."""
+    monkeypatch.setattr(settings_module, "BLEND_MODES", BLEND_MODES + ("own",))
+    monkeypatch.setitem(settings_module._FIXED_GATES, "own", 1.0)
+    settings = random_scene("smoe", 1, 2, 2).settings._replace(blend_mode="own", background_gate=None)
+    assert settings_module.resolve_blend(settings) == ("own", 1.0)
 
 
 @pytest.mark.parametrize("value", ["-1", "nan", "inf", "much", "0,05"])

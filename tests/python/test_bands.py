@@ -5,7 +5,7 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import gradients, op_results, random_scene, with_gate
+from scenes import gradients, op_results, random_scene, with_gate, with_removal
 
 from diff_smoe_rasterization import rasterize, rasterize_with_splats
 from diff_smoe_rasterization.extension import _C
@@ -62,7 +62,7 @@ def test_gradients_without_deterministic(mode, dtype, device, listing):
     assert_same_gradients(gradients(rasterize, scene)[1], expected)
 
 
-@with_gate
+@with_removal
 @pytest.mark.parametrize("most", MOST)
 def test_scores(mode, most, device, listing):
     scene = scene_of(mode, torch.float64)

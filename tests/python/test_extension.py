@@ -19,10 +19,16 @@ from scenes import op_arguments, op_results, random_scene, with_gate
 import diff_smoe_rasterization
 from diff_smoe_rasterization import build_info, rasterize, set_profiling, stage_times
 from diff_smoe_rasterization.extension import _C
-from diff_smoe_rasterization.settings import _FIXED_GATES, BLEND_MODES, OUTPUTS, GaussianRasterizationSettings
+from diff_smoe_rasterization.settings import (
+    _FIXED_GATES,
+    BLEND_MODES,
+    FEATURE_OUTPUTS,
+    OUTPUTS,
+    GaussianRasterizationSettings,
+)
 
 WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
-DIFFERENTIABLE = ("color", "gate_sum", "depth", "inverse_depth")  # images of the op
+DIFFERENTIABLE = ("color", "gate_sum", *FEATURE_OUTPUTS)  # images of the op
 on_every_device = pytest.mark.usefixtures("device")
 
 
@@ -130,7 +136,7 @@ def test_build_info_tells_what_runs():
 
 def test_the_settings_and_the_op_have_the_same_fields():
     """A setting is a line of csrc/torch/fields.h and a field of this name; these options are no settings."""
-    options = set(_C.options) - {"fixed_background_gate", "depth", "inverse_depth", "for_backward"}
+    options = set(_C.options) - {"fixed_background_gate", *FEATURE_OUTPUTS, "for_backward"}
     fields = set(GaussianRasterizationSettings._fields)
     assert fields - options == {"bg", "viewmatrix", "projmatrix", "campos", "background_gate"}  # tensors
     assert fields - options <= set(_C.inputs) and options <= fields

@@ -6,6 +6,7 @@ import torch
 from scenes import assert_not_empty, gradients, random_scene, random_weights, with_gates
 
 from diff_smoe_rasterization import Footprints, blend_footprints, project_gaussians, rasterize
+from diff_smoe_rasterization.settings import OUTPUTS
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -27,9 +28,8 @@ def test_the_halves_give_the_bits_of_the_whole(mode, case):
     """float32: the type that trains. deterministic has no effect on the CPU, whose gradients always are."""
     case = {**case, "deterministic": True}
     scene = random_scene(mode, dtype=torch.float32, **case)
-    outputs = ("alpha", "depth", "inverse_depth")
-    expected, expected_gradients = gradients(rasterize, scene, outputs)
-    actual, actual_gradients = gradients(in_halves, scene, outputs)
+    expected, expected_gradients = gradients(rasterize, scene, OUTPUTS)
+    actual, actual_gradients = gradients(in_halves, scene, OUTPUTS)
     assert_not_empty(expected, scene.settings)
     assert_equal(actual._asdict(), expected._asdict())
     assert_equal(actual_gradients, expected_gradients)

@@ -6,7 +6,7 @@ import torch
 from by_hand import facing_camera, on_axis
 from comparison import assert_close, one_thread
 from devices import on_the_cpu, random_normal
-from scenes import gate_of, random_scene, with_gate, with_gates
+from scenes import BACKGROUND_GATES, REMOVABLE_MODES, gate_of, random_scene, with_removal
 
 from diff_smoe_rasterization import Importance, rasterize, rasterize_with_splats, reference
 
@@ -22,6 +22,8 @@ SCENES = {
     "one_pixel": lambda mode: random_scene(mode, 50, 1, 1, scale=0.3),
     "sparse": lambda mode: random_scene(mode, 50, 40, 33, scale=0.03, opacity=(0.02, 0.9)),
 }
+
+with_removals = pytest.mark.parametrize("mode", REMOVABLE_MODES + tuple(BACKGROUND_GATES))
 
 
 def maps_for(settings, dtype=torch.float64):
@@ -50,7 +52,7 @@ def without_full_pixels(scene):
     return scene
 
 
-@with_gates
+@with_removals
 @pytest.mark.parametrize("name", SCENES)
 def test_equals_the_image_blended_again_without_each_gaussian(mode, name):
     scene = without_full_pixels(SCENES[name](mode))
@@ -82,7 +84,7 @@ def test_full_pixels_hide_no_more_than_they_may_reveal(mode):
     assert 1e-9 < difference.max() < may_reveal.norm().cpu()
 
 
-@with_gates
+@with_removals
 def test_the_only_owner_leaves_the_background(mode):
     """One Gaussian: without it every pixel it was in shows the background, whatever the mode."""
     settings = facing_camera(mode, 11, 7)
@@ -111,7 +113,7 @@ def test_a_wall_by_hand(dtype, tolerance):
     assert_close(importance.shares, torch.tensor([first, second], dtype=torch.float64), tolerance, "shares")
 
 
-@with_gate
+@with_removal
 def test_float32_keeps_the_digits_that_rank_gaussians(mode):
     scene = random_scene(mode, 200, 64, 48, scale=0.1)
     maps = maps_for(scene.settings)
@@ -122,7 +124,7 @@ def test_float32_keeps_the_digits_that_rank_gaussians(mode):
         assert_close(values, other, 1e-3, field)
 
 
-@with_gate
+@with_removal
 def test_shares_and_the_backgrounds_make_one(mode):
     scene = random_scene(mode, 60, 33, 21, scale=0.2)
     rendering, splats = rasterize_with_splats(settings=scene.settings, outputs=("alpha",), **scene.inputs)
@@ -137,7 +139,7 @@ def test_shares_and_the_backgrounds_make_one(mode):
     assert_close(total, shares.sum(), 1e-12, "sum of shares")
 
 
-@with_gate
+@with_removal
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_does_not_depend_on_threads(mode, dtype, device):
     if device.type != "cpu":
@@ -154,7 +156,7 @@ def test_does_not_depend_on_threads(mode, dtype, device):
         assert all(torch.equal(first, second) for first, second in zip(results[0], other))
 
 
-@with_gate
+@with_removal
 def test_other_outputs_and_absent_maps_change_nothing(mode):
     scene = random_scene(mode, 60, 33, 21, scale=0.2)
     ones = torch.ones(21, 33, dtype=torch.float64)
@@ -170,6 +172,7 @@ def test_other_outputs_and_absent_maps_change_nothing(mode):
         importance_of(scene, ones.float())
 
 
+@pytest.mark.parametrize("mode", REMOVABLE_MODES)
 def test_no_gaussians_have_no_importance(mode):
     scene = random_scene(mode, 20, 33, 21).rows(slice(0))
     assert all(values.shape == (0,) for values in importance_of(scene))

@@ -5,14 +5,14 @@ import pytest
 import torch
 from comparison import assert_same_gradients
 from devices import random_normal
-from scenes import gradients, op_arguments, op_results, random_scene
+from scenes import REMOVABLE_MODES, gradients, op_arguments, op_results, random_scene
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
 
 # torch.compile of 2.4.1 breaks the graph where the package looks at its arguments; 2.11 and 2.15 do not.
 WHOLE = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)
-NUM_IMAGES = 5  # results of the op that are the caller's: color, radii, gate_sum, depth, inverse_depth
+NUM_IMAGES = 2 + len(OUTPUTS)  # results of the op that are the caller's: color and radii too
 
 pytestmark = [
     pytest.mark.usefixtures("device"),
@@ -127,6 +127,7 @@ def test_opcheck_of_importance(mode):
     torch.library.opcheck(op, arguments, **parts)
 
 
+@pytest.mark.parametrize("mode", REMOVABLE_MODES)
 def test_compiled_contributions_equal_eager(mode):
     def score(settings, pixel_weights, **inputs):
         rendering, splats = diff_smoe_rasterization.rasterize_with_splats(settings=settings, **inputs)

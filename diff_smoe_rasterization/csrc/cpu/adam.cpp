@@ -1,6 +1,7 @@
 // Adam on the CPU: threads take runs of rows.
 #include <algorithm>
 
+#include "../refuse_training.h"
 #include "dsmoe/adam_tensors.h"
 #include "multiversion.h"
 #include "parallel.h"
@@ -40,6 +41,7 @@ template <class S> void step_visible(const AdamTensor<S>& tensor, const AdamStep
 }  // namespace
 
 template <class S> void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step, int num_threads) {
+  refuse_adam("cpu::adam", tensors);
   for (const AdamTensor<S>& tensor : tensors) {
     if (tensor.size == 0) continue;
     const int64_t chunk_rows = std::max<int64_t>(1, kChunk / tensor.row_size);

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "../refuse_training.h"
 #include "parallel.h"
 
 namespace dsmoe {
@@ -15,6 +16,7 @@ constexpr int64_t kChunk = 1 << 12;  // rows a thread takes at a time
 
 template <class S>
 void gather_rows(const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows, int num_threads) {
+  refuse_gather("cpu::gather_rows", tensors, rows);
   for (const GatherTensor<S>& tensor : tensors) {
     const int64_t size = tensor.row_size;
     parallel_for(num_threads, rows.count, kChunk, [&](int64_t begin, int64_t end) {

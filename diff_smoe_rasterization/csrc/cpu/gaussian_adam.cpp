@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "../refuse_training.h"
 #include "parallel.h"
 
 namespace dsmoe {
@@ -40,6 +41,7 @@ void step_quaternion_at(const GaussianAdam<S>& adam, const ActivatedTensor<S>& t
 }  // namespace
 
 template <class S> void step_gaussians(const GaussianAdam<S>& adam, int num_threads) {
+  refuse_step_gaussians("cpu::step_gaussians", adam);
   parallel_for(num_threads, adam.num_gaussians, kChunk, [&](int64_t begin, int64_t end) {
     for (const ActivatedTensor<S>& tensor : adam.tensors) {
       const int group = tensor.group(), size = tensor.row_size;

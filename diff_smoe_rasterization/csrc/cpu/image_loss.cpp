@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <vector>
 
+#include "../refuse_training.h"
 #include "multiversion.h"
 #include "parallel.h"
 
@@ -240,6 +241,7 @@ template <class S, class Body> void for_each_band(const ImageLoss<S>& loss, int 
 int64_t num_image_loss_sums(int64_t planes, int height, int) { return planes * bands_of(height); }
 
 template <class S> void image_loss(const ImageLoss<S>& loss, int num_threads) {
+  refuse_image_loss("cpu::image_loss", loss);
   for_each_band(loss, num_threads, [&](int64_t chunk, int64_t plane, int begin, int end) {
     loss.sums[chunk] = value_band(loss, plane, begin, end);
   });

@@ -1,6 +1,7 @@
 // Lazy Adam on the CPU: threads take runs of rows.
 #include "dsmoe/lazy_adam.h"
 
+#include "../refuse_training.h"
 #include "parallel.h"
 
 namespace dsmoe {
@@ -32,6 +33,7 @@ template <class S> void catch_up_row(const LazyAdam<S>& adam, int64_t row) {
 }  // namespace
 
 template <class S> void catch_up(const LazyAdam<S>& adam, int num_threads) {
+  refuse_catch_up("cpu::catch_up", adam);
   parallel_for(num_threads, adam.num_rows, kChunk, [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row) {
       const bool wanted = adam.radii == nullptr || adam.radii[row] > 0;
@@ -41,6 +43,7 @@ template <class S> void catch_up(const LazyAdam<S>& adam, int num_threads) {
 }
 
 template <class S> void note_step(const LazyAdamStep<S>& step) {
+  refuse_note_step("cpu::note_step", step);
   for (int t = 0; t < step.num_tensors; ++t) step.rates[t] = step.new_rates[t];
   for (int64_t row = 0; row < step.num_rows; ++row) {
     if (step.radii[row] > 0) step.marks[row] = ~step.steps;

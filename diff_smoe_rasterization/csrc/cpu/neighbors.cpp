@@ -7,6 +7,7 @@
 #include <numeric>
 #include <vector>
 
+#include "../refuse.h"
 #include "parallel.h"
 
 namespace dsmoe {
@@ -100,6 +101,8 @@ template <class S> class Tree {
 }  // namespace
 
 template <class S> void mean_squared_distances(const S* points, int64_t count, S* result, int num_threads) {
+  refuse_null("cpu::mean_squared_distances", "points", points, "[N, 3]", count);
+  refuse_null("cpu::mean_squared_distances", "result", result, "[N]", count);
   const Tree<S> tree(points, count);
   const int64_t others = std::min<int64_t>(kNeighbors, count - 1);
   parallel_for(num_threads, count, kChunk, [&](int64_t begin, int64_t end) {

@@ -112,7 +112,9 @@ int64_t importance_of_tile(const Tile<S>& tile, const TileImportances<S>& out, S
 template <class S> int64_t importance(const Tile<S>& tile, const TileImportances<S>& out, S* scratch) {
   int64_t pairs = 0;
   dispatch_blend(tile.config.mode, tile.config.num_channels, [&](auto mode, auto channels) {
-    pairs = importance_of_tile<S, decltype(mode)::value, decltype(channels)::value>(tile, out, scratch);
+    constexpr BlendMode kMode = decltype(mode)::value;
+    constexpr int kChannels = decltype(channels)::value;
+    if constexpr (kRemovable<kMode>) pairs = importance_of_tile<S, kMode, kChannels>(tile, out, scratch);
   });
   return pairs;
 }

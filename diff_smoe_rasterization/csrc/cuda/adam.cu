@@ -1,6 +1,7 @@
 // Adam over several tensors in one launch: a block takes a piece of one of them.
 #include <algorithm>
 
+#include "../refuse_training.h"
 #include "dsmoe/adam_tensors.h"
 #include "tuning.cuh"
 
@@ -56,6 +57,7 @@ template <class S> void launch(const Batch<S>& batch, int64_t num_blocks, cudaSt
 }  // namespace
 
 template <class S> void adam(const std::vector<AdamTensor<S>>& tensors, const AdamStep<S>& step, void* stream) {
+  refuse_adam("cuda::adam", tensors);
   Batch<S> batch = {};
   batch.step = step;
   int64_t num_blocks = 0;

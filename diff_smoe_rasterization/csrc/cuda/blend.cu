@@ -48,7 +48,7 @@ template <class S, int kSums> struct BlendedPixels {
 // Blends kSums features, front to back.
 template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = Blend<kMode>::kStopsEarly;
-  static constexpr bool kReadsFeatures = true, kInSegments = kWalksSegments<S, kSums>;
+  static constexpr bool kReadsFeatures = true, kInSegments = kWalksSegments<S, kMode, kSums>;
   static constexpr int kUnroll = kBlendUnroll;
 
   __device__ __forceinline__ void begin_batch(int32_t position) {

@@ -286,7 +286,7 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
     for (int k = 0; k < kLanePixels; ++k) seen = seen > pixels.last[k] ? seen : pixels.last[k];
     range.end = max_over_lanes(seen);
   }
-  if (kWalksSegments<S, kFeatures> && has_segments(arguments.saved, tile)) {
+  if (kWalksSegments<S, kMode, kFeatures> && has_segments(arguments.saved, tile)) {
     range.begin = segment * kSegmentLength;
     if (range.begin >= range.end) return range;
     const int segments = (range.end + kSegmentLength - 1) / kSegmentLength;
@@ -298,7 +298,7 @@ __device__ __forceinline__ WalkRange range_of_segment(const BackwardArguments<S>
         for (int f = 0; f < kFastFeatures; ++f) {
           behind = fma(pixels.scaled.get(arguments, tile, k, f), next_begin.sums[f], behind);
         }
-        resume_backward<kMode>(pixels.state[k], next_begin.transmittance, behind);
+        if constexpr (kResumes<kMode>) resume_backward<kMode>(pixels.state[k], next_begin.transmittance, behind);
       }
       range.end = range.begin + kSegmentLength;
     }

@@ -1,4 +1,5 @@
 // Rows by a list, of several tensors in one launch: a block writes a piece of one of them.
+#include "../refuse_training.h"
 #include "dsmoe/gather.h"
 #include "tuning.cuh"
 
@@ -46,6 +47,7 @@ template <class S> void launch(const Batch<S>& batch, int64_t num_blocks, cudaSt
 }  // namespace
 
 template <class S> void gather_rows(const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows, void* stream) {
+  refuse_gather("cuda::gather_rows", tensors, rows);
   Batch<S> batch = {};
   batch.rows = rows;
   int64_t num_blocks = 0;

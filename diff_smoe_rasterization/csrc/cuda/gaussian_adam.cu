@@ -1,4 +1,5 @@
 // Adam with activations: a block takes a piece of one tensor, as in adam.cu.
+#include "../refuse_training.h"
 #include "dsmoe/gaussian_adam.h"
 #include "tuning.cuh"
 
@@ -79,6 +80,7 @@ __global__ void __launch_bounds__(kAdamBlock) step_gaussians_kernel(const __grid
 }  // namespace
 
 template <class S> void step_gaussians(const GaussianAdam<S>& adam, void* stream) {
+  refuse_step_gaussians("cuda::step_gaussians", adam);
   if (adam.num_gaussians == 0) return;
   Blocks<S> blocks = {};
   blocks.adam = adam;

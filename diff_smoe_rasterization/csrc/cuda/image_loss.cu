@@ -1,5 +1,6 @@
 // L1 and SSIM. One kernel computes the values, and SSIM's derivatives by the local moments; one the gradient; one adds
 // up. A block computes one tile of one plane. Windows run along rows, then along columns, in shared memory.
+#include "../refuse_training.h"
 #include "dsmoe/image_loss.h"
 #include "tuning.cuh"
 
@@ -247,6 +248,7 @@ template <class S> int64_t num_image_loss_sums(int64_t planes, int height, int w
 }
 
 template <class S> void image_loss(const ImageLoss<S>& loss, void* stream) {
+  refuse_image_loss("cuda::image_loss", loss);
   const auto cuda_stream = static_cast<cudaStream_t>(stream);
   const int64_t blocks = num_blocks<S>(loss.planes, loss.height, loss.width);
   const LossWeights<S> weights = {ssim_window<S>(), static_cast<S>(loss.l1_scale()), static_cast<S>(loss.ssim_scale())};

@@ -157,7 +157,7 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
 
 // Whether a warp may begin at a segment: what lies in front of it is known there by T.
 template <class S, BlendMode kMode, int kChannels>
-constexpr bool kWeighsSegments = kWalksSegments<S, kChannels>&& Blend<kMode>::kStopsEarly;
+constexpr bool kWeighsSegments = kWalksSegments<S, kMode, kChannels>&& Blend<kMode>::kStopsEarly;
 
 // Whether T tells enough of what lies in front of a segment. W = 1 - T loses digits where it is small, and so does D,
 // unless a gate of the background is in it: behind 1,300 opacities of 2e-5 to 5e-5 the norm of the costs is off by
@@ -273,10 +273,13 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
     dispatch_blend(frame.config.mode, num_channels, [&](auto mode, auto channels) {
       constexpr BlendMode kMode = decltype(mode)::value;
       constexpr int kChannels = decltype(channels)::value;
-      const bool segments = kWeighsSegments<S, kMode, kChannels> && band.saved.segments != nullptr;
-      const int64_t blocks = arguments.tiles + (segments ? num_segment_rows(band.saved.capacity) : 0);
-      importance_kernel<S, kMode, kChannels><<<static_cast<unsigned>(blocks), kWalkBlock, 0, work.stream>>>(arguments);
-      DSMOE_CHECK_LAUNCH("importance");
+      if constexpr (kRemovable<kMode>) {
+        const bool segments = kWeighsSegments<S, kMode, kChannels> && band.saved.segments != nullptr;
+        const int64_t blocks = arguments.tiles + (segments ? num_segment_rows(band.saved.capacity) : 0);
+        importance_kernel<S, kMode, kChannels>
+            <<<static_cast<unsigned>(blocks), kWalkBlock, 0, work.stream>>>(arguments);
+        DSMOE_CHECK_LAUNCH("importance");
+      }
     });
   });
 }

@@ -1,4 +1,5 @@
 // Lazy Adam: a warp finds the rows to bring up to date among 32, and each half of it takes every other one of them.
+#include "../refuse_training.h"
 #include "dsmoe/lazy_adam.h"
 #include "tuning.cuh"
 
@@ -111,6 +112,7 @@ __global__ void __launch_bounds__(kStoreBlock) note_step_kernel(const __grid_con
 }  // namespace
 
 template <class S> void catch_up(const LazyAdam<S>& adam, void* stream) {
+  refuse_catch_up("cuda::catch_up", adam);
   if (adam.num_rows == 0) return;
   const unsigned blocks = blocks_for(adam.num_rows, kAdamBlock);
   catch_up_kernel<<<blocks, kAdamBlock, 0, static_cast<cudaStream_t>(stream)>>>(adam);
@@ -118,6 +120,7 @@ template <class S> void catch_up(const LazyAdam<S>& adam, void* stream) {
 }
 
 template <class S> void note_step(const LazyAdamStep<S>& step, void* stream) {
+  refuse_note_step("cuda::note_step", step);
   if (step.num_rows == 0) return;
   const unsigned blocks = blocks_for(step.num_rows, kStoreBlock);
   note_step_kernel<<<blocks, kStoreBlock, 0, static_cast<cudaStream_t>(stream)>>>(step);

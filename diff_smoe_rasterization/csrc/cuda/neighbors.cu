@@ -1,6 +1,7 @@
 // The three nearest neighbours of every point: exact, by leaving out boxes that are too far.
 #include <cmath>
 
+#include "../refuse.h"
 #include "dsmoe/hd.h"
 #include "dsmoe/neighbors.h"
 #include "tuning.cuh"
@@ -128,6 +129,11 @@ template <class S> void morton_codes(const MortonCodes<S>& morton, void* stream)
 }
 
 template <class S> void mean_squared_distances(const NeighborDistances<S>& search, void* stream) {
+  const char* function = "cuda::mean_squared_distances";
+  refuse_null(function, "points", search.points, "[N, 3]", search.count);
+  refuse_null(function, "order", search.order, "[N]", search.count);
+  refuse_null(function, "boxes", search.boxes, "[ceil(N / kBoxPoints), 2, 3]", search.count);
+  refuse_null(function, "result", search.result, "[N]", search.count);
   if (search.count == 0) return;
   const auto cuda_stream = static_cast<cudaStream_t>(stream);
   box_kernel<<<blocks_for(search.count, kBoxPoints), kWarp, 0, cuda_stream>>>(search);

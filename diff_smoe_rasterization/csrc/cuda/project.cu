@@ -35,7 +35,8 @@ template <int kFeatures, class S> __device__ bool store_features(const ColorSour
   const RasterConfig<S>& config = source.config;
   if constexpr (kFeatures == kFastFeatures) {
     RasterConfig<S> known = config;
-    known.num_channels = kFastFeatures, known.depth = false, known.inverse_depth = false;
+    known.num_channels = kFastFeatures;
+    known.leave_out_further_features();
     S features[kFastFeatures];
     if (!write_features<S>({source.colors, source.mean, source.camera, known}, depth, features)) return false;
     *reinterpret_cast<float4*>(out) = make_float4(features[0], features[1], features[2], 0);

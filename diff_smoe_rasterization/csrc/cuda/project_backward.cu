@@ -55,7 +55,7 @@ __device__ ProjectedGradient<S> image_gradient(const ProjectBackwardArguments<S>
 }
 
 constexpr int kRecordLength = kNumGateMoments + kFastFeatures;  // of colours
-constexpr int kMostRecordLength = kRecordLength + 2;            // with depth and inverse depth
+constexpr int kMostRecordLength = kRecordLength + kMostFurtherFeatures;
 using RecordRows = WarpRows<kRecordLength>;
 
 // The gradients of a lane's Gaussian, but for those of its SH row.
@@ -112,7 +112,7 @@ __global__ void __launch_bounds__(kRowsBlock, kCamera ? kCameraBackwardBlocks : 
 
   RasterConfig<float> config = arguments.config;
   config.num_channels = kFastFeatures;
-  if constexpr (kOnlyColors) config.depth = false, config.inverse_depth = false;
+  if constexpr (kOnlyColors) config.leave_out_further_features();
   float* memory = reinterpret_cast<float*>(shared_rows) +
                   warp * kWarp * (Rows::stride(Rows::kLength) + RecordRows::stride(kRecordLength));
   const Rows rows(memory, Rows::kLength, exist, lane);

@@ -29,8 +29,8 @@ __device__ SegmentPixel<S>& segment_pixel(const SavedForward<S>& saved, const Wa
 }
 
 // Which kernels can walk segments.
-template <class S, int kFeatures>
-constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && kFeatures == kFastFeatures;
+template <class S, BlendMode kMode, int kFeatures>
+constexpr bool kWalksSegments = sizeof(S) == sizeof(float) && (kFeatures == kFastFeatures) && kResumes<kMode>;
 
 template <class S> __device__ bool has_segments(const SavedForward<S>& saved, const WarpTile<S>& tile) {
   return saved.segments != nullptr && tile.source.listed && tile.source.length > kSegmentLength;

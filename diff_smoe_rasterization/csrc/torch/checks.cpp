@@ -111,7 +111,7 @@ void check_footprints(const char* function, const Footprints& of, const Options&
   check_options(function, options);
   check_real(function, "gates", of.gates);
   check_shape(function, "gates", of.gates, {"N", kProjectedGaussianSize});
-  const int64_t count = of.gates.size(0), extra = options.depth + options.inverse_depth;
+  const int64_t count = of.gates.size(0), extra = num_further_features(options);
   check_like(function, "bg", of.background, "gates", of.gates);
   check_shape(function, "bg", of.background, {"C"});
   TORCH_CHECK_VALUE(of.background.numel() > 0, function, ": bg has shape ", of.background.sizes(),
@@ -146,7 +146,7 @@ void check_footprint_gradients(const char* function, const at::Tensor& records, 
                                const Options& options) {
   const at::Tensor& like = inputs[kMeans3D];
   const int64_t count = num_gaussians(inputs);
-  const int64_t num_features = num_channels(inputs) + options.depth + options.inverse_depth;
+  const int64_t num_features = num_channels(inputs) + num_further_features(options);
   check_like(function, "records", records, "means3D", like);
   check_shape(function, "records", records, {count, kNumGateGradients + num_features});
   check_like(function, "features", features, "means3D", like);

@@ -45,10 +45,16 @@
   X(bool, "bool", prefiltered)                                             \
   X(bool, "bool", for_backward) /* whether a backward pass may follow; else what only makes it faster is left out */
 
-// The images: X(enumerator, name). All but the radii are differentiable.
-#define DSMOE_IMAGES(X)                                                            \
-  X(kColor, color)                /* [C, H, W] */                                  \
-  X(kRadii, radii)                /* [N] int32; no image, but the caller's too */  \
-  X(kGateSum, gate_sum)           /* [1, H, W] the denominator; the alpha image */ \
-  X(kDepth, depth)                /* [1, H, W], or [0] where it is not wanted */   \
-  X(kInverseDepth, inverse_depth) /* [1, H, W], or [0] */
+// The images on request, [1, H, W], or [0] where the option of that name is not set: X(enumerator, name). Each is of a
+// feature behind the colour's channels; in the core a flag of RasterConfig and a pointer of ImageOutputs and of
+// ImageGradients have the name too.
+#define DSMOE_FEATURE_IMAGES(X) \
+  X(kDepth, depth)              \
+  X(kInverseDepth, inverse_depth)
+
+// All images: X(enumerator, name). All but the radii are differentiable.
+#define DSMOE_IMAGES(X)                                                  \
+  X(kColor, color)      /* [C, H, W] */                                  \
+  X(kRadii, radii)      /* [N] int32; no image, but the caller's too */  \
+  X(kGateSum, gate_sum) /* [1, H, W] the denominator; the alpha image */ \
+  DSMOE_FEATURE_IMAGES(X)

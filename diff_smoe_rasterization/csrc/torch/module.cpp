@@ -6,6 +6,7 @@
 #include "dsmoe/blend.h"
 #include "dsmoe/constants.h"
 #include "dsmoe/rasterize_cuda.h"
+#include "dsmoe/removal.h"
 #include "io/python_bindings.h"
 #include "most_instances.h"
 #include "profiling.h"
@@ -62,8 +63,8 @@ py::dict saved() {
 }
 
 // The core's list: names in the order of their numbers, each with the facts that Python asks for. `divides`: the
-// backward pass reads the images of the forward pass. `background_gate`: the mode's own, or None where the caller gives
-// it.
+// backward pass reads the images of the forward pass. `removable`: `importance` takes the mode. `background_gate`: the
+// mode's own, or None where the caller gives it.
 py::dict blend_modes() {
   using namespace py::literals;
   py::dict modes;
@@ -71,8 +72,9 @@ py::dict blend_modes() {
     using Policy = dsmoe::Blend<decltype(mode)::value>;
     py::object gate = py::none();
     if (!Policy::kLearnsGate) gate = py::float_(Policy::background_gate(0.0));
-    modes[Policy::kName] = py::dict("number"_a = static_cast<int>(decltype(mode)::value),
-                                    "divides"_a = Policy::kDivides, "background_gate"_a = gate);
+    modes[Policy::kName] =
+        py::dict("number"_a = static_cast<int>(decltype(mode)::value), "divides"_a = Policy::kDivides,
+                 "removable"_a = dsmoe::kRemovable<decltype(mode)::value>, "background_gate"_a = gate);
   });
   return modes;
 }

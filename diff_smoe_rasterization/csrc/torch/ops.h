@@ -58,6 +58,13 @@ class Arguments {
     torch::jit::push(stack_, std::forward<Results>(results)...);
   }
 
+  // The same of the images that `which` lists, and what was saved.
+  template <class Which> void give_back_images(const Which& which, const Images& images, Saved saved) {
+    stack_.resize(begin_);
+    for (const Image image : which) stack_.emplace_back(images[image]);
+    stack_.emplace_back(std::move(saved));
+  }
+
  private:
   const c10::IValue& next() { return stack_[next_++]; }
 
@@ -132,8 +139,7 @@ template <class Backend> void rasterize(const c10::OperatorHandle& op, torch::ji
   if (options.debug) {
     for (Image image : kDifferentiable) refuse_nan(std::string("rasterize: ") + kImageNames[image], images[image]);
   }
-  call.arguments.give_back(images[kColor], images[kRadii], images[kGateSum], images[kDepth], images[kInverseDepth],
-                           memory.take_saved());
+  call.arguments.give_back_images(kAllImages, images, memory.take_saved());
 }
 
 template <class Backend> void radii(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
@@ -264,7 +270,7 @@ template <class Backend> void project(const c10::OperatorHandle& op, torch::jit:
   const Inputs& inputs = call.inputs;
   const at::TensorOptions like = inputs[kMeans3D].options();
   const int64_t count = num_gaussians(inputs);
-  const int64_t num_features = num_channels(inputs) + call.options.depth + call.options.inverse_depth;
+  const int64_t num_features = num_channels(inputs) + num_further_features(call.options);
   const at::Tensor gates = at::empty({count, kProjectedGaussianSize}, like);
   const at::Tensor features = at::empty({count, Backend::feature_columns(num_features)}, like);
   Images images;
@@ -294,7 +300,7 @@ template <class Backend> void blend(const c10::OperatorHandle& op, torch::jit::S
   TensorMemory memory(of.gates);
   memory.give(0, of.gates), memory.give(1, of.features.view(-1));
   dispatch("blend", of.gates, [&](auto zero) { Backend::template blend<decltype(zero)>(of, options, images, memory); });
-  arguments.give_back(images[kColor], images[kGateSum], images[kDepth], images[kInverseDepth], memory.take_saved());
+  arguments.give_back_images(kDifferentiable, images, memory.take_saved());
 }
 
 template <class Backend> void blend_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
@@ -310,7 +316,7 @@ template <class Backend> void blend_backward(const c10::OperatorHandle& op, torc
   check_length(function, "images", image_list.size(), kDifferentiable.size());
   TORCH_CHECK_VALUE(saved.size() > 1, function, ": saved has length ", saved.size(),
                     "; it must be what blend returned");
-  const int64_t num_features = of.background.numel() + options.depth + options.inverse_depth;
+  const int64_t num_features = of.background.numel() + num_further_features(options);
   const int64_t columns = Backend::feature_columns(num_features);
   of.gates = saved[0], of.features = saved[1];
   if (of.gates.dim() == 2 && of.features.numel() == of.gates.size(0) * columns) {
@@ -414,8 +420,7 @@ template <class Backend> void importance(const c10::OperatorHandle& op, torch::j
     RasterConfig<S> config = blend_config<S>(background_gate, options);
     config.num_channels = static_cast<int>(images.color.size(0));
     config.background = data<S>(images.background);
-    config.depth = options.depth;
-    config.inverse_depth = options.inverse_depth;
+    ask_for_features(config, options);
     ImportanceMap<S> map;
     map.color = data<S>(images.color);
     map.pixel_weights = data<S>(weights);

@@ -28,7 +28,10 @@ struct Given : GaussianRasterizationSettings {
   int64_t blend_mode = 0;
   double fixed_background_gate = 0;
   at::Tensor background_gate;
-  bool depth = false, inverse_depth = false, for_backward = false;
+#define DSMOE_FLAG(enumerator, name) bool name = false;
+  DSMOE_FEATURE_IMAGES(DSMOE_FLAG)
+#undef DSMOE_FLAG
+  bool for_backward = false;
 
  private:
   void resolve_blend();
@@ -37,30 +40,37 @@ struct Given : GaussianRasterizationSettings {
 Given::Given(const Settings& settings, const RasterizeArguments& arguments) : Settings(settings) {
   resolve_blend();
   for (const std::string& name : arguments.outputs) {
-    TORCH_CHECK_VALUE(name == "alpha" || name == "depth" || name == "inverse_depth", "rasterize: outputs holds '", name,
-                      "'; it may hold alpha, depth, inverse_depth");
-    depth |= name == "depth";
-    inverse_depth |= name == "inverse_depth";
+    bool known = name == "alpha";
+    std::string names = "alpha";
+#define DSMOE_ASK(enumerator, field) \
+  field |= name == #field;           \
+  known |= name == #field;           \
+  names += ", " #field;
+    DSMOE_FEATURE_IMAGES(DSMOE_ASK)
+#undef DSMOE_ASK
+    TORCH_CHECK_VALUE(known, "rasterize: outputs holds '", name, "'; it may hold ", names);
   }
 }
 
 void Given::resolve_blend() {
   blend_mode = -1;
+  bool learns_gate = false;
   std::string names;
   BlendModes::for_each([&](auto mode) {
-    const std::string name = Blend<decltype(mode)::value>::kName;
-    names += (names.empty() ? "" : ", ") + name;
-    if (Settings::blend_mode == name) blend_mode = static_cast<int64_t>(mode());
+    using Policy = Blend<decltype(mode)::value>;
+    names += (names.empty() ? "" : ", ") + std::string(Policy::kName);
+    if (Settings::blend_mode != Policy::kName) return;
+    blend_mode = static_cast<int64_t>(mode());
+    learns_gate = Policy::kLearnsGate;
+    fixed_background_gate = Policy::background_gate(0.0);
   });
   TORCH_CHECK_VALUE(blend_mode >= 0, "rasterize: blend_mode is '", Settings::blend_mode, "'; it must be one of ",
                     names);
-  const auto alpha = static_cast<int64_t>(BlendMode::kAlpha), smoe = static_cast<int64_t>(BlendMode::kSmoe);
   const std::optional<BackgroundGate>& gate = Settings::background_gate;
   const bool is_one = gate && !gate->tensor.defined() && gate->number == 1;
-  fixed_background_gate = blend_mode == alpha ? 1 : 0;
-  if (!gate || (blend_mode == alpha && is_one)) return;
-  TORCH_CHECK_VALUE(blend_mode == smoe, "rasterize: background_gate is given, but blend_mode is '",
-                    Settings::blend_mode, "'; only 'smoe' knows it");
+  if (!gate || (!learns_gate && fixed_background_gate == 1 && is_one)) return;
+  TORCH_CHECK_VALUE(learns_gate, "rasterize: background_gate is given, but blend_mode is '", Settings::blend_mode,
+                    "'; only 'smoe' knows it");
   if (gate->tensor.defined()) {
     background_gate = gate->tensor;
     return;
@@ -68,7 +78,9 @@ void Given::resolve_blend() {
   TORCH_CHECK_VALUE(0 <= gate->number && gate->number <= kMaxBackgroundGate, "rasterize: background_gate is ",
                     gate->number, "; it must be a number, 0 or more and at most ", kMaxBackgroundGate);
   fixed_background_gate = gate->number;
-  if (is_one) blend_mode = alpha;
+  if (is_one && Settings::blend_mode == Blend<BlendMode::kSmoe>::kName) {
+    blend_mode = static_cast<int64_t>(BlendMode::kAlpha);
+  }
 }
 
 // The op's tensors in their order; absent ones are undefined.
@@ -109,6 +121,7 @@ struct Call {
   variable_list tensors;
   c10::List<bool> present;  // kNumInputs
   std::vector<c10::IValue> options;
+  variable_list* saved = nullptr;  // where what the backend saves goes too, or null
 };
 
 // The images, and behind them what the backend saves.
@@ -135,6 +148,7 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
     context->saved_data["options"] = c10::ivalue::Tuple::create(call.options);
     context->set_materialize_grads(false);
     context->mark_non_differentiable({results[binding::kRadii]});
+    if (call.saved != nullptr) call.saved->assign(results.begin() + kNumImages, results.end());
     results.resize(kNumImages);
     return results;
   }
@@ -174,24 +188,88 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
 
 }  // namespace
 
-Rendering rasterize(const at::Tensor& means3D, const at::Tensor& opacities,
-                    const GaussianRasterizationSettings& settings, const RasterizeArguments& arguments) {
+// What the ops of scores take besides maps.
+struct Splats::Saved {
+  at::Tensor color, radii, gate_sum, background;
+  c10::IValue background_gate;  // a tensor, or none
+  variable_list arrays;
+  std::vector<c10::IValue> options;
+};
+
+namespace {
+
+// splats: filled, or null.
+Rendering render(const at::Tensor& means3D, const at::Tensor& opacities, const GaussianRasterizationSettings& settings,
+                 const RasterizeArguments& arguments, Splats::Saved* splats) {
   Given given(settings, arguments);
   Call call;
-  for (const at::Tensor& tensor : gather(means3D, opacities, given, arguments)) {
+  const Inputs inputs = gather(means3D, opacities, given, arguments);
+  for (const at::Tensor& tensor : inputs) {
     call.present.push_back(tensor.defined());
     if (tensor.defined()) call.tensors.push_back(tensor);
   }
   given.for_backward = at::GradMode::is_enabled() && std::any_of(call.tensors.begin(), call.tensors.end(),
                                                                  [](const auto& t) { return t.requires_grad(); });
   call.options = gather_options(given);
+  if (splats != nullptr) call.saved = &splats->arrays;
   const variable_list images =
       given.for_backward ? Rasterize::apply(at::TensorList(call.tensors), call) : call_rasterize(call);
+  if (splats != nullptr) {
+    if (!given.for_backward) splats->arrays.assign(images.begin() + kNumImages, images.end());
+    splats->color = images[binding::kColor].detach(), splats->gate_sum = images[binding::kGateSum].detach();
+    splats->radii = images[binding::kRadii];
+    // Copies: an optimizer may change these before anybody asks for sums.
+    splats->background = inputs[binding::kBackground].detach().clone();
+    const at::Tensor& gate = inputs[binding::kBackgroundGate];
+    if (gate.defined()) splats->background_gate = gate.detach().clone();
+    splats->options = call.options;
+  }
   const auto& wanted = arguments.outputs;
   const bool alpha = std::find(wanted.begin(), wanted.end(), "alpha") != wanted.end();
   const auto if_asked = [&](bool asked, binding::Image image) { return asked ? images[image] : at::Tensor(); };
   return {images[binding::kColor], images[binding::kRadii], if_asked(alpha, binding::kGateSum),
           if_asked(given.depth, binding::kDepth), if_asked(given.inverse_depth, binding::kInverseDepth)};
+}
+
+// Calls an op with maps or images, then what every op of scores takes.
+torch::jit::Stack score(const char* name, std::vector<c10::IValue> stack, const Splats::Saved& saved) {
+  torch::jit::push(stack, saved.radii, saved.arrays, saved.background_gate);
+  stack.insert(stack.end(), saved.options.begin(), saved.options.end());
+  binding::call_boxed(binding::find_op(name), stack);
+  return stack;
+}
+
+}  // namespace
+
+Rendering rasterize(const at::Tensor& means3D, const at::Tensor& opacities,
+                    const GaussianRasterizationSettings& settings, const RasterizeArguments& arguments) {
+  return render(means3D, opacities, settings, arguments, nullptr);
+}
+
+std::pair<Rendering, Splats> rasterize_with_splats(const at::Tensor& means3D, const at::Tensor& opacities,
+                                                   const GaussianRasterizationSettings& settings,
+                                                   const RasterizeArguments& arguments) {
+  const auto saved = std::make_shared<Splats::Saved>();
+  const Rendering rendering = render(means3D, opacities, settings, arguments, saved.get());
+  Splats splats;
+  splats.saved = saved;
+  return {rendering, splats};
+}
+
+Contributions Splats::contributions(const at::Tensor& pixel_weights) const {
+  TORCH_CHECK_VALUE(saved != nullptr,
+                    "contributions: these Splats are of no rendering; rasterize_with_splats makes them");
+  TORCH_CHECK_VALUE(pixel_weights.defined(), "contributions: pixel_weights is undefined; it must be given");
+  const auto sums = score("contributions", {pixel_weights.detach()}, *saved);
+  return {sums[0].toTensor(), sums[1].toTensor(), sums[2].toTensor(), sums[3].toTensor()};
+}
+
+Importance Splats::importance(const at::Tensor& pixel_weights, const at::Tensor& share_weights) const {
+  TORCH_CHECK_VALUE(saved != nullptr, "importance: these Splats are of no rendering; rasterize_with_splats makes them");
+  const at::Tensor weights = pixel_weights.defined() ? pixel_weights.detach() : at::ones_like(saved->gate_sum[0]);
+  const at::Tensor of_shares = share_weights.defined() ? share_weights.detach() : weights;
+  const auto sums = score("importance", {weights, of_shares, saved->color, saved->gate_sum, saved->background}, *saved);
+  return {sums[0].toTensor(), sums[1].toTensor(), sums[2].toTensor()};
 }
 
 }  // namespace dsmoe

@@ -12,6 +12,17 @@ const std::string kInputs = DSMOE_INPUTS(DSMOE_ARGUMENT);
 const std::string kOptions = DSMOE_OPTIONS(DSMOE_ARGUMENT);
 #undef DSMOE_ARGUMENT
 
+// All images but the radii, each name behind `before`.
+std::string of_differentiable(const std::string& before) {
+  std::string list;
+#define DSMOE_ADD(enumerator, name) \
+  if (std::string(#name) != "radii") list += before + #name + ", ";
+  DSMOE_IMAGES(DSMOE_ADD)
+#undef DSMOE_ADD
+  return list;
+}
+const std::string kImageGradients = of_differentiable("Tensor? dL_d");
+
 std::string without_comma(const std::string& list) { return list.substr(0, list.size() - 2); }
 
 // Besides the images, a backend returns what its backward pass reads again, as ordinary typed tensors, so that torch
@@ -23,17 +34,15 @@ const std::string kRasterize =
 
 // images, saved: all results of rasterize; inputs: the present ones of its tensors. Returned are the gradients of the
 // wanted inputs, in their order. The lists hold no None, or torch would not see that they require a gradient.
-const std::string kRasterizeBackward =
-    "rasterize_backward(Tensor? dL_dcolor, Tensor? dL_dgate_sum, Tensor? dL_ddepth, Tensor? dL_dinverse_depth, "
-    "Tensor[] inputs, bool[] present, Tensor[] images, Tensor[] saved, " +
-    kOptions + "bool[] wanted) -> Tensor[]";
+const std::string kRasterizeBackward = "rasterize_backward(" + kImageGradients +
+                                       "Tensor[] inputs, bool[] present, Tensor[] images, Tensor[] saved, " + kOptions +
+                                       "bool[] wanted) -> Tensor[]";
 
 // The same into the caller's memory, a tensor for each wanted input. Of the Gaussians only the rows are written whose
 // radius is above 0; the others stay as they are.
-const std::string kRasterizeBackwardSeen =
-    "rasterize_backward_seen(Tensor? dL_dcolor, Tensor? dL_dgate_sum, Tensor? dL_ddepth, Tensor? dL_dinverse_depth, "
-    "Tensor[] inputs, bool[] present, Tensor[] images, Tensor[] saved, " +
-    kOptions + "bool[] wanted, Tensor(a!)[] gradients) -> ()";
+const std::string kRasterizeBackwardSeen = "rasterize_backward_seen(" + kImageGradients +
+                                           "Tensor[] inputs, bool[] present, Tensor[] images, Tensor[] saved, " +
+                                           kOptions + "bool[] wanted, Tensor(a!)[] gradients) -> ()";
 
 // The radii [N] that rasterize would return for the same arguments.
 const std::string kRadii = "radii(" + kInputs + without_comma(kOptions) + ") -> Tensor";
@@ -44,14 +53,13 @@ const std::string kRadii = "radii(" + kInputs + without_comma(kOptions) + ") -> 
 const std::string kProject =
     "project(" + kInputs + without_comma(kOptions) + ") -> (Tensor gates, Tensor features, Tensor radii)";
 const std::string kBlend = "blend(Tensor gates, Tensor features, Tensor radii, Tensor bg, Tensor? background_gate, " +
-                           without_comma(kOptions) +
-                           ") -> (Tensor color, Tensor gate_sum, Tensor depth, Tensor inverse_depth, Tensor[] saved)";
+                           without_comma(kOptions) + ") -> (" + of_differentiable("Tensor ") + "Tensor[] saved)";
 
 // records: [N, 6 + F] gradients by a footprint's centre (2 numbers), conic (3), opacity and features.
 const std::string kBlendBackward =
-    "blend_backward(Tensor? dL_dcolor, Tensor? dL_dgate_sum, Tensor? dL_ddepth, Tensor? dL_dinverse_depth, "
-    "Tensor[] images, Tensor[] saved, Tensor radii, Tensor bg, Tensor? background_gate, " +
-    kOptions + "bool wants_background) -> (Tensor records, Tensor dL_dbg, Tensor dL_dbackground_gate)";
+    "blend_backward(" + kImageGradients +
+    "Tensor[] images, Tensor[] saved, Tensor radii, Tensor bg, Tensor? background_gate, " + kOptions +
+    "bool wants_background) -> (Tensor records, Tensor dL_dbg, Tensor dL_dbackground_gate)";
 
 // dL_ddepths: [N] by the view depths, besides what the features say. Returned is what rasterize_backward returns.
 const std::string kProjectBackward =

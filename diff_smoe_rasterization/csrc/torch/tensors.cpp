@@ -17,12 +17,12 @@ std::vector<int64_t> image_shape(Image image, const ImageSizes& sizes, const Opt
       return {sizes.num_channels, height, width};
     case kRadii:
       return {sizes.num_gaussians};
-    case kDepth:
-      if (!options.depth) return {0};
-      break;
-    case kInverseDepth:
-      if (!options.inverse_depth) return {0};
-      break;
+#define DSMOE_CASE(enumerator, name) \
+  case enumerator:                   \
+    if (!options.name) return {0};   \
+    break;
+      DSMOE_FEATURE_IMAGES(DSMOE_CASE)
+#undef DSMOE_CASE
     default:
       break;
   }

@@ -33,7 +33,22 @@ constexpr const char* kImageNames[] = {DSMOE_IMAGES(DSMOE_NAME_OF_IMAGE)};
 #undef DSMOE_NAME_OF_IMAGE
 
 // The images that loss gradients arrive at, in the order of the backward op's arguments.
-constexpr std::array<Image, kNumImages - 1> kDifferentiable = {kColor, kGateSum, kDepth, kInverseDepth};
+constexpr std::array<Image, kNumImages - 1> all_but_radii() {
+  std::array<Image, kNumImages - 1> images = {};
+  size_t next = 0;
+  for (int i = 0; i < kNumImages; ++i) {
+    if (i != kRadii) images[next++] = static_cast<Image>(i);
+  }
+  return images;
+}
+constexpr auto kDifferentiable = all_but_radii();
+static_assert(kNumImages == kDepth + kMostFurtherFeatures,
+              "params.h: kMostFurtherFeatures counts DSMOE_FEATURE_IMAGES");
+constexpr std::array kAllImages = {
+#define DSMOE_LISTED(enumerator, name) enumerator,
+    DSMOE_IMAGES(DSMOE_LISTED)
+#undef DSMOE_LISTED
+};
 
 using Inputs = std::array<at::Tensor, kNumInputs>;  // an absent input is an undefined tensor
 using Images = std::array<at::Tensor, kNumImages>;  // also their gradients, undefined where there is none
@@ -46,6 +61,21 @@ struct Options {
   DSMOE_OPTIONS(DSMOE_MEMBER)
 #undef DSMOE_MEMBER
 };
+
+// How many features are behind the colour's channels.
+inline int64_t num_further_features(const Options& options) {
+  int64_t count = 0;
+#define DSMOE_COUNT(enumerator, name) count += options.name;
+  DSMOE_FEATURE_IMAGES(DSMOE_COUNT)
+#undef DSMOE_COUNT
+  return count;
+}
+
+template <class S> void ask_for_features(RasterConfig<S>& config, const Options& options) {
+#define DSMOE_ASK(enumerator, name) config.name = options.name;
+  DSMOE_FEATURE_IMAGES(DSMOE_ASK)
+#undef DSMOE_ASK
+}
 
 inline int64_t num_gaussians(const Inputs& inputs) { return inputs[kMeans3D].size(0); }
 
@@ -154,8 +184,7 @@ template <class S> RasterConfig<S> raster_config(const Inputs& inputs, const Opt
   out.scale_modifier = static_cast<S>(options.scale_modifier);
   out.low_pass = static_cast<S>(options.low_pass);
   out.antialiasing = options.antialiasing;
-  out.depth = options.depth;
-  out.inverse_depth = options.inverse_depth;
+  ask_for_features(out, options);
   out.clamp_color = options.clamp_color;
   return out;
 }
@@ -167,8 +196,7 @@ RasterConfig<S> footprint_config(const at::Tensor& background, const at::Tensor&
   RasterConfig<S> out = blend_config<S>(background_gate, options);
   out.num_channels = static_cast<int>(background.numel());
   out.background = data<S>(background);
-  out.depth = options.depth;
-  out.inverse_depth = options.inverse_depth;
+  ask_for_features(out, options);
   return out;
 }
 
@@ -184,8 +212,9 @@ template <class Camera> void set_image(Camera& camera, const Options& options) {
 template <class S> ImageOutputs<S> image_outputs(const Images& images) {
   ImageOutputs<S> out;
   out.color = mutable_data<S>(images[kColor]);
-  out.depth = mutable_data<S>(images[kDepth]);
-  out.inverse_depth = mutable_data<S>(images[kInverseDepth]);
+#define DSMOE_POINT(enumerator, name) out.name = mutable_data<S>(images[enumerator]);
+  DSMOE_FEATURE_IMAGES(DSMOE_POINT)
+#undef DSMOE_POINT
   out.radii = mutable_data<int32_t>(images[kRadii]);
   out.gate_sum = mutable_data<S>(images[kGateSum]);
   return out;
@@ -195,8 +224,9 @@ template <class S> ImageGradients<S> image_gradients(const Images& gradients) {
   ImageGradients<S> out;
   out.color = data<S>(gradients[kColor]);
   out.gate_sum = data<S>(gradients[kGateSum]);
-  out.depth = data<S>(gradients[kDepth]);
-  out.inverse_depth = data<S>(gradients[kInverseDepth]);
+#define DSMOE_POINT(enumerator, name) out.name = data<S>(gradients[enumerator]);
+  DSMOE_FEATURE_IMAGES(DSMOE_POINT)
+#undef DSMOE_POINT
   return out;
 }
 

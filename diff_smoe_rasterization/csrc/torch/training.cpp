@@ -1,10 +1,9 @@
 // dsmoe/torch_training.h: the trainers' ops with their gradients for C++.
 #include <torch/csrc/autograd/custom_function.h>
 
-#include <cmath>
-
 #include "call_op.h"
 #include "check_tensor.h"
+#include "dsmoe/adam.h"
 #include "dsmoe/torch_training.h"
 #include "tensors.h"
 
@@ -106,13 +105,13 @@ void adam_step(std::vector<AdamParameter>& parameters, double epsilon, double be
     for (at::Tensor* moment : {&parameter.moment, &parameter.square}) {
       if (!moment->defined()) *moment = at::zeros(parameter.value.sizes(), gradient.options());
     }
-    const auto age = static_cast<double>(++parameter.step);
+    const auto corrected = adam_rates<double>(parameter.lr, ++parameter.step, beta1, beta2);
     values.push_back(parameter.value.detach());
     gradients.push_back(gradient);
     moments.push_back(parameter.moment);
     squares.push_back(parameter.square);
-    rates.push_back(parameter.lr / (1 - std::pow(beta1, age)));
-    root_scales.push_back(1 / std::sqrt(1 - std::pow(beta2, age)));
+    rates.push_back(corrected.rate);
+    root_scales.push_back(corrected.root_scale);
   }
   if (values.empty()) return;
   call_op<Signature>(op, at::TensorList(values), at::TensorList(gradients), at::TensorList(moments),

@@ -29,11 +29,6 @@ inline void note_change(at::TensorList tensors) {
   for (const at::Tensor& tensor : tensors) tensor.unsafeGetTensorImpl()->bump_version();
 }
 
-template <class S> AdamConstants<S> adam_constants(double beta1, double beta2, double epsilon) {
-  return {static_cast<S>(beta1), static_cast<S>(beta2), static_cast<S>(1 - beta1), static_cast<S>(1 - beta2),
-          static_cast<S>(epsilon)};
-}
-
 inline std::string item_name(const char* list, size_t i) { return std::string(list) + "[" + std::to_string(i) + "]"; }
 
 // A list that must have a dense tensor for each parameter, of its shape, type and device.

@@ -1,6 +1,9 @@
 // One step of Adam (Kingma and Ba 2015, algorithm 1) on one number.
 #pragma once
 
+#include <cmath>
+#include <cstdint>
+
 #include "dsmoe/hd.h"
 
 namespace dsmoe {
@@ -15,6 +18,19 @@ template <class S> struct AdamConstants {
 // Constants of one parameter. With bias correction in step t: rate = lr / (1 - beta1^t) and
 // root_scale = 1 / sqrt(1 - beta2^t). Without: rate = lr and root_scale = 1.
 template <class S> struct AdamRates { S rate, root_scale; };
+
+template <class S> AdamConstants<S> adam_constants(double beta1 = 0.9, double beta2 = 0.999, double epsilon = 1e-8) {
+  return {static_cast<S>(beta1), static_cast<S>(beta2), static_cast<S>(1 - beta1), static_cast<S>(1 - beta2),
+          static_cast<S>(epsilon)};
+}
+
+// With bias correction. step: 1 in the first.
+template <class S>
+AdamRates<S> adam_rates(double learning_rate, int64_t step, double beta1 = 0.9, double beta2 = 0.999) {
+  const auto t = static_cast<double>(step);
+  return {static_cast<S>(learning_rate / (1 - std::pow(beta1, t))),
+          static_cast<S>(1 / std::sqrt(1 - std::pow(beta2, t)))};
+}
 
 // a b + c. In kernels it is always one fused operation, so that all kernels come to the same bits.
 template <class S> DSMOE_HD S multiply_add(S a, S b, S c) {

@@ -124,10 +124,11 @@ DSMOE_HD PairGradient<Real> transmit_backward(PixelBackward<Real>& pixel, Real l
   return {power, weight};
 }
 
-// What a pixel sums. Each mode states its own as kLaw, so that algebra which holds for one law can assert it.
+// What a pixel sums. Each mode states its own as kLaw. Algebra that holds for the gates' law alone asks for it: a mode
+// of another law has no importance (kRemovable), and its backward pass walks long lists whole (kResumes).
 enum class Law {
   kGates,  // what GateBlend's parameters say
-  kOther,  // the mode has an `accumulate` of its own
+  kOther,  // the mode has an `accumulate` and a `backward` of its own
 };
 
 // The arithmetic of all modes, and the facts that most of them share. kTInNumerator: w_i is alpha_i T_i; else alpha_i.
@@ -137,11 +138,12 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   static constexpr bool kWithinRadius = false;               // pairs outside the tiles of the 3-sigma square do not
   static constexpr bool kNeedsDepthOrder = kTInNumerator;    // pairs are taken front to back
   static constexpr bool kStopsEarly = kTInDenominator;       // once full, a pixel is done
-  static constexpr bool kSuffixAboutBase = kTInDenominator;  // u_i = g'.c_i - b; else g'.c_i
+  static constexpr bool kSuffixAboutBase = kTInDenominator;  // u_i = g'.c_i - b, b in nothing else; else g'.c_i
   static constexpr bool kDivides = true;                     // a pixel is divided by D; else D is 1
   static constexpr bool kLearnsGate = false;                 // the caller gives lambda, and may learn it
   template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda
 
+  // Reads alpha and counts, and no logit: not every walk has one here.
   template <class Real> static DSMOE_HD PairWeight<Real> accumulate(PixelState<Real>& state, const Gate<Real>& gate) {
     const Real alpha = select(gate.counts, gate.alpha, Real(Scalar<Real>(0)));
     if constexpr (!kTInDenominator) state.gate_sum = state.gate_sum + alpha;
@@ -206,15 +208,18 @@ DSMOE_HD constexpr bool within_radius(BlendMode mode) {
   return within;
 }
 
+// Whether a backward walk of the mode can be continued by resume_backward. Else one walk takes a whole list.
+template <BlendMode kMode> constexpr bool kResumes = Blend<kMode>::kLaw == Law::kGates;
+
 // Continues a backward walk in front of pairs that another walk takes. transmittance: T in front of those pairs.
 // behind: their sum w g'.c. Where u is g'.c - b, the sum needs their sum w b too, which is b times
 // (T in front of them - T behind them).
 template <BlendMode kMode, class Real>
 DSMOE_HD void resume_backward(PixelBackward<Real>& pixel, Real transmittance, Real behind) {
+  static_assert(kResumes<kMode>, "another law has another sum of w, and may have another suffix: ask kResumes first");
   pixel.suffix = pixel.suffix + behind;
   if constexpr (Blend<kMode>::kSuffixAboutBase) {
-    static_assert(Blend<kMode>::kLaw == Law::kGates && Blend<kMode>::kNeedsDepthOrder,
-                  "the sum of w is taken from T: this is right where w_i is alpha_i T_i only");
+    static_assert(Blend<kMode>::kNeedsDepthOrder, "the sum of w is taken from T, so w_i has to be alpha_i T_i");
     pixel.suffix = pixel.suffix - pixel.base * (transmittance - pixel.transmittance);
   }
   pixel.transmittance = transmittance;

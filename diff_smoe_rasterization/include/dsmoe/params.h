@@ -7,6 +7,8 @@
 
 #include <cstdint>
 #include <limits>
+#include <optional>
+#include <string_view>
 
 #include "dsmoe/project.h"
 
@@ -30,6 +32,15 @@ inline int64_t band_tiles(const TileGrid& grid, const TileBand& band) {
   return static_cast<int64_t>(grid.columns) * (min(band.end, grid.rows) - band.begin);
 }
 
+// The mode that files and settings name so; absent where no mode has the name.
+inline std::optional<BlendMode> blend_mode_of(std::string_view name) {
+  std::optional<BlendMode> found;
+  BlendModes::for_each([&](auto mode) {
+    if (name == Blend<decltype(mode)::value>::kName) found = mode();
+  });
+  return found;
+}
+
 template <class S> struct GaussianInputs {
   int64_t num_gaussians = 0;
   const S* means3D = nullptr;         // [N, 3] world
@@ -43,6 +54,9 @@ template <class S> struct GaussianInputs {
   int num_sh = 0;                     // K
   int sh_degree = 0;                  // active degree, 0 to 3; dc and shs have (degree + 1)^2 coefficients or more
 };
+
+// Features that may follow the colour's channels: the flags of RasterConfig that its num_features counts.
+constexpr int kMostFurtherFeatures = 2;
 
 template <class S> struct RasterConfig {
   BlendMode mode = BlendMode::kAlpha;
@@ -68,6 +82,7 @@ template <class S> struct RasterConfig {
     return {mode, scale_modifier, alpha_cut(), low_pass, antialiasing, inverse_depth};
   }
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
+  DSMOE_HD void leave_out_further_features() { depth = inverse_depth = false; }
 };
 
 // One (Gaussian, tile) pair, in a tile's list from front to back.

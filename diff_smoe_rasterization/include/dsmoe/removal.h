@@ -60,12 +60,15 @@ template <class Real> DSMOE_HD Real rest_of(Real total, Real part) {
   return select(rest > total * Real(kRounding), rest, Real(S(0)));
 }
 
+// Whether the algebra above holds in the mode. Where it does not, `importance` refuses the mode.
+template <BlendMode kMode> constexpr bool kRemovable = Blend<kMode>::kLaw == Law::kGates;
+
 // Moves `state` past a pair. end: the pixel behind its last pair. wanted: the walk has not passed the pixel's last
 // pair.
 template <BlendMode kMode, class Real>
 DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>& end, const Gate<Real>& gate,
                                    Mask<Real> wanted) {
-  static_assert(Blend<kMode>::kLaw == Law::kGates, "another law needs its own C' - C, derived as at the top");
+  static_assert(kRemovable<kMode>, "another law needs its own C' - C, derived as at the top: ask kRemovable first");
   using S = Scalar<Real>;
   constexpr bool kSeesThrough = Blend<kMode>::kNeedsDepthOrder, kCountsWeights = Blend<kMode>::kStopsEarly;
   const Real zero = S(0), one = S(1);

@@ -13,6 +13,7 @@
 #include <ATen/ATen.h>
 
 #include <cstdint>
+#include <memory>
 #include <optional>
 #include <string>
 #include <utility>
@@ -83,6 +84,41 @@ struct Rendering {
 /// derivatives do not exist. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
 Rendering rasterize(const at::Tensor& means3D, const at::Tensor& opacities,
                     const GaussianRasterizationSettings& settings, const RasterizeArguments& arguments = {});
+
+/// Sums over the pixels that blended each of N Gaussians; a Gaussian without pixels has 0.
+struct Contributions {
+  at::Tensor pixel_weights;  // [N] sum of the given map
+  at::Tensor pixels;         // [N] int32, how many they are
+  at::Tensor blend_weights;  // [N] sum of alpha T, in `smoe_std` of alpha; divided by no gate sum
+  at::Tensor distances;      // [N] sum of |pixel - centre| in pixels
+};
+
+/// What each of N Gaussians is worth to an image: sums over the pixels, with e the weight of a pixel and f the share of
+/// the Gaussian, dC/dc of its colour c. A culled Gaussian has 0.
+struct Importance {
+  at::Tensor shares;          // [N] sum e f
+  at::Tensor squared_shares;  // [N] sum e f^2
+  at::Tensor removal_costs;   // [N] sum e |C' - C|^2, over all channels; C' is the pixel without the Gaussian
+};
+
+/// What one rendering knows of each Gaussian, as Python's class of this name. Nothing here has a gradient. The images
+/// of the rendering must not be changed in place meanwhile.
+class Splats {
+ public:
+  /// pixel_weights: [H, W], any numbers, of the Gaussians' type and device.
+  Contributions contributions(const at::Tensor& pixel_weights) const;
+
+  /// pixel_weights: [H, W] e; undefined: 1. share_weights: [H, W] e of the shares; undefined: pixel_weights.
+  Importance importance(const at::Tensor& pixel_weights = {}, const at::Tensor& share_weights = {}) const;
+
+  struct Saved;                        // of the implementation
+  std::shared_ptr<const Saved> saved;  // likewise
+};
+
+/// The same as `rasterize`, and what scores its Gaussians.
+std::pair<Rendering, Splats> rasterize_with_splats(const at::Tensor& means3D, const at::Tensor& opacities,
+                                                   const GaussianRasterizationSettings& settings,
+                                                   const RasterizeArguments& arguments = {});
 
 /// The settings of a pinhole camera, transposed matrices included, as Python's function of this name. K: [3, 3]
 /// intrinsics in pixels; as in COLMAP, the centre of the top left pixel is (0.5, 0.5). R, t: [3, 3] and [3], world to

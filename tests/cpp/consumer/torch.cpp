@@ -1,6 +1,7 @@
 // The rasterizer for LibTorch, through the installed library: against the core, finite differences and formulas.
 #include "dsmoe/torch.h"
 
+#include <c10/core/GradMode.h>
 #include <gtest/gtest.h>
 
 #include <cmath>
@@ -121,6 +122,31 @@ TEST_P(Modes, GradientsAreTheCores) {
   EXPECT_TRUE(at::equal(alpha[0], rendering.alpha[0][0]) && at::equal(depth, rendering.depth[0]));
   EXPECT_TRUE(at::equal(inverse_depth, rendering.inverse_depth[0]));
   EXPECT_GT(rendering.radii.count_nonzero().item<int64_t>(), kGaussians / 2);
+
+  // The scores too, without and with a gradient.
+  const at::Tensor e = random({kSize, kSize}, 0, 1), f = random({kSize, kSize}, 0, 1);
+  const auto sum = [] { return at::zeros({kGaussians}, at::kDouble); };
+  const at::Tensor pixels = at::zeros({kGaussians}, at::kInt);
+  const std::vector<at::Tensor> sums = {sum(), sum(), sum(), sum(), sum(), sum()};
+  dsmoe::cpu::contributions(frame,
+                            {data(e), {data(sums[0]), pixels.data_ptr<int32_t>(), data(sums[1]), data(sums[2])}});
+  dsmoe::cpu::importance(frame, {data(color), data(e), data(f), {data(sums[3]), data(sums[4]), data(sums[5])}});
+  for (const bool differentiable : {true, false}) {
+    const c10::AutoGradMode mode(differentiable);
+    const auto splats =
+        dsmoe::rasterize_with_splats(scene.means3D, scene.opacities, scene.settings, scene.arguments).second;
+    const auto contributions = splats.contributions(e);
+    const auto importance = splats.importance(e, f);
+    const std::vector<at::Tensor> actual = {contributions.pixel_weights, contributions.blend_weights,
+                                            contributions.distances,     importance.shares,
+                                            importance.squared_shares,   importance.removal_costs};
+    for (size_t i = 0; i < sums.size(); ++i) EXPECT_TRUE(at::equal(actual[i], sums[i])) << "sums " << i;
+    EXPECT_TRUE(at::equal(contributions.pixels, pixels));
+    EXPECT_GT(pixels.sum().item<int64_t>(), 0);
+    const at::Tensor ones = at::ones({kSize, kSize}, at::kDouble);
+    EXPECT_TRUE(at::equal(splats.importance().shares, splats.importance(ones, ones).shares));
+  }
+  EXPECT_THROW(dsmoe::Splats().contributions(e), c10::ValueError);
 
   dsmoe::cpu::Gradients<double> gradients;
   gradients.images = {data(w[0]), data(w[1]), data(w[2]), data(w[3])};

@@ -21,7 +21,11 @@ namespace {
 // What a rendering and its backward pass leave.
 template <class S> struct Results {
   explicit Results(const Scene<S>& scene)
-      : rendering(scene), weights(scene, 7), gradient(scene), means2D_abs(2 * scene.count, S(NAN)) {}
+      : mode(scene.config.mode),
+        rendering(scene),
+        weights(scene, 7),
+        gradient(scene),
+        means2D_abs(2 * scene.count, S(NAN)) {}
 
   Gradients<S> gradients() {
     Gradients<S> out = {weights.gradients(), gradient.gradients()};
@@ -42,13 +46,14 @@ template <class S> struct Results {
     std::vector<S> pixel_weights, unused(2 * count);
     for (const bool left_out : unsure) pixel_weights.push_back(S(!left_out));
     std::vector<int32_t> pixels(count);
-    worth.assign(4 * count, S(NAN));
+    worth.assign(4 * count, is_removable(mode) ? S(NAN) : S(0));
     const auto sums = [&](int k) { return worth.data() + k * count; };
     walk(ContributionMap<S>{pixel_weights.data(), {sums(0), pixels.data(), unused.data(), unused.data() + count}},
          ImportanceMap<S>{
              rendering.color.data(), pixel_weights.data(), pixel_weights.data(), {sums(1), sums(2), sums(3)}});
   }
 
+  BlendMode mode;
   Rendering<S> rendering;
   ImageWeights<S> weights;
   SceneGradient<S> gradient;
@@ -69,7 +74,8 @@ Results<double> on_cpu(const Scene<double>& scene, const std::vector<bool>& unsu
   cpu::Heap heap;
   cpu::forward(frame, heap);
   out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
-    cpu::contributions(frame, contributions), cpu::importance(frame, importance);
+    cpu::contributions(frame, contributions);
+    if (is_removable(frame.config.mode)) cpu::importance(frame, importance);
   });
   cpu::backward(frame, out.gradients());
   return out;
@@ -119,7 +125,8 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   if (frame.saved.capacity > 0) expect_longest_first(frame.saved, int64_t(grid.columns) * grid.rows);
   const cuda::Work work = {nullptr, &memory};
   out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
-    cuda::contributions(frame, contributions, work), cuda::importance(frame, importance, work);
+    cuda::contributions(frame, contributions, work);
+    if (is_removable(frame.config.mode)) cuda::importance(frame, importance, work);
   });
   cuda::backward(frame, out.gradients(), run, memory);
   return out;

@@ -7,7 +7,7 @@ import pytest
 import torch
 from comparison import assert_close
 from devices import random_normal
-from scenes import random_scene
+from scenes import REMOVABLE_MODES, random_scene
 
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.integrations import (
@@ -251,6 +251,7 @@ def test_counts_of_pixels(mode):
     assert not rendered(fastgs, scene, {"get_flag": False})[2].any()
 
 
+@pytest.mark.parametrize("mode", REMOVABLE_MODES)
 def test_scores_are_what_a_removal_changes(mode):
     """Each Gaussian is left out in turn."""
     scene = random_scene(mode, 6, WIDTH, HEIGHT, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)

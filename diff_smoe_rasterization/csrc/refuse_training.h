@@ -1,0 +1,99 @@
+// What the trainers' functions of both backends refuse, as refuse.h does for the passes: null pointers, by name. They
+// look at pointers alone, once a call. The passes of gaussians.h do not look.
+#pragma once
+
+#include <vector>
+
+#include "dsmoe/adam_tensors.h"
+#include "dsmoe/gather.h"
+#include "dsmoe/gaussian_adam.h"
+#include "dsmoe/image_loss.h"
+#include "dsmoe/lazy_adam.h"
+#include "refuse.h"
+
+namespace dsmoe {
+
+// "name[i].field": of an item of a list.
+inline void refuse_null_item(const char* function, const char* list, size_t i, const char* field, const void* array,
+                             int64_t size) {
+  if (array == nullptr && size > 0) {
+    refuse(function, list, "[", i, "].", field, " is null; it must point to an array of ", size, " numbers");
+  }
+}
+
+template <class S> void refuse_adam(const char* function, const std::vector<AdamTensor<S>>& tensors) {
+  for (size_t i = 0; i < tensors.size(); ++i) {
+    const AdamTensor<S>& tensor = tensors[i];
+    refuse_null_item(function, "tensors", i, "parameter", tensor.parameter, tensor.size);
+    refuse_null_item(function, "tensors", i, "gradient", tensor.gradient, tensor.size);
+    refuse_null_item(function, "tensors", i, "moment", tensor.moment, tensor.size);
+    refuse_null_item(function, "tensors", i, "square", tensor.square, tensor.size);
+    if (tensor.size > 0 && (tensor.row_size < 1 || tensor.size % tensor.row_size != 0)) {
+      refuse(function, "tensors[", i, "].row_size is ", tensor.row_size, "; it must be 1 or more and divide ",
+             tensor.size);
+    }
+  }
+}
+
+template <class S> void refuse_step_gaussians(const char* function, const GaussianAdam<S>& adam) {
+  for (size_t i = 0; i < kGaussianAdamTensors; ++i) {
+    const ActivatedTensor<S>& tensor = adam.tensors[i];
+    const int64_t size = adam.num_gaussians * tensor.row_size;
+    refuse_null_item(function, "tensors", i, "raw", tensor.raw, size);
+    refuse_null_item(function, "tensors", i, "value", tensor.value, tensor.activation == Activation::kNone ? 0 : size);
+    refuse_null_item(function, "tensors", i, "dL_dvalue", tensor.dL_dvalue, size);
+    refuse_null_item(function, "tensors", i, "moment", tensor.moment, size);
+    refuse_null_item(function, "tensors", i, "square", tensor.square, size);
+  }
+  refuse_null(function, "radii", adam.radii, "[N]", adam.num_gaussians);
+}
+
+inline void refuse_num_tensors(const char* function, int num_tensors) {
+  if (0 <= num_tensors && num_tensors <= kLazyAdamMaxTensors) return;
+  refuse(function, "num_tensors is ", num_tensors, "; it must be 0 to ", kLazyAdamMaxTensors);
+}
+
+template <class S> void refuse_catch_up(const char* function, const LazyAdam<S>& adam) {
+  refuse_num_tensors(function, adam.num_tensors);
+  for (int i = 0; i < adam.num_tensors; ++i) {
+    const LazyAdamTensor<S>& tensor = adam.tensors[i];
+    const int64_t size = adam.num_rows * tensor.row_size;
+    refuse_null_item(function, "tensors", i, "parameter", tensor.parameter, size);
+    refuse_null_item(function, "tensors", i, "moment", tensor.moment, size);
+    refuse_null_item(function, "tensors", i, "square", tensor.square, size);
+    refuse_null_item(function, "tensors", i, "gradient", tensor.gradient, size);
+  }
+  refuse_null(function, "marks", adam.marks, "[N]", adam.num_rows);
+  refuse_null(function, "rates", adam.rates, "[steps, num_tensors]", adam.num_rows > 0 ? adam.steps : 0);
+}
+
+template <class S> void refuse_note_step(const char* function, const LazyAdamStep<S>& step) {
+  refuse_num_tensors(function, step.num_tensors);
+  refuse_null(function, "marks", step.marks, "[N]", step.num_rows);
+  refuse_null(function, "radii", step.radii, "[N]", step.num_rows);
+  refuse_null(function, "rates", step.rates, "[num_tensors]", step.num_tensors);
+}
+
+template <class S>
+void refuse_gather(const char* function, const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows) {
+  for (size_t i = 0; i < tensors.size(); ++i) {
+    const int64_t size = rows.count * tensors[i].row_size;
+    refuse_null_item(function, "tensors", i, "to", tensors[i].to, size);
+    if (tensors[i].from == nullptr && size > 0) refuse(function, "tensors[", i, "].from is null; it must have rows");
+  }
+  refuse_null(function, "rows", rows.rows, "[count]", tensors.empty() ? 0 : rows.count);
+}
+
+template <class S> void refuse_image_loss(const char* function, const ImageLoss<S>& loss) {
+  const int64_t size = loss.planes * loss.height * loss.width;
+  refuse_null(function, "image", loss.image, "[planes, height, width]", size);
+  if (loss.target == nullptr && loss.target_bytes == nullptr && size > 0) {
+    refuse(function, "target and target_bytes are null; one must point to an array [planes, height, width]");
+  }
+  refuse_null(function, "loss", loss.loss, "[1]", 1);
+  refuse_null(function, "sums", loss.sums, "[num_image_loss_sums(...)]", size);
+  refuse_null(function, "derivatives", loss.derivatives, "[3, planes, height, width], as a gradient is wanted",
+              loss.gradient != nullptr ? size : 0);
+}
+
+}  // namespace dsmoe
