@@ -59,4 +59,4 @@ def parse_gate_options(text: str) -> GateOptions:
 
 def gate_settings(options: GateOptions) -> str:
     """All settings, as `parse_gate_options` takes them."""
-    return ",".join(f"{name}={value:g}" for name, value in dataclasses.asdict(options).items())
+    return ",".join(f"{name}={value:.12g}" for name, value in dataclasses.asdict(options).items())

@@ -316,7 +316,7 @@ def test_settings_of_gate_are_checked(text, words):
 
 
 def test_settings_of_gate_are_of_gate_only():
-    text = "overshoot=0,removals=1,views=1,moves=0,worth=0,bands=1,anneal=0.5,squares=0"
+    text = "overshoot=0,removals=1,views=1000000,moves=0,worth=0,bands=1,anneal=0.5,squares=0"
     assert TrainConfig(budget=60, strategy_options=text.replace(",", ", ")).validate()
     assert gate_settings(parse_gate_options(text)) == text
     with pytest.raises(ConfigError, match="--strategy-options is 'views=3'; it must be left out with --strategy mcmc"):
