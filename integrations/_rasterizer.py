@@ -73,10 +73,10 @@ def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any])
 def results_with_features(names: Sequence[str], settings: Settings, inputs: Dict[str, Any], feature: str,
                           features: torch.Tensor) -> Tuple[torch.Tensor, ...]:
     """Returns `results_of`, in one rendering with features [N, F] or [N, 1, F], whose image is the result `feature`."""
-    features = features.reshape(len(features), -1)
+    features = features.flatten(1)
     inputs = dict(inputs)
     shs, colors = inputs.pop("shs", None), inputs.pop("colors_precomp", None)
-    if colors is None or colors.numel() == 0:
+    if colors is None or colors.numel() == 0 and shs is not None:
         colors = reference.color(reference.Gaussians(inputs["means3D"], None, None, shs, None, None, None, None),
                                  settings)
     inputs["colors_precomp"] = torch.cat([colors, features], 1)

@@ -12,6 +12,6 @@ def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:
     """Positions [M, 3], opacity logits [M, 1], log scales [M, 3], quaternions [M, 4], dc [M, 3] and the other harmonics
     [M, 3 (K - 1)] of the M Gaussians all of whose numbers are finite."""
     arrays = [gaussians.means3D, gaussians.opacity_logits, gaussians.log_scales, gaussians.rotations,
-              gaussians.dc[:, 0], gaussians.shs.reshape(len(gaussians.shs), -1)]
+              gaussians.dc[:, 0], gaussians.shs.reshape(len(gaussians.shs), 3 * gaussians.shs.shape[1])]
     finite = np.isfinite(np.hstack(arrays)).all(axis=1)
     return [array[finite] for array in arrays]

@@ -73,6 +73,14 @@ def test_a_splat_file_leaves_out_what_no_viewer_can_show(arrays):
     assert splat_bytes(gaussians(**arrays)) == whole[:32], "the second, which is first in the file"
 
 
+def test_a_model_without_gaussians_is_an_empty_file_and_an_empty_page():
+    nothing = gaussians(**{name: np.zeros((0, *shape)) for name, shape in [
+        ("means3D", (3,)), ("dc", (1, 3)), ("shs", (15, 3)), ("opacity_logits", (1,)), ("log_scales", (3,)),
+        ("rotations", (4,))]})
+    assert splat_bytes(nothing) == b""
+    assert html.pack(nothing) == (0, b"", b"")
+
+
 def test_a_page_holds_every_gaussian_to_the_bits_it_promises():
     random = np.random.RandomState(0)
     model = gaussians(means3D=random.normal(0, 9, (50, 3)), dc=random.normal(0, 1, (50, 1, 3)),

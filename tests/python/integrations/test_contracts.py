@@ -315,6 +315,18 @@ def test_the_gaussian_of_the_largest_weight_and_where_its_rays_are_deepest(mode,
         mini_splatting.GaussianRasterizer(scene.settings).render_depth(torch.zeros(1, 3), None, torch.ones(1, 1))
 
 
+@pytest.mark.parametrize("module, name", [(feature_3dgs, "semantic_feature"), (grouping, "sh_objs")])
+@pytest.mark.parametrize("colors", ["sh", "precomp"])
+def test_features_of_no_gaussians_are_the_background(module, name, colors):
+    inputs = {"sh": {"shs": torch.zeros(0, 4, 3).double()}, "precomp": {"colors_precomp": torch.zeros(0, 3).double()}}
+    scene = scene_of("smoe")
+    nothing = {key: tensor[:0] for key, tensor in scene.inputs.items() if key not in ("shs", "colors_precomp")}
+    made = module.GaussianRasterizationSettings(**scene.settings._asdict())
+    color, *others = module.GaussianRasterizer(made)(**nothing, **inputs[colors], **{name: torch.zeros(0, 1, 4).double()})
+    assert torch.equal(color, scene.settings.bg[:, None, None].expand_as(color))
+    assert [4, HEIGHT, WIDTH] in [list(image.shape) for image in others]
+
+
 def test_mini_splatting_without_gaussians_is_the_background():
     scene = scene_of("smoe").rows(torch.zeros(N, dtype=torch.bool))
     color, *scores = rendered(mini_splatting, scene)
