@@ -130,7 +130,8 @@ class TrainConfig:
         self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.schedule}")
         if self.schedule == "gate":
             self.gate_options()
-            self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy gate")
+            self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy gate; "
+                          "--scale-recipe makes it half of --iterations")
             self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter "
                           "with --strategy gate, whose removals end there; --scale-recipe shortens all of it")
         self._require("strategy_options", not self.strategy_options or self.schedule == "gate",

@@ -78,7 +78,11 @@ def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
 
 
 def orbit_of_points(positions: np.ndarray) -> Orbit:
-    """An orbit about the middle of points [N, 3], for a model without a scene; -y is up, as COLMAP mostly has it."""
+    """An orbit about the middle of points [N, 3], for a model without a scene; -y is up, as COLMAP mostly has it.
+
+    Without points it is about the origin.
+    """
+    positions = positions if len(positions) else np.zeros((1, 3))
     target = np.median(positions, axis=0)
     size = float(np.percentile(np.linalg.norm(positions - target, axis=1), 90)) or 1.0
     distance = size / math.tan(FIELD_OF_VIEW / 2)

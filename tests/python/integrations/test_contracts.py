@@ -321,8 +321,9 @@ def test_features_of_no_gaussians_are_the_background(module, name, colors):
     inputs = {"sh": {"shs": torch.zeros(0, 4, 3).double()}, "precomp": {"colors_precomp": torch.zeros(0, 3).double()}}
     scene = scene_of("smoe")
     nothing = {key: tensor[:0] for key, tensor in scene.inputs.items() if key not in ("shs", "colors_precomp")}
+    nothing[name] = torch.zeros(0, 1, 4).double()
     made = module.GaussianRasterizationSettings(**scene.settings._asdict())
-    color, *others = module.GaussianRasterizer(made)(**nothing, **inputs[colors], **{name: torch.zeros(0, 1, 4).double()})
+    color, *others = module.GaussianRasterizer(made)(**nothing, **inputs[colors])
     assert torch.equal(color, scene.settings.bg[:, None, None].expand_as(color))
     assert [4, HEIGHT, WIDTH] in [list(image.shape) for image in others]
 
