@@ -36,7 +36,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     if config.budget:
         unusual["budget"] = config.budget
     if config.schedule == "gate":  # with the defaults of this version
-        unusual["strategy_options"] = gate_settings(config.gate_options())
+        unusual.update(strategy_options=gate_settings(config.gate_options()),
+                       densify_until_iter=config.densify_until_iter)
     if config.random_background:
         unusual["random_background"] = True
     if views[0].mask is not None:

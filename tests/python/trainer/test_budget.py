@@ -94,6 +94,7 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, kille
     assert row["num_gaussians"] == 120
     recorded = row["protocol"].get("strategy_options")
     assert recorded is None if schedule == "mcmc" else (settings or "removals=16") in recorded
+    assert row["protocol"].get("densify_until_iter") == (None if schedule == "mcmc" else 30)
 
 
 def looking(trainer, monkeypatch):
