@@ -28,44 +28,48 @@ struct Given : GaussianRasterizationSettings {
   int64_t blend_mode = 0;
   double fixed_background_gate = 0;
   at::Tensor background_gate;
-#define DSMOE_FLAG(enumerator, name) bool name = false;
-  DSMOE_FEATURE_IMAGES(DSMOE_FLAG)
-#undef DSMOE_FLAG
-  bool for_backward = false;
+  bool depth = false, inverse_depth = false, for_backward = false;
 
  private:
   void resolve_blend();
 };
 
+// For messages alone.
+std::string output_names() {
+  std::string names = "alpha";
+  binding::for_each_feature_image([&](binding::Image image, auto) { (names += ", ") += binding::kImageNames[image]; });
+  return names;
+}
+
+std::string mode_names() {
+  std::string names;
+  BlendModes::for_each([&](auto mode) { (names += names.empty() ? "" : ", ") += Blend<decltype(mode)::value>::kName; });
+  return names;
+}
+
 Given::Given(const Settings& settings, const RasterizeArguments& arguments) : Settings(settings) {
   resolve_blend();
   for (const std::string& name : arguments.outputs) {
     bool known = name == "alpha";
-    std::string names = "alpha";
-#define DSMOE_ASK(enumerator, field) \
-  field |= name == #field;           \
-  known |= name == #field;           \
-  names += ", " #field;
-    DSMOE_FEATURE_IMAGES(DSMOE_ASK)
-#undef DSMOE_ASK
-    TORCH_CHECK_VALUE(known, "rasterize: outputs holds '", name, "'; it may hold ", names);
+    binding::for_each_feature_image([&](binding::Image image, auto field) {
+      if (name == binding::kImageNames[image]) field(*this) = known = true;
+    });
+    TORCH_CHECK_VALUE(known, "rasterize: outputs holds '", name, "'; it may hold ", output_names());
   }
 }
 
 void Given::resolve_blend() {
   blend_mode = -1;
   bool learns_gate = false;
-  std::string names;
   BlendModes::for_each([&](auto mode) {
     using Policy = Blend<decltype(mode)::value>;
-    names += (names.empty() ? "" : ", ") + std::string(Policy::kName);
     if (Settings::blend_mode != Policy::kName) return;
     blend_mode = static_cast<int64_t>(mode());
     learns_gate = Policy::kLearnsGate;
     fixed_background_gate = Policy::background_gate(0.0);
   });
   TORCH_CHECK_VALUE(blend_mode >= 0, "rasterize: blend_mode is '", Settings::blend_mode, "'; it must be one of ",
-                    names);
+                    mode_names());
   const std::optional<BackgroundGate>& gate = Settings::background_gate;
   const bool is_one = gate && !gate->tensor.defined() && gate->number == 1;
   if (!gate || (!learns_gate && fixed_background_gate == 1 && is_one)) return;
