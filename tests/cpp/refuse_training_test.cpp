@@ -14,7 +14,7 @@ AdamRates<float> rates[1] = {};
 const int32_t radii[1] = {1};
 const int64_t row = 0;
 
-std::string null(const std::string& name, const std::string& what) {
+std::string null(const std::string& name, const char* what) {
   return name + " is null; it must point to an array " + what;
 }
 

@@ -138,7 +138,9 @@ variable_list call_rasterize(const Call& call) {
   binding::call_boxed(op, stack);
   variable_list results;
   for (int i = 0; i < kNumImages; ++i) results.push_back(stack[i].toTensor());
-  for (const at::Tensor& tensor : stack[kNumImages].toTensorVector()) results.push_back(tensor);
+  const variable_list saved = stack[kNumImages].toTensorVector();
+  if (call.saved != nullptr) *call.saved = saved;
+  results.insert(results.end(), saved.begin(), saved.end());
   return results;
 }
 
@@ -152,7 +154,6 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
     context->saved_data["options"] = c10::ivalue::Tuple::create(call.options);
     context->set_materialize_grads(false);
     context->mark_non_differentiable({results[binding::kRadii]});
-    if (call.saved != nullptr) call.saved->assign(results.begin() + kNumImages, results.end());
     results.resize(kNumImages);
     return results;
   }
@@ -219,7 +220,6 @@ Rendering render(const at::Tensor& means3D, const at::Tensor& opacities, const G
   const variable_list images =
       given.for_backward ? Rasterize::apply(at::TensorList(call.tensors), call) : call_rasterize(call);
   if (splats != nullptr) {
-    if (!given.for_backward) splats->arrays.assign(images.begin() + kNumImages, images.end());
     splats->color = images[binding::kColor].detach(), splats->gate_sum = images[binding::kGateSum].detach();
     splats->radii = images[binding::kRadii];
     // Copies: an optimizer may change these before anybody asks for sums.
@@ -236,7 +236,7 @@ Rendering render(const at::Tensor& means3D, const at::Tensor& opacities, const G
 }
 
 // Calls an op with maps or images, then what every op of scores takes.
-torch::jit::Stack score(const char* name, std::vector<c10::IValue> stack, const Splats::Saved& saved) {
+torch::jit::Stack score(const char* name, torch::jit::Stack stack, const Splats::Saved& saved) {
   torch::jit::push(stack, saved.radii, saved.arrays, saved.background_gate);
   stack.insert(stack.end(), saved.options.begin(), saved.options.end());
   binding::call_boxed(binding::find_op(name), stack);
@@ -254,10 +254,7 @@ std::pair<Rendering, Splats> rasterize_with_splats(const at::Tensor& means3D, co
                                                    const GaussianRasterizationSettings& settings,
                                                    const RasterizeArguments& arguments) {
   const auto saved = std::make_shared<Splats::Saved>();
-  const Rendering rendering = render(means3D, opacities, settings, arguments, saved.get());
-  Splats splats;
-  splats.saved = saved;
-  return {rendering, splats};
+  return {render(means3D, opacities, settings, arguments, saved.get()), Splats{saved}};
 }
 
 Contributions Splats::contributions(const at::Tensor& pixel_weights) const {
