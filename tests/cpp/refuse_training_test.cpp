@@ -71,6 +71,9 @@ TEST(RefuseTraining, LazyAdam) {
                   {{[](auto& a) { a.rates = nullptr; }, null("rates", "[steps, num_tensors]")},
                    {[](auto& a) { a.marks = nullptr; }, null("marks", "[N]")},
                    {[](auto& a) { a.tensors[0].gradient = nullptr; }, null("tensors[0].gradient", "of 3 numbers")},
+                   {[](auto& a) { a.tensors[0].parameter = nullptr; }, null("tensors[0].parameter", "of 3 numbers")},
+                   {[](auto& a) { a.tensors[0].moment = nullptr; }, null("tensors[0].moment", "of 3 numbers")},
+                   {[](auto& a) { a.tensors[0].square = nullptr; }, null("tensors[0].square", "of 3 numbers")},
                    {[](auto& a) { a.num_tensors = 5; }, "num_tensors is 5; it must be 0 to 4"},
                    {[](auto& a) { a.num_tensors = -1; }, "num_tensors is -1; it must be 0 to 4"}});
   const LazyAdamStep<float> step = {1, marks, radii, rates, {}, 1, 0};
@@ -91,6 +94,8 @@ TEST(RefuseTraining, GatherAndNeighbours) {
                  "cpu::gather_rows: tensors[0].to is null; it must point to an array of 3 numbers");
   expect_refusal([&] { gather(numbers, to, nullptr); },
                  "cpu::gather_rows: rows is null; it must point to an array [count]");
+  expect_refusal([&] { cpu::mean_squared_distances<float>(nullptr, 4, to, 1); },
+                 "cpu::mean_squared_distances: points is null; it must point to an array [N, 3]");
   expect_refusal([&] { cpu::mean_squared_distances<float>(numbers, 4, nullptr, 1); },
                  "cpu::mean_squared_distances: result is null; it must point to an array [N]");
 }
