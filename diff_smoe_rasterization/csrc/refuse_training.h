@@ -1,7 +1,8 @@
-// What the trainers' functions of both backends refuse, as refuse.h does for the passes: null pointers, by name. They
-// look at pointers alone, once a call. The passes of gaussians.h do not look.
+// What the trainers' functions of both backends refuse, as refuse.h does for the passes: null pointers, by name, and
+// sizes that would have them read elsewhere. The passes of gaussians.h do not look.
 #pragma once
 
+#include <initializer_list>
 #include <vector>
 
 #include "dsmoe/adam_tensors.h"
@@ -13,37 +14,38 @@
 
 namespace dsmoe {
 
-// "name[i].field": of an item of a list.
-inline void refuse_null_item(const char* function, const char* list, size_t i, const char* field, const void* array,
-                             int64_t size) {
-  if (array == nullptr && size > 0) {
-    refuse(function, list, "[", i, "].", field, " is null; it must point to an array of ", size, " numbers");
+struct NamedArray {
+  const char* name;
+  const void* array;
+};
+
+// Arrays of tensors[i]. size: of each.
+inline void refuse_null_fields(const char* function, size_t i, int64_t size, std::initializer_list<NamedArray> fields) {
+  for (const NamedArray& field : fields) {
+    if (field.array != nullptr || size <= 0) continue;
+    refuse(function, "tensors[", i, "].", field.name, " is null; it must point to an array of ", size, " numbers");
   }
 }
 
 template <class S> void refuse_adam(const char* function, const std::vector<AdamTensor<S>>& tensors) {
   for (size_t i = 0; i < tensors.size(); ++i) {
-    const AdamTensor<S>& tensor = tensors[i];
-    refuse_null_item(function, "tensors", i, "parameter", tensor.parameter, tensor.size);
-    refuse_null_item(function, "tensors", i, "gradient", tensor.gradient, tensor.size);
-    refuse_null_item(function, "tensors", i, "moment", tensor.moment, tensor.size);
-    refuse_null_item(function, "tensors", i, "square", tensor.square, tensor.size);
-    if (tensor.size > 0 && (tensor.row_size < 1 || tensor.size % tensor.row_size != 0)) {
-      refuse(function, "tensors[", i, "].row_size is ", tensor.row_size, "; it must be 1 or more and divide ",
-             tensor.size);
+    const AdamTensor<S>& t = tensors[i];
+    refuse_null_fields(
+        function, i, t.size,
+        {{"parameter", t.parameter}, {"gradient", t.gradient}, {"moment", t.moment}, {"square", t.square}});
+    if (t.size > 0 && (t.row_size < 1 || t.size % t.row_size != 0)) {
+      refuse(function, "tensors[", i, "].row_size is ", t.row_size, "; it must be 1 or more and divide ", t.size);
     }
   }
 }
 
 template <class S> void refuse_step_gaussians(const char* function, const GaussianAdam<S>& adam) {
   for (size_t i = 0; i < kGaussianAdamTensors; ++i) {
-    const ActivatedTensor<S>& tensor = adam.tensors[i];
-    const int64_t size = adam.num_gaussians * tensor.row_size;
-    refuse_null_item(function, "tensors", i, "raw", tensor.raw, size);
-    refuse_null_item(function, "tensors", i, "value", tensor.value, tensor.activation == Activation::kNone ? 0 : size);
-    refuse_null_item(function, "tensors", i, "dL_dvalue", tensor.dL_dvalue, size);
-    refuse_null_item(function, "tensors", i, "moment", tensor.moment, size);
-    refuse_null_item(function, "tensors", i, "square", tensor.square, size);
+    const ActivatedTensor<S>& t = adam.tensors[i];
+    const int64_t size = adam.num_gaussians * t.row_size;
+    refuse_null_fields(function, i, size,
+                       {{"raw", t.raw}, {"dL_dvalue", t.dL_dvalue}, {"moment", t.moment}, {"square", t.square}});
+    if (t.activation != Activation::kNone) refuse_null_fields(function, i, size, {{"value", t.value}});
   }
   refuse_null(function, "radii", adam.radii, "[N]", adam.num_gaussians);
 }
@@ -56,12 +58,10 @@ inline void refuse_num_tensors(const char* function, int num_tensors) {
 template <class S> void refuse_catch_up(const char* function, const LazyAdam<S>& adam) {
   refuse_num_tensors(function, adam.num_tensors);
   for (int i = 0; i < adam.num_tensors; ++i) {
-    const LazyAdamTensor<S>& tensor = adam.tensors[i];
-    const int64_t size = adam.num_rows * tensor.row_size;
-    refuse_null_item(function, "tensors", i, "parameter", tensor.parameter, size);
-    refuse_null_item(function, "tensors", i, "moment", tensor.moment, size);
-    refuse_null_item(function, "tensors", i, "square", tensor.square, size);
-    refuse_null_item(function, "tensors", i, "gradient", tensor.gradient, size);
+    const LazyAdamTensor<S>& t = adam.tensors[i];
+    refuse_null_fields(
+        function, i, adam.num_rows * t.row_size,
+        {{"parameter", t.parameter}, {"moment", t.moment}, {"square", t.square}, {"gradient", t.gradient}});
   }
   refuse_null(function, "marks", adam.marks, "[N]", adam.num_rows);
   refuse_null(function, "rates", adam.rates, "[steps, num_tensors]", adam.num_rows > 0 ? adam.steps : 0);
@@ -78,7 +78,7 @@ template <class S>
 void refuse_gather(const char* function, const std::vector<GatherTensor<S>>& tensors, const GatherRows& rows) {
   for (size_t i = 0; i < tensors.size(); ++i) {
     const int64_t size = rows.count * tensors[i].row_size;
-    refuse_null_item(function, "tensors", i, "to", tensors[i].to, size);
+    refuse_null_fields(function, i, size, {{"to", tensors[i].to}});
     if (tensors[i].from == nullptr && size > 0) refuse(function, "tensors[", i, "].from is null; it must have rows");
   }
   refuse_null(function, "rows", rows.rows, "[count]", tensors.empty() ? 0 : rows.count);

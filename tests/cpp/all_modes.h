@@ -15,7 +15,7 @@ template <class Tuple> struct TypesOf;
 template <class... Modes> struct TypesOf<std::tuple<Modes...>> { using Type = testing::Types<Modes...>; };
 
 template <BlendMode kMode>
-constexpr bool kDividesByGates = Blend<kMode>::kDivides ? Blend<kMode>::kLaw == Law::kGates : false;
+constexpr bool kDividesByGates = Blend<kMode>::kDivides && (Blend<kMode>::kLaw == Law::kGates);
 
 template <BlendMode kMode, bool kIf>
 using ModeIf = std::conditional_t<kIf, std::tuple<ModeConstant<kMode>>, std::tuple<>>;

@@ -5,6 +5,7 @@
 
 #include "cpu/tile_loop.h"
 #include "dsmoe/removal.h"
+#include "refusal.h"
 #include "refuse.h"
 #include "test_scene.h"
 
@@ -42,12 +43,8 @@ namespace {
 static_assert(!kResumes<kMean> && !kRemovable<kMean>);
 TEST(OwnMode, HasNoImportance) {
   EXPECT_NO_THROW(refuse_unremovable("importance", BlendMode::kSmoe));
-  try {
-    refuse_unremovable<ModeList<kMean>>("importance", kMean);
-    FAIL() << "no refusal";
-  } catch (const std::invalid_argument& error) {
-    EXPECT_STREQ(error.what(), "importance: blend_mode is mean; it must be one whose law dsmoe/removal.h knows");
-  }
+  expect_refusal([] { refuse_unremovable<ModeList<kMean>>("importance", kMean); },
+                 "importance: blend_mode is mean; it must be one whose law dsmoe/removal.h knows");
 }
 
 TEST(OwnMode, IsDrawnAndDifferentiatedByTheWalk) {

@@ -5,24 +5,15 @@
 
 #include <cmath>
 #include <functional>
-#include <stdexcept>
 #include <string>
 #include <vector>
 
 #include "dsmoe/rasterize_cuda.h"
+#include "refusal.h"
 #include "test_scene.h"
 
 namespace dsmoe {
 namespace {
-
-void expect_refusal(const std::function<void()>& call, const std::string& message) {
-  try {
-    call();
-    ADD_FAILURE() << "nothing was thrown; expected: " << message;
-  } catch (const std::invalid_argument& error) {
-    EXPECT_EQ(error.what(), message);
-  }
-}
 
 Scene<float> scene_with_depths() {
   Scene<float> scene = convert<float>(make_scene(1, 20, 37, 29));

@@ -58,10 +58,12 @@ class Arguments {
     torch::jit::push(stack_, std::forward<Results>(results)...);
   }
 
-  // The same of the images that `which` lists, and what was saved.
-  template <class Which> void give_back_images(const Which& which, const Images& images, Saved saved) {
+  // The same of the images and what was saved.
+  void give_back_images(const Images& images, bool with_radii, Saved saved) {
     stack_.resize(begin_);
-    for (const Image image : which) stack_.emplace_back(images[image]);
+    for (int i = 0; i < kNumImages; ++i) {
+      if (i != kRadii || with_radii) stack_.emplace_back(images[i]);
+    }
     stack_.emplace_back(std::move(saved));
   }
 
@@ -139,7 +141,7 @@ template <class Backend> void rasterize(const c10::OperatorHandle& op, torch::ji
   if (options.debug) {
     for (Image image : kDifferentiable) refuse_nan(std::string("rasterize: ") + kImageNames[image], images[image]);
   }
-  call.arguments.give_back_images(kAllImages, images, memory.take_saved());
+  call.arguments.give_back_images(images, /*with_radii=*/true, memory.take_saved());
 }
 
 template <class Backend> void radii(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
@@ -300,7 +302,7 @@ template <class Backend> void blend(const c10::OperatorHandle& op, torch::jit::S
   TensorMemory memory(of.gates);
   memory.give(0, of.gates), memory.give(1, of.features.view(-1));
   dispatch("blend", of.gates, [&](auto zero) { Backend::template blend<decltype(zero)>(of, options, images, memory); });
-  arguments.give_back_images(kDifferentiable, images, memory.take_saved());
+  arguments.give_back_images(images, /*with_radii=*/false, memory.take_saved());
 }
 
 template <class Backend> void blend_backward(const c10::OperatorHandle& op, torch::jit::Stack* stack) {

@@ -28,44 +28,48 @@ struct Given : GaussianRasterizationSettings {
   int64_t blend_mode = 0;
   double fixed_background_gate = 0;
   at::Tensor background_gate;
-#define DSMOE_FLAG(enumerator, name) bool name = false;
-  DSMOE_FEATURE_IMAGES(DSMOE_FLAG)
-#undef DSMOE_FLAG
-  bool for_backward = false;
+  bool depth = false, inverse_depth = false, for_backward = false;
 
  private:
   void resolve_blend();
 };
 
+// For messages alone.
+std::string output_names() {
+  std::string names = "alpha";
+  binding::for_each_feature_image([&](binding::Image image, auto) { (names += ", ") += binding::kImageNames[image]; });
+  return names;
+}
+
+std::string mode_names() {
+  std::string names;
+  BlendModes::for_each([&](auto mode) { (names += names.empty() ? "" : ", ") += Blend<decltype(mode)::value>::kName; });
+  return names;
+}
+
 Given::Given(const Settings& settings, const RasterizeArguments& arguments) : Settings(settings) {
   resolve_blend();
   for (const std::string& name : arguments.outputs) {
     bool known = name == "alpha";
-    std::string names = "alpha";
-#define DSMOE_ASK(enumerator, field) \
-  field |= name == #field;           \
-  known |= name == #field;           \
-  names += ", " #field;
-    DSMOE_FEATURE_IMAGES(DSMOE_ASK)
-#undef DSMOE_ASK
-    TORCH_CHECK_VALUE(known, "rasterize: outputs holds '", name, "'; it may hold ", names);
+    binding::for_each_feature_image([&](binding::Image image, auto field) {
+      if (name == binding::kImageNames[image]) field(*this) = known = true;
+    });
+    TORCH_CHECK_VALUE(known, "rasterize: outputs holds '", name, "'; it may hold ", output_names());
   }
 }
 
 void Given::resolve_blend() {
   blend_mode = -1;
   bool learns_gate = false;
-  std::string names;
   BlendModes::for_each([&](auto mode) {
     using Policy = Blend<decltype(mode)::value>;
-    names += (names.empty() ? "" : ", ") + std::string(Policy::kName);
     if (Settings::blend_mode != Policy::kName) return;
     blend_mode = static_cast<int64_t>(mode());
     learns_gate = Policy::kLearnsGate;
     fixed_background_gate = Policy::background_gate(0.0);
   });
   TORCH_CHECK_VALUE(blend_mode >= 0, "rasterize: blend_mode is '", Settings::blend_mode, "'; it must be one of ",
-                    names);
+                    mode_names());
   const std::optional<BackgroundGate>& gate = Settings::background_gate;
   const bool is_one = gate && !gate->tensor.defined() && gate->number == 1;
   if (!gate || (!learns_gate && fixed_background_gate == 1 && is_one)) return;
@@ -134,7 +138,9 @@ variable_list call_rasterize(const Call& call) {
   binding::call_boxed(op, stack);
   variable_list results;
   for (int i = 0; i < kNumImages; ++i) results.push_back(stack[i].toTensor());
-  for (const at::Tensor& tensor : stack[kNumImages].toTensorVector()) results.push_back(tensor);
+  const variable_list saved = stack[kNumImages].toTensorVector();
+  if (call.saved != nullptr) *call.saved = saved;
+  results.insert(results.end(), saved.begin(), saved.end());
   return results;
 }
 
@@ -148,7 +154,6 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
     context->saved_data["options"] = c10::ivalue::Tuple::create(call.options);
     context->set_materialize_grads(false);
     context->mark_non_differentiable({results[binding::kRadii]});
-    if (call.saved != nullptr) call.saved->assign(results.begin() + kNumImages, results.end());
     results.resize(kNumImages);
     return results;
   }
@@ -215,7 +220,6 @@ Rendering render(const at::Tensor& means3D, const at::Tensor& opacities, const G
   const variable_list images =
       given.for_backward ? Rasterize::apply(at::TensorList(call.tensors), call) : call_rasterize(call);
   if (splats != nullptr) {
-    if (!given.for_backward) splats->arrays.assign(images.begin() + kNumImages, images.end());
     splats->color = images[binding::kColor].detach(), splats->gate_sum = images[binding::kGateSum].detach();
     splats->radii = images[binding::kRadii];
     // Copies: an optimizer may change these before anybody asks for sums.
@@ -232,7 +236,7 @@ Rendering render(const at::Tensor& means3D, const at::Tensor& opacities, const G
 }
 
 // Calls an op with maps or images, then what every op of scores takes.
-torch::jit::Stack score(const char* name, std::vector<c10::IValue> stack, const Splats::Saved& saved) {
+torch::jit::Stack score(const char* name, torch::jit::Stack stack, const Splats::Saved& saved) {
   torch::jit::push(stack, saved.radii, saved.arrays, saved.background_gate);
   stack.insert(stack.end(), saved.options.begin(), saved.options.end());
   binding::call_boxed(binding::find_op(name), stack);
@@ -250,10 +254,7 @@ std::pair<Rendering, Splats> rasterize_with_splats(const at::Tensor& means3D, co
                                                    const GaussianRasterizationSettings& settings,
                                                    const RasterizeArguments& arguments) {
   const auto saved = std::make_shared<Splats::Saved>();
-  const Rendering rendering = render(means3D, opacities, settings, arguments, saved.get());
-  Splats splats;
-  splats.saved = saved;
-  return {rendering, splats};
+  return {render(means3D, opacities, settings, arguments, saved.get()), Splats{saved}};
 }
 
 Contributions Splats::contributions(const at::Tensor& pixel_weights) const {

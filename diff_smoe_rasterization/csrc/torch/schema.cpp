@@ -3,7 +3,7 @@
 
 #include <string>
 
-#include "fields.h"
+#include "tensors.h"
 
 namespace {
 
@@ -15,10 +15,8 @@ const std::string kOptions = DSMOE_OPTIONS(DSMOE_ARGUMENT);
 // All images but the radii, each name behind `before`.
 std::string of_differentiable(const std::string& before) {
   std::string list;
-#define DSMOE_ADD(enumerator, name) \
-  if (std::string(#name) != "radii") list += before + #name + ", ";
-  DSMOE_IMAGES(DSMOE_ADD)
-#undef DSMOE_ADD
+  using namespace dsmoe::binding;
+  for (const Image image : kDifferentiable) list += before + kImageNames[image] + ", ";
   return list;
 }
 const std::string kImageGradients = of_differentiable("Tensor? dL_d");

@@ -12,21 +12,13 @@ Inputs contiguous(Inputs inputs) {
 
 std::vector<int64_t> image_shape(Image image, const ImageSizes& sizes, const Options& options) {
   const int64_t height = options.image_height, width = options.image_width;
-  switch (image) {
-    case kColor:
-      return {sizes.num_channels, height, width};
-    case kRadii:
-      return {sizes.num_gaussians};
-#define DSMOE_CASE(enumerator, name) \
-  case enumerator:                   \
-    if (!options.name) return {0};   \
-    break;
-      DSMOE_FEATURE_IMAGES(DSMOE_CASE)
-#undef DSMOE_CASE
-    default:
-      break;
-  }
-  return {1, height, width};
+  if (image == kColor) return {sizes.num_channels, height, width};
+  if (image == kRadii) return {sizes.num_gaussians};
+  bool wanted = true;
+  for_each_feature_image([&](Image other, auto field) {
+    if (image == other) wanted = field(options);
+  });
+  return wanted ? std::vector<int64_t>{1, height, width} : std::vector<int64_t>{0};
 }
 
 Images allocate_images(const at::Tensor& like_tensor, const ImageSizes& sizes, const Options& options) {

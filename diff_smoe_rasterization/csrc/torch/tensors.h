@@ -28,27 +28,24 @@ constexpr const char* kInputNames[] = {DSMOE_INPUTS(DSMOE_NAME_OF_INPUT)};
 enum Image : int { DSMOE_IMAGES(DSMOE_ENUMERATOR) kNumImages };
 constexpr const char* kImageNames[] = {DSMOE_IMAGES(DSMOE_NAME_OF_IMAGE)};
 
+// The images that loss gradients arrive at, in the order of the backward op's arguments.
+constexpr std::array kDifferentiable = {kColor, kGateSum, DSMOE_FEATURE_IMAGES(DSMOE_ENUMERATOR)};
+static_assert(kDifferentiable.size() == kNumImages - 1, "all images but the radii");
+static_assert(kDifferentiable.size() == 2 + kMostFurtherFeatures,
+              "params.h: kMostFurtherFeatures counts DSMOE_FEATURE_IMAGES");
+
 #undef DSMOE_ENUMERATOR
 #undef DSMOE_NAME_OF_INPUT
 #undef DSMOE_NAME_OF_IMAGE
 
-// The images that loss gradients arrive at, in the order of the backward op's arguments.
-constexpr std::array<Image, kNumImages - 1> all_but_radii() {
-  std::array<Image, kNumImages - 1> images = {};
-  size_t next = 0;
-  for (int i = 0; i < kNumImages; ++i) {
-    if (i != kRadii) images[next++] = static_cast<Image>(i);
-  }
-  return images;
+// Calls body(image, field) for each image on request; field(struct) is the member that has its name.
+template <class Body> void for_each_feature_image(const Body& body) {
+#define DSMOE_CALL(enumerator, name) \
+  body(                              \
+      enumerator, [](auto& of) -> auto& { return of.name; });
+  DSMOE_FEATURE_IMAGES(DSMOE_CALL)
+#undef DSMOE_CALL
 }
-constexpr auto kDifferentiable = all_but_radii();
-static_assert(kNumImages == kDepth + kMostFurtherFeatures,
-              "params.h: kMostFurtherFeatures counts DSMOE_FEATURE_IMAGES");
-constexpr std::array kAllImages = {
-#define DSMOE_LISTED(enumerator, name) enumerator,
-    DSMOE_IMAGES(DSMOE_LISTED)
-#undef DSMOE_LISTED
-};
 
 using Inputs = std::array<at::Tensor, kNumInputs>;  // an absent input is an undefined tensor
 using Images = std::array<at::Tensor, kNumImages>;  // also their gradients, undefined where there is none
@@ -65,16 +62,12 @@ struct Options {
 // How many features are behind the colour's channels.
 inline int64_t num_further_features(const Options& options) {
   int64_t count = 0;
-#define DSMOE_COUNT(enumerator, name) count += options.name;
-  DSMOE_FEATURE_IMAGES(DSMOE_COUNT)
-#undef DSMOE_COUNT
+  for_each_feature_image([&](Image, auto field) { count += field(options); });
   return count;
 }
 
 template <class S> void ask_for_features(RasterConfig<S>& config, const Options& options) {
-#define DSMOE_ASK(enumerator, name) config.name = options.name;
-  DSMOE_FEATURE_IMAGES(DSMOE_ASK)
-#undef DSMOE_ASK
+  for_each_feature_image([&](Image, auto field) { field(config) = field(options); });
 }
 
 inline int64_t num_gaussians(const Inputs& inputs) { return inputs[kMeans3D].size(0); }
@@ -212,9 +205,7 @@ template <class Camera> void set_image(Camera& camera, const Options& options) {
 template <class S> ImageOutputs<S> image_outputs(const Images& images) {
   ImageOutputs<S> out;
   out.color = mutable_data<S>(images[kColor]);
-#define DSMOE_POINT(enumerator, name) out.name = mutable_data<S>(images[enumerator]);
-  DSMOE_FEATURE_IMAGES(DSMOE_POINT)
-#undef DSMOE_POINT
+  for_each_feature_image([&](Image image, auto field) { field(out) = mutable_data<S>(images[image]); });
   out.radii = mutable_data<int32_t>(images[kRadii]);
   out.gate_sum = mutable_data<S>(images[kGateSum]);
   return out;
@@ -224,9 +215,7 @@ template <class S> ImageGradients<S> image_gradients(const Images& gradients) {
   ImageGradients<S> out;
   out.color = data<S>(gradients[kColor]);
   out.gate_sum = data<S>(gradients[kGateSum]);
-#define DSMOE_POINT(enumerator, name) out.name = data<S>(gradients[enumerator]);
-  DSMOE_FEATURE_IMAGES(DSMOE_POINT)
-#undef DSMOE_POINT
+  for_each_feature_image([&](Image image, auto field) { field(out) = data<S>(gradients[image]); });
   return out;
 }
 
