@@ -28,9 +28,9 @@ class GateOptions:
     # A Gaussian moves where its cost is below this part of the error at its new place.
     worth: float = _setting(0.2, lambda x: 0 <= x < math.inf, "at least 0")
     # The learning rate of the higher SH bands is so many times that of the recipe.
-    bands: float = _setting(2.0, lambda x: 0 < x < math.inf, "a positive number")
+    bands: float = _setting(2.0, lambda x: 0 < x < math.inf, "above 0")
     # Behind the moves all learning rates but the positions' fall to this part of themselves.
-    anneal: float = _setting(0.1, lambda x: 0 < x < math.inf, "a positive number")
+    anneal: float = _setting(0.1, lambda x: 0 < x < math.inf, "above 0")
     # There too the loss has so many times the squared error in place of the absolute one; 0: it keeps that one. With 30
     # both pull alike where they differ by 1/60.
     squares: float = _setting(30.0, lambda x: 0 <= x < math.inf, "at least 0")
@@ -47,13 +47,14 @@ def parse_gate_options(text: str) -> GateOptions:
         name, _, value = part.strip().partition("=")
         if name not in known:
             raise ConfigError(f"--strategy-options: {name!r} is unknown; it may name {', '.join(known)}")
+        kind, requirement = type(known[name].default), known[name].metadata["requirement"]
         try:
-            values[name] = type(known[name].default)(value)
+            values[name] = kind(value)
         except ValueError as error:
-            raise ConfigError(f"--strategy-options: {name} is {value!r}; it must be a number") from error
+            what = "a whole number" if kind is int else "a number"
+            raise ConfigError(f"--strategy-options: {name} is {value!r}; it must be {what}, {requirement}") from error
         if not known[name].metadata["holds"](values[name]):
-            raise ConfigError(f"--strategy-options: {name} is {value}; it must be "
-                              f"{known[name].metadata['requirement']}")
+            raise ConfigError(f"--strategy-options: {name} is {value}; it must be {requirement}")
     return GateOptions(**values)
 
 
