@@ -383,8 +383,8 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
         arguments.command_parser.error("--scale-recipe needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")
     if not arguments.resume or "scene" in given and (arguments.scale_recipe or not holds_run(run)):
-        return config_from_arguments(arguments)
-    return TrainConfig.of_run(run, "SCENE", **given)
+        return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
+    return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
 
 
 def _eval(arguments: argparse.Namespace) -> None:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any, Mapping, Sequence, Union
 
+from ...trainer.config import RECIPE as TRAINER_RECIPE
 from ..errors import BenchError
 
 NATIVE = "native"
@@ -35,10 +36,7 @@ ROW_NAME = "row.json"  # in it too: what came out
 SUITE_NAME = "suite.json"  # its name, its protocol, and the names of all its cells, run or not
 
 # Options of the native trainer that a suite may set: those of the recipe. The others have a field of their own.
-RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
-          "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
-          "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval",
-          "strategy_options")
+RECIPE = (*TRAINER_RECIPE, "strategy_options")
 
 # LPIPS's weights, .npz: conv1.weight [outputs, inputs, h, w], conv1.bias, ..., lin0.weight, ..., lin4.weight.
 VARIABLES = {"vgg": "DSMOE_LPIPS_VGG", "alex": "DSMOE_LPIPS_ALEX"}

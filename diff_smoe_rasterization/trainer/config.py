@@ -19,6 +19,10 @@ SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
 BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")
 LEARNED = "learned"  # the background gate that a training finds
+# Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
+RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
+          "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
+          "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval")
 
 
 def _option(default: Any, text: str, **extra: Any) -> Any:
@@ -169,13 +173,22 @@ class TrainConfig:
         Another blend mode takes its own background gate, and another strategy what of the recipe is at its default and
         its own options.
         """
+        return self._changed(options).validate()
+
+    def _changed(self, options: Dict[str, Any]) -> TrainConfig:
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
             options = {"background_gate": None, **options}
         if options.get("schedule", self.schedule) != self.schedule:
             usual = _recipe_of(str(self.schedule))
             options = {**{name: None for name in usual if getattr(self, name) == usual[name]},
                        "strategy_options": "", **options}
-        return dataclasses.replace(self, **options).validate()
+        return dataclasses.replace(self, **options)
+
+    def unusual_recipe(self) -> Dict[str, Any]:
+        """What of the recipe differs from the strategy's defaults."""
+        usual = {**{option.name: option.default for option in dataclasses.fields(self)},
+                 **_recipe_of(str(self.schedule))}
+        return {name: getattr(self, name) for name in RECIPE if getattr(self, name) != usual[name]}
 
     def shortened(self) -> TrainConfig:
         """The same recipe squeezed into `iterations` steps: each milestone keeps its share of the 30,000 of 3DGS.
@@ -234,12 +247,16 @@ class TrainConfig:
             raise ConfigError(f"{path}: {error}") from error
 
     @classmethod
-    def of_run(cls, folder: str, scene_option: str, **options: Any) -> TrainConfig:
+    def of_run(cls, folder: str, scene_option: str, resumes: bool = False, **options: Any) -> TrainConfig:
         """The options of the run in a folder with some set. Raises ConfigError, also where its scene is not there.
 
-        scene_option: what says where the scene lies now, for that error.
+        scene_option: what says where the scene lies now, for that error. resumes: whether that run goes on with them.
         """
-        config = cls.load(folder).changed(**options)
+        earlier = cls.load(folder)
+        config = earlier._changed(options)
+        if resumes:
+            earlier.check_continued_by(config)
+        config.validate()
         if "scene" not in options and not is_folder(config.scene):
             here = "" if os.path.isabs(config.scene) else " here, and the path is relative to where it was trained"
             raise ConfigError(f"scene {config.scene}, on which {folder} was trained: no such folder{here}; "
@@ -258,6 +275,13 @@ class TrainConfig:
             if option.name not in harmless and mine != theirs:
                 texts.append(f"{_flag(option)} is {mine!r}, not {theirs!r}")
         return texts
+
+    def check_continued_by(self, later: TrainConfig) -> None:
+        """Raises ConfigError where `later` cannot continue this run. Comes before `validate`, which knows no run."""
+        differences = self.differences(later)
+        if differences:
+            raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `--resume -o "
+                              f"{self.output}` alone keeps the run's options; more --iterations extend it")
 
 
 def _recipe_of(schedule: str) -> Dict[str, Any]:
@@ -347,11 +371,16 @@ def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
     return {name: value for name, value in vars(arguments).items() if name in names}
 
 
-def config_from_arguments(arguments: argparse.Namespace) -> TrainConfig:
+def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None) -> TrainConfig:
     """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
 
-    With --scale-recipe the milestones that are not given keep their share of the iterations.
+    With --scale-recipe the milestones that are not given keep their share of the iterations. earlier: the run that goes
+    on with these options.
     """
     options = given_options(arguments)
     config = TrainConfig(**options)
-    return config.shortened().changed(**options) if getattr(arguments, "scale_recipe", False) else config.validate()
+    if getattr(arguments, "scale_recipe", False):
+        config = dataclasses.replace(config.shortened(), **options)
+    if earlier:
+        earlier.check_continued_by(config)
+    return config.validate()

@@ -38,6 +38,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     if config.schedule == "gate":  # with the defaults of this version
         unusual.update(strategy_options=gate_settings(config.gate_options()),
                        densify_until_iter=config.densify_until_iter)
+    if config.unusual_recipe():
+        unusual["recipe"] = config.unusual_recipe()
     if config.random_background:
         unusual["random_background"] = True
     if views[0].mask is not None:

@@ -380,9 +380,8 @@ def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = 
                            "replace it with --overwrite, or choose another folder")
     elif resume or not record:  # a record is enough to be replaced
         earlier = TrainConfig.load(output)
-        differences = earlier.differences(config) if resume else []
-        if differences:
-            raise TrainerError(f"{output} holds a run with other options: " + "; ".join(differences))
+        if resume:
+            earlier.check_continued_by(config)
         record = record or Record(earlier.scene, [_model_name(earlier.iterations)])
     if os.path.lexists(models) and not os.path.isdir(models):
         raise TrainerError(f"{models} is no folder; a run writes its model there")

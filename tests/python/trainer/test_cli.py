@@ -549,6 +549,21 @@ def test_scale_recipe(scene, tmp_path):
         config = json.load(file)
     assert (config["densify_until_iter"], config["opacity_reset_interval"], config["densify_from_iter"]) == (15, 3, 3)
     assert config["sh_degree_interval"] == 1000, "a value that is given wins, though it equals the default"
+    row, = results_of(output)
+    recipe = row["protocol"]["recipe"]
+    assert recipe == {"densify_from_iter": 3, "densify_until_iter": 15, "densification_interval": 1,
+                      "opacity_reset_interval": 3, "position_lr_max_steps": 30}, "what differs from the defaults"
+
+
+@pytest.mark.parametrize("with_scene", [False, True])
+def test_a_changed_milestone_is_told_before_what_is_wrong_with_it(scene, tmp_path, capsys, with_scene):
+    """15,000 is above the iterations, which `gate` refuses; the run that is there has 15."""
+    output, options = str(tmp_path / "out"), ["--iterations", "30", "--scale-recipe", "--budget", "40"]
+    assert main(["train", scene, "-o", output, *options, "--quiet"]) == 0
+    words = [scene, *options] if with_scene else []
+    text = fails(capsys, "train", "--resume", "-o", output, *words, "--densify-until-iter", "15000")
+    assert "--densify-until-iter is 15, not 15000" in text and f"`--resume -o {output}` alone keeps" in text
+    assert main(["train", "--resume", "-o", output, *words, "--quiet"]) == 0
 
 
 def test_info(capsys):
