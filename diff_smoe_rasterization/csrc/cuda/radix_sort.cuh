@@ -129,28 +129,35 @@ __global__ void __launch_bounds__(kSortBlock, kStripsPerMultiprocessor)
   __shared__ uint32_t warp_sums[kWarps];
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const Strip strip(pass);
-  if (strip.begin == strip.end && blockIdx.x > 0) return;
+  const bool says_total = blockIdx.x == 0 && threadIdx.x == 0 && pass.total != nullptr;
+  if (strip.begin == strip.end) {
+    if (says_total) *pass.total = 0;
+    return;
+  }
 
   // Where the strip's next pair of each digit goes. A thread has kOwn neighbouring digits.
-  const unsigned group = blockIdx.x / kStripsPerGroup, groups = (gridDim.x - 1) / kStripsPerGroup + 1;
-  uint32_t next[kOwn], smaller = 0, total;
+  uint32_t next[kOwn] = {};
+  const auto find_places = [&] {
+    const unsigned group = blockIdx.x / kStripsPerGroup, groups = (gridDim.x - 1) / kStripsPerGroup + 1;
+    uint32_t smaller = 0, total;
 #pragma unroll
-  for (int d = 0; d < kOwn; ++d) {
-    const int bin = threadIdx.x * kOwn + d;
-    uint32_t before = 0, all = 0;
-    for_each_row<kBins>(pass.groups + bin, 0, groups, [&](unsigned g, uint32_t counted) {
-      if (g < group) before += counted;
-      all += counted;
-    });
-    for_each_row<kBins>(pass.strips + bin, group * kStripsPerGroup, blockIdx.x,
-                        [&](unsigned, uint32_t counted) { before += counted; });
-    next[d] = smaller + before;
-    smaller += all;
-  }
-  const uint32_t digits_before = sum_before_thread(smaller, warp_sums, total);
+    for (int d = 0; d < kOwn; ++d) {
+      const int bin = threadIdx.x * kOwn + d;
+      uint32_t before = 0, all = 0;
+      for_each_row<kBins>(pass.groups + bin, 0, groups, [&](unsigned g, uint32_t counted) {
+        if (g < group) before += counted;
+        all += counted;
+      });
+      for_each_row<kBins>(pass.strips + bin, group * kStripsPerGroup, blockIdx.x,
+                          [&](unsigned, uint32_t counted) { before += counted; });
+      next[d] = smaller + before;
+      smaller += all;
+    }
+    const uint32_t digits_before = sum_before_thread(smaller, warp_sums, total);
 #pragma unroll
-  for (int d = 0; d < kOwn; ++d) next[d] += digits_before;
-  if (blockIdx.x == 0 && threadIdx.x == 0 && pass.total != nullptr) *pass.total = total;
+    for (int d = 0; d < kOwn; ++d) next[d] += digits_before;
+    if (says_total) *pass.total = total;
+  };
 
   for (int64_t tile = strip.begin; tile < strip.end; tile += kSortTile<Key>) {
     for (int i = threadIdx.x; i < kWarps * kBins; i += kSortBlock) warp_counts[i / kBins][i % kBins] = 0;
@@ -158,15 +165,21 @@ __global__ void __launch_bounds__(kSortBlock, kStripsPerMultiprocessor)
     // Ranks: pairs of equal digits keep their order. A warp has neighbouring pairs, 32 at a time.
     const int rounds = static_cast<int>(min<int64_t>(kItems, (strip.end - tile + kSortBlock - 1) / kSortBlock));
     const int64_t first = tile + warp * kWarp * rounds + lane;
+    const auto inside = [&](int i) { return i < rounds && first + i * kWarp < strip.end; };
     Key keys[kItems];
+    int32_t values[kItems];
     uint32_t ranks[kItems];
     unsigned exist = 0;
 #pragma unroll
     for (int i = 0; i < kItems; ++i) {
       const int64_t at = first + i * kWarp;
-      const bool inside = i < rounds && at < strip.end;
-      keys[i] = inside ? pass.keys[at] : Key(0);
-      if (inside && takes_part(pass, keys[i])) exist |= 1u << i;
+      keys[i] = inside(i) ? pass.keys[at] : Key(0);
+      values[i] = pass.values == nullptr ? static_cast<int32_t>(at) : inside(i) ? pass.values[at] : 0;
+    }
+    if (tile == strip.begin) find_places();  // while the pairs are read
+#pragma unroll
+    for (int i = 0; i < kItems; ++i) {
+      if (inside(i) && takes_part(pass, keys[i])) exist |= 1u << i;
     }
     __syncthreads();
     const auto digit = [&](Key key) { return static_cast<uint32_t>(key >> pass.shift) & (kBins - 1); };
@@ -220,9 +233,8 @@ __global__ void __launch_bounds__(kSortBlock, kStripsPerMultiprocessor)
     for (int i = 0; i < kItems; ++i) {
       if (!(exist >> i & 1)) continue;
       const uint32_t d = digit(keys[i]), place = starts[d] + warp_counts[warp][d] + ranks[i];
-      const int64_t at = first + i * kWarp;
       tile_keys[place] = keys[i];
-      tile_values[place] = pass.values != nullptr ? pass.values[at] : static_cast<int32_t>(at);
+      tile_values[place] = values[i];
     }
     __syncthreads();
     for (uint32_t k = threadIdx.x; k < in_tile; k += kSortBlock) {
