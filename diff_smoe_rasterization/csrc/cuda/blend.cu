@@ -8,10 +8,10 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// What a warp has blended so far, of the kPixels pixels a lane that it walks for: both, or one where two warps share
-// the square of pixels.
+// What a lane's pixels have blended so far. A lane has kLanePixels of a square, or one where two warps share the
+// square.
 template <class S, int kSums, int kPixels> struct BlendedPixels {
-  int first;  // the lane's pixel that stands here as pixel 0
+  int first;  // of these pixels, in a lane that has all of them
   PixelState<S> state[kPixels];
   S sums[kPixels][kSums];  // of weighted features
   int32_t last[kPixels];   // entries of the list that the numerator has seen
@@ -91,10 +91,11 @@ template <class S, BlendMode kMode, int kSums, int kPixels> struct BlendVisitor 
   int* begun;            // the last segment that a warp of a shared square has begun
 };
 
-// Blends kSums features from `first_feature` on, and writes them. Where two warps share a square, first_pixel says which
-// pixels are the warp's, and all warps of the block must call this together. begun: 0, in shared memory.
-template <BlendMode kMode, int kSums, int kPixels = kLanePixels, class S, class Stage>
-__device__ void blend_features(const BlendArguments<S>& arguments, const WarpTile<S>& tile, Stage& stage,
+// Blends kSums features from `first_feature` on, and writes them. Where two warps share a square, first_pixel says
+// which half is the warp's, begun is 0 in shared memory, and all warps of the block call this that have pixels in the
+// image.
+template <BlendMode kMode, int kSums, int kPixels = kLanePixels, class S>
+__device__ void blend_features(const BlendArguments<S>& arguments, const WarpTile<S>& tile, Stage<S, true>& stage,
                                int first_feature, int first_pixel = 0, int* begun = nullptr) {
   const RasterConfig<S>& config = arguments.config;
   BlendedPixels<S, kSums, kPixels> blended;
@@ -116,7 +117,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     if (!Visitor::kStopsEarly) visitor.begin_segments(tile.source.length - 1);
     int last = visitor.next_segment / kSegmentLength - 1;
     if constexpr (kPixels != kLanePixels) {
-      // The backward pass asks for both halves of a segment that one of them has begun.
+      // The backward pass asks for both halves of a segment that one of the warps has begun.
       __syncthreads();
       for (int segment = last + 1; segment <= *begun; ++segment) note_segment(arguments, tile, segment, blended);
       last = *begun;
@@ -145,7 +146,8 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
 }
 
 // The first blocks come in pairs, for the tiles with the longest lists. Where such a list is long, each of the two has
-// half of the tile, and two warps share a square of pixels. Else the first of them has the tile, as all other blocks do.
+// half of the tile, and two warps share a square of pixels. Else the first of them has the tile, as all other blocks
+// do.
 template <class S, BlendMode kMode, int kFeatures>
 __global__ void __launch_bounds__(kWalkBlock,
                                   sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBlendBlocks : kGeneralWalkBlocks)

@@ -310,7 +310,8 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
 template <class S>
 __device__ void count_pairs(const BlendArguments<S>& arguments, int lane, unsigned met,
                             int pixels = kWarpTile * kWarpTile) {
-  if (arguments.pairs != nullptr && lane == 0) atomicAdd(arguments.pairs, static_cast<unsigned long long>(met) * pixels);
+  if (arguments.pairs != nullptr && lane == 0)
+    atomicAdd(arguments.pairs, static_cast<unsigned long long>(met) * pixels);
 }
 
 }  // namespace cuda

@@ -35,17 +35,12 @@ constexpr int kVisitsPerCheck = 8;
 constexpr int kBlendUnroll = 2;
 constexpr int kBlendBlocks = 6;
 
-// Where a list is longer than this, two warps share a square of pixels, so that the warps of few long lists do not
-// decide how long the forward pass takes. Only so many tiles are asked. Their visits that are interleaved: a lane has
-// one pixel, and room for more of them.
-#ifndef SHARED_FROM
-#define SHARED_FROM 1024
-#define MOST_SHARED 128
-#define SHARED_UNROLL 4
-#endif
-constexpr int kSharedFrom = SHARED_FROM;
-constexpr unsigned kMostSharedTiles = MOST_SHARED;
-constexpr int kSharedBlendUnroll = SHARED_UNROLL;
+// Two warps share a square of pixels in the forward walk where the list is longer than this, so that few long lists do
+// not decide how long the pass takes. Only so many tiles are looked at, those of the longest lists. A lane then has one
+// pixel, and registers for more visits that are interleaved.
+constexpr int kSharedFrom = 1024;
+constexpr unsigned kMostSharedTiles = 128;
+constexpr int kSharedBlendUnroll = 4;
 
 // Visits of the backward walk that are interleaved, where it sums by tensor cores.
 constexpr int kBackwardUnroll = 2;
