@@ -8,57 +8,60 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// Notes the state of the pixels where a segment begins, and queues the segment for the backward pass.
-template <class S, int kSums>
-__device__ void begin_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
-                              const PixelState<S> (&state)[kLanePixels], const S (&sums)[kLanePixels][kSums]) {
+// What a lane's pixels have blended so far. A lane has kLanePixels of a square, or one where two warps share the
+// square.
+template <class S, int kSums, int kPixels> struct BlendedPixels {
+  int first;  // of these pixels, in a lane that has all of them
+  PixelState<S> state[kPixels];
+  S sums[kPixels][kSums];  // of weighted features
+  int32_t last[kPixels];   // entries of the list that the numerator has seen
+};
+
+// Notes the state of the pixels where a segment begins.
+template <class S, int kSums, int kPixels>
+__device__ void note_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
+                             const BlendedPixels<S, kSums, kPixels>& pixels) {
 #pragma unroll
-  for (int k = 0; k < kLanePixels; ++k) {
-    SegmentPixel<S> begin = {abs(state[k].transmittance), {}};
-    for (int f = 0; f < kSums; ++f) begin.sums[f] = sums[k][f];
-    segment_pixel(arguments.saved, tile, segment, k) = begin;
-  }
-  if (tile.lane == 0) {
-    segment_queue(arguments.saved).push(tile.index, tile.quarter, segment);
+  for (int k = 0; k < kPixels; ++k) {
+    SegmentPixel<S> begin = {abs(pixels.state[k].transmittance), {}};
+    for (int f = 0; f < kSums; ++f) begin.sums[f] = pixels.sums[k][f];
+    segment_pixel(arguments.saved, tile, segment, pixels.first + k) = begin;
   }
 }
 
 // Called at the end of the list: turns the sums in front of each segment into the sums from there to the end.
-template <class S, int kSums>
+template <class S, int kSums, int kPixels>
 __device__ void end_segments(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int last,
-                             const S (&sums)[kLanePixels][kSums]) {
+                             const BlendedPixels<S, kSums, kPixels>& pixels) {
 #pragma unroll 1
   for (int segment = 1; segment <= last; ++segment) {
 #pragma unroll
-    for (int k = 0; k < kLanePixels; ++k) {
-      SegmentPixel<S> begin = segment_pixel(arguments.saved, tile, segment, k);
-      for (int f = 0; f < kSums; ++f) begin.sums[f] = sums[k][f] - begin.sums[f];
-      segment_pixel(arguments.saved, tile, segment, k) = begin;
+    for (int k = 0; k < kPixels; ++k) {
+      SegmentPixel<S> begin = segment_pixel(arguments.saved, tile, segment, pixels.first + k);
+      for (int f = 0; f < kSums; ++f) begin.sums[f] = pixels.sums[k][f] - begin.sums[f];
+      segment_pixel(arguments.saved, tile, segment, pixels.first + k) = begin;
     }
   }
 }
 
-// What a lane's pixels have blended so far.
-template <class S, int kSums> struct BlendedPixels {
-  PixelState<S> state[kLanePixels];
-  S sums[kLanePixels][kSums];  // of weighted features
-  int32_t last[kLanePixels];   // entries of the list that the numerator has seen
-};
-
 // Blends kSums features, front to back.
-template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
+template <class S, BlendMode kMode, int kSums, int kPixels> struct BlendVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = Blend<kMode>::kStopsEarly;
   static constexpr bool kReadsFeatures = true, kInSegments = kWalksSegments<S, kMode, kSums>;
-  static constexpr int kUnroll = kBlendUnroll;
+  static constexpr int kUnroll = kPixels == kLanePixels ? kBlendUnroll : kSharedBlendUnroll;
 
   __device__ __forceinline__ void begin_batch(int32_t position) {
     if constexpr (kInSegments) begin_segments(position);
   }
 
-  // Begins the segments up to that of the entry at `position`.
+  // Begins the segments up to that of the entry at `position`, and queues them for the backward pass.
   __device__ __forceinline__ void begin_segments(int32_t position) {
     for (; next_segment <= position; next_segment += kSegmentLength) {
-      begin_segment(arguments, tile, next_segment / kSegmentLength, pixels.state, pixels.sums);
+      const int segment = next_segment / kSegmentLength;
+      note_segment(arguments, tile, segment, pixels);
+      if (tile.lane == 0 && (kPixels == kLanePixels || atomicMax(begun, segment) < segment)) {
+        segment_queue(arguments.saved).push(tile.index, tile.quarter, segment);
+      }
     }
   }
 
@@ -67,8 +70,8 @@ template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
     const auto exponent = gaussian.gate.column(S(tile.x) - gaussian.mean.x);
     const S dy = S(tile.y) - gaussian.mean.y;
 #pragma unroll
-    for (int k = 0; k < kLanePixels; ++k) {
-      const auto gate = gaussian.gate.evaluate(exponent.at(below(dy, k)));
+    for (int k = 0; k < kPixels; ++k) {
+      const auto gate = gaussian.gate.evaluate(exponent.at(below(dy, pixels.first + k)));
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
       for (int f = 0; f < kSums; ++f) pixels.sums[k][f] = fma(pair.weight, gaussian.features[f], pixels.sums[k][f]);
       pixels.last[k] = pair.contributes ? gaussian.seen : pixels.last[k];
@@ -77,42 +80,55 @@ template <class S, BlendMode kMode, int kSums> struct BlendVisitor {
 
   __device__ __forceinline__ bool is_done() const {
     bool open = false;
-    for (int k = 0; k < kLanePixels; ++k) open |= pixels.state[k].is_open();
+    for (int k = 0; k < kPixels; ++k) open |= pixels.state[k].is_open();
     return !__any_sync(kAllLanes, open);
   }
 
   const BlendArguments<S>& arguments;
   const WarpTile<S>& tile;
-  BlendedPixels<S, kSums>& pixels;
+  BlendedPixels<S, kSums, kPixels>& pixels;
   int32_t next_segment;  // where the next segment begins; beyond the list where it is not noted in segments
+  int* begun;            // the last segment that a warp of a shared square has begun
 };
 
-// Blends kSums features from `first_feature` on, and writes them.
-template <class S, BlendMode kMode, int kSums>
-__device__ void blend_features(const BlendArguments<S>& arguments, const WarpTile<S>& tile,
-                               WarpStage<S, BlendVisitor<S, kMode, kSums>>& stage, int first_feature) {
+// Blends kSums features from `first_feature` on, and writes them. Where two warps share a square, first_pixel says
+// which half is the warp's, begun is 0 in shared memory, and all warps of the block call this that have pixels in the
+// image.
+template <BlendMode kMode, int kSums, int kPixels = kLanePixels, class S>
+__device__ void blend_features(const BlendArguments<S>& arguments, const WarpTile<S>& tile, Stage<S, true>& stage,
+                               int first_feature, int first_pixel = 0, int* begun = nullptr) {
   const RasterConfig<S>& config = arguments.config;
-  BlendedPixels<S, kSums> blended;
-  for (int k = 0; k < kLanePixels; ++k) {
+  BlendedPixels<S, kSums, kPixels> blended;
+  blended.first = kPixels == kLanePixels ? 0 : first_pixel;
+  for (int k = 0; k < kPixels; ++k) {
     blended.state[k] = PixelState<S>::open();
-    if (!tile.inside(arguments, k)) blended.state[k].transmittance = -blended.state[k].transmittance;  // closed
+    if (!tile.inside(arguments, blended.first + k)) {  // closed
+      blended.state[k].transmittance = -blended.state[k].transmittance;
+    }
     for (int f = 0; f < kSums; ++f) blended.sums[k][f] = S(0);
     blended.last[k] = 0;
   }
-  using Visitor = BlendVisitor<S, kMode, kSums>;
+  using Visitor = BlendVisitor<S, kMode, kSums, kPixels>;
   const bool segments = Visitor::kInSegments && has_segments(arguments.saved, tile);
-  Visitor visitor = {arguments, tile, blended, segments ? kSegmentLength : INT32_MAX};
+  Visitor visitor = {arguments, tile, blended, segments ? kSegmentLength : INT32_MAX, begun};
   const unsigned met = walk_tile(stage, {0, tile.source.length, first_feature}, visitor);
   if (Visitor::kInSegments && segments) {
     // Where pixels do not stop, the backward pass walks the whole list.
     if (!Visitor::kStopsEarly) visitor.begin_segments(tile.source.length - 1);
-    end_segments(arguments, tile, visitor.next_segment / kSegmentLength - 1, blended.sums);
+    int last = visitor.next_segment / kSegmentLength - 1;
+    if constexpr (kPixels != kLanePixels) {
+      // The backward pass asks for both halves of a segment that one of the warps has begun.
+      __syncthreads();
+      for (int segment = last + 1; segment <= *begun; ++segment) note_segment(arguments, tile, segment, blended);
+      last = *begun;
+    }
+    end_segments(arguments, tile, last, blended);
   }
 
   const int64_t pixels = int64_t(arguments.width) * arguments.height;
-  for (int k = 0; k < kLanePixels; ++k) {
-    if (!tile.inside(arguments, k)) continue;
-    const int64_t index = tile.pixel_index(arguments, k);
+  for (int k = 0; k < kPixels; ++k) {
+    if (!tile.inside(arguments, blended.first + k)) continue;
+    const int64_t index = tile.pixel_index(arguments, blended.first + k);
     const auto end = blended.state[k].end(config.gate_of_background());
     if (first_feature == 0) {
       arguments.saved.final_transmittance[index] = end.transmittance;
@@ -126,23 +142,43 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
           feature_rule(config, feature), end, blended.sums[k][f], feature_background(config, feature));
     }
   }
-  if (first_feature == 0) count_pairs(arguments, tile.lane, met);
+  if (first_feature == 0) count_pairs(arguments, tile.lane, met, kPixels * kWarp);
 }
 
+// The first blocks come in pairs, for the tiles with the longest lists. Where such a list is long, each of the two has
+// half of the tile, and two warps share a square of pixels. Else the first of them has the tile, as all other blocks
+// do.
 template <class S, BlendMode kMode, int kFeatures>
 __global__ void __launch_bounds__(kWalkBlock,
                                   sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBlendBlocks : kGeneralWalkBlocks)
-    blend_kernel(const __grid_constant__ BlendArguments<S> arguments) {
+    blend_kernel(const __grid_constant__ BlendArguments<S> arguments, int paired_tiles) {
   constexpr int kSums = kFeatures != kAnyFeatures ? kFeatures : kFeatureChunk;
-  __shared__ WarpStage<S, BlendVisitor<S, kMode, kSums>> stages[kWarpsPerTile];
-  const WarpTile<S> tile(arguments, arguments.saved.tile_order[blockIdx.x], threadIdx.x / kWarp);
-  if (tile.empty) return;
-  auto& stage = stages[threadIdx.x / kWarp];
+  __shared__ Stage<S, true> stages[kWarpsPerTile];
+  __shared__ int begun[kWarpsPerTile];
+  const int block = blockIdx.x, warp = threadIdx.x / kWarp;
+  const bool paired = block < 2 * paired_tiles;
+  const int index = arguments.saved.tile_order[paired ? block / 2 : block - paired_tiles];
+  auto& stage = stages[warp];
   if constexpr (kFeatures != kAnyFeatures) {
-    blend_features<S, kMode, kSums>(arguments, tile, stage, 0);
+    if (paired) {
+      const int square = block % 2 * 2 + warp / 2;
+      const WarpTile<S> tile(arguments, index, square);
+      if (tile.source.length > kSharedFrom) {
+        if (threadIdx.x < kWarpsPerTile) begun[threadIdx.x] = 0;
+        __syncthreads();
+        if (!tile.empty) blend_features<kMode, kSums, 1>(arguments, tile, stage, 0, warp % 2, begun + square);
+        return;
+      }
+      if (block % 2 > 0) return;
+    }
+  }
+  const WarpTile<S> tile(arguments, index, warp);
+  if (tile.empty) return;
+  if constexpr (kFeatures != kAnyFeatures) {
+    blend_features<kMode, kSums>(arguments, tile, stage, 0);
   } else {
     for (int feature = 0; feature < arguments.config.num_features(); feature += kSums) {
-      blend_features<S, kMode, kSums>(arguments, tile, stage, feature);
+      blend_features<kMode, kSums>(arguments, tile, stage, feature);
     }
   }
 }
@@ -156,8 +192,9 @@ template <class S> void blend(const Frame<S>& frame, const Work& work) {
     // Double is for checking: it has only the general kernel.
     dispatch_blend(config.mode, sizeof(S) == 4 ? config.num_features() : kAnyFeatures, [&](auto mode, auto features) {
       constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
+      const unsigned paired_tiles = kFeatures != kAnyFeatures ? min(tiles, kMostSharedTiles) : 0;
       blend_kernel<S, decltype(mode)::value, kFeatures>
-          <<<tiles, kWalkBlock, 0, work.stream>>>(blend_arguments(band, work));
+          <<<tiles + paired_tiles, kWalkBlock, 0, work.stream>>>(blend_arguments(band, work), paired_tiles);
       DSMOE_CHECK_LAUNCH("blend");
     });
   });

@@ -28,7 +28,6 @@ constexpr int kSquares = kMacroSize / kWarpTile;  // squares of warps, each way
 static_assert(kSquares == 8 && kTileSize == 2 * kWarpTile, "a macro tile's squares are 64 bits, a tile's are four");
 template <class Key> constexpr int kMacroDigit = sizeof(Key) == 2 ? kShortMacroDigit : kLongMacroDigit;
 template <class Key> constexpr int kMacroBins = 1 << kMacroDigit<Key>;
-template <class Key> constexpr int kMostPasses = (8 * sizeof(Key) + kMacroDigit<Key> - 1) / kMacroDigit<Key>;
 
 // How many entries the lists of macro tiles have; none where they did not fit.
 struct EntryCount {
@@ -59,8 +58,6 @@ template <class S, class Key> struct ListArguments {
   int64_t* num_entries;   // [1] written: how many there are
   Key* keys;              // [capacity] written: macro tile
   int32_t* values;        // [capacity] written: Gaussian
-  uint32_t* histograms;   // [passes, kMacroBins] entries with each digit; zero before
-  int passes;             // of the sort
 };
 
 // Neighbouring macro tiles, two 16-bit numbers in one.
@@ -89,14 +86,10 @@ template <class S, class Key>
 __global__ void __launch_bounds__(kListBlock)
     list_macro_tiles_kernel(const __grid_constant__ ListArguments<S, Key> list) {
   constexpr int kPerWarp = kWarp * kListedPerLane, kPerBlock = kPerWarp * kListWarps;
-  __shared__ uint32_t counts[kMostPasses<Key>][kMacroBins<Key>];
   __shared__ unsigned long long warp_totals[kListWarps], shared_before;
   __shared__ unsigned shared_block;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   if (threadIdx.x == 0) shared_block = take_block_number(list.look_back);
-  for (int p = 0; p < list.passes; ++p) {
-    for (int i = threadIdx.x; i < kMacroBins<Key>; i += kListBlock) counts[p][i] = 0;
-  }
   __syncthreads();
   const unsigned block = shared_block;
   const int64_t ordered = *list.saved.num_ordered, block_begin = int64_t(block) * kPerBlock;
@@ -153,20 +146,11 @@ __global__ void __launch_bounds__(kListBlock)
       if (k >= line.total) continue;
       const unsigned row = in_rect / width, column = in_rect - row * width;
       const uint32_t key = ((corner >> 16) + row) * list.grid.columns + (corner & 0xffff) + column;
-      for (int p = 0; p < list.passes; ++p) {
-        atomicAdd(&counts[p][key >> (p * kMacroDigit<Key>)&(kMacroBins<Key> - 1)], 1u);
-      }
       if (slot + k >= list.capacity) continue;
       list.keys[slot + k] = static_cast<Key>(key);
       list.values[slot + k] = value;
     }
     slot += line.total;
-  }
-  __syncthreads();
-  for (int p = 0; p < list.passes; ++p) {
-    for (int i = threadIdx.x; i < kMacroBins<Key>; i += kListBlock) {
-      if (counts[p][i] > 0) atomicAdd(list.histograms + p * kMacroBins<Key> + i, counts[p][i]);
-    }
   }
 }
 
@@ -483,24 +467,22 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   const MacroGrid grid(tiles);
   const int64_t num_tiles = int64_t(tiles.columns) * tiles.rows, macros = grid.count();
   // Where a list of macro tiles is longer than all lists of tiles, it does not fit; num_instances then says so.
-  const int64_t capacity = max<int64_t>(1, min<int64_t>(saved.capacity, kCountMask));
+  const int64_t capacity = max<int64_t>(1, min<int64_t>(saved.capacity, std::numeric_limits<uint32_t>::max()));
   const int64_t list_blocks = max<int64_t>(1, blocks_for(frame.inputs.num_gaussians, kListBlock * kListedPerLane));
   const int64_t offset_blocks = blocks_for(num_tiles + 1, kSortBlock);
   int passes = 1;
   while (int64_t(1) << (passes * kMacroDigit<Key>) < macros) ++passes;
 
   // What must be zero, in one piece: the states of the look-backs, each with its counter behind, and the counts.
-  const int64_t states = radix_states<Key>(capacity, kMacroBins<Key>);
+  const int64_t of_groups = num_groups(capacity) * kMacroBins<Key>;
   const int64_t longs = (list_blocks + 1) + (offset_blocks + 1);
-  const int64_t words = 2 * longs + passes * (kMacroBins<Key> + states + 1) + num_tiles + kLengthClasses;
+  const int64_t words = 2 * longs + passes * of_groups + num_tiles + kLengthClasses;
   auto* zeros = reinterpret_cast<uint32_t*>(allocate<unsigned long long>(scratch, (words + 1) / 2));
   check(cudaMemsetAsync(zeros, 0, words * sizeof(*zeros), stream), "listing instances");
   auto* list_states = reinterpret_cast<unsigned long long*>(zeros);
   auto* offset_states = list_states + list_blocks + 1;
-  uint32_t* histograms = zeros + 2 * longs;
-  uint32_t* pass_states = histograms + passes * kMacroBins<Key>;
-  uint32_t* pass_counters = pass_states + passes * states;
-  uint32_t* tile_counts = pass_counters + passes;
+  uint32_t* groups = zeros + 2 * longs;
+  uint32_t* tile_counts = groups + passes * of_groups;
   uint32_t* longer = tile_counts + num_tiles;
 
   int64_t* num_entries = allocate<int64_t>(scratch, 1);
@@ -512,8 +494,6 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   list.num_entries = num_entries;
   list.keys = allocate<Key>(scratch, capacity);
   list.values = allocate<int32_t>(scratch, capacity);
-  list.histograms = histograms;
-  list.passes = passes;
   list_macro_tiles_kernel<<<static_cast<unsigned>(list_blocks), kListBlock, 0, stream>>>(list);
   DSMOE_CHECK_LAUNCH("list_macro_tiles");
 
@@ -521,14 +501,14 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   int32_t* values[2] = {allocate<int32_t>(scratch, capacity), list.values};
   RadixPass<Key> pass = {};
   pass.capacity = capacity;
+  pass.count = num_entries;
+  pass.strips = allocate<uint32_t>(scratch, num_strips(capacity) * kMacroBins<Key>);
   pass.keys = list.keys;
   pass.values = list.values;
   for (int p = 0; p < passes; ++p) {
     pass.sorted_keys = keys[p % 2];
     pass.sorted_values = values[p % 2];
-    pass.histogram = histograms + p * kMacroBins<Key>;
-    pass.states = pass_states + p * states;
-    pass.next_block = pass_counters + p;
+    pass.groups = groups + p * of_groups;
     pass.shift = p * kMacroDigit<Key>;
     launch_radix_pass<kMacroDigit<Key>>(pass, stream);
     pass.keys = pass.sorted_keys;

@@ -1,9 +1,10 @@
-// One pass of a stable radix sort of pairs whose number only the device knows. (Onesweep, Adinets and Merrill,
-// arXiv:2206.01784.) CUB's sort wants the number on the host, and so would sort culled Gaussians, and room that stayed
-// empty.
+// One pass of a stable radix sort of pairs whose number only the device knows. CUB's sort wants the number on the host,
+// and so would sort culled Gaussians, and room that stayed empty.
 //
-// A block takes kSortTile pairs, ranks them by their digit, and learns by looking back how many pairs of each digit lie
-// before them. It puts them in order in shared memory first, so that it writes neighbouring places.
+//   count   a block counts the digits of its strip: neighbouring pairs
+//   place   it adds up the pairs of each digit in the strips before, and writes its own behind them
+//
+// No block waits for another. Sums over groups of strips leave few numbers for a block to add up.
 #pragma once
 
 #include "device.cuh"
@@ -13,20 +14,70 @@ namespace dsmoe {
 namespace cuda {
 
 template <class Key> constexpr int kSortItems = sizeof(Key) == 8 ? kSortItemsOfFloats / 2 : kSortItemsOfFloats;
-template <class Key> constexpr int kSortTile = kSortBlock* kSortItems<Key>;  // pairs a block
+template <class Key> constexpr int kSortTile = kSortBlock* kSortItems<Key>;  // pairs that a block places at a time
 
 template <class Key> struct RadixPass {
-  int64_t capacity;           // pairs there are at most; where there are more, nothing is sorted
-  const Key* keys;            // [capacity]
-  const int32_t* values;      // [capacity]; null: value i is i, and pairs whose key is the greatest one are left out
-  Key* sorted_keys;           // [capacity] written; or null
-  int32_t* sorted_values;     // [capacity] written
-  const uint32_t* histogram;  // [2^bits] how many pairs have each digit
-  uint32_t* states;           // [blocks, 2^bits] for the look-back; zero before
-  unsigned* next_block;       // [1] zero before
-  int64_t* total;             // [1] how many pairs there are is written; or null
-  int shift;                  // of the digit
+  int64_t capacity;        // pairs there is room for
+  const int64_t* count;    // [1] pairs there are; where they do not fit, none is sorted. Null: as many as fit
+  const Key* keys;         // [capacity]
+  const int32_t* values;   // [capacity]; null: value i is i, and pairs whose key is the greatest one are left out
+  Key* sorted_keys;        // [capacity] written; or null
+  int32_t* sorted_values;  // [capacity] written
+  int64_t* total;          // [1] written: how many pairs were sorted; or null
+  uint32_t* strips;        // [num_strips, 2^bits] written: pairs of each digit in each strip
+  uint32_t* groups;        // [num_groups, 2^bits] and in each group of strips; zero before
+  int shift;               // of the digit
 };
+
+inline unsigned num_strips(int64_t capacity) {
+  return min(blocks_for(capacity, kSortBlock), kStripsPerMultiprocessor * static_cast<unsigned>(num_multiprocessors()));
+}
+inline unsigned num_groups(int64_t capacity) { return blocks_for(num_strips(capacity), kStripsPerGroup); }
+
+// A block's pairs.
+struct Strip {
+  int64_t begin, end;
+  template <class Key> __device__ explicit Strip(const RadixPass<Key>& pass) {
+    int64_t count = pass.count != nullptr ? *pass.count : pass.capacity;
+    if (count > pass.capacity) count = 0;
+    const int64_t rounds = (count + int64_t(gridDim.x) * kSortBlock - 1) / (int64_t(gridDim.x) * kSortBlock);
+    begin = min(rounds * kSortBlock * blockIdx.x, count);
+    end = min(begin + rounds * kSortBlock, count);
+  }
+};
+
+template <class Key> __device__ bool takes_part(const RadixPass<Key>& pass, Key key) {
+  return pass.values != nullptr || key != static_cast<Key>(~Key(0));
+}
+
+template <class Key, int kBits>
+__global__ void __launch_bounds__(kSortBlock) count_digits_kernel(const __grid_constant__ RadixPass<Key> pass) {
+  constexpr int kBins = 1 << kBits;
+  __shared__ uint32_t counts[kBins * kDigitCopies];
+  for (int i = threadIdx.x; i < kBins * kDigitCopies; i += kSortBlock) counts[i] = 0;
+  __syncthreads();
+  const Strip strip(pass);
+  for (int64_t first = strip.begin + threadIdx.x; first < strip.end; first += kKeysAtOnce * kSortBlock) {
+    Key keys[kKeysAtOnce];  // read together, so that the loads do not wait for each other
+#pragma unroll
+    for (int i = 0; i < kKeysAtOnce; ++i) {
+      keys[i] = first + i * kSortBlock < strip.end ? pass.keys[first + i * kSortBlock] : Key(0);
+    }
+#pragma unroll
+    for (int i = 0; i < kKeysAtOnce; ++i) {
+      if (first + i * kSortBlock >= strip.end || !takes_part(pass, keys[i])) continue;
+      const uint32_t digit = static_cast<uint32_t>(keys[i] >> pass.shift) & (kBins - 1);
+      atomicAdd(&counts[digit * kDigitCopies + threadIdx.x % kDigitCopies], 1u);
+    }
+  }
+  __syncthreads();
+  for (int bin = threadIdx.x; bin < kBins; bin += kSortBlock) {
+    uint32_t sum = 0;
+    for (int c = 0; c < kDigitCopies; ++c) sum += counts[bin * kDigitCopies + c];
+    pass.strips[blockIdx.x * kBins + bin] = sum;
+    if (sum > 0) atomicAdd(pass.groups + blockIdx.x / kStripsPerGroup * kBins + bin, sum);
+  }
+}
 
 // What a block's thread gets of a sum over the threads before it, in the order of threads. All threads must call it.
 // warp_sums: [kSortBlock / kWarp + 1] in shared memory. Returns the sum over all threads in `total`.
@@ -52,148 +103,156 @@ inline __device__ uint32_t sum_before_thread(uint32_t own, uint32_t* warp_sums, 
   return before + sum - own;
 }
 
-// States of the look-back hold a sum, and its kind in the two upper bits.
-constexpr uint32_t kOwnCount = 1u << 30, kRunningCount = 2u << 30, kCountMask = kOwnCount - 1;
-
-// The pairs of one digit in the blocks before this one. Reads several predecessors at a time. states: of the digit.
-template <int kBins> __device__ uint32_t look_back(const volatile uint32_t* states, unsigned block) {
-  constexpr int kAtOnce = 8;
-  uint32_t before = 0;
-  int64_t predecessor = int64_t(block) - 1;
-  while (predecessor >= 0) {
-    uint32_t seen[kAtOnce];
+// Calls visit(row, number) for a column's numbers in the rows from `begin` to `end`, and with 0 for some rows behind.
+template <int kColumns, class Visit>
+__device__ void for_each_row(const uint32_t* column, unsigned begin, unsigned end, const Visit& visit) {
+  for (unsigned first = begin; first < end; first += kRowsAtOnce) {
+    uint32_t numbers[kRowsAtOnce];  // read together, so that the loads do not wait for each other
 #pragma unroll
-    for (int i = 0; i < kAtOnce; ++i) {
-      seen[i] = predecessor >= i ? states[(predecessor - i) * kBins] : kRunningCount;
+    for (unsigned i = 0; i < kRowsAtOnce; ++i) {
+      numbers[i] = first + i < end ? column[(first + i) * kColumns] : 0;
     }
 #pragma unroll
-    for (int i = 0; i < kAtOnce; ++i) {
-      if (seen[i] == 0) break;  // not yet published: read again from here on
-      before += seen[i] & kCountMask;
-      if (seen[i] & kRunningCount) return before;
-      --predecessor;
-    }
+    for (unsigned i = 0; i < kRowsAtOnce; ++i) visit(first + i, numbers[i]);
   }
-  return before;
 }
 
 template <class Key, int kBits>
-__global__ void __launch_bounds__(kSortBlock, kSortBlocks)
-    radix_pass_kernel(const __grid_constant__ RadixPass<Key> pass) {
+__global__ void __launch_bounds__(kSortBlock, kStripsPerMultiprocessor)
+    place_pairs_kernel(const __grid_constant__ RadixPass<Key> pass) {
   constexpr int kBins = 1 << kBits, kOwn = kBins / kSortBlock, kItems = kSortItems<Key>, kWarps = kSortBlock / kWarp;
   static_assert(kBins % kSortBlock == 0, "each thread has the same number of digits");
   __shared__ uint32_t warp_counts[kWarps][kBins];    // pairs of each digit, then those in the warps before
-  __shared__ uint32_t starts[kBins], places[kBins];  // of each digit: in the block's order; what leads from there out
-  __shared__ Key block_keys[kSortTile<Key>];
-  __shared__ int32_t block_values[kSortTile<Key>];
+  __shared__ uint32_t starts[kBins], places[kBins];  // of each digit: in the tile's order; what leads from there out
+  __shared__ Key tile_keys[kSortTile<Key>];
+  __shared__ int32_t tile_values[kSortTile<Key>];
   __shared__ uint32_t warp_sums[kWarps];
-  __shared__ unsigned shared_block;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  if (threadIdx.x == 0) shared_block = atomicAdd(pass.next_block, 1u);
-  for (int i = threadIdx.x; i < kWarps * kBins; i += kSortBlock) warp_counts[i / kBins][i % kBins] = 0;
-
-  // Where each digit begins in the result. A thread has kOwn neighbouring digits.
-  uint32_t own[kOwn], base[kOwn], sum = 0, total;
-#pragma unroll
-  for (int d = 0; d < kOwn; ++d) {
-    base[d] = sum;
-    sum += pass.histogram[threadIdx.x * kOwn + d];
+  const Strip strip(pass);
+  const bool says_total = blockIdx.x == 0 && threadIdx.x == 0 && pass.total != nullptr;
+  if (strip.begin == strip.end) {
+    if (says_total) *pass.total = 0;
+    return;
   }
-  const uint32_t digits_before = sum_before_thread(sum, warp_sums, total);
-  const unsigned block = shared_block;
-  if (block == 0 && threadIdx.x == 0 && pass.total != nullptr) *pass.total = total;
-  const int64_t count = pass.values == nullptr ? pass.capacity : int64_t(total);
-  if (total > pass.capacity || int64_t(block) * kSortTile<Key> >= count) return;
 
-  // Ranks: pairs of equal digits keep their order. A warp has neighbouring pairs, 32 at a time.
-  const int64_t first = int64_t(block) * kSortTile<Key> + warp * kWarp * kItems + lane;
-  Key keys[kItems];
-  uint32_t ranks[kItems];
-  unsigned exist = 0;
+  // Where the strip's next pair of each digit goes. A thread has kOwn neighbouring digits.
+  uint32_t next[kOwn] = {};
+  const auto find_places = [&] {
+    const unsigned group = blockIdx.x / kStripsPerGroup, groups = (gridDim.x - 1) / kStripsPerGroup + 1;
+    uint32_t smaller = 0, total;
 #pragma unroll
-  for (int i = 0; i < kItems; ++i) {
-    const int64_t at = first + i * kWarp;
-    keys[i] = at < count ? pass.keys[at] : Key(0);
-    if (at < count && (pass.values != nullptr || keys[i] != static_cast<Key>(~Key(0)))) exist |= 1u << i;
-  }
-  const auto digit = [&](Key key) { return static_cast<uint32_t>(key >> pass.shift) & (kBins - 1); };
-#pragma unroll
-  for (int i = 0; i < kItems; ++i) {
-    const bool exists = exist >> i & 1;
-    const uint32_t d = digit(keys[i]);
-    unsigned equal = __ballot_sync(kAllLanes, exists);
-#pragma unroll
-    for (int bit = 0; bit < kBits; ++bit) {
-      const bool set = d >> bit & 1;
-      const unsigned with = __ballot_sync(kAllLanes, set);
-      equal &= set ? with : ~with;
+    for (int d = 0; d < kOwn; ++d) {
+      const int bin = threadIdx.x * kOwn + d;
+      uint32_t before = 0, all = 0;
+      for_each_row<kBins>(pass.groups + bin, 0, groups, [&](unsigned g, uint32_t counted) {
+        if (g < group) before += counted;
+        all += counted;
+      });
+      for_each_row<kBins>(pass.strips + bin, group * kStripsPerGroup, blockIdx.x,
+                          [&](unsigned, uint32_t counted) { before += counted; });
+      next[d] = smaller + before;
+      smaller += all;
     }
-    const int before = __popc(equal & ((1u << lane) - 1));
-    const uint32_t counted = warp_counts[warp][d];
-    __syncwarp();
-    if (exists && before == 0) warp_counts[warp][d] = counted + __popc(equal);
-    __syncwarp();
-    ranks[i] = counted + before;
-  }
-  __syncthreads();
+    const uint32_t digits_before = sum_before_thread(smaller, warp_sums, total);
+#pragma unroll
+    for (int d = 0; d < kOwn; ++d) next[d] += digits_before;
+    if (says_total) *pass.total = total;
+  };
 
-  volatile uint32_t* states = pass.states;
-  sum = 0;
+  for (int64_t tile = strip.begin; tile < strip.end; tile += kSortTile<Key>) {
+    for (int i = threadIdx.x; i < kWarps * kBins; i += kSortBlock) warp_counts[i / kBins][i % kBins] = 0;
+
+    // Ranks: pairs of equal digits keep their order. A warp has neighbouring pairs, 32 at a time.
+    const int rounds = static_cast<int>(min<int64_t>(kItems, (strip.end - tile + kSortBlock - 1) / kSortBlock));
+    const int64_t first = tile + warp * kWarp * rounds + lane;
+    const auto inside = [&](int i) { return i < rounds && first + i * kWarp < strip.end; };
+    Key keys[kItems];
+    int32_t values[kItems];
+    uint32_t ranks[kItems];
+    unsigned exist = 0;
 #pragma unroll
-  for (int d = 0; d < kOwn; ++d) {
-    const int bin = threadIdx.x * kOwn + d;
-    uint32_t running = 0;
-#pragma unroll
-    for (int w = 0; w < kWarps; ++w) {
-      const uint32_t counted = warp_counts[w][bin];
-      warp_counts[w][bin] = running;
-      running += counted;
+    for (int i = 0; i < kItems; ++i) {
+      const int64_t at = first + i * kWarp;
+      keys[i] = inside(i) ? pass.keys[at] : Key(0);
+      values[i] = pass.values == nullptr ? static_cast<int32_t>(at) : inside(i) ? pass.values[at] : 0;
     }
-    own[d] = running;
-    states[int64_t(block) * kBins + bin] = (block > 0 ? kOwnCount : kRunningCount) | running;
-    sum += running;
-  }
-  uint32_t in_block;
-  uint32_t start = sum_before_thread(sum, warp_sums, in_block);
+    if (tile == strip.begin) find_places();  // while the pairs are read
 #pragma unroll
-  for (int d = 0; d < kOwn; ++d) {
-    const int bin = threadIdx.x * kOwn + d;
-    uint32_t before = 0;
-    if (block > 0) {
-      before = look_back<kBins>(states + bin, block);
-      states[int64_t(block) * kBins + bin] = kRunningCount | (before + own[d]);
+    for (int i = 0; i < kItems; ++i) {
+      if (inside(i) && takes_part(pass, keys[i])) exist |= 1u << i;
     }
-    starts[bin] = start;
-    places[bin] = digits_before + base[d] + before - start;
-    start += own[d];
-  }
-  __syncthreads();
+    __syncthreads();
+    const auto digit = [&](Key key) { return static_cast<uint32_t>(key >> pass.shift) & (kBins - 1); };
+#pragma unroll
+    for (int i = 0; i < kItems; ++i) {
+      if (i >= rounds) break;
+      const bool exists = exist >> i & 1;
+      const uint32_t d = digit(keys[i]);
+      unsigned equal = __ballot_sync(kAllLanes, exists);
+#pragma unroll
+      for (int bit = 0; bit < kBits; ++bit) {
+        const bool set = d >> bit & 1;
+        const unsigned with = __ballot_sync(kAllLanes, set);
+        equal &= set ? with : ~with;
+      }
+      const int before = __popc(equal & ((1u << lane) - 1));
+      const uint32_t counted = warp_counts[warp][d];
+      __syncwarp();
+      if (exists && before == 0) warp_counts[warp][d] = counted + __popc(equal);
+      __syncwarp();
+      ranks[i] = counted + before;
+    }
+    __syncthreads();
+
+    uint32_t own[kOwn], sum = 0;
+#pragma unroll
+    for (int d = 0; d < kOwn; ++d) {
+      const int bin = threadIdx.x * kOwn + d;
+      uint32_t running = 0;
+#pragma unroll
+      for (int w = 0; w < kWarps; ++w) {
+        const uint32_t counted = warp_counts[w][bin];
+        warp_counts[w][bin] = running;
+        running += counted;
+      }
+      own[d] = running;
+      sum += running;
+    }
+    uint32_t in_tile, start = sum_before_thread(sum, warp_sums, in_tile);
+#pragma unroll
+    for (int d = 0; d < kOwn; ++d) {
+      const int bin = threadIdx.x * kOwn + d;
+      starts[bin] = start;
+      places[bin] = next[d] - start;
+      next[d] += own[d];
+      start += own[d];
+    }
+    __syncthreads();
 
 #pragma unroll
-  for (int i = 0; i < kItems; ++i) {
-    if (!(exist >> i & 1)) continue;
-    const uint32_t d = digit(keys[i]), place = starts[d] + warp_counts[warp][d] + ranks[i];
-    const int64_t at = first + i * kWarp;
-    block_keys[place] = keys[i];
-    block_values[place] = pass.values != nullptr ? pass.values[at] : static_cast<int32_t>(at);
+    for (int i = 0; i < kItems; ++i) {
+      if (!(exist >> i & 1)) continue;
+      const uint32_t d = digit(keys[i]), place = starts[d] + warp_counts[warp][d] + ranks[i];
+      tile_keys[place] = keys[i];
+      tile_values[place] = values[i];
+    }
+    __syncthreads();
+    for (uint32_t k = threadIdx.x; k < in_tile; k += kSortBlock) {
+      const Key key = tile_keys[k];
+      const uint32_t place = places[digit(key)] + k;
+      if (pass.sorted_keys != nullptr) pass.sorted_keys[place] = key;
+      pass.sorted_values[place] = tile_values[k];
+    }
+    __syncthreads();  // of this tile nobody reads any more
   }
-  __syncthreads();
-  for (uint32_t k = threadIdx.x; k < in_block; k += kSortBlock) {
-    const Key key = block_keys[k];
-    const uint32_t place = places[digit(key)] + k;
-    if (pass.sorted_keys != nullptr) pass.sorted_keys[place] = key;
-    pass.sorted_values[place] = block_values[k];
-  }
-}
-
-// How many numbers `states` of a pass has.
-template <class Key> int64_t radix_states(int64_t capacity, int bins) {
-  return int64_t(blocks_for(capacity, kSortTile<Key>)) * bins;
 }
 
 template <int kBits, class Key> void launch_radix_pass(const RadixPass<Key>& pass, cudaStream_t stream) {
-  radix_pass_kernel<Key, kBits><<<blocks_for(pass.capacity, kSortTile<Key>), kSortBlock, 0, stream>>>(pass);
-  DSMOE_CHECK_LAUNCH("radix_pass");
+  const unsigned strips = num_strips(pass.capacity);
+  count_digits_kernel<Key, kBits><<<strips, kSortBlock, 0, stream>>>(pass);
+  DSMOE_CHECK_LAUNCH("count_digits");
+  place_pairs_kernel<Key, kBits><<<strips, kSortBlock, 0, stream>>>(pass);
+  DSMOE_CHECK_LAUNCH("place_pairs");
 }
 
 }  // namespace cuda

@@ -140,11 +140,12 @@ struct FoundEntry {
 };
 
 // Where a warp keeps what it has found and what it visits, in shared memory.
-template <class S, class Visitor> struct WarpStage {
+template <class S, bool kWithFeatures> struct Stage {
   FoundEntry found[kFoundEntries];  // a ring
-  StagedGaussian<S, Visitor::kReadsFeatures> gaussians[kWarp];
+  StagedGaussian<S, kWithFeatures> gaussians[kWarp];
   int32_t numbers[kWarp];  // of these Gaussians
 };
+template <class S, class Visitor> using WarpStage = Stage<S, Visitor::kReadsFeatures>;
 
 // The vertical distance of the lane's pixel k, from that of its first one.
 template <class S> __device__ __forceinline__ S below(S dy, int k) { return k == 0 ? dy : dy + S(k * kLaneStep); }
@@ -305,11 +306,12 @@ __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, cons
   return met;
 }
 
-// Adds the pairs of the entries that a warp has met to the count of the rendering.
-template <class S> __device__ void count_pairs(const BlendArguments<S>& arguments, int lane, unsigned met) {
-  if (arguments.pairs != nullptr && lane == 0) {
-    atomicAdd(arguments.pairs, static_cast<unsigned long long>(met) * (kWarpTile * kWarpTile));
-  }
+// Adds the pairs of the entries that a warp has met to the count of the rendering. pixels: that the warp walked for.
+template <class S>
+__device__ void count_pairs(const BlendArguments<S>& arguments, int lane, unsigned met,
+                            int pixels = kWarpTile * kWarpTile) {
+  if (arguments.pairs != nullptr && lane == 0)
+    atomicAdd(arguments.pairs, static_cast<unsigned long long>(met) * pixels);
 }
 
 }  // namespace cuda

@@ -35,6 +35,13 @@ constexpr int kVisitsPerCheck = 8;
 constexpr int kBlendUnroll = 2;
 constexpr int kBlendBlocks = 6;
 
+// Two warps share a square of pixels in the forward walk where the list is longer than this, so that few long lists do
+// not decide how long the pass takes. Only so many tiles are looked at, those of the longest lists. A lane then has one
+// pixel, and registers for more visits that are interleaved.
+constexpr int kSharedFrom = 1024;
+constexpr unsigned kMostSharedTiles = 128;
+constexpr int kSharedBlendUnroll = 4;
+
 // Visits of the backward walk that are interleaved, where it sums by tensor cores.
 constexpr int kBackwardUnroll = 2;
 // Blocks of the backward walk that one multiprocessor holds at once, where the number of features is known: 5 x 128
@@ -61,21 +68,19 @@ constexpr int kEnoughWarpsPerMultiprocessor = 32;
 //
 // Threads a block: one for each digit of 8 bits.
 constexpr int kSortBlock = 256;
-// Pairs a thread: enough that few blocks look back, and that keys and values of a block fit 48 KiB.
+// Pairs that a thread places at a time: as many as keys and values of a block fit 48 KiB.
 constexpr int kSortItemsOfFloats = 16;
-// Blocks of a pass that one multiprocessor holds at once: what their shared memory allows.
-constexpr int kSortBlocks = 4;
+// Strips, a block each, that one multiprocessor sorts at once. More of them would wait less, but each block adds up the
+// strips before it: the sums of all groups, and the strips of its own. With 132 multiprocessors these are 17 rows and
+// up to 15, each read at once.
+constexpr unsigned kStripsPerMultiprocessor = 2, kStripsPerGroup = 16, kRowsAtOnce = 18;
+// Copies of a strip's counts in shared memory. Depths share their upper digits, so that many lanes would count at one
+// place. And keys that a lane reads at once.
+constexpr int kDigitCopies = 8, kKeysAtOnce = 8;
 // Bits of a depth that one pass sorts, and of a macro tile with 16 or 32 bits. With 9 bits one pass serves images up to
 // 2048x1024; more bits, or longer keys with as many, would not fit 48 KiB.
 constexpr int kDepthDigit = 8;
 constexpr int kShortMacroDigit = 9, kLongMacroDigit = 8;
-// Copies of the histogram of depths in a block's shared memory. Depths share their upper digits, so that many lanes
-// would count at one place.
-template <class S> constexpr int kHistogramCopies = sizeof(S) == 4 ? 8 : 4;
-// Depths that a lane reads at once for the histogram. And blocks a multiprocessor: their 32 KiB of counts fit six
-// times, but each block adds its counts to the sums by atomics.
-constexpr int kDepthsAtOnce = 8;
-constexpr unsigned kHistogramBlocks = 4;
 // Gaussians that a lane lists in macro tiles: blocks of 1,024 Gaussians look back seldom.
 constexpr int kListedPerLane = 4;
 // Entries of a macro tile that one block gives to its tiles.

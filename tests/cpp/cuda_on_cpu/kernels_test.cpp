@@ -211,6 +211,20 @@ Scene<double> long_lists() {
   return scene;
 }
 
+// One list of five segments, which pixels leave in the second, third and fourth one, or not at all.
+Scene<double> list_of_two_rounds() {
+  Random random(7);
+  Scene<double> scene = make_scene(7, 2300, 16, 8);
+  for (int64_t i = 0; i < scene.count; ++i) {
+    const double x = random.uniform(-0.6, 0.6);
+    scene.means3D[3 * i] = x, scene.means3D[3 * i + 1] = random.uniform(-0.6, 0.6);
+    scene.means3D[3 * i + 2] = random.uniform(-0.6, 0.6);
+    for (int axis = 0; axis < 3; ++axis) scene.scales[3 * i + axis] = random.uniform(0.1, 0.2);
+    scene.opacities[i] = random.uniform(0.004, 0.01) + 0.1 * std::max(0.0, x + 0.3);
+  }
+  return scene;
+}
+
 // A wall behind a list's first segment, in which W stays small.
 Scene<double> wall_behind_a_veil() {
   Scene<double> scene = long_lists();
@@ -243,6 +257,10 @@ TYPED_TEST(KernelsIn, EqualTheCpuWithOtherColoursAndDepth) {
 }
 
 TYPED_TEST(KernelsIn, EqualTheCpuOnLongLists) { this->expect(long_lists()); }
+
+TYPED_TEST(KernelsIn, EqualTheCpuOnAListOfTwoRounds) {
+  if (Blend<TypeParam::value>::kStopsEarly) this->expect(list_of_two_rounds());
+}
 
 TYPED_TEST(KernelsIn, EqualTheCpuBehindAVeil) { this->expect(wall_behind_a_veil()); }
 
