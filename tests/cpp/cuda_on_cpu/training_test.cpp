@@ -4,12 +4,22 @@
 #include <numeric>
 #include <vector>
 
+#include "dsmoe/lazy_adam.h"
 #include "dsmoe/neighbors.h"
 #include "finite_difference.h"
 #include "refusal.h"
 
 namespace dsmoe {
 namespace {
+
+TEST(Kernels, NoteTheRatesOfAStepOfNoRows) {
+  AdamRates<float> noted[] = {{7, 7}, {7, 7}};
+  const LazyAdamStep<float> step = {0, nullptr, nullptr, noted, {{0.25, 3}, {0.5, 4}}, 1, 0};
+  cuda::note_step(step, nullptr);
+  EXPECT_EQ(noted[0].rate, 0.25f);
+  EXPECT_EQ(noted[1].rate, 7) << "of one tensor";
+  EXPECT_NO_THROW(cuda::note_step<float>({}, nullptr));
+}
 
 TEST(Kernels, FindTheNeighboursThatTheCpuFinds) {
   Random random(1);
