@@ -113,6 +113,35 @@ def test_a_strangers_project_uses_what_cmake_installs(tmp_path):
 
 
 @needs_cmake
+@pytest.mark.parametrize("name, package", [("cuda", "CUDAToolkit"), ("torch", "Torch")])
+@pytest.mark.parametrize("asked", ["COMPONENTS", "OPTIONAL_COMPONENTS"])
+@pytest.mark.parametrize("is_there", [True, False])
+def test_what_a_component_takes_may_be_absent_where_it_is_optional(tmp_path, name, package, asked, is_there):
+    """The config that CMake installs, with files of its own in place of the targets and of what these take."""
+    for library, file in (("core", "dsmoe_targets.cmake"), (name, f"dsmoe_{name}_targets.cmake")):
+        (tmp_path / file).write_text(f"add_library(dsmoe::{library} INTERFACE IMPORTED)\n")
+    for found in ("Threads", package):
+        (tmp_path / f"Find{found}.cmake").write_text(f"set({found}_FOUND TRUE)\n")
+    (tmp_path / "CMakeLists.txt").write_text(f"""cmake_minimum_required(VERSION 3.21)
+project(program LANGUAGES NONE)
+list(APPEND CMAKE_MODULE_PATH "${{CMAKE_CURRENT_LIST_DIR}}")
+set(CMAKE_DISABLE_FIND_PACKAGE_{package} {not is_there})
+set(DSMOE_WITH_CUDA ON)
+set(DSMOE_TORCH ON)
+include(CMakePackageConfigHelpers)
+configure_package_config_file({ROOT}/build_support/config.cmake.in
+  "${{CMAKE_CURRENT_LIST_DIR}}/diff_smoe_rasterization-config.cmake" INSTALL_DESTINATION .)
+find_package(diff_smoe_rasterization QUIET {asked} {name} PATHS "${{CMAKE_CURRENT_LIST_DIR}}" NO_DEFAULT_PATH)
+get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
+message(STATUS "found ${{diff_smoe_rasterization_FOUND}} ${{targets}}")
+""")
+    printed = run("cmake", "-S", tmp_path, "-B", tmp_path / "build")
+    found, targets = re.search("found (.) (.*)", printed).groups()
+    assert found == ("1" if is_there or asked == "OPTIONAL_COMPONENTS" else "0"), printed
+    assert {*targets.split(";")} == {"dsmoe::core", *([f"dsmoe::{name}"] if is_there else [])}
+
+
+@needs_cmake
 def test_a_package_of_another_torch_is_not_found(tmp_path):
     package = tmp_path / "site" / "diff_smoe_rasterization"
     (package / "cmake").mkdir(parents=True)
