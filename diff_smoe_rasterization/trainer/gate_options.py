@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any, Callable
@@ -36,6 +37,7 @@ class GateOptions:
     squares: float = _setting(30.0, lambda x: 0 <= x < math.inf, "at least 0")
 
 
+@functools.lru_cache(maxsize=None)
 def parse_gate_options(text: str) -> GateOptions:
     """The settings from `NAME=X,...`; what is not named keeps its default.
 

@@ -390,6 +390,30 @@ TYPED_TEST(BlendOf, EachOutputAloneHasItsOwnDerivative) {
   }
 }
 
+// Sums of integers (csrc/cuda/integer_sums.cuh) have room for so much, and for 8 times as much of another law.
+TYPED_TEST(BlendOf, GradientsAreBoundedByThoseOfTheImageAndTheLargestFeature) {
+  using Policy = Blend<TypeParam::value>;
+  const double spare = Policy::kLaw == Law::kGates ? 1 + 1e-12 : 8;  // sums of 40 terms in double
+  Random random(5);
+  for (int i = 0; i < 400; ++i) {
+    const Pixel pixel = random_pixel(random, 1 + i % 40, i % 2 ? 1e-3 : 0.98);
+    const Weights g = {random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1)};
+    const PixelGradient actual = backward<TypeParam::value, double>(pixel, g);
+    double most = abs(g.gate_sum);
+    const auto feature = [&](double gradient, const Vector& values, double background, const Vector& by_value) {
+      double largest = abs(background);
+      for (const double value : values) largest = std::max(largest, abs(value));
+      most += 2 * abs(gradient) * largest;
+      for (const double value : by_value) EXPECT_LE(abs(value), spare * abs(gradient));
+    };
+    feature(g.color, pixel.color, pixel.background, actual.color);
+    feature(g.depth, pixel.depth, 0, actual.depth);
+    feature(g.inverse_depth, pixel.inverse_depth, 0, actual.inverse_depth);
+    most *= 2 * std::max(1.0, Policy::background_gate(pixel.background_gate));
+    for (const double power : actual.power) EXPECT_LE(abs(power), spare * most);
+  }
+}
+
 // Alphas near 1e-6 under one gate: dL/dalpha is near 1e6, and dL/dpower is what leaves the pair.
 TYPED_TEST(BlendOf, FloatGradientsOfAFaintPixelKeepFiveDigits) {
   Pixel pixel;

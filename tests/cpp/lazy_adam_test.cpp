@@ -55,5 +55,12 @@ TEST(LazyAdam, RowsThatWaitMakeTheStepsOfDenseAdam) {
   }
 }
 
+TEST(LazyAdam, AStepOfNoRowsNotesItsRates) {
+  AdamRates<double> noted[] = {{7, 7}, {7, 7}};
+  cpu::note_step<double>({0, nullptr, nullptr, noted, {{0.1, 3}, {0.2, 4}}, 1, 0});
+  EXPECT_EQ(noted[0].rate, 0.1);
+  EXPECT_EQ(noted[1].rate, 7) << "of one tensor";
+}
+
 }  // namespace
 }  // namespace dsmoe

@@ -112,20 +112,68 @@ def test_a_strangers_project_uses_what_cmake_installs(tmp_path):
     run(tmp_path / "consumer" / "consumer_torch")
 
 
+def what_is_found(folder, asked, absent="", before="", prefixes=""):
+    """Whether find_package finds this package without the package `absent`, and the targets that come of it."""
+    (folder / "CMakeLists.txt").write_text(f"""cmake_minimum_required(VERSION 3.21)
+project(program LANGUAGES NONE)
+list(APPEND CMAKE_MODULE_PATH "${{CMAKE_CURRENT_LIST_DIR}}")
+set(CMAKE_DISABLE_FIND_PACKAGE_{absent or "Nothing"} TRUE)
+{before}
+find_package(diff_smoe_rasterization QUIET {asked} PATHS "${{CMAKE_CURRENT_LIST_DIR}}")
+get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
+message(STATUS "found ${{diff_smoe_rasterization_FOUND}} ${{targets}}")
+""")
+    printed = run("cmake", "-S", folder, "-B", folder / "build", f"-DCMAKE_PREFIX_PATH={prefixes}")
+    found, targets = re.search("found (TRUE|FALSE|0|1) (.*)", printed).groups()
+    return found in ("TRUE", "1"), {*targets.split(";")}
+
+
+@needs_cmake
+@pytest.mark.parametrize("name, package", [("cuda", "CUDAToolkit"), ("torch", "Torch")])
+@pytest.mark.parametrize("asked", ["COMPONENTS", "OPTIONAL_COMPONENTS"])
+@pytest.mark.parametrize("is_there", [True, False])
+def test_what_a_component_takes_may_be_absent_where_it_is_optional(tmp_path, name, package, asked, is_there):
+    """The config that CMake installs, with files of its own in place of the targets and of what these take."""
+    for library, file in (("core", "dsmoe_targets.cmake"), (name, f"dsmoe_{name}_targets.cmake")):
+        (tmp_path / file).write_text(f"add_library(dsmoe::{library} INTERFACE IMPORTED)\n")
+    for found in ("Threads", package):
+        (tmp_path / f"Find{found}.cmake").write_text(f"set({found}_FOUND TRUE)\n")
+    found, targets = what_is_found(tmp_path, f"{asked} {name}", "" if is_there else package, f"""
+set(DSMOE_WITH_CUDA ON)
+set(DSMOE_TORCH ON)
+include(CMakePackageConfigHelpers)
+configure_package_config_file({ROOT}/build_support/config.cmake.in
+  "${{CMAKE_CURRENT_LIST_DIR}}/diff_smoe_rasterization-config.cmake" INSTALL_DESTINATION .)""")
+    assert found == (is_there or asked == "OPTIONAL_COMPONENTS")
+    assert targets == {"dsmoe::core", *([f"dsmoe::{name}"] if is_there else [])}
+
+
+def package_built_against(folder, torch_version, cuda_version):
+    """A copy of the installed package's config that says so, in `folder`; returns where CMake has to look."""
+    package = folder / "site" / "diff_smoe_rasterization"
+    shutil.copytree(str(INSTALLED / "cmake"), str(package / "cmake"))
+    shutil.copy(str(INSTALLED / "_version.py"), str(package))
+    (package / "_build_info.py").write_text(
+        f"TORCH_VERSION = {torch_version!r}\nCUDA_VERSION = {cuda_version!r}\nCXX11_ABI = True\n")
+    return extension.cmake_prefix_path().replace(str(INSTALLED), str(package))
+
+
 @needs_cmake
 def test_a_package_of_another_torch_is_not_found(tmp_path):
-    package = tmp_path / "site" / "diff_smoe_rasterization"
-    (package / "cmake").mkdir(parents=True)
-    for path in (INSTALLED / "cmake").iterdir():
-        shutil.copy(str(path), str(package / "cmake"))
-    shutil.copy(str(INSTALLED / "_version.py"), str(package))
-    (package / "_build_info.py").write_text("TORCH_VERSION = '0.4.1'\nCUDA_VERSION = None\nCXX11_ABI = True\n")
-    prefixes = extension.cmake_prefix_path().replace(str(INSTALLED), str(package))
+    prefixes = package_built_against(tmp_path, "0.4.1", None)
     result = subprocess.run(["cmake", "-S", str(CONSUMER), "-B", str(tmp_path / "build"), "-DCONSUMER=core",
                              f"-DCMAKE_PREFIX_PATH={prefixes}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                             universal_newlines=True)
     assert result.returncode != 0
     assert "built against torch 0.4.1" in " ".join(result.stdout.split())
+
+
+@needs_cmake
+@pytest.mark.parametrize("asked, found", [("COMPONENTS cuda", False), ("OPTIONAL_COMPONENTS cuda", True), ("", True)])
+def test_a_package_with_kernels_is_found_without_a_toolkit(tmp_path, asked, found):
+    prefixes = package_built_against(tmp_path, torch.__version__, "13.0")
+    actual, targets = what_is_found(tmp_path, asked, "CUDAToolkit", prefixes=prefixes)
+    assert actual == found and "dsmoe::cuda" in targets
 
 
 def documented_programs():

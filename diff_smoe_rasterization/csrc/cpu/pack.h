@@ -87,12 +87,6 @@ template <class T> struct Pack {
 
   static DSMOE_HD Pack load(const T* p) { return *reinterpret_cast<const Values*>(p); }  // aligned
   DSMOE_HD void store(T* p) const { *reinterpret_cast<Values*>(p) = v; }                 // aligned
-  // 0, 1, 2, ...
-  static DSMOE_HD Pack iota() {
-    Values lanes = {};
-    for (int i = 0; i < kLanes; ++i) lanes[i] = T(i);
-    return lanes;
-  }
 
   friend DSMOE_HD Pack operator+(Pack a, Pack b) { return a.v + b.v; }
   friend DSMOE_HD Pack operator-(Pack a, Pack b) { return a.v - b.v; }

@@ -43,6 +43,7 @@ template <class S> struct TileImportances {
   const ImportanceMap<S>& map;
   Importance<S>* instances;  // [I] by slot; the tile's are written whole
 };
+
 // Numbers that the backward pass of a tile writes for an instance.
 constexpr int record_size(int num_features, bool absolute) {
   return kNumGateMoments + num_features + (absolute ? kNumAbsoluteSums : 0);
@@ -50,7 +51,8 @@ constexpr int record_size(int num_features, bool absolute) {
 
 constexpr int kImportanceArrays = 8;  // numbers a pixel besides its channels
 
-// Numbers of scratch memory that one tile needs, for any of the kernels.
+// Numbers of scratch memory that one tile needs, for any of the kernels: for each pixel its features and at most five
+// others, and for each feature the largest pack.
 inline int64_t tile_scratch_size(int num_features) {
   return static_cast<int64_t>(kTilePixels) * (num_features + 5) + 16 * num_features;
 }

@@ -1,4 +1,6 @@
 // Lazy Adam: a warp finds the rows to bring up to date among 32, and each half of it takes every other one of them.
+#include <algorithm>
+
 #include "../refuse_training.h"
 #include "dsmoe/lazy_adam.h"
 #include "tuning.cuh"
@@ -121,8 +123,8 @@ template <class S> void catch_up(const LazyAdam<S>& adam, void* stream) {
 
 template <class S> void note_step(const LazyAdamStep<S>& step, void* stream) {
   refuse_note_step("cuda::note_step", step);
-  if (step.num_rows == 0) return;
-  const unsigned blocks = blocks_for(step.num_rows, kStoreBlock);
+  const unsigned blocks = blocks_for(std::max<int64_t>(step.num_rows, step.num_tensors), kStoreBlock);
+  if (blocks == 0) return;
   note_step_kernel<<<blocks, kStoreBlock, 0, static_cast<cudaStream_t>(stream)>>>(step);
   DSMOE_CHECK_LAUNCH("a step of lazy Adam");
 }

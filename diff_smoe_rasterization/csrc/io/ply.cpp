@@ -5,6 +5,7 @@
 #include <cmath>
 #include <utility>
 
+#include "dsmoe/sh.h"
 #include "io/cursor.h"
 #include "io/ply_vertices.h"
 
@@ -14,9 +15,8 @@ namespace {
 
 constexpr std::string_view kBlendModeKey = "blend_mode ";
 constexpr std::string_view kBackgroundGateKey = "background_gate";
-constexpr int kMaxShDegree = 3;
 
-std::size_t num_rest(int sh_degree) { return static_cast<std::size_t>((sh_degree + 1) * (sh_degree + 1) - 1); }
+std::size_t num_rest(int sh_degree) { return static_cast<std::size_t>(sh_coefficients(sh_degree) - 1); }
 
 using Columns = std::vector<const PlyProperty*>;
 

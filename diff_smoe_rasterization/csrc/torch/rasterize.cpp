@@ -235,6 +235,11 @@ Rendering render(const at::Tensor& means3D, const at::Tensor& opacities, const G
           if_asked(given.depth, binding::kDepth), if_asked(given.inverse_depth, binding::kInverseDepth)};
 }
 
+const Splats::Saved& saved_of(const Splats& splats, const char* function) {
+  TORCH_CHECK_VALUE(splats.saved, function, ": these Splats are of no rendering; rasterize_with_splats makes them");
+  return *splats.saved;
+}
+
 // Calls an op with maps or images, then what every op of scores takes.
 torch::jit::Stack score(const char* name, torch::jit::Stack stack, const Splats::Saved& saved) {
   torch::jit::push(stack, saved.radii, saved.arrays, saved.background_gate);
@@ -258,18 +263,16 @@ std::pair<Rendering, Splats> rasterize_with_splats(const at::Tensor& means3D, co
 }
 
 Contributions Splats::contributions(const at::Tensor& pixel_weights) const {
-  TORCH_CHECK_VALUE(saved != nullptr,
-                    "contributions: these Splats are of no rendering; rasterize_with_splats makes them");
   TORCH_CHECK_VALUE(pixel_weights.defined(), "contributions: pixel_weights is undefined; it must be given");
-  const auto sums = score("contributions", {pixel_weights.detach()}, *saved);
+  const auto sums = score("contributions", {pixel_weights.detach()}, saved_of(*this, "contributions"));
   return {sums[0].toTensor(), sums[1].toTensor(), sums[2].toTensor(), sums[3].toTensor()};
 }
 
 Importance Splats::importance(const at::Tensor& pixel_weights, const at::Tensor& share_weights) const {
-  TORCH_CHECK_VALUE(saved != nullptr, "importance: these Splats are of no rendering; rasterize_with_splats makes them");
-  const at::Tensor weights = pixel_weights.defined() ? pixel_weights.detach() : at::ones_like(saved->gate_sum[0]);
+  const Saved& own = saved_of(*this, "importance");
+  const at::Tensor weights = pixel_weights.defined() ? pixel_weights.detach() : at::ones_like(own.gate_sum[0]);
   const at::Tensor of_shares = share_weights.defined() ? share_weights.detach() : weights;
-  const auto sums = score("importance", {weights, of_shares, saved->color, saved->gate_sum, saved->background}, *saved);
+  const auto sums = score("importance", {weights, of_shares, own.color, own.gate_sum, own.background}, own);
   return {sums[0].toTensor(), sums[1].toTensor(), sums[2].toTensor()};
 }
 

@@ -162,9 +162,7 @@ void lazy_adam_step(const at::Tensor& marks, const at::Tensor& rates, int64_t st
   const auto count = static_cast<int64_t>(new_rates.size());
   TORCH_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors && root_scales.size() == new_rates.size(), function, ": ",
                     count, " new_rates and ", root_scales.size(),
-                    " root_scales are given; it must be as many, 1 "
-                    "to ",
-                    kLazyAdamMaxTensors);
+                    " root_scales are given; it must be equally many, 1 to ", kLazyAdamMaxTensors);
   check_real(function, "rates", rates);
   check_shape(function, "rates", rates, {"capacity", count, 2});
   check_contiguous(function, "rates", rates);

@@ -44,20 +44,17 @@ template <class S> DSMOE_HD S multiply_add(S a, S b, S c) {
 // parameter - rate * moment / (sqrt(square) * root_scale + epsilon). In kernels root and reciprocal of floats are the
 // hardware's own: lazy Adam (lazy_adam.h) makes this move for every step that a row has missed, and exact ones would
 // take most of its time. The relative error is below 2^-20, of the move and not of the parameter.
-DSMOE_HD double adam_move(const AdamConstants<double>& constants, const AdamRates<double>& rates, double parameter,
-                          double moment, double square) {
-  return parameter - rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
-}
-DSMOE_HD float adam_move(const AdamConstants<float>& constants, const AdamRates<float>& rates, float parameter,
-                         float moment, float square) {
+template <class S>
+DSMOE_HD S adam_move(const AdamConstants<S>& constants, const AdamRates<S>& rates, S parameter, S moment, S square) {
 #if defined(__CUDA_ARCH__)
-  float root, inverse;
-  asm("sqrt.approx.f32 %0, %1;" : "=f"(root) : "f"(square));
-  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(fma(root, rates.root_scale, constants.epsilon)));
-  return fma(-(rates.rate * moment), inverse, parameter);
-#else
-  return parameter - rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
+  if constexpr (sizeof(S) == sizeof(float)) {
+    float root, inverse;
+    asm("sqrt.approx.f32 %0, %1;" : "=f"(root) : "f"(square));
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(fma(root, rates.root_scale, constants.epsilon)));
+    return fma(-(rates.rate * moment), inverse, parameter);
+  }
 #endif
+  return parameter - rates.rate * moment / (sqrt(square) * rates.root_scale + constants.epsilon);
 }
 
 template <class S>

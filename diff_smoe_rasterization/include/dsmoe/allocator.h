@@ -41,8 +41,7 @@ class Allocator : public Scratch {
  public:
   // Returns memory for array number `index` of those that `for_each_array` names, at a multiple of 256 bytes, or null
   // where there is no memory left. It must last until the backward pass has run, or until the caller knows that none
-  // will.
-  // Where an index is asked for again, the array before it is no longer used.
+  // will. Where an index is asked for again, the array before it is no longer used.
   virtual void* keep(int index, const SavedArray& array) = 0;
 
   // Says that the callee has done with all that `allocate` has given so far. Later work on the same stream may use it.

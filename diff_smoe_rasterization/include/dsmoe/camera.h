@@ -116,12 +116,16 @@ template <class S> DSMOE_HD Mat3<S> view_rotation(const S* m) {
   return {{m[0], m[4], m[8]}, {m[1], m[5], m[9]}, {m[2], m[6], m[10]}};
 }
 
+// 1 / w of a point in clip space. m: the projection.
+template <class S> DSMOE_HD S inverse_clip_w(const S* m, Vec3<S> p) {
+  return S(1) / (m[3] * p.x + m[7] * p.y + m[11] * p.z + m[15] + S(kHomogeneousEpsilon));
+}
+
 // World to pixel coordinates. Pixel centres are integers. NDC -1 and 1 are the outer edges of the border pixels.
 template <class S> DSMOE_HD Vec2<S> project_to_pixel(const Camera<S>& camera, Vec3<S> p) {
   const S* m = camera.projection;
   const Vec3<S> clip = transform_point(m, p);
-  const S w = m[3] * p.x + m[7] * p.y + m[11] * p.z + m[15];
-  const S inverse_w = S(1) / (w + S(kHomogeneousEpsilon));
+  const S inverse_w = inverse_clip_w(m, p);
   return {((clip.x * inverse_w + S(1)) * S(camera.width) - S(1)) * S(0.5),
           ((clip.y * inverse_w + S(1)) * S(camera.height) - S(1)) * S(0.5)};
 }
@@ -135,8 +139,7 @@ template <class S>
 DSMOE_HD PixelGradient<S> project_to_pixel_backward(const Camera<S>& camera, Vec3<S> p, Vec2<S> dL_dpixel) {
   const S* m = camera.projection;
   const Vec3<S> clip = transform_point(m, p);
-  const S w = m[3] * p.x + m[7] * p.y + m[11] * p.z + m[15];
-  const S inverse_w = S(1) / (w + S(kHomogeneousEpsilon));
+  const S inverse_w = inverse_clip_w(m, p);
   const S dL_dx = dL_dpixel.x * S(0.5) * S(camera.width) * inverse_w;
   const S dL_dy = dL_dpixel.y * S(0.5) * S(camera.height) * inverse_w;
   const S dL_dw = -(dL_dx * clip.x + dL_dy * clip.y) * inverse_w;

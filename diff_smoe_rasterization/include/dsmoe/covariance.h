@@ -25,8 +25,8 @@ template <class S> DSMOE_HD Vec4<S> quaternion_to_rotation_backward(Vec4<S> q, c
       S(2) * (r * (g.r1.x - g.r0.y) + x * (g.r0.z + g.r2.x) + y * (g.r1.z + g.r2.y) - S(2) * z * (g.r0.x + g.r1.y))};
 }
 
-// The local affine approximation of the perspective projection (EWA splatting): J W, 2x3. The slopes x/z and y/z are
-// clamped a little outside the frustum, where the approximation would explode.
+// J, 2x3: the perspective projection's local affine approximation (EWA splatting), by view coordinates. The slopes x/z
+// and y/z are clamped a little outside the frustum, where the approximation would explode.
 template <class S> struct ProjectionJacobian {
   Vec2<S> focal;  // pixels
   Vec2<S> slope;  // clamped x/z, y/z

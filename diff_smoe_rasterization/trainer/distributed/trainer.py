@@ -1,21 +1,17 @@
 """Training on batches of views, on one process or with the Gaussians divided over several."""
 from __future__ import annotations
 
-import statistics
-from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Optional, Sequence
 
 import torch
 
 from ..config import BATCHED, TrainConfig
 from ..errors import ConfigError
 from ..model import GaussianModel
-from ..results.evaluation import PASSES, SECONDS, WARM_UP_VIEWS, Evaluation, summary
-from ..results.metrics import image_metrics
+from ..results.evaluation import Evaluation, rows_of_views, summary
 from ..scenes.images import View
 from ..scenes.scene import Scene
 from ..system.group import Group
-from ..system.progress import progress_bar
-from ..system.stopwatch import synchronised_time
 from ..training.loop import Trainer
 from ..training.strategy import BatchStep
 from .batch import Batch
@@ -100,39 +96,20 @@ class BatchTrainer(Trainer):
         """Whether a process was asked to stop before the latest step, which all learn in that step."""
         return self._asked
 
-    @torch.no_grad()
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views, each in one of the processes; a time of a view is that of all by their number."""
         group, device, views = self.group, self.config.device, self.scene.test
-        measured: List[Dict[str, Any]] = []
-        batches = [views[begin:begin + group.size] for begin in range(0, len(views), group.size)]
-        seconds: List[List[float]] = []  # of each batch, in each pass, as `evaluate` has them
 
-        def timed(some: Sequence[View]) -> Tuple[Dict[int, torch.Tensor], float]:
+        def render(some: Sequence[View]) -> Dict[int, torch.Tensor]:
             settings = [self.renderer.settings_of(view.camera) for view in some]
-            started = synchronised_time(device)
             batch = Batch(group, self.model, settings)
-            colors = {view: batch.draw(view, settings[view], for_backward=False).color for view in batch.own_views}
-            return colors, synchronised_time(device) - started
+            return {view: batch.draw(view, settings[view], for_backward=False).color for view in batch.own_views}
 
-        for some in batches[:WARM_UP_VIEWS]:
-            timed(some)
-        for some in progress_bar(batches, desc="evaluation", unit="view", disable=not progress, leave=False):
-            colors, elapsed = timed(some)
-            seconds.append([elapsed])
-            measured += [{"name": some[index].camera.name, "batch": len(seconds) - 1,
-                          **image_metrics(color, some[index].image_float(), some[index].mask_float())}
-                         for index, color in colors.items()]
-        for _ in range(PASSES - 1):
-            milliseconds = group.gather_numbers([round(1000 * sum(map(sum, seconds)))], device)
-            if max(milliseconds)[0] >= 1000 * SECONDS:  # all processes decide alike
-                break
-            for some, times in zip(batches, seconds):
-                times.append(timed(some)[1])
-        for row in measured:
-            number = row.pop("batch")
-            row["milliseconds"] = 1000 * statistics.median(seconds[number]) / len(batches[number])
-        by_process = group.gather_objects(measured)
+        def longest(seconds: float) -> float:  # all processes decide alike
+            return max(group.gather_numbers([round(1000 * seconds)], device))[0] / 1000
+
+        batches = [views[begin:begin + group.size] for begin in range(0, len(views), group.size)]
+        by_process = group.gather_objects(rows_of_views(render, batches, device, progress, agreed=longest))
         return summary([by_process[index % group.size][index // group.size]  # type: ignore[index]
                         for index in range(len(views))])
 

@@ -39,30 +39,44 @@ def evaluate(renderer: Renderer, views: Sequence[View], device: str, progress: b
     name. passes: how often the views are rendered, as long as that takes less than SECONDS in all; the time of a view
     is the median. Raises what `summary` raises.
     """
-    per_view: List[Dict[str, Any]] = []
-    seconds: List[List[float]] = []  # of each view, in each pass
+    return summary(rows_of_views(lambda views: {0: renderer(views[0].camera).color}, [[view] for view in views], device,
+                                 progress, measure, passes))
 
-    def timed(view: View) -> Tuple[torch.Tensor, float]:
+
+def rows_of_views(render: Callable[[Sequence[View]], Dict[int, torch.Tensor]], batches: Sequence[Sequence[View]],
+                  device: str, progress: bool = False, measure: Measure = image_metrics, passes: int = PASSES,
+                  agreed: Callable[[float], float] = float) -> List[Dict[str, Any]]:
+    """What `summary` takes. `evaluate` says what is timed; a view's time is its part of that of its batch.
+
+    render: the images of a batch by their index in it, all or some. agreed: from the seconds that one process has
+    rendered to those by which all decide on a further pass.
+    """
+    rows: List[List[Dict[str, Any]]] = []  # of each batch
+    seconds: List[List[float]] = []  # of each batch, in each pass
+
+    def timed(views: Sequence[View]) -> Tuple[Dict[int, torch.Tensor], float]:
         started = synchronised_time(device)
-        color = renderer(view.camera).color
-        return color, synchronised_time(device) - started
+        colors = render(views)
+        return colors, synchronised_time(device) - started
 
     with torch.no_grad():
-        for view in views[:WARM_UP_VIEWS]:
-            renderer(view.camera)
-        for view in progress_bar(views, desc="evaluation", unit="view", disable=not progress, leave=False):
-            color, elapsed = timed(view)
+        for views in batches[:WARM_UP_VIEWS]:
+            render(views)
+        for views in progress_bar(batches, desc="evaluation", unit="view", disable=not progress, leave=False):
+            colors, elapsed = timed(views)
             seconds.append([elapsed])
-            per_view.append({"name": view.camera.name, "milliseconds": None,
-                             **measure(color, view.image_float(), view.mask_float())})
+            rows.append([{"name": views[index].camera.name, "milliseconds": None,
+                          **measure(color, views[index].image_float(), views[index].mask_float())}
+                         for index, color in colors.items()])
         for _ in range(passes - 1):
-            if sum(map(sum, seconds)) >= SECONDS:
+            if agreed(sum(map(sum, seconds))) >= SECONDS:
                 break
-            for view, times in zip(views, seconds):
-                times.append(timed(view)[1])
-    for row, times in zip(per_view, seconds):
-        row["milliseconds"] = 1000 * statistics.median(times)
-    return summary(per_view)
+            for views, times in zip(batches, seconds):
+                times.append(timed(views)[1])
+    for views, times, of_batch in zip(batches, seconds, rows):
+        for row in of_batch:
+            row["milliseconds"] = 1000 * statistics.median(times) / len(views)
+    return sum(rows, [])
 
 
 def summary(per_view: List[Dict[str, Any]]) -> Evaluation:

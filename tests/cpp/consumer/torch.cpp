@@ -147,6 +147,7 @@ TEST_P(Modes, GradientsAreTheCores) {
     EXPECT_TRUE(at::equal(splats.importance().shares, splats.importance(ones, ones).shares));
   }
   EXPECT_THROW(dsmoe::Splats().contributions(e), c10::ValueError);
+  EXPECT_THROW(dsmoe::Splats().importance(), c10::ValueError);
 
   dsmoe::cpu::Gradients<double> gradients;
   gradients.images = {data(w[0]), data(w[1]), data(w[2]), data(w[3])};

@@ -151,9 +151,9 @@ def test_another_rasterizer_is_refused(tiny_config):
 
 
 def test_a_disturbed_rendering_does_not_count_in_batches_either(tiny_config, scene, monkeypatch):
-    """As in test_loop.py: of five passes the clock disturbs one, behind two renderings that warm up."""
-    clock = iter([0.0] * 4 + [0.0, 0.01, 1.0, 1.99, *(2 + 0.01 * (i % 2) for i in range(16))])
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.distributed.trainer.synchronised_time", lambda _: next(clock))
+    """As in test_loop.py: of five passes the clock disturbs one."""
+    clock = iter([0.0, 0.01, 1.0, 1.99, *(2 + 0.01 * (i % 2) for i in range(16))])
+    monkeypatch.setattr("diff_smoe_rasterization.trainer.results.evaluation.synchronised_time", lambda _: next(clock))
     evaluation = BatchTrainer(tiny_config, scene, ALONE).evaluate()
     assert [row["milliseconds"] for row in evaluation.per_view] == pytest.approx([10, 10], rel=1e-9)
     assert next(clock, None) is None
