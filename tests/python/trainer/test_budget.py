@@ -14,6 +14,7 @@ from diff_smoe_rasterization.losses import fused_ssim
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import ConfigError
 from diff_smoe_rasterization.trainer.gate_options import gate_settings, parse_gate_options
+from diff_smoe_rasterization.trainer.scenes.nerf import random_points
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.training.loop import Trainer, train
 from diff_smoe_rasterization.trainer.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
@@ -46,6 +47,14 @@ def test_gate_overshoots_and_ends_with_the_budget(tiny_config, budget, mode):
     assert changes == [16, 19, 22, 25] and counts[-1] == budget
     ratios = [counts[i - 1] / counts[i] for i in changes]
     assert max(ratios) < 1.05 * min(ratios), "steps of equal ratios"
+
+
+@pytest.mark.parametrize("points", [40, 250], ids=["below_the_budget", "above_the_budget"])
+def test_gate_starts_from_random_points(tiny_config, points):
+    config = tiny_config.changed(schedule="gate", budget=100, densification_interval=2)
+    scene = dataclasses.replace(load_scene(config, progress=False), points=random_points(points, seed=0))
+    counts = counts_of(Trainer(config, scene))
+    assert counts[0] == points and counts[-1] == 100
 
 
 def test_gate_adds_what_the_threshold_leaves_out(tiny_config):
