@@ -176,6 +176,18 @@ def test_a_package_with_kernels_is_found_without_a_toolkit(tmp_path, asked, foun
     assert actual == found and "dsmoe::cuda" in targets
 
 
+@needs_cmake
+def test_a_component_that_is_none_is_said_with_those_that_are(tmp_path):
+    (tmp_path / "CMakeLists.txt").write_text("""cmake_minimum_required(VERSION 3.21)
+project(program LANGUAGES NONE)
+find_package(diff_smoe_rasterization REQUIRED COMPONENTS gpu)
+""")
+    with pytest.raises(AssertionError) as error:
+        run("cmake", "-S", tmp_path, "-B", tmp_path / "build", f"-DCMAKE_PREFIX_PATH={extension.cmake_prefix_path()}")
+    text = " ".join(str(error.value).split())
+    assert "There is no component gpu; the components are core, io, cuda and torch." in text
+
+
 def documented_programs():
     """The programs of docs/cpp.md, by the target that the comment in their first line names."""
     blocks = re.findall(r"```cpp\n(// dsmoe::(\w+)[^\n]*\n.*?)```", (ROOT / "docs" / "cpp.md").read_text(), re.DOTALL)
