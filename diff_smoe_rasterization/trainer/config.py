@@ -18,6 +18,7 @@ CONFIG_NAME = "config.json"
 SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
 BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")
+KINDS = {bool: "true or false", int: "a whole number", float: "a number"}  # what an option of this type must be
 LEARNED = "learned"  # the background gate that a training finds
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
@@ -119,6 +120,9 @@ class TrainConfig:
         """Checks every option that needs no file; returns self."""
         for option in dataclasses.fields(self):
             value, choices = getattr(self, option.name), option.metadata.get("choices")
+            kind = type(option.metadata.get("published", option.default))
+            if kind in KINDS and not isinstance(value, (int, float) if kind is float else kind):
+                raise ConfigError(f"{_flag(option)} is {value!r}; it must be {KINDS[kind]}")
             if choices and value not in choices:
                 raise ConfigError(f"{_flag(option)} is {value!r}; it must be one of {', '.join(choices)}")
         self._require("iterations", self.iterations >= 1, "at least 1")

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any, Callable
+from typing import Any, Callable, Dict
 
 from .errors import ConfigError
 
@@ -19,7 +19,7 @@ class GateOptions:
     """Settings of the strategy `gate`."""
 
     # Growth ends at so many times the budget; 0: wherever the threshold leads.
-    overshoot: float = _setting(10.0, lambda x: x == 0 or 1 <= x < math.inf, "0 or at least 1")
+    overshoot: float = _setting(10.0, lambda x: x == 0 or x >= 1, "0 or at least 1")
     # Steps down to the budget.
     removals: int = _setting(16, lambda x: x >= 1, "at least 1")
     # Training views that a decision looks at.
@@ -27,14 +27,14 @@ class GateOptions:
     # The most Gaussians that move at a time, as a part of all; 0: none.
     moves: float = _setting(0.1, lambda x: 0 <= x <= 1, "between 0 and 1")
     # A Gaussian moves where its cost is below this part of the error at its new place.
-    worth: float = _setting(0.2, lambda x: 0 <= x < math.inf, "at least 0")
+    worth: float = _setting(0.2, lambda x: x >= 0, "at least 0")
     # The learning rate of the higher SH bands is so many times that of the recipe.
-    bands: float = _setting(2.0, lambda x: 0 < x < math.inf, "above 0")
+    bands: float = _setting(2.0, lambda x: x > 0, "above 0")
     # Behind the moves all learning rates but the positions' fall to this part of themselves.
-    anneal: float = _setting(0.1, lambda x: 0 < x < math.inf, "above 0")
+    anneal: float = _setting(0.1, lambda x: x > 0, "above 0")
     # There too the loss has so many times the squared error in place of the absolute one; 0: it keeps that one. With 30
     # both pull alike where they differ by 1/60.
-    squares: float = _setting(30.0, lambda x: 0 <= x < math.inf, "at least 0")
+    squares: float = _setting(30.0, lambda x: x >= 0, "at least 0")
 
 
 @functools.lru_cache(maxsize=None)
@@ -44,16 +44,20 @@ def parse_gate_options(text: str) -> GateOptions:
     Raises ConfigError with the name, the value and what it must be.
     """
     known = {option.name: option for option in dataclasses.fields(GateOptions)}
-    values = {}
+    values: Dict[str, Any] = {}
     for part in filter(None, text.split(",")):
         name, _, value = part.strip().partition("=")
         if name not in known:
             raise ConfigError(f"--strategy-options: {name!r} is unknown; it may name {', '.join(known)}")
+        if name in values:
+            raise ConfigError(f"--strategy-options: {name} stands there twice; it must stand there once")
         kind, requirement = type(known[name].default), known[name].metadata["requirement"]
         try:
             values[name] = kind(value)
+            if not abs(values[name]) < math.inf:
+                raise ValueError(value)
         except ValueError as error:
-            what = "a whole number" if kind is int else "a number"
+            what = "a whole number" if kind is int else "a finite number"
             raise ConfigError(f"--strategy-options: {name} is {value!r}; it must be {what}, {requirement}") from error
         if not known[name].metadata["holds"](values[name]):
             raise ConfigError(f"--strategy-options: {name} is {value}; it must be {requirement}")

@@ -315,10 +315,13 @@ def test_what_cannot_be_is_said(options, words):
 
 @pytest.mark.parametrize("text, words", [
     ("views=1.5", "views is '1.5'; it must be a whole number, at least 1"), ("speed=1", "'speed' is unknown"),
-    ("moves=x", "moves is 'x'; it must be a number, between 0 and 1"), ("views", "views is ''"),
+    ("moves=x", "moves is 'x'; it must be a finite number, between 0 and 1"), ("views", "views is ''"),
     ("removals=0", "removals is 0; it must be at least 1"), ("views=0", "views is 0; it must be at least 1"),
-    ("moves=2", "moves is 2; it must be between 0 and 1"), ("moves=nan", "moves is nan; it must be between 0 and 1"),
-    ("overshoot=0.5", "overshoot is 0.5; it must be 0 or at least 1"), ("overshoot=inf", "overshoot is inf"),
+    ("moves=2", "moves is 2; it must be between 0 and 1"),
+    ("moves=nan", "moves is 'nan'; it must be a finite number, between 0 and 1"),
+    ("overshoot=0.5", "overshoot is 0.5; it must be 0 or at least 1"),
+    ("overshoot=inf", "overshoot is 'inf'; it must be a finite number, 0 or at least 1"),
+    ("views=1, views=2", "views stands there twice"),
     ("worth=-1", "worth is -1; it must be at least 0"), ("anneal=0", "anneal is 0; it must be above 0"),
     ("bands=0", "bands is 0; it must be above 0"), ("squares=-1", "squares is -1; it must be at least 0")])
 def test_settings_of_gate_are_checked(text, words):

@@ -110,6 +110,10 @@ def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypa
     ("checkpoint_every", -1, "--checkpoint-every is -1"),
     ("schedule", "fast", "--strategy is 'fast'; it must be one of 3dgs, steady, gate, mcmc"),
     ("device", "tpu", "--device is 'tpu'"),
+    ("budget", "500", "--budget is '500'; it must be a whole number"),
+    ("iterations", 1e3, "--iterations is 1000.0; it must be a whole number"),
+    ("feature_lr", "0.1", "--feature-lr is '0.1'; it must be a number"),
+    ("white_background", 1, "--white-background is 1; it must be true or false"),
 ])
 def test_bad_values_name_the_option(option, value, words):
     with pytest.raises(ConfigError) as error:
