@@ -433,6 +433,9 @@ def _render(arguments: argparse.Namespace) -> None:
     if is_folder(arguments.source):
         config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
     else:
+        if not os.path.isfile(arguments.source):
+            raise TrainerError(f"{arguments.source}: no such file or folder; name the output folder of `dsmoe train`, "
+                               "or a .ply and --scene")
         if not arguments.scene:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source

@@ -155,6 +155,7 @@ def test_render_writes_into_its_own_folder_alone(trained, scene, tmp_path, capsy
     assert f"{photographs} is not empty (view_000.png)" in text and "-o" in text
     assert before == {path.name: path.read_bytes() for path in photographs.iterdir()}
     assert "dsmoe train wrote" in fails(capsys, "render", trained, "-o", trained)
+    assert "none: no such file or folder" in fails(capsys, "render", str(tmp_path / "none"), "-o", trained)
 
     own = tmp_path / "own"
     own.mkdir()
