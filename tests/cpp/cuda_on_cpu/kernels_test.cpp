@@ -287,12 +287,12 @@ TEST(Kernels, GiveTheSameBitsInEveryOrder) {
     const std::vector<bool> all_sure(scene.pixels(), false);
     Results<float> first = by_kernels(scene, all_sure, {true});
     for (const auto order : {emulator::Order::kBackward, emulator::Order::kShuffled}) {
-      emulator::order = order;
+      emulator::run_in(order);
       Results<float> other = by_kernels(scene, all_sure, {true});
       EXPECT_EQ(other.rendering.color, first.rendering.color);
       EXPECT_EQ(other.all_gradients(), first.all_gradients());
     }
-    emulator::order = emulator::Order::kForward;
+    emulator::run_in(emulator::Order::kForward);
   }
 }
 
