@@ -20,6 +20,7 @@ dim3 threadIdx, blockIdx, blockDim, gridDim;
 namespace emulator {
 
 alignas(256) char dynamic_shared[kSharedBytes];
+int multiprocessors = 10;
 
 namespace {
 
