@@ -99,6 +99,7 @@ struct How {
   bool deterministic = false;
   int64_t most_instances = kMostInstances;
   bool overflows = false;  // the lists do not fit their memory
+  StageTimes* times = nullptr;
 };
 
 Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& unsure, const How& how) {
@@ -114,6 +115,7 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   frame.config.most_instances = how.most_instances;
   cuda::Run run;
   run.deterministic = how.deterministic;
+  run.times = how.times;
   cuda::StreamMemory memory(nullptr);
   cuda::forward(frame, run, memory);
   if (how.overflows) {
@@ -279,6 +281,16 @@ TYPED_TEST(KernelsIn, EqualTheCpuWhereLittleIsSeen) {
   for (int64_t i = 0; i < unseen.count; ++i) unseen.means3D[3 * i + 2] = -9;
   this->expect(unseen);
   this->expect(make_scene(8, 0, 33, 17));
+}
+
+// Where pixels do not stop, both passes evaluate all pairs of the entries that meet a square.
+TEST(Kernels, CountThePairsOfBothPasses) {
+  Scene<double> scene = long_lists();
+  scene.config.mode = BlendMode::kSmoeTn;
+  StageTimes times;
+  by_kernels(convert<float>(scene), std::vector<bool>(scene.pixels(), false), {false, kMostInstances, false, &times});
+  EXPECT_GT(times.backward_pairs, 0);
+  EXPECT_EQ(times.forward_pairs, times.backward_pairs);
 }
 
 TEST(Kernels, GiveTheSameBitsInEveryOrder) {
