@@ -122,7 +122,7 @@ __global__ void __launch_bounds__(kSortBlock, kStripsPerMultiprocessor)
     place_pairs_kernel(const __grid_constant__ RadixPass<Key> pass) {
   constexpr int kBins = 1 << kBits, kOwn = kBins / kSortBlock, kItems = kSortItems<Key>, kWarps = kSortBlock / kWarp;
   static_assert(kBins % kSortBlock == 0, "each thread has the same number of digits");
-  __shared__ uint32_t warp_counts[kWarps][kBins];    // pairs of each digit, then those in the warps before
+  __shared__ uint32_t warp_counts[kWarps][kBins];  // pairs of each digit, then those in the warps before
   // Of each digit: its first place in the tile, and what is added to a place in the tile for that in the output.
   __shared__ uint32_t starts[kBins], places[kBins];
   __shared__ Key tile_keys[kSortTile<Key>];
