@@ -12,6 +12,7 @@ from ..neighbors import distCUDA2
 from ..optimizers import FusedAdam
 from .config import TrainConfig
 from .scenes.pointcloud import PointCloud
+from .system.process import return_spare_memory
 
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi))
 INITIAL_OPACITY = 0.1
@@ -170,6 +171,7 @@ class GaussianOptimizer:
         """Adds Gaussians, raw parameters as in PARAMETERS; their moments start at zero."""
         for name in PARAMETERS:
             self._replace(name, lambda tensor, new: torch.cat([tensor, new]), rows[name])
+        return_spare_memory(self.model.raw["means3D"].device)
 
     def keep(self, mask: torch.Tensor) -> None:
         """Removes the Gaussians where mask [N] (bool) is False."""
@@ -194,6 +196,7 @@ class GaussianOptimizer:
                     tensor[len(tensor) - fresh:] = new[name]
             del old
             self._put(name, tensors)
+        return_spare_memory(self.model.raw["means3D"].device)
 
     def set_opacity_logits(self, logits: torch.Tensor) -> None:
         """Sets all opacity logits [N, 1] and forgets their moments."""

@@ -147,7 +147,8 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
 
 // The first blocks come in pairs, for the tiles with the longest lists. Where such a list is long, each of the two has
 // half of the tile, and two warps share a square of pixels. Else the first of them has the tile, as all other blocks
-// do.
+// do. Which lists are shared may change from run to run, with the order of tiles of one class. So both ways must come
+// to the same bits: products are added by fma or behind a select, and the compiler has no choice.
 template <class S, BlendMode kMode, int kFeatures>
 __global__ void __launch_bounds__(kWalkBlock,
                                   sizeof(S) == 4 && kFeatures != kAnyFeatures ? kBlendBlocks : kGeneralWalkBlocks)

@@ -80,7 +80,7 @@ __global__ void __launch_bounds__(kSortBlock) count_digits_kernel(const __grid_c
 }
 
 // What a block's thread gets of a sum over the threads before it, in the order of threads. All threads must call it.
-// warp_sums: [kSortBlock / kWarp + 1] in shared memory. Returns the sum over all threads in `total`.
+// warp_sums: [kSortBlock / kWarp] in shared memory. Returns the sum over all threads in `total`.
 inline __device__ uint32_t sum_before_thread(uint32_t own, uint32_t* warp_sums, uint32_t& total) {
   constexpr int kWarps = kSortBlock / kWarp;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
@@ -122,8 +122,9 @@ __global__ void __launch_bounds__(kSortBlock, kStripsPerMultiprocessor)
     place_pairs_kernel(const __grid_constant__ RadixPass<Key> pass) {
   constexpr int kBins = 1 << kBits, kOwn = kBins / kSortBlock, kItems = kSortItems<Key>, kWarps = kSortBlock / kWarp;
   static_assert(kBins % kSortBlock == 0, "each thread has the same number of digits");
-  __shared__ uint32_t warp_counts[kWarps][kBins];    // pairs of each digit, then those in the warps before
-  __shared__ uint32_t starts[kBins], places[kBins];  // of each digit: in the tile's order; what leads from there out
+  __shared__ uint32_t warp_counts[kWarps][kBins];  // pairs of each digit, then those in the warps before
+  // Of each digit: its first place in the tile, and what is added to a place in the tile for that in the output.
+  __shared__ uint32_t starts[kBins], places[kBins];
   __shared__ Key tile_keys[kSortTile<Key>];
   __shared__ int32_t tile_values[kSortTile<Key>];
   __shared__ uint32_t warp_sums[kWarps];

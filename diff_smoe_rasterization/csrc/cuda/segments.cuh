@@ -36,7 +36,7 @@ template <class S> __device__ bool has_segments(const SavedForward<S>& saved, co
   return saved.segments != nullptr && tile.source.listed && tile.source.length > kSegmentLength;
 }
 
-// The segments that some pixel of a warp has reached, in any order. Entry 0 holds their number.
+// The segments that some pixel of a square has reached, in any order. Entry 0 holds their number.
 struct SegmentQueue {
   int2* entries;  // (tile and quarter, segment)
 

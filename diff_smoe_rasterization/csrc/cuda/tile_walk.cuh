@@ -1,7 +1,8 @@
 // The tile walk: how a warp goes through the list of a tile. Every pass over pixels is a visitor of it.
 //
 // A warp owns a square of pixels, a quarter of a tile; each lane owns two of them, one below the other, so that they
-// share a Gaussian's terms in x. (HiGS, arXiv:2606.00352, also has small squares for warps inside larger tiles.)
+// share a Gaussian's terms in x. (HiGS, arXiv:2606.00352, also has small squares for warps inside larger tiles.) Two
+// warps may also walk for one square; the visitor then knows which pixel of each lane is its own.
 //
 //   find    the warp looks ahead in the list for entries that may meet its pixels. In most lists entries are marked
 //           with the quarters that they may meet
@@ -10,7 +11,7 @@
 //   stage   those that meet them go to shared memory
 //   visit   all lanes read the staged entries one after the other, and the visitor does the work of its pass
 //
-// Warps do not wait for each other.
+// In the walk, warps do not wait for each other.
 #pragma once
 
 #include <type_traits>
@@ -87,7 +88,7 @@ template <class S> class EntrySource {
   uint32_t wanted_;         // the bit of an entry that tells
 };
 
-// The pixels of a warp, and the entries that may meet them.
+// The square of pixels of a warp, or of two that share it, and the entries that may meet them.
 template <class S> class WarpTile {
  public:
   __device__ explicit WarpTile(const BlendArguments<S>& arguments)
@@ -117,7 +118,7 @@ template <class S> class WarpTile {
   int lane;
   int index;           // of the tile in the band
   int tile_x, tile_y;  // of the tile, in tiles
-  int x, y;            // of the lane's first pixel
+  int x, y;            // of the lane's first pixel, in a lane that has all of them
   bool empty;          // no pixel of the warp lies in the image
   PixelRect<S> rect;   // the warp's pixels in the image
   EntrySource<S> source;

@@ -14,7 +14,7 @@ namespace cuda {
 // are evaluated count, and two pixels a lane share the terms in x.
 constexpr int kWarpTile = 8;
 constexpr int kWarpsPerTile = (kTileSize / kWarpTile) * (kTileSize / kWarpTile);
-constexpr int kWalkBlock = kWarpsPerTile * kWarp;           // threads: one block a tile
+constexpr int kWalkBlock = kWarpsPerTile * kWarp;           // threads: a tile, or half of one with a long list
 constexpr int kLanePixels = kWarpTile * kWarpTile / kWarp;  // one below the other
 constexpr int kLaneStep = kWarpTile / kLanePixels;          // rows between them
 
@@ -36,8 +36,8 @@ constexpr int kBlendUnroll = 2;
 constexpr int kBlendBlocks = 6;
 
 // Two warps share a square of pixels in the forward walk where the list is longer than this, so that few long lists do
-// not decide how long the pass takes. Only so many tiles are looked at, those of the longest lists. A lane then has one
-// pixel, and registers for more visits that are interleaved.
+// not decide how long the pass takes. Only so many tiles are looked at, the first ones in the order of lengths (below).
+// A lane then has one pixel, and registers for more visits that are interleaved.
 constexpr int kSharedFrom = 1024;
 constexpr unsigned kMostSharedTiles = 128;
 constexpr int kSharedBlendUnroll = 4;
@@ -72,7 +72,7 @@ constexpr int kSortBlock = 256;
 constexpr int kSortItemsOfFloats = 16;
 // Strips, a block each, that one multiprocessor sorts at once. More of them would wait less, but each block adds up the
 // strips before it: the sums of all groups, and the strips of its own. With 132 multiprocessors these are 17 rows and
-// up to 15, each read at once.
+// up to 15, each read at once; with more than 144 the sums take two turns.
 constexpr unsigned kStripsPerMultiprocessor = 2, kStripsPerGroup = 16, kRowsAtOnce = 18;
 // Copies of a strip's counts in shared memory. Depths share their upper digits, so that many lanes would count at one
 // place. And keys that a lane reads at once.

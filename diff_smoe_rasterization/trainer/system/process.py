@@ -9,6 +9,8 @@ import torch
 M_TRIM_THRESHOLD, TRIM_BYTES = -1, 1 << 30
 M_MMAP_THRESHOLD, MMAP_BYTES = -3, 1 << 25  # glibc accepts no more
 
+SPARE_BYTES = 4 << 30  # GPU memory that torch may keep beyond twice what the run has needed
+
 
 def set_up_process(device: str) -> None:
     """Readies the process for a training on the device, "cpu" or "cuda": its memory, and how many threads torch has.
@@ -18,6 +20,19 @@ def set_up_process(device: str) -> None:
     keep_freed_memory()
     if device == "cuda":
         torch.set_num_threads(1)
+
+
+def return_spare_memory(device: torch.device) -> None:
+    """Returns the GPU memory that torch keeps for later to the driver, where that is much.
+
+    To be called where all arrays have changed their sizes: blocks of the sizes before seldom fit again, and torch would
+    keep them until the card is full. It costs time, so it waits until much has gathered.
+    """
+    if device.type != "cuda":
+        return
+    stats = torch.cuda.memory_stats(device)
+    if stats["reserved_bytes.all.current"] > 2 * stats["allocated_bytes.all.peak"] + SPARE_BYTES:
+        torch.cuda.empty_cache()
 
 
 def keep_freed_memory() -> None:

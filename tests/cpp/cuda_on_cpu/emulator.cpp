@@ -19,8 +19,8 @@ dim3 threadIdx, blockIdx, blockDim, gridDim;
 
 namespace emulator {
 
-Order order = Order::kForward;
 alignas(256) char dynamic_shared[kSharedBytes];
+int multiprocessors = 10;
 
 namespace {
 
@@ -66,6 +66,7 @@ const std::function<void()>* kernel;
 unsigned running;  // the thread
 jmp_buf scheduler;
 std::mt19937 random_numbers;
+Order order = Order::kForward;
 
 void to_scheduler() {
   if (_setjmp(fibers[running]->resume) == 0) _longjmp(scheduler, 1);
@@ -152,6 +153,8 @@ void run_block(unsigned threads) {
 }
 
 }  // namespace
+
+void run_in(Order of) { order = of; }
 
 void launch(const std::function<void()>& thread, dim3 grid, dim3 threads, size_t shared_bytes, void*) {
   const unsigned count = threads.x * threads.y * threads.z;

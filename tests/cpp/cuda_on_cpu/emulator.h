@@ -46,6 +46,7 @@ namespace emulator {
 constexpr int kLanes = 32;
 constexpr size_t kSharedBytes = 48 << 10;  // what every card gives a block
 extern char dynamic_shared[kSharedBytes];
+extern int multiprocessors;  // that the card says it has
 
 // Where something is called, as an argument that is left out.
 struct Place {
@@ -207,7 +208,9 @@ inline const char* cudaGetErrorString(cudaError_t) { return "an error"; }
 inline const char* cudaGetErrorName(cudaError_t) { return "an error"; }
 inline cudaError_t cudaGetDevice(int* device) { return *device = 0, cudaSuccess; }
 inline cudaError_t cudaGetDeviceProperties(cudaDeviceProp* of, int) { return *of = {"emulator", 8, 0}, cudaSuccess; }
-inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr, int) { return *value = 10, cudaSuccess; }
+inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr, int) {
+  return *value = emulator::multiprocessors, cudaSuccess;
+}
 inline cudaError_t cudaStreamIsCapturing(cudaStream_t, cudaStreamCaptureStatus* is) { return *is = {}, cudaSuccess; }
 inline cudaError_t cudaStreamSynchronize(cudaStream_t) { return cudaSuccess; }
 inline cudaError_t cudaMallocAsync(void** memory, size_t bytes, cudaStream_t) {

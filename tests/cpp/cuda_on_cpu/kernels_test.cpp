@@ -99,6 +99,7 @@ struct How {
   bool deterministic = false;
   int64_t most_instances = kMostInstances;
   bool overflows = false;  // the lists do not fit their memory
+  StageTimes* times = nullptr;
 };
 
 Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& unsure, const How& how) {
@@ -114,6 +115,7 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   frame.config.most_instances = how.most_instances;
   cuda::Run run;
   run.deterministic = how.deterministic;
+  run.times = how.times;
   cuda::StreamMemory memory(nullptr);
   cuda::forward(frame, run, memory);
   if (how.overflows) {
@@ -211,16 +213,21 @@ Scene<double> long_lists() {
   return scene;
 }
 
-// One list of five segments, which pixels leave in the second, third and fourth one, or not at all.
-Scene<double> list_of_two_rounds() {
+// One list of five segments and two squares of pixels. All pixels of a half of a square leave in the first segment: of
+// one square the upper half, of the other one the lower half. Some of each other half stay until the third or fourth.
+Scene<double> list_of_unlike_halves() {
   Random random(7);
   Scene<double> scene = make_scene(7, 2300, 16, 8);
+  const double* view = scene.camera.view;
   for (int64_t i = 0; i < scene.count; ++i) {
-    const double x = random.uniform(-0.6, 0.6);
-    scene.means3D[3 * i] = x, scene.means3D[3 * i + 1] = random.uniform(-0.6, 0.6);
-    scene.means3D[3 * i + 2] = random.uniform(-0.6, 0.6);
-    for (int axis = 0; axis < 3; ++axis) scene.scales[3 * i + axis] = random.uniform(0.1, 0.2);
-    scene.opacities[i] = random.uniform(0.004, 0.01) + 0.1 * std::max(0.0, x + 0.3);
+    const double x = random.uniform(-2.2, 2.2), y = random.uniform(-1.3, 1.3), z = random.uniform(2.7, 3.3);
+    const double from_camera[] = {x - view[12], y - view[13], z - view[14]};
+    for (int axis = 0; axis < 3; ++axis) {
+      double& mean = scene.means3D[3 * i + axis] = 0;
+      for (int k = 0; k < 3; ++k) mean += view[4 * axis + k] * from_camera[k];
+      scene.scales[3 * i + axis] = random.uniform(0.2, 0.3);
+    }
+    scene.opacities[i] = random.uniform(0.5, 1) * ((x < 0) == (y < 0) ? 0.6 : 0.05);
   }
   return scene;
 }
@@ -258,8 +265,10 @@ TYPED_TEST(KernelsIn, EqualTheCpuWithOtherColoursAndDepth) {
 
 TYPED_TEST(KernelsIn, EqualTheCpuOnLongLists) { this->expect(long_lists()); }
 
-TYPED_TEST(KernelsIn, EqualTheCpuOnAListOfTwoRounds) {
-  if (Blend<TypeParam::value>::kStopsEarly) this->expect(list_of_two_rounds());
+TYPED_TEST(KernelsIn, EqualTheCpuWhereTheHalvesOfASquareLeaveAListApart) {
+  if (!Blend<TypeParam::value>::kStopsEarly) return;
+  this->expect(list_of_unlike_halves());
+  this->expect(list_of_unlike_halves(), {false, kMostInstances, true});
 }
 
 TYPED_TEST(KernelsIn, EqualTheCpuBehindAVeil) { this->expect(wall_behind_a_veil()); }
@@ -276,17 +285,29 @@ TYPED_TEST(KernelsIn, EqualTheCpuWhereLittleIsSeen) {
   this->expect(make_scene(8, 0, 33, 17));
 }
 
+// Where pixels do not stop, both passes evaluate all pairs of the entries that meet a square.
+TEST(Kernels, CountThePairsOfBothPasses) {
+  Scene<double> scene = long_lists();
+  scene.config.mode = BlendMode::kSmoeTn;
+  StageTimes times;
+  by_kernels(convert<float>(scene), std::vector<bool>(scene.pixels(), false), {false, kMostInstances, false, &times});
+  EXPECT_GT(times.backward_pairs, 0);
+  EXPECT_EQ(times.forward_pairs, times.backward_pairs);
+}
+
 TEST(Kernels, GiveTheSameBitsInEveryOrder) {
-  const Scene<float> scene = convert<float>(in_mode<BlendMode::kSmoe>(make_scene(4, 70, 17, 17)).back());
-  const std::vector<bool> all_sure(scene.pixels(), false);
-  Results<float> first = by_kernels(scene, all_sure, {true});
-  for (const auto order : {emulator::Order::kBackward, emulator::Order::kShuffled}) {
-    emulator::order = order;
-    Results<float> other = by_kernels(scene, all_sure, {true});
-    EXPECT_EQ(other.rendering.color, first.rendering.color);
-    EXPECT_EQ(other.all_gradients(), first.all_gradients());
+  for (const Scene<double>& of : {make_scene(4, 70, 17, 17), list_of_unlike_halves()}) {
+    const Scene<float> scene = convert<float>(in_mode<BlendMode::kSmoe>(of).back());
+    const std::vector<bool> all_sure(scene.pixels(), false);
+    Results<float> first = by_kernels(scene, all_sure, {true});
+    for (const auto order : {emulator::Order::kBackward, emulator::Order::kShuffled}) {
+      emulator::run_in(order);
+      Results<float> other = by_kernels(scene, all_sure, {true});
+      EXPECT_EQ(other.rendering.color, first.rendering.color);
+      EXPECT_EQ(other.all_gradients(), first.all_gradients());
+    }
+    emulator::run_in(emulator::Order::kForward);
   }
-  emulator::order = emulator::Order::kForward;
 }
 
 }  // namespace

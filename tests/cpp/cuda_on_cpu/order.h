@@ -4,6 +4,6 @@
 namespace emulator {
 
 enum class Order { kForward, kBackward, kShuffled };
-extern Order order;
+void run_in(Order order);  // from now on
 
 }  // namespace emulator

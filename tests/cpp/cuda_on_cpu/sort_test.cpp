@@ -70,6 +70,14 @@ TEST(RadixPass, SortsByItsDigitAndKeepsTheOrderOfEqualOnes) {
   expect_sorted<9, uint16_t>();
 }
 
+TEST(RadixPass, SortsOnCardsOfOtherSizes) {
+  for (const int multiprocessors : {1, 200}) {  // two strips; more groups of strips than a thread reads at once
+    emulator::multiprocessors = multiprocessors;
+    expect_sorted<8, uint32_t>();
+  }
+  emulator::multiprocessors = 10;
+}
+
 TEST(RadixPass, LeavesOutTheGreatestKeyWhereValuesAreTheirPlaces) {
   for (const int64_t count : kSizes) {
     std::vector<uint32_t> keys = random_keys<uint32_t>(count, 11);

@@ -16,6 +16,7 @@ from diff_smoe_rasterization.trainer.model import PARAMETERS
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.system.group import ALONE
+from diff_smoe_rasterization.trainer.system.process import SPARE_BYTES, return_spare_memory
 from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
 
 pytestmark = pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
@@ -110,6 +111,16 @@ def test_a_resumed_run_goes_on_where_it_stopped(config, scene):
                            twin.trainer.optimizer.adam.state[theirs]["exp_avg"])
     assert twin.trainer.order.state_dict() == run.trainer.order.state_dict()
     assert math.isfinite(twin.train()["psnr"]) and twin.trainer.iteration == config.iterations
+
+
+def test_memory_that_a_run_never_needed_goes_back():
+    torch.cuda.empty_cache()
+    torch.zeros(SPARE_BYTES + (1 << 29), dtype=torch.uint8, device="cuda")  # freed at once, and kept by torch
+    return_spare_memory(torch.device("cuda"))  # all of it has been needed
+    assert torch.cuda.memory_reserved() > SPARE_BYTES
+    torch.cuda.reset_peak_memory_stats()
+    return_spare_memory(torch.device("cuda"))
+    assert torch.cuda.memory_reserved() < SPARE_BYTES
 
 
 def test_targets_lie_on_the_device_as_bytes(config, scene):
