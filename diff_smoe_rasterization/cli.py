@@ -363,6 +363,9 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
+    if config.schedule == "gate" and 4 * config.densify_until_iter >= 3 * config.iterations:
+        print(f"note: --densify-until-iter {config.densify_until_iter} leaves no iterations to settle; below three "
+              "quarters of --iterations it does, and --scale-recipe makes it half of them")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group)
     print(results_table([row]))
     if row["psnr"] is None:

@@ -567,6 +567,14 @@ def test_a_changed_milestone_is_told_before_what_is_wrong_with_it(scene, tmp_pat
     assert main(["train", "--resume", "-o", output, *words, "--quiet"]) == 0
 
 
+@pytest.mark.parametrize("until, has_time", [(22, True), (23, False)])
+def test_a_budget_without_time_to_settle_is_told(scene, tmp_path, capsys, until, has_time):
+    """Moves end at 4/3 of --densify-until-iter: at 29.3 and 30.7 of the 30 iterations."""
+    assert main(["train", scene, "-o", str(tmp_path / "out"), "--iterations", "30", "--scale-recipe", "--budget", "40",
+                 "--densify-until-iter", str(until), "--quiet"]) == 0
+    assert ("no iterations to settle" in capsys.readouterr().out) is not has_time
+
+
 def test_info(capsys):
     assert main(["info"]) == 0
     text = capsys.readouterr().out
