@@ -5,7 +5,7 @@ import pytest
 import torch
 from comparison import assert_all_close
 from devices import random_normal
-from scenes import gradients, random_scene, with_gate
+from scenes import gradients, op_results, random_scene, with_gate
 from test_cuda_graphs import TrainingStep, graph_of, list_size, own_width
 
 from diff_smoe_rasterization import rasterize
@@ -50,6 +50,17 @@ def test_images_are_the_same_bits_without_it(mode, gpu):
     for _ in range(9):
         again = rasterize(settings=scene.settings, outputs=OUTPUTS, **scene.inputs)
         assert all(torch.equal(image, other) for image, other in zip(again, first))
+
+
+@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+def test_images_are_the_same_bits_with_more_long_lists_than_are_shared(mode, gpu):
+    """Two warps share a square in 128 tiles with lists above 1,024; which ones is up to the order of atomics."""
+    scene = random_scene(mode, 8000, 256, 256, scale=0.6, opacity=(0.01, 0.05), degree=0, dtype=torch.float32).to(gpu)
+    outputs, saved = op_results(scene)
+    offsets = saved["tile_offsets"][:-2]
+    assert (offsets[1:] - offsets[:-1] > 1024).sum() > 128, "too few long lists"
+    for _ in range(9):
+        assert torch.equal(op_results(scene)[0]["color"], outputs["color"])
 
 
 def test_nothing_visible(mode, gpu):
