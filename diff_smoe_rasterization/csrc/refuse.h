@@ -54,6 +54,7 @@ template <class Frame> void refuse_frame(const char* function, const Frame& fram
   }
   if (config.num_channels < 1) refuse(function, "num_channels is ", config.num_channels, "; it must be 1 or more");
   refuse_negative(function, "alpha_min", config.alpha_min);
+  refuse_negative(function, "tails_below", config.tails_below);
   if (kOnHost<Frame> || config.background_gate_at == nullptr) {
     refuse_negative(function, "background_gate", config.gate_of_background());
   }
@@ -270,6 +271,7 @@ void refuse_importance(const char* function, const Frame& frame, const Importanc
   refuse_null(function, "background", frame.config.background, "[C]", 1);
   refuse_null(function, "saved.final_transmittance", frame.saved.final_transmittance, "[H, W]", 1);
   refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", 1);
+  refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", has_tails(frame.config.mode));
   refuse_null(function, "color", map.color, "[C, H, W]", 1);
   refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
   refuse_null(function, "share_weights", map.share_weights, "[H, W]", 1);

@@ -21,9 +21,11 @@ template <class S> TileRect bounds_in(const Frame<S>& frame, int64_t i) {
   return bounds;
 }
 
-template <class S, class Visit>
-void for_each_tile_row(const ProjectedGaussian<S>& gaussian, const TileRect& bounds, Visit visit) {
-  for_each_tile_row(gaussian.conic, gaussian.mean, gaussian.squared_reach, bounds, visit);
+// Calls visit(tile_x0, tile_x1, tile_y) for each row of tiles that list Gaussian i.
+template <class S, class Visit> void for_each_tile_row(const Frame<S>& frame, int64_t i, Visit visit) {
+  const ProjectedGaussian<S>& gaussian = frame.saved.projected[i];
+  const S reach = gaussian.squared_reach + frame.config.tail_reach();
+  for_each_tile_row(gaussian.conic, gaussian.mean, reach, bounds_in(frame, i), visit);
 }
 
 // Whether the frame has no lists.
@@ -40,8 +42,7 @@ template <class S> std::vector<int64_t> count_rows(const Frame<S>& frame) {
     std::vector<int64_t> own(rows.size());
     for (int64_t i = begin; i < end; ++i) {
       if (frame.images.radii[i] == 0) continue;
-      for_each_tile_row(frame.saved.projected[i], bounds_in(frame, i),
-                        [&](int x0, int x1, int y) { own[y] += x1 - x0; });
+      for_each_tile_row(frame, i, [&](int x0, int x1, int y) { own[y] += x1 - x0; });
     }
     const std::lock_guard<std::mutex> lock(mutex);
     for (size_t y = 0; y < rows.size(); ++y) rows[y] += own[y];

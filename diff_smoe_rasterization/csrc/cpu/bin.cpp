@@ -70,8 +70,7 @@ template <class S> void bin(const Frame<S>& frame, StageTimes* times) {
   run_threads(num_runs, [&](int run) {
     for_each_gaussian(run, [&](int32_t i) {
       uint32_t* next = &tile_of_slot[saved.instance_offsets[i]];
-      const ProjectedGaussian<S>& gaussian = saved.projected[i];
-      for_each_tile_row(gaussian, bounds_in(frame, i), [&](int x0, int x1, int y) {
+      for_each_tile_row(frame, i, [&](int x0, int x1, int y) {
         for (int x = x0; x < x1; ++x) {
           const uint32_t tile = static_cast<uint32_t>(y - band.begin) * grid.columns + x;
           ++cursors[run][tile];

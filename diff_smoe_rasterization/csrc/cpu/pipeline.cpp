@@ -12,6 +12,7 @@ void draw(Frame<S>& frame, SavedSizes sizes, int64_t num_instances, Allocator& m
   const bool fit = num_instances <= frame.config.most_instances;
   sizes.num_instances = fit ? num_instances : 0;
   allocate_saved(frame.saved, sizes, memory);
+  set_sums(frame.saved, sizes, frame.images.gate_sum);
   if (fit) {
     bin(frame, times);
   } else {
@@ -26,7 +27,6 @@ template <class S> void forward(Frame<S>& frame, Allocator& memory, StageTimes* 
   refuse_forward("cpu::forward", frame);
   SavedSizes sizes = saved_sizes(frame);
   frame.saved = {};
-  frame.saved.gate_sum = frame.images.gate_sum;
   allocate_saved(frame.saved, sizes, memory);
   draw(frame, sizes, project(frame, times), memory, times);
 }
@@ -37,7 +37,6 @@ template <class S> void blend_footprints(Frame<S>& frame, Allocator& memory, Sta
   const SavedForward<S> given = frame.saved;
   frame.saved = {};
   frame.saved.projected = given.projected, frame.saved.features = given.features;
-  frame.saved.gate_sum = frame.images.gate_sum;
   allocate_saved(frame.saved, sizes, memory);
   draw(frame, sizes, count_instances(frame, times), memory, times);
 }

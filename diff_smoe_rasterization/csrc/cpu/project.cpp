@@ -17,7 +17,7 @@ constexpr int64_t kChunk = 1024;  // Gaussians: enough to hide the hand-out, few
 // How many tiles the footprint of Gaussian i meets.
 template <class S> int64_t count_tiles(const Frame<S>& frame, int64_t i) {
   int64_t count = 0;
-  for_each_tile_row(frame.saved.projected[i], bounds_in(frame, i), [&](int x0, int x1, int) { count += x1 - x0; });
+  for_each_tile_row(frame, i, [&](int x0, int x1, int) { count += x1 - x0; });
   return count;
 }
 

@@ -11,7 +11,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
  public:
   using P = Pack<S>;
   static constexpr BlendMode kMode = kBlendMode;
-  static constexpr bool kBackToFront = true;
+  static constexpr bool kBackToFront = true, kTails = false;
 
   DSMOE_HD BackwardVisitor(int num_features, Scratch<S> scratch, const TileGradients<S>& gradients)
       : num_features_(num_features),
@@ -35,9 +35,12 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
         gradients.dL_dbackground != nullptr ? gradients.dL_dbackground + tile.index * (num_channels + 1) : nullptr;
     int64_t num_seen = 0;
     extent.for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
-      const PixelEnd<S> end = {tile.saved.final_transmittance[index], tile.saved.gate_sum[index], background_gate};
-      const S* dL_dgate_sum = gradients.dL_dimages.gate_sum;
-      auto pixel = begin_backward(end, dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
+      PixelEnd<S> end = {tile.saved.final_transmittance[index], tile.saved.gate_sum[index], background_gate, S(0)};
+      if constexpr (Blend<kMode>::kTails) end.tails = tile.saved.tails[index];
+      const S* dL_dalpha = gradients.dL_dimages.gate_sum;
+      const auto begin = begin_backward<kMode>(end, dL_dalpha != nullptr ? dL_dalpha[index] : S(0));
+      auto pixel = begin.pixel;
+      if (Blend<kMode>::kTails && dL_dbackground != nullptr) dL_dbackground[num_channels] += begin.background_gate;
       for (int f = 0; f < num_features(); ++f) {
         const S* gradient = feature_image(tile.config, gradients.dL_dimages, f, pixels);
         if (gradient == nullptr) continue;

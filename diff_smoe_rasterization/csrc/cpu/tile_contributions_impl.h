@@ -13,7 +13,7 @@ template <class S, BlendMode kBlendMode> class ContributionVisitor {
  public:
   using P = Pack<S>;
   static constexpr BlendMode kMode = kBlendMode;
-  static constexpr bool kBackToFront = false;
+  static constexpr bool kBackToFront = false, kTails = false;
 
   DSMOE_HD ContributionVisitor(Scratch<S> scratch, const TileContributions<S>& out)
       : transmittance_(scratch.pixels()),

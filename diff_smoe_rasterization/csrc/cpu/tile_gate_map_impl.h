@@ -12,7 +12,7 @@ template <class S, BlendMode kBlendMode> class GateMapVisitor {
  public:
   using P = Pack<S>;
   static constexpr BlendMode kMode = kBlendMode;
-  static constexpr bool kBackToFront = false;
+  static constexpr bool kBackToFront = false, kTails = false;
 
   DSMOE_HD explicit GateMapVisitor(Scratch<S> scratch)
       : transmittance_(scratch.pixels()),

@@ -13,7 +13,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
  public:
   using P = Pack<S>;
   static constexpr BlendMode kMode = kBlendMode;
-  static constexpr bool kBackToFront = false;
+  static constexpr bool kBackToFront = false, kTails = false;
 
   DSMOE_HD ImportanceVisitor(const Tile<S>& tile, Scratch<S> scratch, const TileImportances<S>& out)
       : num_channels_(kFeatures != kAnyFeatures ? kFeatures : tile.config.num_channels),
@@ -40,12 +40,16 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
     TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
       last_.pixel(x, y) = S(tile.saved.last_contributor[index]);
       end_transmittance_.pixel(x, y) = tile.saved.final_transmittance[index];
-      end_gate_sum_.pixel(x, y) = tile.saved.gate_sum[index];
+      // The tails' sum is held constant. So it stands in front of all pairs, with the background's colour.
+      const S tails = Blend<kMode>::kTails ? tile.saved.tails[index] : S(0);
+      gate_sum_.pixel(x, y) = tails;
+      end_gate_sum_.pixel(x, y) = tile.saved.gate_sum[index] + tails;
       weight_.pixel(x, y) = out_.map.pixel_weights[index];
       share_weight_.pixel(x, y) = out_.map.share_weights[index];
       for (int c = 0; c < num_channels_; ++c) {
         const S value = out_.map.color[c * pixels + index], distance = background_[c] - value;
         value_of(c).pixel(x, y) = value;
+        front_of(c).pixel(x, y) = tails > S(0) ? tails * distance : S(0);
         alone_.pixel(x, y) += distance * distance;
       }
       num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
@@ -66,7 +70,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
 
   template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P> not_past, Importance<P>& sum) const {
     PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
-    const PixelEnd<P> end = {end_transmittance_.load(at), end_gate_sum_.load(at), background_gate_};
+    const PixelEnd<P> end = {end_transmittance_.load(at), end_gate_sum_.load(at), background_gate_, P(S(0))};
     const auto removal = remove_pair<kMode>(state, end, pairs.gate, not_past);
     transmittance_.store(at, state.transmittance);
     gate_sum_.store(at, state.gate_sum);

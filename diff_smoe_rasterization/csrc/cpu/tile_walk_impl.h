@@ -105,7 +105,7 @@ template <class S> struct ListedGaussian {
   S opacity, least_alpha;
   S position;  // in the list, from 0
   uint32_t slot;
-  CellBits met;       // the cells that the footprint meets, or some more
+  CellBits met;       // the cells that the footprint meets, or some more; where tails are walked, theirs too
   CellBits smooth;    // those of them over which the Gaussian is smooth
   const S* features;  // [F]
 
@@ -118,8 +118,13 @@ template <class S> struct ListedGaussian {
 // The Gaussians of a tile's list, one after the other.
 template <class S> class GaussianList {
  public:
-  DSMOE_HD GaussianList(const Tile<S>& tile, const TileExtent& extent, int num_features)
-      : tile_(tile), extent_(extent), num_features_(num_features), cut_(tile.config.alpha_cut()) {}
+  // further_reach: is added to the squared reach that decides which cells a Gaussian meets.
+  DSMOE_HD GaussianList(const Tile<S>& tile, const TileExtent& extent, int num_features, S further_reach = S(0))
+      : tile_(tile),
+        extent_(extent),
+        num_features_(num_features),
+        further_reach_(further_reach),
+        cut_(tile.config.alpha_cut()) {}
 
   // Fills `listed` with entry i of all lists. next: an entry that will soon be wanted; the Gaussians of a list lie
   // anywhere in memory.
@@ -158,7 +163,7 @@ template <class S> class GaussianList {
       const P x = fma(P::load(kSquareOfFour<S>.columns + first), P(S(kCellSize)), P(S(extent_.x0)));
       const P y = fma(P::load(kSquareOfFour<S>.rows + first), P(S(kCellSize)), P(S(extent_.y0)));
       const PixelRect<P> rects = {x, y, x + P(S(kCellSize - 1)), y + P(S(kCellSize - 1))};
-      listed.met |= bits_of(may_meet(conic, gaussian.mean, gaussian.squared_reach, rects)) << first;
+      listed.met |= bits_of(may_meet(conic, gaussian.mean, gaussian.squared_reach + further_reach_, rects)) << first;
       if (!may_be_smooth) continue;
       const P dx = x + P(kReach) - P(gaussian.mean.x), dy = y + P(kReach) - P(gaussian.mean.y);
       const P slope_x = fma(P(S(2) * factors.xx), dx, P(factors.xy) * dy);
@@ -206,6 +211,7 @@ template <class S> class GaussianList {
   const Tile<S>& tile_;
   const TileExtent& extent_;
   const int num_features_;
+  const S further_reach_;
   const AlphaCut<S> cut_;
 };
 
@@ -217,6 +223,7 @@ template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
 
   P dx, dy;  // pixel - mean
   std::conditional_t<kSmooth, UnclampedGate<P>, Gate<P>> gate;
+  Mask<P> inside;  // the conic is an ellipse
 
   DSMOE_HD PackPairs(const ListedGaussian<S>& gaussian, const PixelCenters<S>& pixels, int at)
       : dx(P::load(pixels.x + at) - P(gaussian.mean.x)), dy(P::load(pixels.y + at) - P(gaussian.mean.y)) {
@@ -225,16 +232,18 @@ template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
       const P column = P::load(gaussian.column_factors[cell % kCellColumns] + first);
       const P row = P::load(gaussian.row_factors[cell / kCellColumns] + first);
       gate.logit = gate.alpha = P(gaussian.alpha[cell]) * column * row;
-      gate.counts = Mask<P>::all();
+      gate.counts = inside = Mask<P>::all();
     } else {
       const P power = ColumnExponent<P, S>(gaussian.exponent, dx).at(dy);
       gate = evaluate_gate<kMode>(power, gaussian.opacity, gaussian.least_alpha);
+      inside = power <= P(S(0));
     }
   }
 };
 
 // Visits the pairs of the list entries [begin, end), and returns how many pairs it visited. A visitor has:
 //   kMode, kBackToFront   how pairs are cut, and the direction
+//   kTails                whether pairs that are tails are visited too
 //   expect(slot)          the slot of a Gaussian that will soon come
 //   begin(gaussian)       returns the sums of a Gaussian, in registers
 //   wanted(at, pixels)    whether pairs of a pack are wanted, and of which pixels; at: of the first in a PixelArray
@@ -246,7 +255,7 @@ template <class S, class Visitor>
 DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int num_features, Visitor& visitor) {
   const TileExtent extent(tile);
   const PixelCenters<S> pixels(extent);
-  const GaussianList<S> list(tile, extent, num_features);
+  const GaussianList<S> list(tile, extent, num_features, Visitor::kTails ? tile.config.tail_reach() : S(0));
   const CellBits on_image = extent.cells();
   ListedGaussian<S> gaussian;
   int64_t num_pairs = 0;

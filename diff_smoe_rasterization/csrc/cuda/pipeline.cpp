@@ -57,9 +57,9 @@ int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& ke
 // Allocates what frame.saved has not got yet, but what depends on the number of instances.
 template <class S> SavedSizes begin_saved(Frame<S>& frame, const Run& run, Allocator& memory) {
   const SavedSizes sizes = saved_sizes(frame, run);
-  frame.saved.gate_sum = frame.images.gate_sum;
   allocate_saved(frame.saved, sizes, memory);
   complete(frame.saved, sizes);
+  set_sums(frame.saved, sizes, frame.images.gate_sum);
   return sizes;
 }
 

@@ -31,6 +31,7 @@
   X(double, "float", scale_modifier)                                       \
   X(double, "float", near)                                                 \
   X(double, "float", alpha_min)                                            \
+  X(double, "float", tails_below)                                          \
   X(double, "float", low_pass)                                             \
   X(double, "float", fixed_background_gate) /* where no tensor is given */ \
   X(int64_t, "int", sh_degree)                                             \
@@ -56,5 +57,5 @@
 #define DSMOE_IMAGES(X)                                                  \
   X(kColor, color)      /* [C, H, W] */                                  \
   X(kRadii, radii)      /* [N] int32; no image, but the caller's too */  \
-  X(kGateSum, gate_sum) /* [1, H, W] the denominator; the alpha image */ \
+  X(kGateSum, gate_sum) /* [1, H, W] the alpha image */                  \
   DSMOE_FEATURE_IMAGES(X)

@@ -76,7 +76,7 @@ struct Cpu {
                              const at::Tensor& background) {
     auto own = frame_of_footprints<S>(of, options, images);
     own.saved = unpack<S>("blend_backward", saved, cpu::saved_sizes(own), of.gates.device());
-    own.saved.gate_sum = own.images.gate_sum;
+    set_sums(own.saved, cpu::saved_sizes(own), own.images.gate_sum);
     cpu::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
     gradients.inputs.background = mutable_data<S>(background);
@@ -115,7 +115,7 @@ struct Cpu {
     auto own = frame_of_gaussians<S>(inputs, options, images);
     const char* function = seen_only ? "rasterize_backward_seen" : "rasterize_backward";
     own.saved = unpack<S>(function, saved, cpu::saved_sizes(own), inputs[kMeans3D].device());
-    own.saved.gate_sum = own.images.gate_sum;
+    set_sums(own.saved, cpu::saved_sizes(own), own.images.gate_sum);
     cpu::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
     with_input_gradients<S>(inputs, gradient_tensors, seen_only, gradients, [&] {
@@ -152,7 +152,7 @@ struct Cpu {
                          const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
     auto own = frame_of_rendering<S>(radii, config, options);
     own.saved = unpack<S>("importance", saved, cpu::saved_sizes(own), radii.device());
-    own.saved.gate_sum = mutable_data<S>(gate_sum);
+    set_sums(own.saved, cpu::saved_sizes(own), mutable_data<S>(gate_sum));
     cpu::importance(own, map);
   }
 

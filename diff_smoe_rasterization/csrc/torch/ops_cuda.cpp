@@ -85,7 +85,7 @@ struct Cuda {
     StageRecorder recorder(Pass::kBackward);
     const cuda::Run how = run(options, recorder.times());
     own.saved = unpack<S>("blend_backward", saved, cuda::saved_sizes(own, how), of.gates.device());
-    own.saved.gate_sum = own.images.gate_sum;
+    set_sums(own.saved, cuda::saved_sizes(own, how), own.images.gate_sum);
     cuda::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
     gradients.inputs.background = mutable_data<S>(background);
@@ -130,7 +130,7 @@ struct Cuda {
     const cuda::Run how = run(options, recorder.times());
     const char* function = seen_only ? "rasterize_backward_seen" : "rasterize_backward";
     own.saved = unpack<S>(function, saved, cuda::saved_sizes(own, how), inputs[kMeans3D].device());
-    own.saved.gate_sum = own.images.gate_sum;
+    set_sums(own.saved, cuda::saved_sizes(own, how), own.images.gate_sum);
     cuda::Gradients<S> gradients;
     gradients.images = image_gradients<S>(image_gradient_tensors);
     TensorMemory memory(inputs[kMeans3D]);
@@ -168,7 +168,7 @@ struct Cuda {
     auto own = frame_of_rendering<S>(radii, config, options);
     const cuda::Run how = run(options, nullptr);
     own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
-    own.saved.gate_sum = mutable_data<S>(gate_sum);
+    set_sums(own.saved, cuda::saved_sizes(own, how), mutable_data<S>(gate_sum));
     TensorMemory memory(gate_sum);
     cuda::importance(own, map, {how.stream, &memory});
   }

@@ -6,16 +6,23 @@
 // and T what is left behind the last pair:
 //
 //   alpha     Eq. 3   C = sum c_i w_i + T bg
-//   smoe      Eq. 7   C = sum c_i w_i / W
+//   smoe              C = (sum c_i w_i + B bg) / (W + B)
+//   smoe_eq7  Eq. 7   C = sum c_i w_i / W
 //   smoe_tn   Eq. 8   C = sum c_i w_i / sum alpha_i
 //   smoe_std  Eq. 6   C = sum c_i alpha_i / sum alpha_i
 //
-// The first two are the ends of a family, in which the background is one more expert, with the gate lambda:
+// `smoe` is Eq. 7 as the paper's authors compute it. Their pairs are strong or tails (Cut::kStrong). The sums over i are
+// of strong pairs. B is the sum of alpha T over the tails, which takes nothing from T. So where Gaussians end, those that
+// almost reach a pixel draw it to the background.
 //
-//   C = (sum c_i w_i + lambda T bg) / D,   D = W + lambda T         (smoe at 0; alpha at 1, where D is 1)
+// The first three are of one family, in which the background is one more expert, with the gate lambda:
+//
+//   C = (sum c_i w_i + (B + lambda T) bg) / D,   D = W + B + lambda T
+//
+// B is 0 but in `smoe`; `alpha` has lambda 1, where D is 1.
 //
 // With g' = dL/dC / D, b = g'.C, u_i = g'.c_i - b and the suffix R_i = sum_{j>i} w_j u_j, which begins at
-// lambda T (g'.bg - b):
+// lambda T (g'.bg - b), with B held constant:
 //
 //   dL/dalpha_i = T_i u_i - R_i / (1 - alpha_i),   dL/dc_i = w_i g'
 //
@@ -32,7 +39,7 @@
 
 namespace dsmoe {
 
-enum class BlendMode : int { kAlpha, kSmoe, kSmoeTn, kSmoeStd };  // the numbers are the callers'
+enum class BlendMode : int { kAlpha, kSmoe, kSmoeEq7, kSmoeTn, kSmoeStd };  // the numbers are the callers'
 
 template <BlendMode kMode> using ModeConstant = std::integral_constant<BlendMode, kMode>;
 
@@ -45,7 +52,8 @@ template <BlendMode... kModes> struct ModeList {
 #endif
   template <class Body> static DSMOE_HD constexpr void for_each(Body body) { (body(ModeConstant<kModes>{}), ...); }
 };
-using BlendModes = ModeList<BlendMode::kAlpha, BlendMode::kSmoe, BlendMode::kSmoeTn, BlendMode::kSmoeStd>;
+using BlendModes =
+    ModeList<BlendMode::kAlpha, BlendMode::kSmoe, BlendMode::kSmoeEq7, BlendMode::kSmoeTn, BlendMode::kSmoeStd>;
 
 // The policy of a mode.
 template <BlendMode kMode> struct Blend;
@@ -60,6 +68,7 @@ template <class Real> struct PixelEnd {
   Real transmittance;            // T
   Real gate_sum;                 // W; ablations: sum alpha
   Scalar<Real> background_gate;  // lambda
+  Real tails = Real(Scalar<Real>(0));  // B, where the mode has tails
 };
 
 // The running sums of a pixel. The sign of the transmittance says whether the pixel still takes pairs: it is never 0,
@@ -71,7 +80,7 @@ template <class Real> struct PixelState {
   static DSMOE_HD PixelState open() { return {Real(Scalar<Real>(1)), Real(Scalar<Real>(0))}; }
   DSMOE_HD Mask<Real> is_open() const { return transmittance > Real(Scalar<Real>(0)); }
   DSMOE_HD PixelEnd<Real> end(Scalar<Real> background_gate) const {
-    return {abs(transmittance), gate_sum, background_gate};
+    return {abs(transmittance), gate_sum, background_gate, Real(Scalar<Real>(0))};
   }
 };
 
@@ -141,6 +150,7 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   static constexpr bool kSuffixAboutBase = kTInDenominator;  // u_i = g'.c_i - b, b in nothing else; else g'.c_i
   static constexpr bool kDivides = true;                     // a pixel is divided by D; else D is 1
   static constexpr bool kLearnsGate = false;                 // the caller gives lambda, and may learn it
+  static constexpr bool kTails = false;                      // pairs that do not count may be tails
   template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda
 
   // Reads alpha and counts, and no logit: not every walk has one here.
@@ -181,6 +191,14 @@ template <> struct Blend<BlendMode::kAlpha> : GateBlend<true, true> {
 template <> struct Blend<BlendMode::kSmoe> : GateBlend<true, true> {
   static constexpr const char* kName = "smoe";
   static constexpr Law kLaw = Law::kGates;
+  static constexpr Cut kCut = Cut::kStrong;
+  static constexpr bool kWithinRadius = true, kLearnsGate = true, kTails = true;
+  template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
+};
+
+template <> struct Blend<BlendMode::kSmoeEq7> : GateBlend<true, true> {
+  static constexpr const char* kName = "smoe_eq7";
+  static constexpr Law kLaw = Law::kGates;
   static constexpr bool kLearnsGate = true;
   template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
@@ -206,6 +224,21 @@ DSMOE_HD constexpr bool within_radius(BlendMode mode) {
   BlendModes::for_each(
       [&](auto of) { within |= decltype(of)::value == mode && Blend<decltype(of)::value>::kWithinRadius; });
   return within;
+}
+
+DSMOE_HD constexpr bool has_tails(BlendMode mode) {
+  bool tails = false;
+  BlendModes::for_each([&](auto of) { tails |= decltype(of)::value == mode && Blend<decltype(of)::value>::kTails; });
+  return tails;
+}
+
+// The sum of a pixel's tails, B: the pairs of `smoe` that are too weak to be strong, front to back, while the pixel is
+// open. strong: the state of the pixel in front of the pair; it moves past the pair.
+template <class Real>
+DSMOE_HD void add_tail(PixelState<Real>& strong, Real& tails, const Gate<Real>& gate, Mask<Real> inside) {
+  const Real alpha = select(strong.is_open(), tail_of(gate, inside), Real(Scalar<Real>(0)));
+  tails = fma(alpha, strong.transmittance, tails);
+  transmit(strong, gate);
 }
 
 // Whether a backward walk of the mode can be continued by resume_backward. Else one walk takes a whole list.

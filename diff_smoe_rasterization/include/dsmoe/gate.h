@@ -10,7 +10,8 @@ namespace dsmoe {
 // Which pairs count.
 enum class Cut {
   kAlpha,   // 3DGS: those of alpha >= 1/255
-  kKernel,  // the paper: those of G >= 1e-5, and of the least alpha below
+  kStrong,  // the paper's authors: those of alpha >= 1/2040, or of the caller's least alpha. Weaker ones are tails
+  kKernel,  // the paper's text: those of G >= 1e-5, and of the least alpha below
 };
 
 // The factors of d.x^2, d.x d.y and d.y^2 in the exponent -1/2 d^T Sigma2D^-1 d, where d = pixel - mean.
@@ -37,22 +38,27 @@ template <class Real, class S> struct ColumnExponent {
   DSMOE_HD Real at(Real dy) const { return fma(fma(Real(quadratic), dy, linear), dy, constant); }
 };
 
-// The least alpha that counts where pairs are cut by G.
+// The least alpha that counts, besides what the cut says itself.
 template <class S> struct AlphaCut {
   S alpha_min;  // the caller's
-  S faint;      // lambda / 255, and nothing inside 3 sigma
+  S faint;      // where pairs are cut by G: lambda / 255, and nothing inside 3 sigma
 
   DSMOE_HD AlphaCut(S alpha_min, S background_gate)
       : alpha_min(alpha_min), faint(static_cast<float>(background_gate) * kAlphaCut) {}
   DSMOE_HD S of(S opacity) const { return max(alpha_min, min(faint, opacity * S(kCoreKernel))); }
 };
 
+// The squared reach k^2 of a Gaussian that no pixel sees: no further reach that is added to it makes it 0.
+constexpr float kNoReach = -1e30f;
+
 // The squared reach k^2 of a Gaussian of this opacity: no pair with d^T Sigma2D^-1 d > k^2 counts. Where it is negative
 // no pair counts.
 template <class S> DSMOE_HD S squared_reach(Cut cut, S opacity, S least_alpha) {
-  if (!(opacity > S(0))) return S(-1);
-  const S by_alpha = S(2) * log(opacity / (cut == Cut::kAlpha ? S(kAlphaCut) : least_alpha));
-  if (cut == Cut::kAlpha) return by_alpha;
+  if (!(opacity > S(0))) return S(kNoReach);
+  if (cut == Cut::kAlpha) least_alpha = S(kAlphaCut);
+  if (cut == Cut::kStrong) least_alpha = max(least_alpha, S(kStrongAlpha));
+  const S by_alpha = S(2) * log(opacity / least_alpha);
+  if (cut != Cut::kKernel) return by_alpha;
   const S by_gate = S(-2) * log(S(kGateCut));
   return least_alpha > S(0) ? min(by_gate, by_alpha) : by_gate;
 }
@@ -67,6 +73,13 @@ template <class Real> struct Gate {
 // One whose alpha is o G.
 template <class Real> struct UnclampedGate : Gate<Real> { static constexpr bool kClamps = false; };
 
+// The alpha of a pair that is a tail; 0 where it is strong, or too weak to be felt. counts: by Cut::kStrong.
+template <class Real> DSMOE_HD Real tail_of(const Gate<Real>& gate, Mask<Real> inside) {
+  using S = Scalar<Real>;
+  const Mask<Real> felt = inside & (gate.logit >= Real(S(kTailAlpha)));
+  return select(gate.counts, Real(S(0)), select(felt, gate.logit, Real(S(0))));
+}
+
 template <class Real> DSMOE_HD Real clamped(Real logit) { return min(logit, Real(Scalar<Real>(kAlphaMax))); }
 
 template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
@@ -77,6 +90,8 @@ template <Cut kCut, class Real, class S> DSMOE_HD Gate<Real> evaluate_gate(Real 
   gate.alpha = clamped(gate.logit);
   if constexpr (kCut == Cut::kAlpha) {
     gate.counts = (power <= Real(S(0))) & (gate.logit >= Real(S(kAlphaCut)));
+  } else if constexpr (kCut == Cut::kStrong) {
+    gate.counts = (power <= Real(S(0))) & (gate.logit >= Real(max(least_alpha, S(kStrongAlpha))));
   } else {
     gate.counts = (power <= Real(S(0))) & (kernel >= Real(S(kGateCut))) & (gate.logit >= Real(least_alpha));
   }
@@ -103,9 +118,10 @@ template <class S> struct LogGate {
     Gate<Real> gate;
     gate.logit = exp2(log_logit);
     gate.alpha = clamped(gate.logit);
-    gate.counts = (log_logit >= Real(least)) & (log_logit <= Real(greatest));
+    gate.counts = (log_logit >= Real(least)) & inside(log_logit);
     return gate;
   }
+  template <class Real> DSMOE_HD Mask<Real> inside(Real log_logit) const { return log_logit <= Real(greatest); }
 };
 
 // Sums over pixels of dL/dpower times 1, d.x, d.y, d.x^2, d.x d.y and d.y^2. The gradients of a Gaussian's shape on the

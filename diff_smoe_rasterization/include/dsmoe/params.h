@@ -64,9 +64,10 @@ template <class S> struct RasterConfig {
   const S* background = nullptr;  // [C]
   S scale_modifier = 1;
   S low_pass = S(kLowPass);               // px^2 added to the projected variances
-  S alpha_min = 0;                        // SMoE modes: also skip alpha below this
-  S background_gate = 0;                  // lambda of kSmoe, 0 or more; 1 is kAlpha, but for rounding and the cuts
+  S alpha_min = 0;                        // SMoE modes: also skip alpha below this; kSmoe: such pairs are no strong ones
+  S background_gate = 0;                  // lambda of kSmoe and kSmoeEq7, 0 or more
   const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
+  S tails_below = S(kTailsBelow);         // kSmoe: the tails count where the gate sum is below this; above 1: everywhere
   bool antialiasing = false;
   bool clamp_color = true;  // colours from shs are at least 0
   bool depth = false;       // the expected depth is asked for
@@ -77,7 +78,13 @@ template <class S> struct RasterConfig {
   DSMOE_HD S gate_of_background() const {
     return background_gate_at != nullptr ? *background_gate_at : background_gate;
   }
-  DSMOE_HD AlphaCut<S> alpha_cut() const { return {alpha_min, gate_of_background()}; }
+  DSMOE_HD AlphaCut<S> alpha_cut() const {
+    return {alpha_min, cut_of(mode) == Cut::kKernel ? gate_of_background() : S(0)};
+  }
+  // What the tails reach beyond the strong pairs: is added to the squared reach of a footprint where tiles are listed.
+  DSMOE_HD S tail_reach() const {
+    return has_tails(mode) ? S(2) * log(max(alpha_min, S(kStrongAlpha)) / S(kTailAlpha)) : S(0);
+  }
   DSMOE_HD ProjectionRules<S> projection_rules() const {
     return {mode, scale_modifier, alpha_cut(), low_pass, antialiasing, inverse_depth};
   }
@@ -99,7 +106,9 @@ template <class S> struct SavedForward {
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
   TileInstance* instances = nullptr;          // [I], or null: no lists are kept, each pass makes them band by band
   S* final_transmittance = nullptr;           // [H, W] T_{N+1}
-  S* gate_sum = nullptr;                      // [H, W] the denominator: the caller's image
+  S* gate_sum = nullptr;                      // [H, W] W; the caller's alpha image but in a mode with tails
+  S* tails = nullptr;                         // [H, W] B, in a mode with tails
+  S* sums = nullptr;                          // [2, H, W] gate_sum and tails, in a mode with tails
   int32_t* last_contributor = nullptr;        // [H, W] how many entries of the tile's list the numerator has seen
   TileBand band;                              // the rows of tiles that tile_offsets and instances are of
 };
@@ -111,10 +120,11 @@ struct SavedSizes {
   int64_t tiles = 0;           // of the image
   int64_t pixels = 0;          // H W
   int64_t num_instances = -1;  // I where lists are kept; -1: not known yet
+  bool tails = false;          // the mode has them
 };
 
-// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. All
-// code that allocates, checks or passes on these arrays uses this list and its order.
+// Calls visit(name, pointer, number of elements or -1) for each array; set_sums makes the others. All code that
+// allocates, checks or passes on these arrays uses this list and its order.
 template <class S, class Visit> void for_each_array(SavedForward<S>& saved, const SavedSizes& sizes, Visit visit) {
   visit("projected", saved.projected, sizes.num_gaussians);
   visit("features", saved.features, sizes.num_features < 0 ? -1 : sizes.num_gaussians * sizes.num_features);
@@ -122,7 +132,14 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("tile_offsets", saved.tile_offsets, sizes.tiles + 1);
   visit("final_transmittance", saved.final_transmittance, sizes.pixels);
   visit("last_contributor", saved.last_contributor, sizes.pixels);
+  visit("sums", saved.sums, sizes.tails ? 2 * sizes.pixels : 0);
   visit("instances", saved.instances, sizes.num_instances);
+}
+
+// Sets where a pixel's sums lie, for either backend. alpha: the caller's image, [H, W].
+template <class Saved, class Sizes, class S> void set_sums(Saved& saved, const Sizes& sizes, S* alpha) {
+  saved.gate_sum = sizes.tails ? saved.sums : alpha;
+  saved.tails = sizes.tails ? saved.sums + sizes.pixels : nullptr;
 }
 
 // Seconds of each stage, and how much work the blend did. Each call that is given this struct adds to it.
@@ -137,7 +154,7 @@ template <class S> struct ImageOutputs {
   S* depth = nullptr;          // [H, W], or null where the config does not ask for it
   S* inverse_depth = nullptr;  // [H, W], likewise
   int32_t* radii = nullptr;    // [N] pixels
-  S* gate_sum = nullptr;       // [H, W] the alpha image
+  S* gate_sum = nullptr;       // [H, W] the alpha image: W, or W / D in a mode with tails
 };
 
 // Sums over the pixels that blended a Gaussian, as contribution.h says; written whole.

@@ -15,7 +15,9 @@ enum class FeatureRule {
 
 // A feature of a pixel is (sum + weight background) / denominator where some gate is open, else its background.
 template <class Real> struct FeatureEnd {
-  Real weight, denominator;
+  Real weight;  // of the background: lambda T + B
+  Real moving;  // lambda T, the part of it that moves with the pairs
+  Real denominator;
   Mask<Real> open;
   bool divides;
 
@@ -30,21 +32,17 @@ DSMOE_HD FeatureEnd<Real> feature_end(FeatureRule rule, const PixelEnd<Real>& en
   using S = Scalar<Real>;
   const bool averaged = rule == FeatureRule::kAveraged, divides = averaged || Blend<kMode>::kDivides;
   const S gate = averaged ? S(0) : Blend<kMode>::background_gate(end.background_gate);
-  const Real weight = Real(gate) * end.transmittance;
+  const Real moving = Real(gate) * end.transmittance;
+  const Real weight = Blend<kMode>::kTails && !averaged ? moving + end.tails : moving;
   // Where nothing is divided the gate sum is not read: it is an image of the caller's, who may have changed it.
   const S least = divides ? S(kGateSumCut) : S(-INFINITY);
-  return {weight, divides ? end.gate_sum + weight : Real(S(1)), end.gate_sum >= Real(least), divides};
+  return {weight, moving, divides ? end.gate_sum + weight : Real(S(1)), end.gate_sum >= Real(least), divides};
 }
 
 template <BlendMode kMode, class Real>
 DSMOE_HD Real finish_feature(FeatureRule rule, const PixelEnd<Real>& end, Real sum, Real background) {
   const auto by = feature_end<kMode>(rule, end);
   return select(by.open, (sum + by.if_gated(by.weight * background)) / by.denominator, background);
-}
-
-// Starts a pixel's backward pass; the features join one by one through add_feature.
-template <class Real> DSMOE_HD PixelBackward<Real> begin_backward(const PixelEnd<Real>& end, Real dL_dgate_sum) {
-  return {end.transmittance, Real(Scalar<Real>(0)), -dL_dgate_sum};
 }
 
 // What one feature of a pixel hands on.
@@ -63,9 +61,34 @@ DSMOE_HD FeatureBackward<Real> add_feature(FeatureRule rule, PixelBackward<Real>
   const Real scaled = select(by.open, dL_dvalue / by.denominator, zero), weighted = by.weight * scaled;
   const Real distance = background - value;
   if (by.divides) pixel.base = pixel.base + scaled * value;
-  pixel.suffix = pixel.suffix + by.if_gated(weighted * (by.divides ? distance : background));
+  pixel.suffix = pixel.suffix + by.if_gated(by.moving * scaled * (by.divides ? distance : background));
   const bool learns = Blend<kMode>::kLearnsGate && rule == FeatureRule::kBlended;
   return {scaled, select(by.open, weighted, dL_dvalue), learns ? end.transmittance * scaled * distance : zero};
+}
+
+// The alpha image: the gate sum. In a mode with tails it is the share of the pixel that is not the background's, which is
+// what a feature of 1 over a background of 0 would be.
+template <BlendMode kMode, class Real> DSMOE_HD Real finish_alpha(const PixelEnd<Real>& end) {
+  const Real zero = Scalar<Real>(0);
+  if constexpr (!Blend<kMode>::kTails) return end.gate_sum;
+  return finish_feature<kMode>(FeatureRule::kBlended, end, end.gate_sum, zero);
+}
+
+// A pixel where its backward pass begins, and dL/dlambda of its alpha.
+template <class Real> struct BackwardBegin {
+  PixelBackward<Real> pixel;
+  Real background_gate;
+};
+
+// Starts a pixel's backward pass; the features join one by one through add_feature. dL_dalpha: by the alpha image.
+template <BlendMode kMode, class Real>
+DSMOE_HD BackwardBegin<Real> begin_backward(const PixelEnd<Real>& end, Real dL_dalpha) {
+  const Real zero = Scalar<Real>(0);
+  if constexpr (!Blend<kMode>::kTails) return {{end.transmittance, zero, -dL_dalpha}, zero};
+  PixelBackward<Real> pixel = {end.transmittance, zero, zero};
+  const auto by = add_feature<kMode>(FeatureRule::kBlended, pixel, end, dL_dalpha, finish_alpha<kMode>(end), zero);
+  pixel.base = pixel.base - by.scaled;
+  return {pixel, by.background_gate};
 }
 
 }  // namespace dsmoe

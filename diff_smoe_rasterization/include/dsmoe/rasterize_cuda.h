@@ -69,7 +69,9 @@ template <class S> struct SavedForward {
   S* segments = nullptr;             // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
   int32_t* segment_queue = nullptr;  // [num_queue_entries(capacity), 2] which segments some pixel has reached, or null
   S* final_transmittance = nullptr;  // [H, W] T_{N+1}
-  S* gate_sum = nullptr;             // [H, W] the denominator: the caller's image
+  S* gate_sum = nullptr;             // [H, W] W; the caller's alpha image but in a mode with tails
+  S* tails = nullptr;                // [H, W] B, in a mode with tails
+  S* sums = nullptr;                 // [2, H, W] gate_sum and tails, in a mode with tails
   int32_t* last_contributor = nullptr;  // [H, W] how many entries of the list the numerator has seen
 };
 
@@ -81,10 +83,11 @@ struct SavedSizes {
   int64_t pixels = 0;         // H W
   int64_t capacity = -1;      // of `instances`; -1: not known yet
   bool segments = false;      // the backward pass walks long lists in segments
+  bool tails = false;         // the mode has them
 };
 
-// Calls visit(name, pointer, number of elements or -1) for each array but the gate sum, which is an image. All code
-// that allocates, checks or passes on these arrays uses this list and its order. tile_offsets has num_ordered and
+// Calls visit(name, pointer, number of elements or -1) for each array; set_sums makes the others. All code that
+// allocates, checks or passes on these arrays uses this list and its order. tile_offsets has num_ordered and
 // num_instances behind it.
 template <class S, class Visit> void for_each_array(SavedForward<S>& saved, const SavedSizes& sizes, Visit visit) {
   const bool known = sizes.capacity >= 0;
@@ -96,6 +99,7 @@ template <class S, class Visit> void for_each_array(SavedForward<S>& saved, cons
   visit("tile_order", saved.tile_order, sizes.tiles);
   visit("final_transmittance", saved.final_transmittance, sizes.pixels);
   visit("last_contributor", saved.last_contributor, sizes.pixels);
+  visit("sums", saved.sums, sizes.tails ? 2 * sizes.pixels : 0);
   visit("instances", saved.instances, sizes.capacity);
   visit("segments", saved.segments, !sizes.segments ? 0 : known ? num_segment_rows(sizes.capacity) * kSegmentRow : -1);
   visit("segment_queue", saved.segment_queue, !sizes.segments ? 0 : known ? 2 * num_queue_entries(sizes.capacity) : -1);
@@ -161,6 +165,7 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run)
   sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
   sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
   sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
+  sizes.tails = has_tails(frame.config.mode);
   return sizes;
 }
 
