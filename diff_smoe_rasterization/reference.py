@@ -13,9 +13,10 @@ What the paper leaves open is decided here:
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
 - Opacity plays no part in culling or in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
+- `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `pair_tails`.
 - The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
-- In `smoe` a background gate that is the number 1 is the mode `alpha`, with its tile rectangle and its cut; a tensor of
-  value 1 keeps the footprints of `smoe`. Where the background has a gate, opacity cuts pairs too: see `pair_counts`.
+- In `smoe_eq7` a background gate that is the number 1 is the mode `alpha`, with its tile rectangle and its cut; a
+  tensor of value 1 keeps the footprints. Where the background has a gate, opacity cuts pairs too: see `pair_counts`.
 - The value of `means2D` is ignored; it only receives a gradient.
 """
 from __future__ import annotations
@@ -40,7 +41,9 @@ EIGENVALUE_SPREAD_MIN = _float32(0.1)  # px^4 under the root of the radius rule 
 TILE = 16  # px; the tiles of 3DGS, whose rectangle is part of its image
 ALPHA_MAX = _float32(0.99)  # no Gaussian is opaque, else T would reach 0 (3DGS)
 ALPHA_MIN = _float32(1 / 255)  # less changes no 8-bit image (3DGS)
-KERNEL_MIN = _float32(1e-5)  # SMoE modes cut on G, not on alpha: faint tails decide where gates are weak (paper)
+STRONG_MIN = _float32(1 / 2040)  # `smoe`: pairs of at least this alpha are blended; weaker ones are tails (authors)
+TAIL_MIN = 2.0**-35  # `smoe`: weaker tails are below half a float32 unit of STRONG_MIN, the least sum they could change
+KERNEL_MIN = _float32(1e-5)  # other SMoE modes cut on G: faint pairs decide where gates are weak (paper's text)
 KERNEL_KEPT = _float32(math.exp(-4.5))  # G at 3 sigma: nearer, a background gate cuts nothing, or gradients would end
 TRANSMITTANCE_MIN = _float32(1e-4)  # a pixel this dark behind what it has is finished (3DGS)
 GATE_SUM_MIN = _float32(1e-30)  # under this, and only then, a sum of gates is none; far above float32's smallest number
@@ -155,6 +158,7 @@ def importance(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussia
                cov3D_precomp: _Absent = None) -> Importance:
     """What each Gaussian is worth to the image: each is left out, and the image blended again without it.
 
+    The sum of a pixel's tails stays, as in the gradients of `smoe`.
     pixel_weights, share_weights: [height, width]. The others are the arguments of `rasterize`. Culled Gaussians have 0.
     """
     with torch.no_grad():
@@ -164,16 +168,18 @@ def importance(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussia
         splats = project(_rows(gaussians, order), settings)
         x = torch.arange(settings.image_width).to(splats.depth).repeat(settings.image_height)
         y = torch.arange(settings.image_height).to(splats.depth).repeat_interleave(settings.image_width)
-        alpha = pair_alphas(splats, x, y, pair_counts(splats, x, y, settings, mode, gate))
+        counts = pair_counts(splats, x, y, settings, mode, gate)
+        alpha = pair_alphas(splats, x, y, counts)
+        tails = tail_sum(splats, x, y, counts, alpha, settings, mode)
         count, weights = len(order), pixel_weights.reshape(-1)
         # With a channel for each Gaussian, the image is the map of their shares.
-        share = blend(alpha, torch.eye(count).to(alpha), splats.depth, alpha.new_zeros(count), mode, gate)[:count]
-        image = blend(alpha, splats.color, splats.depth, settings.bg, mode, gate)[:len(settings.bg)]
+        share = blend(alpha, torch.eye(count).to(alpha), splats.depth, alpha.new_zeros(count), mode, gate, tails)[:count]
+        image = blend(alpha, splats.color, splats.depth, settings.bg, mode, gate, tails)[:len(settings.bg)]
         costs = alpha.new_zeros(count)
         for k in range(count):
             others = alpha.clone()
             others[k] = 0
-            without = blend(others, splats.color, splats.depth, settings.bg, mode, gate)[:len(settings.bg)]
+            without = blend(others, splats.color, splats.depth, settings.bg, mode, gate, tails)[:len(settings.bg)]
             costs[k] = (weights * (without - image).square()).sum()
 
     def of_all(values):
@@ -340,11 +346,11 @@ def tile_rectangle(splats, settings):
 def footprint_meets(splats, left, top, right, bottom, settings, mode, slack=0.0):
     """Returns whether each footprint meets a rectangle of pixel centres, edges included [n].
 
-    The footprint is the tile rectangle of 3DGS in "alpha" and the ellipse G >= 1e-5 in the SMoE modes, where slack is
-    added to d^T Sigma^-1 d.
+    The footprint is the tile rectangle of 3DGS in "alpha" and "smoe", and the ellipse G >= 1e-5 in the other modes,
+    where slack is added to d^T Sigma^-1 d.
     """
     low, high = splats.position.new_tensor([left, top]), splats.position.new_tensor([right, bottom])
-    if mode == "alpha":
+    if mode in ("alpha", "smoe"):
         first, past = tile_rectangle(splats, settings)
         return ((past > first) & (first * TILE <= high) & (past * TILE > low)).all(1)
     return _closest_squared(splats, left, top, right, bottom) <= -2 * math.log(KERNEL_MIN) + slack
@@ -381,23 +387,48 @@ class _PassThroughClamp(torch.autograd.Function):
 def pair_counts(splats, x, y, settings, mode, gate):
     """Returns which pairs of Gaussian and pixel count [n, pixels]; x, y [pixels] are pixel coordinates.
 
-    A pair counts where o > 0, power <= 0 and, in "alpha", alpha >= 1/255 within the tile rectangle of 3DGS; in the
-    SMoE modes G >= 1e-5 and alpha >= alpha_min. Where the background has a gate lambda > 0, a pair of less than
-    lambda / 255 changes no 8-bit image either, and counts only within 3 sigma, whatever the Gaussian's opacity.
+    A pair counts where o > 0, power <= 0 and, in "alpha", alpha >= 1/255 within the tile rectangle of 3DGS; in "smoe"
+    alpha >= 1/2040 (or alpha_min) within that rectangle; in the other modes G >= 1e-5 and alpha >= alpha_min. Where
+    the background has a gate lambda > 0 there, a pair of less than lambda / 255 changes no 8-bit image either, and
+    counts only within 3 sigma, whatever the Gaussian's opacity.
     """
     opacity = splats.opacity[:, None]
     power = _power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y)
     kernel = torch.exp(power)
     alpha = opacity * kernel
     counts = (opacity > 0) & (power <= 0)
-    if mode != "alpha":
+    if mode not in ("alpha", "smoe"):
         cut = torch.tensor(float(gate), dtype=torch.float32) * ALPHA_MIN  # rounded as float32
         return (counts & (kernel >= KERNEL_MIN) & (alpha >= _float32(settings.alpha_min))
                 & (alpha >= (opacity * KERNEL_KEPT).clamp(max=cut.item())))
+    least = ALPHA_MIN if mode == "alpha" else max(STRONG_MIN, _float32(settings.alpha_min))
+    return counts & in_rectangle(splats, x, y, settings) & (alpha >= least)
+
+
+def in_rectangle(splats, x, y, settings):
+    """Returns whether each pixel lies in the tile rectangle of each Gaussian [n, pixels]."""
     (first_x, first_y), (past_x, past_y) = (edge.T[:, :, None] for edge in tile_rectangle(splats, settings))
     tile_x, tile_y = torch.floor(x / TILE), torch.floor(y / TILE)
-    counts &= (tile_x >= first_x) & (tile_x < past_x) & (tile_y >= first_y) & (tile_y < past_y)
-    return counts & (alpha >= ALPHA_MIN)
+    return (tile_x >= first_x) & (tile_x < past_x) & (tile_y >= first_y) & (tile_y < past_y)
+
+
+def tail_sum(splats, x, y, counts, alpha, settings, mode):
+    """Returns the sum B of each pixel's tails [pixels]; 0 in modes but "smoe", and where W >= tails_below. No gradient.
+
+    A tail is a pair within the tile rectangle that is too weak to count. Its alpha T joins B while its pixel is open,
+    and T does not feel it. counts, alpha: [n, pixels], of `pair_counts` and `pair_alphas`.
+    """
+    with torch.no_grad():
+        if mode != "smoe":
+            return torch.zeros_like(x)
+        opacity = splats.opacity[:, None]
+        power = _power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y)
+        tail = opacity * torch.exp(power)
+        is_tail = (opacity > 0) & (power <= 0) & ~counts & in_rectangle(splats, x, y, settings) & (tail >= TAIL_MIN)
+        weight, stopped = numerator(alpha, mode)
+        transmittance = torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)])[:len(alpha)]
+        total = (tail * transmittance).masked_fill(~is_tail | stopped, 0).sum(0)
+        return total.masked_fill(weight.sum(0) >= _float32(settings.tails_below), 0)
 
 
 def pair_alphas(splats, x, y, counts):
@@ -429,27 +460,30 @@ def numerator(alpha, mode):
     return (alpha * transmittance).masked_fill(stopped, 0), stopped
 
 
-def blend(alpha, color, depth, bg, mode, gate):
+def blend(alpha, color, depth, bg, mode, gate, tails):
     """Blends the Gaussians of every pixel, front to back, and behind them the background.
 
-    alpha: [n, pixels]; color: [n, C]; depth: [n]; bg: [C]; gate: number or [].
+    alpha: [n, pixels]; color: [n, C]; depth: [n]; bg: [C]; gate: number or []; tails: [pixels], of `tail_sum`.
     Returns [C + 3, pixels]: colour, alpha, depth, inverse depth.
     """
     weight, stopped = numerator(alpha, mode)
-    gate_sum = weight.sum(0) if mode in ("alpha", "smoe") else alpha.sum(0)
-    background = gate * (1 - alpha).masked_fill(stopped, 1).prod(0)  # lambda T, behind the last pair that was blended
-    # alpha (Eq. 3) divides by 1, which this sum is only to rounding; Eq. 7 (smoe), 8 (smoe_tn) and 6 (smoe_std) differ
-    # in weight and gate_sum, and the background has a gate in smoe alone.
+    gate_sum = weight.sum(0) if mode in ("alpha", "smoe", "smoe_eq7") else alpha.sum(0)
+    # lambda T, behind the last pair that was blended, and B
+    background = gate * (1 - alpha).masked_fill(stopped, 1).prod(0) + tails
+    # alpha (Eq. 3) divides by 1, which this sum is only to rounding; Eq. 7 (smoe, smoe_eq7), 8 (smoe_tn) and 6
+    # (smoe_std) differ in weight and gate_sum, and the background has a weight in the first two alone.
     total = torch.ones_like(gate_sum) if mode == "alpha" else gate_sum + background
 
-    blended = color.T @ weight
-    if isinstance(gate, torch.Tensor) or gate:  # else a background that is NaN must not reach other pixels
-        blended = blended + background * bg[:, None]
+    of_background = background * bg[:, None]
+    if not (isinstance(gate, torch.Tensor) or gate):  # a background that is NaN must not reach other pixels
+        of_background = of_background.masked_fill(background == 0, 0)
+    blended = color.T @ weight + of_background
     without = gate_sum < GATE_SUM_MIN
     image = _quotient(blended, total, without, bg[:, None])
     expected_depth = _quotient(depth @ weight, gate_sum, without, 0)
     inverse_depth = _quotient((1 / depth) @ weight, total, without, 0)
-    return torch.cat([image, torch.stack([gate_sum, expected_depth, inverse_depth])])
+    covered = _quotient(gate_sum, total, without, 0) if mode == "smoe" else gate_sum
+    return torch.cat([image, torch.stack([covered, expected_depth, inverse_depth])])
 
 
 def _quotient(numerator, gates, without, otherwise):
@@ -467,8 +501,10 @@ def _render_blocks(splats, settings, mode, gate):
             # The slack keeps rounding in this shortcut from losing a pair; `pair_counts` alone decides.
             near = footprint_meets(splats, left, top, right - 1, bottom - 1, settings, mode, slack=1.0)
             counts = pair_counts(_rows(splats, near), x, y, settings, mode, gate)
-        alpha = pair_alphas(_rows(splats, near), x, y, counts)
-        image = blend(alpha, splats.color[near], splats.depth[near], settings.bg, mode, gate)
+        near = _rows(splats, near)
+        alpha = pair_alphas(near, x, y, counts)
+        tails = tail_sum(near, x, y, counts, alpha, settings, mode)
+        image = blend(alpha, near.color, near.depth, settings.bg, mode, gate, tails)
         return image.reshape(-1, bottom - top, right - left)
 
     bands = []

@@ -8,27 +8,36 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Optional, Tuple, Union, cast
 if TYPE_CHECKING:
     import torch  # which takes seconds to load: the command line reads this file for its names
 
-BLEND_MODES = ("alpha", "smoe", "smoe_tn", "smoe_std")
+BLEND_MODES = ("alpha", "smoe", "smoe_eq7", "smoe_tn", "smoe_std")
 """The blend modes, by number in the C++ core.
 
 ========== ====================== =========================================== ==========
 name       paper                  colour of a pixel                           background
 ========== ====================== =========================================== ==========
 alpha      Eq. 3 (3DGS)           sum c_i alpha_i T_i + T bg                  blended
-smoe       Eq. 7 (the method)     sum c_i alpha_i T_i / sum alpha_i T_i       by its gate
+smoe       the authors' program   (sum c_i alpha_i T_i + B bg) / (W + B)      by tails and gate
+smoe_eq7   Eq. 7 (the text)       sum c_i alpha_i T_i / W                     by its gate
 smoe_tn    Eq. 8 (ablation)       sum c_i alpha_i T_i / sum alpha_i           where no gate
 smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               where no gate
 ========== ====================== =========================================== ==========
 
-`smoe` is a family. With a `background_gate` lambda > 0 the background is one more expert, behind all others:
+W = sum alpha_i T_i. In `smoe` the sums are of strong pairs, those of alpha >= 1/2040. A weaker pair in the tiles of its
+Gaussian's 3-sigma square is a tail: B is the sum of the tails' alpha T, and gets no gradient. B counts in pixels where
+W < `tails_below`. `smoe_eq7` sums all pairs of G >= 1e-5.
 
-    (sum c_i alpha_i T_i + lambda T bg) / (sum alpha_i T_i + lambda T)
+With a `background_gate` lambda > 0 the background is one more expert of both, behind all others:
 
-At 0, the default, this is Eq. 7, and the background is seen where no gate is open; at 1 it is alpha blending.
+    (sum c_i alpha_i T_i + (B + lambda T) bg) / (W + B + lambda T)
+
+At lambda 0, the default, the background is seen in `smoe` where Gaussians end, and in `smoe_eq7` where no gate is open.
+At lambda 1 `smoe_eq7` is alpha blending.
 """
 
-_FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_tn": 0.0, "smoe_std": 0.0}
+_FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_eq7": None, "smoe_tn": 0.0, "smoe_std": 0.0}
 """The background's gate that a blend mode has by itself. None: the caller gives it."""
+
+GATED_MODES = tuple(mode for mode, gate in _FIXED_GATES.items() if gate is None)
+"""The blend modes that take a `background_gate`: `smoe` and `smoe_eq7`."""
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
@@ -38,8 +47,8 @@ MAX_BACKGROUND_GATE = 1e30  # that and a background's colour still make a float3
 BackgroundGate = Union[float, "torch.Tensor"]
 """lambda: a number, or a tensor of one element, which receives a gradient.
 
-The number 1 is alpha blending bit for bit. A tensor of 1 keeps the footprints of `smoe`, and pixels differ
-where tiles end.
+In `smoe_eq7` the number 1 is alpha blending bit for bit. A tensor of 1 keeps the footprints of `smoe_eq7`, and pixels
+differ where tiles end.
 """
 
 
@@ -63,15 +72,18 @@ class GaussianRasterizationSettings(NamedTuple):
     debug: bool = False  # check inputs and results for NaN; slower
     antialiasing: bool = False  # scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
     near: float = 0.2  # Gaussians with view depth <= near are culled
-    alpha_min: float = 0.0  # SMoE modes: also skip alpha below this; 0 is the paper's rule
+    # SMoE modes: also skip alpha below this; 0 is the paper's rule. `smoe`: pairs below this are no strong ones
+    alpha_min: float = 0.0
     strict: bool = False  # raise where an attribute is NaN or infinite, instead of culling that Gaussian
     blend_mode: Optional[str] = None  # one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha"
     # CUDA: gradients equal bit for bit from run to run; slower. The CPU's always are, at one SIMD level.
     deterministic: bool = False
     clamp_color: bool = True  # colours from shs are at least 0; False: as the harmonics give them, with their gradient
-    # `smoe`: how much the background weighs against the Gaussians, 0 or more; None: $DSMOE_BACKGROUND_GATE, else 0
+    # `smoe` and `smoe_eq7`: the background's weight, 0 or more; None: $DSMOE_BACKGROUND_GATE, else 0
     background_gate: Optional[BackgroundGate] = None
     low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
+    # `smoe`: tails count in pixels whose gate sum is below this. 2: in all, as in the authors' program; slower
+    tails_below: float = 0.9
 
 
 class Rendering(NamedTuple):
@@ -79,7 +91,9 @@ class Rendering(NamedTuple):
 
     color: torch.Tensor  # [C, H, W]
     radii: torch.Tensor  # [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
-    alpha: Optional[torch.Tensor] = None  # [1, H, W]; the gate sum W = sum alpha_i T_i; ablations: sum alpha_i
+    # [1, H, W]; the gate sum W = sum alpha_i T_i; `smoe`: W / (W + B + lambda T), the share that the background has not;
+    # ablations: sum alpha_i
+    alpha: Optional[torch.Tensor] = None
     depth: Optional[torch.Tensor] = None  # [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
     inverse_depth: Optional[torch.Tensor] = None  # [1, H, W]; 1 / z blended as a colour, over background 0
 
@@ -134,8 +148,8 @@ def resolve_blend_mode(blend_mode: Optional[str]) -> str:
 def resolve_background_gate(blend_mode: str, background_gate: Optional[BackgroundGate]) -> BackgroundGate:
     """Returns the background's gate lambda that a rendering in this blend mode uses.
 
-    In `smoe` an explicit value wins; None means the environment variable DSMOE_BACKGROUND_GATE, for callers that
-    cannot be edited, and 0 (Eq. 7) where that is unset. `alpha` is the family's member with 1; the ablations have none.
+    In `smoe` and `smoe_eq7` an explicit value wins; None means the environment variable DSMOE_BACKGROUND_GATE, for
+    callers that cannot be edited, and 0 where that is unset. `alpha` has the gate 1; the ablations have none.
     Raises ValueError for a number that is negative, NaN or above MAX_BACKGROUND_GATE, a tensor of not one element, and
     for a value in a mode that knows none.
     """
@@ -143,7 +157,7 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     if fixed is not None:
         if background_gate is None or (fixed == 1 and not _is_tensor(background_gate) and background_gate == fixed):
             return fixed
-        raise ValueError(f"background_gate is given, but blend_mode is {blend_mode!r}; only 'smoe' knows it")
+        raise ValueError(f"background_gate is given, but blend_mode is {blend_mode!r}; only {_gated_names()} know it")
     source = "background_gate"
     if background_gate is None:
         background_gate = os.environ.get(BACKGROUND_GATE_VARIABLE) or 0.0
@@ -163,6 +177,10 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
     return value
 
 
+def _gated_names() -> str:
+    return " and ".join(repr(mode) for mode in GATED_MODES)
+
+
 def _is_tensor(value: Any) -> bool:
     return hasattr(value, "numel")
 
@@ -174,14 +192,14 @@ blend_of_process: Optional[Tuple[str, Optional[float]]] = None
 def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, BackgroundGate]:
     """Returns the blend mode and the background's gate of a rendering.
 
-    `smoe` with the number 1 is `alpha`, bit for bit. Raises ValueError as the two functions above do.
+    `smoe_eq7` with the number 1 is `alpha`, bit for bit. Raises ValueError as the two functions above do.
     """
     mode, gate = settings.blend_mode, settings.background_gate
     if mode is None and gate is None and blend_of_process is not None:
         mode, gate = blend_of_process
     mode = resolve_blend_mode(mode)
     gate = resolve_background_gate(mode, gate)
-    return "alpha" if mode == "smoe" and not _is_tensor(gate) and gate == 1 else mode, gate
+    return "alpha" if mode == "smoe_eq7" and not _is_tensor(gate) and gate == 1 else mode, gate
 
 
 def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:

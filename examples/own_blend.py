@@ -16,14 +16,14 @@ def render(settings, power, means3D, opacities, colors, scales, rotations):
     """[3, H, W]: projection and pairs by the reference, blended by the sharpened gate."""
     unused = torch.zeros_like(means3D)  # means2D
     gaussians = reference.Gaussians(means3D, unused, opacities, None, colors, scales, rotations, None)
-    _, order = reference.visible(gaussians, settings, "smoe")
+    _, order = reference.visible(gaussians, settings, "smoe_eq7")
     splats = reference.project(reference.Gaussians(*(t if t is None else t[order] for t in gaussians)), settings)
     height, width = settings.image_height, settings.image_width
     x = torch.arange(width).float().repeat(height)
     y = torch.arange(height).float().repeat_interleave(width)
-    counts = reference.pair_counts(splats, x, y, settings, "smoe", gate=0.0)
+    counts = reference.pair_counts(splats, x, y, settings, "smoe_eq7", gate=0.0)
     alpha = reference.pair_alphas(splats, x, y, counts)  # [n, pixels], nearest first
-    weight, _ = reference.numerator(alpha, "smoe")  # alpha T
+    weight, _ = reference.numerator(alpha, "smoe_eq7")  # alpha T
     gate = (weight + 1e-12) ** power
     return ((splats.color.T @ gate) / gate.sum(0)).view(3, height, width)
 

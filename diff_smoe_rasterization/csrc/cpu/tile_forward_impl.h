@@ -1,11 +1,43 @@
 // The images of one tile. Included once per instruction set.
 #pragma once
 
+#include <algorithm>
+
 #include "tile_walk_impl.h"
 
 namespace dsmoe {
 namespace cpu {
 namespace DSMOE_SIMD {
+
+// Sums the tails of a tile's pixels: a walk of its own, without features. A pixel that wants none is closed.
+template <class S, BlendMode kBlendMode> class TailVisitor {
+ public:
+  using P = Pack<S>;
+  static constexpr BlendMode kMode = kBlendMode;
+  static constexpr bool kBackToFront = false, kTails = true;
+
+  DSMOE_HD TailVisitor(PixelArray<S> transmittance, PixelArray<S> tails)
+      : transmittance_(transmittance), tails_(tails) {}
+
+  struct Sums {};
+  DSMOE_HD void expect(uint32_t) const {}
+  DSMOE_HD Sums begin(const ListedGaussian<S>&) const { return {}; }
+  DSMOE_HD bool wanted(int at, Mask<P>& pixels) const {
+    pixels = transmittance_.load(at) > P(S(0));
+    return any(pixels);
+  }
+  template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P>, Sums&) const {
+    PixelState<P> state = {transmittance_.load(at), P(S(0))};
+    P tails = tails_.load(at);
+    add_tail(state, tails, static_cast<const Gate<P>&>(pairs.gate), pairs.inside);
+    transmittance_.store(at, state.transmittance);
+    tails_.store(at, tails);
+  }
+  DSMOE_HD void end(const ListedGaussian<S>&, Sums&) const {}
+
+ private:
+  const PixelArray<S> transmittance_, tails_;
+};
 
 // Draws a tile. Its list is taken in batches. For each batch and each pack of pixels, the alphas of the Gaussians that
 // meet the pack's cell come first, those of smooth cells apart. Then the pack blends them in order, with its sums in
@@ -22,12 +54,31 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
         gate_sum_(scratch.pixels()),
         last_(scratch.pixels()),
         sums_{scratch.next},
+        tails_{scratch.next + num_features * kTilePixels},
         open_(extent.cells()) {
     for (int i = 0; i < kTilePixels; ++i) transmittance_.values[i] = S(-1);  // outside the image: closed
     for (int i = 0; i < kTilePixels * (2 + num_features); ++i) gate_sum_.values[i] = S(0);
     for (int y = 0; y < extent.rows; ++y) {
       for (int x = 0; x < extent.columns; ++x) transmittance_.pixel(x, y) = S(1);
     }
+    if (Blend<kMode>::kTails) std::fill_n(tails_.values, kTilePixels, S(0));
+  }
+
+  // Sums the tails where the gate sum is small. Returns how many pairs had their exponent evaluated.
+  DSMOE_HD int64_t add_tails() const {
+    const PixelArray<S> transmittance = {tails_.values + kTilePixels};
+    std::fill_n(transmittance.values, kTilePixels, S(-1));
+    bool some = false;
+    for (int y = 0; y < extent_.rows; ++y) {
+      for (int x = 0; x < extent_.columns; ++x) {
+        const bool wants = gate_sum_.pixel(x, y) < tile_.config.tails_below;
+        if (wants) transmittance.pixel(x, y) = S(1);
+        some |= wants;
+      }
+    }
+    if (!some) return 0;
+    TailVisitor<S, kMode> visitor(transmittance, tails_);
+    return walk_tile(tile_, tile_.begin, tile_.end, num_features_, visitor);
   }
 
   // Returns how many pairs had their exponent evaluated.
@@ -57,6 +108,11 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
     extent_.for_each_pixel(tile_.width, [&](int x, int y, int64_t index) {
       tile_.saved.final_transmittance[index] = abs(transmittance_.pixel(x, y));
       tile_.saved.gate_sum[index] = gate_sum_.pixel(x, y);
+      if constexpr (Blend<kMode>::kTails) {
+        tile_.saved.tails[index] = tails_.pixel(x, y);
+        images.gate_sum[index] = finish_alpha<kMode>(
+            PixelEnd<S>{abs(transmittance_.pixel(x, y)), gate_sum_.pixel(x, y), background_gate, tails_.pixel(x, y)});
+      }
       tile_.saved.last_contributor[index] = static_cast<int32_t>(last_.pixel(x, y));
     });
     for (int f = 0; f < num_features_; ++f) {
@@ -66,7 +122,9 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
       const PixelArray<S> sum = sum_of(f);
       for (int at = 0; at < kTilePixels; at += P::kLanes) {
         const PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
-        sum.store(at, finish_feature<kMode>(rule, state.end(background_gate), sum.load(at), background));
+        auto end = state.end(background_gate);
+        if constexpr (Blend<kMode>::kTails) end.tails = tails_.load(at);
+        sum.store(at, finish_feature<kMode>(rule, end, sum.load(at), background));
       }
       extent_.for_each_pixel(tile_.width, [&](int x, int y, int64_t index) { image[index] = sum.pixel(x, y); });
     }
@@ -143,8 +201,9 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   const TileExtent& extent_;
   const int num_features_;
   const PixelArray<S> transmittance_, gate_sum_, last_;
-  const PixelArray<S> sums_;  // one array a feature
-  CellBits open_;             // cells that take further pairs
+  const PixelArray<S> sums_;   // one array a feature
+  const PixelArray<S> tails_;  // behind them, with room for one more: where the mode has tails
+  CellBits open_;              // cells that take further pairs
   ListedGaussian<S> batch_[kBatch];
   alignas(64) CellBits met_[kBatch], smooth_[kBatch];  // of the batch
   alignas(64) S alphas_[kBatch][P::kLanes];            // of a pack of pixels; 0 where the pair does not count
@@ -155,7 +214,8 @@ int64_t blend_tile(const Tile<S>& tile, const ImageOutputs<S>& images, S* memory
   const int num_features = kFeatures != kAnyFeatures ? kFeatures : tile.config.num_features();
   const TileExtent extent(tile);
   TilePainter<S, kMode, kFeatures> painter(tile, extent, num_features, {memory});
-  const int64_t pairs = painter.paint();
+  int64_t pairs = painter.paint();
+  if constexpr (Blend<kMode>::kTails) pairs += painter.add_tails();
   painter.write(images);
   return pairs;
 }

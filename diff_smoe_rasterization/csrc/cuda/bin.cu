@@ -19,6 +19,7 @@ template <class S> struct CountArguments {
   TileGrid grid;           // of the image
   SavedForward<S> saved;   // projected, order and num_ordered are read; num_instances is added to
   const int32_t* radii;    // [N] pixels
+  S tail_reach;            // of RasterConfig
 };
 
 // The rows of tiles that the warp's Gaussians meet. position: of the lane's Gaussian in the depth order.
@@ -33,7 +34,7 @@ __device__ WarpTileRows<S> rows_at(const CountArguments<S>& count, int64_t posit
     TileRect bounds =
         tile_bounds(count.mode, count.grid, projected.mean, bounding_radius<S>(count.mode, count.radii, gaussian));
     bounds.y0 = max(bounds.y0, count.saved.band.begin), bounds.y1 = min(bounds.y1, count.saved.band.end);
-    tiles = {projected.conic, projected.mean, projected.squared_reach, bounds};
+    tiles = {projected.conic, projected.mean, projected.squared_reach + count.tail_reach, bounds};
   }
   return {tiles, shared, lane};
 }
@@ -74,6 +75,7 @@ template <class S> void count_instances(const Frame<S>& frame, const Work& work)
   arguments.grid = TileGrid(frame.camera.width, frame.camera.height);
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
+  arguments.tail_reach = frame.config.tail_reach();
   check(cudaMemsetAsync(frame.saved.num_instances, 0, sizeof(int64_t), work.stream), "counting instances");
   const unsigned blocks = blocks_for(num_gaussians, kListWarps * arguments.gaussians_per_warp);
   if (blocks == 0) return;

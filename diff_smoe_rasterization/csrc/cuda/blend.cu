@@ -91,6 +91,55 @@ template <class S, BlendMode kMode, int kSums, int kPixels> struct BlendVisitor 
   int* begun;            // the last segment that a warp of a shared square has begun
 };
 
+// Sums the tails of a lane's pixels. A pixel that wants none is closed.
+template <class S, int kPixels> struct TailVisitor {
+  static constexpr bool kBackToFront = false, kStopsEarly = true, kTails = true;
+  static constexpr bool kReadsFeatures = true, kInSegments = false;
+  static constexpr int kUnroll = kBlendUnroll;
+
+  __device__ __forceinline__ void begin_batch(int32_t) {}
+
+  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged, const int32_t&) {
+    const StagedShape<S> gaussian = staged;
+    const auto exponent = gaussian.gate.column(S(tile.x) - gaussian.mean.x);
+    const S dy = S(tile.y) - gaussian.mean.y;
+#pragma unroll
+    for (int k = 0; k < kPixels; ++k) {
+      const S log_logit = exponent.at(below(dy, first + k));
+      add_tail(state[k], tails[k], gaussian.gate.evaluate(log_logit), gaussian.gate.inside(log_logit));
+    }
+  }
+
+  __device__ __forceinline__ bool is_done() const {
+    bool open = false;
+    for (int k = 0; k < kPixels; ++k) open |= state[k].is_open();
+    return !__any_sync(kAllLanes, open);
+  }
+
+  const BlendArguments<S>& arguments;
+  const WarpTile<S>& tile;
+  int first;  // of the lane's pixels, in a lane that has all of them
+  PixelState<S> state[kPixels];
+  S tails[kPixels];
+};
+
+// Walks the list once more for the tails of the pixels whose gate sum is small. Returns how many entries it met.
+template <class S, int kSums, int kPixels>
+__device__ unsigned sum_tails(const BlendArguments<S>& arguments, const WarpTile<S>& strong, Stage<S, true>& stage,
+                              const BlendedPixels<S, kSums, kPixels>& pixels, S (&tails)[kPixels]) {
+  WarpTile<S> tile = strong;
+  tile.source.tails = true;
+  TailVisitor<S, kPixels> visitor = {arguments, tile, pixels.first, {}, {}};
+  for (int k = 0; k < kPixels; ++k) {
+    const bool wants =
+        tile.inside(arguments, pixels.first + k) && pixels.state[k].gate_sum < arguments.config.tails_below;
+    visitor.state[k] = {wants ? S(1) : S(-1), S(0)};
+  }
+  const unsigned met = visitor.is_done() ? 0 : walk_tile(stage, {0, tile.source.length}, visitor);
+  for (int k = 0; k < kPixels; ++k) tails[k] = visitor.tails[k];
+  return met;
+}
+
 // Blends kSums features from `first_feature` on, and writes them. Where two warps share a square, first_pixel says
 // which half is the warp's, begun is 0 in shared memory, and all warps of the block call this that have pixels in the
 // image.
@@ -111,7 +160,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   using Visitor = BlendVisitor<S, kMode, kSums, kPixels>;
   const bool segments = Visitor::kInSegments && has_segments(arguments.saved, tile);
   Visitor visitor = {arguments, tile, blended, segments ? kSegmentLength : INT32_MAX, begun};
-  const unsigned met = walk_tile(stage, {0, tile.source.length, first_feature}, visitor);
+  unsigned met = walk_tile(stage, {0, tile.source.length, first_feature}, visitor);
   if (Visitor::kInSegments && segments) {
     // Where pixels do not stop, the backward pass walks the whole list.
     if (!Visitor::kStopsEarly) visitor.begin_segments(tile.source.length - 1);
@@ -125,15 +174,24 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     end_segments(arguments, tile, last, blended);
   }
 
+  [[maybe_unused]] S tails[kPixels] = {};
+  if constexpr (Blend<kMode>::kTails) {
+    if (first_feature == 0) met += sum_tails(arguments, tile, stage, blended, tails);
+  }
   const int64_t pixels = int64_t(arguments.width) * arguments.height;
   for (int k = 0; k < kPixels; ++k) {
     if (!tile.inside(arguments, blended.first + k)) continue;
     const int64_t index = tile.pixel_index(arguments, blended.first + k);
-    const auto end = blended.state[k].end(config.gate_of_background());
+    auto end = blended.state[k].end(config.gate_of_background());
+    if constexpr (Blend<kMode>::kTails) {
+      if (first_feature == 0) arguments.saved.tails[index] = tails[k];
+      end.tails = first_feature == 0 ? tails[k] : arguments.saved.tails[index];
+    }
     if (first_feature == 0) {
       arguments.saved.final_transmittance[index] = end.transmittance;
       arguments.saved.gate_sum[index] = end.gate_sum;
       arguments.saved.last_contributor[index] = blended.last[k];
+      if constexpr (Blend<kMode>::kTails) arguments.images.gate_sum[index] = finish_alpha<kMode>(end);
     }
     for (int f = 0; f < kSums; ++f) {
       const int feature = first_feature + f;

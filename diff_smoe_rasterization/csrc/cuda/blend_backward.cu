@@ -233,16 +233,20 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
   const int num_features = kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
   const int64_t size = int64_t(arguments.width) * arguments.height;
   PixelEnd<S> end[kLanePixels];
+  S dL_dbackground_gate = S(0);
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
-    end[k] = {S(1), S(0), config.gate_of_background()};
+    end[k] = {S(1), S(0), config.gate_of_background(), S(0)};
     if (inside) {
       end[k].transmittance = arguments.saved.final_transmittance[index];
       end[k].gate_sum = arguments.saved.gate_sum[index];
+      if constexpr (Blend<kMode>::kTails) end[k].tails = arguments.saved.tails[index];
     }
-    const S* dL_dgate_sum = arguments.dL_dimages.gate_sum;
-    pixels.state[k] = begin_backward(end[k], inside && dL_dgate_sum != nullptr ? dL_dgate_sum[index] : S(0));
+    const S* dL_dalpha = arguments.dL_dimages.gate_sum;
+    const auto begin = begin_backward<kMode>(end[k], inside && dL_dalpha != nullptr ? dL_dalpha[index] : S(0));
+    pixels.state[k] = begin.pixel;
+    if constexpr (Blend<kMode>::kTails) dL_dbackground_gate += begin.background_gate;
     pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
   }
   S* dL_dbackground = nullptr;  // the warp's row
@@ -250,7 +254,6 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
     dL_dbackground = arguments.dL_dbackground_rows +
                      (int64_t(place.tile) * kWarpsPerTile + place.quarter) * (config.num_channels + 1);
   }
-  S dL_dbackground_gate = S(0);
   for (int f = 0; f < num_features; ++f) {
     const S* gradient = feature_image(config, arguments.dL_dimages, f, size);
     S share = S(0);

@@ -37,7 +37,7 @@ inline int num_multiprocessors() {
 // Whether each instance says in its upper four bits which quarters of its tile the footprint may meet, quarter 0 in
 // the lowest of them. The Gaussian is in the bits below.
 constexpr int kMarkShift = 28;
-inline bool marks_quarters(int64_t num_gaussians) { return num_gaussians <= int64_t(1) << kMarkShift; }
+inline bool marks_quarters(int64_t num_gaussians) { return num_gaussians < int64_t(1) << kMarkShift; }
 
 // Whether the instances did not fit their memory. Then no tile list is read; the depth order is the list of every tile.
 template <class S> __device__ bool overflows(const SavedForward<S>& saved) {

@@ -166,8 +166,9 @@ template <BlendMode kMode, class Config> __device__ bool knows_front(const Confi
   return !Blend<kMode>::kDivides || config.gate_of_background() >= 0.01f;
 }
 
-// Sets what a warp's pixels start with at the list's begin.
-template <class S, int kChannels>
+// Sets what a warp's pixels start with at the list's begin. The tails' sum is held constant, as in the backward pass.
+// So it stands in front of all pairs, with the background's colour.
+template <BlendMode kMode, class S, int kChannels>
 __device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& arguments, const WarpTile<S>& tile,
                                              WeighedPixels<S, kChannels>& pixels) {
   const S background_gate = arguments.config.gate_of_background();
@@ -175,9 +176,10 @@ __device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& argum
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
-    pixels.state[k] = PixelState<S>::open();
-    pixels.end[k] = {arguments.saved.final_transmittance[index], inside ? arguments.saved.gate_sum[index] : S(0),
-                     background_gate};
+    const S tails = Blend<kMode>::kTails && inside ? arguments.saved.tails[index] : S(0);
+    pixels.state[k] = {S(1), tails};
+    pixels.end[k] = {arguments.saved.final_transmittance[index],
+                     inside ? arguments.saved.gate_sum[index] + tails : S(0), background_gate, S(0)};
     pixels.weight[k] = inside ? arguments.map.pixel_weights[index] : S(0);
     pixels.share_weight[k] = inside ? arguments.map.share_weights[index] : S(0);
     pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
@@ -186,6 +188,7 @@ __device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& argum
     for (int c = 0; c < num_channels; ++c) {
       const S distance = arguments.config.background[c] - pixels.channels.value(arguments, tile, k, c);
       pixels.alone[k] = fma(distance, distance, pixels.alone[k]);
+      if (Blend<kMode>::kTails && tails > S(0)) pixels.channels.set_front(arguments, tile, k, c, tails * distance);
     }
   }
 }
@@ -201,6 +204,10 @@ __device__ __forceinline__ void move_to_segment(const ImportanceArguments<S>& ar
     const PixelEnd<S>& end = pixels.end[k];
     const auto by = feature_end<kMode>(FeatureRule::kBlended, end);
     pixels.state[k] = {begin.transmittance, S(1) - begin.transmittance};
+    if constexpr (Blend<kMode>::kTails) {
+      const S tails = arguments.saved.tails[tile.pixel_index(arguments, k)];
+      pixels.state[k].gate_sum = pixels.state[k].gate_sum + tails;
+    }
     for (int c = 0; c < kChannels; ++c) {
       const S value = pixels.channels.value(arguments, tile, k, c);
       const S behind = fma(-value, begin.transmittance - end.transmittance, begin.sums[c]);
@@ -229,7 +236,7 @@ __global__ void __launch_bounds__(kWalkBlock,
   if (tile.empty) return;
 
   WeighedPixels<S, kChannels> pixels;
-  begin_pixels(arguments, tile, pixels);
+  begin_pixels<kMode>(arguments, tile, pixels);
   WalkRange range = {0, tile.source.length};
   if (Blend<kMode>::kStopsEarly) {
     int32_t seen = 0;

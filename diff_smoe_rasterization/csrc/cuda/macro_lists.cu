@@ -44,15 +44,19 @@ struct MacroGrid {
   __host__ __device__ int count() const { return columns * rows; }
 };
 
-// A Gaussian as seen from the band's first row.
-template <class S> __device__ ProjectedGaussian<S> in_band(ProjectedGaussian<S> gaussian, TileBand band) {
+// A Gaussian as seen from the band's first row, whose footprint reaches further by `reach`.
+template <class S> __device__ ProjectedGaussian<S> in_band(ProjectedGaussian<S> gaussian, TileBand band, S reach) {
   gaussian.mean.y -= S(band.begin * kTileSize);
+  gaussian.squared_reach += reach;
   return gaussian;
 }
 
 template <class S, class Key> struct ListArguments {
   SavedForward<S> saved;  // projected, order and num_ordered are read
   MacroGrid grid;         // of the band
+  TileGrid image;         // all its tiles
+  const int32_t* radii;   // [N] pixels; null where footprints have no other bounds
+  S tail_reach;           // of RasterConfig
   LookBack look_back;     // zero before
   int64_t capacity;       // entries there is room for
   int64_t* num_entries;   // [1] written: how many there are
@@ -65,6 +69,22 @@ struct MacroRect {
   uint32_t corner, size;  // columns and rows, the columns in the lower half
   __device__ unsigned count() const { return (size & 0xffff) * (size >> 16); }
 };
+
+// Tiles of the image as tiles of a band.
+__device__ TileRect rows_in_band(TileRect tiles, TileBand band, int rows) {
+  tiles.y0 = max(tiles.y0 - band.begin, 0), tiles.y1 = min(tiles.y1 - band.begin, rows);
+  return tiles;
+}
+
+// The macro tiles of both.
+__device__ MacroRect cut(MacroRect rect, TileRect tiles) {
+  const int x = rect.corner & 0xffff, y = rect.corner >> 16;
+  const int x0 = max(x, tiles.x0 / kMacroTiles), y0 = max(y, tiles.y0 / kMacroTiles);
+  const int x1 = min(x + int(rect.size & 0xffff), (tiles.x1 - 1) / kMacroTiles + 1);
+  const int y1 = min(y + int(rect.size >> 16), (tiles.y1 - 1) / kMacroTiles + 1);
+  if (tiles.empty() || x0 >= x1 || y0 >= y1) return {};
+  return {static_cast<uint32_t>(y0) << 16 | x0, static_cast<uint32_t>(y1 - y0) << 16 | (x1 - x0)};
+}
 
 // The macro tiles that the bounding box of a footprint meets; some of them the footprint itself may miss.
 template <class S> __device__ MacroRect macro_rect(const ProjectedGaussian<S>& gaussian, MacroGrid grid) {
@@ -106,8 +126,14 @@ __global__ void __launch_bounds__(kListBlock)
 #pragma unroll
   for (int r = 0; r < kListedPerLane; ++r) {
     rects[r] = {};
-    if (gaussians[r] >= 0)
-      rects[r] = macro_rect(in_band(list.saved.projected[gaussians[r]], list.saved.band), list.grid);
+    if (gaussians[r] >= 0) {
+      const ProjectedGaussian<S> projected = list.saved.projected[gaussians[r]];
+      rects[r] = macro_rect(in_band(projected, list.saved.band, list.tail_reach), list.grid);
+      if (list.radii != nullptr) {
+        const TileRect bounds = radius_rect(projected.mean, S(list.radii[gaussians[r]]), list.image);
+        rects[r] = cut(rects[r], rows_in_band(bounds, list.saved.band, list.grid.rows * kMacroTiles));
+      }
+    }
     total += rects[r].count();
   }
   for (int step = kWarp / 2; step > 0; step /= 2) total += __shfl_xor_sync(kAllLanes, total, step);
@@ -257,13 +283,16 @@ template <class S> struct TestArguments {
   BlendMode mode;            // decides the bounds of footprints
   TileGrid image, tiles;     // all tiles, and those of the band
   int macro_columns;
+  S tail_reach;           // of RasterConfig
   uint64_t* squares;      // [entries] written: which squares the footprint meets
+  uint64_t* listed;       // [entries] written: those too that its tails meet; null where the mode has no tails
   uint32_t* tile_counts;  // [tiles] entries of each tile; zero before
 };
 
 // The squares of a macro tile that a footprint meets, inside bounds.
 template <class S>
 __device__ uint64_t met_squares(const ProjectedGaussian<S>& gaussian, TileRect bounds, int macro_x, int macro_y) {
+  if (!(gaussian.squared_reach >= S(0))) return 0;
   const EllipseBand<S> ellipse(gaussian.conic, gaussian.squared_reach);
   const S x0 = gaussian.mean.x - S(macro_x * kMacroSize), y0 = gaussian.mean.y - S(macro_y * kMacroSize);
   const S size = S(kWarpTile), last = S(kWarpTile - 1);
@@ -300,9 +329,13 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
       TileRect bounds = tile_bounds(arguments.mode, arguments.image, projected.mean,
                                     bounding_radius<S>(arguments.mode, arguments.radii, gaussian));
       const TileBand& band = arguments.saved.band;
-      bounds.y0 = max(bounds.y0 - band.begin, 0), bounds.y1 = min(bounds.y1 - band.begin, arguments.tiles.rows);
-      squares = met_squares(in_band(projected, band), bounds, macro_x, macro_y);
+      bounds = rows_in_band(bounds, band, arguments.tiles.rows);
+      squares = met_squares(in_band(projected, band, S(0)), bounds, macro_x, macro_y);
       arguments.squares[entry] = squares;
+      if (arguments.listed != nullptr) {
+        squares |= met_squares(in_band(projected, band, arguments.tail_reach), bounds, macro_x, macro_y);
+        arguments.listed[entry] = squares;
+      }
     }
     const uint64_t tiles = tiles_of(squares);
     uint32_t own = 0;
@@ -381,6 +414,7 @@ struct GiveArguments {
   Chunks chunks;
   const int32_t* gaussians;  // [entries] of each entry
   const uint64_t* squares;   // [entries] that the footprint meets
+  const uint64_t* listed;    // [entries] those in whose tiles it is listed
   TileGrid tiles;
   int macro_columns;
   const int64_t* tile_offsets;   // [tiles + 1]
@@ -408,7 +442,8 @@ __global__ void __launch_bounds__(kChunk) give_to_tiles_kernel(const __grid_cons
     if (chunk.begin >= chunk.end) continue;
     const int64_t entry = chunk.begin + threadIdx.x;
     const bool exists = entry < chunk.end;
-    const uint64_t squares = exists ? arguments.squares[entry] : 0, tiles = tiles_of(squares);
+    const uint64_t squares = exists ? arguments.squares[entry] : 0;
+    const uint64_t tiles = tiles_of(exists ? arguments.listed[entry] : 0);
     const int32_t gaussian = exists ? arguments.gaussians[entry] : 0;
 
     // Where this chunk's instances of each tile begin: behind those of the macro tile's earlier chunks.
@@ -489,6 +524,9 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   ListArguments<S, Key> list = {};
   list.saved = saved;
   list.grid = grid;
+  list.image = image;
+  list.radii = has_tails(frame.config.mode) ? frame.images.radii : nullptr;
+  list.tail_reach = frame.config.tail_reach();
   list.look_back = {list_states, reinterpret_cast<unsigned*>(list_states + list_blocks)};
   list.capacity = capacity;
   list.num_entries = num_entries;
@@ -535,7 +573,9 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   test.image = image;
   test.tiles = tiles;
   test.macro_columns = grid.columns;
+  test.tail_reach = list.tail_reach;
   test.squares = allocate<uint64_t>(scratch, capacity);
+  test.listed = has_tails(frame.config.mode) ? allocate<uint64_t>(scratch, capacity) : nullptr;
   test.tile_counts = tile_counts;
   test_squares_kernel<<<resident_blocks(most_chunks), kChunk, 0, stream>>>(test);
   DSMOE_CHECK_LAUNCH("test_squares");
@@ -556,6 +596,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   give.chunks = chunks;
   give.gaussians = pass.values;
   give.squares = test.squares;
+  give.listed = test.listed != nullptr ? test.listed : test.squares;
   give.tiles = tiles;
   give.macro_columns = grid.columns;
   give.tile_offsets = saved.tile_offsets;

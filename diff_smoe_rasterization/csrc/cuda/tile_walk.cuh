@@ -33,6 +33,7 @@ template <class S> struct BlendArguments {
   SavedForward<S> saved;      // what the forward pass leaves, and reads itself
   ImageOutputs<S> images;     // [features, H, W], and the radii [N]
   bool marked;                // entries of lists are marked with quarters
+  S tail_reach;               // of RasterConfig
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
@@ -46,6 +47,7 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   arguments.saved = frame.saved;
   arguments.images = frame.images;
   arguments.marked = marks_quarters(frame.inputs.num_gaussians);
+  arguments.tail_reach = frame.config.tail_reach();
   arguments.pairs = work.pairs;
   return arguments;
 }
@@ -68,18 +70,22 @@ template <class S> class EntrySource {
   __device__ uint32_t entry(int32_t position) const { return static_cast<uint32_t>(entries_[position]); }
 
   // Stands for an entry, and meets no pixels.
-  __device__ uint32_t no_entry() const { return marked ? 0 : kSign; }
+  __device__ uint32_t no_entry() const { return marked ? (1u << kMarkShift) - 1 : kSign; }
 
   // Whether an entry may meet the quarter's pixels. Never for a culled Gaussian, which only the depth order has.
-  __device__ bool may_meet(uint32_t entry) const { return ((marked ? entry : ~entry) & wanted_) != 0; }
+  __device__ bool may_meet(uint32_t entry) const {
+    if (tails && marked) return entry != no_entry();
+    return ((marked ? entry : ~entry) & wanted_) != 0;
+  }
   __device__ int32_t gaussian(uint32_t entry) const {
     return static_cast<int32_t>(marked ? entry & ((1u << kMarkShift) - 1) : entry);
   }
 
-  bool listed;     // the entries are the tile's list; else the depth order, which knows nothing of tiles
-  bool marked;     // an entry says which quarters it may meet
-  int64_t begin;   // the list's first instance
-  int32_t length;  // entries
+  bool listed;         // the entries are the tile's list; else the depth order, which knows nothing of tiles
+  bool marked;         // an entry says which quarters its strong pairs may meet
+  bool tails = false;  // entries whose pairs in the quarter are tails are wanted too
+  int64_t begin;       // the list's first instance
+  int32_t length;      // entries
 
  private:
   static constexpr uint32_t kSign = 1u << 31;
@@ -226,6 +232,14 @@ template <class S, bool kWithFeatures> struct LoadedEntry {
   bool meets;  // the warp's pixels
 };
 
+// Whether a visitor has end_visits.
+template <class Visitor, class = void> constexpr bool kEndsVisits = false;
+template <class Visitor> constexpr bool kEndsVisits<Visitor, std::void_t<decltype(&Visitor::end_visits)>> = true;
+
+// Whether a visitor wants pairs that are tails too: it says so by kTails.
+template <class Visitor, class = void> constexpr bool kVisitsTails = false;
+template <class Visitor> constexpr bool kVisitsTails<Visitor, std::void_t<decltype(Visitor::kTails)>> = Visitor::kTails;
+
 template <class Visitor, class S>
 __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEntry& entry, bool exists,
                                            const WalkRange& range) {
@@ -245,8 +259,9 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
   }
   StagedShape<S>& shape = loaded.staged;
   shape = {gaussian.mean, LogGate<S>(gaussian.conic, gaussian.opacity, gaussian.squared_reach), entry.position + 1};
-  if (tile.source.marked) return loaded;
-  loaded.meets = may_meet(gaussian.conic, gaussian.mean, gaussian.squared_reach, tile.rect);
+  if (tile.source.marked && !kVisitsTails<Visitor>) return loaded;
+  const S reach = gaussian.squared_reach + (kVisitsTails<Visitor> ? arguments.tail_reach : S(0));
+  loaded.meets = may_meet(gaussian.conic, gaussian.mean, reach, tile.rect);
   if (!tile.source.listed) {
     const BlendMode mode = arguments.config.mode;
     const TileRect bounds = tile_bounds(mode, TileGrid(arguments.width, arguments.height), gaussian.mean,
@@ -256,10 +271,6 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
   }
   return loaded;
 }
-
-// Whether a visitor has end_visits.
-template <class Visitor, class = void> constexpr bool kEndsVisits = false;
-template <class Visitor> constexpr bool kEndsVisits<Visitor, std::void_t<decltype(&Visitor::end_visits)>> = true;
 
 // The walk itself. Returns how many entries met the warp's pixels. A visitor has
 //

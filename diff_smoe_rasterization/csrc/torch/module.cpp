@@ -74,7 +74,8 @@ py::dict blend_modes() {
     if (!Policy::kLearnsGate) gate = py::float_(Policy::background_gate(0.0));
     modes[Policy::kName] =
         py::dict("number"_a = static_cast<int>(decltype(mode)::value), "divides"_a = Policy::kDivides,
-                 "removable"_a = dsmoe::kRemovable<decltype(mode)::value>, "background_gate"_a = gate);
+                 "removable"_a = dsmoe::kRemovable<decltype(mode)::value>, "background_gate"_a = gate,
+                 "tails"_a = Policy::kTails);
   });
   return modes;
 }

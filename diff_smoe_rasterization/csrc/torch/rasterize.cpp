@@ -74,7 +74,7 @@ void Given::resolve_blend() {
   const bool is_one = gate && !gate->tensor.defined() && gate->number == 1;
   if (!gate || (!learns_gate && fixed_background_gate == 1 && is_one)) return;
   TORCH_CHECK_VALUE(learns_gate, "rasterize: background_gate is given, but blend_mode is '", Settings::blend_mode,
-                    "'; only 'smoe' knows it");
+                    "'; only 'smoe' and 'smoe_eq7' know it");
   if (gate->tensor.defined()) {
     background_gate = gate->tensor;
     return;
@@ -82,7 +82,7 @@ void Given::resolve_blend() {
   TORCH_CHECK_VALUE(0 <= gate->number && gate->number <= kMaxBackgroundGate, "rasterize: background_gate is ",
                     gate->number, "; it must be a number, 0 or more and at most ", kMaxBackgroundGate);
   fixed_background_gate = gate->number;
-  if (is_one && Settings::blend_mode == Blend<BlendMode::kSmoe>::kName) {
+  if (is_one && Settings::blend_mode == Blend<BlendMode::kSmoeEq7>::kName) {
     blend_mode = static_cast<int64_t>(BlendMode::kAlpha);
   }
 }

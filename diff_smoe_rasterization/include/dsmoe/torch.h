@@ -47,13 +47,14 @@ struct GaussianRasterizationSettings {
   bool debug = false;                // check inputs and results for NaN; slower
   bool antialiasing = false;         // scale opacity by sqrt(det(cov2D) / det(cov2D + low_pass I))
   double near = 0.2;                 // Gaussians with view depth <= near are culled
-  double alpha_min = 0;              // SMoE modes: also skip alpha below this; 0 is the paper's rule
+  double alpha_min = 0;              // SMoE modes: also skip alpha below this; `smoe`: such pairs are no strong ones
   bool strict = false;               // raise where an attribute is NaN or infinite, instead of culling that Gaussian
-  std::string blend_mode = "alpha";  // "alpha", "smoe", "smoe_tn" or "smoe_std"
+  std::string blend_mode = "alpha";  // "alpha", "smoe", "smoe_eq7", "smoe_tn" or "smoe_std"
   bool deterministic = false;        // CUDA: gradients equal bit for bit from run to run; slower
   bool clamp_color = true;           // colours from shs are at least 0
-  std::optional<BackgroundGate> background_gate;  // `smoe` only; absent: 0
+  std::optional<BackgroundGate> background_gate;  // `smoe` and `smoe_eq7` only; absent: 0
   double low_pass = 0.3;                          // px^2 added to the variances on the image
+  double tails_below = 0.9;                       // `smoe`: tails count where the gate sum is below this; 2: everywhere
 };
 
 /// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.
