@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 
 from ._version import __version__
 from .patches import TRAINERS, PatchError
-from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
+from .settings import BLEND_MODES
 from .trainer.config import (
     PRINCIPAL_POINTS,
     TrainConfig,
@@ -125,7 +125,7 @@ def build_parser() -> argparse.ArgumentParser:
                      help="nothing records it: give the same where a trained model is rendered")
     run.add_argument("--background-gate", "--background_gate", type=float, metavar="V",
                      help="in smoe, how much the background weighs; 0 is the paper's Eq. 7 (default: "
-                          f"$DSMOE_BACKGROUND_GATE, else {RECOMMENDED_BACKGROUND_GATE}); nothing records it either")
+                          "$DSMOE_BACKGROUND_GATE, else 0); nothing records it either")
     run.add_argument("--trainer", metavar="NAME",
                      help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
                           "(inria, inria_2024, scaffold, ...); default: found out from the script's folder")

@@ -173,7 +173,8 @@ def importance(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussia
         tails = tail_sum(splats, x, y, counts, alpha, settings, mode)
         count, weights = len(order), pixel_weights.reshape(-1)
         # With a channel for each Gaussian, the image is the map of their shares.
-        share = blend(alpha, torch.eye(count).to(alpha), splats.depth, alpha.new_zeros(count), mode, gate, tails)[:count]
+        identity, black = torch.eye(count).to(alpha), alpha.new_zeros(count)
+        share = blend(alpha, identity, splats.depth, black, mode, gate, tails)[:count]
         image = blend(alpha, splats.color, splats.depth, settings.bg, mode, gate, tails)[:len(settings.bg)]
         costs = alpha.new_zeros(count)
         for k in range(count):

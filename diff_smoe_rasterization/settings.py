@@ -39,9 +39,11 @@ _FIXED_GATES = {"alpha": 1.0, "smoe": None, "smoe_eq7": None, "smoe_tn": 0.0, "s
 GATED_MODES = tuple(mode for mode, gate in _FIXED_GATES.items() if gate is None)
 """The blend modes that take a `background_gate`: `smoe` and `smoe_eq7`."""
 
+_RECORDED = {"smoe": "smoe_tails"}
+"""What files call a blend mode where it is not its name: `smoe` in a file is the rule of version 0.1, `smoe_eq7`."""
+
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
-RECOMMENDED_BACKGROUND_GATE = 0.03  # of captures, for trainers that cannot learn it: benchmarks/RESULTS.md
 MAX_BACKGROUND_GATE = 1e30  # that and a background's colour still make a float32 number
 
 BackgroundGate = Union[float, "torch.Tensor"]
@@ -91,8 +93,8 @@ class Rendering(NamedTuple):
 
     color: torch.Tensor  # [C, H, W]
     radii: torch.Tensor  # [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
-    # [1, H, W]; the gate sum W = sum alpha_i T_i; `smoe`: W / (W + B + lambda T), the share that the background has not;
-    # ablations: sum alpha_i
+    # [1, H, W]; the gate sum W = sum alpha_i T_i. `smoe`: W / (W + B + lambda T), what is not the background's.
+    # Ablations: sum alpha_i
     alpha: Optional[torch.Tensor] = None
     depth: Optional[torch.Tensor] = None  # [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
     inverse_depth: Optional[torch.Tensor] = None  # [1, H, W]; 1 / z blended as a colour, over background 0
@@ -127,6 +129,18 @@ class Importance(NamedTuple):
 FEATURE_OUTPUTS = ("depth", "inverse_depth")  # images of the op on request, in its order
 OUTPUTS = ("alpha", *FEATURE_OUTPUTS)
 """The optional outputs of `rasterize`, in the order of `Rendering`."""
+
+
+def record_of(blend_mode: str) -> str:
+    """Returns the name under which files record a blend mode."""
+    return _RECORDED.get(blend_mode, blend_mode)
+
+
+def mode_of_record(record: str) -> str:
+    """Returns the blend mode that a file records; a name that is none as it is."""
+    if record in _RECORDED:
+        return f"{record}_eq7"
+    return next((mode for mode, name in _RECORDED.items() if name == record), record)
 
 
 def resolve_blend_mode(blend_mode: Optional[str]) -> str:
@@ -203,13 +217,10 @@ def resolve_blend(settings: GaussianRasterizationSettings) -> Tuple[str, Backgro
 
 
 def training_background_gate(blend_mode: str, background_gate: Optional[float] = None) -> Optional[float]:
-    """Returns the background's gate that a training takes and records; None in other modes than `smoe`.
+    """Returns the background's gate that a training takes and records; None in modes that know none.
 
-    In `smoe` that is the given value, else the environment variable DSMOE_BACKGROUND_GATE, else the recommended one.
+    In GATED_MODES that is the given value, else the environment variable DSMOE_BACKGROUND_GATE, else 0.
     Raises ValueError as `resolve_background_gate` does.
     """
-    takes_gate = _FIXED_GATES.get(blend_mode, 0.0) is None
-    if takes_gate and background_gate is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
-        background_gate = RECOMMENDED_BACKGROUND_GATE
     gate = resolve_background_gate(blend_mode, background_gate)
-    return gate if takes_gate else None
+    return cast(float, gate) if blend_mode in GATED_MODES else None

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Optional, Tuple
 
 from diff_smoe_rasterization import settings
-from diff_smoe_rasterization.settings import BLEND_MODES, resolve_blend_mode
+from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES, resolve_blend_mode
 
 SHIMS, STAND_INS = (Path(__file__).resolve().parent / name for name in ("shims", "stand_ins"))
 OPTIONS = ("blend_mode", "background_gate")
@@ -57,11 +57,11 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
         mode = "alpha"
     if mode not in BLEND_MODES:
         raise ValueError(f"the blend mode is {mode!r}; it must be one of {', '.join(BLEND_MODES)}")
-    if mode == "smoe" and gate is None:
+    if mode in GATED_MODES and gate is None:
         _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, "
               "or in another mode); --background_gate says otherwise")
         gate = 0.0
-    is_of_smoe = mode != "smoe" and not isinstance(gate, str)
+    is_of_smoe = mode not in GATED_MODES and not isinstance(gate, str)
     gate = settings.training_background_gate(mode, None if gate == "" or is_of_smoe else gate)
     say(f"blend mode {mode}" + (f", background gate {gate}" if gate is not None else ""))
     # Rendering without an option never warns: it has what cfg_args records.
@@ -98,7 +98,7 @@ def _noting(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _say_rasterizer(flavour: str) -> None:
     mode = resolve_blend_mode(None)
-    gate = f", background gate {settings.resolve_background_gate(mode, None)}" if mode == "smoe" else ""
+    gate = f", background gate {settings.resolve_background_gate(mode, None)}" if mode in GATED_MODES else ""
     say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
 
 

@@ -12,7 +12,7 @@ from typing import Any, Dict, List, Sequence, Tuple
 
 import yaml
 
-from ...settings import resolve_background_gate
+from ...settings import GATED_MODES, resolve_background_gate
 from ...trainer.config import BATCHED, LEARNED
 from ...trainer.errors import ConfigError
 from ..errors import BenchError
@@ -264,8 +264,8 @@ def _cells(content: Values, protocol: Values, scene: Values, method: Values, axe
 
 
 def _gated(blend_mode: str, gate: Any, *rest: Any) -> Tuple[Any, ...]:
-    """A combination of the axes with the gate that is its mode's: those of the axis are for `smoe` alone."""
-    own = gate if blend_mode == "smoe" else resolve_background_gate(blend_mode, None)
+    """A combination of the axes with the gate that is its mode's: those of the axis are only for GATED_MODES."""
+    own = gate if blend_mode in GATED_MODES else resolve_background_gate(blend_mode, None)
     return (blend_mode, own if own == LEARNED else float(own), *rest)
 
 

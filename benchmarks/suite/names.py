@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import Any, Mapping, Sequence, Union
 
+from diff_smoe_rasterization.settings import GATED_MODES
+
 from ...trainer.config import RECIPE as TRAINER_RECIPE
 from ..errors import BenchError
 
@@ -47,11 +49,11 @@ def read_json(path: Union[str, Path]) -> Any:
 
 
 def blend_of(row: Mapping[str, Any]) -> str:
-    """Such as "smoe 0.05" or "smoe learned"; rows that say no gate are older than it, and of 0, the paper's Eq. 7."""
+    """Such as "smoe 0.05" or "smoe learned"; rows that say no gate are of 0."""
     gate = row.get("background_gate") or 0
-    if row["blend_mode"] != "smoe" or gate == 0:
+    if row["blend_mode"] not in GATED_MODES or gate == 0:
         return row["blend_mode"]
-    return f"smoe {gate if isinstance(gate, str) else format(gate, 'g')}"
+    return f"{row['blend_mode']} {gate if isinstance(gate, str) else format(gate, 'g')}"
 
 
 def net_of(kind: str) -> str:

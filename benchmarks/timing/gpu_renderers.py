@@ -12,7 +12,6 @@ from typing import Dict, List, Type
 import torch
 from models import Model, mode_and_gate
 
-from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE
 from diff_smoe_rasterization.trainer.scenes.cameras import Camera
 
 NEAR = 0.2
@@ -254,7 +253,7 @@ class GsplatInference(Renderer):
 
 RENDERERS = {
     "inria": Inria,
-    **{name: ours(name) for name in ("ours alpha", f"ours smoe:{RECOMMENDED_BACKGROUND_GATE}", "ours smoe",
+    **{name: ours(name) for name in ("ours alpha", "ours smoe", "ours smoe_eq7:0.03", "ours smoe_eq7",
                                      "ours smoe_tn", "ours smoe_std", "ours alpha deterministic",
                                      "ours smoe deterministic")},
     "dr_aa": InriaAntialiasing, "accel": Accelerated, "speedy": Speedy, "fastergs": FasterGS,

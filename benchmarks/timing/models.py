@@ -7,7 +7,12 @@ from typing import Dict, List, Mapping, NamedTuple, Optional, Tuple
 import numpy as np
 import torch
 
-from diff_smoe_rasterization.settings import GaussianRasterizationSettings, resolve_background_gate, resolve_blend_mode
+from diff_smoe_rasterization.settings import (
+    GATED_MODES,
+    GaussianRasterizationSettings,
+    resolve_background_gate,
+    resolve_blend_mode,
+)
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.results.modelfile import load_model
 from diff_smoe_rasterization.trainer.scenes.cameras import Camera
@@ -17,7 +22,7 @@ from diff_smoe_rasterization.trainer.scenes.scene import load_cameras
 def mode_and_gate(blend: str) -> Tuple[str, Optional[float]]:
     """The settings ("smoe", 0.05) of "smoe:0.05"; "smoe" alone has gate 0. Raises ValueError."""
     mode, _, text = blend.partition(":")
-    gate = float(text) if text else 0.0 if mode == "smoe" else None
+    gate = float(text) if text else 0.0 if mode in GATED_MODES else None
     resolve_background_gate(resolve_blend_mode(mode), gate)
     return mode, gate
 

@@ -6,6 +6,7 @@ import os
 from typing import Any, Optional, Tuple
 
 from .. import io
+from ..settings import GATED_MODES, record_of
 from ..trainer.errors import TrainerError
 from ..trainer.opening import Trained, open_trained
 from ..trainer.results.pictures import evenly_spaced
@@ -51,7 +52,7 @@ def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians) -> None:
     if os.path.exists(path) and os.path.samefile(path, trained.ply):
         raise TrainerError(f"{path} is the model itself; choose another file with -o")
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
-    recorded = {"blend_mode": mode, "background_gate": float(gate) if mode == "smoe" else None}
+    recorded = {"blend_mode": record_of(mode), "background_gate": float(gate) if mode in GATED_MODES else None}
     io.write_gaussians(path, dataclasses.replace(gaussians, **recorded))
 
 

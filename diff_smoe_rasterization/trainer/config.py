@@ -9,7 +9,15 @@ import os
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Sequence, Union
 
-from ..settings import BACKGROUND_GATE_VARIABLE, BLEND_MODES, resolve_background_gate, resolve_blend_mode
+from ..settings import (
+    BACKGROUND_GATE_VARIABLE,
+    BLEND_MODES,
+    GATED_MODES,
+    mode_of_record,
+    record_of,
+    resolve_background_gate,
+    resolve_blend_mode,
+)
 from .errors import ConfigError
 from .gate_options import GateOptions, parse_gate_options
 from .system.files import is_file, is_folder, write_text_atomically
@@ -212,14 +220,16 @@ class TrainConfig:
     def save(self, folder: str) -> None:
         """Writes OUT/config.json, with the scene's absolute path."""
         scene = os.path.abspath(self.scene) if self.scene else ""
-        text = json.dumps({**dataclasses.asdict(self), "scene": scene}, indent=2) + "\n"
+        values = {**dataclasses.asdict(self), "scene": scene, "blend_mode": record_of(str(self.blend_mode))}
+        text = json.dumps(values, indent=2) + "\n"
         write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
 
     @classmethod
     def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
         """The options of an earlier run; one that names no background gate was trained with 0."""
-        gate = values.get("background_gate")
-        return cls(**{**values, "background_gate": 0.0 if gate is None and values["blend_mode"] == "smoe" else gate})
+        mode, gate = mode_of_record(values["blend_mode"]), values.get("background_gate")
+        return cls(**{**values, "blend_mode": mode,
+                      "background_gate": 0.0 if gate is None and mode in GATED_MODES else gate})
 
     @classmethod
     def load(cls, folder: str) -> TrainConfig:
@@ -241,7 +251,7 @@ class TrainConfig:
         if unknown:
             raise ConfigError(f"{path}: unknown option {', '.join(unknown)} (written by another version?)")
         # Rendering must use the mode of the training, so an absent mode is never replaced by a default.
-        if values.get("blend_mode") not in BLEND_MODES:
+        if mode_of_record(str(values.get("blend_mode"))) not in BLEND_MODES:
             raise ConfigError(f"{path}: blend_mode is {values.get('blend_mode')!r}; "
                              f"it must be one of {', '.join(BLEND_MODES)}")
         values["output"] = folder  # the folder may have been moved
@@ -306,7 +316,7 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     asked: None means in `smoe` $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is no gate, and
     for one that the mode does not know.
     """
-    if blend_mode != "smoe":
+    if blend_mode not in GATED_MODES:
         fixed = float(resolve_background_gate(blend_mode, None))
         return fixed if asked in (None, fixed) else float(resolve_background_gate(blend_mode, asked))
     if asked == LEARNED or asked is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):

@@ -7,7 +7,7 @@ from typing import Optional
 import numpy as np
 import torch
 
-from ..settings import RECOMMENDED_BACKGROUND_GATE, resolve_background_gate
+from ..settings import GATED_MODES, resolve_background_gate
 from ..trainer.inspection import to_image
 from ..trainer.results.rendering import Renderer
 from ..trainer.scenes.cameras import Camera
@@ -22,16 +22,16 @@ class Blend:
     """By which equation a picture is made."""
 
     mode: str  # one of BLEND_MODES
-    background_gate: float = RECOMMENDED_BACKGROUND_GATE  # of smoe; the other modes have their own
+    background_gate: float = 0.0  # of GATED_MODES; the other modes have their own
 
     @classmethod
     def of(cls, renderer: Renderer) -> Blend:
         """The one that a model was trained with."""
-        gate = float(renderer.background_gate) if renderer.blend_mode == "smoe" else RECOMMENDED_BACKGROUND_GATE
+        gate = float(renderer.background_gate) if renderer.blend_mode in GATED_MODES else 0.0
         return cls(renderer.blend_mode, gate)
 
     def __str__(self) -> str:
-        return f"smoe {self.background_gate:.3g}" if self.mode == "smoe" else self.mode
+        return f"{self.mode} {self.background_gate:.3g}" if self.mode in GATED_MODES else self.mode
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def picture(renderer: Renderer, camera: Camera, look: Look) -> np.ndarray:
 
 
 def _of_blend(renderer: Renderer, camera: Camera, blend: Blend, shown: str) -> np.ndarray:
-    gate = blend.background_gate if blend.mode == "smoe" else resolve_background_gate(blend.mode, None)
+    gate = blend.background_gate if blend.mode in GATED_MODES else resolve_background_gate(blend.mode, None)
     own = Renderer(renderer.model, blend.mode, renderer.background, renderer.antialiasing, renderer.rasterize,
                    background_gate=gate)
     if shown == "gates":

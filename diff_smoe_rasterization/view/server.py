@@ -9,7 +9,7 @@ from typing import Any, Dict, Optional
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..settings import BLEND_MODES, MAX_BACKGROUND_GATE
+from ..settings import BLEND_MODES, GATED_MODES, MAX_BACKGROUND_GATE
 from ..trainer.errors import TrainerError
 from ..trainer.scenes.cameras import Camera
 from ..trainer.system.stopwatch import synchronised_time
@@ -51,10 +51,10 @@ class Controls:
                               hint="smoe: how much the background weighs; 0 is Eq. 7, 1 alpha blending")
 
     def _only_what_matters(self) -> None:
-        self.gate.disabled = self.mode.value != "smoe"
+        self.gate.disabled = self.mode.value not in GATED_MODES
         for control in (self.split, self.other_mode, self.other_gate):
             control.visible = self.beside.value
-        self.other_gate.disabled = self.other_mode.value != "smoe"
+        self.other_gate.disabled = self.other_mode.value not in GATED_MODES
 
     def follow(self, before: Blend, after: Blend) -> None:
         """Takes the background gate that a training has learned meanwhile, where nobody has set another."""

@@ -17,8 +17,8 @@ from diff_smoe_rasterization.settings import (
 )
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
-BACKGROUND_GATES = {"smoe_gate": 0.05, "smoe_learned_gate": torch.tensor(0.25, device="cpu")}
-"""Further modes of the tests: `smoe` with these background gates, a number and a tensor."""
+BACKGROUND_GATES = {"eq7_gate": ("smoe_eq7", 0.05), "smoe_learned_gate": ("smoe", torch.tensor(0.25, device="cpu"))}
+"""Further modes of the tests: a blend mode and its background gate, a number and a tensor."""
 with_gate = pytest.mark.parametrize("mode", BLEND_MODES + ("smoe_learned_gate",))
 with_gates = pytest.mark.parametrize("mode", BLEND_MODES + tuple(BACKGROUND_GATES))
 REMOVABLE_MODES = tuple(mode for mode in BLEND_MODES if _C.blend_modes[mode]["removable"])
@@ -28,7 +28,12 @@ with_removal = pytest.mark.parametrize("mode", REMOVABLE_MODES + ("smoe_learned_
 
 def gate_of(mode):
     """Returns lambda, by which a mode weighs the background: a number."""
-    return 1.0 if mode == "alpha" else float(BACKGROUND_GATES.get(mode, 0.0))
+    return 1.0 if mode == "alpha" else float(BACKGROUND_GATES.get(mode, ("", 0.0))[1])
+
+
+def blend_of(mode):
+    """Returns the blend mode of a mode of the tests."""
+    return BACKGROUND_GATES[mode][0] if mode in BACKGROUND_GATES else mode
 
 
 class Scene(NamedTuple):
@@ -77,7 +82,7 @@ def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, princi
     principal_point: offset from the image centre in pixels. blend_mode: may be a name from BACKGROUND_GATES.
     """
     if blend_mode in BACKGROUND_GATES:
-        gate, blend_mode = BACKGROUND_GATES[blend_mode], "smoe"
+        blend_mode, gate = BACKGROUND_GATES[blend_mode]
         fields["background_gate"] = gate.to(default_device(), dtype) if isinstance(gate, torch.Tensor) else gate
     position = torch.tensor(position, dtype=torch.float64)
     forward = -position / position.norm()

@@ -110,7 +110,7 @@ WITH_OUTPUTS = ("default", "split_dc", "channels_7", "antialiasing", "saturating
 # What is in front of the blend is one code for all modes: the two that are trained with go through all of it.
 BLENDING = WITH_OUTPUTS + ("channels_3", "many_faint", "negative_opacities", "one_pixel_more_than_tiles")
 CASES = [(mode, name) for mode in BLEND_MODES + ("smoe_learned_gate",)
-         for name in (SCENES if mode in ("alpha", "smoe") else BLENDING)] + [("smoe_gate", "default")]
+         for name in (SCENES if mode in ("alpha", "smoe") else BLENDING)] + [("eq7_gate", "default")]
 
 
 @functools.lru_cache(maxsize=None)

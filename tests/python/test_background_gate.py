@@ -48,7 +48,7 @@ def assert_same_bits(scene, other):
                          ids=["shs", "channels"])
 def test_the_ends_of_the_family(options, dtype):
     """0 is Eq. 7 and 1 is alpha blending, bit for bit."""
-    smoe, alpha = (random_scene(mode, opacity=(1e-3, 1.2), dtype=dtype, **options) for mode in ("smoe", "alpha"))
+    smoe, alpha = (random_scene(mode, opacity=(1e-3, 1.2), dtype=dtype, **options) for mode in ("smoe_eq7", "alpha"))
     for nothing in (0, 0.0):
         assert_same_bits(smoe.with_settings(background_gate=nothing), smoe)
     for one in (1, 1.0):
@@ -57,7 +57,7 @@ def test_the_ends_of_the_family(options, dtype):
 
 
 def test_a_tensor_of_value_0_is_eq_7_and_has_a_gradient():
-    smoe = random_scene("smoe", opacity=(0.02, 0.9))
+    smoe = random_scene("smoe_eq7", opacity=(0.02, 0.9))
     expected, expected_gradients = gradients(rasterize, smoe)
     actual, actual_gradients = gradients(rasterize, smoe.with_settings(background_gate=torch.zeros(()).double()))
     assert torch.equal(actual.radii, expected.radii)
@@ -71,7 +71,7 @@ def test_a_tensor_of_value_1_is_alpha_where_no_tile_ends(function):
     alpha = random_scene("alpha", 80, 16, 16, opacity=(0.36, 0.98), degree=1, seed=5)
     inside = ((alpha.inputs["means3D"] @ alpha.settings.viewmatrix[:3, :2]).abs() < 1.5).all(1)
     alpha = alpha.rows(inside)
-    smoe = alpha.with_settings(blend_mode="smoe", background_gate=torch.ones(()).double())
+    smoe = alpha.with_settings(blend_mode="smoe_eq7", background_gate=torch.ones(()).double())
     expected, expected_gradients = gradients(function, alpha, OUTPUTS)
     actual, actual_gradients = gradients(function, smoe, OUTPUTS)
     assert (expected.radii > 0).sum() > 20 and torch.equal(actual.radii, expected.radii)
@@ -87,7 +87,7 @@ def test_a_pixel_and_its_gradients_by_hand(function, shape):
     a, c, b, value, depth = 0.6, RED, (0.1, 0.2, 0.3), 0.3, 2.0
     gate = torch.full(shape, value, dtype=torch.float64, requires_grad=True)
     inputs = {name: tensor.requires_grad_(True) for name, tensor in on_axis([depth], [a], [c]).items()}
-    settings = facing_camera("smoe", bg=b, background_gate=gate)
+    settings = facing_camera("smoe_eq7", bg=b, background_gate=gate)
     settings.bg.requires_grad_(True)
     rendering = function(settings=settings, outputs=OUTPUTS, **inputs)
     d = a + value * (1 - a)
@@ -119,7 +119,7 @@ def test_a_pixel_and_its_gradients_by_hand(function, shape):
 def test_the_background_is_behind_the_last_pair_that_was_blended(function):
     """The third would leave T = 1e-5 and is left out, so that T is 0.001 for the background and 0 for the last."""
     gate, opacities, colors = learned(2.0), (0.9, 0.99, 0.99, 0.5), [[0.8], [0.4], [0.2], [0.6]]
-    settings = facing_camera("smoe", 1, 1, bg=(0.1,), background_gate=gate)
+    settings = facing_camera("smoe_eq7", 1, 1, bg=(0.1,), background_gate=gate)
     rendering = function(settings=settings, outputs=("alpha",), **on_axis((1, 2, 3, 4), opacities, colors))
     first, second, behind = 0.9, 0.1 * 0.99, 0.1 * 0.01
     total = first + second + 2 * behind
@@ -134,7 +134,7 @@ def test_the_background_is_behind_the_last_pair_that_was_blended(function):
 def test_the_larger_the_gate_the_nearer_is_the_background(function):
     inputs, distance = on_axis([2.0], [0.8], [RED], variance=0.2), None
     for value in (0.0, 1e-6, 1e-3, 0.1, 1.0, 10.0, 1e4, 1e8):
-        settings = facing_camera("smoe", 21, 21, bg=WHITE, background_gate=learned(value))
+        settings = facing_camera("smoe_eq7", 21, 21, bg=WHITE, background_gate=learned(value))
         nearer = (function(settings=settings, **inputs).color - 1).abs()
         assert torch.isfinite(nearer).all()
         assert distance is None or (nearer <= distance).all() and nearer[:, 10, 10].sum() < distance[:, 10, 10].sum()
@@ -144,7 +144,7 @@ def test_the_larger_the_gate_the_nearer_is_the_background(function):
 
 def row(function, opacity, gate, sigma=SIGMA, **fields):
     """Returns a rendering of one Gaussian in the middle of a row of 81 pixels, and its opacity."""
-    settings = facing_camera("smoe", 81, 1, bg=WHITE, background_gate=gate, **fields)
+    settings = facing_camera("smoe_eq7", 81, 1, bg=WHITE, background_gate=gate, **fields)
     inputs = on_axis([2.0], [opacity], [RED], (sigma ** 2 - 0.3) / (81 / 4) ** 2)
     inputs["opacities"].requires_grad_(True)
     return function(settings=settings, outputs=("alpha",), **inputs), inputs["opacities"]
@@ -193,7 +193,7 @@ def test_alpha_min_cuts_beside_it(function):
 @pytest.mark.parametrize("opacity, gate", [(0.0, 1e-31), (1e-32, 1e-31), (1e-31, 0.0)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_where_all_gates_are_closed_the_background_takes_pixel_and_gradient(function, opacity, gate, dtype):
-    settings = facing_camera("smoe", 9, 7, background_gate=torch.tensor(gate))
+    settings = facing_camera("smoe_eq7", 9, 7, background_gate=torch.tensor(gate))
     scene = Scene(on_axis([2.0], [opacity], [RED]), settings).to(dtype)
     rendering, gradient = gradients(function, scene, ("depth", "inverse_depth"))
     assert torch.equal(rendering.color, scene.settings.bg[:, None, None].expand_as(rendering.color))
@@ -202,7 +202,7 @@ def test_where_all_gates_are_closed_the_background_takes_pixel_and_gradient(func
     assert not rendering.depth.any() and not rendering.inverse_depth.any()
 
 
-@pytest.mark.parametrize("mode", ["smoe", "smoe_tn", "smoe_std"])
+@pytest.mark.parametrize("mode", ["smoe_eq7", "smoe_tn", "smoe_std"])
 @pytest.mark.parametrize("background", [math.nan, math.inf])
 def test_without_a_gate_a_background_that_is_no_number_shows_in_empty_pixels_alone(function, mode, background):
     scene = random_scene(mode, 20, 24, 20, scale=0.05, degree=1,
@@ -221,7 +221,7 @@ def test_an_empty_pixel_is_the_background_itself(dtype):
     """Not lambda b / lambda, which is another number after rounding."""
     for value in (0.05, 0.3, 0.7, 1e-3, 30.0):
         for gate in (value, torch.tensor(value, dtype=dtype)):
-            scene = random_scene("smoe", 60, scale=0.05, dtype=dtype, background_gate=gate)
+            scene = random_scene("smoe_eq7", 60, scale=0.05, dtype=dtype, background_gate=gate)
             rendering = rasterize(settings=scene.settings, outputs=("alpha",), **scene.inputs)
             empty = rendering.alpha[0] == 0
             assert empty.any() and not empty.all()
@@ -231,7 +231,7 @@ def test_an_empty_pixel_is_the_background_itself(dtype):
 @pytest.mark.parametrize("gate", [1e-3, 0.05, 1.0, 20.0])
 def test_dL_dlambda_equals_a_finite_difference(function, gate):
     """Of a whole image, in which pairs come and go with lambda no nearer than the step."""
-    scene = random_scene("smoe", 30, 24, 18, seed=3, scale=0.3, opacity=(0.05, 0.9), degree=1)
+    scene = random_scene("smoe_eq7", 30, 24, 18, seed=3, scale=0.3, opacity=(0.05, 0.9), degree=1)
     weights, step = random_normal((6, 18, 24), 4), 1e-5
 
     def loss(value):
@@ -250,7 +250,7 @@ def test_the_common_factor_of_all_opacities_has_a_gradient():
     """Eq. 7 does not see it where opacities are small, which is why its Gaussians could not fade."""
     slopes = {}
     for gate in (0.0, 0.05):
-        scene = random_scene("smoe", opacity=(1e-7, 2e-7), scale=0.3, background_gate=gate).requiring_grad()
+        scene = random_scene("smoe_eq7", opacity=(1e-7, 2e-7), scale=0.3, background_gate=gate).requiring_grad()
         color = rasterize(settings=scene.settings, **scene.inputs).color
         slope, = torch.autograd.grad((color - scene.settings.bg.detach()[:, None, None]).square().sum(),
                                      scene.inputs["opacities"])
@@ -259,26 +259,26 @@ def test_the_common_factor_of_all_opacities_has_a_gradient():
 
 
 def test_the_environment_is_for_smoe_alone(function, monkeypatch):
-    scene = random_scene("smoe", 30, 24, 20, degree=1)
+    scene = random_scene("smoe_eq7", 30, 24, 20, degree=1)
 
     def color(mode, **fields):
         return function(settings=scene.settings._replace(blend_mode=mode, **fields), **scene.inputs).color
 
     without = {mode: color(mode) for mode in BLEND_MODES}
-    gated = color("smoe", background_gate=0.2)
+    gated = color("smoe_eq7", background_gate=0.2)
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.2")
     for mode in BLEND_MODES:
-        assert torch.equal(color(mode), gated if mode == "smoe" else without[mode])
-    assert torch.equal(color("smoe", background_gate=0.0), without["smoe"]), "what is given wins"
+        assert torch.equal(color(mode), gated if mode == "smoe_eq7" else without[mode])
+    assert torch.equal(color("smoe_eq7", background_gate=0.0), without["smoe_eq7"]), "what is given wins"
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "1")
-    assert torch.equal(color("smoe"), without["alpha"])
+    assert torch.equal(color("smoe_eq7"), without["alpha"])
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "")
-    assert torch.equal(color("smoe"), without["smoe"])
+    assert torch.equal(color("smoe_eq7"), without["smoe_eq7"])
 
 
 def test_splats_keep_the_gate_of_their_rendering(monkeypatch):
     """And sum over its pairs, though the environment has changed since."""
-    scene, ones = random_scene("smoe", 60, degree=1), torch.ones(37, 50, dtype=torch.float64)
+    scene, ones = random_scene("smoe_eq7", 60, degree=1), torch.ones(37, 50, dtype=torch.float64)
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.5")
     splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1]
     monkeypatch.delenv("DSMOE_BACKGROUND_GATE")
@@ -289,8 +289,8 @@ def test_splats_keep_the_gate_of_their_rendering(monkeypatch):
 
 
 @pytest.mark.parametrize("mode, gate", [
-    ("smoe", -0.1), ("smoe", math.nan), ("smoe", math.inf), ("smoe", 1e39), ("smoe", "much"), ("smoe", (0.1, 0.2)),
-    ("smoe", torch.ones(2, device="cpu")), ("smoe", torch.ones(0, device="cpu")), ("alpha", 0.5), ("alpha", 0),
+    ("smoe", -0.1), ("smoe", math.nan), ("smoe_eq7", math.inf), ("smoe", 1e39), ("smoe", "much"), ("smoe", (0.1, 0.2)),
+    ("smoe_eq7", torch.ones(2, device="cpu")), ("smoe_eq7", torch.ones(0, device="cpu")), ("alpha", 0.5), ("alpha", 0),
     ("alpha", torch.tensor(1.0, device="cpu")), ("smoe_tn", 0.0), ("smoe_tn", 0.05),
     ("smoe_std", 1.0)], ids=lambda value: str(value).replace(" ", ""))
 def test_a_gate_that_cannot_be_is_named(function, mode, gate):
@@ -303,13 +303,13 @@ def test_a_mode_with_a_gate_of_one_is_no_alpha(monkeypatch):
     """Of a mode that the core may get: only `smoe` is `alpha` at 1."""
     monkeypatch.setattr(settings_module, "BLEND_MODES", BLEND_MODES + ("own",))
     monkeypatch.setitem(settings_module._FIXED_GATES, "own", 1.0)
-    settings = random_scene("smoe", 1, 2, 2).settings._replace(blend_mode="own", background_gate=None)
+    settings = random_scene("smoe_eq7", 1, 2, 2).settings._replace(blend_mode="own", background_gate=None)
     assert settings_module.resolve_blend(settings) == ("own", 1.0)
 
 
 @pytest.mark.parametrize("value", ["-1", "nan", "inf", "much", "0,05"])
 def test_a_gate_in_the_environment_that_cannot_be_is_named(function, value, monkeypatch):
-    scene = random_scene("smoe", 5, 20, 18)
+    scene = random_scene("smoe_eq7", 5, 20, 18)
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", value)
     with pytest.raises(ValueError, match=f"DSMOE_BACKGROUND_GATE is '{value}'; it must be a number"):
         function(settings=scene.settings, **scene.inputs)
@@ -322,7 +322,7 @@ def test_a_gate_in_the_environment_that_cannot_be_is_named(function, value, monk
     (lambda: torch.tensor(0.1, device="meta"), "on meta"), (lambda: [0.1], None)],
     ids=["float64", "int64", "device", "list"])
 def test_a_tensor_that_does_not_fit_is_named(gate, words):
-    scene = random_scene("smoe", 5, 20, 18, dtype=torch.float32)
+    scene = random_scene("smoe_eq7", 5, 20, 18, dtype=torch.float32)
     with pytest.raises(TypeError if words else ValueError, match=f"background_gate .*{words or 'must be'}"):
         rasterize(settings=scene.settings._replace(background_gate=gate()), **scene.inputs)
 
@@ -331,7 +331,7 @@ def test_a_tensor_that_does_not_fit_is_named(gate, words):
 def test_the_value_of_a_tensor_is_checked_where_nobody_waits_for_it(value, device):
     if device.type != "cpu":
         pytest.skip("the host would wait for the GPU")
-    scene = random_scene("smoe", 5, 20, 18, background_gate=torch.tensor(value).double())
+    scene = random_scene("smoe_eq7", 5, 20, 18, background_gate=torch.tensor(value).double())
     with pytest.raises(ValueError, match=f"background_gate is {value}; it must be 0 or more and finite"):
         rasterize(settings=scene.settings, **scene.inputs)
 
@@ -340,7 +340,7 @@ def test_the_value_of_a_tensor_is_checked_where_nobody_waits_for_it(value, devic
                     reason=f"torch {torch.__version__} only refuses what it sees: a loss that is not linear")
 def test_second_derivatives_by_the_gate_are_refused():
     gate = learned(0.1)
-    scene = random_scene("smoe", 20, 20, 18, background_gate=gate)
+    scene = random_scene("smoe_eq7", 20, 20, 18, background_gate=gate)
     first, = torch.autograd.grad(rasterize(settings=scene.settings._replace(background_gate=gate),
                                            **scene.inputs).color.sum(), gate, create_graph=True)
     with pytest.raises(RuntimeError, match="rasterize: second derivatives"):

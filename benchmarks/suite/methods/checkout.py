@@ -16,7 +16,7 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import numpy as np
 import torch
 
-from ....settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE
+from ....settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, GATED_MODES
 from ....trainer.config import TrainConfig
 from ....trainer.results.evaluation import Evaluation, summary
 from ....trainer.results.pictures import evenly_spaced
@@ -73,7 +73,7 @@ class ThreeDGS:
         words += self.recipe_arguments()
         if self.method["variant"] != "unpatched":
             words += ["--blend_mode", config.blend_mode]
-            words += ["--background_gate", config.background_gate] if config.blend_mode == "smoe" else []
+            words += ["--background_gate", config.background_gate] if config.blend_mode in GATED_MODES else []
         return [str(word) for word in words] + (self.method["arguments"] if self.trains_with_arguments else [])
 
     def test_arguments(self) -> List[Any]:

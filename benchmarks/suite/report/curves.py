@@ -19,8 +19,9 @@ from .tables import column  # noqa: E402
 # Okabe and Ito's colours, told apart with every kind of colour vision; black and yellow are left out for the pages.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 # Blends differ by more than colour: mark and line.
-MARKS = {"alpha": ("o", "--"), "smoe": ("s", "-"), "smoe_tn": ("^", "-."), "smoe_std": ("v", ":")}
-OTHER_MARKS = (("D", "-"), ("P", "-"), ("X", "-"))  # gates of smoe, as they come
+MARKS = {"alpha": ("o", "--"), "smoe": ("s", "-"), "smoe_eq7": ("P", "-"), "smoe_tn": ("^", "-."),
+         "smoe_std": ("v", ":")}
+OTHER_MARKS = (("D", "-"), ("p", "-"), ("X", "-"))  # gates of smoe, as they come
 INK, GRID = "#1c1c1e", "#d8d8dc"
 STYLE = {"text.color": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.edgecolor": GRID,
          "grid.color": GRID, "axes.grid": True, "axes.axisbelow": True, "axes.spines.top": False,

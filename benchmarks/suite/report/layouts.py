@@ -5,6 +5,8 @@ import statistics
 from pathlib import Path
 from typing import Dict, Iterator, List, Optional, Sequence, Set, Tuple
 
+from diff_smoe_rasterization.settings import GATED_MODES
+
 from ..names import read_json
 from ..rows import Row
 from . import groups as grouping
@@ -40,7 +42,7 @@ def tables_of(suite: str, rows: Sequence[Row]) -> List[Table]:
     blends = {group.setting.blend: group.setting.mode for group in groups}
     made = [table1(groups), table2(groups), table3(groups),
             *(deltas(groups, base, blend) for base in COMPARED for blend, mode in blends.items()
-              if mode == "smoe" and blend != base),
+              if mode in GATED_MODES and blend != base),
             cells(groups), failures(rows)]
     return [table.without_empty_columns()._replace(name=safe_name(f"{suite}_{table.name}")) for table in made
             if any(row.source == OURS for row in table.rows)]

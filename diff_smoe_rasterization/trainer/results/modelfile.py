@@ -7,7 +7,7 @@ from typing import NamedTuple, Optional, Tuple
 import torch
 
 from ... import io
-from ...settings import BLEND_MODES, resolve_background_gate
+from ...settings import BLEND_MODES, GATED_MODES, mode_of_record, record_of, resolve_background_gate
 from ..errors import TrainerError
 from ..model import GaussianModel
 from ..system.files import is_file
@@ -36,13 +36,13 @@ def trained_model_path(output: str, iterations: int) -> str:
 
 
 def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float) -> None:
-    """Writes the raw parameters, `comment blend_mode NAME` and in `smoe` `comment background_gate VALUE`."""
+    """Writes the raw parameters, `comment blend_mode NAME` and in GATED_MODES `comment background_gate VALUE`."""
     os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
     raw = {name: tensor.detach().cpu().numpy() for name, tensor in model.raw.items()}
     io.write_gaussians(path, io.Gaussians(
         means3D=raw["means3D"], dc=raw["dc"], shs=raw["shs"], opacity_logits=raw["opacities"],
-        log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=blend_mode,
-        background_gate=background_gate if blend_mode == "smoe" else None))
+        log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=record_of(blend_mode),
+        background_gate=background_gate if blend_mode in GATED_MODES else None))
 
 
 def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
@@ -59,7 +59,8 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
     raw = {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
     model = GaussianModel(raw, stored.sh_degree)
     model.active_sh_degree = stored.sh_degree
-    return model, Recorded(stored.blend_mode, stored.background_gate)
+    record = stored.blend_mode
+    return model, Recorded(record if record is None else mode_of_record(record), stored.background_gate)
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
@@ -82,9 +83,9 @@ def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) 
 def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked: Optional[float]) -> float:
     """The background gate to render a .ply with in this blend mode: by the rules of `agreed_blend_mode`.
 
-    A file that records `smoe` and no gate is an older one, trained with 0. Raises TrainerError.
+    A file that records `smoe_eq7` and no gate is an older one, trained with 0. Raises TrainerError.
     """
-    if blend_mode != "smoe":
+    if blend_mode not in GATED_MODES:
         fixed = float(resolve_background_gate(blend_mode, None))
         for said in (recorded.background_gate, asked):
             if said not in (None, fixed):

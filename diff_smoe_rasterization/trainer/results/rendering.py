@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Tuple
 
 import torch
 
-from ...settings import BackgroundGate, GaussianRasterizationSettings, Rendering
+from ...settings import GATED_MODES, BackgroundGate, GaussianRasterizationSettings, Rendering
 from ..model import GaussianModel
 from ..scenes.cameras import Camera
 
@@ -78,7 +78,7 @@ class Renderer:
         changes: Dict[str, Any] = {"sh_degree": self.model.active_sh_degree, "deterministic": self.deterministic}
         if background is not None:
             changes["bg"] = background
-        if self.blend_mode == "smoe":
+        if self.blend_mode in GATED_MODES:
             changes["background_gate"] = self.background_gate if background_gate is None else background_gate
         return self._settings[id(camera)][1]._replace(**changes)
 

@@ -5,6 +5,7 @@ import json
 import os
 from typing import Any, Dict, List, Optional, Union
 
+from ...settings import GATED_MODES
 from ..config import LEARNED, TrainConfig
 from ..errors import TrainerError
 from ..gate_options import gate_settings
@@ -110,10 +111,10 @@ def results_table(rows: List[Dict[str, Any]]) -> str:
 
 
 def blend_name(blend_mode: str, background_gate: Union[float, str, None]) -> str:
-    """The blend in words: the mode, in `smoe` with its background gate."""
-    if blend_mode != "smoe" or background_gate is None:
+    """The blend in words: the mode, in GATED_MODES with its background gate."""
+    if blend_mode not in GATED_MODES or background_gate is None:
         return blend_mode
-    return f"smoe {background_gate if isinstance(background_gate, str) else format(background_gate, '.3g')}"
+    return f"{blend_mode} {background_gate if isinstance(background_gate, str) else format(background_gate, '.3g')}"
 
 
 def viewer_warning(row: Dict[str, Any], form: str = "ply") -> str:

@@ -15,7 +15,7 @@ import torch
 from ...direct import DirectRendering
 from ...extension import _C  # noqa: F401  (loading it registers the ops)
 from ...gaussians import activate
-from ...settings import Rendering
+from ...settings import GATED_MODES, Rendering
 from ...splats import Splats
 from ..model import PARAMETERS, GaussianModel, GaussianOptimizer
 from ..results.rendering import Renderer, package_rasterizer
@@ -88,7 +88,7 @@ class DirectPasses:
         parameters = model.stored
         # Weak, so that of what a densification replaces only 64 bytes of geometry stay till the next rendering.
         self._rendered = {name: weakref.ref(tensor) for name, tensor in parameters.items()}
-        self._gate = background_gate if self.renderer.blend_mode == "smoe" else None
+        self._gate = background_gate if self.renderer.blend_mode in GATED_MODES else None
         gate = None if self._gate is None else self._gate.detach()
         settings = self.renderer.settings_of(camera, background, gate)
         self._means2D = self._buffer("means2D", parameters["means3D"]).requires_grad_()

@@ -130,7 +130,7 @@ def exponential(theta, rho):
 
 def test_monogs_moves_the_camera_by_its_gradients():
     """By finite differences along each axis: T becomes exp(rho, theta) T."""
-    scene = random_scene("smoe_gate", 8, WIDTH, HEIGHT, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)
+    scene = random_scene("eq7_gate", 8, WIDTH, HEIGHT, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)
     view = scene.settings.viewmatrix
     raw = torch.linalg.solve(view, scene.settings.projmatrix)
     weights = random_normal((3, HEIGHT, WIDTH), 84)
