@@ -469,15 +469,16 @@ def blend(alpha, color, depth, bg, mode, gate, tails):
     """
     weight, stopped = numerator(alpha, mode)
     gate_sum = weight.sum(0) if mode in ("alpha", "smoe", "smoe_eq7") else alpha.sum(0)
-    # lambda T, behind the last pair that was blended, and B
-    background = gate * (1 - alpha).masked_fill(stopped, 1).prod(0) + tails
+    background = tails  # B
+    if isinstance(gate, torch.Tensor) or gate:
+        background = background + gate * (1 - alpha).masked_fill(stopped, 1).prod(0)  # lambda T, behind the last pair
     # alpha (Eq. 3) divides by 1, which this sum is only to rounding; Eq. 7 (smoe, smoe_eq7), 8 (smoe_tn) and 6
     # (smoe_std) differ in weight and gate_sum, and the background has a weight in the first two alone.
     total = torch.ones_like(gate_sum) if mode == "alpha" else gate_sum + background
 
     of_background = background * bg[:, None]
-    if not (isinstance(gate, torch.Tensor) or gate):  # a background that is NaN must not reach other pixels
-        of_background = of_background.masked_fill(background == 0, 0)
+    if background is tails:  # a background that is NaN must not reach pixels without tails
+        of_background = of_background.masked_fill(tails == 0, 0)
     blended = color.T @ weight + of_background
     without = gate_sum < GATE_SUM_MIN
     image = _quotient(blended, total, without, bg[:, None])

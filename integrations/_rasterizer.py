@@ -33,16 +33,17 @@ def settings_with(names: Sequence[str], module: str) -> type:
                       defaults=[defaults[field] for field in fields if field in defaults])
 
 
-def share_of_gaussians(gate_sum: torch.Tensor, settings: Settings) -> torch.Tensor:
+def share_of_gaussians(alpha: torch.Tensor, settings: Settings) -> torch.Tensor:
     """Returns the share beta of each pixel that the background does not have, so C = beta G + (1 - beta) bg.
 
-    gate_sum: W = sum(alpha T), [1, H, W], of the output `alpha`. With the background gate lambda beta is
-    W / (W + lambda (1 - W)), by W + T = 1. So it is W in `alpha`; and with gate 0 it is 1 wherever a gate is open, as
-    in `smoe_tn` and `smoe_std`.
+    alpha: [1, H, W], the output of that name. In `alpha` and `smoe` it is beta. In the other modes it is a gate sum W:
+    with the background gate lambda beta is W / (W + lambda (1 - W)), by W + T = 1. With gate 0 it is 1 wherever a gate
+    is open, as in `smoe_tn` and `smoe_std`.
     """
     mode, gate = resolve_blend(settings)
-    if mode == "alpha":
-        return gate_sum
+    if mode in ("alpha", "smoe"):
+        return alpha
+    gate_sum = alpha
     if not isinstance(gate, torch.Tensor) and gate == 0:
         return (gate_sum > 0).to(gate_sum.dtype)
     total = gate_sum + gate * (1 - gate_sum)

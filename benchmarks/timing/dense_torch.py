@@ -13,7 +13,6 @@ import math
 import torch
 
 from diff_smoe_rasterization import reference
-from diff_smoe_rasterization.settings import resolve_background_gate, resolve_blend_mode
 
 TILE = reference.TILE
 
@@ -28,7 +27,7 @@ def rasterize_with_gradients(gaussians, settings, dL_dcolor=None):
         dL_dcolor: [C, H, W], or None to render only.
     Returns: the image [C, H, W], and a dict of gradients, a key an argument (None without dL_dcolor).
     """
-    mode = "alpha" if settings.background_gate == 1 else resolve_blend_mode(settings.blend_mode)
+    mode, _ = reference.mode_and_gate(settings)
     backward = dL_dcolor is not None
     leaves = {name: tensor.detach().clone().requires_grad_(backward) for name, tensor in gaussians.items()}
     with torch.set_grad_enabled(backward):
@@ -57,8 +56,9 @@ def tile_lists(splats, settings, mode):
     Returns members [instances], rows of splats tile by tile, nearest first, and ends, the list of each tile's end.
     """
     tiles_x, tiles_y = -(-settings.image_width // TILE), -(-settings.image_height // TILE)
-    if mode == "alpha":
-        distance_squared = 2 * torch.log(splats.opacity.clamp(min=1e-30) / reference.ALPHA_MIN)
+    if mode in ("alpha", "smoe"):
+        least = reference.ALPHA_MIN if mode == "alpha" else reference.TAIL_MIN
+        distance_squared = 2 * torch.log(splats.opacity.clamp(min=1e-30) / least)
     else:
         distance_squared = torch.full_like(splats.opacity, -2 * math.log(reference.KERNEL_MIN))
         distance_squared[splats.opacity <= 0] = -1
@@ -69,7 +69,7 @@ def tile_lists(splats, settings, mode):
     zero = torch.zeros_like(grid)
     first = torch.floor((splats.position - reach) / TILE).clamp(zero, grid)
     past = (torch.floor((splats.position + reach) / TILE) + 1).clamp(zero, grid)
-    if mode == "alpha":
+    if mode in ("alpha", "smoe"):
         rectangle_first, rectangle_past = reference.tile_rectangle(splats, settings)
         first, past = torch.maximum(first, rectangle_first), torch.minimum(past, rectangle_past)
     first, size = first.long(), (past - first).clamp(min=0).long()
@@ -124,12 +124,13 @@ def blend_tile(rows, x, y, settings, mode):
     kernel = torch.exp(power)
     raw = opacity * kernel
     with torch.no_grad():
-        skipped = raw < reference.ALPHA_MIN if mode == "alpha" else kernel < reference.KERNEL_MIN
+        if mode in ("alpha", "smoe"):
+            skipped = raw < (reference.ALPHA_MIN if mode == "alpha" else max(reference.STRONG_MIN, settings.alpha_min))
+        else:
+            skipped = (kernel < reference.KERNEL_MIN) | (raw < settings.alpha_min)
         skipped |= power > 0
-        gate = resolve_background_gate(mode, settings.background_gate)
-        if mode != "alpha" and settings.alpha_min > 0:
-            skipped |= raw < settings.alpha_min
-        if mode == "smoe" and gate > 0:
+        gate = reference.mode_and_gate(settings)[1]
+        if mode == "smoe_eq7" and gate > 0:
             least = float(torch.tensor(gate, dtype=torch.float32) * reference.ALPHA_MIN)  # rounded as float32
             skipped |= raw < (opacity * reference.KERNEL_KEPT).clamp(max=least)
     alpha = reference._PassThroughClamp.apply(raw.masked_fill(skipped, 0))
@@ -144,10 +145,15 @@ def blend_tile(rows, x, y, settings, mode):
     if mode == "alpha":
         blended = weight @ (color - settings.bg) + settings.bg  # the transmittance left over is 1 - sum of weights
     else:
-        gate_sum = (weight if mode == "smoe" else alpha).sum(1, keepdim=True)
+        gate_sum = (weight if mode in ("smoe", "smoe_eq7") else alpha).sum(1, keepdim=True)
         background = gate * (1 - gate_sum)
+        if mode == "smoe":
+            with torch.no_grad():
+                tails = raw.masked_fill(~skipped | (power > 0) | (raw < reference.TAIL_MIN) | stopped, 0)
+                tails = (tails * transmittance).sum(1, keepdim=True)
+                background = background + tails.masked_fill(gate_sum >= settings.tails_below, 0)
         total = gate_sum + background
-        has_gate = total >= reference.GATE_SUM_MIN
+        has_gate = gate_sum >= reference.GATE_SUM_MIN
         blended = weight @ color + background * settings.bg
         blended = torch.where(has_gate, blended / total.masked_fill(~has_gate, 1), settings.bg)
     return blended.T.reshape(-1, len(y), len(x))

@@ -220,9 +220,12 @@ class TrainConfig:
     def save(self, folder: str) -> None:
         """Writes OUT/config.json, with the scene's absolute path."""
         scene = os.path.abspath(self.scene) if self.scene else ""
-        values = {**dataclasses.asdict(self), "scene": scene, "blend_mode": record_of(str(self.blend_mode))}
-        text = json.dumps(values, indent=2) + "\n"
+        text = json.dumps({**self.record(), "scene": scene}, indent=2) + "\n"
         write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
+
+    def record(self) -> Dict[str, Any]:
+        """The options as files hold them: what `of_record` reads."""
+        return {**dataclasses.asdict(self), "blend_mode": record_of(str(self.blend_mode))}
 
     @classmethod
     def of_record(cls, values: Dict[str, Any]) -> TrainConfig:

@@ -103,8 +103,8 @@ def threshold_margin(scene):
             counts = reference.pair_counts(splats, x, y, settings, mode, gate)
             alpha = reference.pair_alphas(splats, x, y, counts)
             distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
-        if mode == "smoe":
+        if mode == "smoe" and settings.tails_below > 0:
             weight = reference.numerator(alpha, mode)[0].sum(0, keepdim=True)
-            distances.append(weight.clamp(min=1e-300).log() - math.log(max(settings.tails_below, 1e-300)))
+            distances.append(weight.clamp(min=1e-300).log() - math.log(settings.tails_below))
         nearest = torch.cat([torch.full_like(x, math.inf)[None]] + [distance.abs() for distance in distances]).min(0)[0]
     return nearest.reshape(settings.image_height, settings.image_width)

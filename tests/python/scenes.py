@@ -75,6 +75,11 @@ class Scene(NamedTuple):
         return {name: tensor for name, tensor in {**self.inputs, **self.camera()}.items() if tensor.requires_grad}
 
 
+def without_tails(scene):
+    """Returns the scene without the tails of `smoe`, whose sum the gradients hold constant: for finite differences."""
+    return scene.with_settings(tails_below=0.0)
+
+
 def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, principal_point=(0.0, 0.0), degree=0, bg=None,
                     dtype=torch.float64, blend_mode=None, **fields):
     """Returns settings of a camera that looks from position to the origin, matrices transposed as trainers pass them.
@@ -175,6 +180,11 @@ def gradients(function, scene, outputs=(), camera=True):
     values = torch.autograd.grad(images, list(leaves.values()), weights, allow_unused=True)
     return rendering, {name: torch.zeros_like(leaf) if value is None else value
                        for (name, leaf), value in zip(leaves.items(), values)}
+
+
+def transmittance_of(scene):
+    """Returns T behind the last pair of each pixel [H, W]."""
+    return op_results(scene)[1]["final_transmittance"].reshape(scene.settings.image_height, -1)
 
 
 def op_arguments(scene, op="rasterize", **others):

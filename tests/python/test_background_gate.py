@@ -17,7 +17,7 @@ from scenes import Scene, gradients, random_scene
 
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization import settings as settings_module
-from diff_smoe_rasterization.settings import BLEND_MODES, OUTPUTS
+from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES, OUTPUTS
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -258,17 +258,17 @@ def test_the_common_factor_of_all_opacities_has_a_gradient():
     assert abs(slopes[0.0]) < 1e-3 and slopes[0.05] > 0
 
 
-def test_the_environment_is_for_smoe_alone(function, monkeypatch):
+def test_the_environment_is_for_gated_modes(function, monkeypatch):
     scene = random_scene("smoe_eq7", 30, 24, 20, degree=1)
 
     def color(mode, **fields):
         return function(settings=scene.settings._replace(blend_mode=mode, **fields), **scene.inputs).color
 
     without = {mode: color(mode) for mode in BLEND_MODES}
-    gated = color("smoe_eq7", background_gate=0.2)
+    gated = {mode: color(mode, background_gate=0.2) for mode in GATED_MODES}
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.2")
     for mode in BLEND_MODES:
-        assert torch.equal(color(mode), gated if mode == "smoe_eq7" else without[mode])
+        assert torch.equal(color(mode), gated.get(mode, without[mode]))
     assert torch.equal(color("smoe_eq7", background_gate=0.0), without["smoe_eq7"]), "what is given wins"
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "1")
     assert torch.equal(color("smoe_eq7"), without["alpha"])

@@ -29,16 +29,16 @@ def same_number_of_threads_afterwards():
 def test_the_command_measures_every_case(tmp_path, capsys):
     path = tmp_path / "out.json"
     assert cpu_rasterizer.main(["--synthetic", "300", "--repeats", "1", "--threads", "1,2",
-                                "--modes", "alpha,smoe,smoe:0.5", "--no-memory", "--json", str(path)]) == 0
+                                "--modes", "alpha,smoe_eq7,smoe_eq7:0.5", "--no-memory", "--json", str(path)]) == 0
     rows = {(row["mode"], row["threads"]): row for row in json.loads(path.read_text(encoding="utf-8"))["rows"]}
-    assert sorted(rows) == [(mode, threads) for mode in ("alpha", "smoe", "smoe:0.5") for threads in (1, 2)]
+    assert sorted(rows) == [(mode, threads) for mode in ("alpha", "smoe_eq7", "smoe_eq7:0.5") for threads in (1, 2)]
     for row in rows.values():
         stages = [row[name] for name in cpu_rasterizer.STAGES]
         assert min(stages) > 0
         assert sum(stages) <= row["total"]
         # A gate reaches 4.8 sigma, an alpha at most 3.33, the background's gate lies between. Threads change nothing.
-        assert 0 < rows["alpha", 1]["forward_pairs"] < rows["smoe:0.5", 1]["forward_pairs"]
-        assert rows["smoe:0.5", 1]["forward_pairs"] < rows["smoe", 1]["forward_pairs"]
+        assert 0 < rows["alpha", 1]["forward_pairs"] < rows["smoe_eq7:0.5", 1]["forward_pairs"]
+        assert rows["smoe_eq7:0.5", 1]["forward_pairs"] < rows["smoe_eq7", 1]["forward_pairs"]
         assert row["forward_pairs"] == rows[row["mode"], 1]["forward_pairs"]
     assert "times the floor" in capsys.readouterr().out
 

@@ -8,7 +8,7 @@ import torch
 from by_hand import facing_camera, on_axis
 from comparison import assert_close, assert_same_gradients, one_thread
 from devices import default_device, on_the_cpu, random_normal
-from scenes import gate_of, gradients, random_scene, with_gate, with_gates
+from scenes import blend_of, gate_of, gradients, random_scene, transmittance_of, with_gate, with_gates
 
 from diff_smoe_rasterization import Contributions, rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.settings import OUTPUTS
@@ -86,6 +86,8 @@ def test_the_pairs_are_those_that_the_image_was_blended_of(mode, dtype):
     rendering, splats = rasterize_with_splats(settings=scene.settings, outputs=("alpha",), **scene.inputs)
     blended = rendering.color > 0
     denominator = rendering.alpha + gate_of(mode) * (1 - rendering.alpha)
+    if blend_of(mode) == "smoe":  # whose alpha is W / D, with W = 1 - T
+        denominator = (1 - transmittance_of(scene)) / rendering.alpha.clamp(min=1e-30)
     weights = (rendering.color * denominator).double()
     y, x = torch.meshgrid(torch.arange(43), torch.arange(61), indexing="ij")
     centers = splats.centers.double()[:, :, None, None]
@@ -118,8 +120,12 @@ def test_two_gaussians_by_hand(mode):
                 exponent = -0.5 * ((x - center_x) ** 2 / (variance * (width / 2 / depth) ** 2 + 0.3)
                                    + (y - center_y) ** 2 / (variance * (height / 2 / depth) ** 2 + 0.3))
                 alpha = opacity * math.exp(exponent)
-                faint = alpha < gate_of(mode) / 255 and (mode == "alpha" or exponent < -4.5)
-                if faint or mode != "alpha" and exponent < math.log(1e-5):
+                if blend_of(mode) == "smoe":
+                    faint = alpha < 1 / 2040
+                else:
+                    faint = alpha < gate_of(mode) / 255 and (mode == "alpha" or exponent < -4.5)
+                    faint |= mode != "alpha" and exponent < math.log(1e-5)
+                if faint:
                     continue
                 weight = alpha if mode == "smoe_std" else alpha * transmittance
                 distance = math.hypot(x - center_x, y - center_y)

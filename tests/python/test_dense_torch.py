@@ -40,7 +40,7 @@ def compare(mode, gate=None, **scene_options):
     assert torch.equal(rendered, image)
 
 
-@pytest.mark.parametrize("mode, gate", [*((mode, None) for mode in BLEND_MODES), ("smoe", 0.05)])
+@pytest.mark.parametrize("mode, gate", [*((mode, None) for mode in BLEND_MODES), ("smoe_eq7", 0.05)])
 def test_image_and_gradients_are_those_of_the_reference(mode, gate):
     compare(mode, gate)
 

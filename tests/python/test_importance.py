@@ -6,9 +6,17 @@ import torch
 from by_hand import facing_camera, on_axis
 from comparison import assert_close, one_thread
 from devices import on_the_cpu, random_normal
-from scenes import BACKGROUND_GATES, REMOVABLE_MODES, gate_of, random_scene, with_removal
+from scenes import (
+    BACKGROUND_GATES,
+    REMOVABLE_MODES,
+    blend_of,
+    gate_of,
+    random_scene,
+    transmittance_of,
+    with_removal,
+)
 
-from diff_smoe_rasterization import Importance, rasterize, rasterize_with_splats, reference
+from diff_smoe_rasterization import Importance, rasterize_with_splats, reference
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -47,8 +55,7 @@ def expected_of(scene, *maps):
 def without_full_pixels(scene):
     """The scene with opacities at which no pixel is full: the removal's image is then known wherever it is seen."""
     scene = scene.with_inputs(opacities=scene.inputs["opacities"] * 0.15)
-    rendering = rasterize(settings=scene.settings, outputs=("alpha",), **scene.inputs)
-    assert scene.settings.blend_mode not in ("alpha", "smoe") or (rendering.alpha < 1 - 1e-3).all()
+    assert (transmittance_of(scene) > 1e-3).all()
     return scene
 
 
@@ -65,19 +72,19 @@ def test_equals_the_image_blended_again_without_each_gaussian(mode, name):
     assert (expected.removal_costs > 0).sum() > 5
 
 
-@pytest.mark.parametrize("mode", ["alpha", "smoe", "smoe_learned_gate"])
+@pytest.mark.parametrize("mode", ["alpha", "smoe", "smoe_eq7", "smoe_learned_gate"])
 def test_full_pixels_hide_no_more_than_they_may_reveal(mode):
     """Behind a full pixel nothing is known: its image without a Gaussian may take more, of a weight below T'."""
     scene = random_scene(mode, 150, 20, 16, scale=0.5, opacity=(0.5, 0.9), channels=3)
     scene = scene.with_inputs(colors_precomp=scene.inputs["colors_precomp"].sigmoid())
     scene = scene.with_settings(bg=scene.settings.bg.sigmoid())
     ones = torch.ones(16, 20, dtype=torch.float64)
-    rendering, splats = rasterize_with_splats(settings=scene.settings, outputs=("alpha",), **scene.inputs)
+    splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1]
     actual, expected = splats.importance(ones), expected_of(scene, ones, ones)
     assert_close(actual.shares, expected.shares, TOLERANCE, "shares")
     # A pixel stops where a pair of alpha <= 0.9 would lead below 1e-4, so at T < 1e-3. Without a Gaussian that is 10 T
     # at most, of colours that differ by sqrt(3) at most; D' is 0.99 at least there.
-    transmittance = 1 - rendering.alpha
+    transmittance = transmittance_of(scene)
     may_reveal = 10 * transmittance[transmittance < 1e-3] * 3**0.5 / 0.99
     assert len(may_reveal) > 10
     difference = (actual.removal_costs.cpu().sqrt() - expected.removal_costs.sqrt()).abs()
@@ -133,9 +140,12 @@ def test_shares_and_the_backgrounds_make_one(mode):
     if mode == "smoe_tn":
         assert total < (alpha > 0).sum()
         return
-    shares = alpha if mode == "alpha" else torch.where(alpha > 0, alpha / (alpha + gate * (1 - alpha)).clamp(1e-30), 0.)
     if mode == "smoe_std":
         shares = (alpha > 0).to(alpha)
+    elif blend_of(mode) in ("alpha", "smoe"):
+        shares = alpha
+    else:
+        shares = torch.where(alpha > 0, alpha / (alpha + gate * (1 - alpha)).clamp(1e-30), 0.)
     assert_close(total, shares.sum(), 1e-12, "sum of shares")
 
 

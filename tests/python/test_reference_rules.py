@@ -7,7 +7,7 @@ import pytest
 import torch
 from by_hand import facing_camera, middle, on_axis
 from comparison import assert_close
-from scenes import gate_of, with_gate, with_gates
+from scenes import blend_of, gate_of, with_gate, with_gates
 
 from diff_smoe_rasterization import reference
 
@@ -26,6 +26,14 @@ def splat_at(x, y, variance2D):
     return inputs
 
 
+WITHIN_TILES = ("alpha", "smoe")  # modes in which the tile rectangle of 3DGS bounds a footprint
+
+
+def least_kernel(mode, opacity):
+    """The least G that counts, beyond 3 sigma."""
+    return 1 / 2040 / opacity if blend_of(mode) == "smoe" else max(1e-5, gate_of(mode) / 255 / opacity)
+
+
 def render(mode, inputs, outputs=(), **fields):
     settings = facing_camera(mode, WIDTH, WIDTH, bg=(0.0,))._replace(**fields)
     return reference.rasterize(settings=settings, outputs=outputs, **inputs)
@@ -35,14 +43,17 @@ def render(mode, inputs, outputs=(), **fields):
 @pytest.mark.parametrize("excess, counts", [(1.01, True), (0.99, False)])
 def test_the_cut_off_of_a_pair(mode, excess, counts):
     distance, opacity = 10, 0.5
-    kernel = excess * max(1e-5, gate_of(mode) / 255 / opacity)
+    kernel = excess * least_kernel(mode, opacity)
     inputs = splat_at(20, 31, distance ** 2 / (-2 * math.log(kernel)))
     inputs["opacities"][:] = opacity
     alpha = render(mode, inputs, ("alpha",)).alpha[0, 31]
     assert kernel < math.exp(-4.5)  # beyond 3 sigma, where a background gate may cut
+    expected = opacity * kernel if counts else 0
+    if blend_of(mode) == "smoe":
+        expected /= expected + gate_of(mode) * (1 - expected) or 1
     # 1e-5: the position is divided by w + 1e-7, which moves it by 1e-6 px.
-    assert alpha[30].item() == pytest.approx(opacity * kernel if counts else 0, rel=1e-5)
-    assert alpha[10].item() == pytest.approx(opacity * kernel if counts else 0, rel=1e-5)
+    assert alpha[30].item() == pytest.approx(expected, rel=1e-5)
+    assert alpha[10].item() == pytest.approx(expected, rel=1e-5)
     assert alpha[29] > 0 and alpha[31] == 0
 
 
@@ -65,7 +76,7 @@ def test_alpha_stays_in_the_tile_rectangle_of_3dgs(mode):
         column = render(mode, splat_at(31, center, 100.0), ("alpha",)).alpha[0, :, 31]
         for line in (row, column):
             assert line[inside] > 0
-            assert (line[outside] > 0) == (mode != "alpha")
+            assert (line[outside] > 0) == (blend_of(mode) not in WITHIN_TILES)
 
 
 def test_the_truncation_of_3dgs_equals_the_floor_on_the_grid():
@@ -85,8 +96,9 @@ def test_the_truncation_of_3dgs_equals_the_floor_on_the_grid():
 @pytest.mark.parametrize("side", ["left", "right", "above", "below"])
 def test_the_footprint_decides_whether_a_radius_is_zero(mode, side):
     # Variance 9: the radius is ceil(3 sqrt(9 + sqrt(0.1))) = 10, G = 1e-5 lies at 3 sqrt(2 ln 1e5) = 14.395.
-    low, high = (-8.9, -9.1) if mode == "alpha" else (-14.3, -14.5)  # alpha: (-9 + 10 + 15) / 16 = 1
-    far_low, far_high = (73.9, 74.1) if mode == "alpha" else (63 + 14.3, 63 + 14.5)  # (74 - 10) / 16 = 4
+    within = blend_of(mode) in WITHIN_TILES
+    low, high = (-8.9, -9.1) if within else (-14.3, -14.5)  # tiles: (-9 + 10 + 15) / 16 = 1
+    far_low, far_high = (73.9, 74.1) if within else (63 + 14.3, 63 + 14.5)  # (74 - 10) / 16 = 4
     touching, missing = (low, high) if side in ("left", "above") else (far_low, far_high)
     for position, radius in ((touching, 10), (missing, 0)):
         x, y = (position, 30) if side in ("left", "right") else (30, position)
@@ -100,7 +112,7 @@ def test_a_tilted_footprint_is_tested_as_an_ellipse():
     unit = (DEPTH / (WIDTH / 2)) ** 2
     for sign, visible in ((1, True), (-1, False)):
         inputs["cov3D_precomp"] = unit * torch.tensor([[50.2, sign * 49.5, 0, 50.2, 0, 0]], dtype=torch.float64)
-        assert bool(render("smoe", inputs).radii[0] > 0) == visible
+        assert bool(render("smoe_eq7", inputs).radii[0] > 0) == visible
         assert bool(render("alpha", inputs).radii[0] > 0)  # the square of 3DGS
 
 
@@ -159,7 +171,7 @@ def test_a_pixel_beyond_the_cut_off_shows_the_background(mode):
     settings = facing_camera(mode, 41, 41)
     image = reference.rasterize(settings=settings, **on_axis([2.0], [0.6], [[1.0, 1.0, 1.0]], variance=0.01)).color
     sigma = math.sqrt(0.01 * (41 / 4) ** 2 + 0.3)
-    reach = sigma * math.sqrt(-2 * math.log(max(1e-5, gate_of(mode) / 255 / 0.6)))
+    reach = sigma * math.sqrt(-2 * math.log(least_kernel(mode, 0.6)))
     row = (image[0, 20, 20:] - 0.1).abs() > 1e-9
     assert row.tolist() == [distance <= reach for distance in range(21)]
 

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import os
 import re
@@ -197,7 +196,7 @@ class Trainer:
     def state_dict(self) -> Dict[str, Any]:
         """Everything the rest of the run depends on, as tensors and plain values."""
         return {
-            "config": dataclasses.asdict(self.config),
+            "config": self.config.record(),
             "scene": scene_fingerprint(self.scene),
             "iteration": self.iteration,
             "train_seconds": self.watch.seconds,

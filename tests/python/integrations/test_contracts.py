@@ -251,7 +251,7 @@ def test_counts_of_pixels(mode):
     assert not rendered(fastgs, scene, {"get_flag": False})[2].any()
 
 
-@pytest.mark.parametrize("mode", REMOVABLE_MODES)
+@pytest.mark.parametrize("mode", [mode for mode in REMOVABLE_MODES if mode != "smoe"])  # which holds its tails constant
 def test_scores_are_what_a_removal_changes(mode):
     """Each Gaussian is left out in turn."""
     scene = random_scene(mode, 6, WIDTH, HEIGHT, seed=1, scale=0.3, opacity=(0.3, 0.8), degree=1)

@@ -59,17 +59,17 @@ def test_scales_may_be_three_of_six_columns(mode):
 
 
 def test_the_blend_mode_decides_what_is_seen(monkeypatch):
-    """A footprint reaches further under SMoE modes: 4.8 sigma in place of tiles around 3."""
+    """A footprint reaches further where G cuts it: 4.8 sigma in place of tiles around 3."""
     def radii(scene, **settings):
         return GaussianRasterizer(scene.settings._replace(**settings)).visible_filter(
             **shape_of(scene, "means3D", "scales", "rotations"))
 
     scene = random_scene(None, 2000, 45, 30, seed=24)
-    alpha, smoe = radii(scene), radii(scene, blend_mode="smoe")
+    alpha, smoe = radii(scene), radii(scene, blend_mode="smoe_eq7")
     assert ((smoe > 0) != (alpha > 0)).any()
     both = (smoe > 0) & (alpha > 0)
     assert torch.equal(alpha[both], smoe[both])
-    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe")
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe_eq7")
     assert torch.equal(radii(scene), smoe)
 
 

@@ -155,11 +155,11 @@ def test_a_decision_looks_at_the_first_of_each_group_of_neighbours(tiny_config):
     assert len(beginnings) > 2
 
 
-@pytest.mark.parametrize("mode", ["alpha", "smoe"])
+@pytest.mark.parametrize("mode", ["alpha", "smoe_eq7"])
 def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
     """The cost of a Gaussian, and all errors together, against renderings of all training views."""
     trainer = trainer_of(tiny_config, schedule="gate", budget=60, blend_mode=mode,
-                         **({"background_gate": 0.05} if mode == "smoe" else {}))
+                         **({"background_gate": 0.05} if mode == "smoe_eq7" else {}))
     with torch.no_grad():
         trainer.model.raw["opacities"] -= 1.0  # no pixel is full
     strategy = looking(trainer, monkeypatch)
@@ -169,7 +169,7 @@ def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
     def images(rows):
         model, (opacities, scales, rotations) = trainer.model, trainer.model.activated()
         settings = [view.camera.settings(trainer.renderer.background, 0, mode)._replace(
-            background_gate=0.05 if mode == "smoe" else None) for view in trainer.scene.train]
+            background_gate=0.05 if mode == "smoe_eq7" else None) for view in trainer.scene.train]
         return [rasterize(model.raw["means3D"][rows], opacities[rows], one, shs=model.raw["dc"][rows],
                           scales=scales[rows], rotations=rotations[rows]).color for one in settings]
 
