@@ -13,11 +13,11 @@ from scenes import camera_settings, random_scene, with_gates
 
 from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.integrations.gsplat import (
-from diff_smoe_rasterization.settings import BLEND_MODES
     compute_relocation,
     quat_scale_to_covar_preci,
     rasterization,
 )
+from diff_smoe_rasterization.settings import BLEND_MODES
 
 pytestmark = pytest.mark.usefixtures("device")
 
