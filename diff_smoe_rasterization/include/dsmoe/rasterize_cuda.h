@@ -48,7 +48,8 @@ template <class S> struct DeviceCamera {
 DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features + 3) / 4 * 4; }
 
 // The backward pass of float and kFastFeatures features walks lists longer than this in segments. All others it walks
-// whole.
+// whole, and all lists where Run::deterministic is set: a segment begins with another rounding of T than a whole walk
+// has there, and lists that do not fit their memory have no segments.
 constexpr int kSegmentLength = 512;
 constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kFastFeatures);  // numbers
 DSMOE_HD constexpr int64_t num_segment_rows(int64_t capacity) { return capacity / kSegmentLength + 1; }
@@ -116,7 +117,8 @@ template <class S> using Frame = RenderingFrame<S, DeviceCamera<S>, SavedForward
 // How a pass runs.
 struct Run {
   cudaStream_t stream = nullptr;
-  bool deterministic = false;   // backward: gradients are equal bit for bit from run to run; slower
+  bool deterministic = false;   // backward: gradients are equal bit for bit from run to run, whatever was rendered
+                                // before; slower
   bool for_backward = true;     // false: what only makes a backward pass faster is left out
   StageTimes* times = nullptr;  // is added to, or null; the pass then waits for its kernels
 };
@@ -160,7 +162,8 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run)
   sizes.num_features = frame.config.num_features();
   sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
   sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
-  sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
+  sizes.segments =
+      run.for_backward && !run.deterministic && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
   return sizes;
 }
 
