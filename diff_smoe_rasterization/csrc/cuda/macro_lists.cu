@@ -346,18 +346,18 @@ struct TileOffsetArguments {
 // Adds up the tiles before each tile, and those that come before each class of lengths.
 __global__ void __launch_bounds__(kSortBlock)
     add_up_tiles_kernel(const __grid_constant__ TileOffsetArguments arguments) {
-  __shared__ uint32_t warp_sums[kSortBlock / kWarp], classes[kLengthClasses];
-  __shared__ unsigned long long shared_before;
+  __shared__ uint32_t classes[kLengthClasses];
+  __shared__ unsigned long long warp_sums[kSortBlock / kWarp], shared_before;
   __shared__ unsigned shared_block;
   if (threadIdx.x == 0) shared_block = take_block_number(arguments.look_back);
   if (threadIdx.x < kLengthClasses) classes[threadIdx.x] = 0;
   __syncthreads();
   const unsigned block = shared_block;
   const int64_t tile = int64_t(block) * kSortBlock + threadIdx.x;
-  uint32_t total;
-  const uint32_t own = tile < arguments.tiles ? arguments.counts[tile] : 0;
-  if (tile < arguments.tiles) atomicAdd(&classes[length_class(own)], 1u);
-  const uint32_t before = sum_before_thread(own, warp_sums, total);  // waits for the classes too
+  unsigned long long total;  // 256 tiles may have more than 2^32 instances
+  const unsigned long long own = tile < arguments.tiles ? arguments.counts[tile] : 0;
+  if (tile < arguments.tiles) atomicAdd(&classes[length_class(static_cast<int64_t>(own))], 1u);
+  const unsigned long long before = sum_before_thread(own, warp_sums, total);  // waits for the classes too
   if (threadIdx.x < kLengthClasses) {
     uint32_t longer = 0;
     for (unsigned c = 0; c < threadIdx.x; ++c) longer += classes[c];
