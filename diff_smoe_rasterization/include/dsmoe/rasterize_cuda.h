@@ -210,7 +210,9 @@ template <class S> void key_footprints(const Frame<S>& frame, DepthBits<S>* dept
 // Fills frame.saved.order and frame.saved.num_ordered.
 template <class S> void sort_by_depth(const Frame<S>& frame, const DepthBits<S>* depths, const Work& work);
 
-// Fills only frame.saved.num_instances, for a caller that wants exactly as much memory as is needed.
+// Fills only frame.saved.num_instances, for a caller that wants as much memory as is needed: with the number of
+// instances or, where that is more, of entries in the lists of macro tiles (csrc/cuda/macro_lists.cu). work.scratch is
+// needed.
 template <class S> void count_instances(const Frame<S>& frame, const Work& work);
 
 // Fills saved.num_instances, instances, tile_offsets and tile_order of the frame, and empties segment_queue.

@@ -293,6 +293,63 @@ TYPED_TEST(KernelsIn, EqualTheCpuWhereLittleIsSeen) {
   this->expect(make_scene(8, 0, 33, 17));
 }
 
+// A needle along the diagonal passes by macro tiles whose tiles it does not meet.
+TEST(Kernels, CountTheRoomThatListsOfMacroTilesNeed) {
+  ProjectedGaussian<float> needle = {};
+  const double length = 500, width = 2;  // standard deviations, pixels
+  const auto along = static_cast<float>(1 / (length * length)), across = static_cast<float>(1 / (width * width));
+  needle.mean = {512, 512};
+  needle.conic = {(along + across) / 2, (along - across) / 2, (along + across) / 2};
+  needle.opacity = 0.5f, needle.squared_reach = 4;
+  int32_t order = 0, radius = 1000;
+  const int64_t tiles = 64 * 64;
+  std::vector<int64_t> tile_offsets(tiles + 3);
+  std::vector<int32_t> tile_order(tiles), instances(1000);
+  cuda::Frame<float> frame = {};
+  frame.inputs.num_gaussians = 1;
+  frame.camera.width = frame.camera.height = 1024;
+  frame.images.radii = &radius;
+  frame.saved.projected = &needle, frame.saved.order = &order;
+  frame.saved.tile_offsets = tile_offsets.data(), frame.saved.tile_order = tile_order.data();
+  frame.saved.instances = instances.data();
+  cuda::SavedSizes sizes;
+  sizes.tiles = tiles, sizes.capacity = static_cast<int64_t>(instances.size());
+  cuda::complete(frame.saved, sizes);
+  *frame.saved.num_ordered = 1;
+  cuda::StreamMemory memory(nullptr);
+  cuda::count_instances(frame, {nullptr, &memory});
+  const int64_t room = *frame.saved.num_instances;
+  EXPECT_EQ(room, 16 * 16) << "macro tiles";
+  cuda::bin(frame, {nullptr, &memory});
+  EXPECT_EQ(*frame.saved.num_instances, room);
+  EXPECT_LT(tile_offsets[tiles], room) << "else this is no such needle";
+  frame.saved.capacity = room;
+  cuda::bin(frame, {nullptr, &memory});
+  EXPECT_GT(tile_offsets[tiles], 0) << "the lists fit";
+}
+
+TEST(Kernels, OrderFootprintsByTheirDepthsAlsoNegativeOnes) {
+  std::vector<ProjectedGaussian<float>> projected;
+  for (const float depth : {2.0f, -4.0f, 0.0f, 5.0f, -0.0f, -4.5f, 1e-40f, 2.0f}) {
+    projected.push_back({}), projected.back().depth = depth;
+  }
+  const auto count = static_cast<int64_t>(projected.size());
+  std::vector<int32_t> radii(count, 1), order(count, -1);
+  std::vector<DepthBits<float>> keys(count);
+  int64_t ordered = -1;
+  radii[3] = 0;  // culled
+  cuda::Frame<float> frame = {};
+  frame.inputs.num_gaussians = count;
+  frame.saved.projected = projected.data(), frame.saved.order = order.data(), frame.saved.num_ordered = &ordered;
+  frame.images.radii = radii.data();
+  cuda::StreamMemory memory(nullptr);
+  cuda::key_footprints(frame, keys.data(), {nullptr, &memory});
+  cuda::sort_by_depth(frame, keys.data(), {nullptr, &memory});
+  ASSERT_EQ(ordered, count - 1);
+  order.resize(ordered);
+  EXPECT_EQ(order, (std::vector<int32_t>{5, 1, 2, 4, 6, 0, 7}));
+}
+
 // Where pixels do not stop, both passes evaluate all pairs of the entries that meet a square.
 TEST(Kernels, CountThePairsOfBothPasses) {
   Scene<double> scene = long_lists();
