@@ -194,6 +194,7 @@ struct Work {
   cudaStream_t stream = nullptr;
   Scratch* scratch = nullptr;           // for memory between its kernels
   unsigned long long* pairs = nullptr;  // in device memory; (Gaussian, pixel) pairs evaluated are added to it; or null
+  bool deterministic = false;  // sums of `contributions` and `importance` are equal bit for bit from run to run
 };
 
 // Fills frame.saved.projected, frame.saved.features, frame.images.radii and depths. depths: [N] what the depth sort
@@ -242,9 +243,10 @@ template <class S> void finish_records(const Frame<S>& frame, const BackwardPass
 template <class S> void project_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
-// may differ in their last digits from call to call. Of the frame it reads the number of Gaussians, the image's size,
-// of config the mode, alpha_min, the background's gate and most_instances, of images the radii, and of saved neither
-// features nor images but last_contributor. work.scratch is needed, here and in the next two.
+// may differ in their last digits from call to call, unless work.deterministic is set. Then it walks twice, and takes
+// 36 bytes more for each Gaussian. Of the frame it reads the number of Gaussians, the image's size, of config the mode,
+// alpha_min, the background's gate and most_instances, of images the radii, and of saved neither features nor images
+// but last_contributor. work.scratch is needed, here and in the next two.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work);
 
 // Walks the tile lists once more, and sums what each Gaussian is worth to the image, by atomics as `contributions`.

@@ -126,7 +126,7 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   }
   const TileGrid grid(camera.width, camera.height);
   if (frame.saved.capacity > 0) expect_longest_first(frame.saved, int64_t(grid.columns) * grid.rows);
-  const cuda::Work work = {nullptr, &memory};
+  const cuda::Work work = {nullptr, &memory, nullptr, how.deterministic};
   if (how.weighs) {
     out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
       cuda::contributions(frame, contributions, work);
@@ -206,10 +206,10 @@ Scene<double> with_degree_3(Scene<double> scene, bool dc_apart) {
   return scene;
 }
 
-// Four tiles whose lists have two or three segments.
-Scene<double> long_lists() {
+// Four tiles whose lists have two or three segments, or other numbers.
+Scene<double> long_lists(int count = 1300, int width = 19, int height = 18) {
   Random random(6);
-  Scene<double> scene = make_scene(6, 1300, 19, 18);
+  Scene<double> scene = make_scene(6, count, width, height);
   for (double& x : scene.means3D) x = random.uniform(-0.6, 0.6);
   for (double& scale : scene.scales) scale = random.uniform(0.2, 0.4);
   for (double& opacity : scene.opacities) opacity = random.uniform(0.004, 0.02);
@@ -284,6 +284,20 @@ TYPED_TEST(KernelsIn, EqualTheCpuBehindAVeil) { this->expect(wall_behind_a_veil(
 TYPED_TEST(KernelsIn, EqualTheCpuInBands) { this->expect(crowd(), {false, 60}); }
 
 TYPED_TEST(KernelsIn, EqualTheCpuWhereListsDoNotFit) { this->expect(crowd(), {false, kMostInstances, true}); }
+
+TYPED_TEST(KernelsIn, EqualTheCpuDeterministically) {
+  this->expect(crowd(), {true});
+}
+
+TYPED_TEST(KernelsIn, GiveTheSameBitsDeterministicallyWhetherListsFitOrNot) {
+  const Scene<float> scene = convert<float>(in_mode<TypeParam::value>(long_lists(700, 16, 8)).back());
+  const std::vector<bool> all_sure(scene.pixels(), false);
+  Results<float> fit = by_kernels(scene, all_sure, {true});
+  Results<float> overflow = by_kernels(scene, all_sure, {true, kMostInstances, true});
+  EXPECT_EQ(overflow.rendering.color, fit.rendering.color);
+  EXPECT_EQ(overflow.all_gradients(), fit.all_gradients());
+  EXPECT_EQ(overflow.worth, fit.worth);
+}
 
 TYPED_TEST(KernelsIn, EqualTheCpuWhereLittleIsSeen) {
   this->expect(make_scene(8, 3, 1, 1));
@@ -370,6 +384,7 @@ TEST(Kernels, GiveTheSameBitsInEveryOrder) {
       Results<float> other = by_kernels(scene, all_sure, {true});
       EXPECT_EQ(other.rendering.color, first.rendering.color);
       EXPECT_EQ(other.all_gradients(), first.all_gradients());
+      EXPECT_EQ(other.worth, first.worth);
     }
     emulator::run_in(emulator::Order::kForward);
   }
