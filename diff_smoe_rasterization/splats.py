@@ -44,8 +44,8 @@ class Splats:
         """Sums a map over the pixels of each Gaussian, and what else `Contributions` names.
 
         pixel_weights: [H, W], any numbers, of the Gaussians' type and device. On the CPU the sums are equal bit for bit
-        from call to call and for any number of threads; on CUDA real numbers are added by atomics in any order, and
-        the host does not wait.
+        from call to call and for any number of threads. On CUDA real numbers are added by atomics in any order, unless
+        the settings had `deterministic`, and the host does not wait.
         Raises ValueError or TypeError where pixel_weights does not fit.
         """
         _check_map("contributions", "pixel_weights", pixel_weights)

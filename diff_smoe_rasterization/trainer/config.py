@@ -80,7 +80,8 @@ class TrainConfig:
     sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
     deterministic: bool = _option(
-        False, "cuda: gradients of a step equal bit for bit from run to run, and for any number of GPUs; slower")
+        False, "cuda: gradients of a step, and the scores of `gate`, equal bit for bit from run to run, and for any "
+               "number of GPUs; slower")
 
     lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
     position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")

@@ -90,6 +90,21 @@ def test_of_equal_depths_the_first_is_in_front():
     assert center[0] > 0.8 and center[2] < 0.3  # 0.9, and what is left of 1
 
 
+@pytest.mark.parametrize("depths", [(-4.0, 2.0), (-2.0, -1.0), (-0.5, 0.0)])
+def test_footprints_of_negative_depths_are_in_front(depths):
+    """Depths that a caller makes may be negative. Red is nearer, and the second footprint."""
+    scene = random_scene("alpha", 1, scale=0.5, opacity=(0.9, 0.9))
+    scene.inputs["means3D"][:] = 0
+    footprint = project_gaussians(settings=scene.settings, **scene.inputs)
+    twice = Footprints.joined([footprint, footprint])
+    gates = twice.gates.clone()
+    gates[:, 7] = gates.new_tensor(depths[::-1])
+    green, red = (twice.features.new_tensor(color) for color in ([0, 1, 0], [1, 0, 0]))
+    center = blend_footprints(Footprints(gates, torch.stack([green, red]), twice.radii),
+                              scene.settings).color[:, 18, 25]
+    assert center[0] > 0.8 and center[1] < 0.3  # 0.9, and what is left of 1
+
+
 def test_gradients_by_footprints_are_those_of_finite_differences(mode):
     """In double, with steps of 1e-6: 1e-7 of rounding, and 1e-5 of the largest gradient for what curves."""
     scene = random_scene(mode, 40)
