@@ -10,11 +10,12 @@ import sys
 from functools import partial
 from typing import IO, Any, Dict, List, Mapping, Optional, Sequence
 
+from ...trainer.system.children import die_with_parent
 from ...trainer.system.files import write_json_atomically, write_text_atomically
 from ...trainer.system.output_folder import make_folder, only_one
 from ..errors import BenchError
 from . import require
-from .cell import die_with_parent, identity
+from .cell import identity
 from .expansion import AXIS_OF, NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
 from .names import CELL_NAME, CELLS_FOLDER, NATIVE, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
 from .preparation import made_scene, prepared_method, what_is_missing

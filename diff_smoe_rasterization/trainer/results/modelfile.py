@@ -10,7 +10,7 @@ from ... import io
 from ...settings import BLEND_MODES, resolve_background_gate
 from ..errors import TrainerError
 from ..model import GaussianModel
-from ..system.files import is_file
+from ..system.files import is_file, new_file
 
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
 
@@ -37,12 +37,13 @@ def trained_model_path(output: str, iterations: int) -> str:
 
 def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float) -> None:
     """Writes the raw parameters, `comment blend_mode NAME` and in `smoe` `comment background_gate VALUE`."""
-    os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
     raw = {name: tensor.detach().cpu().numpy() for name, tensor in model.raw.items()}
-    io.write_gaussians(path, io.Gaussians(
+    gaussians = io.Gaussians(
         means3D=raw["means3D"], dc=raw["dc"], shs=raw["shs"], opacity_logits=raw["opacities"],
         log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=blend_mode,
-        background_gate=background_gate if blend_mode == "smoe" else None))
+        background_gate=background_gate if blend_mode == "smoe" else None)
+    with new_file(path) as temporary:
+        io.write_gaussians(temporary, gaussians)
 
 
 def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:

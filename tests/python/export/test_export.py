@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import struct
 
 import numpy as np
@@ -133,7 +134,8 @@ def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
 @pytest.mark.parametrize("arguments, text", [
     (["-o", "model.obj"], "model.obj: its ending is none of html, ply, splat"),
     (["-o", "model.PLY", "--format", "splat"], "model.PLY: its ending says ply, and --format says splat"),
-    (["-o", "trained.ply"], "is the model itself"),
+    (["-o", "trained.ply"], "trained.ply is there already; --overwrite replaces it"),
+    *((["-o", "trained.ply", "--overwrite", *form], "is the model itself") for form in ([], ["--format", "ply"])),
     (["-o", "a.html", "--blend-mode", "alpha"], "trained with the blend mode smoe, not alpha"),
     (["-o", "a.html", "--background-gate", "0.5"], "trained with the background gate 0.25, not 0.5"),
 ])
@@ -142,6 +144,21 @@ def test_what_cannot_be_written_is_refused(model, tmp_path, monkeypatch, capsys,
     assert main(["export", model, *arguments]) == 1
     assert text in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["trained.ply"]
+
+
+@pytest.mark.parametrize("name", ["thesis.html", "thesis.ply", "thesis.splat"])
+def test_a_file_that_is_there_is_replaced_only_where_asked(model, tmp_path, capsys, name):
+    path = tmp_path / name
+    path.write_text("mine")
+    assert main(["export", model, "-o", str(path)]) == 1
+    assert f"{name} is there already; --overwrite replaces it" in capsys.readouterr().err
+    assert path.read_text() == "mine"
+    assert main(["export", model, "-o", str(path), "--overwrite"]) == 0
+    assert path.stat().st_size > 50 and sorted(os.listdir(tmp_path)) == sorted([name, "trained.ply"])
+    path.unlink()
+    os.mkfifo(path)
+    assert main(["export", model, "-o", str(path), "--overwrite"]) == 1
+    assert "is no regular file" in capsys.readouterr().err and not path.is_file()
 
 
 def test_a_page_refuses_the_ablations(tmp_path, capsys):

@@ -171,12 +171,23 @@ def test_render_writes_into_its_own_folder_alone(trained, scene, tmp_path, capsy
     assert [path.name for path in sorted(own.glob("*.png"))] == ["view_000.png", "view_008.png"], "no other model's"
 
 
-def test_records_that_name_files_elsewhere_are_refused(trained, tmp_path, capsys):
-    (tmp_path / "own").mkdir()
-    for name in ("../mine", "/mine"):
-        (tmp_path / "own" / ".dsmoe.json").write_text(json.dumps(
-            {"command": "dsmoe render", "of": "a scene", "files": [name]}))
-        assert "names files elsewhere" in fails(capsys, "render", trained, "-o", str(tmp_path / "own"))
+@pytest.mark.parametrize("content, words", [
+    *((json.dumps({"command": "dsmoe render", "of": "a scene", "files": [name]}), "names files elsewhere")
+      for name in ("../mine", "/mine", "a\0b")),
+    (json.dumps({"command": "dsmoe render", "of": "a scene", "files": ["link/thesis.pdf"]}), "by a link"),
+    ('{"command": "dsmoe render", "of": 1, "files": []}', "not a record"), ("[]", "not a record"),
+    ('{"command": "dsmoe render", "of": "", "files": [1]}', "not a record"), ("[" * 100_000, "not a record"),
+    ('{"command": ["dsmoe render"], "of": "", "files": "a"}', "not a record"), ("\udcff", "not a record")])
+def test_records_of_strangers_remove_nothing(trained, tmp_path, capsys, content, words):
+    own, elsewhere = tmp_path / "own", tmp_path / "elsewhere"
+    own.mkdir()
+    elsewhere.mkdir()
+    (elsewhere / "thesis.pdf").write_text("mine")
+    (own / "link").symlink_to(elsewhere)
+    (own / ".dsmoe.json").write_bytes(content.encode(errors="surrogateescape"))
+    for options in ([], ["--overwrite"], ["--orbit", "--frames", "1"]):
+        assert words in fails(capsys, "render", trained, "-o", str(own), *options)
+    assert (elsewhere / "thesis.pdf").read_text() == "mine"
 
 
 def test_eval_of_a_moved_run_and_a_moved_scene(trained, scene, tmp_path, capsys):
@@ -217,28 +228,37 @@ def test_eval_measures_lpips_where_asked(trained, tmp_path, capsys, monkeypatch)
     assert asked == [("lpips_vgg_std", "cpu")] and results_of(run)[0]["lpips_vgg"] == 0.25
 
 
-def test_render_follows_no_link_and_keeps_no_image_of_another_size(trained, tmp_path):
+def test_render_follows_no_link_and_keeps_no_image_of_another_size(trained, tmp_path, capsys):
     images, photo = tmp_path / "images", tmp_path / "photo.png"
     assert main(["render", trained, "-o", str(images), "--depth"]) == 0
     os.replace(images / "view_000.png", photo)
     os.symlink(photo, images / "view_000.png")
     before = photo.read_bytes()
+    for option in ([], ["--overwrite"]):
+        assert "view_000.png is a link" in fails(capsys, "render", trained, "-o", str(images), "--resolution", "2",
+                                                 *option)
+    assert photo.read_bytes() == before and (images / "view_000.png").is_symlink()
+    (images / "view_000.png").unlink()
     assert main(["render", trained, "-o", str(images), "--resolution", "2"]) == 0
-    assert photo.read_bytes() == before and not (images / "view_000.png").is_symlink()
     assert not (images / "view_000.depth.npy").exists(), "of another size"
 
 
-def test_overwrite_removes_models_alone_whatever_a_record_names(scene, tmp_path):
-    output, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+def test_overwrite_removes_products_alone_whatever_a_record_names(scene, tmp_path):
+    output = tmp_path / "out"
     assert main(["train", scene, "-o", str(output), *SMOE]) == 0
-    os.replace(output / "point_cloud", elsewhere)
-    os.symlink(elsewhere, output / "point_cloud")
-    (elsewhere / "key").write_text("mine")
+    (output / "point_cloud" / "key").write_text("mine")
     record = json.loads((output / ".dsmoe.json").read_text())
     record["files"].append("point_cloud/key")
     (output / ".dsmoe.json").write_text(json.dumps(record))
     assert main(["train", scene, "-o", str(output), *SMOE, "--overwrite"]) == 0
-    assert (elsewhere / "key").read_text() == "mine"
+    assert (output / "point_cloud" / "key").read_text() == "mine"
+
+
+def test_render_replaces_files_that_it_has_not_written_where_asked(trained, tmp_path):
+    (tmp_path / "view_000.png").write_text("mine")
+    (tmp_path / "notes").write_text("mine")
+    assert main(["render", trained, "-o", str(tmp_path), "--overwrite"]) == 0
+    assert Image.open(tmp_path / "view_000.png").size == (32, 24) and (tmp_path / "notes").read_text() == "mine"
 
 
 def test_eval_measures_the_pixels_that_training_did(trained, scene, tmp_path, capsys):
@@ -503,13 +523,14 @@ def interrupt_at(monkeypatch, iteration, number):
 
 @pytest.fixture
 def ctrl_c_works():
-    """Programs that a shell starts in the background inherit that Ctrl-C is ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Programs that a shell starts in the background inherit that Ctrl-C is ignored, under nohup SIGHUP."""
+    before = [signal.signal(signal.SIGINT, signal.default_int_handler), signal.signal(signal.SIGHUP, signal.SIG_DFL)]
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in zip((signal.SIGINT, signal.SIGHUP), before):
+        signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works, number,
                                                    status):
     output = str(tmp_path / "out")

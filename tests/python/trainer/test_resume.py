@@ -6,16 +6,18 @@ import json
 import os
 import resource
 import shutil
+import subprocess
 
 import pytest
 import torch
 
 from diff_smoe_rasterization import io
+from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.system import files
-from diff_smoe_rasterization.trainer.training import checkpoint
+from diff_smoe_rasterization.trainer.training import checkpoint, loop
 from diff_smoe_rasterization.trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from diff_smoe_rasterization.trainer.training.loop import Trainer, train
 from diff_smoe_rasterization.trainer.training.order import ViewOrder
@@ -228,21 +230,17 @@ def test_the_output_of_another_program_is_not_written_over(tiny_config, name):
 
 def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tiny_config, tmp_path):
     config = dataclasses.replace(tiny_config, iterations=3)
-    output, elsewhere = config.output, tmp_path / "elsewhere"
-    (elsewhere / "iteration_7000").mkdir(parents=True)
-    os.makedirs(output)
+    output = config.output
     train(config, progress=False)
-    shutil.move(os.path.join(output, "point_cloud", "iteration_3"), str(elsewhere))
-    os.rmdir(os.path.join(output, "point_cloud"))
-    os.symlink(str(elsewhere), os.path.join(output, "point_cloud"))
-    mine = [str(elsewhere / "iteration_7000" / "point_cloud.ply"), str(elsewhere / "notes.txt"),
-            os.path.join(output, "notes.txt")]
+    mine = [os.path.join(output, "point_cloud", "iteration_7000", "point_cloud.ply"),
+            os.path.join(output, "point_cloud", "notes.txt"), os.path.join(output, "notes.txt")]
     for path in mine:
         files.write_text_atomically(path, "mine")
     before = {name: os.path.getmtime(os.path.join(output, name)) for name in ("checkpoint.pt", "results.json")}
     with pytest.raises(TrainerError, match="no such folder"):
         train(dataclasses.replace(config, scene=str(tmp_path / "nowhere")), overwrite=True, progress=False)
     broken = copied_scene(config.scene, tmp_path / "broken")
+    os.remove(os.path.join(broken, "images", "view_001.png"))
     files.write_text_atomically(os.path.join(broken, "images", "view_001.png"), "no image")
     with pytest.raises(TrainerError, match="view_001.png: not a readable image"):
         train(dataclasses.replace(config, scene=broken), overwrite=True, progress=False)
@@ -250,15 +248,88 @@ def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tiny_config, tmp_pa
         train(dataclasses.replace(config, iterations=7000), overwrite=True, progress=False)
     assert before == {name: os.path.getmtime(os.path.join(output, name)) for name in before}
     train(dataclasses.replace(config, iterations=2), overwrite=True, progress=False)
-    assert os.path.islink(os.path.join(output, "point_cloud"))
-    assert sorted(os.listdir(elsewhere)) == ["iteration_2", "iteration_7000", "notes.txt"]
+    assert sorted(os.listdir(os.path.join(output, "point_cloud"))) == ["iteration_2", "iteration_7000", "notes.txt"]
     for path in mine:
         with open(path, encoding="utf-8") as file:
             assert file.read() == "mine"
-    os.remove(os.path.join(output, "point_cloud"))
-    os.symlink(str(tmp_path / "nowhere"), os.path.join(output, "point_cloud"))
-    with pytest.raises(TrainerError, match="point_cloud is no folder"):
+
+
+@pytest.mark.parametrize("name", ["point_cloud", "tensorboard"])
+def test_nothing_is_written_or_removed_where_a_link_leads_out_of_the_folder(tiny_config, tmp_path, name):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    output, elsewhere = config.output, tmp_path / "elsewhere"
+    train(config, progress=False)
+    elsewhere.mkdir()
+    path = os.path.join(output, name)
+    if os.path.isdir(path):
+        os.rename(path, str(elsewhere / name))
+    os.symlink(str(elsewhere / name), path)
+    (elsewhere / name).mkdir(exist_ok=True)
+    before = {path: os.path.getmtime(path) for path, _, _ in os.walk(elsewhere)}
+    for options in ({"overwrite": True}, {"resume": True}):
+        with pytest.raises(TrainerError, match=f"leads to {elsewhere / name}.* by a link"):
+            train(config, progress=False, **options)
+    assert before == {path: os.path.getmtime(path) for path, _, _ in os.walk(elsewhere)}
+    os.remove(path)
+    os.symlink(str(tmp_path / "nowhere"), path)
+    with pytest.raises(TrainerError, match="nowhere.* by a link|point_cloud is no folder"):
         train(config, overwrite=True, progress=False)
+    os.rename(output, str(tmp_path / "real"))
+    os.symlink(str(tmp_path / "real"), output)  # the folder itself may be one
+    os.remove(path)
+    train(config, overwrite=True, progress=False)
+
+
+def test_a_link_in_the_place_of_a_product_is_named(tiny_config, tmp_path):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    train(config, progress=False)
+    path = os.path.join(config.output, "results.json")
+    os.rename(path, str(tmp_path / "precious"))
+    os.symlink(str(tmp_path / "precious"), path)
+    with pytest.raises(TrainerError, match="results.json is a link, which is never replaced"):
+        train(config, overwrite=True, progress=False)
+    assert os.path.islink(path)
+
+
+@pytest.mark.parametrize("step", [0, 1, 2])
+def test_what_an_overwriting_run_leaves_that_is_killed_as_it_begins_is_not_gone_on_with(tiny_config, monkeypatch, step):
+    """After 0, 1 or 2 of its removals: the old run whole, or none."""
+    config, removals, remove = dataclasses.replace(tiny_config, iterations=4), [], loop.remove_files
+    train(config, progress=False)
+
+    def killed(*arguments):
+        if len(removals) == step:
+            raise Killed
+        removals.append(arguments)
+        remove(*arguments)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(loop, "remove_files", killed)
+        patch.setattr(TrainConfig, "save", killed)
+        train(dataclasses.replace(config, seed=1), overwrite=True, progress=False)
+    assert os.path.isfile(os.path.join(config.output, "config.json")) == (step == 0)
+    assert os.path.isfile(os.path.join(config.output, "checkpoint.pt")) == (step < 2)
+    train(dataclasses.replace(config, seed=1), overwrite=step == 0, progress=False)
+    assert TrainConfig.load(config.output).seed == 1
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_a_folder_that_goes_during_the_training_ends_it(tiny_config, tmp_path, monkeypatch, moved):
+    config, new, step = dataclasses.replace(tiny_config, checkpoint_every=2), str(tmp_path / "new"), Trainer.step
+
+    def step_without_folder(self, *arguments):
+        if self.iteration == 2:
+            os.rename(config.output, new)
+            if not moved:
+                shutil.rmtree(new)
+                os.mkdir(config.output)  # such as another run's
+        return step(self, *arguments)
+
+    monkeypatch.setattr(Trainer, "step", step_without_folder)
+    words = f"out has been moved to {new} .* --resume -o {new}" if moved else "out has been removed"
+    with pytest.raises(TrainerError, match=words):
+        train(config, progress=False)
+    assert not os.path.isdir(config.output) or not os.listdir(config.output)
 
 
 def test_a_run_has_its_folder_alone(tiny_config, monkeypatch):
@@ -355,10 +426,45 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
 def test_no_unfinished_file_is_written_through_a_link(tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("mine")
-    os.symlink(precious, tmp_path / "file.part")
+    os.symlink(precious, tmp_path / f"{files.PART}{os.getpid()}-file")
     files.write_text_atomically(str(tmp_path / "file"), "new")
     assert precious.read_text() == "mine" and (tmp_path / "file").read_text() == "new"
     assert sorted(os.listdir(tmp_path)) == ["file", "precious"]
+
+
+def test_processes_do_not_share_an_unfinished_file_and_what_a_killed_one_left_goes(tmp_path, monkeypatch):
+    """A file FILE.part may be the user's."""
+    with subprocess.Popen(["true"]) as ended:
+        pass
+    path, left, others = str(tmp_path / "file"), tmp_path / f"{files.PART}{ended.pid}-file", tmp_path / "file.part"
+    left.write_text("half")
+    others.write_text("the user's")
+    with files.new_file(path) as mine:
+        assert not left.exists()
+        files.write_text_atomically(mine, "mine, the later one")
+        with monkeypatch.context() as patch:
+            parent = os.getppid()
+            patch.setattr(os, "getpid", lambda: parent)  # as that of another process
+            files.write_text_atomically(path, "the other's")
+        assert (tmp_path / "file").read_text() == "the other's"
+    assert (tmp_path / "file").read_text() == "mine, the later one"
+    (tmp_path / "file").unlink()
+    with pytest.raises(TrainerError, match="file is there already"), files.new_file(path, overwrite=False) as mine:
+        files.write_text_atomically(mine, "mine")
+        files.write_text_atomically(path, "the other's, which is first")
+    assert (tmp_path / "file").read_text() == "the other's, which is first"
+    assert sorted(os.listdir(tmp_path)) == ["file", "file.part"]
+
+
+@pytest.mark.parametrize("what, make", [
+    ("a link", lambda path: os.symlink("precious", path)), ("no regular file", os.mkfifo), ("a folder", os.mkdir)])
+def test_what_is_no_regular_file_is_never_replaced(tmp_path, what, make):
+    path = str(tmp_path / "file")
+    make(path)
+    for overwrite in (True, False):
+        with pytest.raises(TrainerError, match=f"file is {what}, which is never replaced"):
+            files.write_atomically(path, lambda file: file.write(b"new"), overwrite)
+    assert os.listdir(tmp_path) == ["file"] and not os.path.isfile(path)
 
 
 def test_json_holds_null_where_it_has_no_number(tmp_path):
