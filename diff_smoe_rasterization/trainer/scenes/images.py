@@ -25,6 +25,8 @@ MAX_ASPECT_ERROR = 0.02
 # What Pillow raises for damaged files.
 UNREADABLE = (OSError, ValueError, SyntaxError, NotImplementedError, Image.DecompressionBombError)
 DOWNSCALER = "pillow bicubic"
+# Of files of images, whatever their names end in. Pillow knows more, and runs Ghostscript on EPS.
+FORMATS = ("PNG", "JPEG", "MPO", "JPEG2000", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "GIF", "PPM", "TGA")
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,12 @@ class View:
                                             if plane is not None})
 
 
+def open_image(path: str) -> Image.Image:
+    """The image in a file of one of the FORMATS, not read yet. Raises one of UNREADABLE."""
+    Image.init()
+    return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
+
+
 def target_size(width: int, height: int, resolution: int) -> Tuple[int, int]:
     """Image size (width, height) for a --resolution, by the rule of 3DGS.
 
@@ -82,7 +90,7 @@ def load_views(images: Sequence[PosedImage], config: TrainConfig, progress: bool
 def load_view(posed: PosedImage, config: TrainConfig) -> View:
     """Reads one image: transparency composited, then resized; the camera follows the size."""
     try:
-        with Image.open(posed.path) as file:
+        with open_image(posed.path) as file:
             image = composited(file, config.white_background)
             opacity = _opacity(file) if config.random_background else None
     except UNREADABLE as error:
@@ -106,7 +114,7 @@ def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -
 def _mask(path: str, image_path: str, size: Tuple[int, int], camera: Camera) -> torch.Tensor:
     """[1, H, W] uint8: the mask of an image file of that size (width, height)."""
     try:
-        with Image.open(path) as file:
+        with open_image(path) as file:
             mask = composited(file, white=False).convert("L")
     except UNREADABLE as error:
         raise SceneError(f"{path}: not a readable image ({error})") from error
@@ -159,7 +167,7 @@ def _opacity(image: Image.Image) -> Optional[Image.Image]:
 def image_size(path: str) -> Tuple[int, int]:
     """(width, height) from an image's header. Raises SceneError."""
     try:
-        with Image.open(path) as file:
+        with open_image(path) as file:
             return file.size
     except UNREADABLE as error:
         raise SceneError(f"{path}: not a readable image ({error})") from error

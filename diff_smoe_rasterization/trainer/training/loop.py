@@ -46,6 +46,7 @@ from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses
 from .randomness import random_state, restore_random_state, seed_everything
 from .shards import Shards
+from .state_check import check_state
 from .strategies import STRATEGIES
 from .strategy import AnyStep, Step, StrategyContext, is_due
 
@@ -220,8 +221,8 @@ class Trainer:
             "random": random_state(),
         }
 
-    def load_state_dict(self, state: Dict[str, Any]) -> None:
-        """Takes what `state_dict` gave. Raises TrainerError where it was another run's."""
+    def check_state(self, state: Dict[str, Any]) -> None:
+        """Raises TrainerError where a state is another run's, Misfit and others where it can be none's."""
         differences = TrainConfig.of_record(state["config"]).differences(self.config)
         if differences:
             raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
@@ -230,6 +231,10 @@ class Trainer:
             if here != there:
                 raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
                                    f"and {here} in {self.config.scene}")
+        check_state(state, self.config, self.strategy.state_dict(), self.order.count)
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        """Takes what `state_dict` gave, and `check_state` found to fit."""
         self.iteration = state["iteration"]
         self.watch.seconds = state["train_seconds"]
         self.optimizer.replace_all(state["raw"])
@@ -261,6 +266,7 @@ class Run:
             return False
         with damage_named(path):
             state = load_checkpoint(path, self.trainer.checkpoint_device)
+            self.trainer.check_state(state)
             self.trainer.load_state_dict(state)
             self.history = list(state["history"])
             self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]

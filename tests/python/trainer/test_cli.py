@@ -496,7 +496,10 @@ def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
 def test_damaged_results_are_named(trained, tmp_path, capsys):
     run = str(tmp_path / "run")
     shutil.copytree(trained, run)
-    for content, words in (("[{", "not valid json"), ("[1]", "list of rows")):
+    row = '[{"blend_mode": "smoe", "%s": %s}]'
+    for content, words in (("[{", "not valid json"), ("[1]", "list of rows"), ("[" * 100_000, "not valid json"),
+                           (row % ("protocol", 1), "`protocol` is 1"), (row % ("protocol", "[]"), "`protocol` is []"),
+                           (row % ("train_seconds", '"1"'), "`train_seconds` is '1'")):
         with open(os.path.join(run, "results.json"), "w", encoding="utf-8") as file:
             file.write(content)
         text = fails(capsys, "eval", run)

@@ -392,6 +392,58 @@ def test_a_damaged_checkpoint_is_named(tiny_config, tmp_path, monkeypatch):
         train(tiny_config, resume=True, progress=False)
 
 
+def altered(state, path, value):
+    """A copy of nested dictionaries and lists with another value, or value(the old one), at a/b/0."""
+    name, _, rest = path.partition("/")
+    key = int(name) if isinstance(state, list) else name
+    copy = list(state) if isinstance(state, list) else dict(state)
+    copy[key] = altered(copy[key], rest, value) if rest else value(copy.get(key) if isinstance(copy, dict)
+                                                                   else copy[key]) if callable(value) else value
+    return copy
+
+
+ALTERATIONS = [
+    *(("iteration", value) for value in (-5, 0, 10**9, float("nan"), "10", None, True, [10], 39.5)),
+    *(("train_seconds", value) for value in (float("nan"), float("inf"), -1, "1", None)),
+    *(("active_sh_degree", value) for value in (-1, 4, 1.5, "1", None)),
+    *((f"raw/{name}", change) for name in ("means3D", "shs", "rotations") for change in (
+        lambda rows: rows[1:], lambda rows: rows[:, :2], lambda rows: rows.double(),
+        lambda rows: rows.tolist(), lambda rows: None)),
+    ("raw", lambda raw: {name: rows[:0] for name, rows in raw.items()}),
+    ("raw", lambda raw: {name: rows for name, rows in raw.items() if name != "dc"}), ("raw/more", torch.ones(3)),
+    ("optimizer/more", {}), ("optimizer/dc", {}), ("optimizer/dc/step", -1), ("optimizer/dc/step", float("nan")),
+    ("optimizer/dc/step", "many"), ("optimizer/dc/exp_avg", lambda rows: rows[1:]), ("optimizer", [1]),
+    ("optimizer/scales/exp_avg_sq", lambda rows: rows.half()), ("optimizer/scales/exp_avg_sq", 1.0),
+    ("strategy", {}), ("strategy/more", 1), ("strategy/view_count", lambda rows: rows[1:]),
+    ("strategy/gradient_sum", lambda rows: rows.int()), ("strategy/gradient_sum", None), ("strategy", None),
+    ("gate", None), ("gate/logarithm", torch.ones(2)), ("gate/logarithm", 1.0), ("gate/adam/exp_avg", torch.ones(2)),
+    ("order/left", [0, 0]), ("order/left", [7]), ("order/left", [-1]), ("order/left", ["0"]), ("order/left", None),
+    ("order/random/1", lambda numbers: numbers[1:]), ("order/random/1/624", 10**6), ("order/random/2", "1"),
+    ("random/python/1/0", -1), ("random/python/0", 9), ("random/numpy/0", "other"), ("random/numpy/1", [1, 2]),
+    ("random/torch", torch.ones(3)), ("random/torch", lambda numbers: numbers[1:]), ("random/torch", "1"),
+    ("random/cuda", [1]), ("random/cuda", None), ("random", {}),
+    ("history", None), ("history", [1]), ("losses", [1]), ("losses", [[1, "2"]]), ("losses", [[1, float("nan")]]),
+    ("config/iterations", 10**6), ("config/iterations", "40"), ("config", None), ("config", {}), ("config/seed", "0"),
+    ("config/more", 1), ("scene", {}), ("scene", None)]
+
+
+def test_a_checkpoint_that_is_no_state_of_the_run_is_named_and_not_begun_with(tiny_config, monkeypatch):
+    config = dataclasses.replace(tiny_config, iterations=20)
+    train(config, progress=False)
+    path, begun = os.path.join(config.output, "checkpoint.pt"), []
+    state = load_checkpoint(path, "cpu")
+    run = loop.Run(Trainer(config, load_scene(config, progress=False)), progress=False)
+    monkeypatch.setattr(run.trainer, "load_state_dict", begun.append)
+    assert run.resume() and len(begun) == 1 and state["gate"]["adam"]
+    for place, value in ALTERATIONS:
+        save_checkpoint(path, altered(state, place, value))
+        with pytest.raises(TrainerError, match="checkpoint.pt: (not a readable checkpoint|no state of this run: its `.*"
+                                               "it must be )|of a run with other options") as error:
+            run.resume()
+        assert len(begun) == 1, place
+        assert "weights_only" not in str(error.value)
+
+
 def test_a_checkpoint_returns_what_it_was_given(tmp_path):
     path = str(tmp_path / "checkpoint.pt")
     state = {"a": {"b": [1, 0.1, None, torch.arange(3)], "c": "text"}, "d": torch.ones(2, dtype=torch.uint8)}

@@ -323,6 +323,17 @@ def test_an_unreadable_image(colmap_folder):
     refused(colmap_folder, "view_004.png", "not a readable image")
 
 
+def test_a_format_that_runs_another_program_is_refused(colmap_folder, monkeypatch):
+    """EPS, on which Pillow runs Ghostscript, under the name of a PNG; JPEG under that name is read."""
+    path, ran = os.path.join(colmap_folder, "images", "view_004.png"), []
+    monkeypatch.setattr("PIL.EpsImagePlugin.Ghostscript", lambda *arguments, **more: ran.append(arguments))
+    Image.new("RGB", (32, 24)).save(path, format="EPS")
+    refused(colmap_folder, "view_004.png", "not a readable image")
+    assert not ran
+    Image.new("RGB", (32, 24)).save(path, format="JPEG")
+    load(colmap_folder)
+
+
 @pytest.mark.parametrize("dtype, kind", [(np.uint16, "PNG"), (np.int32, "TIFF"), (np.float32, "TIFF")])
 def test_more_than_8_bits(colmap_folder, dtype, kind):
     path = os.path.join(colmap_folder, "images", "view_004.png")
