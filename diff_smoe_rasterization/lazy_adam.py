@@ -9,7 +9,7 @@ step and all that it has missed since are made at once, in registers.
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
@@ -42,6 +42,9 @@ class LazyAdam:
         self.adam = adam
         self.parameters = list(parameters)
         self._steps = 0  # since all rows were up to date
+        self._constants: List[float] = []  # betas and eps
+        self._left: List[Tuple[torch.Tensor, int]] = []
+        self._left_ages: List[int] = []
         self._look_up()
         self.gradients = [torch.empty_like(parameter, requires_grad=False) for parameter in self.parameters]
         """Where the gradients of the rows that are seen go; a row keeps its gradient until it is caught up."""
@@ -55,7 +58,7 @@ class LazyAdam:
         if any(id(parameter) not in groups for parameter in self.parameters):
             raise ValueError("LazyAdam: a parameter is not among those of adam")
         self._groups: List[Dict[str, Any]] = [groups[id(parameter)] for parameter in self.parameters]
-        constants, *others = [(*group["betas"], group["eps"]) for group in self._groups]
+        constants, *others = [[*group["betas"], group["eps"]] for group in self._groups]
         if any(other != constants for other in others):
             raise ValueError("LazyAdam: the parameters' groups differ in betas or eps; they must be the same")
         if any(group.get(option) for group in self._groups for option in ("weight_decay", "amsgrad", "maximize")):
@@ -88,7 +91,7 @@ class LazyAdam:
 
     def _is_as_left(self) -> bool:
         return self._ages() == self._left_ages and all(
-            tensor is left and left._version == version for tensor, (left, version) in zip(self._tensors(), self._left))
+            left._version == version and tensor is left for tensor, (left, version) in zip(self._tensors(), self._left))
 
     @torch.no_grad()
     def catch_up(self, radii: Optional[torch.Tensor] = None) -> None:
