@@ -134,15 +134,16 @@ class Viewer:
             raise self._error
 
     def _connected(self, handle: Any) -> None:
+        client = self._clients[handle.client_id] = _Client(handle)
+        handle.camera.on_update(lambda _: self._moved(client))
         first, orbit = self.followed.cameras[0], self.followed.orbit
         forward = first.rotation[2]
         distance = max(float(forward @ (orbit.target - first.center)), 0.1)
-        handle.camera.fov = 2 * math.atan(first.height / (2 * first.fy))
-        handle.camera.up_direction = orbit.up
-        handle.camera.position = first.center
-        handle.camera.look_at = first.center + distance * forward
-        client = self._clients[handle.client_id] = _Client(handle)
-        handle.camera.on_update(lambda _: self._moved(client))
+        with contextlib.suppress(Exception):  # viser goes from the browser's camera, which may be anything
+            handle.camera.fov = 2 * math.atan(first.height / (2 * first.fy))
+            handle.camera.up_direction = orbit.up
+            handle.camera.position = first.center
+            handle.camera.look_at = first.center + distance * forward
         self._moved(client)
 
     def _moved(self, client: _Client) -> None:
@@ -169,8 +170,11 @@ class Viewer:
                 self._polled = time.monotonic()
                 self._follow()
             look = self.controls.look()
-            for client in list(self._clients.values()):
-                if client.wants_picture():
+            connected = self.server.get_clients()
+            for number, client in list(self._clients.items()):
+                if number not in connected:  # it may have gone before it was noted
+                    self._clients.pop(number, None)
+                elif client.wants_picture():
                     client.show(self.followed, look, self._trouble)
 
     def _follow(self) -> None:
