@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ class View:
     image: torch.Tensor  # [3, H, W] uint8, over black or white
     opacity: Optional[torch.Tensor] = None  # [1, H, W] uint8; --random-background: the alpha plane, if there is one
     mask: Optional[torch.Tensor] = None  # [1, H, W] uint8: 255, the pixel counts, to 0; None: all count
+    checksum: str = ""  # of the image's file and the mask's; empty where there is no file
 
     def image_float(self) -> torch.Tensor:
         """[3, H, W] in [0, 1]"""
@@ -98,10 +100,21 @@ def load_view(posed: PosedImage, config: TrainConfig) -> View:
     camera = fitted_camera(posed, image.size, config)
     mask = None if posed.mask is None else _mask(posed.mask, posed.path, image.size, camera)
     try:
-        return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask)
+        return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask,
+                    _checksum(posed.path, posed.mask))
     except MemoryError as error:  # Pillow's says nothing
         raise SceneError(f"{posed.path}: the machine is out of memory at {camera.width}x{camera.height}; take smaller "
                          "images (--resolution)") from error
+
+
+def _checksum(path: str, mask: Optional[str]) -> str:
+    """Of the files, not of the pixels: another release of Pillow may decode the same JPEG to other pixels."""
+    hashed = hashlib.sha256()
+    for name in (path, mask):
+        if name is not None:
+            with open(name, "rb") as file:
+                hashed.update(file.read())
+    return hashed.hexdigest()
 
 
 def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -> torch.Tensor:

@@ -227,7 +227,7 @@ class Trainer:
         if differences:
             raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
         for name, here in scene_fingerprint(self.scene).items():
-            there = state["scene"][name]
+            there = state["scene"].get(name, here)  # earlier versions recorded fewer of them
             if here != there:
                 raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
                                    f"and {here} in {self.config.scene}")
@@ -270,6 +270,10 @@ class Run:
             self.trainer.load_state_dict(state)
             self.history = list(state["history"])
             self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
+        unknown = [name for name in scene_fingerprint(self.trainer.scene) if name not in state["scene"]]
+        if unknown and self.trainer.leads:
+            print(f"note: {path} is of an earlier version and lacks the {', the '.join(unknown)}: whether these have "
+                  "changed since is not known")
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations and self.trainer.leads:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "

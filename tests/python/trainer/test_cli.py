@@ -1,6 +1,7 @@
 """The `dsmoe` command from end to end, on a tiny ray-traced scene."""
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -548,6 +549,24 @@ def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, mon
     for path in (ply_of, lambda run: os.path.join(run, "loss.png")):
         with open(path(output), "rb") as mine, open(path(trained), "rb") as theirs:
             assert mine.read() == theirs.read()
+
+
+def test_names_of_images_need_not_be_utf_8(scene, tmp_path, capsys):
+    """One of the training and one of the test, as an old camera's disk has them: each command takes them."""
+    folder, output = str(tmp_path / "scene"), str(tmp_path / "out")
+    shutil.copytree(scene, folder)
+    model, names = io.read_colmap(folder), {"view_000.png": os.fsdecode(b"view_000\xe9.png"),
+                                            "view_001.png": os.fsdecode(b"view_001\xff.png")}
+    images = [dataclasses.replace(image, name=names.get(image.name, image.name)) for image in model.images]
+    io.write_colmap(model.folder, dataclasses.replace(model, images=images))
+    for before, name in names.items():
+        os.rename(os.path.join(folder, "images", before), os.path.join(folder, "images", name))
+    assert main(["train", folder, "-o", output, *SMOE]) == 0
+    assert main(["train", "--resume", "-o", output, "--iterations", "13", "--quiet"]) == 0
+    assert "extended" in capsys.readouterr().out
+    assert main(["eval", output]) == 0 and main(["render", output, "-o", str(tmp_path / "images")]) == 0
+    assert "view_000\\udce9.png" in os.listdir(tmp_path / "images"), "in letters that every system has"
+    assert main(["export", output, "-o", str(tmp_path / "a.html")]) == 0
 
 
 def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monkeypatch, capsys):

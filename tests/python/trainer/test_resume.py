@@ -10,6 +10,7 @@ import subprocess
 
 import pytest
 import torch
+from PIL import Image
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.trainer.config import TrainConfig
@@ -164,9 +165,35 @@ def remove_a_point(folder):
         model.cameras, model.images, io.Points(points.positions[1:], points.colors[1:])), text=True)
 
 
+def move_a_test_camera(folder):
+    model = io.read_colmap(folder)
+    model.images[8].tvec[0] += 0.001  # of a training view would change the extent too
+    io.write_colmap(model.folder, model, text=True)
+
+
+def change_the_focal_length(folder):
+    model = io.read_colmap(folder)
+    model.cameras[1].params[0] += 0.01
+    io.write_colmap(model.folder, model, text=True)
+
+
+def darken(name):
+    """An edit that makes one pixel of an image black."""
+    def edit(folder):
+        path = os.path.join(folder, "images", name)
+        with Image.open(path) as image:
+            image.load()
+        image.putpixel((5, 5), (0, 0, 0))
+        image.save(path)
+
+    return edit
+
+
 @pytest.mark.parametrize("edit, words", [
     (rename_a_view, "training views' names"), (move_a_point, "checksum of the points"),
-    (remove_a_point, "number of points")])
+    (remove_a_point, "number of points"), (move_a_test_camera, "checksum of the poses"),
+    (change_the_focal_length, "checksum of the intrinsics"), (darken("view_003.png"), "of the training images"),
+    (darken("view_008.png"), "of the test images")])
 def test_another_scene_cannot_be_resumed(tiny_scene, tiny_config, tmp_path, edit, words):
     config = dataclasses.replace(tiny_config, iterations=2)
     train(config, progress=False)
@@ -174,6 +201,22 @@ def test_another_scene_cannot_be_resumed(tiny_scene, tiny_config, tmp_path, edit
     edit(other)
     with pytest.raises(TrainerError, match=f"another scene: .*{words}.*other"):
         train(dataclasses.replace(config, scene=other), resume=True, progress=False)
+
+
+def test_a_checkpoint_without_checksums_of_images_resumes_and_says_so(tiny_config, capsys):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    train(config, progress=False)
+    path = os.path.join(config.output, "checkpoint.pt")
+    state = load_checkpoint(path, "cpu")
+    newer = [f"checksum of the {name}" for name in ("poses", "intrinsics", "training images", "test images")]
+    for name in newer:
+        del state["scene"][name]
+    save_checkpoint(path, state)
+    train(config, resume=True, progress=False)
+    assert f"lacks the {', the '.join(newer)}: whether these have changed" in capsys.readouterr().out
+    train(config, overwrite=True, progress=False)
+    train(config, resume=True, progress=False)
+    assert "lacks" not in capsys.readouterr().out
 
 
 def test_a_moved_scene_resumes(tiny_scene, tiny_config, tmp_path):
@@ -424,7 +467,7 @@ ALTERATIONS = [
     ("random/cuda", [1]), ("random/cuda", None), ("random", {}),
     ("history", None), ("history", [1]), ("losses", [1]), ("losses", [[1, "2"]]), ("losses", [[1, float("nan")]]),
     ("config/iterations", 10**6), ("config/iterations", "40"), ("config", None), ("config", {}), ("config/seed", "0"),
-    ("config/more", 1), ("scene", {}), ("scene", None)]
+    ("config/more", 1), ("scene", None)]
 
 
 def test_a_checkpoint_that_is_no_state_of_the_run_is_named_and_not_begun_with(tiny_config, monkeypatch):
