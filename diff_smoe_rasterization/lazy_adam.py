@@ -13,6 +13,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
+from .checks import check_tensors
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 from .optimizers import FusedAdam
 
@@ -39,8 +40,13 @@ class LazyAdam:
 
     def __init__(self, adam: FusedAdam, parameters: Sequence[torch.Tensor]) -> None:
         """parameters: of `adam`, 1 to 4, [N, ...] dense, which the caller does not let it step. They have one age."""
+        if not isinstance(adam, FusedAdam):
+            raise TypeError(f"LazyAdam: adam is of type {type(adam).__name__}; it must be a FusedAdam")
         self.adam = adam
         self.parameters = list(parameters)
+        if not self.parameters:
+            raise ValueError("LazyAdam: parameters is empty; it must be 1 to 4 tensors")
+        check_tensors("LazyAdam", **{f"parameters[{index}]": value for index, value in enumerate(self.parameters)})
         self._steps = 0  # since all rows were up to date
         self._constants: List[float] = []  # betas and eps
         self._left: List[Tuple[torch.Tensor, int]] = []
@@ -96,6 +102,8 @@ class LazyAdam:
     @torch.no_grad()
     def catch_up(self, radii: Optional[torch.Tensor] = None) -> None:
         """Brings rows up to date: all, or those where radii [N] (int32) is above 0."""
+        if radii is not None:
+            check_tensors("LazyAdam.catch_up", radii=radii)
         if self._steps == 0:
             return
         self._look_up()
@@ -111,15 +119,17 @@ class LazyAdam:
     @torch.no_grad()
     def step(self, radii: torch.Tensor) -> None:
         """Makes a step. Rows where radii [N] (int32) is above 0 are up to date, and `gradients` has theirs."""
+        check_tensors("LazyAdam.step", radii=radii)
         if self._steps == len(self._rates):
             self.catch_up()
         self._look_up()
-        rates, root_scales = [], []
-        for group, state in zip(self._groups, self._states):
+        rates, root_scales, age = [], [], int(self._states[0]["step"]) + 1
+        for group in self._groups:
             beta1, beta2 = group["betas"]
-            age = state["step"] = int(state["step"]) + 1
             rates.append(group["lr"] / (1 - beta1**age))
             root_scales.append(1 / math.sqrt(1 - beta2**age))
         _OPS.lazy_adam_step(self._marks, self._rates, self._steps, rates, root_scales, radii)
+        for state in self._states:  # behind the op: where it refuses radii no step is counted
+            state["step"] = age
         self._steps += 1
         self._leave()

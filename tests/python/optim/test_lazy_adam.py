@@ -200,3 +200,13 @@ def test_what_does_not_fit_is_refused(device):
         lazy.step(torch.ones(3, dtype=torch.int32))
     with pytest.raises(TypeError, match="radii is bool"):
         lazy.step(torch.ones(4, dtype=torch.bool))
+    for function in (lazy.step, lazy.catch_up):
+        with pytest.raises(TypeError, match=f"LazyAdam.{function.__name__}: radii is of type list; it must be a torch"):
+            function([1, 1, 1, 1])
+    assert lazy.adam.state[first]["step"] == 0, "what was refused is no step"
+    with pytest.raises(TypeError, match="LazyAdam: adam is of type SGD; it must be a FusedAdam"):
+        LazyAdam(torch.optim.SGD([first], lr=0.1), [first])
+    with pytest.raises(TypeError, match=r"LazyAdam: parameters\[1\] is of type int; it must be a torch.Tensor"):
+        LazyAdam(adam_of([first]), [first, 1])
+    with pytest.raises(ValueError, match="LazyAdam: parameters is empty"):
+        LazyAdam(adam_of([first]), [])
