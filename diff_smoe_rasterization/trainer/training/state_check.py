@@ -14,6 +14,7 @@ from ..model import PARAMETERS
 ROWS = {"means3D": (3,), "dc": (1, 3), "opacities": (1,), "scales": (3,), "rotations": (4,)}  # behind [N]
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam
 MOST_STEPS = 2**53  # of Adam
+LARGEST_LOGARITHM = 80.0  # whose exponential float32 holds
 
 
 class Misfit(ValueError):
@@ -52,6 +53,8 @@ def check_state(state: Dict[str, Any], config: TrainConfig, strategy: Dict[str, 
              "there where the background gate is learned, and only there")
     if state["gate"] is not None:
         _check_tensor("gate/logarithm", state["gate"]["logarithm"], (1,))
+        logarithm = float(state["gate"]["logarithm"])
+        _require(logarithm <= LARGEST_LOGARITHM, "gate/logarithm", logarithm, f"at most {LARGEST_LOGARITHM}")
         if state["gate"]["adam"]:
             _check_adam("gate/adam", state["gate"]["adam"], (1,))
 
