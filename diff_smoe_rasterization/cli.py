@@ -84,6 +84,8 @@ def build_parser() -> argparse.ArgumentParser:
                         help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
     render.add_argument("--alpha", action="store_true",
                         help="also NAME.alpha.png: how much of a pixel Gaussians cover, 8 bits")
+    render.add_argument("--overwrite", action="store_true",
+                        help="write into any folder, and replace files of the same names; a VIDEO that is there too")
     _add_device(render)
     render.set_defaults(run=_render)
 
@@ -99,6 +101,7 @@ def build_parser() -> argparse.ArgumentParser:
                         help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
                              "holds degree 0)")
     _add_model_options(export, "whose test views the page begins with (default: the run's)")
+    export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
     export.set_defaults(run=_export)
 
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
@@ -443,7 +446,8 @@ def _render(arguments: argparse.Namespace) -> None:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
-                          background_gate=arguments.background_gate, outputs=outputs)
+                          background_gate=arguments.background_gate, outputs=outputs,
+                          overwrite=arguments.overwrite)
     print(f"{len(paths)} images in {arguments.output}")
 
 
@@ -453,7 +457,7 @@ def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outp
 
     trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
                            **overrides)
-    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs))
+    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs, arguments.overwrite))
 
 
 def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
@@ -466,7 +470,8 @@ def _export(arguments: argparse.Namespace) -> None:
     from .export.command import export
 
     path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
-                           arguments.blend_mode, arguments.background_gate, **_overrides(arguments))
+                           arguments.blend_mode, arguments.background_gate, arguments.overwrite,
+                           **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

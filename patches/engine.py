@@ -23,6 +23,7 @@ from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Tra
 UNFINISHED = ".dsmoe_unfinished"  # begins the name of a folder of new files, until all are written
 # Signs of an environment, of a run's output and of another checkout or package.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
+CALLS = r"|\b(?:chosen_blend|default_blend|blend_of|saved_blend_of)\("  # what nothing imports without the patch
 PathLike = Union[str, Path]
 
 
@@ -55,8 +56,9 @@ class Patched:
     def __init__(self, before: Mapping[str, bytes], trainer: Trainer, options: Sequence[str]) -> None:
         self.before, self.after = before, dict(before)
         self.rules: Dict[str, List[str]] = {}  # of each file
-        self.problems = [f"{name}: {leftover(data)}; change that line, by which `revert` takes a patch out"
-                         for name, data in before.items() if leftover(data)]  # why it cannot be patched
+        # Why it cannot be patched.
+        self.problems = [f"{name}: {leftover(data)}, which is not as a patch writes it; change that line back, or "
+                         "take the mark out of it" for name, data in before.items() if leftover(data)]
         scripts = [name for name, data in before.items() if "/" not in name and b"__main__" in data]
         self.notes = [f"--{one}: fits no script: no .py beside train.py has __main__" for one in options if not scripts]
         for rule in rules_of(trainer):
@@ -155,7 +157,7 @@ def apply(path: PathLike, **options: Any) -> Plan:
     """
     planned = check(path, **options).possible()
     todo = {name: data for name, data in planned.after.items() if data != planned.now[name]}
-    _write(planned.root, todo)
+    _write(planned.root, todo, planned.now)
     return planned._replace(written=bool(todo))
 
 
@@ -169,7 +171,7 @@ def revert(path: PathLike) -> List[str]:
     back = {name: data for name, data in before.items() if data != now[name]}
     for name, data in before.items():
         try:
-            why = leftover(data, f"|{INTEGRATIONS}" if name in back and name == GR else "")
+            why = leftover(data, "" if name not in back else f"|{INTEGRATIONS}{CALLS}" if name == GR else CALLS)
             if name in back and not why:
                 tree_of(data)
         except PatchError as error:
@@ -179,7 +181,7 @@ def revert(path: PathLike) -> List[str]:
                              "again; nothing was touched")
     if not back and not any(root.glob(UNFINISHED + "*")):
         raise PatchError(f"{root}: no file has a line of a patch, so nothing can be taken back")
-    _write(root, back)
+    _write(root, back, now)
     return list(back)
 
 
@@ -196,8 +198,11 @@ def _files(root: Path) -> Dict[str, bytes]:
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(paths) if path.is_file()}
 
 
-def _write(root: Path, files: Mapping[str, bytes]) -> None:
-    """Writes files, each at once: a kill leaves every one as it was or as it becomes. Modes, owners and links stay."""
+def _write(root: Path, files: Mapping[str, bytes], now: Mapping[str, bytes]) -> None:
+    """Writes files, each at once: a kill leaves every one as it was or as it becomes. Modes, owners and links stay.
+
+    now: what they were read as. Raises PatchError where one is another one by now, as an editor has saved it.
+    """
     targets = {name: (root / name).resolve() for name in files}
     for name, target in targets.items():
         if root.resolve() not in target.parents:
@@ -212,8 +217,13 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
             shutil.copymode(targets[name], unfinished / name)
             with contextlib.suppress(PermissionError):
                 os.chown(unfinished / name, targets[name].stat().st_uid, targets[name].stat().st_gid)
+        there = {target: now[name] for name, target in targets.items()}  # of two names of one file once
+        for name, target in targets.items():  # all of them before the first is replaced
+            _check_unchanged(name, target, there)
         for name, target in targets.items():
+            _check_unchanged(name, target, there)
             os.replace(unfinished / name, target)
+            there[target] = files[name]
     except OSError as error:
         raise PatchError(f"{error.filename or root}: cannot be written: {error}; `dsmoe patch check {root}` says how "
                          "the checkout is") from None
@@ -221,3 +231,9 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
         for folder in root.glob(UNFINISHED + "*"):  # but those of other processes that still run
             if folder.suffix[1:] == str(os.getpid()) or not os.path.exists(f"/proc/{folder.suffix[1:]}/fd"):
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _check_unchanged(name: str, target: Path, there: Mapping[Path, bytes]) -> None:
+    if target.read_bytes() != there[target]:
+        raise PatchError(f"{name}: another program has saved it meanwhile, and it is left as it is now; the same "
+                         "command again finishes")

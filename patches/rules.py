@@ -9,7 +9,7 @@ import re
 from functools import partial
 from typing import Callable, List, NamedTuple, Sequence
 
-from .source import MARK, PatchError, Source
+from .source import MARK, PatchError, Source, digest, marked
 from .trainers import ARGUMENTS, GR, INTEGRATIONS, PACKAGE, RASTERIZER, RUNTIME, Entry, Trainer
 
 SETTINGS = "GaussianRasterizationSettings"
@@ -38,10 +38,10 @@ def rules_of(trainer: Trainer) -> List[Rule]:
 def import_rasterizer(source: Source, trainer: Trainer) -> None:
     """`from diff_gaussian_rasterization import ...` takes the names from this package."""
     found = [node for node in source.nodes(ast.ImportFrom) if (node.module, node.level) == (RASTERIZER, 0)]
+    ours = f"{INTEGRATIONS}.{trainer.flavour}".encode()
     for node in found:
-        source.put(f"{MARK} {trainer.name}: {RASTERIZER}", node)
+        source.put(f"{MARK} {trainer.name}: {RASTERIZER} {digest(ours)}", node)
         above, line = source.lines[node.lineno - 1].split(source.newline, 1)
-        ours = f"{INTEGRATIONS}.{trainer.flavour}".encode()
         source.lines[node.lineno - 1] = above + source.newline + line.replace(RASTERIZER.encode(), ours, 1)
     if not found:
         raise PatchError("no match")
@@ -51,7 +51,7 @@ def _import(source: Source, name: str, found: Sequence[ast.AST]) -> None:
     """A rule's file gets the import of what the rule put in. Raises PatchError where it found nothing."""
     if not found:
         raise PatchError("no match")
-    source.put_on_top(f"from {RUNTIME} import {name}  {MARK}")
+    source.put_on_top(marked(f"from {RUNTIME} import {name}"))
 
 
 def settings_blend(source: Source) -> None:
@@ -68,7 +68,7 @@ def settings_blend(source: Source) -> None:
         place = line.rfind(name.encode(), 0, value.col_offset)
         if place < 0:
             raise misfit
-        text = f"**chosen_blend({pipe}),  {MARK}".encode() + source.newline + indent + b"    " * (place > len(indent))
+        text = marked(f"**chosen_blend({pipe}),").encode() + source.newline + indent + b"    " * (place > len(indent))
         source.lines[value.lineno - 1] = line[:place] + text + line[place:]
     _import(source, "chosen_blend", calls)
 
@@ -79,7 +79,7 @@ def model_options(source: Source) -> None:
              for init in model.body if getattr(init, "name", "") == "__init__" for line in init.body
              if re.match(rb"\s*super\(.*\)\.__init__\(", source.lines[line.lineno - 1])]
     for line in found[:1]:
-        source.put(f"self.blend_mode, self.background_gate = default_blend()  {MARK}", line)
+        source.put(marked("self.blend_mode, self.background_gate = default_blend()"), line)
     _import(source, "default_blend", found)
 
 
@@ -89,10 +89,10 @@ def pipe_blend(source: Source, entry: Entry) -> None:
              and {entry.dataset, entry.pipe} <= {node.arg for node in ast.walk(node.args) if isinstance(node, ast.arg)}]
     for node in found:
         first = node.body[int(ast.get_docstring(node) is not None and len(node.body) > 1)]
-        source.put(f"{entry.pipe}.blend = {entry.blend}({entry.dataset})  {MARK}", first)
+        source.put(marked(f"{entry.pipe}.blend = {entry.blend}({entry.dataset})"), first)
     _import(source, entry.blend, found)
 
 
 def start(source: Source, option: str) -> None:
     """A script begins with the option's start()."""
-    source.put_on_top(f"from {PACKAGE}.patches import {option}; {option}.start()  {MARK}")
+    source.put_on_top(marked(f"from {PACKAGE}.patches import {option}; {option}.start()"))

@@ -17,6 +17,7 @@ from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
 
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_of
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
+from diff_smoe_rasterization.trainer.system.children import die_with_parent
 
 from . import facts
 from .runtime import RASTERIZER_VARIABLE, SHIMS, STAND_INS, USED_VARIABLE, WITHOUT_VARIABLE
@@ -31,7 +32,8 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
         background_gate: Optional[float] = None) -> NoReturn:
     """Runs the command, and ends with its exit status, or 128 + N where signal N ended it.
 
-    Raises PatchError where the command would not run, or did not, with this rasterizer.
+    Where this process is killed, the command gets a SIGTERM. Raises PatchError where the command would not run, or did
+    not, with this rasterizer.
     """
     environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
     for line in lines:
@@ -39,7 +41,8 @@ def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
     with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
         used = Path(folder, "used")
         try:
-            child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)})
+            child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)},
+                                     preexec_fn=die_with_parent)
         except OSError as error:
             raise PatchError(f"{words[0]}: {error.strerror}") from None
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the command too

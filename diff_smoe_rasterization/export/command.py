@@ -10,7 +10,7 @@ from ..trainer.errors import TrainerError
 from ..trainer.opening import Trained, open_trained
 from ..trainer.results.pictures import evenly_spaced
 from ..trainer.results.rows import viewer_warning
-from ..trainer.system.files import write_atomically
+from ..trainer.system.files import check_output, new_file, write_atomically
 from . import html
 from .splat import splat_bytes
 
@@ -19,12 +19,13 @@ VIEWS = 16  # of a page, at most
 
 
 def export(source: str, path: Optional[str] = None, form: Optional[str] = None, sh_degree: Optional[int] = None,
-           blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
+           blend_mode: Optional[str] = None, background_gate: Optional[float] = None, overwrite: bool = False,
            **options: Any) -> Tuple[str, str]:
     """Writes the model of a run's folder or of a .ply; returns the file's path and a warning, which may be empty.
 
     form: one of FORMATS; None: by the ending of `path`, else html. path: None: model.FORM. sh_degree: the highest
-    degree of view-dependent colour that is kept. The rest is as in `open_trained`. Raises TrainerError.
+    degree of view-dependent colour that is kept. overwrite: `path` may be a file that is there. The rest is as in
+    `open_trained`. Raises TrainerError.
     """
     ending = os.path.splitext(path)[1][1:].lower() if path else FORMATS[0]
     if form and path and ending in FORMATS and ending != form:
@@ -33,26 +34,28 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
     if form not in FORMATS:
         raise TrainerError(f"{path}: its ending is none of {', '.join(FORMATS)}; say which --format it is")
     path = path or f"model.{form}"
+    check_output(path, overwrite)  # refused before anything is read
     trained = open_trained(source, blend_mode, background_gate, **options)
+    if os.path.exists(path) and os.path.samefile(path, trained.ply):
+        raise TrainerError(f"{path} is the model itself; choose another file with -o")
     gaussians = io.read_gaussians(trained.ply)
     if sh_degree is not None:
         gaussians = dataclasses.replace(gaussians, shs=gaussians.shs[:, :(sh_degree + 1) ** 2 - 1])
     if form == "ply":
-        _write_ply(path, trained, gaussians)
+        _write_ply(path, trained, gaussians, overwrite)
     else:
         text = splat_bytes(gaussians) if form == "splat" else html.page(gaussians, _shown(trained)).encode("utf-8")
-        write_atomically(path, lambda file: file.write(text))
+        write_atomically(path, lambda file: file.write(text), overwrite)
     renderer = trained.renderer
     return path, "" if form == "html" else viewer_warning(
         {"blend_mode": renderer.blend_mode, "background_gate": renderer.background_gate}, form)
 
 
-def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians) -> None:
-    if os.path.exists(path) and os.path.samefile(path, trained.ply):
-        raise TrainerError(f"{path} is the model itself; choose another file with -o")
+def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: bool) -> None:
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
     recorded = {"blend_mode": mode, "background_gate": float(gate) if mode == "smoe" else None}
-    io.write_gaussians(path, dataclasses.replace(gaussians, **recorded))
+    with new_file(path, overwrite) as temporary:
+        io.write_gaussians(temporary, dataclasses.replace(gaussians, **recorded))
 
 
 def _shown(trained: Trained) -> html.Shown:

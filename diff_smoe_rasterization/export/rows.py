@@ -6,6 +6,7 @@ from typing import List
 import numpy as np
 
 from ..io import Gaussians
+from ..trainer.results.modelfile import finite_gaussians
 
 
 def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:
@@ -13,5 +14,5 @@ def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:
     [M, 3 (K - 1)] of the M Gaussians all of whose numbers are finite."""
     arrays = [gaussians.means3D, gaussians.opacity_logits, gaussians.log_scales, gaussians.rotations,
               gaussians.dc[:, 0], gaussians.shs.reshape(len(gaussians.shs), 3 * gaussians.shs.shape[1])]
-    finite = np.isfinite(np.hstack(arrays)).all(axis=1)
+    finite = finite_gaussians(gaussians)
     return [array[finite] for array in arrays]

@@ -9,7 +9,7 @@ import dataclasses
 import hashlib
 import os
 from dataclasses import dataclass
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, Iterable, List, Optional, Sequence
 
 import numpy as np
 
@@ -76,21 +76,45 @@ def read_layout(config: TrainConfig) -> Layout:
 def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
     """Plain values that differ between scenes and stay when a folder is moved: what a resumed run must find again."""
 
-    def names_and_sizes(views: Sequence[View]) -> str:
-        lines = sorted(f"{view.camera.name} {view.camera.width}x{view.camera.height}" for view in views)
-        return _checksum("\n".join(lines).encode("utf-8"))
+    def lines(texts: Iterable[str]) -> str:
+        return _checksum("\n".join(sorted(texts)).encode("utf-8", "surrogateescape"))  # a name may be no UTF-8
 
+    def names_and_sizes(views: Sequence[View]) -> str:
+        return lines(f"{view.camera.name} {view.camera.width}x{view.camera.height}" for view in views)
+
+    def files(views: Sequence[View]) -> str:
+        return lines(f"{view.camera.name} {view.checksum}" for view in views)
+
+    views = [*scene.train, *scene.test]
     return {
         "number of training views": len(scene.train),
         "number of test views": len(scene.test),
-        "number of masks": sum(view.mask is not None for view in [*scene.train, *scene.test]),
+        "number of masks": sum(view.mask is not None for view in views),
         "number of points": len(scene.points.positions),
         # Six digits, since another numpy may sum in another order.
         "extent": f"{scene.extent:.6g}",
         "checksum of the training views' names and sizes": names_and_sizes(scene.train),
         "checksum of the test views' names and sizes": names_and_sizes(scene.test),
         "checksum of the points": _checksum(scene.points.positions.tobytes() + scene.points.colors.tobytes()),
+        "checksum of the poses": _checksum(b"".join(_pose(view.camera, scene.extent) for view in views)),
+        "checksum of the intrinsics": _checksum(b"".join(_intrinsics(view.camera) for view in views)),
+        "checksum of the training images": files(scene.train),
+        "checksum of the test images": files(scene.test),
     }
+
+
+def _pose(camera: Camera, extent: float) -> bytes:
+    """A camera's pose, to a millionth of the scene's extent: another scipy may round the last digits otherwise."""
+    return _rounded([*camera.rotation.reshape(-1), *(camera.translation / extent)], 6)
+
+
+def _intrinsics(camera: Camera) -> bytes:
+    """To a 10,000th of a pixel."""
+    return _rounded([camera.fx, camera.fy, camera.cx, camera.cy], 4)
+
+
+def _rounded(values: Sequence[float], digits: int) -> bytes:
+    return (np.round(np.asarray(values, "<f8"), digits) + 0.0).tobytes()  # + 0.0 makes 0 of -0
 
 
 def _checksum(content: bytes) -> str:

@@ -5,7 +5,8 @@ import pytest
 import torch
 from devices import random_normal
 
-from diff_smoe_rasterization.gaussians import activate, add_view
+from diff_smoe_rasterization.gaussians import activate, add_view, divided
+from diff_smoe_rasterization.neighbors import distCUDA2
 
 SHAPES = ((1,), (3,), (4,))  # opacities, scales, rotations of one Gaussian
 
@@ -104,3 +105,19 @@ def test_what_does_not_fit_is_refused(device):
         add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int64), torch.zeros(4), torch.zeros(4))
     with pytest.raises(ValueError, match=r"add_view: view_count has shape \[5\]; it must be \[4\]"):
         add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int32), torch.zeros(4), torch.zeros(5))
+
+
+@pytest.mark.parametrize("wrong", [None, 1, "a", [1.0]])
+def test_what_is_no_tensor_is_named(wrong):
+    row, radii = torch.ones(4), torch.ones(4, dtype=torch.int32)
+    words = f"is of type {type(wrong).__name__}; it must be"
+    for function, arguments in ((activate, {"opacities": row, "scales": row, "rotations": row}),
+                                (add_view, {"dL_dmeans2D": row, "radii": radii, "gradient_sum": row,
+                                            "view_count": row}), (divided, {"opacities": row, "copies": row})):
+        for name in arguments:
+            with pytest.raises(TypeError, match=f"{function.__name__}: {name} {words} a torch.Tensor"):
+                function(**{**arguments, name: wrong})
+    with pytest.raises(ValueError, match=r"divided: opacities has shape \[4\] and copies \[3\]; both must be"):
+        divided(row, row[:3])
+    with pytest.raises(TypeError, match=f"distCUDA2: points {words} a torch.Tensor"):
+        distCUDA2(wrong)

@@ -61,6 +61,18 @@ def test_it_ends_as_the_command_unless_nothing_was_rendered(code, tmp_path, pyth
     assert result.status == status and said in result.err, result.err
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
+def test_the_command_ends_where_dsmoe_run_is_killed(tmp_path):
+    make(tmp_path, {"x.py": "import signal, sys, time\n"
+                            "signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('told to end', flush=True)))\n"
+                            "print('ready', flush=True)\ntime.sleep(60)\n"})
+    words = [sys.executable, "-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py"]
+    with subprocess.Popen(words, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.kill()
+        assert process.stdout.read() == "told to end\n", "read to its end, at which the command has ended"
+
+
 @pytest.mark.parametrize("number, ignored", [(signal.SIGTERM, False), (signal.SIGUSR1, False), (signal.SIGHUP, True)])
 def test_a_signal_reaches_the_command(number, ignored, tmp_path):
     """It was sent to `dsmoe run` only. What is ignored, as under nohup, stays so. Ctrl-C is the command's affair."""
