@@ -8,8 +8,8 @@ What the paper leaves open is decided here:
 
 - Gaussians are sorted by view depth; equal depths keep the order of the input.
 - A Gaussian is culled (radius 0, gradients exactly 0) where any value of its attributes, used or not, is NaN or
-  infinite, its opacity is above 1e20, its view depth is not beyond `near`, its projected covariance is not positive definite, its pixel position,
-  conic or colour is not finite, or its footprint misses the image.
+  infinite, its opacity is above 1e20, its view depth is not beyond `near`, its projected covariance is not positive
+  definite, its pixel position, conic or colour is not finite, or its footprint misses the image.
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
 - Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
