@@ -11,7 +11,7 @@ from ..config import TrainConfig
 from ..errors import SceneError
 from ..system.files import is_folder
 from .cameras import Camera
-from .layout import HOLD_OUT, LARGEST, Layout, PosedImage, hold_out, refuse_doubles
+from .layout import HOLD_OUT, Layout, PosedImage, hold_out
 from .pointcloud import PointCloud
 
 
@@ -23,9 +23,6 @@ def read_colmap_layout(folder: str, config: TrainConfig) -> Layout:
         raise SceneError(str(error)) from error
     for camera in model.cameras.values():
         _refuse_distortion(model.folder, camera)
-        _refuse_large(model.folder, f"camera {camera.id}", camera.params)
-    for image in model.images:
-        _refuse_large(model.folder, f"the position of image {image.name}", image.tvec)
     image_folder = os.path.join(folder, config.images)
     if not is_folder(image_folder):
         raise SceneError(f"{image_folder}: no such folder of images (--images names another)")
@@ -33,7 +30,6 @@ def read_colmap_layout(folder: str, config: TrainConfig) -> Layout:
         PosedImage(_camera(image, model.cameras[image.camera_id]), os.path.join(image_folder, image.name))
         for image in model.images
     ]
-    refuse_doubles(images, model.folder)
     train, test = hold_out(images)
     positions = np.asarray(model.points.positions, np.float64)
     colors = model.points.colors
@@ -49,11 +45,6 @@ def _refuse_distortion(folder: str, camera: io.ColmapCamera) -> None:
             f"{folder}: camera {camera.id} has the model {camera.model}; only PINHOLE and SIMPLE_PINHOLE images "
             "(without lens distortion) can be trained on. Undistort them first, with COLMAP: "
             "colmap image_undistorter --image_path IMAGES --input_path SPARSE --output_path SCENE --output_type COLMAP")
-
-
-def _refuse_large(folder: str, what: str, numbers: np.ndarray) -> None:
-    if not np.abs(numbers).max() <= LARGEST:
-        raise SceneError(f"{folder}: {what} has the numbers {numbers.tolist()}; none may be above {LARGEST:g}")
 
 
 def _camera(image: io.ColmapImage, intrinsics: io.ColmapCamera) -> Camera:

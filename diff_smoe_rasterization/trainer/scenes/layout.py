@@ -12,7 +12,6 @@ from .cameras import Camera
 from .pointcloud import PointCloud
 
 MASKS = "masks"  # folder of a scene, beside its images
-LARGEST = 1e9  # of all numbers of a camera, pixels or world units: with larger ones float32 overflows
 HOLD_OUT = 8  # every 8th image of a COLMAP scene, by sorted name, is a test image
 
 
@@ -41,16 +40,6 @@ def hold_out(images: Sequence[PosedImage]) -> Tuple[List[PosedImage], List[Posed
     ordered = sorted(images, key=lambda image: image.camera.name)
     train = [image for index, image in enumerate(ordered) if index % HOLD_OUT != 0]
     return train, ordered[::HOLD_OUT]
-
-
-def refuse_doubles(images: Sequence[PosedImage], source: str) -> None:
-    """Raises SceneError where two images are one file. source: where they are listed."""
-    seen = set()
-    for image in images:
-        path = os.path.normpath(image.path)
-        if path in seen:
-            raise SceneError(f"{source} lists the image {image.camera.name} twice; each image must be there once")
-        seen.add(path)
 
 
 def check_files(paths: Sequence[str]) -> None:

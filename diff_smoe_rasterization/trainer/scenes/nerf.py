@@ -16,11 +16,12 @@ from ..model import SH_C0
 from ..system.files import is_file
 from .cameras import Camera
 from .images import image_size
-from .layout import LARGEST, Layout, PosedImage, refuse_doubles
+from .layout import Layout, PosedImage
 from .pointcloud import PointCloud
 
 RANDOM_POINTS = 100_000  # as 3DGS
 HALF_SIDE = 1.3  # of the cube that random points fill: the extent of the NeRF-synthetic scenes
+LARGEST = 1e9  # of all numbers, pixels or world units: with larger ones float32 overflows
 MAX_SKEW = 1e-3  # of a rotation, as far as rounded json numbers may leave it
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 # From OpenGL's camera axes (y up, z backward) to ours (y down, z forward).
@@ -70,9 +71,7 @@ def _read_transforms(folder: str, name: str) -> List[PosedImage]:
         raise SceneError(f"{path}: expected an object with a list `frames`")
     if not content["frames"]:
         raise SceneError(f"{path}: the list `frames` is empty")
-    images = [_posed_image(folder, path, content, index) for index in range(len(content["frames"]))]
-    refuse_doubles(images, path)
-    return images
+    return [_posed_image(folder, path, content, index) for index in range(len(content["frames"]))]
 
 
 def _posed_image(folder: str, json_path: str, content: Dict[str, Any], index: int) -> PosedImage:

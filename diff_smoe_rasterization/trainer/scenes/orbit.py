@@ -9,8 +9,7 @@ from typing import List, Sequence
 import numpy as np
 
 from ..errors import SceneError
-from .cameras import Camera
-from .layout import LARGEST
+from .cameras import LARGEST, Camera
 
 FIELD_OF_VIEW = 0.9  # radians, of a camera that no scene gives
 SIZE = (800, 600)  # pixels, likewise

@@ -16,7 +16,7 @@ import numpy as np
 from ..config import TrainConfig
 from ..errors import SceneError
 from ..system.files import is_file, is_folder
-from .cameras import Camera, scene_extent
+from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
 from .images import View, fitted_camera, image_size, load_views
 from .layout import Layout, check_files, with_masks
@@ -69,8 +69,29 @@ def read_layout(config: TrainConfig) -> Layout:
                          "(NeRF-synthetic) is in it")
     if not layout.train:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
+    _check_images(folder, layout)
     check_files([image.path for image in list(layout.train) + list(layout.test)])
     return with_masks(folder, layout)
+
+
+def _check_images(folder: str, layout: Layout) -> None:
+    """Raises SceneError for an image that is listed twice, and for a camera that float32 cannot hold."""
+    every = [*layout.train, *layout.test]
+    # The two files of NeRF-synthetic may list the same images.
+    for images in (every,) if layout.kind == "colmap" else (layout.train, layout.test):
+        seen = set()
+        for image in images:
+            path = os.path.normpath(image.path)
+            if path in seen:
+                raise SceneError(f"scene {folder}: the image {image.camera.name} is listed twice, with a pose each")
+            seen.add(path)
+    for image in every:
+        camera = image.camera
+        numbers = [*camera.translation, camera.fx, camera.fy, camera.cx, camera.cy]
+        if not np.abs(numbers).max() <= LARGEST:
+            raise SceneError(f"scene {folder}: the camera of {camera.name} has the translation "
+                             f"{camera.translation.tolist()} and fx, fy, cx, cy {numbers[3:]}; no number may be above "
+                             f"{LARGEST:g}")
 
 
 def scene_fingerprint(scene: Scene) -> Dict[str, Any]:

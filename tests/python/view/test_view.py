@@ -25,7 +25,7 @@ from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
 from diff_smoe_rasterization.view import server
 from diff_smoe_rasterization.view.following import Followed
 from diff_smoe_rasterization.view.gate_map import largest_gates
-from diff_smoe_rasterization.view.guard import refusal
+from diff_smoe_rasterization.view.guard import CAMERA, is_wanted, refusal
 from diff_smoe_rasterization.view.picture import SHOWN, Blend, Look, own_colours, picture
 
 
@@ -171,6 +171,17 @@ def test_pages_of_others_are_refused(origin, host, words):
     assert why is None if words is None else words in why
 
 
+def test_only_cameras_and_values_are_passed_on():
+    camera = {"type": "ViewerCameraMessage", **{name: 1.0 if count == 1 else [1, 0.5, math.nan, 0][:count]
+                                                for name, count in CAMERA.items()}}
+    update = {"type": "GuiUpdateMessage", "uuid": "1", "updates": {"value": True}}
+    assert is_wanted(camera) and is_wanted({**camera, "near": 1}) and is_wanted(update)
+    for other in (None, [], {}, {"type": "ShareUrlRequest"}, {**camera, "fov": None}, {**camera, "wxyz": [1, 0, 0]},
+                  {**camera, "position": "abc"}, {**camera, "up_direction": [0, "1", 0]},
+                  {**update, "updates": {"value": {}}}, {**update, "updates": {"sync_cb": 1}}, {**update, "uuid": 1}):
+        assert not is_wanted(other), other
+
+
 def handle_of(**changes):
     """What viser knows of a browser's camera."""
     return SimpleNamespace(**{"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, -4.0), "fov": 0.9,
@@ -262,13 +273,18 @@ def test_the_server_refuses_other_pages_and_outlives_bad_messages(model, capsys)
             second.send(camera())
             until(lambda: len(viewer._clients) == 2)
             bad, good = (viewer._clients[number] for number in sorted(viewer._clients))
-            for message in (camera(fov=0.0), camera(fov=math.nan), camera(wxyz=(0.0, 0.0, 0.0, 0.0))):
+            gate = viewer.controls.gate._impl
+            for updates in ({"update_cb": "x" * 99}, {"visible": 0, "value": 0.7}, {"value": [1]}, {"value": 0.25}):
+                first.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": gate.uuid, "updates": updates}))
+            until(lambda: gate.value == 0.25)
+            assert isinstance(gate.update_cb, list) and viewer.controls.gate.visible
+            for message in (b"no message", camera(fov=0.0), camera(fov=math.nan), camera(wxyz=(0.0, 0.0, 0.0, 0.0))):
                 first.send(message)
             until(lambda: bad.text.content.startswith("no picture"))
             viewer.controls.gate.value = -1.0
             good.due = True
             until(lambda: not good.due and good.text.content.startswith("60 Gaussians"))
-            first.send(b"no message")  # viser ends this connection
+            first.close()
             until(lambda: len(viewer._clients) == 1)
             second.send(camera(fov=0.5))
             until(lambda: good.handle.camera.fov == 0.5 and not good.due and good.text.content)
