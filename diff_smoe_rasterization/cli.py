@@ -10,6 +10,7 @@ from ._version import __version__
 from .patches import TRAINERS, PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.config import (
+    DEVICES,
     PRINCIPAL_POINTS,
     TrainConfig,
     add_arguments,
@@ -184,7 +185,16 @@ def main(argv: Optional[List[str]] = None) -> int:
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to render (default: cpu)")
+    parser.add_argument("--device", choices=DEVICES, default="auto",
+                        help="where to render; auto: $DSMOE_DEVICE, else the GPU if it can be used (default: auto)")
+
+
+def _choose_device(arguments: argparse.Namespace) -> None:
+    """Replaces `auto` by a device, and says which it is."""
+    from .trainer.system.device import chosen_device, device_line
+
+    arguments.device = chosen_device(arguments.device)
+    print(device_line(arguments.device), flush=True)
 
 
 def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
@@ -225,6 +235,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                                                     "fig4, fig5, captures, captures_ablation, captures_baselines, "
                                                     "gate, gate_equal, budgets")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
+    run.add_argument("--device", choices=DEVICES,
+                     help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
     run.add_argument("--jobs", type=int, metavar="N",
                      help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
                           "FPS stay out of the report)")
@@ -280,7 +292,7 @@ def _bench_run(arguments: argparse.Namespace) -> int:
 
     rows = run_suite(arguments.suite, results=arguments.output, jobs=arguments.jobs, slurm=arguments.slurm,
                      retry_failed=arguments.retry_failed, dry_run=arguments.dry_run, only=arguments.only,
-                     per_gpu=arguments.per_gpu, rows=arguments.rows)
+                     per_gpu=arguments.per_gpu, rows=arguments.rows, device=arguments.device)
     if rows:
         print(rows_table(rows))
     failed = sum(not row["ok"] for row in rows)
@@ -320,7 +332,7 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
     if gpus is not None:
         if launched_by_torchrun():
             raise TrainerError("--gpus is given to a process that torchrun has started; leave out one of the two")
-        if not arguments.resume and not hasattr(arguments, "device"):
+        if not arguments.resume and getattr(arguments, "device", "auto") == "auto":
             arguments.device = "cuda"
             arguments.command_words += ["--device", "cuda"]
     config = _train_config(arguments)
@@ -349,11 +361,13 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
 
 def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) -> None:
     from .trainer.results.rows import blend_name, results_table, viewer_warning
+    from .trainer.system.device import device_line
     from .trainer.training.loop import train
 
     if not group.leads:
         train(config, arguments.resume, arguments.overwrite, progress=False, group=group)
         return
+    print(device_line(config.device), flush=True)
     blend = blend_name(config.blend_mode, config.background_gate)
     budget = f" to {config.budget} Gaussians" if config.budget else ""
     batch = f", {config.batch} views a step" if config.batch > 1 else ""
@@ -385,6 +399,11 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     if arguments.resume and arguments.scale_recipe and "scene" not in given:
         arguments.command_parser.error("--scale-recipe needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")
+    if given.get("device", "auto") == "auto":
+        from .trainer.system.device import chosen_device
+
+        earlier = TrainConfig.load(run).device if arguments.resume and holds_run(run) else None
+        given["device"] = arguments.device = earlier or chosen_device()
     if not arguments.resume or "scene" in given and (arguments.scale_recipe or not holds_run(run)):
         return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
     return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
@@ -395,6 +414,7 @@ def _eval(arguments: argparse.Namespace) -> None:
     from .trainer.results.metrics import image_metrics
     from .trainer.results.rows import results_table
 
+    _choose_device(arguments)
     measure = _with_lpips(arguments.lpips, arguments.device) if arguments.lpips else image_metrics
     row = evaluate_run(arguments.output, arguments.device, arguments.split, arguments.scene, measure=measure)
     print(f"{arguments.split} views")
@@ -428,6 +448,7 @@ def _with_lpips(net: str, device: str) -> Measure:
 def _render(arguments: argparse.Namespace) -> None:
     from .trainer.inspection import render_images
 
+    _choose_device(arguments)
     overrides = _overrides(arguments)
     outputs = [name for name in ("depth", "alpha") if getattr(arguments, name)]
     if arguments.orbit:
@@ -476,6 +497,7 @@ def _view(arguments: argparse.Namespace) -> None:
     from .view.following import Followed
     from .view.server import Viewer
 
+    _choose_device(arguments)
     viewer = Viewer(Followed(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
                              **_overrides(arguments)), arguments.host, arguments.port)
     print(f"{viewer.address}: open it in a browser; Ctrl-C ends", flush=True)

@@ -18,6 +18,7 @@ CONFIG_NAME = "config.json"
 SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
 BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")
+DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
 KINDS = {bool: "true or false", int: "a whole number", float: "a number"}  # what an option of this type must be
 LEARNED = "learned"  # the background gate that a training finds
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
@@ -75,7 +76,8 @@ class TrainConfig:
         choices=SCHEDULES, flags=("--strategy", "--schedule"))
     strategy_options: str = _option("", "settings of `gate`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
-    device: str = _option("cpu", "where tensors live", choices=("cpu", "cuda"))
+    device: str = _option("cpu", "where to train; auto: $DSMOE_DEVICE, else the GPU if it can be used",
+                          choices=DEVICES[1:], typed_choices=DEVICES, typed_default=DEVICES[0])
     sh_degree: int = _option(3, "highest spherical-harmonics degree, 0 to 3")
     sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
@@ -360,9 +362,9 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), def
         if option.metadata.get("required"):
             keywords["required"] = True
         elif option.default is not None and defaults:
-            text += f" (default: {option.default})"
+            text += f" (default: {option.metadata.get('typed_default', option.default)})"
         if option.metadata.get("choices"):
-            keywords["choices"] = option.metadata["choices"]
+            keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
         else:
             kind = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
             keywords["metavar"] = option.metadata.get("metavar", kind)

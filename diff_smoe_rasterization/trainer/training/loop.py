@@ -23,7 +23,7 @@ from ..results.rows import RESULTS_NAME, result_row, write_results
 from ..results.scalars import Scalars, scalar_files
 from ..scenes.images import View
 from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
-from ..system.environment import extension_info
+from ..system.device import check_device
 from ..system.files import is_file, write_atomically, write_json_atomically
 from ..system.group import ALONE, Group
 from ..system.interrupt import DelayedInterrupt
@@ -45,19 +45,6 @@ PER_VIEW_NAME = "per_view.json"
 PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME)  # beside config.json and the models
 TRAIN = "dsmoe train"  # in its folders' records
 PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
-
-
-def check_device(device: str) -> None:
-    """Raises TrainerError where this machine or this build cannot train on the device."""
-    if device == "cpu":
-        return
-    if not torch.cuda.is_available():
-        raise TrainerError("--device cuda: torch finds no CUDA device on this machine; use --device cpu")
-    info = extension_info()
-    if not info.get("cuda_built"):
-        reason = info.get("without_cuda_because") or "it was built without CUDA"
-        raise TrainerError(f"--device cuda: this diff_smoe_rasterization has no CUDA backend ({reason}); "
-                           "use --device cpu")
 
 
 class Trainer:

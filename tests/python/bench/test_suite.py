@@ -47,6 +47,13 @@ def test_gates_are_of_smoe_alone(content):
     assert names[1].startswith("native_tiny_smoe-learned_3dgs_") and names[3].startswith("native_tiny_smoe-0.05_3dgs_")
 
 
+def test_auto_becomes_the_device_of_this_machine(content):
+    """And the command's --device goes before the suite's."""
+    protocol = {**content["protocol"], "device": "auto"}
+    assert expand(dict(content, protocol=protocol), "").protocol["device"] == "cpu"
+    assert expand(dict(content, protocol=protocol), "", device="cuda").cells[0]["protocol"]["device"] == "cuda"
+
+
 def test_the_name_of_a_cell_is_that_of_its_figures(content, tmp_path):
     """Another protocol is another cell; another place of the same data is not."""
     def name(**changes):
