@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 
@@ -27,6 +28,12 @@ if TYPE_CHECKING:
     from .trainer.system.group import Group
 
 
+TRAIN_EXAMPLES = """examples:
+  dsmoe train garden -o garden_model                              the recipe of 3DGS
+  dsmoe train garden -o small --blend-mode smoe --budget 30000    a model of 30,000 Gaussians
+  dsmoe train garden -o quick --iterations 3000 --scale-recipe --resolution 4    minutes on a processor"""
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     parser = argparse.ArgumentParser(prog="dsmoe", description="Gaussian splatting with alpha and SMoE blending.")
@@ -34,24 +41,29 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     train = commands.add_parser("train", help="train Gaussians on a scene",
-                                description="Trains Gaussians on a COLMAP or NeRF-synthetic scene.")
+                                usage="%(prog)s SCENE -o OUT [OPTION ...]\n       %(prog)s --resume OUT [OPTION ...]",
+                                description="Trains Gaussians on a scene: photographs whose cameras are known.",
+                                formatter_class=argparse.RawDescriptionHelpFormatter, epilog=TRAIN_EXAMPLES)
     train.add_argument("scene", metavar="SCENE", nargs="?", default=argparse.SUPPRESS,
-                       help="folder of a COLMAP or NeRF-synthetic scene; --resume finds it in OUT")
+                       help="folder of a COLMAP scene, of a transforms.json (nerfstudio, instant-ngp, Polycam) or of a "
+                            "NeRF-synthetic scene; --resume finds it in OUT")
     train.add_argument("-o", "--output", metavar="OUT", default=argparse.SUPPRESS, help="folder to write")
-    add_arguments(train, skip=("scene", "output"))
-    train.add_argument("--scale-recipe", action="store_true",
-                       help="squeeze the recipe into --iterations: its milestones (densification, resets, learning "
-                            "rate, SH degrees) keep their share of 30,000 steps, unless they are given")
-    earlier_run = train.add_mutually_exclusive_group()
+    groups = add_arguments(train, skip=("scene", "output"))
+    groups["length, and number of Gaussians"].add_argument(
+        "--scale-recipe", action="store_true",
+        help="squeeze the recipe into --iterations: its milestones (densification, resets, learning rate, SH degrees) "
+             "keep their share of 30,000 steps, unless they are given")
+    earlier_run = groups["run"].add_mutually_exclusive_group()
     earlier_run.add_argument("--resume", action="store_true",
                              help="continue the run in OUT from its last checkpoint with its own options; more "
                                   "--iterations extend it")
     earlier_run.add_argument("--overwrite", action="store_true",
                              help="replace the run in OUT, once this one can start")
-    train.add_argument("--gpus", type=int, metavar="N",
-                       help="train on so many GPUs of this machine: torchrun starts this command once for each; with "
-                            "--batch N or more")
-    train.add_argument("--quiet", action="store_true", help="no progress bars")
+    groups["run"].add_argument(
+        "--gpus", type=int, metavar="N",
+        help="train on so many GPUs of this machine: torchrun starts this command once for each; with --batch N or "
+             "more")
+    groups["run"].add_argument("--quiet", action="store_true", help="no progress bars")
     train.set_defaults(run=_train)
 
     evaluate = commands.add_parser("eval", help="measure a trained run again",
@@ -360,8 +372,10 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
 
 
 def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) -> None:
+    from .trainer.results.modelfile import model_path
     from .trainer.results.rows import blend_name, results_table, viewer_warning
     from .trainer.system.device import device_line
+    from .trainer.system.process import command
     from .trainer.training.loop import train
 
     if not group.leads:
@@ -380,12 +394,15 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if config.schedule == "gate" and 4 * config.densify_until_iter >= 3 * config.iterations:
         print(f"note: --densify-until-iter {config.densify_until_iter} leaves no iterations to settle; below three "
               "quarters of --iterations it does, and --scale-recipe makes it half of them")
-    row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group)
+    row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
+                say=lambda text: print(text, flush=True))
     print(results_table([row]))
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")
     if viewer_warning(row):
         print(viewer_warning(row))
+    print(f"model: {printable(model_path(config.output, config.iterations))}")
+    print(f"to look at it in a browser: {command()} export {shlex.quote(config.output)} -o model.html")
 
 
 def _train_config(arguments: argparse.Namespace) -> TrainConfig:

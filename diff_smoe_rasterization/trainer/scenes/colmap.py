@@ -11,7 +11,7 @@ from ..config import TrainConfig
 from ..errors import SceneError
 from ..system.files import is_folder
 from .cameras import Camera
-from .layout import HOLD_OUT, Layout, PosedImage, hold_out
+from .layout import Layout, PosedImage, hold_out
 from .pointcloud import PointCloud
 
 
@@ -30,13 +30,13 @@ def read_colmap_layout(folder: str, config: TrainConfig) -> Layout:
         PosedImage(_camera(image, model.cameras[image.camera_id]), os.path.join(image_folder, image.name))
         for image in model.images
     ]
-    train, test = hold_out(images)
+    train, test, split = hold_out(images, config.test_every)
     positions = np.asarray(model.points.positions, np.float64)
     colors = model.points.colors
     if colors is None:
         colors = np.full(positions.shape, 128, np.uint8)
     points = PointCloud(positions, colors / 255.0).checked(model.folder)
-    return Layout("colmap", train, test, points, f"sorted by name, every {HOLD_OUT}th is a test image")
+    return Layout("colmap", train, test, points, split)
 
 
 def _refuse_distortion(folder: str, camera: io.ColmapCamera) -> None:

@@ -12,7 +12,6 @@ from .cameras import Camera
 from .pointcloud import PointCloud
 
 MASKS = "masks"  # folder of a scene, beside its images
-HOLD_OUT = 8  # every 8th image of a COLMAP scene, by sorted name, is a test image
 
 
 @dataclass(frozen=True)
@@ -35,11 +34,17 @@ class Layout:
     split: str  # how test images are chosen, for the protocol
 
 
-def hold_out(images: Sequence[PosedImage]) -> Tuple[List[PosedImage], List[PosedImage]]:
-    """Training and test images: sorted by name, every 8th from the first on is a test image."""
+def hold_out(images: Sequence[PosedImage], every: int = 8) -> Tuple[List[PosedImage], List[PosedImage], str]:
+    """Training and test images: sorted by name, every so many from the first on is a test image. And this in words.
+
+    every: 0, no test images.
+    """
     ordered = sorted(images, key=lambda image: image.camera.name)
-    train = [image for index, image in enumerate(ordered) if index % HOLD_OUT != 0]
-    return train, ordered[::HOLD_OUT]
+    if every == 0:
+        return ordered, [], "no image is kept for testing"
+    train = [image for index, image in enumerate(ordered) if index % every != 0]
+    ordinal = {2: "2nd", 3: "3rd"}.get(every, f"{every}th")
+    return train, ordered[::every], f"sorted by name, every {ordinal} is a test image"
 
 
 def check_files(paths: Sequence[str]) -> None:

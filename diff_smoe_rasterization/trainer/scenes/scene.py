@@ -18,7 +18,7 @@ from ..errors import SceneError
 from ..system.files import is_file, is_folder
 from .cameras import Camera, scene_extent
 from .colmap import read_colmap_layout
-from .images import View, fitted_camera, image_size, load_views
+from .images import MAX_WIDTH, View, fitted_camera, image_size, load_views
 from .layout import Layout, check_files, with_masks
 from .nerf import read_nerf_layout
 from .pointcloud import PointCloud
@@ -71,6 +71,20 @@ def read_layout(config: TrainConfig) -> Layout:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
     check_files([image.path for image in list(layout.train) + list(layout.test)])
     return with_masks(folder, layout)
+
+
+def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
+    """A line of what was loaded; layout: what the scene was loaded from."""
+    sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
+    size = " to ".join(f"{width}x{height}" for width, height in sizes[::max(1, len(sizes) - 1)])
+    first, file_size = scene.train[0].camera, image_size(layout.train[0].path)
+    if (first.width, first.height) != file_size:
+        why = f", at most {MAX_WIDTH} wide" if config.resolution == -1 else ""
+        size += f" (scaled from {file_size[0]}x{file_size[1]} by --resolution {config.resolution}{why})"
+    count, there = len(scene.points.positions), len(layout.points.positions)
+    points = f"{count:,} points" if count == there else f"{count:,} of {there:,} points"
+    return (f"{len(scene.train)} training and {len(scene.test)} test images ({scene.split}), {size} pixels, {points} "
+            "to start from")
 
 
 def scene_fingerprint(scene: Scene) -> Dict[str, Any]:

@@ -60,10 +60,17 @@ def test_every_eighth_image_by_sorted_name_is_a_test_image():
     shuffled = [names[(7 * index) % 20] for index in range(20)]
     camera = Camera("", np.eye(3), np.zeros(3), 1, 1, 1, 1, 2, 2)
     images = [PosedImage(Camera(**{**camera.__dict__, "name": name}), name) for name in shuffled]
-    train, test = hold_out(images)
+    train, test, _ = hold_out(images)
     assert [image.camera.name for image in test] == ["00.png", "08.png", "16.png"]
     assert [image.camera.name for image in train] == [name for name in names if name not in
                                                       ("00.png", "08.png", "16.png")]
+
+
+@pytest.mark.parametrize("every, tests, words", [(3, [0, 3, 6], "every 3rd"), (0, [], "no image"), (8, [0, 8], "8th")])
+def test_how_many_images_are_kept_for_testing(tiny_scene, every, tests, words):
+    scene = load(tiny_scene, test_every=every)
+    assert [view.camera.name for view in scene.test] == [f"view_{index:03d}.png" for index in tests]
+    assert len(scene.train) == 9 - len(tests) and words in scene.split
 
 
 @pytest.mark.parametrize("size, resolution, expected", [
