@@ -9,6 +9,7 @@ from typing import List, Optional, Sequence, Tuple
 from ..errors import SceneError
 from ..system.files import is_file, is_folder
 from .cameras import Camera
+from .lens import Lens
 from .pointcloud import PointCloud
 
 MASKS = "masks"  # folder of a scene, beside its images
@@ -21,13 +22,14 @@ class PosedImage:
     camera: Camera
     path: str
     mask: Optional[str] = None  # the file that says which pixels count
+    lens: Optional[Lens] = None  # what bends the image; the camera is the pinhole camera without it
 
 
 @dataclass(frozen=True)
 class Layout:
     """What a scene folder says, images unread."""
 
-    kind: str  # "colmap" or "nerf-synthetic"
+    kind: str  # "colmap", "transforms" or "nerf-synthetic"
     train: Sequence[PosedImage]
     test: Sequence[PosedImage]
     points: PointCloud
@@ -61,6 +63,8 @@ def with_masks(folder: str, layout: Layout) -> Layout:
     Raises SceneError where an image has none.
     """
     masks = os.path.join(folder, MASKS)
+    if any(image.mask for image in [*layout.train, *layout.test]):  # the scene's own file names them
+        return layout
     if not is_folder(masks):
         if os.path.lexists(masks):
             raise SceneError(f"{masks} is no folder; masks must lie in one, one image each")
