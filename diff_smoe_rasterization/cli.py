@@ -1,4 +1,4 @@
-"""The `dsmoe` command: train, eval, render, patch, run, bench, info; a few lines each over what does the work."""
+"""The `dsmoe` command: scene, train, eval, render, patch, run, bench, info; a few lines each over what works."""
 from __future__ import annotations
 
 import argparse
@@ -65,6 +65,22 @@ def build_parser() -> argparse.ArgumentParser:
              "more")
     groups["run"].add_argument("--quiet", action="store_true", help="no progress bars")
     train.set_defaults(run=_train)
+
+    scene = commands.add_parser("scene", help="make a scene of photographs",
+                                description="Finds where photographs were taken, by COLMAP, and writes a scene for "
+                                            "`dsmoe train`: images without lens distortion, cameras and points. It "
+                                            "needs pycolmap. Started again it goes on with what it has found.")
+    scene.add_argument("photos", metavar="PHOTOS", help="folder of photographs; subfolders are read too")
+    scene.add_argument("-o", "--output", metavar="SCENE", required=True,
+                       help="folder to write: new, empty, or of the same photographs")
+    scene.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto",
+                       help="which photographs are compared. exhaustive: all pairs; sequential: neighbours by name, as "
+                            "of a video; auto: all pairs of up to 200 (default: auto)")
+    scene.add_argument("--camera-model", default="OPENCV",
+                       choices=("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"),
+                       help="of the lens, by COLMAP's names (default: OPENCV)")
+    scene.add_argument("--quiet", action="store_true", help="no progress bars")
+    scene.set_defaults(run=_scene)
 
     evaluate = commands.add_parser("eval", help="measure a trained run again",
                                    description="Measures PSNR, SSIM and FPS of a finished run.")
@@ -159,7 +175,7 @@ def build_parser() -> argparse.ArgumentParser:
                                                  "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
     completion.add_argument("shell", choices=("bash", "zsh"))
     completion.set_defaults(run=_completion)
-    for command in (train, evaluate, render, export, view, run, info, completion):
+    for command in (train, scene, evaluate, render, export, view, run, info, completion):
         command.set_defaults(command_parser=command)
     return parser
 
@@ -190,7 +206,7 @@ def main(argv: Optional[List[str]] = None) -> int:
 
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = "; continue it with --resume" if continues else ""
-        if arguments.command == "bench" and arguments.action == "run":
+        if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return exit_status(stop)
@@ -424,6 +440,15 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     if not arguments.resume or "scene" in given and (arguments.scale_recipe or not holds_run(run)):
         return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
     return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
+
+
+def _scene(arguments: argparse.Namespace) -> None:
+    from .trainer.photos import make_scene
+    from .trainer.system.process import command
+
+    print(make_scene(arguments.photos, arguments.output, arguments.matching, arguments.camera_model,
+                     not arguments.quiet, say=lambda text: print(text, flush=True)))
+    print(f"to train on it: {command()} train {shlex.quote(arguments.output)} -o MODEL")
 
 
 def _eval(arguments: argparse.Namespace) -> None:

@@ -71,7 +71,8 @@ def read_layout(config: TrainConfig) -> Layout:
         layout = read_transforms_layout(folder, config)
     else:
         raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor {TRANSFORMS} (nerfstudio, "
-                         "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it")
+                         "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it. Of photographs "
+                         "`dsmoe scene PHOTOS -o SCENE` makes a scene")
     if not layout.train:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
     check_files([image.path for image in list(layout.train) + list(layout.test)])
