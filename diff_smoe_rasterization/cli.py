@@ -1,4 +1,4 @@
-"""The `dsmoe` command: scene, train, eval, render, patch, run, bench, info; a few lines each over what works."""
+"""The `dsmoe` command: scene, train, eval, render, patch, run, bench, info; a few lines each over what does it."""
 from __future__ import annotations
 
 import argparse

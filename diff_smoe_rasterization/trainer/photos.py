@@ -17,6 +17,7 @@ from .errors import SceneError, TrainerError
 from .scenes.images import UNREADABLE, image_size
 from .system.files import is_folder
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
+from .system.process import pip_install
 from .system.progress import progress_bar
 
 SCENE = "dsmoe scene"  # in its folder's record
@@ -61,7 +62,7 @@ def make_scene(photos: str, output: str, matching: str = "auto", camera_model: s
     try:
         import pycolmap
     except ImportError as error:
-        raise TrainerError("dsmoe scene needs COLMAP's Python package: pip install pycolmap") from error
+        raise TrainerError(f"dsmoe scene needs COLMAP's Python package: {pip_install('pycolmap')}") from error
     names = photo_names(photos)
     own_record(output, SCENE)  # refused before anything is made
     make_folder(output)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..settings import BLEND_MODES, MAX_BACKGROUND_GATE
 from ..trainer.errors import TrainerError
 from ..trainer.scenes.cameras import Camera
+from ..trainer.system.process import pip_install
 from ..trainer.system.stopwatch import synchronised_time
 from .following import Followed
 from .picture import SHOWN, Blend, Look, picture
@@ -75,7 +76,7 @@ class Viewer:
         try:
             import viser
         except ImportError as error:
-            raise TrainerError("the viewer needs viser (pip install viser)") from error
+            raise TrainerError(f"the viewer needs viser: {pip_install('viser')}") from error
         self.followed = followed
         self.server = viser.ViserServer(host=host, port=port, label="dsmoe view", verbose=False)
         self.server.scene.set_up_direction(tuple(followed.orbit.up.tolist()))

@@ -14,6 +14,7 @@ from PIL import Image
 
 from ..errors import SceneError
 from ..system.files import is_file
+from ..system.process import pip_install
 from ..system.progress import progress_bar
 from .cameras import Camera
 from .images import UNREADABLE, image_size
@@ -39,7 +40,7 @@ def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str
     models = ", ".join(sorted({image.lens.model for image in bent}))
     if not _opencv():
         raise SceneError(f"scene {scene}: {len(bent)} images have lens distortion (camera model {models}); OpenCV "
-                         "removes it: pip install opencv-python-headless, then type the same command")
+                         f"removes it: {pip_install('opencv-python-headless')}, then type the same command")
     folder = cache_folder(scene)
     os.makedirs(folder, exist_ok=True)
     new = sum(not is_file(_image_path(image, folder)) for image in bent)

@@ -36,6 +36,14 @@ def command() -> str:
     return shlex.quote(min(script, os.path.relpath(script), key=len))
 
 
+def pip_install(*packages: str) -> str:
+    """What to type to bring packages into the environment that this process runs in."""
+    pip = os.path.join(os.path.dirname(sys.executable), "pip")
+    if shutil.which("pip") == pip:
+        return f"pip install {' '.join(packages)}"
+    return f"{shlex.quote(sys.executable)} -m pip install {' '.join(packages)}"
+
+
 def return_spare_memory(device: torch.device) -> None:
     """Returns the GPU memory that torch keeps for later to the driver, where that is much.
 

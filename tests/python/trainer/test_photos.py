@@ -105,7 +105,7 @@ def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
     (tmp_path / "mine" / "letter.txt").write_text("")
     assert "mine is not empty (letter.txt)" in fails(capsys, tmp_path, "-o", tmp_path / "mine")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert "needs COLMAP's Python package: pip install pycolmap" in fails(capsys, tmp_path, "-o", tmp_path / "scene")
+    assert "pip install pycolmap" in fails(capsys, tmp_path, "-o", tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
 
 
