@@ -286,6 +286,33 @@ def test_transforms_with_intrinsics_of_each_frame(transforms_folder):
     np.testing.assert_allclose(np.abs(scene.points.positions).max(axis=0), 3.0, rtol=0, atol=0.01)
 
 
+def test_transforms_of_a_colmap_scene_are_that_scene(colmap_folder, tmp_path):
+    """nerfstudio's conversion, written out: camera to world, with y up and z backward."""
+    expected, model, frames = load(colmap_folder), io.read_colmap(colmap_folder), []
+    shutil.copytree(os.path.join(colmap_folder, "images"), str(tmp_path / "json" / "images"))
+    for image in model.images:
+        w, x, y, z = image.qvec
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation.T * [1, -1, -1]
+        matrix[:3, 3] = -rotation.T @ image.tvec
+        frames.append({"file_path": f"images/{image.name}", "transform_matrix": matrix.tolist()})
+    fx, fy, cx, cy = model.cameras[1].params
+    io.write_points(str(tmp_path / "json" / "points.ply"), model.points)
+    (tmp_path / "json" / "transforms.json").write_text(json.dumps(
+        {"camera_model": "PINHOLE", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": 32, "h": 24,
+         "ply_file_path": "points.ply", "frames": frames}))
+    scene = load(tmp_path / "json")
+    for views, theirs in ((scene.train, expected.train), (scene.test, expected.test)):
+        assert [view.camera.name for view in views] == [f"images/{view.camera.name}" for view in theirs]
+        for view, other in zip(views, theirs):
+            np.testing.assert_allclose(view.camera.rotation, other.camera.rotation, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(view.camera.translation, other.camera.translation, rtol=0, atol=1e-12)
+            assert torch.equal(view.image, other.image) and view.camera.fx == other.camera.fx
+    np.testing.assert_allclose(scene.points.positions, expected.points.positions, rtol=1e-6, atol=1e-6)  # float32
+    assert scene.split == expected.split and scene.extent == pytest.approx(expected.extent)
+
+
 def test_transforms_with_points_masks_and_listed_images(transforms_folder):
     positions = np.arange(15.0).reshape(5, 3)
     io.write_points(str(transforms_folder / "sparse_pc.ply"), io.Points(positions, np.full((5, 3), 51, np.uint8)))
