@@ -47,7 +47,7 @@ In PNG and MP4 depth and count become colours from blue (least) to red (most); t
 picture, and is printed. In EXR they are numbers, and gates the Gaussian's number, -1 where there is none.
 
 Further options
-  --view NAME|NUMBER  only this camera: its image name, or its place in the list from 0
+  --view NAME|NUMBER  only this camera: its image name, or its place in the list or on the orbit, from 0
   --size WxH          of the pictures in pixels; only W keeps the shape. Default: as the cameras say; orbit 1280x720
   --blend NAME        alpha, smoe, smoe_tn or smoe_std. Default: what the model was trained with, if the file says so
   --background-gate X of smoe. Default: likewise, else 0
@@ -130,9 +130,9 @@ Orbit read_orbit(const CommandLine& line, const Extent& extent, ImageSize size) 
 std::vector<View> choose_views(const CommandLine& line, const Model& model) {
   const ImageSize size = read_size(line);
   if (line.has("cameras") == line.has("orbit")) throw UsageError("one of --cameras and --orbit is needed");
-  if (line.has("orbit")) return orbit_views(read_orbit(line, extent_of(model), size));
-
-  std::vector<View> views = read_views(line.text("cameras", ""), size.height > 0 ? size : ImageSize{});
+  const bool orbit = line.has("orbit");
+  std::vector<View> views = orbit ? orbit_views(read_orbit(line, extent_of(model), size))
+                                  : read_views(line.text("cameras", ""), size.height > 0 ? size : ImageSize{});
   if (line.has("view")) {
     const std::string wanted = line.text("view", "");
     auto found = std::find_if(views.begin(), views.end(), [&](const View& view) { return view.name == wanted; });
@@ -141,6 +141,7 @@ std::vector<View> choose_views(const CommandLine& line, const Model& model) {
     }
     views = {*found};
   }
+  if (orbit) return views;  // they have their size
   for (View& view : views) {
     const int width = size.width > 0 ? size.width : view.width;
     const double shape = double(view.height) / view.width;

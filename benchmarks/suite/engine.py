@@ -11,6 +11,7 @@ from functools import partial
 from typing import IO, Any, Dict, List, Mapping, Optional, Sequence
 
 from ...trainer.system.children import die_with_parent
+from ...trainer.system.device import device_line
 from ...trainer.system.files import write_json_atomically, write_text_atomically
 from ...trainer.system.output_folder import (
     Record,
@@ -37,14 +38,15 @@ SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile"
 
 def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = None,
               slurm: Optional[Sequence[str]] = None, retry_failed: bool = False, dry_run: bool = False,
-              only: Sequence[str] = (), per_gpu: int = 1, rows: Optional[str] = None) -> List[Row]:
+              only: Sequence[str] = (), per_gpu: int = 1, rows: Optional[str] = None,
+              device: Optional[str] = None) -> List[Row]:
     """Runs what is not done of a suite; returns the rows of its cells, failed ones included.
 
     name: a file or a shipped suite. results: by default bench_results/NAME. The others are the options of `dsmoe bench
     run`; slurm: None, or Snakemake's default resources. Raises BenchError. Where nothing is to be done, neither a GPU
     nor Snakemake is needed.
     """
-    suite = load_suite(find_suite(name))
+    suite = load_suite(find_suite(name), device)
     check_sharing(suite, jobs, slurm, per_gpu)
     check_weights(suite.protocol["lpips"])
     cells = chosen(suite.cells, only)
@@ -67,6 +69,8 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     if absent:
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
+    if to_do and slurm is None:
+        print(device_line(suite.protocol["device"]), flush=True)
     words = command(suite, to_do, results, jobs, slurm, per_gpu) if to_do else None
     make_folder(results)
     with only_one(results) as lock:

@@ -20,6 +20,16 @@ BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, an
 PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
 LARGEST = 2**53  # of whole numbers, up to which floats hold each
+DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
+# How `--help` groups the options; those that no group names are of the last one.
+GROUPS = {
+    "scene": ("images", "resolution", "test_every", "principal_point", "init_points", "white_background",
+              "random_background"),
+    "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
+    "length, and number of Gaussians": ("iterations", "batch", "budget", "schedule", "strategy_options"),
+    "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
+    "recipe": (),
+}
 LEARNED = "learned"  # the background gate that a training finds
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
@@ -44,7 +54,7 @@ class TrainConfig:
     Raises ConfigError from `validate` with the option's name, its value and what it must be.
     """
 
-    scene: str = _option("", "folder of a COLMAP or NeRF-synthetic scene", positional=True)
+    scene: str = _option("", "folder of a scene: COLMAP, transforms.json or NeRF-synthetic", positional=True)
     output: str = _option("", "folder to write", flags=("-o", "--output"), required=True)
     blend_mode: Optional[str] = _option(
         None, "how Gaussians make a pixel (default: $DSMOE_BLEND_MODE, else alpha)", choices=BLEND_MODES)
@@ -62,6 +72,9 @@ class TrainConfig:
     principal_point: str = _option(
         "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
         choices=PRINCIPAL_POINTS)
+    test_every: int = _option(
+        8, "every so many images, sorted by name, one is kept for testing, the first among them; 0: none. A scene that "
+           "lists its test images itself keeps those")
     white_background: bool = _option(False, "white background instead of black")
     random_background: bool = _option(
         False, "each step's image with transparency lies over a colour of its own; measured over black or white")
@@ -76,7 +89,8 @@ class TrainConfig:
         choices=SCHEDULES, flags=("--strategy", "--schedule"))
     strategy_options: str = _option("", "settings of `gate`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
-    device: str = _option("cpu", "where tensors live", choices=("cpu", "cuda"))
+    device: str = _option("cpu", "where to train; auto: $DSMOE_DEVICE, else the GPU if it can be used",
+                          choices=DEVICES[1:], typed_choices=DEVICES, typed_default=DEVICES[0])
     sh_degree: int = _option(3, "highest spherical-harmonics degree, 0 to 3")
     sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
@@ -138,6 +152,7 @@ class TrainConfig:
             raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.schedule}: only "
                               f"{' and '.join(BATCHED)} know batches")
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
+        self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
         self._require("budget", self.budget >= 0, "at least 0")
         needs_budget = self.schedule in ("gate", "mcmc")
@@ -345,12 +360,15 @@ def flags_text(options: Dict[str, Any]) -> str:
 _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
 
 
-def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), defaults: bool = True) -> None:
-    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser.
+def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
+                  defaults: bool = True) -> Dict[str, argparse._ArgumentGroup]:
+    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser; returns their groups.
 
     Options that are not given are absent from the parsed arguments. defaults: whether the help text names what they
     are then.
     """
+    groups = {title: parser.add_argument_group(title) for title in GROUPS}
+    titles = {name: title for title, names in GROUPS.items() for name in names}
     for option in dataclasses.fields(TrainConfig):
         if option.name in skip:
             continue
@@ -358,21 +376,22 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), def
         if option.metadata.get("positional"):
             parser.add_argument(option.name, metavar=option.name.upper(), help=text)
             continue
-        flags = _flags(option)
+        flags, group = _flags(option), groups[titles.get(option.name, "recipe")]
         if option.type == "bool":
-            parser.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
+            group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue
         keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": argparse.SUPPRESS}
         if option.metadata.get("required"):
             keywords["required"] = True
         elif option.default is not None and defaults:
-            text += f" (default: {option.default})"
+            text += f" (default: {option.metadata.get('typed_default', option.default)})"
         if option.metadata.get("choices"):
-            keywords["choices"] = option.metadata["choices"]
+            keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
         else:
             kind = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
             keywords["metavar"] = option.metadata.get("metavar", kind)
-        parser.add_argument(*flags, help=text, dest=option.name, **keywords)
+        group.add_argument(*flags, help=text, dest=option.name, **keywords)
+    return groups
 
 
 def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:

@@ -18,10 +18,11 @@ from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import read_results, result_row, write_results
 from .scenes.cameras import Camera
 from .scenes.scene import load_cameras, load_scene
+from .system.device import check_device
 from .system.files import write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.progress import progress_bar
-from .training.loop import PER_VIEW_NAME, check_device
+from .training.loop import PER_VIEW_NAME
 
 RENDER = "dsmoe render"  # in its folders' records
 

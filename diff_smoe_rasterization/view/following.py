@@ -12,10 +12,10 @@ from ..trainer.results.modelfile import model_path
 from ..trainer.results.rendering import Renderer, background_color
 from ..trainer.scenes.cameras import Camera
 from ..trainer.scenes.orbit import Orbit
+from ..trainer.system.device import check_device
 from ..trainer.system.files import is_file, is_folder
 from ..trainer.training.background_gate import LearnedGate
 from ..trainer.training.checkpoint import CHECKPOINT_NAME, load_checkpoint
-from ..trainer.training.loop import check_device
 
 
 class Followed:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..settings import BLEND_MODES, MAX_BACKGROUND_GATE
 from ..trainer.errors import TrainerError
 from ..trainer.scenes.cameras import Camera
+from ..trainer.system.process import pip_install
 from ..trainer.system.stopwatch import synchronised_time
 from .following import Followed
 from .guard import only_own_pages
@@ -98,7 +99,7 @@ class Viewer:
         try:
             import viser
         except ImportError as error:
-            raise TrainerError("the viewer needs viser (pip install viser)") from error
+            raise TrainerError(f"the viewer needs viser: {pip_install('viser')}") from error
         self.followed = followed
         with only_own_pages(host):
             self.server = viser.ViserServer(host=host, port=port, label="dsmoe view", verbose=False)

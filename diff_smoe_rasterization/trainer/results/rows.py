@@ -42,7 +42,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["recipe"] = config.unusual_recipe()
     if config.random_background:
         unusual["random_background"] = True
-    if views[0].mask is not None:
+    if any(view.mask is not None for view in views):
         unusual["masks"] = "metrics over the kept pixels; SSIM of images times their masks"
     return {
         "scene": os.path.basename(os.path.abspath(config.scene)),

@@ -1,6 +1,7 @@
 """Loads a scene folder: cameras, images, the train/test split and the points to start from.
 
-Two kinds are known: COLMAP (a sparse model beside a folder of images) and NeRF-synthetic (transforms_*.json).
+Three kinds are known: COLMAP (a sparse model beside a folder of images), transforms.json, and NeRF-synthetic
+(transforms_train.json).
 Everything that can be wrong with a folder is a SceneError here, before training starts.
 """
 from __future__ import annotations
@@ -18,10 +19,11 @@ from ..errors import SceneError
 from ..system.files import is_file, is_folder
 from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
-from .images import View, fitted_camera, image_size, load_views
+from .images import MAX_WIDTH, View, fitted_camera, image_size, load_views
 from .layout import Layout, check_files, with_masks
-from .nerf import read_nerf_layout
+from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
 from .pointcloud import PointCloud
+from .undistortion import undistorted
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Scene:
     points: PointCloud
     extent: float  # world units
     split: str
+    note: str = ""  # what was done to its images, in a line
 
     def to(self, device: str) -> Scene:
         """The same scene with its images on `device`."""
@@ -47,12 +50,12 @@ def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layo
 
     layout: what `read_layout` gave, where it is at hand. Raises SceneError naming the file and the reason.
     """
-    layout = layout or read_layout(config)
+    layout, note = undistorted(layout or read_layout(config), config.scene, progress)
     images = load_views(list(layout.train) + list(layout.test), config, progress)
     train, test = images[:len(layout.train)], images[len(layout.train):]
     points = layout.points.subset(config.init_points, config.seed).subset(config.most_points, config.seed)
     extent = scene_extent(np.stack([view.camera.center for view in train]))
-    return Scene(layout.kind, train, test, points, extent, layout.split)
+    return Scene(layout.kind, train, test, points, extent, layout.split, note)
 
 
 def read_layout(config: TrainConfig) -> Layout:
@@ -64,9 +67,12 @@ def read_layout(config: TrainConfig) -> Layout:
         layout = read_nerf_layout(folder, config)
     elif is_folder(os.path.join(folder, "sparse")):
         layout = read_colmap_layout(folder, config)
+    elif is_file(os.path.join(folder, TRANSFORMS)):
+        layout = read_transforms_layout(folder, config)
     else:
-        raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor transforms_train.json "
-                         "(NeRF-synthetic) is in it")
+        raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor {TRANSFORMS} (nerfstudio, "
+                         "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it. Of photographs "
+                         "`dsmoe scene PHOTOS -o SCENE` makes a scene")
     if not layout.train:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
     _check_images(folder, layout)
@@ -92,6 +98,20 @@ def _check_images(folder: str, layout: Layout) -> None:
             raise SceneError(f"scene {folder}: the camera of {camera.name} has the translation "
                              f"{camera.translation.tolist()} and fx, fy, cx, cy {numbers[3:]}; no number may be above "
                              f"{LARGEST:g}")
+
+
+def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
+    """What was loaded, in a line, or two where images were undistorted; layout: what the scene was loaded from."""
+    sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
+    size = " to ".join(f"{width}x{height}" for width, height in sizes[::max(1, len(sizes) - 1)])
+    first, file_size = scene.train[0].camera, image_size(layout.train[0].path)
+    if (first.width, first.height) != file_size:
+        why = f", at most {MAX_WIDTH} wide" if config.resolution == -1 else ""
+        size += f" (scaled from {file_size[0]}x{file_size[1]} by --resolution {config.resolution}{why})"
+    count, there = len(scene.points.positions), len(layout.points.positions)
+    points = f"{count:,} points" if count == there else f"{count:,} of {there:,} points"
+    return (f"{len(scene.train)} training and {len(scene.test)} test images ({scene.split}), {size} pixels, {points} "
+            "to start from" + (f"\n{scene.note}" if scene.note else ""))
 
 
 def scene_fingerprint(scene: Scene) -> Dict[str, Any]:

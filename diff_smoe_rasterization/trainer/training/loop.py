@@ -23,8 +23,8 @@ from ..results.rows import RESULTS_NAME, result_row, write_results
 from ..results.scalars import FOLDER as SCALARS_FOLDER
 from ..results.scalars import Scalars, scalar_files
 from ..scenes.images import View
-from ..scenes.scene import Scene, load_scene, read_layout, scene_fingerprint
-from ..system.environment import extension_info
+from ..scenes.scene import Scene, describe_scene, load_scene, read_layout, scene_fingerprint
+from ..system.device import check_device
 from ..system.files import is_file, write_atomically, write_json_atomically
 from ..system.group import ALONE, Group
 from ..system.interrupt import DelayedInterrupt
@@ -42,6 +42,7 @@ from ..system.progress import progress_bar
 from ..system.stopwatch import Stopwatch
 from .background_gate import LearnedGate
 from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
+from .forecast import Forecast
 from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses
 from .randomness import random_state, restore_random_state, seed_everything
@@ -56,19 +57,6 @@ PER_VIEW_NAME = "per_view.json"
 PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME)  # beside config.json and the models
 TRAIN = "dsmoe train"  # in its folders' records
 PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
-
-
-def check_device(device: str) -> None:
-    """Raises TrainerError where this machine or this build cannot train on the device."""
-    if device == "cpu":
-        return
-    if not torch.cuda.is_available():
-        raise TrainerError("--device cuda: torch finds no CUDA device on this machine; use --device cpu")
-    info = extension_info()
-    if not info.get("cuda_built"):
-        reason = info.get("without_cuda_because") or "it was built without CUDA"
-        raise TrainerError(f"--device cuda: this diff_smoe_rasterization has no CUDA backend ({reason}); "
-                           "use --device cpu")
 
 
 class Trainer:
@@ -250,11 +238,13 @@ class Trainer:
 class Run:
     """A Trainer with an output folder: progress, evaluations on the way, checkpoints."""
 
-    def __init__(self, trainer: Trainer, progress: bool = True, lock: Optional[IO[str]] = None) -> None:
-        """lock: the folder's, where this process leads."""
+    def __init__(self, trainer: Trainer, progress: bool = True, lock: Optional[IO[str]] = None,
+                 forecast: Optional[Forecast] = None) -> None:
+        """lock: the folder's, where this process leads. forecast: says how long it will take, where that is to be said."""
         self.trainer = trainer
         self.progress = progress
         self.lock = lock
+        self.forecast = forecast
         self.history: List[Dict[str, Any]] = []
         self.losses: List[Tuple[int, float]] = []  # iteration and loss, as often as the loss is looked at
         self.scalars: Optional[Scalars] = None  # of the run in progress
@@ -306,6 +296,9 @@ class Run:
         evaluates = following < config.iterations and is_due(following, config.eval_every, config.batch)
         step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
         bar.update(config.batch)
+        forecast = self.forecast(trainer.iteration) if self.forecast else None
+        if forecast:
+            bar.write(forecast)
         last = trainer.iteration >= config.iterations
         if last or step.due(PROGRESS_EVERY[config.device]):
             self.losses.append((trainer.iteration, _check_loss(step)))
@@ -421,15 +414,16 @@ def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = F
 
 
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
-          scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None,
-          group: Optional[Group] = None) -> Dict[str, Any]:
+          scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None, group: Optional[Group] = None,
+          say: Optional[Callable[[str], None]] = None) -> Dict[str, Any]:
     """Trains a scene into config.output; returns the row of results.json.
 
     resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
     of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
     is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
     run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
-    hand. group: the processes that train together, where there are several; all of them call this. Raises TrainerError
+    hand. group: the processes that train together, where there are several; all of them call this. say: is called
+    with a line about what was loaded; with it a training on the CPU also says how long it takes. Raises TrainerError
     before training starts where anything does not fit, as where another run is at work in the folder.
     """
     if resume and overwrite:
@@ -450,7 +444,10 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         if config.random_background and config.background_gate == 0:
             print("warning: --random-background with a background gate of 0: the background is seen only where no "
                   "Gaussian is, so little is learned of transparency")
-        run = Run(_new_trainer(config, scene, rasterize, group), progress, lock)
+        if say and layout:
+            say(describe_scene(scene, layout, config))
+        forecast = Forecast(config, scene) if say and config.device == "cpu" else None
+        run = Run(_new_trainer(config, scene, rasterize, group), progress, lock, forecast)
         if resume:
             resumed = run.resume()
             print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")

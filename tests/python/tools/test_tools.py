@@ -147,6 +147,17 @@ def test_an_orbit_becomes_pictures_and_videos(tmp_path, show, end):
     assert out.stat().st_size > 1000
 
 
+def test_a_view_of_an_orbit(tmp_path):
+    io.write_gaussians(tmp_path / "model.ply", model("smoe", 0.0))
+    orbit = ["--orbit", "--frames", 5, "--size", "33x21", "--device", "cpu"]
+    tool("dsmoe_render", tmp_path / "model.ply", *orbit, "-o", tmp_path / "all")
+    tool("dsmoe_render", tmp_path / "model.ply", *orbit, "--view", 3, "-o", tmp_path / "one.png")
+    pictures = {name: (tmp_path / name).read_bytes() for name in ("one.png", "all/orbit_3.png", "all/orbit_0.png")}
+    assert pictures["one.png"] == pictures["all/orbit_3.png"] != pictures["all/orbit_0.png"]
+    said = tool("dsmoe_render", tmp_path / "model.ply", *orbit, "--view", 5, "-o", tmp_path / "no.png", status=2)
+    assert "--view" in said and not (tmp_path / "no.png").exists()
+
+
 def test_a_model_of_no_known_blend_needs_one(tmp_path):
     io.write_gaussians(tmp_path / "model.ply", model())
     said = tool("dsmoe_render", tmp_path / "model.ply", "--orbit", "-o", tmp_path / "out.mp4", status=2)

@@ -20,7 +20,10 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer import inspection
+from diff_smoe_rasterization.trainer.config import GROUPS, TrainConfig
 from diff_smoe_rasterization.trainer.results.rows import viewer_warning
+from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.training import forecast
 from diff_smoe_rasterization.trainer.training.loop import Trainer
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
@@ -76,6 +79,53 @@ def test_training_leaves_results_config_and_model(trained):
         header = file.read(2000).split(b"end_header")[0].decode()
     assert "comment blend_mode smoe" in header
     assert int(re.search(r"element vertex (\d+)", header).group(1)) == row["num_gaussians"]
+
+
+def test_training_says_what_it_loaded_and_what_comes_next(scene, tmp_path, capsys):
+    output = str(tmp_path / "out put")
+    assert main(["train", scene, "-o", output, "--resolution", "2", "--init-points", "50", *SHORT]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    count = len(io.read_colmap(scene).points.positions)
+    assert lines[0].startswith("device: cpu (") and lines[1].startswith(scene)
+    assert lines[2] == ("7 training and 2 test images (sorted by name, every 8th is a test image), 16x12 (scaled from "
+                        f"32x24 by --resolution 2) pixels, 50 of {count} points to start from")
+    assert re.fullmatch(r"at this speed the other 1 iterations take about \d+ s, longer as .*", lines[3])
+    assert lines[-2] == f"model: {ply_of(output)}"
+    assert lines[-1].endswith(f"export '{output}' -o model.html")
+    assert main(["train", scene, "-o", output, "--test-every", "0", "--overwrite", *SHORT]) == 0
+    text = capsys.readouterr().out
+    assert "9 training and 0 test images (no image is kept for testing), 32x24 pixels" in text
+    assert "nothing was measured" in text
+    assert "--test-every is 1; it must be 0 or at least 2" in fails(capsys, "train", scene, "-o", output,
+                                                                    "--test-every", "1")
+
+
+def test_a_long_training_on_a_processor_is_told_with_a_shorter_one(scene, monkeypatch):
+    config = TrainConfig(scene=scene, iterations=30_000)
+    loaded = load_scene(config, progress=False)
+    clock = iter([0.0, 5.0, 12.0, 25.0])
+    monkeypatch.setattr(forecast.time, "monotonic", lambda: next(clock))
+    told = forecast.Forecast(config, loaded)
+    assert [told(iteration) for iteration in (1, 2, 3)] == [None] * 3
+    line = told(4)  # three steps in 25 seconds: 29,996 take 69.4 hours
+    assert line.startswith("at this speed the other 29,996 iterations take about 2.9 days, longer as ")
+    assert line.endswith(" --scale-recipe --iterations 2000 --strategy steady --densify-grad-threshold 0.001")
+    assert told(5) is None, "it is said once"
+    assert [forecast.duration(seconds) for seconds in (20, 600, 7200)] == ["20 s", "10 min", "2.0 h"]
+
+
+def test_help_has_groups_and_a_wrong_mode_is_named_where_it_is_given(scene, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    text = capsys.readouterr().out
+    parts = re.split(r"\n(?=[a-z][a-zA-Z, ]*:\n)", text)
+    assert [part.partition(":")[0] for part in parts[1:]] == ["positional arguments", "options", *GROUPS, "examples"]
+    assert "--blend-mode" in parts[4] and "--feature-lr" in parts[7] and "dsmoe train garden -o" in parts[8]
+    with pytest.raises(SystemExit):
+        main(["train", scene, "-o", "out", "--blend-mode", "smo"])
+    usage, error = capsys.readouterr().err.rsplit("\n", 2)[:2]
+    assert usage.count("\n") <= 1, "the error is not behind a page of options"
+    assert "argument --blend-mode: invalid choice: 'smo' (choose from" in error and "smoe_tn" in error
 
 
 def test_eval_measures_the_same_again(trained, capsys):

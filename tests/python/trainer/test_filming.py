@@ -85,4 +85,4 @@ def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, output, argum
 def test_an_mp4_without_its_library_is_refused(model, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
     assert orbit(model, tmp_path / "a.mp4") == 1
-    assert "pip install imageio-ffmpeg" in capsys.readouterr().err
+    assert "pip install imageio-ffmpeg; .gif" in capsys.readouterr().err
