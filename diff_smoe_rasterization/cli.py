@@ -89,12 +89,12 @@ def build_parser() -> argparse.ArgumentParser:
 
     export = commands.add_parser("export", help="write a trained model for other programs, or as a page to look at",
                                  description="Writes a trained model as one file. A page (.html) shows it in a "
-                                             "browser by the blend that it was trained with; other viewers show a .ply "
-                                             "or a .splat by alpha.")
+                                             "browser by the blend that it was trained with; other viewers show the "
+                                             "other formats by alpha.")
     export.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
     export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
-    export.add_argument("--format", choices=("html", "ply", "splat"),
-                        help="default: by the ending of FILE, else html")
+    export.add_argument("--format", choices=("html", "ply", "splat", "spz", "glb"),
+                        help="default: by the ending of FILE, else html; spz needs gsply")
     export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
                         help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
                              "holds degree 0)")

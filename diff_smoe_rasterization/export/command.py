@@ -12,9 +12,11 @@ from ..trainer.results.pictures import evenly_spaced
 from ..trainer.results.rows import viewer_warning
 from ..trainer.system.files import write_atomically
 from . import html
+from .glb import BLEND, Blend, glb_bytes
 from .splat import splat_bytes
+from .spz import check_spz, spz_bytes
 
-FORMATS = ("html", "ply", "splat")
+FORMATS = ("html", "ply", "splat", "spz", "glb")
 VIEWS = 16  # of a page, at most
 
 
@@ -33,18 +35,27 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
     if form not in FORMATS:
         raise TrainerError(f"{path}: its ending is none of {', '.join(FORMATS)}; say which --format it is")
     path = path or f"model.{form}"
+    if form == "spz":
+        check_spz()
     trained = open_trained(source, blend_mode, background_gate, **options)
     gaussians = io.read_gaussians(trained.ply)
     if sh_degree is not None:
         gaussians = dataclasses.replace(gaussians, shs=gaussians.shs[:, :(sh_degree + 1) ** 2 - 1])
+    renderer = trained.renderer
+    warning = viewer_warning({"blend_mode": renderer.blend_mode, "background_gate": renderer.background_gate}, form)
     if form == "ply":
         _write_ply(path, trained, gaussians)
     else:
-        text = splat_bytes(gaussians) if form == "splat" else html.page(gaussians, _shown(trained)).encode("utf-8")
-        write_atomically(path, lambda file: file.write(text))
-    renderer = trained.renderer
-    return path, "" if form == "html" else viewer_warning(
-        {"blend_mode": renderer.blend_mode, "background_gate": renderer.background_gate}, form)
+        blend = Blend(renderer.blend_mode, float(renderer.background_gate)) if warning else None
+        content = {"html": lambda: html.page(gaussians, _shown(trained)).encode("utf-8"),
+                   "splat": lambda: splat_bytes(gaussians), "spz": lambda: spz_bytes(gaussians),
+                   "glb": lambda: glb_bytes(gaussians, blend)}[form]()
+        write_atomically(path, lambda file: file.write(content))
+    if form == "html":
+        return path, ""
+    if warning and form == "glb":
+        warning = f"note: the .glb requires {BLEND}, so that no viewer shows its {renderer.blend_mode} by alpha"
+    return path, warning
 
 
 def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians) -> None:
