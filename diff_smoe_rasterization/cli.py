@@ -98,7 +98,12 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
                         help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
                              "holds degree 0)")
-    _add_model_options(export, "whose test views the page begins with (default: the run's)")
+    export.add_argument("--bake", choices=("alpha",),
+                        help="first train the model on to this blend, which every viewer shows; needs the scene's "
+                             "images, and says what it costs in dB")
+    export.add_argument("--bake-iterations", type=int, default=5000, metavar="N", help="(default: 5000)")
+    _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
+    _add_device(export)
     export.set_defaults(run=_export)
 
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
@@ -466,7 +471,8 @@ def _export(arguments: argparse.Namespace) -> None:
     from .export.command import export
 
     path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
-                           arguments.blend_mode, arguments.background_gate, **_overrides(arguments))
+                           arguments.blend_mode, arguments.background_gate, bake=arguments.bake,
+                           bake_iterations=arguments.bake_iterations, device=arguments.device, **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

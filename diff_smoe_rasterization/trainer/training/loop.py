@@ -235,6 +235,8 @@ class Trainer:
 class Run:
     """A Trainer with an output folder: progress, evaluations on the way, checkpoints."""
 
+    title: Optional[str] = None  # of the progress bar; None: the blend mode
+
     def __init__(self, trainer: Trainer, progress: bool = True) -> None:
         self.trainer = trainer
         self.progress = progress
@@ -263,8 +265,9 @@ class Run:
         """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
         trainer, config = self.trainer, self.trainer.config
         self.scalars = Scalars(config.output, trainer.iteration, wanted=trainer.leads)
-        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
-                               disable=not self.progress, dynamic_ncols=True)
+        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration,
+                               desc=self.title or config.blend_mode, unit="it", disable=not self.progress,
+                               dynamic_ncols=True)
         patience = DelayedInterrupt(patient=trainer.is_divided)
         with contextlib.closing(self.scalars), new_bar as bar, patience as interrupt:
             trainer.wants_stop = lambda: interrupt.asked is not None
