@@ -81,6 +81,13 @@ def test_an_own_blend_learns_a_sharper_edge(tmp_path):
     assert quality[-1] > quality[0] + 5 and power[-1] > 2 and is_a_picture(tmp_path / "edge.png")
 
 
+def test_smoe_fits_an_edge_with_fewer_gaussians(tmp_path):
+    text = run("edge.py", "--steps", "120", folder=tmp_path)
+    alpha2, smoe2, alpha4, smoe4 = map(float, re.findall(r"([\d.]+) dB", text))
+    assert smoe2 > alpha2 + 4 and smoe4 > alpha4 + 4 and smoe2 > alpha4, "two by smoe are better than four by alpha"
+    assert is_a_picture(tmp_path / "edge.png")
+
+
 def test_the_notebook_runs_from_top_to_bottom():
     notebook = json.loads((EXAMPLES / "blends.ipynb").read_text(encoding="utf-8"))
     variables = {}
