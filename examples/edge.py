@@ -24,7 +24,7 @@ def edge():
 
 
 def start(count):
-    """Grey Gaussians at depth 2, a quarter of the picture wide: two on both sides of the edge, more at random places."""
+    """Grey Gaussians, a quarter of the picture wide: two on both sides of the edge, more at random places."""
     torch.manual_seed(0)
     places = torch.tensor([[0.15, -0.15], [-0.15, 0.15]]) if count == 2 else torch.rand(count, 2) - 0.5
     return {"means3D": torch.cat([places, torch.full((count, 1), 2.0)], dim=1), "colors": torch.full((count, 3), 0.5),
