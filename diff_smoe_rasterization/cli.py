@@ -472,7 +472,8 @@ def _export(arguments: argparse.Namespace) -> None:
 
     path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
                            arguments.blend_mode, arguments.background_gate, bake=arguments.bake,
-                           bake_iterations=arguments.bake_iterations, device=arguments.device, **_overrides(arguments))
+                           bake_iterations=arguments.bake_iterations,
+                           device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

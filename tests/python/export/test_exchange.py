@@ -227,3 +227,13 @@ def test_a_glb_of_more_than_4_GiB_is_refused(monkeypatch):
     monkeypatch.setattr(glb, "LARGEST", 4000)
     with pytest.raises(TrainerError, match="a lower --sh-degree makes it smaller"):
         glb_bytes(cloud(), None)
+
+
+def test_gsply_reads_a_ply_as_it_was_written(export):
+    gsply = pytest.importorskip("gsply", reason="pip install gsply")
+    model = cloud()
+    read = gsply.plyread(str(export(model, "model.ply")))
+    for mine, theirs in ((model.means3D, read.means), (model.log_scales, read.scales), (model.rotations, read.quats),
+                         (model.opacity_logits[:, 0], read.opacities), (model.dc[:, 0], read.sh0),
+                         (model.shs, read.shN)):
+        assert np.array_equal(mine, theirs)
