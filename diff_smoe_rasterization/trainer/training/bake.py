@@ -2,8 +2,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, NamedTuple, Optional
+from typing import Any, Dict, NamedTuple, Optional, Tuple
 
+import torch
+
+from ...losses import l2_ssim_loss_and_gradient
 from ...settings import resolve_background_gate
 from ..config import TrainConfig
 from ..errors import TrainerError
@@ -27,11 +30,25 @@ class Baked(NamedTuple):
     baked: Optional[float]
 
 
-class RisingGate(Strategy):
-    """A fixed set of Gaussians. The background gate goes to 1, which is alpha, by the same factor in each step."""
+class FixedGaussians(Strategy):
+    """Gaussians are neither added nor removed."""
 
-    def __init__(self, context: StrategyContext) -> None:
+    def __init__(self, context: StrategyContext, squares: float = 0.0) -> None:
+        """squares: the weight of the squared error in place of L1, as at the end of `gate`; 0: L1."""
         super().__init__(context)
+        self.squares = squares
+
+    def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        if self.squares == 0:
+            return super().loss(iteration, image, target)
+        return l2_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim, self.squares)
+
+
+class RisingGate(FixedGaussians):
+    """The background gate goes to 1, which is alpha, by the same factor in each step."""
+
+    def __init__(self, context: StrategyContext, squares: float = 0.0) -> None:
+        super().__init__(context, squares)
         self.first = max(float(context.render.background_gate), LEAST_GATE)
 
     def after_step(self, step: AnyStep) -> None:
@@ -67,17 +84,18 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
     if iterations < 1:
         raise TrainerError(f"--bake-iterations is {iterations}; it must be at least 1")
     blend = {"blend_mode": mode, "background_gate": gate} if _takes_gate(mode) else {"blend_mode": "alpha"}
+    squares = config.gate_options().squares if config.schedule == "gate" else 0.0
     config = config.changed(
         **blend, schedule="steady", densify_until_iter=0, budget=0, batch=1, iterations=iterations,
         sh_degree=renderer.model.sh_degree, position_lr_max_steps=iterations, eval_every=0,
-        # A trained model needs no long ways: from the middle of the rates, as factors go, to the last.
+        # Trained positions move little: they start at the geometric mean of the run's rates.
         position_lr_init=math.sqrt(config.position_lr_init * config.position_lr_final),
         position_lr_final=config.position_lr_final)
     trainer = Trainer(config, load_scene(config, progress))
     trainer.optimizer.replace_all(renderer.model.raw)
     trainer.model.active_sh_degree = renderer.model.active_sh_degree
-    context = trainer.strategy.context
-    trainer.strategy = RisingGate(context) if _takes_gate(mode) else Strategy(context)
+    strategy = RisingGate if _takes_gate(mode) else FixedGaussians
+    trainer.strategy = strategy(trainer.strategy.context, squares)
     trained = _psnr(renderer, trainer)
     shown = _psnr(_alpha(renderer, renderer.model), trainer)
     baked = _Baking(trainer, progress).train()["psnr"]

@@ -8,11 +8,13 @@ import pytest
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.images import as_float
+from diff_smoe_rasterization.losses import fused_ssim, l1_ssim_loss
 from diff_smoe_rasterization.trainer.inspection import open_renderer
 from diff_smoe_rasterization.trainer.results.evaluation import evaluate
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training.bake import RisingGate
+from diff_smoe_rasterization.trainer.training.bake import RisingGate, bake
 from diff_smoe_rasterization.trainer.training.loop import Trainer, train
 
 
@@ -52,6 +54,32 @@ def test_a_baked_model_is_better_in_alpha_than_what_viewers_show(smoe_run, tmp_p
     for ply, mode, expected in ((path, "alpha", baked), (model_path(smoe_run.output, 250), "smoe", trained)):
         renderer = open_renderer(smoe_run, ply, mode, "cpu")
         assert evaluate(renderer, views, "cpu", passes=1).metrics["psnr"] == pytest.approx(expected, abs=0.0051)
+
+
+def l2_ssim_loss(image, target, weight, squares):
+    error = (image - target).square().mean()
+    return (1 - weight) * squares * error + weight * (1 - fused_ssim(image[None], target[None]))
+
+
+@pytest.mark.parametrize("options, squares", [
+    ({"schedule": "3dgs"}, 0), ({"schedule": "gate", "budget": 60}, 30),
+    ({"schedule": "gate", "budget": 60, "strategy_options": "squares=5"}, 5)])
+def test_the_loss_is_the_one_with_which_the_run_ended(smoe_run, monkeypatch, options, squares):
+    """`gate` ends with D-SSIM and so many times the squared error."""
+    losses = []
+    loss = RisingGate.loss
+
+    def remembered(self, iteration, image, target):
+        value, gradient = loss(self, iteration, image, target)
+        losses.append((value, l2_ssim_loss(image, as_float(target), 0.2, squares) if squares else
+                       l1_ssim_loss(image, as_float(target), 0.2)))
+        return value, gradient
+
+    monkeypatch.setattr(RisingGate, "loss", remembered)
+    config = smoe_run.changed(**{"densify_until_iter": 20, **options})
+    bake(config, open_renderer(config, model_path(smoe_run.output, 250), "smoe", "cpu"), 1, progress=False)
+    (value, expected), = losses
+    assert float(value) == pytest.approx(float(expected), rel=1e-5)  # float32 sums
 
 
 def test_a_mode_without_a_gate_is_baked_in_alpha_alone(smoe_run, tiny_scene, tmp_path, capsys):
