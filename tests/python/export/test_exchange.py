@@ -205,11 +205,23 @@ def test_gsply_reads_an_spz_to_the_bits_of_the_format(export, capsys):
     assert (same > 1 - 1e-5).all(), "three components of 9 bits and a sign: 0.0014 / 2 each"
 
 
-@pytest.mark.parametrize("largest, bits", [(0.5, 20), (7.9, 20), (8.0, 19), (1000.0, 13), (1e5, 6), (1e9, 1)])
+@pytest.mark.parametrize("largest, bits", [(0.5, 20), (7.9, 20), (8.0, 19), (1000.0, 13), (8000.0, 10), (1e9, 10)])
 def test_an_spz_has_as_many_bits_behind_the_point_as_there_is_room_for(largest, bits):
     from diff_smoe_rasterization.export.spz import fractional_bits
 
     assert fractional_bits(np.array([[0, -largest, 0.1]], np.float32)) == bits
+
+
+def test_an_spz_brings_what_is_too_far_nearer_along_its_ray(export):
+    """8192 units are the most; the far Gaussian stays where it is seen from the origin, and as large there."""
+    gsply = pytest.importorskip("gsply", reason="pip install gsply")
+    positions, log_scales = cloud().means3D, cloud().log_scales
+    positions[0], log_scales[0] = [30000, -60000, 6000], 1
+    read = gsply.read_spz(str(export(cloud(means3D=positions, log_scales=log_scales), "model.spz")))
+    near = 8192 / 60000
+    assert np.allclose(read.means[0], np.array([30000, 60000, -6000]) * near, atol=0.01)
+    assert np.allclose(read.scales[0], 1 + np.log(near), atol=0.51 / 16)
+    assert np.allclose(read.means[1:], positions[1:] * [1, -1, -1], rtol=0, atol=2.0**-11), "10 bits are left"
 
 
 def test_an_spz_without_gsply_is_refused_with_the_command_that_helps(export, tmp_path, monkeypatch, capsys):
