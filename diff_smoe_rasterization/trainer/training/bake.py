@@ -63,7 +63,9 @@ class RisingGate(FixedGaussians):
 class _Baking(Run):
     """A run of minutes: it writes no checkpoint, and its results are figures."""
 
-    title = "baking to alpha"
+    @property
+    def title(self) -> str:
+        return "baking to alpha"
 
     def save_checkpoint(self) -> None:
         pass

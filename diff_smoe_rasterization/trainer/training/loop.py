@@ -235,8 +235,6 @@ class Trainer:
 class Run:
     """A Trainer with an output folder: progress, evaluations on the way, checkpoints."""
 
-    title: Optional[str] = None  # of the progress bar; None: the blend mode
-
     def __init__(self, trainer: Trainer, progress: bool = True) -> None:
         self.trainer = trainer
         self.progress = progress
@@ -265,9 +263,8 @@ class Run:
         """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
         trainer, config = self.trainer, self.trainer.config
         self.scalars = Scalars(config.output, trainer.iteration, wanted=trainer.leads)
-        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration,
-                               desc=self.title or config.blend_mode, unit="it", disable=not self.progress,
-                               dynamic_ncols=True)
+        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=self.title, unit="it",
+                               disable=not self.progress, dynamic_ncols=True)
         patience = DelayedInterrupt(patient=trainer.is_divided)
         with contextlib.closing(self.scalars), new_bar as bar, patience as interrupt:
             trainer.wants_stop = lambda: interrupt.asked is not None
@@ -350,6 +347,11 @@ class Run:
 
     def _path(self, name: str) -> str:
         return os.path.join(self.trainer.config.output, name)
+
+    @property
+    def title(self) -> str:
+        """Of the progress bar."""
+        return str(self.trainer.config.blend_mode)
 
 
 def _check_loss(step: AnyStep) -> float:
