@@ -169,7 +169,7 @@ def test_a_glb_leaves_out_what_no_viewer_can_show_and_is_never_empty(export, tmp
     assert {len(array) for array in arrays.values()} == {COUNT - 2}
     assert np.array_equal(arrays["POSITION"][0], positions[2] * [1, -1, -1])
     nothing = str(tmp_path / "nothing.ply")
-    io.write_gaussians(nothing, cloud(means3D=np.full((COUNT, 3), np.nan)))
+    io.write_gaussians(nothing, cloud(rotations=np.zeros((COUNT, 4))))
     assert main(["export", nothing, "-o", str(tmp_path / "nothing.glb")]) == 1
     assert "a .glb holds one Gaussian at least" in capsys.readouterr().err
     assert not (tmp_path / "nothing.glb").exists()
