@@ -99,8 +99,8 @@ def build_parser() -> argparse.ArgumentParser:
                         help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
                              "holds degree 0)")
     export.add_argument("--bake", choices=("alpha",),
-                        help="first train the model on to this blend, which every viewer shows; needs the scene's "
-                             "images, and says what it costs in dB")
+                        help="first fine-tune the model to this blend, which every viewer shows; needs the scene's "
+                             "images, and prints the dB that it costs")
     export.add_argument("--bake-iterations", type=int, default=5000, metavar="N", help="(default: 5000)")
     _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
     _add_device(export)

@@ -29,8 +29,8 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
     """Writes the model of a run's folder or of a .ply; returns the file's path and a note, which may be empty.
 
     form: one of FORMATS; None: by the ending of `path`, else html. path: None: model.FORM. sh_degree: the highest
-    degree of view-dependent colour that is kept. bake: "alpha" trains the model on to that blend, on the scene's images
-    and the device; the note says what it costs. The rest is as in `open_trained`. Raises TrainerError.
+    degree of view-dependent colour that is kept. bake: "alpha" fine-tunes the model to that blend, on the scene's
+    images and the device; the note says what it costs. The rest is as in `open_trained`. Raises TrainerError.
     """
     ending = os.path.splitext(path)[1][1:].lower() if path else FORMATS[0]
     if form and path and ending in FORMATS and ending != form:
@@ -65,7 +65,7 @@ def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str
     name = blend_name(before.blend_mode, float(before.background_gate))
     note = "the scene has no test images: what the baking costs was not measured"
     if baked.trained is not None:
-        note = (f"test PSNR: {baked.trained:.2f} dB in {name}, {baked.shown:.2f} dB as viewers show that by alpha, "
+        note = (f"test PSNR: {baked.trained:.2f} dB in {name}, {baked.shown:.2f} dB when viewers blend that by alpha, "
                 f"{baked.baked:.2f} dB baked to alpha ({baked.baked - baked.trained:+.2f} dB)")
     return dataclasses.replace(trained, ply=ply, renderer=baked.renderer), note
 

@@ -1,4 +1,4 @@
-"""A short training that turns a model of another blend into one of alpha, which every viewer shows."""
+"""Fine-tuning of a model of another blend to alpha, which every viewer shows."""
 from __future__ import annotations
 
 import math
@@ -25,8 +25,8 @@ class Baked(NamedTuple):
     """A model for alpha, and the mean PSNR of the test views in dB; None where the scene has none."""
 
     renderer: Renderer
-    trained: Optional[float]  # as it was trained
-    shown: Optional[float]  # what viewers show of that: its Gaussians blended by alpha
+    trained: Optional[float]  # before, in its own blend
+    shown: Optional[float]  # before, blended by alpha, as viewers do
     baked: Optional[float]
 
 
@@ -75,7 +75,7 @@ class _Baking(Run):
 
 
 def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: bool = True) -> Baked:
-    """Trains the renderer's Gaussians on to alpha, by config's scene and options on config.device.
+    """Fine-tunes the renderer's Gaussians to alpha, by config's scene and options on config.device.
 
     Gaussians are neither added nor removed. In a mode without a background gate the whole training is in alpha. Raises
     TrainerError.

@@ -1,4 +1,4 @@
-"""`dsmoe export --bake alpha`: a model of another blend is trained on to alpha."""
+"""`dsmoe export --bake alpha`: a model of another blend is fine-tuned to alpha."""
 from __future__ import annotations
 
 import dataclasses
@@ -42,8 +42,8 @@ def test_a_baked_model_is_better_in_alpha_than_what_viewers_show(smoe_run, tmp_p
     assert main(["export", smoe_run.output, "-o", path, "--bake", "alpha", "--bake-iterations", "150"]) == 0
     said = capsys.readouterr().out
     trained, shown, baked, change = map(float, re.search(
-        r"test PSNR: ([\d.]+) dB in smoe 0.01, ([\d.]+) dB as viewers show that by alpha, ([\d.]+) dB baked to alpha "
-        r"\(([-+][\d.]+) dB\)", said).groups())
+        r"test PSNR: ([\d.]+) dB in smoe 0.01, ([\d.]+) dB when viewers blend that by alpha, "
+        r"([\d.]+) dB baked to alpha \(([-+][\d.]+) dB\)", said).groups())
     assert "viewers of 3DGS" not in said, "what was written is alpha"
     before, after = io.read_gaussians(model_path(smoe_run.output, 250)), io.read_gaussians(path)
     assert (after.blend_mode, after.background_gate) == ("alpha", None)
