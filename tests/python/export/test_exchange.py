@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from diff_smoe_rasterization import io
+from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.export.glb import glb_bytes
 from diff_smoe_rasterization.export.rows import y_up
@@ -138,6 +138,26 @@ def test_the_colours_of_a_glb_are_the_models_from_every_side(export, degree):
     for name, function in zip(HARMONICS[:kept], functions):
         colour += arrays[name] * function[:, None]
     assert np.allclose(colour, expected, atol=1e-6), "constants have 7 digits in the oracle's float32"
+
+
+def test_a_glb_is_rendered_as_the_model_is(export):
+    """By the rasterizer, from its arrays, with the camera in its axes."""
+    model = cloud(log_scales=np.random.RandomState(1).uniform(-1.5, 1, (COUNT, 3)))
+    _, arrays = read_glb(export(model, "model.glb").read_bytes())
+
+    def rendered(turn, means, opacities, scales, rotations, shs):
+        settings = settings_from_camera([[60, 0, 40], [0, 60, 30], [0, 0, 1]], turn, torch.tensor([0.0, 0, 15]), 80, 60,
+                                        blend_mode="alpha", sh_degree=3)
+        values = [torch.tensor(np.array(array, np.float32)) for array in (means, opacities, scales, rotations, shs)]
+        return rasterize(*values[:2], settings, scales=values[2], shs=values[4],
+                         rotations=torch.nn.functional.normalize(values[3])).color
+
+    expected = rendered(torch.eye(3), model.means3D, 1 / (1 + np.exp(-model.opacity_logits)), np.exp(model.log_scales),
+                        model.rotations, np.concatenate([model.dc, model.shs], axis=1))
+    shs = np.stack([arrays[name] for name in [f"{KHR}:SH_DEGREE_0_COEF_0", *HARMONICS]], axis=1)
+    image = rendered(torch.diag(torch.tensor([1.0, -1, -1])), arrays["POSITION"], arrays[f"{KHR}:OPACITY"],
+                     arrays[f"{KHR}:SCALE"], arrays[f"{KHR}:ROTATION"][:, [3, 0, 1, 2]], shs)
+    assert expected.std() > 0.1 and (image - expected).abs().max() < 1e-5, "float32 roundings of what was activated"
 
 
 def test_a_glb_shows_points_where_gaussians_are_unknown(export):
