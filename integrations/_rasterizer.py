@@ -13,10 +13,11 @@ from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.settings import resolve_blend
 
+from ._walk import median_of
 from .contracts import RESULTS, contract_of
 
 ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",),
-              "opacity": ("alpha",)}
+              "opacity": ("alpha",), "median_depth": ("alpha",)}
 COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums")  # results that need another walk
 
 
@@ -67,7 +68,19 @@ def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any])
         found["alpha"] = found["opacity"] = share_of_gaussians(rendering.alpha, settings)
     if "depth" in outputs:
         found["depth"] = rendering.depth * found["alpha"]
+    if "median_depth" in names:
+        found["median_depth"] = _median_depth(settings, inputs, rendering.alpha.detach()[0])
     return tuple(found[name] for name in names)
+
+
+def _median_depth(settings: Settings, inputs: Dict[str, Any], gate_sum: torch.Tensor) -> torch.Tensor:
+    """Returns z [1, H, W] of the Gaussians with which pixels are half full, 0 where they never are; differentiable."""
+    share = share_of_gaussians(gate_sum, settings).detach()
+    total = torch.where(share > 0, gate_sum / torch.where(share > 0, share, 1), torch.zeros_like(share))
+    which = median_of(settings, inputs, total)
+    view = settings.viewmatrix.to(inputs["means3D"])
+    depths = inputs["means3D"] @ view[:3, 2] + view[3, 2]
+    return depths[which.clamp(min=0)].masked_fill(which < 0, 0)[None] if len(depths) else gate_sum[None] * 0
 
 
 def results_with_features(names: Sequence[str], settings: Settings, inputs: Dict[str, Any], feature: str,

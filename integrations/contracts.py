@@ -21,6 +21,7 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "inverse_depth": ("[1, H, W], 1 / z blended as a colour over 0", ""),
     "depth": ("[1, H, W], z blended as a colour over 0", "depth"),
     "alpha": ("[1, H, W], the share of the pixel that the background does not have", "alpha"),
+    "median_depth": ("[1, H, W], z of the Gaussian where the weights, front to back, reach half a pixel", "med"),
     "depth_alpha": ("[2, H, W], the depth, and the share of the pixel that the background has", "depth_alpha"),
     "opacity": ("[1, H, W], the same as alpha", "opac"),
     "is_used": ("[N] int32, 1 where the radius is positive", "used"),
@@ -37,6 +38,15 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "feature_map": ("[F, H, W], semantic_feature blended as a colour over 0", "feature"),
     "language_feature": ("[F, H, W], language_feature_precomp blended as a colour over 0", "feature"),
 }
+
+# What names of results have in them, for callers of a rasterizer that returns these in an order of its own.
+WORDS = (("radii", "radi"), ("median_depth", "med.*depth|depth.*med"), ("inverse_depth", "inv.*depth"),
+         ("depth", "depth"), ("alpha", "alpha|opac|acc"), ("color", "image|colou?r|rgb|render|^im$"))
+# What is in the names of packages that have Inria's names and compute something else: surfels, planes, opacity fields,
+# other lenses, rays of light or sound, other kernels.
+FOREIGN = ("surf", "plan", "gof", "^rade|_rade", "omni", "pano", "spher", "fisheye", "360", "op43", "ortho", "ray",
+           "2d", "4d", "mesh", "triang", "convex", "beta", "gabor", "sonar", "radar", "_rf", "event", "voxel", "normal",
+           "light")
 
 
 class Contract(NamedTuple):
@@ -97,7 +107,7 @@ CONTRACTS = (
     Contract("light_gaussian", "LightGaussian", settings=("f_count",), signs=("sets f_count",),
              other_results=(("counts", "opacity_sums", "color", "radii"),)),
     Contract("inria_2024", "3DGS of 2024 (`antialiasing`, sparse Adam)", ("color", "radii", "inverse_depth"),
-             ("antialiasing",), WITH_DC, ("SparseGaussianAdam",),
+             ("antialiasing",), WITH_DC, ("SparseGaussianAdam", "compute_relocation"),
              ("sets antialiasing", "takes dc", "imports SparseGaussianAdam", "reads invdepthmap")),
     Contract("inria", "3DGS of 2023, GaussianPro, InstantSplat, Compact-3DGS, SuGaR"),
     Contract("depth", "4DGaussians, Deformable 3D Gaussians, GaussianEditor, SplaTAM", ("color", "radii", "depth"),
@@ -117,6 +127,17 @@ CONTRACTS = (
 )
 
 
+def ordered(results: Tuple[str, ...]) -> Contract:
+    """Returns the entry of a rasterizer like Inria's whose results come in another order: names of WORDS, each once.
+
+    Raises KeyError where they are others, or without `color` and `radii`.
+    """
+    if len(set(results)) < len(results) or not {"color", "radii"} <= set(results) <= {name for name, _ in WORDS}:
+        raise KeyError(",".join(results))
+    return Contract(",".join(results), "rasterizers whose results come in this order", results, ("antialiasing",),
+                    (*WITH_DC, "means2D_densify"))
+
+
 def contract_of(name: str) -> Contract:
-    """Returns the entry of a name. Raises KeyError where there is none."""
-    return {contract.name: contract for contract in CONTRACTS}[name]
+    """Returns the entry of a name, or of results with commas between them. Raises KeyError where there is none."""
+    return ordered(tuple(name.split(","))) if "," in name else {contract.name: contract for contract in CONTRACTS}[name]

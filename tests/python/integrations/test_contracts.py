@@ -28,7 +28,8 @@ from diff_smoe_rasterization.integrations import (
     pixel_gs,
     speedy_splat,
 )
-from diff_smoe_rasterization.integrations.contracts import CONTRACTS, SETTINGS
+from diff_smoe_rasterization.integrations._rasterizer import classes_of
+from diff_smoe_rasterization.integrations.contracts import CONTRACTS, SETTINGS, contract_of
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -333,3 +334,30 @@ def test_mini_splatting_without_gaussians_is_the_background():
     color, *scores = rendered(mini_splatting, scene)
     assert torch.equal(color, scene.settings.bg[:, None, None].expand_as(color))
     assert [len(score) for score in scores] == [0, 0, 0, 0]
+
+
+def test_results_in_any_order_and_the_depth_where_a_pixel_is_half_full(mode):
+    """With a channel for each Gaussian, an image is the map of its share of the pixel; these add up front to back."""
+    names = ("depth", "color", "median_depth", "alpha", "radii")
+    settings, rasterizer, function = classes_of(",".join(names), __name__)
+    scene = random_scene(mode, N, WIDTH, HEIGHT, seed=5, degree=1, scale=0.15).requiring_grad(camera=False)
+    found = dict(zip(names, rasterizer(raster_settings=scene.settings)(**scene.inputs)))
+    for name, expected in zip(("color", "radii", "depth", "alpha"), rendered(depth_alpha, scene)):
+        assert torch.equal(found[name], expected)
+    channels = {**{name: tensor.detach() for name, tensor in scene.inputs.items() if name != "shs"},
+                "colors_precomp": torch.eye(N, dtype=torch.float64)}
+    shares = rasterize(settings=scene.settings._replace(bg=torch.zeros(N, dtype=torch.float64)), **channels).color
+    z = (channels["means3D"] @ scene.settings.viewmatrix[:3, 2] + scene.settings.viewmatrix[3, 2]).detach()
+    order = z.argsort()
+    sums = shares[order].cumsum(0)
+    clear = ((sums - 0.5).abs() > 1e-9).all(0)  # else rounding decides which Gaussian it is
+    expected = torch.where(sums[-1] >= 0.5, z[order][(sums >= 0.5).int().argmax(0)], torch.zeros_like(sums[0]))
+    assert clear.float().mean() > 0.99 and (expected > 0).any()
+    assert_close(found["median_depth"][0][clear], expected[clear], TOLERANCE, "median_depth")
+    found["median_depth"].sum().backward()
+    counts = torch.bincount((expected.reshape(-1, 1) == z).int().argmax(1)[expected.reshape(-1) > 0], minlength=N)
+    along = scene.settings.viewmatrix[:3, 2].detach()
+    assert_close(scene.inputs["means3D"].grad, counts[:, None] * along, TOLERANCE * N, "means3D")
+    for wrong in (("color", "depth"), ("color", "radii", "color"), ("color", "radii", "normals")):
+        with pytest.raises(KeyError):
+            contract_of(",".join(wrong))
