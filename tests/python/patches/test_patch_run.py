@@ -159,6 +159,7 @@ def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_pa
 
 CALLS = {  # what a checkout sets, calls with and names the results of, and the rasterizer that it needs
     "mip_splatting": ("kernel_size=1, subpixel_offset=2", "", "image, radii"),
+    "rade_gs": ("kernel_size=1, require_depth=1, require_coord=1", "", "image, radii, a, b, depth, m_depth, alpha, n"),
     "mcmc": ("", "", "image, radii, is_used"), "dngaussian": ("", "", "image, radii, depth, alpha"),
     "monogs": ("projmatrix_raw=1", "theta=1", "image, radii, depth, opacity"),
     "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
