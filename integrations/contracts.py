@@ -67,7 +67,8 @@ class Contract(NamedTuple):
     module: str = RASTERIZER  # what callers import
     other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings, or of a rasterizer beside it
     methods: Tuple[str, ...] = ()  # of a rasterizer, beside METHODS
-    absolute: int = 0  # columns of means2D behind x and y that get sums of absolute gradients: of both axes, or of each
+    absolute: int = 2  # columns of means2D behind x and y that get sums of absolute gradients, if there are so many:
+    # one for both axes, or one for each
 
 
 def _behind(name: str, *further: str) -> Tuple[str, ...]:
@@ -124,9 +125,9 @@ CONTRACTS = (
              settings=("confidence",)),
     Contract("lucid_dreamer", "LucidDreamer, InfiniteScene", ("color", "radii", "depth_alpha")),
     Contract("mcmc", "3DGS-MCMC", ("color", "radii", "is_used"), names=("compute_relocation",)),
-    Contract("absgs", "AbsGS", ("color", "radii", "weights"), module=RASTERIZER + "_abs", absolute=2),
+    Contract("absgs", "AbsGS", ("color", "radii", "weights"), module=RASTERIZER + "_abs"),
     Contract("fastgs", "FastGS", ("color", "radii", "metric_counts"), ("mult", "get_flag", "metric_map"), WITH_DC,
-             ("SparseGaussianAdam",), module=RASTERIZER + "_fastgs", absolute=2),
+             ("SparseGaussianAdam",), module=RASTERIZER + "_fastgs"),
     Contract("mini_splatting", "Mini-Splatting", ("color", "radii", "weights", "counts", "largest"),
              methods=("render_depth",), module=RASTERIZER + "_ms",
              other_results=(("color", "radii"),)),  # of Inria's, which its trainer calls too

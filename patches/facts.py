@@ -33,6 +33,7 @@ BY_DEFAULT = re.compile(rb"\boptimizer_type\s*(:\s*\w+\s*)?=\s*['\"]" + ASKS_FOR
 USES = {"sets ": "its GaussianRasterizationSettings have", "takes ": "its rasterizer is called with",
         "needs ": "it imports", "asks ": "its rasterizer has a method"}
 OF_GSPLAT = "gsplat"
+FOUR_COLUMNS = "means2D of four columns"
 MODULES = {contract.module: contract for contract in CONTRACTS if contract.module not in (RASTERIZER, OF_GSPLAT)}
 OF_ALL = "integrations/README.md lists all, and `dsmoe run --trainer list` their names"
 
@@ -114,11 +115,21 @@ def _of_each(files: Mapping[str, bytes]) -> Dict[str, Set[str]]:
                 shown.add("defines " + node.name)
             elif isinstance(node, ast.Attribute) and node.attr == "invdepthmap":
                 shown.add("reads invdepthmap")
+            elif isinstance(node, ast.Assign) and _has_four_columns(node):
+                shown.add(FOUR_COLUMNS)
             elif isinstance(node, ast.Call):
                 called = getattr(node.func, "attr", getattr(node.func, "id", ""))  # the last part of the name
                 settings = node.keywords if called in settings_names else ()
                 shown.update([f"calls {called}", *(f"sets {keyword.arg}" for keyword in settings if keyword.arg)])
     return facts
+
+
+def _has_four_columns(node: ast.Assign) -> bool:
+    """Whether it makes the points on the screen with two columns more, for sums of absolute gradients (AbsGS)."""
+    shapes = (one.elts[-1] if isinstance(one, ast.Tuple) else one for call in ast.walk(node.value)
+              if isinstance(call, ast.Call) and getattr(call.func, "attr", "") == "zeros" for one in call.args[-1:])
+    return bool(re.search("screenspace|viewspace|means2D", getattr(node.targets[0], "id", ""))
+                and any(getattr(size, "value", None) == 4 for size in shapes))
 
 
 def _of_import(node: Any, may_fail: bool, local: Set[str]) -> Iterator[str]:
@@ -237,7 +248,8 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     for contract in fitting:
         if all(_fits(found, contract) for found in returned) and (
                 not perhaps or any(_fits(found, contract) for found in perhaps)):
-            return contract, ""
+            has_columns = contract.name == "inria" and FOUR_COLUMNS in facts  # which the package's own API has not
+            return contracts.ordered(("color", "radii")) if has_columns else contract, ""
     orders = {_order(found) for found in returned}
     if len(orders) == 1 and None not in orders and not others:
         contract = contracts.ordered(*orders)  # type: ignore[arg-type]

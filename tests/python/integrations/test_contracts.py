@@ -17,6 +17,7 @@ from diff_smoe_rasterization.integrations import (
     fastgs,
     feature_3dgs,
     grouping,
+    inria_2024,
     langsplat,
     light_gaussian,
     lucid_dreamer,
@@ -94,7 +95,7 @@ def test_mip_splatting_has_a_low_pass_filter_of_its_own(mode):
         rendered(mip_splatting, scene, {**given, "subpixel_offset": zeros + 0.25})
 
 
-@pytest.mark.parametrize("module, third", [(absgs, "blend_weights"), (fastgs, None)])
+@pytest.mark.parametrize("module, third", [(absgs, "blend_weights"), (fastgs, None), (inria_2024, None)])
 def test_two_more_columns_of_means2d(mode, module, third):
     scene, weights = scene_of(mode), random_normal((3, HEIGHT, WIDTH), 83)
     points = torch.zeros(N, 4, dtype=torch.float64, requires_grad=True)

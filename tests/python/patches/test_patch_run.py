@@ -254,6 +254,15 @@ print(list(color.shape), [round(one[0, 4, 4].item(), 1) for one in (depth, media
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize("columns, flavour", [("zeros_like(pc.xyz)", "inria"), ("zeros(pc.xyz.shape[0], 3)", "inria"),
+                                              ("zeros((pc.xyz.shape[0], 4), requires_grad=True) + 0", "color,radii")])
+def test_points_of_four_columns_need_what_has_absolute_gradients(columns, flavour, tmp_path, monkeypatch):
+    """AbsGS's rule in a fork of Inria's, whose own module takes three."""
+    text = RENAMED.format("diff_gaussian_rasterization", "image, radii")
+    monkeypatch.chdir(make(tmp_path, {GR: f"{text}screenspace_points = torch.{columns}\n"}))
+    assert run.prepare([sys.executable, "train.py"], "smoe", None, environment())[0]["DSMOE_RASTERIZER"] == flavour
+
+
 def test_the_script_that_is_run_says_which_renderer_counts(tmp_path, monkeypatch):
     """Two renderers, of which each script has one; and what the rest imports has to be there."""
     files = {"gaussian_renderer/a.py": RENAMED.format("diff_gaussian_rasterization", "image, radii, depth, alpha"),
