@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Union
 
 from . import facts
-from .rules import OPTIONS, SETTINGS, import_rasterizer, rules_of, settings_blend, start
+from .rules import OPTIONS, SETTINGS, entries_in, import_rasterizer, rules_of, settings_blend, start
 from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, leftover, tree_of, unpatched
 from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
 
@@ -53,7 +53,8 @@ class Plan(NamedTuple):
 class Patched:
     """What a patch makes of files."""
 
-    def __init__(self, before: Mapping[str, bytes], trainer: Trainer, options: Sequence[str]) -> None:
+    def __init__(self, before: Mapping[str, bytes], trainer: Trainer, options: Sequence[str],
+                 sparse_adam: bool) -> None:
         self.before, self.after = before, dict(before)
         self.rules: Dict[str, List[str]] = {}  # of each file
         # Why it cannot be patched.
@@ -61,12 +62,17 @@ class Patched:
                          "take the mark out of it" for name, data in before.items() if leftover(data)]
         scripts = [name for name, data in before.items() if "/" not in name and b"__main__" in data]
         self.notes = [f"--{one}: fits no script: no .py beside train.py has __main__" for one in options if not scripts]
-        for rule in rules_of(trainer):
+        rendering = [entry for entry in trainer.entries if entry.blend != "blend_of"]
+        if rendering and not entries_in(before, rendering):  # it may render by other means
+            self.notes += [f"{rendering[-1].file}: there is none, nor a function {rendering[-1].function}; a script "
+                           "that renders needs `pipe.blend = saved_blend_of(dataset)`, and says so where it has not"]
+        for rule in rules_of(trainer, before, sparse_adam):
             why = self.apply(rule.file, rule.name, rule.edit)
             self.problems += [f"{rule.file}: rule {rule.name}: {why}; right would be {rule.says}"] if why else []
         for name, data in before.items():  # a script of the user's must not get another rasterizer
             if name != GR and RASTERIZER.encode() in data and not name.startswith("submodules/"):
-                self.apply(name, "import-rasterizer", partial(import_rasterizer, trainer=trainer))
+                edit = partial(import_rasterizer, trainer=trainer, sparse_adam=sparse_adam)
+                self.apply(name, "import-rasterizer", edit)
                 self.notes += [f"{name}: {note}" for note in self.notes_on(name, trainer)]
         for option in options:
             for name, data in before.items():
@@ -118,16 +124,29 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     if name not in by_name:
         raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(TRAINER_NAMES)}")
     chosen = by_name[name]
-    others = facts.those(found, "from ") - {RASTERIZER} or facts.those(found, "defines ")
-    if chosen is not None and (not chosen.entries or others):
-        reason = reason or f"its rasterizer is {chosen.flavour}, for which there is no patch: use `dsmoe run`"
+    renamed = facts.those(found, "renamed ")
+    others = facts.those(found, "from ") - {RASTERIZER} or facts.those(found, "defines ") or renamed
+    callers = facts.importers(before)
+    below = facts.below(root)
+    if below:
+        reason, chosen = below[0], None
+    elif chosen is not None and (not chosen.entries or others):
+        by = f" ({', '.join(sorted(renamed))})" if renamed else ""
+        reason = reason or f"its rasterizer is {chosen.flavour}{by}, for which there is no patch: {_by_run(before)}"
         chosen = None
-    if GR not in now or chosen is None or facts.those(found, "uses "):
-        return Plan(root, "unknown", None, [reason if GR in now else f"there is no {GR} in it"], applied)
+    elif callers and GR not in callers and known:
+        reason = (f"{GR} {'does not import' if GR in now else 'is not there to import'} the rasterizer, but "
+                  f"{', '.join(callers[:3])}, and a patch is of {GR} alone: {_by_run(before)}")
+        chosen = None
+    elif GR not in now:
+        reason, chosen = f"there is no {GR} in it", None
+    if chosen is None or facts.those(found, "uses "):
+        return Plan(root, "unknown", None, [reason], applied)
     wanted = {"modernise": modernise, "fuse": fuse}
     options = [name for name in OPTIONS if wanted[name] or name in applied]
-    patched = Patched(before, chosen, options)
-    as_it_was = (patched if options == applied else Patched(before, chosen, applied)).after
+    sparse_adam = facts.is_for_sparse_adam(root, before, found)
+    patched = Patched(before, chosen, options, sparse_adam)
+    as_it_was = (patched if options == applied else Patched(before, chosen, applied, sparse_adam)).after
     wrong = [f"{name}: is not as this version patches it: `apply` finishes the patch, `revert` takes it back"
              for name, data in now.items() if data != as_it_was[name]]
     state, reasons = (("unpatchable" if now == before else "drifted", patched.problems) if patched.problems else
@@ -137,6 +156,13 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         reason = f"by what it imports and calls it is {known.name}, which has another API" if known else reason
         patched.notes.insert(0, f"--trainer {trainer}: {reason}")
     return Plan(root, state, chosen.name, reasons, applied, now, before, patched.after, patched.rules, patched.notes)
+
+
+def _by_run(files: Mapping[str, bytes]) -> str:
+    """Says how a checkout is run without a patch."""
+    trains = [name for name, data in files.items() if b"def training(" in data and b"__main__" in data]
+    script = min(trains or ["train.py"], key=lambda name: (name.count("/"), name != "train.py", name))
+    return f"type `dsmoe run --blend-mode smoe -- python {script} ...` in it, which needs none"
 
 
 def diff(path: PathLike, **options: Any) -> str:

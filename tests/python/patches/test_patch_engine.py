@@ -100,7 +100,7 @@ def test_drift_is_refused_by_file_and_rule(tmp_path, name, old, new, rule, dsmoe
 
 
 def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
-    refused(make(tmp_path / "missing", {"render.py": None}), "render.py: rule pipe-blend-mode: there is no such file")
+    refused(make(tmp_path / "missing", {"train.py": None}), "train.py: rule pipe-blend-mode: there is no such file")
     refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py: rule pipe-blend-mode: is not Python",
             "(line 11)")
     refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", "nothing imports Gaussian")
@@ -424,7 +424,7 @@ def test_the_readme_has_every_trainer_rule_and_state():
     cells = {line.split(" | ")[0].strip(" |`"): line for line in text.splitlines() if line.startswith("| `")}
     for trainer in TRAINERS:
         assert f"`{trainer.flavour}`" in cells[trainer.name]
-        assert {rule.name for rule in rules_of(trainer)} <= set(cells)
+        assert {rule.name for rule in rules_of(trainer, {}, False)} <= set(cells)
         assert all(f"`{rule.function}`" in cells[trainer.name] for rule in trainer.entries)
     assert all(f"## --{option}\n" in text for option in OPTIONS)
     assert all(f"`{state}`" in text for state in "unknown unpatchable patchable patched half-patched drifted".split())
