@@ -181,6 +181,7 @@ struct Cuda {
     const at::Tensor rows = in_rows ? features : padded(features, columns), dense = gates.contiguous();
     const at::Tensor out = at::empty({visible.numel(), kProjectedGaussianSize + num_features + 1}, gates.options());
     cuda::FootprintRows pack;
+    pack.num_gaussians = gates.size(0);
     pack.count = visible.numel();
     pack.gaussians = visible.data_ptr<int64_t>();
     pack.projected = dense.data_ptr<float>();

@@ -259,8 +259,9 @@ template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, cons
 
 // Some footprints as rows of numbers, to be sent.
 struct FootprintRows {
+  int64_t num_gaussians = 0;           // N
   int64_t count = 0;                   // M
-  const int64_t* gaussians = nullptr;  // [M] which footprints
+  const int64_t* gaussians = nullptr;  // [M] which footprints; of others than 0 to N - 1 the row is NaN
   const float* projected = nullptr;    // [N, kProjectedGaussianSize]
   const float* features = nullptr;     // [N, feature_stride(F)]
   int num_features = 0;                // F

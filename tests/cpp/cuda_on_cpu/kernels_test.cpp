@@ -285,9 +285,7 @@ TYPED_TEST(KernelsIn, EqualTheCpuInBands) { this->expect(crowd(), {false, 60}); 
 
 TYPED_TEST(KernelsIn, EqualTheCpuWhereListsDoNotFit) { this->expect(crowd(), {false, kMostInstances, true}); }
 
-TYPED_TEST(KernelsIn, EqualTheCpuDeterministically) {
-  this->expect(crowd(), {true});
-}
+TYPED_TEST(KernelsIn, EqualTheCpuDeterministically) { this->expect(crowd(), {true}); }
 
 TYPED_TEST(KernelsIn, GiveTheSameBitsDeterministicallyWhetherListsFitOrNot) {
   const Scene<float> scene = convert<float>(in_mode<TypeParam::value>(long_lists(700, 16, 8)).back());
@@ -362,6 +360,36 @@ TEST(Kernels, OrderFootprintsByTheirDepthsAlsoNegativeOnes) {
   ASSERT_EQ(ordered, count - 1);
   order.resize(ordered);
   EXPECT_EQ(order, (std::vector<int32_t>{5, 1, 2, 4, 6, 0, 7}));
+}
+
+TEST(Kernels, PackNoFootprintsThatAreNotThere) {
+  // Three footprints of three features, between numbers that belong to nobody.
+  std::vector<float> projected(5 * kProjectedGaussianSize, -1), features(5 * 4, -1);
+  std::vector<int32_t> radii(5, -1);
+  const std::vector<int64_t> gaussians = {2, -1, 3, int64_t(1) << 40, 0};
+  const int width = kProjectedGaussianSize + 4;
+  std::vector<float> rows(gaussians.size() * width);
+  for (int i = 1; i < 4; ++i) {
+    for (int k = 0; k < kProjectedGaussianSize; ++k) projected[i * kProjectedGaussianSize + k] = static_cast<float>(i);
+    for (int f = 0; f < 3; ++f) features[4 * i + f] = static_cast<float>(i);
+    radii[i] = 0;
+  }
+  cuda::FootprintRows pack;
+  pack.num_gaussians = 3, pack.count = static_cast<int64_t>(gaussians.size());
+  pack.gaussians = gaussians.data(), pack.num_features = 3, pack.rows = rows.data();
+  pack.projected = projected.data() + kProjectedGaussianSize, pack.features = features.data() + 4;
+  pack.radii = radii.data() + 1;
+  cuda::pack_footprints(pack, {});
+  for (size_t row = 0; row < gaussians.size(); ++row) {
+    for (int k = 0; k < width; ++k) {
+      const float number = rows[row * width + k];
+      if (gaussians[row] != 0 && gaussians[row] != 2) {
+        EXPECT_TRUE(std::isnan(number)) << row << " " << k;
+      } else {
+        EXPECT_EQ(number, k + 1 < width ? gaussians[row] + 1 : 0) << row << " " << k;
+      }
+    }
+  }
 }
 
 // Where pixels do not stop, both passes evaluate all pairs of the entries that meet a square.

@@ -121,3 +121,22 @@ def test_what_is_no_tensor_is_named(wrong):
         divided(row, row[:3])
     with pytest.raises(TypeError, match=f"distCUDA2: points {words} a torch.Tensor"):
         distCUDA2(wrong)
+
+
+@pytest.mark.parametrize("name", ["raw", "values", "dL_dvalues", "moments", "squares"])
+def test_rotations_that_do_not_begin_where_a_quaternion_may_are_refused(name, device):
+    """On a GPU a thread reads a quaternion at once."""
+    shapes = ((7, 3), (7, 1), (7, 3), (7, 4))
+    lists = {each: [torch.zeros(shape) for shape in shapes] for each in ("raw", "dL_dvalues", "moments", "squares")}
+    lists["values"] = [torch.zeros(shape) for shape in shapes[1:]]
+    radii = torch.zeros(7, dtype=torch.int32)
+
+    def step():
+        torch.ops.diff_smoe_rasterization.gaussian_adam(
+            *(lists[each] for each in ("raw", "values", "dL_dvalues", "moments", "squares")), radii, [0.1] * 4,
+            [1.0] * 4, 0.9, 0.999, 1e-15)
+
+    step()
+    lists[name][-1] = torch.zeros(29)[1:].view(7, 4)
+    with pytest.raises(ValueError, match="rotations must begin at a multiple of a quaternion's size"):
+        step()
