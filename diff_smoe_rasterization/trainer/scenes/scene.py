@@ -80,26 +80,6 @@ def read_layout(config: TrainConfig) -> Layout:
     return with_masks(folder, layout)
 
 
-def _check_images(folder: str, layout: Layout) -> None:
-    """Raises SceneError for an image that is listed twice, and for a camera that float32 cannot hold."""
-    every = [*layout.train, *layout.test]
-    # The two files of NeRF-synthetic may list the same images.
-    for images in (every,) if layout.kind == "colmap" else (layout.train, layout.test):
-        seen = set()
-        for image in images:
-            path = os.path.normpath(image.path)
-            if path in seen:
-                raise SceneError(f"scene {folder}: the image {image.camera.name} is listed twice, with a pose each")
-            seen.add(path)
-    for image in every:
-        camera = image.camera
-        numbers = [*camera.translation, camera.fx, camera.fy, camera.cx, camera.cy]
-        if not np.abs(numbers).max() <= LARGEST:
-            raise SceneError(f"scene {folder}: the camera of {camera.name} has the translation "
-                             f"{camera.translation.tolist()} and fx, fy, cx, cy {numbers[3:]}; no number may be above "
-                             f"{LARGEST:g}")
-
-
 def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
     """What was loaded, in a line, or two where images were undistorted; layout: what the scene was loaded from."""
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
@@ -167,3 +147,23 @@ def load_cameras(config: TrainConfig, split: str) -> List[Camera]:
     layout = read_layout(config)
     posed = {"train": layout.train, "test": layout.test, "all": list(layout.train) + list(layout.test)}[split]
     return [fitted_camera(image, image_size(image.path), config) for image in posed]
+
+
+def _check_images(folder: str, layout: Layout) -> None:
+    """Raises SceneError for an image that is listed twice, and for a camera that float32 cannot hold."""
+    every = [*layout.train, *layout.test]
+    # The two files of NeRF-synthetic may list the same images.
+    for images in (every,) if layout.kind == "colmap" else (layout.train, layout.test):
+        seen = set()
+        for image in images:
+            path = os.path.normpath(image.path)
+            if path in seen:
+                raise SceneError(f"scene {folder}: the image {image.camera.name} is listed twice, with a pose each")
+            seen.add(path)
+    for image in every:
+        camera = image.camera
+        numbers = [*camera.translation, camera.fx, camera.fy, camera.cx, camera.cy]
+        if not np.abs(numbers).max() <= LARGEST:
+            raise SceneError(f"scene {folder}: the camera of {camera.name} has the translation "
+                             f"{camera.translation.tolist()} and fx, fy, cx, cy {numbers[3:]}; no number may be above "
+                             f"{LARGEST:g}")
