@@ -102,11 +102,21 @@ TEST(ImageFactor, IsHalfOfTheProductOfTheMatrices) {
   EXPECT_NEAR(conic.determinant, by_covariance.determinant, kRounding);
 }
 
+// A loss of the conic and of the image covariance itself, by three weights each.
+double loss_of(const Vector& w, const Conic<double>& conic, const Sym2<double>& cov) {
+  return weighted_sum({w.begin(), w.begin() + 3}, flat(conic.inverse)) +
+         weighted_sum({w.begin() + 3, w.end()}, flat(cov));
+}
+ImageGradient<double> gradient_of(const Vector& w, const Conic<double>& conic) {
+  return {conic.inverse, sym2(&w[0]), sym2(&w[3])};
+}
+
 TEST(ImageFactor, BackwardIsTheDerivative) {
   Random random(4);
-  const Vector x = random.uniforms(18), w = random.uniforms(3);
-  auto loss = [&](const Vector& v) { return weighted_sum(w, flat(covariance_2d(factor_of(v)))); };
-  const auto g = image_factor_backward(mat23(&x[0]), vec3(&x[6]), mat3(&x[9]), factor_of(x), sym2(w.data()));
+  const Vector x = random.uniforms(18), w = random.uniforms(6);
+  auto loss = [&](const Vector& v) { return loss_of(w, conic_of(factor_of(v)), covariance_2d(factor_of(v))); };
+  const auto g = image_factor_backward(mat23(&x[0]), vec3(&x[6]), mat3(&x[9]), factor_of(x),
+                                       gradient_of(w, conic_of(factor_of(x))));
   Vector actual = flat(g.axes);
   append(actual, g.scale);
   for (const double entry : flat(g.rotation)) actual.push_back(entry);
@@ -119,12 +129,13 @@ TEST(ImageFactor, DoesNotTurnASphereInFloat) {
   const Vec4<float> unturned = {1, 0, 0, 0};
   const Mat3<float> rotation = quaternion_to_rotation(unturned);
   for (int i = 0; i < 100; ++i) {
-    const Vector x = random.uniforms(10);
+    const Vector x = random.uniforms(13);
     const std::vector<float> f(x.begin(), x.end());
     const Mat23<float> axes = {{f[0], f[1], f[2]}, {f[3], f[4], f[5]}};
     const Vec3<float> scale = {f[6], f[6], f[6]};
     const auto factor = image_factor(axes, scale, rotation);
-    const auto g = image_factor_backward(axes, scale, rotation, factor, Sym2<float>{f[7], f[8], f[9]});
+    const ImageGradient<float> by_image = {conic_of(factor).inverse, {f[7], f[8], f[9]}, {f[10], f[11], f[12]}};
+    const auto g = image_factor_backward(axes, scale, rotation, factor, by_image);
     const auto q = quaternion_to_rotation_backward(unturned, g.rotation);
     EXPECT_EQ(q.y, 0.0f);
     EXPECT_EQ(q.z, 0.0f);
@@ -218,9 +229,12 @@ TEST(Covariance2D, IsTheProductOfTheMatrices) {
 // x: axes, then the covariance's six numbers.
 TEST(Covariance2D, BackwardIsTheDerivative) {
   Random random(8);
-  const Vector x = random.uniforms(12), w = random.uniforms(3);
-  auto loss = [&](const Vector& v) { return weighted_sum(w, flat(covariance_2d(mat23(&v[0]), sym3(&v[6])))); };
-  const auto g = covariance_2d_backward(mat23(&x[0]), sym3(&x[6]), sym2(w.data()));
+  Vector x = random.uniforms(12);
+  const Vector w = random.uniforms(6);
+  x[6] += 2, x[9] += 2, x[11] += 2;  // positive definite
+  auto cov = [](const Vector& v) { return covariance_2d(mat23(&v[0]), sym3(&v[6])); };
+  auto loss = [&](const Vector& v) { return loss_of(w, make_conic(cov(v)), cov(v)); };
+  const auto g = covariance_2d_backward(mat23(&x[0]), sym3(&x[6]), gradient_of(w, make_conic(cov(x))));
   Vector actual = flat(g.axes);
   for (const double entry : flat(g.cov)) actual.push_back(entry);
   expect_gradient(actual, loss, x);
@@ -236,15 +250,6 @@ TEST(Conic, IsTheInverseOfTheFilteredCovariance) {
   EXPECT_NEAR(c.xx * k.xy + c.xy * k.yy, 0, kRounding);
   EXPECT_NEAR(c.xy * k.xx + c.yy * k.xy, 0, kRounding);
   EXPECT_NEAR(c.xy * k.xy + c.yy * k.yy, 1, kRounding);
-}
-
-TEST(Conic, BackwardIsTheDerivative) {
-  Random random(9);
-  for (const Vector& cov : {Vector{5, 2, 3}, Vector{0.5, -0.2, 4}, Vector{0.3, 0, 0.3}}) {
-    const Vector w = random.uniforms(3);
-    auto loss = [&](const Vector& v) { return weighted_sum(w, flat(make_conic(sym2(v.data())).inverse)); };
-    expect_gradient(flat(make_conic_backward(make_conic(sym2(cov.data())), sym2(w.data()))), loss, cov);
-  }
 }
 
 TEST(Conic, KeepsANeedlesDeterminantInFloat) {
@@ -268,7 +273,7 @@ TEST(OpacityCompensation, BackwardIsTheDerivative) {
     const auto c = sym2(cov.data());
     auto loss = [](const Vector& v) { return 1.7 * compensation(v); };
     // The small covariance is 0.02 across, so the steps must be smaller too: 1e-4.
-    expect_gradient(flat(opacity_compensation_backward(c, make_conic(c), 1.7)), loss, cov, 1e-4);
+    expect_gradient(flat(opacity_compensation_backward(make_conic(c), kLowPass, 1.7)), loss, cov, 1e-4);
   }
 }
 
@@ -277,7 +282,7 @@ TEST(OpacityCompensation, HasAFloorWithoutGradient) {
        {Vector{1e-4, 0, 1e-4}, Vector{4, 2, 1}, Vector{0.1, 0.15, 0.1}}) {  // tiny; a needle; indefinite
     const auto c = sym2(cov.data());
     EXPECT_DOUBLE_EQ(compensation(cov), std::sqrt(static_cast<double>(2.5e-5f)));
-    for (const double g : flat(opacity_compensation_backward(c, make_conic(c), 1.7))) EXPECT_EQ(g, 0);
+    for (const double g : flat(opacity_compensation_backward(make_conic(c), kLowPass, 1.7))) EXPECT_EQ(g, 0);
   }
 }
 

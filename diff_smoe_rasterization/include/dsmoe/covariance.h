@@ -66,6 +66,12 @@ DSMOE_HD Vec3<S> projection_jacobian_backward(const ProjectionJacobian<S>& f, co
   return dL_dview;
 }
 
+// The columns of a 2x3 matrix.
+template <class S> struct Columns {
+  Vec2<S> of[3];
+  DSMOE_HD explicit Columns(const Mat23<S>& m) : of{{m.r0.x, m.r1.x}, {m.r0.y, m.r1.y}, {m.r0.z, m.r1.z}} {}
+};
+
 // M = J W, the rows that take world vectors to the image plane.
 template <class S> DSMOE_HD Mat23<S> image_axes(const Mat23<S>& jacobian, const Mat3<S>& rotation) {
   return {transposed_times(rotation, jacobian.r0), transposed_times(rotation, jacobian.r1)};
@@ -75,28 +81,6 @@ template <class S> DSMOE_HD Mat23<S> image_axes(const Mat23<S>& jacobian, const 
 template <class S> DSMOE_HD Sym2<S> covariance_2d(const Mat23<S>& axes, const Sym3<S>& cov) {
   const Vec3<S> u = cov * axes.r0, v = cov * axes.r1;
   return {dot(axes.r0, u), dot(axes.r0, v), dot(axes.r1, v)};
-}
-
-template <class S> struct Covariance2dGradient {
-  Sym3<S> cov;
-  Mat23<S> axes;
-};
-
-// The derivative by each of the six stored numbers of Sigma: an off-diagonal one stands for two matrix entries.
-template <class S> DSMOE_HD Sym3<S> dL_dcovariance(const Mat23<S>& axes, const Sym2<S>& g) {
-  const Vec3<S> a = axes.r0, b = axes.r1;
-  return {g.xx * a.x * a.x + g.xy * a.x * b.x + g.yy * b.x * b.x,
-          S(2) * g.xx * a.x * a.y + g.xy * (a.x * b.y + a.y * b.x) + S(2) * g.yy * b.x * b.y,
-          S(2) * g.xx * a.x * a.z + g.xy * (a.x * b.z + a.z * b.x) + S(2) * g.yy * b.x * b.z,
-          g.xx * a.y * a.y + g.xy * a.y * b.y + g.yy * b.y * b.y,
-          S(2) * g.xx * a.y * a.z + g.xy * (a.y * b.z + a.z * b.y) + S(2) * g.yy * b.y * b.z,
-          g.xx * a.z * a.z + g.xy * a.z * b.z + g.yy * b.z * b.z};
-}
-
-template <class S>
-DSMOE_HD Covariance2dGradient<S> covariance_2d_backward(const Mat23<S>& axes, const Sym3<S>& cov, const Sym2<S>& g) {
-  const Vec3<S> u = cov * axes.r0, v = cov * axes.r1;
-  return {dL_dcovariance(axes, g), {S(2) * g.xx * u + g.xy * v, g.xy * u + S(2) * g.yy * v}};
 }
 
 // The image covariance of scale and rotation. Sigma = R S S^T R^T (3DGS Eq. 6), so Sigma2D = L L^T with L = M R S. Its
@@ -115,36 +99,6 @@ template <class S> DSMOE_HD ImageFactor<S> image_factor(const Mat23<S>& axes, Ve
 template <class S> DSMOE_HD Sym2<S> covariance_2d(const ImageFactor<S>& factor) {
   const Vec3<S> a = factor.half.r0, b = factor.half.r1;
   return {dot(a, a), dot(a, b), dot(b, b)};
-}
-
-template <class S> struct ImageFactorGradient {
-  Vec3<S> scale;
-  Mat3<S> rotation;
-  Mat23<S> axes;
-};
-
-// The derivative by R is taken through Sigma, to which column k of R adds scale_k^2 r_k r_k^T. The derivative by Sigma
-// is symmetric to the last bit. So the unturned quaternion of a round Gaussian has a gradient of exactly 0.
-template <class S>
-DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3<S> scale, const Mat3<S>& rotation,
-                                                      const ImageFactor<S>& factor, const Sym2<S>& g) {
-  const Vec3<S> dL_da = S(2) * g.xx * factor.half.r0 + g.xy * factor.half.r1;
-  const Vec3<S> dL_db = g.xy * factor.half.r0 + S(2) * g.yy * factor.half.r1;
-  const Sym3<S> dL_dcov = dL_dcovariance(axes, g);
-  const S half = S(0.5);
-  const Sym3<S> by = {dL_dcov.xx, half * dL_dcov.xy, half * dL_dcov.xz, dL_dcov.yy, half * dL_dcov.yz, dL_dcov.zz};
-  const auto column = [&](S axis, Vec3<S> r) {
-    const S twice_variance = product(S(2) * axis, axis);
-    const Vec3<S> turned = by * r;
-    return Vec3<S>{product(twice_variance, turned.x), product(twice_variance, turned.y),
-                   product(twice_variance, turned.z)};
-  };
-  const Vec3<S> x = column(scale.x, {rotation.r0.x, rotation.r1.x, rotation.r2.x});
-  const Vec3<S> y = column(scale.y, {rotation.r0.y, rotation.r1.y, rotation.r2.y});
-  const Vec3<S> z = column(scale.z, {rotation.r0.z, rotation.r1.z, rotation.r2.z});
-  return {factor.turned.r0 * dL_da + factor.turned.r1 * dL_db,
-          {{x.x, y.x, z.x}, {x.y, y.y, z.y}, {x.z, y.z, z.z}},
-          {rotation * (scale * dL_da), rotation * (scale * dL_db)}};
 }
 
 // The conic, the inverse of Sigma2D + low-pass, with what the radius and antialiasing need.
@@ -180,14 +134,6 @@ template <class S> DSMOE_HD bool is_ellipse(const Conic<S>& conic) {
   return conic.filtered.xx > S(0) && conic.determinant > S(0) && is_finite(conic.determinant);
 }
 
-// d(C^-1) = -C^-1 dC C^-1; g.xy is the derivative by the one stored off-diagonal number.
-template <class S> DSMOE_HD Sym2<S> make_conic_backward(const Conic<S>& conic, const Sym2<S>& g) {
-  const auto& k = conic.inverse;
-  return {-(g.xx * k.xx * k.xx + g.xy * k.xx * k.xy + g.yy * k.xy * k.xy),
-          -(S(2) * g.xx * k.xx * k.xy + g.xy * (k.xx * k.yy + k.xy * k.xy) + S(2) * g.yy * k.xy * k.yy),
-          -(g.xx * k.xy * k.xy + g.xy * k.xy * k.yy + g.yy * k.yy * k.yy)};
-}
-
 // Antialiasing: the factor on the opacity that keeps a Gaussian's total weight when the low-pass filter widens it.
 template <class S> DSMOE_HD S opacity_compensation(const Conic<S>& conic) {
   return sqrt(max(S(kCompensationFloor), conic.unfiltered / conic.determinant));
@@ -202,6 +148,92 @@ DSMOE_HD Sym2<S> opacity_compensation_backward(const Sym2<S>& cov2d, const Conic
   const auto& c = conic.filtered;
   return {dL_dbefore * cov2d.yy + dL_dafter * c.yy, S(-2) * (dL_dbefore + dL_dafter) * cov2d.xy,
           dL_dbefore * cov2d.xx + dL_dafter * c.xx};
+}
+
+// The loss's derivative by Sigma2D, H = -K G K + E, as the factors that it is made of. K is the conic, G the derivative
+// by it, and E comes from antialiasing. H itself is never formed: that of a long thin Gaussian is large, and its
+// rounding is no longer orthogonal to what H multiplies next. So K meets that first.
+template <class S> struct ImageGradient {
+  Sym2<S> conic;     // K
+  Sym2<S> by_conic;  // G, by the three stored numbers
+  Sym2<S> direct;    // E, likewise
+};
+
+// p^T G q, where the off-diagonal number of G stands for two entries. In kernels too it is the same number, to the last
+// bit, with p and q exchanged.
+template <class S> DSMOE_HD S bilinear(const Sym2<S>& g, Vec2<S> p, Vec2<S> q) {
+  const S cross = S(0.5) * g.xy * (product(p.x, q.y) + product(p.y, q.x));
+  return product(g.xx, product(p.x, q.x)) + (product(g.yy, product(p.y, q.y)) + cross);
+}
+
+// G m, and K m, for each of three columns.
+template <class S> DSMOE_HD Mat23<S> derivative_times(const Sym2<S>& g, const Mat23<S>& m) {
+  const S half = S(0.5) * g.xy;
+  return {g.xx * m.r0 + half * m.r1, half * m.r0 + g.yy * m.r1};
+}
+template <class S> DSMOE_HD Mat23<S> operator*(const Sym2<S>& k, const Mat23<S>& m) {
+  return {k.xx * m.r0 + k.xy * m.r1, k.xy * m.r0 + k.yy * m.r1};
+}
+
+// H m, for each of three columns.
+template <class S> DSMOE_HD Mat23<S> operator*(const ImageGradient<S>& h, const Mat23<S>& m) {
+  const Mat23<S> by_conic = h.conic * derivative_times(h.by_conic, h.conic * m), direct = derivative_times(h.direct, m);
+  return {direct.r0 - by_conic.r0, direct.r1 - by_conic.r1};
+}
+template <class S> struct CovarianceGradient {
+  Sym3<S> cov;  // by the six stored numbers: an off-diagonal one stands for two matrix entries
+  Mat23<S> axes;
+};
+
+template <class S>
+DSMOE_HD CovarianceGradient<S> covariance_2d_backward(const Mat23<S>& axes, const Sym3<S>& cov,
+                                                      const ImageGradient<S>& h) {
+  const Mat23<S> by_axes = h * Mat23<S>{cov * axes.r0, cov * axes.r1};
+  const Columns<S> m(axes), km(h.conic * axes);
+  const auto entry = [&](int i, int j) {
+    return bilinear(h.direct, m.of[i], m.of[j]) - bilinear(h.by_conic, km.of[i], km.of[j]);
+  };
+  const S two = S(2);
+  return {{entry(0, 0), two * entry(0, 1), two * entry(0, 2), entry(1, 1), two * entry(1, 2), entry(2, 2)},
+          {two * by_axes.r0, two * by_axes.r1}};
+}
+
+template <class S> struct ImageFactorGradient {
+  Vec3<S> scale;
+  Mat3<S> rotation;
+  Mat23<S> axes;
+};
+
+// dL/dR_ij = 2 s_j^2 (M_i^T H t_j), where M_i and t_j are columns of M and of M R. It is symmetric to the last bit
+// where R is 1 and all s are equal. So the unturned quaternion of a round Gaussian has a gradient of exactly 0.
+template <class S>
+DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3<S> scale, const Mat3<S>& rotation,
+                                                      const ImageFactor<S>& factor, const ImageGradient<S>& h) {
+  const Mat23<S> by_half = h * factor.half;
+  const Vec3<S> dL_da = S(2) * by_half.r0, dL_db = S(2) * by_half.r1;
+  const Columns<S> m(axes), km(h.conic * axes), t(factor.turned), kt(h.conic * factor.turned);
+  const S twice_variance[] = {product(S(2) * scale.x, scale.x), product(S(2) * scale.y, scale.y),
+                              product(S(2) * scale.z, scale.z)};
+  const auto entry = [&](int i, int j) {
+    const S by_cov = bilinear(h.direct, m.of[i], t.of[j]) - bilinear(h.by_conic, km.of[i], kt.of[j]);
+    return product(twice_variance[j], by_cov);
+  };
+  return {factor.turned.r0 * dL_da + factor.turned.r1 * dL_db,
+          {{entry(0, 0), entry(0, 1), entry(0, 2)},
+           {entry(1, 0), entry(1, 1), entry(1, 2)},
+           {entry(2, 0), entry(2, 1), entry(2, 2)}},
+          {rotation * (scale * dL_da), rotation * (scale * dL_db)}};
+}
+
+// dL/dopacity times the opacity before, on its way to Sigma2D: what ImageGradient calls E.
+template <class S> DSMOE_HD Sym2<S> opacity_compensation_backward(const Conic<S>& conic, S low_pass, S dL_dfactor) {
+  const S ratio = conic.unfiltered / conic.determinant;
+  if (!(ratio > S(kCompensationFloor))) return {S(0), S(0), S(0)};
+  // ratio = det A / det C, C = A + low_pass: its derivative by A is (adj A - ratio adj C) / det C.
+  const auto& c = conic.filtered;
+  const S less = low_pass * (c.xx + c.yy - low_pass) / conic.determinant;  // 1 - ratio
+  const S by_ratio = dL_dfactor * S(0.5) / (sqrt(ratio) * conic.determinant);
+  return {by_ratio * (less * c.yy - low_pass), S(-2) * by_ratio * less * c.xy, by_ratio * (less * c.xx - low_pass)};
 }
 
 // The 3-sigma radius in pixels that the trainers prune and count by, whatever the blend mode.

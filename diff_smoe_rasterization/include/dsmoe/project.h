@@ -146,19 +146,18 @@ DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const
   const auto made = covariances(gaussian, camera, view, rules);
   const Conic<S>& conic = made.conic;
 
-  Sym2<S> dL_dcov2d = make_conic_backward(conic, g.gate.conic);
+  ImageGradient<S> by_image = {conic.inverse, g.gate.conic, {S(0), S(0), S(0)}};
   out.opacity = g.gate.opacity;
   if (rules.antialiasing) {
-    const Sym2<S> extra = opacity_compensation_backward(made.image, conic, g.gate.opacity * gaussian.opacity);
-    dL_dcov2d = {dL_dcov2d.xx + extra.xx, dL_dcov2d.xy + extra.xy, dL_dcov2d.yy + extra.yy};
+    by_image.direct = opacity_compensation_backward(conic, rules.low_pass, g.gate.opacity * gaussian.opacity);
     out.opacity *= opacity_compensation(conic);
   }
   Mat23<S> dL_daxes;
   if (gaussian.has_covariance) {
-    const auto by = covariance_2d_backward(made.axes, gaussian.covariance, dL_dcov2d);
+    const auto by = covariance_2d_backward(made.axes, gaussian.covariance, by_image);
     out.covariance = by.cov, dL_daxes = by.axes;
   } else {
-    const auto by = image_factor_backward(made.axes, made.scale, made.rotation, made.factor, dL_dcov2d);
+    const auto by = image_factor_backward(made.axes, made.scale, made.rotation, made.factor, by_image);
     out.scale = rules.scale_modifier * by.scale, dL_daxes = by.axes;
     out.rotation = quaternion_to_rotation_backward(gaussian.rotation, by.rotation);
   }
