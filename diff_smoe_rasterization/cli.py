@@ -11,6 +11,7 @@ from ._version import __version__
 from .patches import TRAINERS, PatchError
 from .settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
 from .trainer.config import (
+    CHECKPOINT_NAME,
     DEVICES,
     PRINCIPAL_POINTS,
     TrainConfig,
@@ -210,8 +211,6 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        from .trainer.training.checkpoint import CHECKPOINT_NAME
-
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = "; continue it with --resume" if continues else ""
         if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":

@@ -15,6 +15,7 @@ from .gate_options import GateOptions, parse_gate_options
 from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
+CHECKPOINT_NAME = "checkpoint.pt"  # beside it
 SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
 BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")

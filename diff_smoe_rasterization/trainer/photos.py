@@ -75,14 +75,14 @@ def make_scene(photos: str, output: str, matching: str = "auto", camera_model: s
         work = os.path.join(output, WORK)
         os.makedirs(work, exist_ok=True)
         write_record(output, SCENE, Record(subject, earlier.files), earlier.files)
-        with _quiet(pycolmap):
-            best = _placed(pycolmap, photos, names, work, matching, camera_model, progress, say)
-            say("undistorting")
-            pinhole = os.path.join(work, "undistorted")
-            shutil.rmtree(pinhole, ignore_errors=True)
-            _while_counting(lambda: pycolmap.undistort_images(pinhole, os.path.join(work, "best"), photos),
-                            lambda: _count_files(os.path.join(pinhole, "images")), best.num_reg_images(),
-                            "undistortion", progress)
+        pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # from now on it says errors alone
+        best = _placed(pycolmap, photos, names, work, matching, camera_model, progress, say)
+        say("undistorting")
+        pinhole = os.path.join(work, "undistorted")
+        shutil.rmtree(pinhole, ignore_errors=True)
+        _while_counting(pycolmap, lambda token: pycolmap.undistort_images(
+            pinhole, os.path.join(work, "best"), photos, cancellation_token=token),
+            lambda: _count_files(os.path.join(pinhole, "images")), best.num_reg_images(), "undistortion", progress)
         files = _taken_over(pinhole, output, subject, earlier.files)
         write_record(output, SCENE, Record(subject, files), files)
     placed = {best.images[number].name for number in best.reg_image_ids()}
@@ -116,18 +116,19 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
     mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
     say(f"finding features in {count} photographs of {'one camera' if one_camera else 'several cameras'}, on the "
         f"{'GPU' if pycolmap.has_cuda else 'CPU'}")
-    _while_counting(lambda: pycolmap.extract_features(database, photos, names, mode, reader),
-                    lambda: _count_rows(database, "descriptors"), count, "features", progress)
+    _while_counting(pycolmap, lambda token: pycolmap.extract_features(
+        database, photos, names, mode, reader, cancellation_token=token),
+        lambda: _count_rows(database, "descriptors"), count, "features", progress)
     if matching == "auto":
         matching = "exhaustive" if count <= MOST_EXHAUSTIVE else "sequential"
     pairs = count * (count - 1) // 2
     if matching == "exhaustive":
         say(f"comparing all {pairs:,} pairs")
-        _while_counting(lambda: pycolmap.match_exhaustive(database),
+        _while_counting(pycolmap, lambda token: pycolmap.match_exhaustive(database, cancellation_token=token),
                         lambda: _count_rows(database, "two_view_geometries"), pairs, "pairs", progress)
     else:
         say("comparing neighbours, as sorted by name; --matching exhaustive compares all pairs, which takes longer")
-        _while_counting(lambda: pycolmap.match_sequential(database),
+        _while_counting(pycolmap, lambda token: pycolmap.match_sequential(database, cancellation_token=token),
                         lambda: _count_rows(database, "two_view_geometries"), None, "pairs", progress)
     say("placing them")
     options = pycolmap.IncrementalPipelineOptions()
@@ -137,9 +138,9 @@ def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: s
     shutil.rmtree(models, ignore_errors=True)
     os.makedirs(models)
     with progress_bar(total=count, desc="photographs", unit="photograph", leave=False, disable=not progress) as bar:
-        made = _in_thread(lambda: pycolmap.incremental_mapping(
+        made = _in_thread(pycolmap, lambda token: pycolmap.incremental_mapping(
             database, photos, models, options, initial_image_pair_callback=lambda: bar.update(2),
-            next_image_callback=lambda: bar.update(1)))
+            next_image_callback=lambda: bar.update(1), cancellation_token=token))
     best = max(made.values(), key=lambda model: model.num_reg_images(), default=None)
     registered = best.num_reg_images() if best else 0
     if registered < max(MIN_PHOTOS, count / 2):
@@ -188,48 +189,43 @@ def _taken_over(made: str, output: str, subject: str, earlier: Sequence[str]) ->
     return files
 
 
-@contextlib.contextmanager
-def _quiet(pycolmap: Any) -> Any:
-    """COLMAP says errors alone."""
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
-
-
-def _while_counting(work: Callable[[], Any], done: Callable[[], int], total: Optional[int], what: str,
+def _while_counting(pycolmap: Any, work: Callable[[Any], Any], done: Callable[[], int], total: Optional[int], what: str,
                     progress: bool) -> None:
-    """Does the work, and shows meanwhile how much of it is done."""
+    """Does the work, as `_in_thread`, and shows meanwhile how much of it is done."""
     with progress_bar(total=total, desc=what, leave=False, disable=not progress) as bar:
         def show() -> None:
             bar.update(max(0, done() - bar.n))
 
-        _in_thread(work, show)
+        _in_thread(pycolmap, work, show)
 
 
-def _in_thread(work: Callable[[], Any], show: Callable[[], None] = lambda: None) -> Any:
+def _in_thread(pycolmap: Any, work: Callable[[Any], Any], show: Callable[[], None] = lambda: None) -> Any:
     """The result of the work, which another thread does, so that this one can show how far it is.
 
-    COLMAP's errors, which name a place in its source, become SceneErrors.
+    work: is given a token that cancels it, which Ctrl-C does. COLMAP's errors become SceneErrors.
     """
     outcome: List[Any] = []
+    token = pycolmap.CancellationToken()
 
     def run() -> None:
         try:
-            outcome.append(work())
+            outcome.append(work(token))
         except Exception as error:
             outcome.append(error)
 
-    thread = threading.Thread(target=run, daemon=True)  # Ctrl-C does not wait for it
+    thread = threading.Thread(target=run, daemon=True)
     thread.start()
     shown = 0.0
-    while thread.is_alive():
-        thread.join(0.05)
-        if time.monotonic() - shown > POLL_SECONDS:
-            shown = time.monotonic()
-            show()
+    try:
+        while thread.is_alive():
+            thread.join(0.05)
+            if time.monotonic() - shown > POLL_SECONDS:
+                shown = time.monotonic()
+                show()
+    except KeyboardInterrupt:
+        token.cancel()
+        thread.join()  # it must not outlive Python
+        raise
     if isinstance(outcome[0], Exception):
         raise SceneError(f"COLMAP: {outcome[0]}") from outcome[0]
     return outcome[0]

@@ -68,7 +68,8 @@ def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
                     "Options that are not given are chosen so that a processor finishes in minutes; on a GPU it "
                     "trains at full size for about a minute.")
     parser.add_argument("scene", nargs="?", metavar="SCENE", default=None,
-                        help="folder of a COLMAP or NeRF-synthetic scene (default: a small one made on the spot)")
+                        help="folder of a scene: COLMAP, transforms.json or NeRF-synthetic (default: one made on the "
+                             "spot)")
     parser.add_argument("-o", "--output", metavar="OUT", default=None,
                         help="folder to write: new, empty, or of the same scene (default: "
                              f"{DEFAULT_FOLDER}/NAME, with the scene's name)")
@@ -98,6 +99,8 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
             config = choose_options(folder, given)
         set_up_process(config.device)
         scene = load_scene(config, progress)
+        if scene.note:
+            print(scene.note, flush=True)
         views = shown_views(scene)
         files = [RESULTS_NAME, *(mode + ".ply" for mode in MODES), *views]
         write_record(output, PROGRAM, Record(subject, files), earlier)

@@ -4,7 +4,7 @@ from __future__ import annotations
 import os
 from typing import Any, List, Optional, Tuple
 
-from ..trainer.config import LEARNED, TrainConfig
+from ..trainer.config import CHECKPOINT_NAME, LEARNED, TrainConfig
 from ..trainer.errors import TrainerError
 from ..trainer.model import GaussianModel
 from ..trainer.opening import Trained, open_trained, places
@@ -15,7 +15,7 @@ from ..trainer.scenes.orbit import Orbit
 from ..trainer.system.device import check_device
 from ..trainer.system.files import is_file, is_folder
 from ..trainer.training.background_gate import LearnedGate
-from ..trainer.training.checkpoint import CHECKPOINT_NAME, load_checkpoint
+from ..trainer.training.checkpoint import load_checkpoint
 
 
 class Followed:

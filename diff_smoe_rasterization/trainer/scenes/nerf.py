@@ -135,8 +135,11 @@ def _read_json(path: str) -> Dict[str, Any]:
 
 
 def _image_path(folder: str, name: str) -> str:
+    """Without an ending it is that of the file that is there, else .png."""
     path = os.path.join(folder, name)
-    return path if os.path.splitext(path)[1] else path + ".png"
+    if os.path.splitext(path)[1]:
+        return path
+    return next((path + ending for ending in (".png", ".jpg", ".jpeg") if is_file(path + ending)), path + ".png")
 
 
 def _name_of(folder: str, path: str) -> str:

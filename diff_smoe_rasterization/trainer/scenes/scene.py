@@ -74,7 +74,8 @@ def read_layout(config: TrainConfig) -> Layout:
                          "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it. Of photographs "
                          "`dsmoe scene PHOTOS -o SCENE` makes a scene")
     if not layout.train:
-        raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split})")
+        raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split}); "
+                         "--test-every 0 keeps none for testing")
     _check_images(folder, layout)
     check_files([image.path for image in list(layout.train) + list(layout.test)])
     return with_masks(folder, layout)

@@ -48,6 +48,8 @@ def undistorted(layout: Layout, scene: str, progress: bool) -> Tuple[Layout, str
         working = pool.map(lambda image: _undistorted_image(image, folder) if image.lens else image, images)
         done = list(progress_bar(working, total=len(images), desc="undistortion", unit="image", leave=False,
                                  disable=not progress or not new))
+    for kept in (_maps, _valid):  # they are as large as images
+        kept.cache_clear()
     train, test = done[:len(layout.train)], done[len(layout.train):]
     masked = ", pixels beyond the lens are masked" if any(image.mask for image in done) else ""
     said = (f"{len(bent)} images of camera model {models} are undistorted by OpenCV ({new} of them now) in "

@@ -13,7 +13,6 @@ from ..errors import TrainerError, out_of_memory
 from ..system.files import write_atomically
 from .state_check import Misfit
 
-CHECKPOINT_NAME = "checkpoint.pt"
 TENSOR = "__tensor__"  # marks where a tensor was
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
 SAFE_LOAD = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 6)

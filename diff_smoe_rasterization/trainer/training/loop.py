@@ -11,7 +11,7 @@ from typing import IO, Any, Callable, Dict, List, Optional, Tuple, Union
 import torch
 
 from ...images import as_float
-from ..config import CONFIG_NAME, LEARNED, TrainConfig, holds_run
+from ..config import CHECKPOINT_NAME, CONFIG_NAME, LEARNED, TrainConfig, holds_run
 from ..errors import TrainerError
 from ..model import GaussianModel, GaussianOptimizer
 from ..results.evaluation import Evaluation, evaluate
@@ -41,7 +41,7 @@ from ..system.output_folder import (
 from ..system.progress import progress_bar
 from ..system.stopwatch import Stopwatch
 from .background_gate import LearnedGate
-from .checkpoint import CHECKPOINT_NAME, damage_named, load_checkpoint, save_checkpoint
+from .checkpoint import damage_named, load_checkpoint, save_checkpoint
 from .forecast import Forecast
 from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses

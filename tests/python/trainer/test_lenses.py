@@ -12,12 +12,12 @@ from PIL import Image
 from scipy.optimize import brentq
 
 from diff_smoe_rasterization import io
+from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import SceneError
 from diff_smoe_rasterization.trainer.scenes import undistortion
 from diff_smoe_rasterization.trainer.scenes.lens import lens_of
 from diff_smoe_rasterization.trainer.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from diff_smoe_rasterization.trainer.training.loop import Trainer
 
 WIDTH, HEIGHT = 96, 72
 FX, FY, CX, CY = 70.0, 72.0, 46.5, 37.0
@@ -146,7 +146,7 @@ def test_undistorted_images_are_kept_and_made_anew_where_something_changes(tmp_p
 
 
 @needs_opencv
-def test_a_scene_of_masks_and_distortion_trains(tmp_path):
+def test_a_scene_of_masks_and_distortion_trains(tmp_path, capsys):
     folder = write_scene(tmp_path, "SIMPLE_RADIAL_FISHEYE", [FX, CX, CY, 0.05], bent_image(
         "SIMPLE_RADIAL_FISHEYE", [0.05]), count=4)
     os.makedirs(tmp_path / "masks")
@@ -154,12 +154,15 @@ def test_a_scene_of_masks_and_distortion_trains(tmp_path):
         mask = Image.new("L", (WIDTH // 2, HEIGHT // 2), 0)
         mask.paste(255, (WIDTH // 4, 0, WIDTH // 2, HEIGHT // 2))  # the right half
         mask.save(tmp_path / "masks" / f"{index}.png")
-    config = TrainConfig(scene=folder, resolution=2, iterations=5)
-    scene = load_scene(config, progress=False)
-    mask = scene.train[0].mask[0].numpy()
+    mask = load(folder, resolution=2).train[0].mask[0].numpy()
     assert mask.shape == (HEIGHT // 2, WIDTH // 2) and not mask[:, :20].any() and (mask[:, 28:] == 255).all()
-    trainer = Trainer(config, scene)
-    assert all(math.isfinite(float(trainer.step().loss)) for _ in range(3))
+    run = str(tmp_path / "run")
+    assert main(["train", folder, "-o", run, "--resolution", "2", "--iterations", "3", "--test-every", "3"]) == 0
+    assert "4 images of camera model SIMPLE_RADIAL_FISHEYE are undistorted" in capsys.readouterr().out
+    with open(os.path.join(run, "results.json"), encoding="utf-8") as file:
+        row, = json.load(file)
+    assert {"masks", "undistortion"} <= set(row["protocol"]) and row["psnr"] > 3
+    assert main(["eval", run]) == 0 and f"{row['psnr']:.2f}" in capsys.readouterr().out
 
 
 @needs_opencv

@@ -91,6 +91,15 @@ def test_photographs_that_do_not_connect(tmp_path, capsys):
     assert not (tmp_path / "scene" / "sparse").exists()
 
 
+def test_an_interrupted_command_says_that_it_continues(tmp_path, capsys, monkeypatch):
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(photos, "make_scene", interrupted)
+    assert main(["scene", str(tmp_path), "-o", str(tmp_path / "scene")]) == 130
+    assert capsys.readouterr().err.endswith("interrupted; the same command continues\n")
+
+
 def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", sys)  # it is asked for first
     assert "nowhere: no such folder of photographs" in fails(capsys, tmp_path / "nowhere", "-o", tmp_path / "scene")

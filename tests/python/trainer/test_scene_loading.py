@@ -275,8 +275,11 @@ def transforms_folder(tmp_path):
 
 
 def test_transforms_with_intrinsics_of_each_frame(transforms_folder):
+    edit_json(transforms_folder / "transforms.json", lambda content: content["frames"][3].update(
+        file_path="images/frame_00003"))  # the ending is found
     scene = load(transforms_folder)
     assert (scene.kind, len(scene.train), len(scene.test)) == ("transforms", 8, 2)
+    assert scene.train[2].camera.name == "images/frame_00003.jpg"
     assert [view.camera.name for view in scene.test] == ["images/frame_00000.jpg", "images/frame_00008.jpg"]
     camera = scene.train[0].camera  # of frame 1
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (21, 22, 10.5, 5)
