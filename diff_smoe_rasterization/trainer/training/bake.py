@@ -13,6 +13,7 @@ from ..errors import TrainerError
 from ..model import GaussianModel
 from ..results.evaluation import evaluate
 from ..results.rendering import Renderer
+from ..results.rows import viewer_warning
 from ..scenes.scene import load_scene
 from .loop import Run, Trainer
 from .strategy import AnyStep, Strategy, StrategyContext
@@ -45,23 +46,27 @@ class FixedGaussians(Strategy):
 
 
 class RisingGate(FixedGaussians):
-    """The background gate goes to 1, which is alpha, by the same factor in each step."""
+    """The background gate goes to 1 by the same factor in each step; then the blend is alpha."""
 
     def __init__(self, context: StrategyContext, squares: float = 0.0) -> None:
         super().__init__(context, squares)
         self.first = max(float(context.render.background_gate), LEAST_GATE)
 
     def after_step(self, step: AnyStep) -> None:
-        self.context.render.background_gate = self.gate(step.iteration)
+        renderer, gate = self.context.render, self.gate(step.iteration)
+        if gate != 1:
+            renderer.background_gate = gate
+        elif renderer.blend_mode != "alpha":
+            renderer.blend_by("alpha", 1.0)
 
     def gate(self, iteration: int) -> float:
-        """The gate of the step behind this iteration; the number 1, bit for bit alpha, from its rise on."""
+        """The gate of the step behind this iteration: 1 from the end of its rise on."""
         share = iteration / (RISE * self.context.config.iterations)
         return 1.0 if share >= 1 else math.exp((1 - share) * math.log(self.first))
 
 
 class _Baking(Run):
-    """A run of minutes: it writes no checkpoint, and its results are figures."""
+    """A run of minutes, which writes neither checkpoints nor results."""
 
     @property
     def title(self) -> str:
@@ -71,7 +76,7 @@ class _Baking(Run):
         pass
 
     def _write_results(self) -> Dict[str, Any]:
-        return self.trainer.evaluate(self.progress).metrics
+        return {}
 
 
 def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: bool = True) -> Baked:
@@ -81,7 +86,7 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
     TrainerError.
     """
     mode, gate = renderer.blend_mode, float(renderer.background_gate)
-    if mode == "alpha" or gate == 1:
+    if not viewer_warning({"blend_mode": mode, "background_gate": gate}):
         raise TrainerError("the model is blended by alpha already; leave out --bake")
     if iterations < 1:
         raise TrainerError(f"--bake-iterations is {iterations}; it must be at least 1")
@@ -100,8 +105,9 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
     trainer.strategy = strategy(trainer.strategy.context, squares)
     trained = _psnr(renderer, trainer)
     shown = _psnr(_alpha(renderer, renderer.model), trainer)
-    baked = _Baking(trainer, progress).train()["psnr"]
-    return Baked(_alpha(renderer, trainer.model), trained, shown, baked)
+    _Baking(trainer, progress).train()
+    result = _alpha(renderer, trainer.model)
+    return Baked(result, trained, shown, _psnr(result, trainer))
 
 
 def _takes_gate(mode: str) -> bool:

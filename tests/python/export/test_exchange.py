@@ -14,6 +14,7 @@ from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.export.glb import glb_bytes
 from diff_smoe_rasterization.export.rows import y_up
 from diff_smoe_rasterization.reference import sh_basis
+from diff_smoe_rasterization.trainer.opening import open_trained
 
 COUNT = 20
 KHR = "KHR_gaussian_splatting"
@@ -169,11 +170,13 @@ def test_a_glb_shows_points_where_gaussians_are_unknown(export):
 
 
 def test_viewers_refuse_a_glb_of_another_blend(export, capsys):
-    document, arrays = read_glb(export(cloud("smoe", 0.25), "model.glb").read_bytes())
-    assert f"the .glb requires {OURS}, so that no viewer shows its smoe by alpha" in capsys.readouterr().out
+    path = export(cloud("smoe", 0.25), "model.glb")
+    document, arrays = read_glb(path.read_bytes())
+    mode = open_trained(str(path.parent / "trained.ply")).renderer.blend_mode
+    assert f"the .glb requires {OURS}, so that no viewer shows its {mode} by alpha" in capsys.readouterr().out
     assert set(document["extensionsRequired"]) == set(document["extensionsUsed"]) == {KHR, OURS}
     splatting = document["meshes"][0]["primitives"][0]["extensions"][KHR]
-    assert splatting["extensions"] == {OURS: {"blendMode": "smoe", "backgroundGate": 0.25}}
+    assert mode != "alpha" and splatting["extensions"] == {OURS: {"blendMode": mode, "backgroundGate": 0.25}}
     assert "COLOR_0" not in arrays, "nothing to fall back to"
 
 
@@ -197,11 +200,11 @@ def test_a_glb_leaves_out_what_no_viewer_can_show_and_is_never_empty(export, tmp
 
 def test_pygltflib_reads_a_glb(export):
     pygltflib = pytest.importorskip("pygltflib", reason="pip install pygltflib")
-    path = export(cloud("smoe", 0.25), "model.glb")
+    path = export(cloud("smoe_tn"), "model.glb")
     document = pygltflib.GLTF2().load_binary(str(path))
     assert sorted(document.extensionsRequired) == sorted([KHR, OURS])
     primitive = document.meshes[0].primitives[0]
-    assert primitive.extensions[KHR]["extensions"][OURS] == {"blendMode": "smoe", "backgroundGate": 0.25}
+    assert primitive.extensions[KHR]["extensions"][OURS] == {"blendMode": "smoe_tn", "backgroundGate": 0}
     accessor = document.accessors[primitive.attributes.POSITION]
     view = document.bufferViews[accessor.bufferView]
     data = document.binary_blob()[view.byteOffset:view.byteOffset + view.byteLength]
@@ -213,7 +216,7 @@ def test_gsply_reads_an_spz_to_the_bits_of_the_format(export, capsys):
     gsply = pytest.importorskip("gsply", reason="pip install gsply")
     model = y_up(cloud())
     read = gsply.read_spz(str(export(cloud("smoe", 0.25), "model.spz")))
-    assert "the smoe .spz holds gates" in capsys.readouterr().out
+    assert ".spz holds gates; viewers of 3DGS blend them by alpha" in capsys.readouterr().out
     assert np.allclose(read.means, model.means3D, rtol=0, atol=2.0**-20), "coordinates below 16 leave 19 bits"
     assert np.allclose(1 / (1 + np.exp(-read.opacities)), 1 / (1 + np.exp(-model.opacity_logits[:, 0])),
                        atol=0.51 / 255)

@@ -34,7 +34,21 @@ def test_the_gate_rises_by_equal_factors_to_alpha(tiny_config):
     strategy = RisingGate(Trainer(config, load_scene(config, progress=False)).strategy.context)
     # 4 of 10 iterations: 1/16 to the powers 3/4, 1/2 and 1/4.
     assert [strategy.gate(iteration) for iteration in (0, 1, 2, 3)] == pytest.approx([1 / 16, 1 / 8, 1 / 4, 1 / 2])
-    assert [strategy.gate(iteration) for iteration in (4, 9)] == [1.0, 1.0], "exactly: a number that means alpha"
+    assert [strategy.gate(iteration) for iteration in (4, 9)] == [1.0, 1.0]
+
+
+def test_the_end_of_the_rise_is_alpha_by_name(tiny_config):
+    """Not in every mode is a gate of 1 the blend of viewers."""
+    config = dataclasses.replace(tiny_config.changed(background_gate=0.0625), iterations=10)
+    trainer = Trainer(config, load_scene(config, progress=False))
+    trainer.strategy = RisingGate(trainer.strategy.context)
+    blends = []
+    for _ in range(6):
+        trainer.step()
+        settings = trainer.renderer.settings_of(trainer.scene.train[0].camera)
+        blends.append((settings.blend_mode, trainer.renderer.background_gate))
+    assert [mode for mode, _ in blends] == ["smoe"] * 3 + ["alpha"] * 3
+    assert [gate for _, gate in blends] == pytest.approx([1 / 8, 1 / 4, 1 / 2, 1, 1, 1])
 
 
 def test_a_baked_model_is_better_in_alpha_than_what_viewers_show(smoe_run, tmp_path, capsys):
