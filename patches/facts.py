@@ -250,6 +250,11 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
                 not perhaps or any(_fits(found, contract) for found in perhaps)):
             has_columns = contract.name == "inria" and FOUR_COLUMNS in facts  # which the package's own API has not
             return contracts.ordered(("color", "radii")) if has_columns else contract, ""
+    if others and "from " + RASTERIZER not in facts:  # its name is that of one, and its API another's
+        names = {contract.module for contract in others}
+        contract = contract_of(facts - {"from " + name for name in names} | {"renamed " + name for name in names})[0]
+        if contract:
+            return contract, ""
     orders = {_order(found) for found in returned}
     if len(orders) == 1 and None not in orders and not others:
         contract = contracts.ordered(*orders)  # type: ignore[arg-type]

@@ -76,8 +76,9 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     folders = _folders(script)
     files = {folder: _read(folder, everywhere=folder == folders[0]) for folder in folders}
     flavour, where, warnings, found = _flavour(files, trainer, script)
-    renamed = sorted(facts.those(found, "renamed "))
     module = contract_of(flavour).module
+    known_names = {name for name in facts.MODULES if module == RASTERIZER and "from " + name in found}
+    renamed = sorted(facts.those(found, "renamed ") | known_names)
     named = flavour if module == RASTERIZER else "inria"  # beside another stands Inria's
     if flavour == facts.OF_GSPLAT:  # unless what is beside it is known
         beside = facts.contract_of(found - {"from " + facts.OF_GSPLAT})[0]
@@ -90,10 +91,11 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
     if named == "inria_2024" and not _may_use_sparse_adam(words, files, found):
         environment[WITHOUT_VARIABLE] = facts.SPARSE_ADAM
     if renamed:
-        warnings += [f"{', '.join(renamed)} is taken for {RASTERIZER} under another name, since its calls fit; if it "
-                     "computes something else, that is not computed here"]
+        why = "as --trainer says" if trainer else "since its calls fit"
+        warnings += [f"{', '.join(renamed)} is taken for {RASTERIZER} under another name, {why}; if it computes "
+                     "something else, that is not computed here"]
         module = ", ".join([*renamed, *[module] * ("from " + module in found)])
-    if "," in flavour:
+    if "," in flavour and flavour not in ("color,radii", trainer):
         warnings += [f"the results are told by what the trainer calls them: {flavour}"]
     blend = blend_mode if gate is None else f"{blend_mode}, background gate {gate}"
     return environment, [f"{where}: {module} will be {flavour} of this package, blend mode {blend}; each process that "

@@ -213,6 +213,7 @@ RENAMED = ("from {0} import GaussianRasterizationSettings as Settings, GaussianR
 @pytest.mark.parametrize("name, results, flavour", [
     ("diff_gaussian_rasterization_w_depth", "image, radii, depth", "depth"),
     ("depth_diff_gaussian_rasterization", "image, _, depth, alpha", "depth_alpha"),
+    ("diff_gaussian_rasterization_depth", "image, radii, depth", "depth"),  # not the one that is known by that name
     ("diff_gaussian_rasterization", "color, depth, median_depth, alpha, radii", "color,depth,median_depth,alpha,radii"),
     ("diff_gauss_own", "rendered_depth, opacity, render, radii", "depth,alpha,color,radii"),
     ("diff_gaussian_rasterization", "inv_depth, image, radii", "inverse_depth,color,radii"),
