@@ -536,6 +536,8 @@ def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
 def _export(arguments: argparse.Namespace) -> None:
     from .export.command import export
 
+    if arguments.bake:
+        _choose_device(arguments)
     path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
                            arguments.blend_mode, arguments.background_gate, arguments.overwrite, bake=arguments.bake,
                            bake_iterations=arguments.bake_iterations,

@@ -11,7 +11,6 @@ from functools import partial
 from typing import IO, Any, Dict, List, Mapping, Optional, Sequence
 
 from ...trainer.system.children import die_with_parent
-from ...trainer.system.device import device_line
 from ...trainer.system.files import write_json_atomically, write_text_atomically
 from ...trainer.system.output_folder import (
     Record,
@@ -70,6 +69,8 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
     if to_do and slurm is None:
+        from ...trainer.system.device import device_line  # it loads torch, which a suite does without
+
         print(device_line(suite.protocol["device"]), flush=True)
     words = command(suite, to_do, results, jobs, slurm, per_gpu) if to_do else None
     make_folder(results)
