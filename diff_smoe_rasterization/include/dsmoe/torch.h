@@ -50,7 +50,7 @@ struct GaussianRasterizationSettings {
   double alpha_min = 0;              // SMoE modes: also skip alpha below this; 0 is the paper's rule
   bool strict = false;               // raise where an attribute is NaN or infinite, instead of culling that Gaussian
   std::string blend_mode = "alpha";  // "alpha", "smoe", "smoe_tn" or "smoe_std"
-  bool deterministic = false;        // CUDA: gradients and sums equal bit for bit from run to run; slower
+  bool deterministic = false;        // CUDA: gradients equal bit for bit from run to run; slower
   bool clamp_color = true;           // colours from shs are at least 0
   std::optional<BackgroundGate> background_gate;  // `smoe` only; absent: 0
   double low_pass = 0.3;                          // px^2 added to the variances on the image

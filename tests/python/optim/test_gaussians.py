@@ -92,21 +92,6 @@ def test_statistics_that_were_saved_for_a_backward_pass_are_not_changed_unseen(d
             product.backward()
 
 
-def test_what_does_not_fit_is_refused(device):
-    opacities, scales, rotations = raw_parameters(4, torch.float32)
-    for arguments, error, text in (
-            ((opacities[:, 0], scales, rotations), ValueError, r"opacities has shape \[4\]; it must be \[N, 1\]"),
-            ((opacities, scales[:3], rotations), ValueError, r"scales has shape \[3, 3\]; it must be \[4, 3\]"),
-            ((opacities, scales, rotations.double()), TypeError, "rotations is float64; it must be float32"),
-            ((opacities.half(), scales, rotations), TypeError, "opacities is float16")):
-        with pytest.raises(error, match="activate: " + text):
-            activate(*arguments)
-    with pytest.raises(TypeError, match="add_view: radii is int64; it must be int32"):
-        add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int64), torch.zeros(4), torch.zeros(4))
-    with pytest.raises(ValueError, match=r"add_view: view_count has shape \[5\]; it must be \[4\]"):
-        add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int32), torch.zeros(4), torch.zeros(5))
-
-
 @pytest.mark.parametrize("wrong", [None, 1, "a", [1.0]])
 def test_what_is_no_tensor_is_named(wrong):
     row, radii = torch.ones(4), torch.ones(4, dtype=torch.int32)
@@ -140,3 +125,18 @@ def test_rotations_that_do_not_begin_where_a_quaternion_may_are_refused(name, de
     lists[name][-1] = torch.zeros(29)[1:].view(7, 4)
     with pytest.raises(ValueError, match="rotations must begin at a multiple of a quaternion's size"):
         step()
+
+
+def test_what_does_not_fit_is_refused(device):
+    opacities, scales, rotations = raw_parameters(4, torch.float32)
+    for arguments, error, text in (
+            ((opacities[:, 0], scales, rotations), ValueError, r"opacities has shape \[4\]; it must be \[N, 1\]"),
+            ((opacities, scales[:3], rotations), ValueError, r"scales has shape \[3, 3\]; it must be \[4, 3\]"),
+            ((opacities, scales, rotations.double()), TypeError, "rotations is float64; it must be float32"),
+            ((opacities.half(), scales, rotations), TypeError, "opacities is float16")):
+        with pytest.raises(error, match="activate: " + text):
+            activate(*arguments)
+    with pytest.raises(TypeError, match="add_view: radii is int64; it must be int32"):
+        add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int64), torch.zeros(4), torch.zeros(4))
+    with pytest.raises(ValueError, match=r"add_view: view_count has shape \[5\]; it must be \[4\]"):
+        add_view(torch.zeros(4, 3), torch.ones(4, dtype=torch.int32), torch.zeros(4), torch.zeros(5))
