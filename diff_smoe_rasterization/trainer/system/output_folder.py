@@ -127,13 +127,14 @@ def check_inside(folder: str, names: Collection[str]) -> None:
                                "folder with -o")
 
 
-def own_record(folder: str, command: str, overwrite: bool = False) -> Record:
+def own_record(folder: str, command: str, overwrite: bool = False, folders: Collection[str] = ()) -> Record:
     """What the command recorded in the folder; an empty record where there is no folder, or nothing in it.
 
-    Raises TrainerError where something is in it and the command has not recorded it as its own. overwrite: it may be
-    there.
+    overwrite: other things may be in it. folders: those in it that the command writes into. Raises TrainerError where
+    something is in it that the command has not recorded as its own, and where a link stands for one of the folders.
     """
     record = read_record(folder, command)
+    check_inside(folder, [os.path.join(name, "a") for name in folders])
     there = sorted({*os.listdir(folder)} - {LOCK_NAME}) if os.path.isdir(folder) else []
     if record is None and there and not overwrite:
         raise TrainerError(f"{folder} is not empty ({there[0]}), and nothing says that {command} wrote it; "
