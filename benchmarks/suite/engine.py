@@ -10,7 +10,6 @@ import sys
 from functools import partial
 from typing import IO, Any, Dict, List, Mapping, Optional, Sequence
 
-from ...trainer.system.device import device_line
 from ...trainer.system.files import write_json_atomically, write_text_atomically
 from ...trainer.system.output_folder import make_folder, only_one
 from ..errors import BenchError
@@ -59,6 +58,8 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
     if to_do and slurm is None:
+        from ...trainer.system.device import device_line  # it loads torch
+
         print(device_line(suite.protocol["device"]), flush=True)
     words = command(suite, to_do, results, jobs, slurm, per_gpu) if to_do else None
     make_folder(results)
