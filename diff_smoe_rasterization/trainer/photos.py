@@ -63,7 +63,7 @@ def make_scene(photos: str, output: str, matching: str = "auto", camera_model: s
         import pycolmap
     except ImportError as error:
         raise TrainerError(f"dsmoe scene needs COLMAP's Python package: {pip_install('pycolmap')}") from error
-    names = photo_names(photos)
+    names = photo_names(photos, output)
     own_record(output, SCENE)  # refused before anything is made
     make_folder(output)
     with only_one(output):
@@ -90,13 +90,18 @@ def make_scene(photos: str, output: str, matching: str = "auto", camera_model: s
                 sorted({*names} - placed))
 
 
-def photo_names(folder: str) -> List[str]:
-    """The photographs below a folder, by their paths in it. Raises SceneError where they are too few."""
+def photo_names(folder: str, output: str) -> List[str]:
+    """The photographs below a folder, by their paths in it; hidden files and the folder `output` are left out.
+
+    Raises SceneError where they are too few.
+    """
     if not is_folder(folder):
         kind = " is a file; of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
         raise SceneError(f"{folder}{kind if os.path.isfile(folder) else ': no such folder of photographs'}")
-    names = sorted(os.path.relpath(os.path.join(place, name), folder)
-                   for place, _, files in os.walk(folder) for name in files)
+    made = os.path.join(os.path.realpath(output), "")
+    names = sorted(os.path.relpath(os.path.join(place, name), folder) for place, _, files in os.walk(folder)
+                   if not os.path.join(os.path.realpath(place), "").startswith(made)
+                   for name in files if not name.startswith("."))
     found = [name for name in names if name.lower().endswith(ENDINGS)]
     if len(found) < MIN_PHOTOS:
         other = next((name for name in names if name.lower().endswith(UNKNOWN_ENDINGS + VIDEO_ENDINGS)), None)

@@ -118,6 +118,13 @@ def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "scene").exists()
 
 
+def test_hidden_files_and_the_scene_itself_are_no_photographs(tmp_path):
+    for name in ("a.jpg", "walk/b.PNG", "walk/._b.jpg", ".thumbnails.jpg", "scene/images/a.jpg", "scenery/c.jpg"):
+        os.makedirs((tmp_path / name).parent, exist_ok=True)
+        (tmp_path / name).write_text("")
+    assert photos.photo_names(str(tmp_path), str(tmp_path / "scene")) == ["a.jpg", "scenery/c.jpg", "walk/b.PNG"]
+
+
 def test_photographs_are_of_one_camera_if_size_and_focal_length_say_so(tmp_path):
     def save(name, size=(8, 6), focal=None):
         exif = Image.Exif()
