@@ -4,6 +4,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import inspect
+import itertools
 import re
 from pathlib import Path
 from typing import Any, Dict, Iterator, List, Mapping, Optional, Sequence, Set, Tuple
@@ -27,6 +28,8 @@ PATCHED = "imports from " + INTEGRATIONS
 FOLDER = GR.partition("/")[0]
 LOOKED_AT = (GR, "scene/__init__.py", "scene/gaussian_model.py", "train.py", "render.py")
 OTHER_RASTERIZER = re.compile(r"diff_(gauss|surfel|plane)")
+IMPORTS_RASTERIZER = re.compile(rb"(?m)^\s*((from|import) (\w*diff_(gauss|surfel|plane)|gsplat\b)"
+                                rb"|from (?!diff_smoe_)\w+ import .*GaussianRasteriz)")
 FOREIGN = re.compile("|".join(contracts.FOREIGN))
 SPARSE_ADAM, ASKS_FOR_SPARSE_ADAM = "SparseGaussianAdam", "sparse_adam"
 BY_DEFAULT = re.compile(rb"\boptimizer_type\s*(:\s*\w+\s*)?=\s*['\"]" + ASKS_FOR_SPARSE_ADAM.encode())
@@ -39,14 +42,15 @@ OF_ALL = "integrations/README.md lists all, and `dsmoe run --trainer list` their
 
 
 def of_checkout(files: Mapping[str, bytes], script: str = "") -> Set[str]:
-    """Returns the facts of a checkout like that of 3DGS: of its trainer and renderer, and of what these import from it.
+    """Returns the facts of a checkout: of its trainer and renderer, if it is like 3DGS, and of what they import from it.
 
     script: the file that is run, in place of trainer and renderer. Where they reach no rasterizer, as by a name that is
-    made up while they run, it is looked for in every file.
+    made up while they run, every file that imports one counts.
     """
     scripts = [name for name, data in files.items() if "/" not in name and b"def training(" in data]
-    found = of_files(_reached(files, [script] if script in files else [*LOOKED_AT, *scripts]))
-    return found if calls_some(found) else found | of_files(files)
+    found = of_files(_reached(files, [script] if script in files else [*LOOKED_AT, *scripts] * (GR in files)))
+    others = {name: data for name, data in files.items() if IMPORTS_RASTERIZER.search(data)}
+    return found if calls_some(found) else found | of_files(others)
 
 
 def calls_some(facts: Set[str]) -> bool:
@@ -245,9 +249,9 @@ def contract_of(facts: Set[str]) -> Tuple[Optional[Contract], str]:
     if those(facts, "renamed ") and not returned + perhaps:
         return None, (f"it imports {', '.join(sorted(those(facts, 'renamed ')))}, and what a call returns is not seen: "
                       f"if that is the API of a rasterizer that is known here, --trainer says of which; {OF_ALL}")
-    for contract in fitting:
-        if all(_fits(found, contract) for found in returned) and (
-                not perhaps or any(_fits(found, contract) for found in perhaps)):
+    longest = sorted(perhaps, key=lambda found: -found.count(",")) or [""]  # the most that code takes
+    for kept, contract in itertools.product(longest, fitting):
+        if all(_fits(found, contract) for found in returned) and (not kept or _fits(kept, contract)):
             has_columns = contract.name == "inria" and FOUR_COLUMNS in facts  # which the package's own API has not
             return contracts.ordered(("color", "radii")) if has_columns else contract, ""
     if others and "from " + RASTERIZER not in facts:  # its name is that of one, and its API another's

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -26,8 +25,6 @@ from .source import PatchError
 from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
 
 RENAMED = "DSMOE_RUN_RENAMED"  # the names under which the trainer imports a rasterizer that is known
-IMPORTS_RASTERIZER = re.compile(rb"(?m)^\s*((from|import) (\w*diff_(gauss|surfel|plane)|gsplat\b)"
-                                rb"|from (?!diff_smoe_)\w+ import .*GaussianRasteriz)")
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
 
 
@@ -119,7 +116,7 @@ def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script
     for folder, texts in files.items():
         inside = script is not None and folder in script.parents
         name = script.relative_to(folder).as_posix() if script and inside else ""
-        found = facts.of_checkout(texts, name) if GR in texts else facts.of_files(texts)
+        found = facts.of_checkout(texts, name)
         everything |= found
         if facts.PATCHED in found:
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
@@ -158,13 +155,15 @@ def _folders(script: Optional[Path]) -> List[Path]:
 
 
 def _read(folder: Path, everywhere: bool) -> Dict[str, bytes]:
-    """Returns the files of a checkout like that of 3DGS, else, if so asked, all that import a rasterizer."""
-    of_3dgs = (folder / GR).is_file()
-    patterns = ("*.py", "*/*.py", "*/*/*.py") if of_3dgs or everywhere else ()
+    """Returns the Python files in a folder and two levels below it; {} where none imports a rasterizer.
+
+    everywhere: also where it is no checkout like that of 3DGS.
+    """
+    patterns = ("*.py", "*/*.py", "*/*/*.py") if everywhere or (folder / GR).is_file() else ()
     paths = (path for pattern in patterns for path in folder.glob(pattern) if path.is_file())
     files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths
              if not {"submodules", "site-packages"} & set(path.parts)}
-    return {name: data for name, data in files.items() if of_3dgs or IMPORTS_RASTERIZER.search(data)}
+    return files if GR in files or any(map(facts.IMPORTS_RASTERIZER.search, files.values())) else {}
 
 
 def _may_use_sparse_adam(words: Sequence[str], files: Dict[Path, Dict[str, bytes]], found: Set[str]) -> bool:

@@ -237,14 +237,16 @@ def test_another_name_or_order_is_told_by_what_callers_show(name, results, flavo
 
 
 def test_results_that_are_kept_before_they_are_unpacked_count(tmp_path, monkeypatch):
-    """Code that looks how many there are fits each number."""
+    """Code that looks how many there are gets the most that are known."""
     text = RENAMED.format("diff_gaussian_rasterization", "out").split("out = ")[0]
     own = "def render(draw):\n    out = draw(means3D=1)\n    image, radii, depth, alpha = out\n"
     monkeypatch.chdir(make(tmp_path, {GR: text + own}))
     words = [sys.executable, "train.py"], "smoe", None, environment()
     assert run.prepare(*words)[0]["DSMOE_RASTERIZER"] == "depth_alpha"
-    make(tmp_path, {GR: text + own + "    if len(out) == 2:\n        image, radii = out\n"})
-    assert run.prepare(*words)[0]["DSMOE_RASTERIZER"] == "inria"
+    more = "    if len(out) == 2:\n        image, radii = out\n"
+    for made, flavour in ((own, "depth_alpha"), (own.replace("radii, depth", "radii, normals, depth"), "inria")):
+        make(tmp_path, {GR: text + made + more})
+        assert run.prepare(*words)[0]["DSMOE_RASTERIZER"] == flavour
 
 
 def test_a_renamed_rasterizer_with_results_in_another_order_renders(tmp_path, python):
@@ -276,7 +278,8 @@ def test_points_of_four_columns_need_what_has_absolute_gradients(columns, flavou
     assert run.prepare([sys.executable, "train.py"], "smoe", None, environment())[0]["DSMOE_RASTERIZER"] == flavour
 
 
-def test_the_script_that_is_run_says_which_renderer_counts(tmp_path, monkeypatch):
+@pytest.mark.parametrize("like_3dgs", [True, False])
+def test_the_script_that_is_run_says_which_renderer_counts(like_3dgs, tmp_path, monkeypatch):
     """Two renderers, of which each script has one; and what the rest imports has to be there."""
     files = {"gaussian_renderer/a.py": RENAMED.format("diff_gaussian_rasterization", "image, radii, depth, alpha"),
              GR: "", "gaussian_renderer/b.py": RENAMED.format("diff_surfel_rasterization", "image, radii, allmap"),
@@ -284,6 +287,10 @@ def test_the_script_that_is_run_says_which_renderer_counts(tmp_path, monkeypatch
              "train_b.py": "def later():\n    import gaussian_renderer.b\n", "train.py": None, "render.py": None,
              "train_c.py": "from scene.gaussian_model import M\nfrom gaussian_renderer.a import render\n",
              "utils/more.py": "from diff_gaussian_rasterization import cuda_knn\n"}
+    if not like_3dgs:  # the same in another layout
+        files = {name.replace("gaussian_renderer", "draw"): text and text.replace("gaussian_renderer", "draw")
+                 for name, text in {**files, GR: None}.items()}
+        files[GR] = None
     monkeypatch.chdir(make(tmp_path, files))
 
     def of(script):
