@@ -16,7 +16,7 @@ from diff_smoe_rasterization.trainer.scenes.synthetic import write_synthetic_sce
 RATES = {"means3D": 5e-4, "dc": 0.01, "opacities": 0.05, "scales": 0.01, "rotations": 0.002}  # of Adam, as in 3DGS
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--scene", help="COLMAP or NeRF-synthetic folder")
+parser.add_argument("--scene", help="folder of a scene, as dsmoe train takes it")
 parser.add_argument("--blend-mode", default="smoe", choices=["alpha", "smoe"])
 parser.add_argument("--iterations", type=int, default=300)
 parser.add_argument("-o", "--output", default="model.ply")
@@ -36,7 +36,7 @@ raw = {"means3D": positions, "dc": (torch.tensor(scene.points.colors).float()[:,
        "rotations": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)}
 raw = {name: tensor.clone().requires_grad_() for name, tensor in raw.items()}
 adam = FusedAdam([{"params": [tensor], "lr": RATES[name]} for name, tensor in raw.items()], eps=1e-15)
-gate = 0.03 if arguments.blend_mode == "smoe" else None
+gate = 0.0 if arguments.blend_mode == "smoe" else None
 
 for step in range(arguments.iterations):
     view = scene.train[torch.randint(len(scene.train), (1,)).item()]

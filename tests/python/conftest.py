@@ -4,6 +4,8 @@ A test that uses the fixture `device` runs once on the CPU and, where there is a
 """
 from __future__ import annotations
 
+import os
+
 import pytest
 import torch
 from devices import without_cuda_because
@@ -18,6 +20,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    os.environ["DSMOE_DEVICE"] = "cpu"  # what commands take by themselves, also on a machine with a GPU
     if config.getoption("--device") == "cuda" and without_cuda_because():
         raise pytest.UsageError(f"--device cuda: {without_cuda_because()}")
 
