@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from typing import Any, Optional, Tuple
+from typing import Any, Dict, Optional, Tuple
 
 from .. import io
 from ..settings import GATED_MODES, record_of
@@ -52,8 +52,10 @@ def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians) -> None:
     if os.path.exists(path) and os.path.samefile(path, trained.ply):
         raise TrainerError(f"{path} is the model itself; choose another file with -o")
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
-    recorded = {"blend_mode": record_of(mode), "background_gate": float(gate) if mode in GATED_MODES else None}
-    io.write_gaussians(path, dataclasses.replace(gaussians, **recorded))
+    recorded: Dict[str, Any] = {"blend_mode": record_of(mode),
+                                "background_gate": float(gate) if mode in GATED_MODES else None}
+    others = tuple(line for line in gaussians.comments if line.split(" ")[0] not in recorded)  # it may have an older name
+    io.write_gaussians(path, dataclasses.replace(gaussians, comments=others, **recorded))
 
 
 def _shown(trained: Trained) -> html.Shown:

@@ -122,7 +122,7 @@ def viewer_warning(row: Dict[str, Any], form: str = "ply") -> str:
 
     form: the model file's ending.
     """
-    if row["blend_mode"] == "alpha" or row.get("background_gate") == 1:
+    if row["blend_mode"] == "alpha" or row["blend_mode"] == "smoe_eq7" and row.get("background_gate") == 1:
         return ""
     return (f"note: the {row['blend_mode']} .{form} holds gates; viewers of 3DGS blend them by alpha and show another "
             "image, mostly too dark: use `dsmoe render`")

@@ -8,6 +8,7 @@ import os
 
 import pytest
 
+from diff_smoe_rasterization.settings import record_of
 from diff_smoe_rasterization.trainer.config import TrainConfig, add_arguments, config_from_arguments
 from diff_smoe_rasterization.trainer.errors import ConfigError
 
@@ -52,13 +53,13 @@ def test_blend_mode_follows_the_environment_unless_given(monkeypatch):
 
 
 def test_background_gate_of_each_mode(monkeypatch):
-    modes = ("alpha", "smoe", "smoe_tn", "smoe_std")
-    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, "learned", 0.0, 0.0]
+    modes = ("alpha", "smoe", "smoe_eq7", "smoe_tn", "smoe_std")
+    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, "learned", "learned", 0.0, 0.0]
     assert parse("--blend-mode", "smoe", "--background-gate", "0").background_gate == 0.0, "the paper's"
     assert parse("--blend-mode", "smoe", "--background-gate", "learned").background_gate == "learned"
     assert parse("--blend-mode", "alpha", "--background-gate", "1").background_gate == 1.0
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.2")
-    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, 0.2, 0.0, 0.0]
+    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, 0.2, 0.2, 0.0, 0.0]
     assert parse("--blend-mode", "smoe", "--background-gate", "0.4").background_gate == 0.4
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "learned")
     with pytest.raises(ConfigError, match="DSMOE_BACKGROUND_GATE is 'learned'"):
@@ -67,8 +68,8 @@ def test_background_gate_of_each_mode(monkeypatch):
 
 @pytest.mark.parametrize("mode, gate, words", [
     ("smoe", -0.1, "background_gate is -0.1"), ("smoe", float("inf"), "background_gate is inf"),
-    ("alpha", 0.1, "only 'smoe'"), ("alpha", "learned", "only 'smoe'"), ("smoe_tn", 0.1, "only 'smoe'"),
-    ("smoe_std", 1.0, "only 'smoe'"),
+    *[(mode, gate, "only 'smoe' and 'smoe_eq7' know it")
+      for mode, gate in (("alpha", 0.1), ("alpha", "learned"), ("smoe_tn", 0.1), ("smoe_std", 1.0))],
 ])
 def test_a_background_gate_that_the_mode_does_not_know_is_refused(mode, gate, words):
     with pytest.raises(ConfigError, match=words):
@@ -83,12 +84,12 @@ def test_another_mode_takes_its_own_background_gate():
     assert alpha.changed(blend_mode="smoe", background_gate=0.2).background_gate == 0.2
 
 
-@pytest.mark.parametrize("mode, expected", [("smoe", 0.0), ("alpha", 1.0), ("smoe_tn", 0.0)])
+@pytest.mark.parametrize("mode, expected", [("smoe_eq7", 0.0), ("alpha", 1.0), ("smoe_tn", 0.0)])
 def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypatch, mode, expected):
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")  # must not fill the gap
     TrainConfig(scene="s", output=str(tmp_path), blend_mode=mode).save(str(tmp_path))
     values = json.loads((tmp_path / "config.json").read_text())
-    assert values.pop("background_gate") == (0.7 if mode == "smoe" else expected), "the resolved one"
+    assert values.pop("background_gate") == (0.7 if mode == "smoe_eq7" else expected), "the resolved one"
     (tmp_path / "config.json").write_text(json.dumps(values))
     assert TrainConfig.load(str(tmp_path)).background_gate == expected
 
@@ -125,7 +126,7 @@ def test_file_round_trip(tmp_path, mode):
     config = TrainConfig(scene="s", output=str(tmp_path), blend_mode=mode, iterations=5, white_background=True)
     config.save(str(tmp_path))
     assert TrainConfig.load(str(tmp_path)) == dataclasses.replace(config, scene=os.path.abspath("s"))
-    assert json.loads((tmp_path / "config.json").read_text())["blend_mode"] == mode
+    assert json.loads((tmp_path / "config.json").read_text())["blend_mode"] == record_of(mode)
 
 
 @pytest.mark.parametrize("edit, words", [

@@ -13,6 +13,7 @@ from PIL import Image
 
 from diff_smoe_rasterization import cli
 from diff_smoe_rasterization.io import read_gaussians
+from diff_smoe_rasterization.settings import record_of
 from diff_smoe_rasterization.trainer import quickstart
 from diff_smoe_rasterization.trainer.results.pictures import busiest_window, comparison, evenly_spaced
 from diff_smoe_rasterization.trainer.system import files
@@ -39,7 +40,7 @@ def test_both_modes_are_trained_with_the_same_settings(output):
 def test_the_models_record_their_modes(output):
     for mode in ("alpha", "smoe"):
         model = read_gaussians(str(output / f"{mode}.ply"))
-        assert model.blend_mode == mode
+        assert model.blend_mode == record_of(mode)
         assert model.background_gate is None if mode == "alpha" else 0.03 < model.background_gate < 1
 
 
