@@ -54,7 +54,7 @@ def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians) -> None:
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
     recorded: Dict[str, Any] = {"blend_mode": record_of(mode),
                                 "background_gate": float(gate) if mode in GATED_MODES else None}
-    others = tuple(line for line in gaussians.comments if line.split(" ")[0] not in recorded)  # it may have an older name
+    others = tuple(line for line in gaussians.comments if line.split(" ")[0] not in recorded)  # of an older name
     io.write_gaussians(path, dataclasses.replace(gaussians, comments=others, **recorded))
 
 
