@@ -20,12 +20,15 @@ struct Pixel {
   Vector alpha;
   Vector color, depth, inverse_depth;
   double background = 0.35;
-  double background_gate = 0;  // read by smoe alone
+  double background_gate = 0;  // read by smoe and smoe_eq7 alone
+  double tails = 0;            // B, read by smoe alone
   int size() const { return static_cast<int>(alpha.size()); }
 };
 
 struct Finished {
-  double color = 0, depth = 0, inverse_depth = 0, gate_sum = 0;
+  double color = 0, depth = 0, inverse_depth = 0;
+  double gate_sum = 0;          // the alpha image
+  double denominator_part = 0;  // W; ablations: sum alpha
   double transmittance = 1;
   int last = 0;  // one past the last pair of the numerator
 };
@@ -40,6 +43,7 @@ Terms terms_of(BlendMode mode, double alpha, double t, bool full) {
   switch (mode) {
     case BlendMode::kAlpha:
     case BlendMode::kSmoe:
+    case BlendMode::kSmoeEq7:
       return full ? Terms{0, 0} : Terms{alpha * t, alpha * t};
     case BlendMode::kSmoeTn:
       return {full ? 0 : alpha * t, alpha};
@@ -50,8 +54,8 @@ Terms terms_of(BlendMode mode, double alpha, double t, bool full) {
   return {NAN, NAN};
 }
 
-// The sums as the paper writes them, of Equation 7 with the background as one more expert. stop: the pair before which
-// the numerator ends.
+// The sums as the paper writes them, of Equation 7 with the background as one more expert, which weighs the tails too
+// in smoe. stop: the pair before which the numerator ends.
 Finished paper(BlendMode mode, const Pixel& pixel, int stop) {
   Finished out;
   double sum_color = 0, sum_z = 0, sum_inverse_z = 0;
@@ -70,13 +74,14 @@ Finished paper(BlendMode mode, const Pixel& pixel, int stop) {
   }
   const bool gated = out.gate_sum >= static_cast<double>(1e-30f);
   out.depth = gated ? sum_z / out.gate_sum : 0;
-  const double of_background = pixel.background_gate * out.transmittance;
+  const double of_background = pixel.background_gate * out.transmittance + (mode == BlendMode::kSmoe ? pixel.tails : 0);
   if (mode == BlendMode::kAlpha) {
     out.color = sum_color + out.transmittance * pixel.background;
     out.inverse_depth = sum_inverse_z;
-  } else if (mode == BlendMode::kSmoe && of_background > 0) {
+  } else if (gated && (mode == BlendMode::kSmoe || mode == BlendMode::kSmoeEq7)) {
     out.color = (sum_color + of_background * pixel.background) / (out.gate_sum + of_background);
     out.inverse_depth = sum_inverse_z / (out.gate_sum + of_background);
+    if (mode == BlendMode::kSmoe) out.gate_sum /= out.gate_sum + of_background;  // the alpha image
   } else {
     out.color = gated ? sum_color / out.gate_sum : pixel.background;
     out.inverse_depth = gated ? sum_inverse_z / out.gate_sum : 0;
@@ -112,11 +117,13 @@ template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
     inverse_depth += pair.weight * Real(pixel.inverse_depth[i]);
     if (pair.contributes) out.last = i + 1;
   }
-  const auto end = state.end(Real(pixel.background_gate));
+  auto end = state.end(Real(pixel.background_gate));
+  end.tails = Real(pixel.tails);
   out.color = finish_feature<kMode>(FeatureRule::kBlended, end, color, Real(pixel.background));
   out.depth = finish_feature<kMode>(FeatureRule::kAveraged, end, depth, Real(0));
   out.inverse_depth = finish_feature<kMode>(FeatureRule::kBlended, end, inverse_depth, Real(0));
-  out.gate_sum = state.gate_sum;
+  out.gate_sum = finish_alpha<kMode>(end);
+  out.denominator_part = state.gate_sum;
   out.transmittance = abs(state.transmittance);
   return out;
 }
@@ -124,6 +131,7 @@ template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
 Pixel random_pixel(Random& random, int count, double largest_alpha) {
   Pixel pixel;
   pixel.background_gate = random.uniform(0, 1) < 0.5 ? 0 : random.log_uniform(1e-3, 3);
+  pixel.tails = random.uniform(0, 1) < 0.5 ? 0 : random.log_uniform(1e-6, 1e-1);
   for (int i = 0; i < count; ++i) {
     const double z = random.uniform(1, 4);
     pixel.counts.push_back(random.uniform(0, 1) < 0.8);
@@ -144,6 +152,7 @@ Pixel saturated_pixel() {
   pixel.depth = {1, 1.5, 2, 2.5, 3, 3.5, 4};
   for (const double z : pixel.depth) pixel.inverse_depth.push_back(1 / z);
   pixel.background_gate = 0.4;
+  pixel.tails = 0.02;
   return pixel;
 }
 
@@ -251,8 +260,10 @@ struct PixelGradient {
 // The pairs in front of `middle` belong to another walk, which knows those behind by their sum alone.
 template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel, const Weights& g, int middle = 0) {
   const Finished forward = blended<kMode, Real>(pixel);
-  const PixelEnd<Real> end = {Real(forward.transmittance), Real(forward.gate_sum), Real(pixel.background_gate)};
-  auto constants = begin_backward(end, Real(g.gate_sum));
+  const PixelEnd<Real> end = {Real(forward.transmittance), Real(forward.denominator_part), Real(pixel.background_gate),
+                              Real(pixel.tails)};
+  const auto begin = begin_backward<kMode>(end, Real(g.gate_sum));
+  auto constants = begin.pixel;
   const auto by_color = add_feature<kMode>(FeatureRule::kBlended, constants, end, Real(g.color), Real(forward.color),
                                            Real(pixel.background));
   const auto by_depth =
@@ -264,7 +275,8 @@ template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel
   Real behind = 0;
   PixelGradient out;
   out.background = by_color.background;
-  out.background_gate = by_color.background_gate + by_depth.background_gate + by_inverse_depth.background_gate;
+  out.background_gate =
+      begin.background_gate + by_color.background_gate + by_depth.background_gate + by_inverse_depth.background_gate;
   out.power = out.color = out.depth = out.inverse_depth = Vector(pixel.size());
   for (int i = pixel.size() - 1; i >= 0; --i) {
     if constexpr (kResumes<kMode>) {
@@ -399,7 +411,7 @@ TYPED_TEST(BlendOf, GradientsAreBoundedByThoseOfTheImageAndTheLargestFeature) {
     const Pixel pixel = random_pixel(random, 1 + i % 40, i % 2 ? 1e-3 : 0.98);
     const Weights g = {random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1)};
     const PixelGradient actual = backward<TypeParam::value, double>(pixel, g);
-    double most = abs(g.gate_sum);
+    double most = (Policy::kTails ? 2 : 1) * abs(g.gate_sum);
     const auto feature = [&](double gradient, const Vector& values, double background, const Vector& by_value) {
       double largest = abs(background);
       for (const double value : values) largest = std::max(largest, abs(value));
@@ -453,9 +465,9 @@ TYPED_TEST(GatedBlendOf, AClosedGateGivesItsGradientToTheBackground) {
     EXPECT_EQ(g.depth[i], 0);
     EXPECT_EQ(g.inverse_depth[i], 0);
   }
-  // The gate sum itself is an output too, and still moves.
+  // The gate sum itself is an output too, and still moves; its share of the pixel does not.
   const PixelGradient on_sum = backward<TypeParam::value, double>(pixel, {0, 0, 0, 0.3});
-  EXPECT_DOUBLE_EQ(on_sum.power[1], 0.3 * 2e-32);
+  EXPECT_DOUBLE_EQ(on_sum.power[1], Blend<TypeParam::value>::kTails ? 0 : 0.3 * 2e-32);
 }
 
 }  // namespace

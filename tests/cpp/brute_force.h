@@ -65,6 +65,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
   for (int64_t pixel = 0; pixel < pixels; ++pixel) {
     const int x = static_cast<int>(pixel % camera.width), y = static_cast<int>(pixel / camera.width);
     auto state = PixelState<S>::open();
+    S tails = S(0);
     std::vector<S> sums(num_features);
     double margin = std::numeric_limits<double>::infinity();
     int32_t greatest = -1, num_contributing = 0;
@@ -86,6 +87,8 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
       if (terms > 0) margin = std::min(margin, std::abs(double(power)) / terms);
       if (Blend<kMode>::kCut == Cut::kAlpha) {
         decide(gate.alpha, kAlphaCut);
+      } else if (Blend<kMode>::kCut == Cut::kStrong) {
+        decide(gate.alpha, std::max<double>(least_alpha, kStrongAlpha));
       } else {
         decide(exp(power), kGateCut);
         if (least_alpha > 0) decide(gate.alpha, least_alpha);
@@ -96,6 +99,8 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
           decide(state.transmittance * (S(1) - gate.alpha), kTransmittanceCut);
         }
       }
+      auto strong = state;
+      if (Blend<kMode>::kTails) add_tail(strong, tails, gate, power <= S(0));
       const auto pair = Blend<kMode>::accumulate(state, gate);
       add_pair<double>(out.contributions[i], pair.contributes, brute_force_pixel_weight<S>(pixel), pair.weight, dx, dy);
       num_contributing += pair.contributes;
@@ -108,12 +113,14 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
       for (int f = 0; f < num_features; ++f) sums[f] += pair.weight * features[i * num_features + f];
     }
     if (state.gate_sum > S(0)) decide(state.gate_sum, kGateSumCut);
+    if (Blend<kMode>::kTails) decide(state.gate_sum, config.tails_below);
     out.margin.push_back(margin);
     out.greatest.push_back(greatest);
     out.num_contributing.push_back(num_contributing);
     out.lead.push_back(greatest < 0 ? 1 : 1 - second_weight / greatest_weight);
-    out.gate_sum[pixel] = state.gate_sum;
-    const auto end = state.end(config.gate_of_background());
+    auto end = state.end(config.gate_of_background());
+    if (state.gate_sum < config.tails_below) end.tails = tails;
+    out.gate_sum[pixel] = finish_alpha<kMode>(end);
     int f = 0;
     for (; f < config.num_channels; ++f) {
       out.color[f * pixels + pixel] = finish_feature<kMode>(FeatureRule::kBlended, end, sums[f], config.background[f]);

@@ -156,7 +156,7 @@ template <class S> struct Rendering {
   std::vector<S> features;
   std::vector<int64_t> instance_offsets, tile_offsets;
   std::vector<TileInstance> instances;
-  std::vector<S> final_transmittance, gate_sum, color, depth, inverse_depth;
+  std::vector<S> final_transmittance, gate_sum, sums, color, depth, inverse_depth;
   std::vector<int32_t> last_contributor, radii;
 
   explicit Rendering(const Scene<S>& scene) {
@@ -166,6 +166,7 @@ template <class S> struct Rendering {
     instance_offsets.resize(scene.count + 1, -1);
     tile_offsets.resize(num_tiles(scene.camera.width, scene.camera.height) + 1, -1);
     for (auto* image : {&final_transmittance, &gate_sum}) image->resize(scene.pixels(), unwritten);
+    if (has_tails(scene.config.mode)) sums.resize(2 * scene.pixels(), unwritten);
     color.resize(scene.pixels() * scene.config.num_channels, unwritten);
     if (scene.config.depth) depth.resize(scene.pixels(), unwritten);
     if (scene.config.inverse_depth) inverse_depth.resize(scene.pixels(), unwritten);
@@ -174,9 +175,16 @@ template <class S> struct Rendering {
   }
 
   SavedForward<S> saved() {
-    return {projected.data(),    features.data(),         instance_offsets.data(),
-            tile_offsets.data(), instances.data(),        final_transmittance.data(),
-            gate_sum.data(),     last_contributor.data(), {}};
+    SavedForward<S> out;
+    out.projected = projected.data(), out.features = features.data();
+    out.instance_offsets = instance_offsets.data(), out.tile_offsets = tile_offsets.data();
+    out.instances = instances.data();
+    out.final_transmittance = final_transmittance.data(), out.last_contributor = last_contributor.data();
+    out.sums = sums.data();
+    SavedSizes sizes;
+    sizes.pixels = static_cast<int64_t>(gate_sum.size()), sizes.tails = !sums.empty();
+    set_sums(out, sizes, gate_sum.data());
+    return out;
   }
   ImageOutputs<S> images() {
     return {color.data(), depth.empty() ? nullptr : depth.data(),

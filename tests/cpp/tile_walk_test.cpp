@@ -46,7 +46,7 @@ template <class S> void expect_the_cells_of_random_gaussians() {
     saved.features = const_cast<S*>(features);
     saved.instances = const_cast<TileInstance*>(&instance);
     RasterConfig<S> config;
-    config.mode = BlendMode::kSmoe;
+    config.mode = BlendMode::kSmoeEq7;
     config.background_gate = S(kGate);
     const Tile<S> tile = {config, saved, kSide, kSide, n % 3, n / 3 % 3, 0, 0, 1};
     const TileExtent extent(tile);
@@ -56,11 +56,11 @@ template <class S> void expect_the_cells_of_random_gaussians() {
     for (int at = 0; at < kTilePixels; at += kLanes) {
       const CellBits cell = CellBits(1) << (at / kCellPixels);
       const bool smooth = (listed.smooth & cell) != 0;
-      const PackPairs<BlendMode::kSmoe, S, true> quick(listed, pixels, at);
+      const PackPairs<BlendMode::kSmoeEq7, S, true> quick(listed, pixels, at);
       for (int lane = 0; lane < kLanes; ++lane) {
         const S dx = pixels.x[at + lane] - gaussian.mean.x, dy = pixels.y[at + lane] - gaussian.mean.y;
         const S power = ColumnExponent<S, S>(gaussian.conic, dx).at(dy);
-        const auto gate = evaluate_gate<BlendMode::kSmoe>(power, gaussian.opacity, listed.least_alpha);
+        const auto gate = evaluate_gate<BlendMode::kSmoeEq7>(power, gaussian.opacity, listed.least_alpha);
         counted += gate.counts;
         if (gate.counts) {
           ASSERT_NE(listed.met & cell, 0u) << "Gaussian " << n << " pixel " << at + lane;

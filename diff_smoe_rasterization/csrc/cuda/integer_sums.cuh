@@ -9,6 +9,8 @@
 //
 //   |alpha dL/dalpha| <= 2 max(1, lambda) (sum_f 2 |dL/df| max |c_f| + |dL/dW|)
 //
+// (2 |dL/dA| in a mode with tails, whose alpha image is A = W / D)
+//
 // with the largest gradient and the largest feature of the whole image. Where alpha is clamped, dL/dpower is larger by
 // o G / alpha. A moment has up to two factors of distance, which the footprint bounds; a sum has no more terms than the
 // footprint has pixels.
@@ -195,7 +197,7 @@ __global__ void __launch_bounds__(kStoreBlock)
       sums.exponents[number] = gradient(number - kNumGateMoments) + 1;  // w may exceed D by its rounding
       continue;
     }
-    int most = gradient(num_features);
+    int most = gradient(num_features) + has_tails(config.mode);  // whose alpha image is like a feature of 1
     for (int f = 0; f < num_features; ++f) {
       const S background = abs(feature_background(config, f));
       int feature = max(kNoExponent, bounds.features[f]);

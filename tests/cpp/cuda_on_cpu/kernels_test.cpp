@@ -297,7 +297,7 @@ TEST(Kernels, CountThePairsOfBothPasses) {
 
 TEST(Kernels, GiveTheSameBitsInEveryOrder) {
   for (const Scene<double>& of : {make_scene(4, 70, 17, 17), list_of_unlike_halves()}) {
-    const Scene<float> scene = convert<float>(in_mode<BlendMode::kSmoe>(of).back());
+    const Scene<float> scene = convert<float>(in_mode<BlendMode::kSmoeEq7>(of).back());
     const std::vector<bool> all_sure(scene.pixels(), false);
     Results<float> first = by_kernels(scene, all_sure, {true});
     for (const auto order : {emulator::Order::kBackward, emulator::Order::kShuffled}) {
