@@ -43,7 +43,8 @@ MAX_PIXELS = 70_000  # of an image
 MAX_POINTS = 30_000
 
 # Offered by `dsmoe train` and fixed here.
-FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "eval_every", "checkpoint_every")
+FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "background_gate_start",
+         "background_gate_lr", "eval_every", "checkpoint_every")
 
 
 def main(argv: Optional[List[str]] = None) -> int:

@@ -30,6 +30,9 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     unusual: Dict[str, Any] = {}
     if config.background_gate == LEARNED:
         unusual.update(background_gate_learned=True, background_gate_bound=config.background_gate_bound)
+        for name, value in (("background_gate_start", 1.0), ("background_gate_lr", 0.01)):
+            if getattr(config, name) != value:
+                unusual[name] = getattr(config, name)
     if config.batch > 1:
         unusual["batch"] = config.batch
     if config.deterministic:

@@ -381,9 +381,11 @@ def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path
     output = str(tmp_path / "out")
     assert main(["train", scene, "-o", output, "--blend-mode", "smoe", "--background-gate", "learned", *SHORT]) == 0
     row, = results_of(output)
-    assert row["protocol"]["background_gate_learned"] is True and row["protocol"]["background_gate_bound"] == 0.03
+    protocol = row["protocol"]
+    assert protocol["background_gate_learned"] is True and protocol["background_gate_bound"] == 0
+    assert protocol["background_gate_start"] == 0.1 and "background_gate_lr" not in protocol, "as usual"
     gate = row["background_gate"]
-    assert 0.03 < gate < 2 and gate != 1.0
+    assert 0.05 < gate < 0.2 and gate != 0.1
     text = capsys.readouterr().out
     assert "viewers of 3DGS blend them by alpha" in text
     assert "smoe learned" in text and f"\nsmoe {gate:.3g} " in text

@@ -32,7 +32,7 @@ def test_both_modes_are_trained_with_the_same_settings(output):
     assert [row["blend_mode"] for row in rows] == ["alpha", "smoe"]
     for row in rows:
         assert {"psnr", "ssim", "num_gaussians", "train_seconds", "fps"} <= set(row)
-    learned = {"background_gate_learned": True, "background_gate_bound": 0.03}
+    learned = {"background_gate_learned": True, "background_gate_bound": 0.0, "background_gate_start": 0.1}
     assert rows[1]["protocol"] == {**rows[0]["protocol"], **learned}
     assert (rows[0]["protocol"]["iterations"], rows[0]["protocol"]["seed"]) == (30, 4)
 
@@ -41,7 +41,7 @@ def test_the_models_record_their_modes(output):
     for mode in ("alpha", "smoe"):
         model = read_gaussians(str(output / f"{mode}.ply"))
         assert model.blend_mode == record_of(mode)
-        assert model.background_gate is None if mode == "alpha" else 0.03 < model.background_gate < 1
+        assert model.background_gate is None if mode == "alpha" else 0.05 < model.background_gate < 0.2
 
 
 def test_pictures_show_truth_and_both_modes(output):
