@@ -144,6 +144,14 @@ def mode_of_record(record: str) -> str:
     return next((mode for mode, name in _RECORDED.items() if name == record), record)
 
 
+def said_of_record(record: Optional[str]) -> str:
+    """Returns what to tell a user of a file that records a blend mode so; empty where the name says it all."""
+    if record not in _RECORDED:
+        return ""
+    return (f"it records the blend mode {record} of an earlier version, which is {mode_of_record(record)} now; the new "
+            f"{record} has another rule, and files record it as {record_of(record)}")
+
+
 def resolve_blend_mode(blend_mode: Optional[str]) -> str:
     """Returns the blend mode that a rendering uses.
 

@@ -1,8 +1,8 @@
 """`dsmoe run`: a command of an unmodified trainer, with this package's rasterizer in front of its own.
 
 PYTHONPATH names shims/, in which `diff_gaussian_rasterization` is the module of integrations whose API the trainer
-calls. DSMOE_BLEND_MODE is the mode, and in `smoe` DSMOE_BACKGROUND_GATE the background's gate. Whatever the command
-starts has them. That nothing was rendered is an error.
+calls. DSMOE_BLEND_MODE is the mode, and in GATED_MODES DSMOE_BACKGROUND_GATE the background's gate. Whatever the
+command starts has them. That nothing was rendered is an error.
 """
 from __future__ import annotations
 

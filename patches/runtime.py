@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import Any, Callable, Dict, Optional, Tuple
 
 from diff_smoe_rasterization import settings
-from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES, resolve_blend_mode
+from diff_smoe_rasterization.settings import (
+    BLEND_MODES,
+    GATED_MODES,
+    mode_of_record,
+    record_of,
+    resolve_blend_mode,
+    said_of_record,
+)
 
 SHIMS, STAND_INS = (Path(__file__).resolve().parent / name for name in ("shims", "stand_ins"))
 OPTIONS = ("blend_mode", "background_gate")
@@ -37,28 +44,36 @@ def saved_blend_of(dataset: Any) -> Dict[str, Any]:
     for option in OPTIONS:
         if getattr(dataset, "model_path", "") and not _is_typed(option):
             setattr(dataset, option, saved.get(option))
-    return blend_of(dataset)
+    return blend_of(dataset, of_saved=True)
 
 
-def blend_of(dataset: Any) -> Dict[str, Any]:
-    """Returns the settings `blend_mode` and `background_gate` of a run (None but in `smoe`).
+def blend_of(dataset: Any, of_saved: bool = False) -> Dict[str, Any]:
+    """Returns the settings `blend_mode` and `background_gate` of a run (None but in GATED_MODES).
 
-    Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args. Without a
-    `blend_mode` (a cfg_args of before the patch): "alpha". In `smoe` without a `background_gate`: 0, Eq. 7.
+    Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args; there `smoe` is
+    `smoe_tails`. Without a `blend_mode` (a cfg_args of before the patch): "alpha". In GATED_MODES without a
+    `background_gate`: 0. `smoe` in the cfg_args of an earlier version is `smoe_eq7`, also where it is typed besides:
+    where `dataset` has a trained model's options, so its gate is no text, and under `of_saved`.
     From then on a rendering of this process whose settings name no mode has both.
     Says on stderr what they are. Warns, once, where one may not be what was meant.
     Raises ValueError where one is wrong, RuntimeError where the renderer has another rasterizer.
     """
     _check_renderer()
     mode, gate = (getattr(dataset, option, None) for option in OPTIONS)  # a gate that is typed is a string
+    saved = _saved(dataset)
     if not mode:
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
               "the patch); --blend_mode says otherwise")
         mode = "alpha"
+    if mode == saved.get("blend_mode") and said_of_record(mode) and (of_saved or not isinstance(gate, str)):
+        say(f"{dataset.model_path}/cfg_args: {said_of_record(mode)}")
+        mode = mode_of_record(mode)
+    elif mode not in BLEND_MODES:
+        mode = mode_of_record(mode)
     if mode not in BLEND_MODES:
         raise ValueError(f"the blend mode is {mode!r}; it must be one of {', '.join(BLEND_MODES)}")
     if mode in GATED_MODES and gate is None:
-        _warn("this model's cfg_args records no background gate, so it is 0, Eq. 7 (a model trained by `dsmoe run`, "
+        _warn("this model's cfg_args records no background gate, so it is 0 (a model trained by `dsmoe run`, "
               "or in another mode); --background_gate says otherwise")
         gate = 0.0
     is_of_smoe = mode not in GATED_MODES and not isinstance(gate, str)
@@ -66,12 +81,13 @@ def blend_of(dataset: Any) -> Dict[str, Any]:
     say(f"blend mode {mode}" + (f", background gate {gate}" if gate is not None else ""))
     # Rendering without an option never warns: it has what cfg_args records.
     for option, value in zip(OPTIONS, (mode, gate)):
-        before = _saved(dataset).get(option)
+        before = saved.get(option)
+        before = mode_of_record(before) if isinstance(before, str) else before
         if value is not None and before not in (None, value):
             _warn(f"{dataset.model_path}/cfg_args is of a run with {option} {before}, but this one has {value}; a "
                   f"training overwrites it. To go on as before, give --{option} {before}")
     settings.blend_of_process = mode, gate  # the patch's line in the renderer may be deleted
-    dataset.blend_mode, dataset.background_gate = mode, gate
+    dataset.blend_mode, dataset.background_gate = record_of(mode), gate
     return {"blend_mode": mode, "background_gate": gate}
 
 

@@ -89,27 +89,31 @@ std::vector<std::string> blend_names() {
 
 BlendChoice choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
                          std::optional<double> background_gate) {
-  const std::vector<std::string> names = blend_names();
   const bool is_splat = file_extension(file) == ".splat";  // which viewers blend by alpha
-  const std::string recorded = is_splat ? "alpha" : model.blend_mode;
-  const std::string chosen = mode.empty() ? recorded : mode;
-  if (chosen.empty()) {
+  const std::string record = is_splat ? "alpha" : model.blend_mode;
+  const std::optional<BlendMode> recorded = blend_mode_of_record(record);
+  if (mode.empty() && record.empty()) {
     throw UsageError(file +
                      " does not say which blend it was trained with (no `comment blend_mode`); pass --blend, "
                      "which is alpha for files of other 3DGS programs");
   }
-  const auto found = std::find(names.begin(), names.end(), chosen);
-  if (found == names.end()) {
-    throw io::FormatError(file + ": records the blend mode " + io::printable(chosen) + ", which is none of ours");
+  const std::optional<BlendMode> chosen = mode.empty() ? recorded : blend_mode_of(mode);
+  if (!chosen) {
+    throw io::FormatError(file + ": records the blend mode " + io::printable(record) + ", which is none of ours");
   }
   BlendChoice choice;
-  choice.mode = static_cast<BlendMode>(found - names.begin());
-  if (!recorded.empty() && chosen != recorded) {
-    std::fprintf(stderr, "note: %s %s the blend %s; in another one Gaussians show another scene\n", file.c_str(),
-                 is_splat ? "does not say its blend; viewers take it for" : "was trained with", recorded.c_str());
+  choice.mode = *chosen;
+  const std::string name = recorded ? blend_names()[static_cast<std::size_t>(*recorded)] : io::printable(record);
+  if (recorded && record != name && record != record_of(*recorded)) {
+    std::fprintf(stderr, "note: %s records the blend %s of an earlier version, which is %s now\n", file.c_str(),
+                 record.c_str(), name.c_str());
   }
-  if (choice.mode != BlendMode::kSmoe) {
-    if (background_gate) throw UsageError("--background-gate is for --blend smoe only");
+  if (!record.empty() && chosen != recorded) {
+    std::fprintf(stderr, "note: %s %s the blend %s; in another one Gaussians show another scene\n", file.c_str(),
+                 is_splat ? "does not say its blend; viewers take it for" : "was trained with", name.c_str());
+  }
+  if (choice.mode != BlendMode::kSmoe && choice.mode != BlendMode::kSmoeEq7) {
+    if (background_gate) throw UsageError("--background-gate is for --blend smoe and smoe_eq7 only");
     return choice;
   }
   if (background_gate && model.background_gate && *background_gate != *model.background_gate) {
@@ -117,9 +121,10 @@ BlendChoice choose_blend(const io::GaussianModel& model, const std::string& file
                  file.c_str(), io::shortest_text(*model.background_gate).c_str(),
                  io::shortest_text(*background_gate).c_str());
   }
-  // A file that records no gate was trained with Eq. 7.
+  // A file that records no gate was trained without one.
   choice.background_gate = background_gate.value_or(model.background_gate.value_or(0));
-  if (choice.background_gate == 1) choice = {};  // the family's member that alpha blending is
+  if (choice.mode == BlendMode::kSmoeEq7 && choice.background_gate == 1)
+    choice = {};  // the family's member that alpha blending is
   return choice;
 }
 

@@ -33,13 +33,13 @@ io::GaussianModel read_model(const std::string& path);
 /// How a model is blended.
 struct BlendChoice {
   BlendMode mode = BlendMode::kAlpha;
-  double background_gate = 0;  // of smoe
+  double background_gate = 0;  // of smoe and smoe_eq7
 };
 
 std::vector<std::string> blend_names();
 
 /// The blend that a file records, or the one that is asked for (empty, nullopt: nothing is). Notes go to stderr where
-/// they disagree. Throws UsageError where neither says.
+/// they disagree, and where a file has an older name. Throws UsageError where neither says.
 BlendChoice choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
                          std::optional<double> background_gate);
 

@@ -21,7 +21,7 @@ that have a bar behind them,
   change    how much the bars change a channel, in the mean
 
 Options
-  --blends A,B,...  which, in this order. Default: smoe,smoe_tn,smoe_std; alpha is the fourth
+  --blends A,B,...  which, in this order. Default: smoe,smoe_tn,smoe_std; alpha and smoe_eq7 are others
   --size N          pixels a side. Default: 256
   --threads N       Default: all processors
   --overwrite       replace PICTURE.png where it is there

@@ -4,7 +4,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
-from typing import Any, Optional, Tuple
+from typing import Any, Dict, Optional, Tuple
 
 from .. import io
 from ..settings import GATED_MODES, record_of
@@ -98,9 +98,11 @@ def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], ove
 
 def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: bool) -> None:
     mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
-    recorded = {"blend_mode": record_of(mode), "background_gate": float(gate) if mode in GATED_MODES else None}
+    recorded: Dict[str, Any] = {"blend_mode": record_of(mode),
+                                "background_gate": float(gate) if mode in GATED_MODES else None}
+    others = tuple(line for line in gaussians.comments if line.split(" ")[0] not in recorded)  # of an older name
     with new_file(path, overwrite) as temporary:
-        io.write_gaussians(temporary, dataclasses.replace(gaussians, **recorded))
+        io.write_gaussians(temporary, dataclasses.replace(gaussians, comments=others, **recorded))
 
 
 def _shown(trained: Trained) -> html.Shown:

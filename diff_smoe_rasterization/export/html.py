@@ -20,7 +20,7 @@ from ..trainer.scenes.orbit import Orbit
 from .rows import finite_rows
 
 PAGE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "page")
-MODES = ("alpha", "smoe")
+MODES = ("alpha", "smoe", "smoe_eq7")
 
 # What renderer.js reads of each Gaussian. A rotation is the vector part of a unit quaternion whose real part is the
 # largest, times sqrt(2) as a signed 16-bit fraction.
@@ -44,8 +44,8 @@ class Shown:
 def page(gaussians: Gaussians, shown: Shown) -> str:
     """The page's text. Raises TrainerError for a blend mode that it cannot show."""
     if shown.blend_mode not in MODES:
-        raise TrainerError(f"a page shows {' and '.join(MODES)}, but the model was trained with {shown.blend_mode}; "
-                           "use `dsmoe render` or `dsmoe view`")
+        raise TrainerError(f"a page shows {', '.join(MODES[:-1])} and {MODES[-1]}, but the model was trained with "
+                           f"{shown.blend_mode}; use `dsmoe render` or `dsmoe view`")
     count, first, second = pack(gaussians)
     facts: Dict[str, Any] = {
         "count": count, "degree": gaussians.sh_degree, "mode": shown.blend_mode, "gate": shown.background_gate,

@@ -13,6 +13,7 @@ from ..settings import (
     BACKGROUND_GATE_VARIABLE,
     BLEND_MODES,
     GATED_MODES,
+    MAX_BACKGROUND_GATE,
     mode_of_record,
     record_of,
     resolve_background_gate,
@@ -68,10 +69,15 @@ class TrainConfig:
     blend_mode: Optional[str] = _option(
         None, "how Gaussians make a pixel (default: $DSMOE_BLEND_MODE, else alpha)", choices=BLEND_MODES)
     background_gate: Union[float, str, None] = _option(
-        None, "smoe: how much the background weighs against the Gaussians: 0 is the paper's Eq. 7, 1 alpha blending, "
-              f"`{LEARNED}` finds it with the scene (default: $DSMOE_BACKGROUND_GATE, else {LEARNED})",
+        None, "smoe, smoe_eq7: how much the background weighs against the Gaussians: 0 is the paper's rule, 1 about "
+              f"alpha blending, `{LEARNED}` finds it with the scene (default: $DSMOE_BACKGROUND_GATE, else {LEARNED})",
         metavar=f"X|{LEARNED}")
-    background_gate_bound: float = _option(0.03, "a learned background gate stays above this")
+    background_gate_bound: float = _option(
+        None, "a learned background gate stays above this (default: 0.03; smoe: 0)", kind=float)
+    background_gate_start: float = _option(
+        None, "a learned background gate starts with this (default: 1; smoe: 0.1)", kind=float)
+    background_gate_lr: float = _option(
+        0.01, "learning rate of the logarithm of what a learned background gate has above its bound")
     iterations: int = _option(30_000, "views to train on, a view each step; with --batch B, B each step")
     batch: int = _option(
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
@@ -136,7 +142,7 @@ class TrainConfig:
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
             if self.schedule is None:
                 self.schedule = "gate" if self.budget else "3dgs"
-            for name, value in _recipe_of(self.schedule).items():
+            for name, value in {**_recipe_of(self.schedule), **_learned_gate_of(self.blend_mode)}.items():
                 if getattr(self, name) is None:
                     setattr(self, name, value)
         except ValueError as error:
@@ -146,7 +152,7 @@ class TrainConfig:
         """Checks every option that needs no file; returns self."""
         for option in dataclasses.fields(self):
             value, choices = getattr(self, option.name), option.metadata.get("choices")
-            kind = type(option.metadata.get("published", option.default))
+            kind = option.metadata.get("kind") or type(option.metadata.get("published", option.default))
             fits = isinstance(value, (int, float) if kind is float else kind)
             if kind in KINDS and (not fits or isinstance(value, bool) != (kind is bool)):
                 raise ConfigError(f"{_flag(option)} is {value!r}; it must be {KINDS[kind]}")
@@ -177,11 +183,15 @@ class TrainConfig:
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
         self._require("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "between 0 and 1")
         self._require("background_gate_bound", 0.0 <= self.background_gate_bound < 1.0, "at least 0 and below 1")
+        self._require("background_gate_start",
+                      self.background_gate_bound < self.background_gate_start <= MAX_BACKGROUND_GATE,
+                      f"above --background-gate-bound, {self.background_gate_bound}, and at most "
+                      f"{MAX_BACKGROUND_GATE:g}")
         self._require("seed", 0 <= self.seed < 2**32, "between 0 and 2^32 - 1")
         for name in ("sh_degree_interval", "position_lr_max_steps", "densification_interval", "opacity_reset_interval"):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         for name in ("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr",
-                     "densify_grad_threshold", "percent_dense"):
+                     "densify_grad_threshold", "percent_dense", "background_gate_lr"):
             self._require(name, 0.0 < getattr(self, name) < float("inf"), "a positive number")
         for name in ("densify_from_iter", "densify_until_iter", "eval_every", "checkpoint_every"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
@@ -204,19 +214,23 @@ class TrainConfig:
     def changed(self, **options: Any) -> TrainConfig:
         """A validated copy with some options set.
 
-        Another blend mode takes its own background gate, and another strategy what of the recipe is at its default and
-        its own options.
+        Another blend mode takes its own background gate, also of how that is learned what is at its default. Another
+        strategy takes what of the recipe is at its default and its own options.
         """
         return self._changed(options).validate()
 
     def _changed(self, options: Dict[str, Any]) -> TrainConfig:
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
-            options = {"background_gate": None, **options}
+            usual = _learned_gate_of(str(self.blend_mode))
+            options = {"background_gate": None, **self._unset(usual), **options}
         if options.get("schedule", self.schedule) != self.schedule:
             usual = _recipe_of(str(self.schedule))
-            options = {**{name: None for name in usual if getattr(self, name) == usual[name]},
-                       "strategy_options": "", **options}
+            options = {**self._unset(usual), "strategy_options": "", **options}
         return dataclasses.replace(self, **options)
+
+    def _unset(self, usual: Dict[str, Any]) -> Dict[str, None]:
+        """None for each option that is as usual."""
+        return {name: None for name in usual if getattr(self, name) == usual[name]}
 
     def unusual_recipe(self) -> Dict[str, Any]:
         """What of the recipe differs from the strategy's defaults."""
@@ -330,6 +344,12 @@ def _recipe_of(schedule: str) -> Dict[str, Any]:
             if recipe in option.metadata}
 
 
+def _learned_gate_of(blend_mode: str) -> Dict[str, float]:
+    """How a background gate is learned by default, where blend modes differ."""
+    tails = blend_mode == "smoe"
+    return {"background_gate_bound": 0.0 if tails else 0.03, "background_gate_start": 0.1 if tails else 1.0}
+
+
 def holds_run(folder: str) -> bool:
     """Whether OUT/config.json is there. Raises TrainerError where that cannot be seen."""
     return is_file(os.path.join(folder, CONFIG_NAME))
@@ -338,8 +358,8 @@ def holds_run(folder: str) -> bool:
 def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:
     """The background gate that a training takes: a number, 1 in `alpha` and 0 in the ablations, or LEARNED.
 
-    asked: None means in `smoe` $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is no gate, and
-    for one that the mode does not know.
+    asked: None means in GATED_MODES $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is no gate,
+    and for one that the mode does not know.
     """
     if blend_mode not in GATED_MODES:
         fixed = float(resolve_background_gate(blend_mode, None))

@@ -2,12 +2,14 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 from PIL import Image
 
+from ..settings import mode_of_record
 from .config import LEARNED, TrainConfig
 from .errors import TrainerError
 from .results.evaluation import Measure, evaluate
@@ -39,7 +41,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     config = TrainConfig.of_run(output, "--scene", device=device, **options)
     check_device(device)
     ply = trained_model_path(output, config.iterations)
-    earlier = [row for row in read_results(output) if row.get("blend_mode") == config.blend_mode]
+    earlier = [row for row in read_results(output) if _is_of(row, config)]
     scene = load_scene(config, progress).to(device)
     renderer = open_renderer(config, ply, config.blend_mode, device, rasterize, _gate_of(config))
     views = {"test": scene.test, "train": scene.train}[split]
@@ -66,11 +68,14 @@ def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str]
                   rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None) -> Renderer:
     """A renderer for a .ply with the blend mode and the background gate that it records.
 
-    config gives background and antialiasing. Raises TrainerError where what is asked disagrees with the file.
+    config gives background and antialiasing. A mode that has another name now is told on stderr. Raises TrainerError
+    where what is asked disagrees with the file.
     """
     model, recorded = load_model(ply, device)
     mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
     gate = agreed_background_gate(ply, mode, recorded, asked_gate)
+    if recorded.note:
+        print(f"note: {ply}: {recorded.note}", file=sys.stderr)
     return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize,
                     background_gate=gate)
 
@@ -87,6 +92,12 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
         recorded = Recorded(mode, float(config.background_gate))
         asked_gate = agreed_background_gate(config.output, mode, recorded, asked_gate)
     return open_renderer(config, ply, mode, device, rasterize, asked_gate), ply
+
+
+def _is_of(row: Dict[str, Any], config: TrainConfig) -> bool:
+    """Whether a row is of the run's blend mode, whichever version wrote both."""
+    mode = row.get("blend_mode")
+    return config.blend_mode in (mode, mode_of_record(str(mode)))
 
 
 def _gate_of(config: TrainConfig) -> Optional[float]:

@@ -41,7 +41,8 @@ MADE_UP_NAME = "room"
 MADE_UP_ON_GPU = {"views": 64, "width": 480, "height": 360, "points": 30_000}
 
 # Offered by `dsmoe train` and fixed here.
-FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "eval_every", "checkpoint_every")
+FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "background_gate_start",
+         "background_gate_lr", "eval_every", "checkpoint_every")
 
 
 def main(argv: Optional[List[str]] = None) -> int:

@@ -78,7 +78,7 @@ class Followed:
         model = GaussianModel(state["raw"], config.sh_degree)
         model.active_sh_degree = state["active_sh_degree"]
         if config.background_gate == LEARNED:
-            learned = LearnedGate(config.background_gate_bound, device)
+            learned = LearnedGate(config, device)
             learned.load_state_dict(state["gate"])
             gate = float(learned.value)
         else:

@@ -57,7 +57,7 @@ class Controls:
     @staticmethod
     def _gate(gui: Any, label: str, value: float) -> Any:
         return gui.add_number(label, value, min=0.0, max=MAX_BACKGROUND_GATE, step=0.001,
-                              hint="smoe: how much the background weighs; 0 is Eq. 7, 1 alpha blending")
+                              hint="smoe, smoe_eq7: how much the background weighs; 1 is about alpha blending")
 
     def _only_what_matters(self) -> None:
         self.gate.disabled = self.mode.value not in GATED_MODES

@@ -1,6 +1,7 @@
 // The trainable Gaussians: raw parameters under Adam, and the density control of 3D Gaussian Splatting.
 #pragma once
 
+#include <dsmoe/params.h>
 #include <dsmoe/torch_training.h>
 
 #include "io/ply.h"
@@ -113,10 +114,11 @@ class Gaussians {
       const auto tensor = value(parameter).detach().cpu().contiguous();
       return std::vector<float>(tensor.data_ptr<float>(), tensor.data_ptr<float>() + tensor.numel());
     };
+    const std::string record(dsmoe::record_of(dsmoe::blend_mode_of(blend_mode).value()));
     dsmoe::io::GaussianModel model{
         static_cast<size_t>(count()), recipe_.sh_degree, numbers(kMeans),     numbers(kDc), numbers(kShs),
-        numbers(kOpacities),          numbers(kScales),  numbers(kRotations), blend_mode};
-    if (blend_mode == "smoe") model.background_gate = background_gate;
+        numbers(kOpacities),          numbers(kScales),  numbers(kRotations), record};
+    if (blend_mode == "smoe" || blend_mode == "smoe_eq7") model.background_gate = background_gate;
     dsmoe::io::write_gaussians(path, model);
   }
 

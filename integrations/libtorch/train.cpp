@@ -8,27 +8,34 @@
 
 namespace {
 
-// Blend mode, and the background's gate lambda of `smoe`: a number, or learned with the scene as 0.03 + exp(p), from 1.
+// Blend mode, and the background's gate lambda: a number, or learned with the scene as bound + exp(p). As in `dsmoe
+// train` it starts at 0.1 without a bound in `smoe`, and at 1 with the bound 0.03 in `smoe_eq7`.
 struct Blend {
   std::string mode;
-  double number = 0;
+  bool has_gate;
+  double number = 0, bound, start;
   std::vector<dsmoe::AdamParameter> logarithm;  // p, where it is learned
 
-  Blend(const std::string& mode, const std::string& gate, torch::Device device) : mode(mode) {
-    if (mode != "smoe") return;
+  Blend(const std::string& mode, const std::string& gate, torch::Device device)
+      : mode(mode),
+        has_gate(mode == "smoe" || mode == "smoe_eq7"),
+        bound(mode == "smoe" ? 0 : 0.03),
+        start(mode == "smoe" ? 0.1 : 1) {
+    if (!has_gate) return;
     if (gate != "learned") number = std::stod(gate);
-    if (gate == "learned") logarithm.push_back({torch::full({1}, std::log(0.97), device).requires_grad_(), 0.01});
+    if (gate != "learned") return;
+    logarithm.push_back({torch::full({1}, std::log(start - bound), device).requires_grad_(), 0.01});
   }
 
   dsmoe::GaussianRasterizationSettings settings(const View& view) const {
     auto result = view.settings;
     result.blend_mode = mode;
-    if (mode == "smoe") result.background_gate = number;
-    if (!logarithm.empty()) result.background_gate = 0.03 + logarithm[0].value.exp();
+    if (has_gate) result.background_gate = number;
+    if (!logarithm.empty()) result.background_gate = bound + logarithm[0].value.exp();
     return result;
   }
 
-  double gate() const { return logarithm.empty() ? number : 0.03 + logarithm[0].value.exp().item<double>(); }
+  double gate() const { return logarithm.empty() ? number : bound + logarithm[0].value.exp().item<double>(); }
 };
 
 // Prints mean PSNR and SSIM over the views, of images as an 8-bit file would hold them.

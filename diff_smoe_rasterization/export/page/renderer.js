@@ -4,7 +4,8 @@
 // Each Gaussian is a quad, drawn front to back into a float image that holds (S, W) = (sum w c, sum w), w = alpha T.
 // The blend function (ONE_MINUS_DST_ALPHA, ONE) makes the weights: T in front of a pair is 1 - W, since the weights sum
 // to what is no longer transmitted. W itself is added up, so it keeps its digits where it is small. A second pass
-// divides: C = (S + lambda T bg) / (W + lambda T); lambda = 1 is alpha blending.
+// divides: C = (S + lambda T bg) / (W + lambda T); lambda = 1 is alpha blending. In `smoe` a second image holds B, the
+// sum of the tails' alpha T, and W once more for the blend function; where W is small B is added to lambda T.
 
 const CONSTANTS = `#version 300 es
 precision highp float;
@@ -17,8 +18,12 @@ const float COMPENSATION_FLOOR = 2.5e-5;
 const float RADIUS_ROOT_FLOOR = 0.1;
 const float TILE = 16.0;
 const float ALPHA_MAX = 0.99;
+const int ALPHA = 0, SMOE = 1, SMOE_EQ7 = 2;  // RULES: which pairs count
 const float ALPHA_CUT = 1.0 / 255.0;    // alpha: fainter pairs do not count
-const float KERNEL_CUT = 1e-5;          // smoe: smaller kernels do not count
+const float STRONG_ALPHA = 1.0 / 2040.0;  // smoe: fainter pairs are tails
+const float TAIL_ALPHA = 2.9103830456733704e-11;  // smoe: 2^-35, below which tails do not count
+const float TAILS_BELOW = 0.9;          // smoe: with a larger W no tails count
+const float KERNEL_CUT = 1e-5;          // smoe_eq7: smaller kernels do not count
 const float CORE_KERNEL = 0.011108996;  // G at 3 sigma, inside which no gate of the background cuts
 const float GATE_SUM_CUT = 1e-30;       // below it no gate is open
 `;
@@ -31,7 +36,8 @@ uniform vec3 translation;
 uniform vec3 cameraCentre;     // world
 uniform vec2 focal, principalPoint, size;  // pixels
 uniform int degree;            // of the spherical harmonics
-uniform bool alphaRules, antialiasing;
+uniform int rule;
+uniform bool antialiasing;
 uniform float backgroundGate;  // lambda
 in uint index;                 // of the Gaussian: the instances come front to back
 flat out vec2 mean;
@@ -105,14 +111,16 @@ void main() {
   // How far pairs count.
   opacity = half0.x;
   if (antialiasing) opacity *= sqrt(max(COMPENSATION_FLOOR, unfiltered / determinant));
-  leastAlpha = alphaRules ? ALPHA_CUT : min(backgroundGate * ALPHA_CUT, opacity * CORE_KERNEL);
-  float reach = leastAlpha > 0.0 ? 2.0 * log(opacity / leastAlpha) : 1e9;
-  if (!alphaRules) reach = min(reach, -2.0 * log(KERNEL_CUT));
+  leastAlpha = rule == ALPHA ? ALPHA_CUT : rule == SMOE ? STRONG_ALPHA :
+               min(backgroundGate * ALPHA_CUT, opacity * CORE_KERNEL);
+  float faintest = rule == SMOE ? TAIL_ALPHA : leastAlpha;
+  float reach = faintest > 0.0 ? 2.0 * log(opacity / faintest) : 1e9;
+  if (rule == SMOE_EQ7) reach = min(reach, -2.0 * log(KERNEL_CUT));
   if (!(opacity > 0.0) || !(reach > 0.0)) return;
   mean = focal * view.xy / view.z + principalPoint - 0.5;
   vec2 extent = sqrt(reach * covariance.xz) + 0.5;
   vec2 low = mean - extent, high = mean + extent;
-  if (alphaRules) {  // and inside the tiles of the 3-sigma square
+  if (rule != SMOE_EQ7) {  // and inside the tiles of the 3-sigma square
     float middle = 0.5 * (covariance.x + covariance.z);
     float radius = ceil(3.0 * sqrt(middle + sqrt(max(RADIUS_ROOT_FLOOR, middle * middle - determinant))));
     low = max(low, TILE * floor((mean - radius) / TILE) - 0.5);
@@ -130,36 +138,44 @@ void main() {
 
 const FRAGMENT = CONSTANTS + `
 uniform vec2 size;
-uniform bool alphaRules;
+uniform int rule;
 flat in vec2 mean;
 flat in vec3 conic, colour;
 flat in float opacity, leastAlpha;
-out vec4 pair;
+layout(location = 0) out vec4 pair;
+layout(location = 1) out vec4 tail;
 
 void main() {
   vec2 d = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - 0.5 - mean;
   float power = -0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) - conic.y * d.x * d.y;
   if (power > 0.0) discard;
   float kernel = exp(power), logit = opacity * kernel, alpha = min(logit, ALPHA_MAX);
-  if (alpha < leastAlpha || (!alphaRules && kernel < KERNEL_CUT)) discard;
-  pair = vec4(colour * alpha, alpha);
+  bool isStrong = alpha >= leastAlpha && (rule != SMOE_EQ7 || kernel >= KERNEL_CUT);
+  if (!isStrong && (rule != SMOE || alpha < TAIL_ALPHA)) discard;
+  pair = isStrong ? vec4(colour * alpha, alpha) : vec4(0.0);
+  tail = isStrong ? vec4(0.0, 0.0, 0.0, alpha) : vec4(alpha, 0.0, 0.0, 0.0);
 }`;
 
 const CORNERS = CONSTANTS + `
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
 const DIVISION = CONSTANTS + `
-uniform sampler2D sums;
+uniform sampler2D sums, tails;
+uniform int rule;
 uniform vec3 background;
 uniform float backgroundGate;
 out vec4 pixel;
 
 void main() {
   vec4 sum = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
-  float weight = backgroundGate * max(0.0, 1.0 - sum.a), denominator = sum.a + weight;
+  float weight = backgroundGate * max(0.0, 1.0 - sum.a);
+  if (rule == SMOE && sum.a < TAILS_BELOW) weight += texelFetch(tails, ivec2(gl_FragCoord.xy), 0).r;
+  float denominator = sum.a + weight;
   vec3 blended = (sum.rgb + weight * background) / denominator;
   pixel = vec4(sum.a < GATE_SUM_CUT ? background : blended, 1.0);
 }`;
+
+const RULES = {alpha: 0, smoe: 1, smoe_eq7: 2};  // the shaders' numbers
 
 class Renderer {
   // model: {count, degree, antialiasing, background: [3], gaussians, harmonics: Uint32Array}
@@ -180,7 +196,7 @@ class Renderer {
     gl.enableVertexAttribArray(index);
     gl.vertexAttribIPointer(index, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(index, 1);
-    this.sums = gl.createTexture(), this.frame = gl.createFramebuffer();
+    this.sums = gl.createTexture(), this.tails = gl.createTexture(), this.frame = gl.createFramebuffer();
   }
 
   program(vertex, fragment) {
@@ -219,21 +235,26 @@ class Renderer {
   }
 
   // camera: {rotation [3][3], translation [3], fx, fy, cx, cy}, of an image of the canvas's size.
-  // blend: {mode: "alpha" | "smoe", gate}
+  // blend: {mode: a name of RULES, gate}
   draw(camera, blend) {
-    const gl = this.gl, {width, height} = this.canvas, alphaRules = blend.mode === "alpha" || blend.gate === 1;
-    const gate = alphaRules ? 1 : blend.gate;
+    const gl = this.gl, {width, height} = this.canvas;
+    const rule = blend.mode === "smoe_eq7" && blend.gate === 1 ? RULES.alpha : RULES[blend.mode];
+    const gate = rule === RULES.alpha ? 1 : blend.gate;
     gl.viewport(0, 0, width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
-    gl.activeTexture(gl.TEXTURE0), gl.bindTexture(gl.TEXTURE_2D, this.sums);
+    gl.activeTexture(gl.TEXTURE0);
     if (this.width !== width || this.height !== height) {
       const format = this.exact ? gl.RGBA32F : gl.RGBA16F, type = this.exact ? gl.FLOAT : gl.HALF_FLOAT;
-      gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, type, null);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.sums, 0);
+      for (const [texture, place] of [[this.sums, gl.COLOR_ATTACHMENT0], [this.tails, gl.COLOR_ATTACHMENT1]]) {
+        gl.bindTexture(gl.TEXTURE_2D, texture);
+        gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, type, null);
+        gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+        gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+        gl.framebufferTexture2D(gl.FRAMEBUFFER, place, gl.TEXTURE_2D, texture, 0);
+      }
       this.width = width, this.height = height;
     }
+    gl.drawBuffers([gl.COLOR_ATTACHMENT0, rule === RULES.smoe ? gl.COLOR_ATTACHMENT1 : gl.NONE]);
     gl.clearColor(0, 0, 0, 0), gl.clear(gl.COLOR_BUFFER_BIT);
 
     const splat = this.splat, {rotation: r, translation: t} = camera;
@@ -248,7 +269,7 @@ class Renderer {
     gl.uniform2f(splat.at("principalPoint"), camera.cx, camera.cy);
     gl.uniform2f(splat.at("size"), width, height);
     gl.uniform1i(splat.at("degree"), this.model.degree);
-    gl.uniform1i(splat.at("alphaRules"), alphaRules), gl.uniform1i(splat.at("antialiasing"), this.model.antialiasing);
+    gl.uniform1i(splat.at("rule"), rule), gl.uniform1i(splat.at("antialiasing"), this.model.antialiasing);
     gl.uniform1f(splat.at("backgroundGate"), gate);
     gl.enable(gl.BLEND), gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
     gl.bindVertexArray(this.instances);
@@ -257,7 +278,9 @@ class Renderer {
     gl.disable(gl.BLEND), gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.useProgram(this.divide.program);
     gl.activeTexture(gl.TEXTURE0), gl.bindTexture(gl.TEXTURE_2D, this.sums);
-    gl.uniform1i(this.divide.at("sums"), 0);
+    gl.activeTexture(gl.TEXTURE1), gl.bindTexture(gl.TEXTURE_2D, this.tails);
+    gl.uniform1i(this.divide.at("sums"), 0), gl.uniform1i(this.divide.at("tails"), 1);
+    gl.uniform1i(this.divide.at("rule"), rule);
     gl.uniform3fv(this.divide.at("background"), this.model.background);
     gl.uniform1f(this.divide.at("backgroundGate"), gate);
     gl.bindVertexArray(this.nothing);

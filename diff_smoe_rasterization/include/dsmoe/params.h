@@ -32,13 +32,29 @@ inline int64_t band_tiles(const TileGrid& grid, const TileBand& band) {
   return static_cast<int64_t>(grid.columns) * (min(band.end, grid.rows) - band.begin);
 }
 
-// The mode that files and settings name so; absent where no mode has the name.
+// The mode that settings name so; absent where no mode has the name.
 inline std::optional<BlendMode> blend_mode_of(std::string_view name) {
   std::optional<BlendMode> found;
   BlendModes::for_each([&](auto mode) {
     if (name == Blend<decltype(mode)::value>::kName) found = mode();
   });
   return found;
+}
+
+// The name under which files record a mode. "smoe" in a file is the rule of version 0.1, which is kSmoeEq7.
+inline std::string_view record_of(BlendMode mode) {
+  std::string_view record;
+  BlendModes::for_each([&](auto of) {
+    if (mode == of()) record = Blend<decltype(of)::value>::kName;
+  });
+  return mode == BlendMode::kSmoe ? "smoe_tails" : record;
+}
+
+// The mode that a file records so; absent where none is.
+inline std::optional<BlendMode> blend_mode_of_record(std::string_view record) {
+  if (record == Blend<BlendMode::kSmoe>::kName) return BlendMode::kSmoeEq7;
+  if (record == record_of(BlendMode::kSmoe)) return BlendMode::kSmoe;
+  return blend_mode_of(record);
 }
 
 template <class S> struct GaussianInputs {
@@ -63,11 +79,11 @@ template <class S> struct RasterConfig {
   int num_channels = 3;           // C
   const S* background = nullptr;  // [C]
   S scale_modifier = 1;
-  S low_pass = S(kLowPass);               // px^2 added to the projected variances
-  S alpha_min = 0;                        // SMoE modes: also skip alpha below this; kSmoe: such pairs are no strong ones
-  S background_gate = 0;                  // lambda of kSmoe and kSmoeEq7, 0 or more
+  S low_pass = S(kLowPass);  // px^2 added to the projected variances
+  S alpha_min = 0;           // SMoE modes: also skip alpha below this; kSmoe: such pairs are no strong ones
+  S background_gate = 0;     // lambda of kSmoe and kSmoeEq7, 0 or more
   const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
-  S tails_below = S(kTailsBelow);         // kSmoe: the tails count where the gate sum is below this; above 1: everywhere
+  S tails_below = S(kTailsBelow);  // kSmoe: the tails count where the gate sum is below this; above 1: everywhere
   bool antialiasing = false;
   bool clamp_color = true;  // colours from shs are at least 0
   bool depth = false;       // the expected depth is asked for

@@ -8,7 +8,14 @@ import numpy as np
 import torch
 
 from ... import io
-from ...settings import BLEND_MODES, GATED_MODES, mode_of_record, record_of, resolve_background_gate
+from ...settings import (
+    BLEND_MODES,
+    GATED_MODES,
+    mode_of_record,
+    record_of,
+    resolve_background_gate,
+    said_of_record,
+)
 from ..errors import TrainerError
 from ..model import GaussianModel
 from ..system.files import is_file, new_file
@@ -22,6 +29,7 @@ class Recorded(NamedTuple):
 
     blend_mode: Optional[str]
     background_gate: Optional[float]
+    note: str = ""  # what to tell the user of it
 
 
 def model_path(output: str, iteration: int) -> str:
@@ -67,7 +75,8 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
     model = GaussianModel(raw, stored.sh_degree)
     model.active_sh_degree = stored.sh_degree
     record = stored.blend_mode
-    return model, Recorded(record if record is None else mode_of_record(record), stored.background_gate)
+    mode = record if record is None else mode_of_record(record)
+    return model, Recorded(mode, stored.background_gate, said_of_record(record))
 
 
 def finite_gaussians(gaussians: io.Gaussians) -> np.ndarray:

@@ -30,6 +30,9 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
     unusual: Dict[str, Any] = {}
     if config.background_gate == LEARNED:
         unusual.update(background_gate_learned=True, background_gate_bound=config.background_gate_bound)
+        for name, value in (("background_gate_start", 1.0), ("background_gate_lr", 0.01)):
+            if getattr(config, name) != value:
+                unusual[name] = getattr(config, name)
     if config.batch > 1:
         unusual["batch"] = config.batch
     if config.deterministic:
@@ -128,7 +131,7 @@ def viewer_warning(row: Dict[str, Any], form: str = "ply") -> str:
 
     form: the model file's ending.
     """
-    if row["blend_mode"] == "alpha" or row.get("background_gate") == 1:
+    if row["blend_mode"] == "alpha" or row["blend_mode"] == "smoe_eq7" and row.get("background_gate") == 1:
         return ""
     return (f"note: the {row['blend_mode']} .{form} holds gates; viewers of 3DGS blend them by alpha and show another "
             "image, mostly too dark: use `dsmoe render`")

@@ -1,4 +1,4 @@
-"""The background's gate lambda of `smoe`, learned with the scene."""
+"""The background's gate lambda, learned with the scene."""
 from __future__ import annotations
 
 import math
@@ -7,20 +7,23 @@ from typing import Any, Dict
 import torch
 
 from ...optimizers import FusedAdam
+from ...settings import MAX_BACKGROUND_GATE
+from ..config import TrainConfig
 from ..model import batch_betas
 
-LEARNING_RATE = 0.01
-START = 1.0
+LIMIT = math.log(MAX_BACKGROUND_GATE)  # of |p|: beyond it float32 would soon be 0 or infinite
 
 
 class LearnedGate:
-    """lambda = bound + exp(p): p is stepped by Adam, and lambda starts at 1."""
+    """lambda = bound + exp(p): p is stepped by Adam; with the bound 0 too, lambda stays positive and finite."""
 
-    def __init__(self, bound: float, device: str, batch: int = 1) -> None:
-        """bound: in [0, 1). batch: views a step, by which rate and betas go as those of the Gaussians."""
-        self.bound = bound
-        self.logarithm = torch.full((1,), math.log(START - bound), device=device, requires_grad=True)
-        self.adam = FusedAdam([self.logarithm], lr=LEARNING_RATE * math.sqrt(batch), betas=batch_betas(batch))
+    def __init__(self, config: TrainConfig, device: str) -> None:
+        """config: has bound, start and rate; by its views a step rate and betas go as those of the Gaussians."""
+        self.bound = config.background_gate_bound
+        self.logarithm = torch.full((1,), math.log(config.background_gate_start - self.bound), device=device,
+                                    requires_grad=True)
+        self.adam = FusedAdam([self.logarithm], lr=config.background_gate_lr * math.sqrt(config.batch),
+                              betas=batch_betas(config.batch))
         self.value = self().detach()  # [1], without gradient; always this tensor, so that renderers may hold it
 
     def __call__(self) -> torch.Tensor:
@@ -36,6 +39,7 @@ class LearnedGate:
     def step(self) -> None:
         """One step of Adam; the host does not wait for the device."""
         self.adam.step()
+        self.logarithm.clamp_(-LIMIT, LIMIT)
         self.logarithm.grad = None
         self.value.copy_(self())
 

@@ -73,7 +73,7 @@ class Trainer:
         self.shards = self._make_shards()
         background = background_color(config.white_background, config.device)
         learned = config.background_gate == LEARNED
-        self.gate = LearnedGate(config.background_gate_bound, config.device, config.batch) if learned else None
+        self.gate = LearnedGate(config, config.device) if learned else None
         self.renderer = Renderer(
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate),

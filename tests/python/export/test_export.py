@@ -16,7 +16,7 @@ from diff_smoe_rasterization.export.splat import splat_bytes
 QUARTER = np.sqrt(0.5)  # cos and sin of an eighth turn
 
 
-def gaussians(blend_mode="smoe", background_gate=0.25, **arrays):
+def gaussians(blend_mode="smoe_eq7", background_gate=0.25, **arrays):
     """Two Gaussians: the second is larger, and both turned by quarter turns."""
     arrays = {"means3D": [[1, 2, 3], [4, 5, 6]], "dc": [[[0, 1, -1]], [[9, 0, -9]]],
               "shs": np.arange(48 * 2 - 6).reshape(2, 15, 3) / 50 - 0.5, "opacity_logits": [[0], [np.log(3)]],
@@ -36,9 +36,9 @@ def model(tmp_path):
 def test_a_ply_records_its_blend_and_says_that_viewers_show_it_wrongly(model, tmp_path, capsys):
     copy = str(tmp_path / "copy.ply")
     assert main(["export", model, "-o", copy, "--sh-degree", "1"]) == 0
-    assert "the smoe .ply holds gates; viewers of 3DGS blend them by alpha" in capsys.readouterr().out
+    assert "the smoe_eq7 .ply holds gates; viewers of 3DGS blend them by alpha" in capsys.readouterr().out
     before, after = io.read_gaussians(model), io.read_gaussians(copy)
-    assert (after.blend_mode, after.background_gate, after.sh_degree) == ("smoe", 0.25, 1)
+    assert (after.blend_mode, after.background_gate, after.sh_degree) == ("smoe_eq7", 0.25, 1)
     assert np.array_equal(after.shs, before.shs[:, :3]) and np.array_equal(after.log_scales, before.log_scales)
 
 
@@ -52,7 +52,7 @@ def test_a_model_of_alpha_goes_without_a_warning(tmp_path, capsys):
 def test_a_splat_file_has_32_bytes_a_gaussian_the_largest_first(model, tmp_path, capsys):
     path = tmp_path / "model.splat"
     assert main(["export", model, "-o", str(path)]) == 0
-    assert "the smoe .splat holds gates" in capsys.readouterr().out
+    assert "the smoe_eq7 .splat holds gates" in capsys.readouterr().out
     content = path.read_bytes()
     assert len(content) == 64
     first, second = struct.iter_unpack("<6f8B", content)
@@ -154,7 +154,7 @@ def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
     assert main(["export", model, "-o", str(path)]) == 0
     text = path.read_text(encoding="utf-8")
     assert "{{" not in text and "http" not in text and "src=" not in text
-    assert '"mode": "smoe", "gate": 0.25' in text
+    assert '"mode": "smoe_eq7", "gate": 0.25' in text
 
 
 @pytest.mark.parametrize("arguments, text", [
@@ -162,7 +162,7 @@ def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
     (["-o", "model.PLY", "--format", "splat"], "model.PLY: its ending says ply, and --format says splat"),
     (["-o", "trained.ply"], "trained.ply is there already; --overwrite replaces it"),
     *((["-o", "trained.ply", "--overwrite", *form], "is the model itself") for form in ([], ["--format", "ply"])),
-    (["-o", "a.html", "--blend-mode", "alpha"], "trained with the blend mode smoe, not alpha"),
+    (["-o", "a.html", "--blend-mode", "alpha"], "trained with the blend mode smoe_eq7, not alpha"),
     (["-o", "a.html", "--background-gate", "0.5"], "trained with the background gate 0.25, not 0.5"),
 ])
 def test_what_cannot_be_written_is_refused(model, tmp_path, monkeypatch, capsys, arguments, text):
@@ -191,4 +191,4 @@ def test_a_page_refuses_the_ablations(tmp_path, capsys):
     model = str(tmp_path / "trained.ply")
     io.write_gaussians(model, gaussians("smoe_tn", None))
     assert main(["export", model, "-o", str(tmp_path / "a.html")]) == 1
-    assert "a page shows alpha and smoe, but the model was trained with smoe_tn" in capsys.readouterr().err
+    assert "a page shows alpha, smoe and smoe_eq7, but the model was trained with smoe_tn" in capsys.readouterr().err

@@ -45,8 +45,8 @@ def camera_of(orbit):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode, gate, degree, antialiasing", [
-    ("alpha", 1.0, 3, False), ("smoe", 0.0, 2, False), ("smoe", 0.03, 3, False), ("smoe", 2.0, 1, True),
-    ("smoe", 1.0, 0, False)])
+    ("alpha", 1.0, 3, False), ("smoe", 0.0, 3, False), ("smoe", 0.5, 1, True), ("smoe_eq7", 0.0, 2, False),
+    ("smoe_eq7", 0.03, 3, False), ("smoe_eq7", 2.0, 1, True), ("smoe_eq7", 1.0, 0, False)])
 def test_a_browser_shows_what_is_rendered(browser, tmp_path, mode, gate, degree, antialiasing):  # noqa: F811
     path = str(tmp_path / "model.ply")
     gaussians = cloud(degree=degree)
@@ -63,7 +63,7 @@ def test_a_browser_shows_what_is_rendered(browser, tmp_path, mode, gate, degree,
     with torch.no_grad():
         rendered = Renderer(model, mode, torch.tensor(background), antialiasing, background_gate=gate)(camera).color
     assert psnr(picture, to_image(rendered)) >= LEAST_PSNR
-    other = "alpha" if mode == "smoe" and gate != 1 else "smoe"
+    other = "smoe_eq7" if mode == "alpha" or gate == 1 else "alpha"
     with torch.no_grad():
         wrong = Renderer(model, other, torch.tensor(background), antialiasing, background_gate=0.1)(camera).color
     assert psnr(picture, to_image(wrong)) < LEAST_PSNR, "the other blend would pass too: the test sees nothing"
@@ -100,7 +100,7 @@ def test_a_gpu_that_cannot_blend_32_bit_floats_is_told_of(browser, tmp_path):  #
 @pytest.mark.slow
 def test_the_mouse_turns_it_and_the_switch_shows_what_other_viewers_do(browser, tmp_path):  # noqa: F811
     model, page = str(tmp_path / "model.ply"), str(tmp_path / "page.html")
-    io.write_gaussians(model, io.Gaussians(**{**vars(cloud()), "blend_mode": "smoe", "background_gate": 0.03}))
+    io.write_gaussians(model, io.Gaussians(**{**vars(cloud()), "blend_mode": "smoe_tails", "background_gate": 0.03}))
     assert main(["export", model, "-o", page]) == 0
     browser.open(f"file://{page}", 320, 240)
     drawn = "document.body && document.body.dataset.drawn === 'true'"

@@ -15,7 +15,7 @@ from tiny import GR, RENDERER, make, refused
 from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES
 from diff_smoe_rasterization.patches import run
-from diff_smoe_rasterization.settings import BLEND_MODES, RECOMMENDED_BACKGROUND_GATE
+from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES
 
 SHOW = """import os, sys
 sys.path.insert(0, "")
@@ -123,15 +123,15 @@ def test_stand_ins_only_for_what_is_missing(tmp_path, python):
 
 @pytest.mark.parametrize("mode", BLEND_MODES)
 def test_the_gate_of_the_children(mode, monkeypatch, dsmoe):
-    """That which is asked for, else the variable's, else the recommended one; and none in other modes than smoe."""
+    """That which is asked for, else the variable's, else 0; and none in modes that know none."""
     words = [sys.executable, "show.py"]
-    for variable, asked, gate in (("", None, RECOMMENDED_BACKGROUND_GATE), ("0.25", None, 0.25), ("0.25", 0.0, 0.0)):
+    for variable, asked, gate in (("", None, 0.0), ("0.25", None, 0.25), ("0.25", 0.0, 0.0)):
         monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
-        if mode == "smoe" or asked is None:
+        if mode in GATED_MODES or asked is None:
             made, lines = run.prepare(words, mode, "scaffold", dict(os.environ), asked)
-            assert made["DSMOE_BACKGROUND_GATE"] == (str(gate) if mode == "smoe" else "")
-            assert (f"blend mode {mode}, background gate {gate};" in lines[0]) == (mode == "smoe")
-    for gate in ("-1", "nan") if mode == "smoe" else ("0.1",):
+            assert made["DSMOE_BACKGROUND_GATE"] == (str(gate) if mode in GATED_MODES else "")
+            assert (f"blend mode {mode}, background gate {gate};" in lines[0]) == (mode in GATED_MODES)
+    for gate in ("-1", "nan") if mode in GATED_MODES else ("0.1",):
         said = dsmoe("run", "--blend-mode", mode, "--background-gate", gate, "--trainer", "scaffold", "--", *words)
         assert said.status == 1 and "background_gate is" in said.err
 

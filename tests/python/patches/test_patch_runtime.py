@@ -10,8 +10,7 @@ import pytest
 
 from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings, settings
 from diff_smoe_rasterization.patches import runtime
-from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED
-from diff_smoe_rasterization.settings import resolve_blend
+from diff_smoe_rasterization.settings import GATED_MODES, record_of, resolve_blend
 
 ALPHA = {"blend_mode": "alpha", "background_gate": None}
 
@@ -34,22 +33,22 @@ def test_the_default_is_alpha_or_the_variable(monkeypatch):
     monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe_tn")
     assert runtime.default_blend() == ("smoe_tn", "")
     monkeypatch.setenv("DSMOE_BLEND_MODE", "smo")
-    with pytest.raises(ValueError, match="DSMOE_BLEND_MODE is 'smo'.*alpha, smoe, smoe_tn, smoe_std"):
+    with pytest.raises(ValueError, match="DSMOE_BLEND_MODE is 'smo'.*alpha, smoe, smoe_eq7, smoe_tn, smoe_std"):
         runtime.default_blend()
 
 
 @pytest.mark.parametrize("mode", BLEND_MODES)
 @pytest.mark.parametrize("variable", [None, "0.25"])
 def test_the_blend_of_a_run(mode, variable, monkeypatch):
-    """In `smoe` the gate is the recommended one or the variable's; no other mode has one, whatever that says."""
+    """In GATED_MODES the gate is 0 or the variable's; no other mode has one, whatever that says."""
     if variable:
         monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
-    gate = float(variable or RECOMMENDED) if mode == "smoe" else None
-    for dataset in (run(mode, white_background=False), run(mode, 0.25 if variable else RECOMMENDED)):
+    gate = float(variable or 0) if mode in GATED_MODES else None
+    for dataset in (run(mode, white_background=False), run(record_of(mode), 0.25 if variable else 0.0)):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert runtime.blend_of(dataset) == {"blend_mode": mode, "background_gate": gate}
-        assert (dataset.blend_mode, dataset.background_gate) == (mode, gate)  # what is saved of it
+        assert (dataset.blend_mode, dataset.background_gate) == (record_of(mode), gate)  # what is saved of it
 
 
 @pytest.mark.parametrize("mode, gate", [("smoe", 0.25), ("smoe_tn", 0), ("alpha", 1)])
@@ -62,7 +61,7 @@ def test_settings_that_name_no_mode_have_that_of_the_run(mode, gate, monkeypatch
     assert resolve_blend(SimpleNamespace(**nameless)) == (mode, gate)
     monkeypatch.delenv("DSMOE_BLEND_MODE")
     monkeypatch.delenv("DSMOE_BACKGROUND_GATE")  # and the next run of the process has the defaults again
-    assert runtime.default_blend()[0] == "alpha" and runtime.blend_of(run("smoe"))["background_gate"] == RECOMMENDED
+    assert runtime.default_blend()[0] == "alpha" and runtime.blend_of(run("smoe"))["background_gate"] == 0
 
 
 def test_a_gate_that_is_typed_wins(monkeypatch):
@@ -73,7 +72,8 @@ def test_a_gate_that_is_typed_wins(monkeypatch):
 @pytest.mark.parametrize("mode, gate, variable, message", [
     ("smoe", "-1", "", "background_gate is '-1'; it must be a number, 0 or more"), ("smoe", "x", "", "'x'; it must be"),
     ("smoe", "", "y", "DSMOE_BACKGROUND_GATE is 'y'"),
-    ("alpha", "0.1", "", "blend_mode is 'alpha'; only 'smoe' knows it"), ("smoe_std", "0", "", "'smoe_std'; only")])
+    ("alpha", "0.1", "", "blend_mode is 'alpha'; only 'smoe' and 'smoe_eq7' know it"),
+    ("smoe_std", "0", "", "'smoe_std'; only")])
 def test_a_wrong_gate_is_refused_by_name(mode, gate, variable, message, monkeypatch):
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", variable)
     with pytest.raises(ValueError, match=message):
@@ -83,8 +83,28 @@ def test_a_wrong_gate_is_refused_by_name(mode, gate, variable, message, monkeypa
 def test_a_model_in_smoe_of_before_there_were_gates_has_eq_7_and_says_so(tmp_path):
     (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe')")
     old = SimpleNamespace(blend_mode="smoe", model_path=str(tmp_path))
-    with pytest.warns(UserWarning, match="records no background gate, so it is 0, Eq. 7"):
-        assert runtime.blend_of(old) == {"blend_mode": "smoe", "background_gate": 0}
+    with pytest.warns(UserWarning, match="records no background gate, so it is 0 "):
+        assert runtime.blend_of(old) == {"blend_mode": "smoe_eq7", "background_gate": 0}
+
+
+def test_smoe_of_an_earlier_cfg_args_is_smoe_eq7_and_says_so(monkeypatch, tmp_path, capsys):
+    """Until a training writes it anew: the typed name, or the variable's, is the rule of today there."""
+    path, eq_7 = tmp_path / "cfg_args", {"blend_mode": "smoe_eq7", "background_gate": 0.5}
+    path.write_text("Namespace(blend_mode='smoe', background_gate=0.5)")
+    for words in ([], ["--blend_mode", "smoe"]):
+        monkeypatch.setattr(sys, "argv", ["render.py", *words])
+        assert runtime.saved_blend_of(run("smoe", model_path=str(tmp_path))) == eq_7
+        assert runtime.blend_of(run("smoe", 0.5, model_path=str(tmp_path))) == eq_7  # with the options of cfg_args
+    line, mode = capsys.readouterr().err.splitlines()
+    assert f"{path}: it records the blend mode smoe of an earlier version, which is smoe_eq7 now" in line
+    assert "blend mode smoe_eq7, background gate 0.5" in mode
+    training = run("smoe", "0.5", model_path=str(tmp_path))
+    with pytest.warns(UserWarning, match="a run with blend_mode smoe_eq7, .* has smoe; .*--blend_mode smoe_eq7"):
+        assert runtime.blend_of(training) == {"blend_mode": "smoe", "background_gate": 0.5}
+    path.write_text(f"Namespace(blend_mode={training.blend_mode!r}, background_gate=0.5)")  # as the trainer does
+    monkeypatch.setattr(sys, "argv", ["render.py"])
+    assert runtime.saved_blend_of(run("alpha", model_path=str(tmp_path))) == {
+        "blend_mode": "smoe", "background_gate": 0.5}
 
 
 @pytest.mark.parametrize("dataset", [SimpleNamespace(), SimpleNamespace(blend_mode=None, background_gate=None)])
@@ -99,7 +119,7 @@ def test_an_old_model_is_alpha_and_says_so_once(dataset):
 
 
 def test_a_wrong_mode_is_refused_by_name():
-    with pytest.raises(ValueError, match="mode is 'Smoe'; it must be one of alpha, smoe, smoe_tn, smoe_std"):
+    with pytest.raises(ValueError, match="mode is 'Smoe'; it must be one of alpha, smoe, smoe_eq7, smoe_tn, smoe_std"):
         runtime.blend_of(run("Smoe"))
 
 
@@ -114,14 +134,14 @@ def test_one_line_says_which_mode_it_is(capsys):
         runtime.blend_of(run("alpha"))
         runtime.blend_of(run("smoe"))
     printed = capsys.readouterr()
-    said = ["blend mode alpha\n", f"blend mode smoe, background gate {RECOMMENDED}\n"]
+    said = ["blend mode alpha\n", "blend mode smoe, background gate 0.0\n"]
     assert printed.out == "" and printed.err.split("diff_smoe_rasterization: ")[1:] == said
 
 
 def test_training_again_in_another_mode_is_named(monkeypatch, tmp_path):
     """A rendering without the flag has the mode of cfg_args; a training, resumed or not, has the default."""
-    with pytest.warns(UserWarning, match="a run with blend_mode smoe, .* has alpha; .*--blend_mode smoe"):
-        runtime.blend_of(model(tmp_path, "Namespace(sh_degree=3, blend_mode='smoe')"))
+    with pytest.warns(UserWarning, match="a run with blend_mode smoe, .* has alpha; .*--blend_mode smoe$"):
+        runtime.blend_of(model(tmp_path, "Namespace(sh_degree=3, blend_mode='smoe_tails')"))
     for text in ("Namespace(blend_mode='alpha')", "Namespace(sh_degree=3)", "", "no Python",
                  "Namespace(blend_mode=f())", "__import__('os').mkdir('x')"):
         with warnings.catch_warnings():
@@ -136,7 +156,7 @@ def test_training_again_in_another_mode_is_named(monkeypatch, tmp_path):
 
 def test_a_rendering_takes_the_saved_mode_whatever_default_it_brings(monkeypatch, tmp_path):
     """InstantSplat's render.py makes ModelParams with defaults, which then win over cfg_args."""
-    (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe', background_gate=0.5)")
+    (tmp_path / "cfg_args").write_text("Namespace(blend_mode='smoe_tails', background_gate=0.5)")
 
     def rendered(*words):
         monkeypatch.setattr(sys, "argv", ["render.py", *words])
@@ -160,7 +180,7 @@ def test_a_rendering_takes_the_saved_mode_whatever_default_it_brings(monkeypatch
 
 def test_a_path_that_looks_like_an_option_is_none(monkeypatch, tmp_path):
     """Python 3.8 writes a Namespace sorted by name: the path comes last."""
-    saved = "Namespace(background_gate=0.5, blend_mode='smoe', model_path='out/background_gate=0.03')"
+    saved = "Namespace(background_gate=0.5, blend_mode='smoe_tails', model_path='out/background_gate=0.03')"
     (tmp_path / "cfg_args").write_text(saved)
     assert runtime.saved_blend_of(run("alpha", model_path=str(tmp_path))) == {
         "blend_mode": "smoe", "background_gate": 0.5}

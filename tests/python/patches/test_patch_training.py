@@ -11,7 +11,7 @@ import pytest
 from checkouts import contents, make_checkout
 
 from diff_smoe_rasterization import patches
-from diff_smoe_rasterization.settings import RECOMMENDED_BACKGROUND_GATE as RECOMMENDED
+from diff_smoe_rasterization.settings import record_of
 
 RUN = ("-m", "diff_smoe_rasterization", "run", "--blend-mode")
 
@@ -74,9 +74,9 @@ def test_patched_and_run_train_to_the_same_bits(trained):
     assert contents(checkout) == before, "a run writes into the checkout"
     assert patched.model == plain.model and patched.out == plain.out
     assert patched.model != trained("patched", "alpha").model
-    for mode, gate in (("alpha", None), ("smoe", RECOMMENDED)):
+    for mode, gate in (("alpha", None), ("smoe", 0.0)):
         saved = (trained("patched", mode).output / "cfg_args").read_text()
-        assert f"blend_mode='{mode}'" in saved and f"background_gate={gate}" in saved
+        assert f"blend_mode='{record_of(mode)}'" in saved and f"background_gate={gate}" in saved
 
 
 def test_render_uses_the_saved_mode_or_the_flag(trained):
@@ -88,11 +88,12 @@ def test_render_uses_the_saved_mode_or_the_flag(trained):
 @pytest.mark.slow
 def test_render_uses_the_saved_gate_or_the_flag_or_0_and_without_a_saved_mode_alpha(trained):
     output = trained("patched", "smoe").output
-    saved, eq_7 = trained.rendered(output), trained.rendered(output, "--background_gate", "0")
-    without = trained.rendered(output, change=(r", background_gate=[0-9.]+", ""),
-                               DSMOE_BACKGROUND_GATE=str(RECOMMENDED))
-    assert eq_7 == without and all(saved[picture] != eq_7[picture] for picture in saved)
-    without = trained.rendered(output, change=(r", blend_mode='smoe'", ""))
+    gate = r", background_gate=[0-9.]+"
+    saved, without = (trained.rendered(output, change=(gate, text), DSMOE_BACKGROUND_GATE="0.5")
+                      for text in (", background_gate=0.25", ""))
+    none = trained.rendered(output, "--background_gate", "0")
+    assert none == without and all(saved[picture] != none[picture] for picture in saved)
+    without = trained.rendered(output, change=(r", blend_mode='smoe_tails'", ""))
     assert without == trained.rendered(output, "--blend_mode", "alpha")
 
 

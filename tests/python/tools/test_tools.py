@@ -13,12 +13,14 @@ from PIL import Image
 
 from diff_smoe_rasterization import io, rasterize, settings_from_camera
 from diff_smoe_rasterization.gaussians import activate
+from diff_smoe_rasterization.settings import GATED_MODES, record_of
 
 ROOT = Path(__file__).resolve().parents[3]
 FOLDER = Path(os.environ.get("DSMOE_TOOLS", ROOT / "build" / "cpp" / "tools"))
 WIDTH, HEIGHT, FOCAL = 61, 47, 55.0
 LEVELS = 1  # of 255: both round the same float32 image, up to the order of a sum
-MODES = [("alpha", None), ("smoe", 0.0), ("smoe", 0.05), ("smoe", 1.0), ("smoe_tn", None), ("smoe_std", None)]
+MODES = [("alpha", None), ("smoe", 0.0), ("smoe", 0.25), ("smoe_eq7", 0.0), ("smoe_eq7", 0.05),
+         ("smoe_eq7", 1.0), ("smoe_tn", None), ("smoe_std", None)]
 
 
 def tool(name, *arguments, status=0):
@@ -54,7 +56,7 @@ def pose():
 def package_rendering(gaussians, mode, gate, background=(0.0, 0.0, 0.0), **options):
     R, t = pose()
     K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
-    if mode == "smoe":
+    if mode in GATED_MODES:
         options["background_gate"] = gate
     settings = settings_from_camera(K, R, t, WIDTH, HEIGHT, torch.tensor(background), 2, blend_mode=mode, **options)
     values = [torch.from_numpy(np.asarray(array)) for array in (gaussians.opacity_logits, gaussians.log_scales,
@@ -91,7 +93,7 @@ def levels(image):
 
 @pytest.mark.parametrize("mode, gate", MODES)
 def test_render_draws_what_the_package_draws(tmp_path, mode, gate):
-    gaussians = model(mode, gate)
+    gaussians = model(record_of(mode), gate)
     io.write_gaussians(tmp_path / "model.ply", gaussians)
     cameras = write_cameras(tmp_path, "cameras.json")
     tool("dsmoe_render", tmp_path / "model.ply", "--cameras", cameras, "--background", "0.2,0.4,0.6", "--device", "cpu",
@@ -122,8 +124,8 @@ def test_no_name_in_a_file_leads_out_of_the_folder(tmp_path):
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.png")] == ["a/out/outside/view.png"]
 
 
-def test_alpha_is_the_gate_sum(tmp_path):
-    gaussians = model("smoe", 0.05)
+def test_alpha_is_the_packages(tmp_path):
+    gaussians = model("smoe_tails", 0.05)
     io.write_gaussians(tmp_path / "model.ply", gaussians)
     cameras = write_cameras(tmp_path, "cameras.json")
     tool("dsmoe_render", tmp_path / "model.ply", "--cameras", cameras, "--show", "alpha", "--device", "cpu", "-o",
@@ -136,7 +138,7 @@ def test_alpha_is_the_gate_sum(tmp_path):
 @pytest.mark.parametrize("show, end", [("depth", "png"), ("depth", "exr"), ("gates", "png"), ("count", "png"),
                                        ("gates", "mp4")])
 def test_an_orbit_becomes_pictures_and_videos(tmp_path, show, end):
-    io.write_gaussians(tmp_path / "model.ply", model("smoe", 0.0))
+    io.write_gaussians(tmp_path / "model.ply", model("smoe_tails", 0.0))
     frames = 3 if end == "mp4" else 1
     out = tmp_path / f"out.{end}"
     tool("dsmoe_render", tmp_path / "model.ply", "--orbit", "--frames", frames, "--size", "65x33", "--show", show,
@@ -168,7 +170,8 @@ def test_another_blend_than_the_trained_one_is_said(tmp_path):
     io.write_gaussians(tmp_path / "model.ply", model("smoe", 0.0))
     said = tool("dsmoe_render", tmp_path / "model.ply", "--orbit", "--frames", 1, "--size", 32, "--blend", "alpha",
                 "--device", "cpu", "-o", tmp_path / "out.png")
-    assert "trained with the blend smoe" in said
+    assert "records the blend smoe of an earlier version, which is smoe_eq7 now" in said
+    assert "trained with the blend smoe_eq7" in said
 
 
 def test_a_splat_is_drawn_as_its_ply(tmp_path):

@@ -29,7 +29,7 @@ from diff_smoe_rasterization.trainer.training.loop import Trainer
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
          "--densification-interval", "4", "--quiet"]
 GATE = 0.25
-SMOE = ["--blend-mode", "smoe", "--background-gate", str(GATE), *SHORT]  # how `trained` was
+SMOE = ["--blend-mode", "smoe_eq7", "--background-gate", str(GATE), *SHORT]  # how `trained` was
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_training_leaves_results_config_and_model(trained):
     assert {"blend_mode", "psnr", "ssim", "num_gaussians", "train_seconds", "fps", "protocol"} <= set(row)
     assert row["background_gate"] == GATE
     assert not {"background_gate_learned", "random_background", "masks"} & set(row["protocol"])
-    assert row["blend_mode"] == "smoe" and 3 < row["psnr"] < 60 and 0 < row["ssim"] < 1
+    assert row["blend_mode"] == "smoe_eq7" and 3 < row["psnr"] < 60 and 0 < row["ssim"] < 1
     assert row["train_seconds"] > 0 and row["fps"] > 0
     protocol = row["protocol"]
     assert (protocol["train_views"], protocol["test_views"], protocol["image_size"]) == (7, 2, [32, 24])
@@ -77,7 +77,7 @@ def test_training_leaves_results_config_and_model(trained):
         assert name in protocol
     with open(ply_of(trained), "rb") as file:
         header = file.read(2000).split(b"end_header")[0].decode()
-    assert "comment blend_mode smoe" in header
+    assert "comment blend_mode smoe_eq7" in header
     assert int(re.search(r"element vertex (\d+)", header).group(1)) == row["num_gaussians"]
 
 
@@ -347,16 +347,16 @@ def test_render_never_guesses_or_changes_the_mode(trained, scene, tmp_path, caps
     bare = tmp_path / "bare.ply"
     gate = f"comment background_gate {GATE}\n".encode()
     assert gate in content
-    bare.write_bytes(content.replace(b"comment blend_mode smoe\n", b"").replace(gate, b""))
+    bare.write_bytes(content.replace(b"comment blend_mode smoe_eq7\n", b"").replace(gate, b""))
     text = fails(capsys, "render", str(bare), "-o", output, "--scene", scene)
     assert "bare.ply" in text and "--blend-mode" in text
     text = fails(capsys, "render", ply_of(trained), "-o", output, "--scene", scene, "--blend-mode", "alpha")
-    assert "smoe, not alpha" in text
+    assert "smoe_eq7, not alpha" in text
     text = fails(capsys, "render", trained, "-o", output, "--blend-mode", "alpha")
-    assert "smoe, not alpha" in text
+    assert "smoe_eq7, not alpha" in text
     assert not os.path.exists(output)
     assert main(["render", str(bare), "-o", output, "--scene", scene, "--blend-mode", "alpha"]) == 0
-    assert main(["render", trained, "-o", output + "2", "--blend-mode", "smoe"]) == 0
+    assert main(["render", trained, "-o", output + "2", "--blend-mode", "smoe_eq7"]) == 0
     one, other = (open(os.path.join(folder, "view_000.png"), "rb").read() for folder in (output, output + "2"))
     assert one != other, "the two modes show different images"
 
@@ -367,7 +367,7 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
     gate = f"comment background_gate {GATE}\n".encode()
     older, bare = tmp_path / "older.ply", tmp_path / "bare.ply"
     older.write_bytes(content.replace(gate, b""))
-    bare.write_bytes(content.replace(gate, b"").replace(b"comment blend_mode smoe\n", b""))
+    bare.write_bytes(content.replace(gate, b"").replace(b"comment blend_mode smoe_eq7\n", b""))
 
     def render(source, name, *options):
         arguments = ["render", str(source), "-o", str(tmp_path / name), *options]
@@ -378,22 +378,53 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
         place = [] if source == trained else ["--scene", scene]
         text = fails(capsys, "render", source, "-o", str(tmp_path / "no"), *place, "--background-gate", "0.5")
         assert f"gate {GATE}, not 0.5" in text
-    text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe")
+    text = fails(capsys, "render", str(bare), "-o", str(tmp_path / "no"), "--scene", scene, "--blend-mode", "smoe_eq7")
     assert "bare.ply" in text and "--background-gate" in text
     assert "gate 0.0, not 0.5" in fails(capsys, "render", str(older), "-o", str(tmp_path / "no"), "--scene", scene,
                                       "--background-gate", "0.5")
     assert not (tmp_path / "no").exists()
     as_trained = render(trained, "run", "--background-gate", str(GATE))
-    assert render(bare, "bare", "--blend-mode", "smoe", "--background-gate",
+    assert render(bare, "bare", "--blend-mode", "smoe_eq7", "--background-gate",
                   str(GATE)) == as_trained
     of_the_paper = render(older, "older")
-    assert of_the_paper == render(bare, "bare_0", "--blend-mode", "smoe", "--background-gate", "0") != as_trained
+    assert of_the_paper == render(bare, "bare_0", "--blend-mode", "smoe_eq7", "--background-gate", "0") != as_trained
+
+
+def test_smoe_of_an_earlier_version_is_smoe_eq7_and_a_line_says_so(trained, scene, tmp_path, capsys):
+    run = str(tmp_path / "run")
+    shutil.copytree(trained, run)
+    edit_config(run, blend_mode="smoe")
+    with open(ply_of(run), "rb") as file:
+        content = file.read().replace(b"comment blend_mode smoe_eq7\n", b"comment blend_mode smoe\n")
+    with open(ply_of(run), "wb") as file:
+        file.write(content)
+    with open(os.path.join(run, "results.json"), encoding="utf-8") as file:
+        rows = file.read().replace('"smoe_eq7"', '"smoe"')
+    with open(os.path.join(run, "results.json"), "w", encoding="utf-8") as file:
+        file.write(rows)
+    said = f"note: {ply_of(run)}: it records the blend mode smoe of an earlier version, which is smoe_eq7 now;"
+    commands = {"eval": [run], "render": [run, "-o", str(tmp_path / "old")],
+                "export": [ply_of(run), "-o", str(tmp_path / "new.ply")]}
+    for command, words in commands.items():
+        capsys.readouterr()
+        assert main([command, *words]) == 0
+        line, = capsys.readouterr().err.splitlines()
+        assert line.startswith(said), command
+    before, after = results_of(trained)[0], results_of(run)[0]
+    for name in ("blend_mode", "psnr", "train_seconds"):
+        assert after[name] == before[name], name
+    assert io.read_gaussians(str(tmp_path / "new.ply")).blend_mode == "smoe_eq7"
+    capsys.readouterr()
+    assert main(["render", trained, "-o", str(tmp_path / "images")]) == 0
+    assert capsys.readouterr().err == ""
+    old, new = (open(tmp_path / folder / "view_000.png", "rb").read() for folder in ("old", "images"))
+    assert old == new
 
 
 def test_a_run_from_before_the_background_gate_is_of_the_paper(scene, tmp_path, monkeypatch):
     """Without a gate in config.json and .ply it evaluates as it did: with 0."""
     output = str(tmp_path / "out")
-    assert main(["train", scene, "-o", output, "--blend-mode", "smoe", "--background-gate", "0", *SHORT]) == 0
+    assert main(["train", scene, "-o", output, "--blend-mode", "smoe_eq7", "--background-gate", "0", *SHORT]) == 0
     before, = results_of(output)
     path = os.path.join(output, "config.json")
     with open(path, encoding="utf-8") as file:
@@ -411,8 +442,8 @@ def test_a_run_from_before_the_background_gate_is_of_the_paper(scene, tmp_path, 
     assert (after["psnr"], after["background_gate"]) == (before["psnr"], 0.0)
 
 
-@pytest.mark.parametrize("mode, gate, warns", [("alpha", 1, False), ("smoe", 1, False), ("smoe", 0.03, True),
-                                               ("smoe_std", 0, True)])
+@pytest.mark.parametrize("mode, gate, warns", [
+    ("alpha", 1, False), ("smoe_eq7", 1, False), ("smoe", 1, True), ("smoe", 0.03, True), ("smoe_std", 0, True)])
 def test_a_model_that_viewers_would_show_wrongly_is_named(mode, gate, warns):
     assert bool(viewer_warning({"blend_mode": mode, "background_gate": gate})) == warns
 
@@ -421,9 +452,11 @@ def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path
     output = str(tmp_path / "out")
     assert main(["train", scene, "-o", output, "--blend-mode", "smoe", "--background-gate", "learned", *SHORT]) == 0
     row, = results_of(output)
-    assert row["protocol"]["background_gate_learned"] is True and row["protocol"]["background_gate_bound"] == 0.03
+    protocol = row["protocol"]
+    assert protocol["background_gate_learned"] is True and protocol["background_gate_bound"] == 0
+    assert protocol["background_gate_start"] == 0.1 and "background_gate_lr" not in protocol, "as usual"
     gate = row["background_gate"]
-    assert 0.03 < gate < 2 and gate != 1.0
+    assert 0.05 < gate < 0.2 and gate != 0.1
     text = capsys.readouterr().out
     assert "viewers of 3DGS blend them by alpha" in text
     assert "smoe learned" in text and f"\nsmoe {gate:.3g} " in text
@@ -439,11 +472,11 @@ def test_a_ply_and_a_config_that_disagree_are_refused(trained, tmp_path, capsys)
     run = str(tmp_path / "run")
     shutil.copytree(trained, run)
     with open(ply_of(run), "r+b") as file:
-        content = file.read().replace(b"comment blend_mode smoe\n", b"comment blend_mode alpha\n")
+        content = file.read().replace(b"comment blend_mode smoe_eq7\n", b"comment blend_mode alpha\n")
         file.seek(0)
         file.write(content)
-    assert "alpha, not smoe" in fails(capsys, "eval", run)
-    assert "alpha, not smoe" in fails(capsys, "render", run, "-o", str(tmp_path / "images"))
+    assert "alpha, not smoe_eq7" in fails(capsys, "eval", run)
+    assert "alpha, not smoe_eq7" in fails(capsys, "render", run, "-o", str(tmp_path / "images"))
 
 
 def test_resume_on_the_command_line(scene, tmp_path, capsys):

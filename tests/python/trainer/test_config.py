@@ -8,6 +8,7 @@ import os
 
 import pytest
 
+from diff_smoe_rasterization.settings import record_of
 from diff_smoe_rasterization.trainer.config import TrainConfig, add_arguments, config_from_arguments
 from diff_smoe_rasterization.trainer.errors import ConfigError
 
@@ -52,13 +53,13 @@ def test_blend_mode_follows_the_environment_unless_given(monkeypatch):
 
 
 def test_background_gate_of_each_mode(monkeypatch):
-    modes = ("alpha", "smoe", "smoe_tn", "smoe_std")
-    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, "learned", 0.0, 0.0]
+    modes = ("alpha", "smoe", "smoe_eq7", "smoe_tn", "smoe_std")
+    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, "learned", "learned", 0.0, 0.0]
     assert parse("--blend-mode", "smoe", "--background-gate", "0").background_gate == 0.0, "the paper's"
     assert parse("--blend-mode", "smoe", "--background-gate", "learned").background_gate == "learned"
     assert parse("--blend-mode", "alpha", "--background-gate", "1").background_gate == 1.0
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.2")
-    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, 0.2, 0.0, 0.0]
+    assert [parse("--blend-mode", mode).background_gate for mode in modes] == [1.0, 0.2, 0.2, 0.0, 0.0]
     assert parse("--blend-mode", "smoe", "--background-gate", "0.4").background_gate == 0.4
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "learned")
     with pytest.raises(ConfigError, match="DSMOE_BACKGROUND_GATE is 'learned'"):
@@ -67,8 +68,8 @@ def test_background_gate_of_each_mode(monkeypatch):
 
 @pytest.mark.parametrize("mode, gate, words", [
     ("smoe", -0.1, "background_gate is -0.1"), ("smoe", float("inf"), "background_gate is inf"),
-    ("alpha", 0.1, "only 'smoe'"), ("alpha", "learned", "only 'smoe'"), ("smoe_tn", 0.1, "only 'smoe'"),
-    ("smoe_std", 1.0, "only 'smoe'"),
+    *[(mode, gate, "only 'smoe' and 'smoe_eq7' know it")
+      for mode, gate in (("alpha", 0.1), ("alpha", "learned"), ("smoe_tn", 0.1), ("smoe_std", 1.0))],
 ])
 def test_a_background_gate_that_the_mode_does_not_know_is_refused(mode, gate, words):
     with pytest.raises(ConfigError, match=words):
@@ -83,12 +84,33 @@ def test_another_mode_takes_its_own_background_gate():
     assert alpha.changed(blend_mode="smoe", background_gate=0.2).background_gate == 0.2
 
 
-@pytest.mark.parametrize("mode, expected", [("smoe", 0.0), ("alpha", 1.0), ("smoe_tn", 0.0)])
+def test_how_a_gate_is_learned_follows_the_mode_unless_given(tmp_path):
+    def learned(config):
+        return config.background_gate_bound, config.background_gate_start, config.background_gate_lr
+
+    assert learned(parse("--blend-mode", "smoe")) == (0, 0.1, 0.01)
+    assert learned(parse("--blend-mode", "smoe_eq7")) == learned(parse("--blend-mode", "alpha")) == (0.03, 1, 0.01)
+    given = parse("--blend-mode", "smoe", "--background-gate-start", "0.5", "--background-gate-lr", "0.02")
+    assert learned(given) == (0, 0.5, 0.02)
+    assert learned(given.changed(blend_mode="smoe_eq7")) == (0.03, 0.5, 0.02), "what is given stays"
+    given.changed(scene="s", output=str(tmp_path)).save(str(tmp_path))
+    assert learned(TrainConfig.load(str(tmp_path))) == (0, 0.5, 0.02)
+
+    values = json.loads((tmp_path / "config.json").read_text())
+    for name in ("background_gate_start", "background_gate_lr"):  # as version 0.1 wrote it
+        del values[name]
+    values.update(blend_mode="smoe", background_gate_bound=0.03)
+    (tmp_path / "config.json").write_text(json.dumps(values))
+    old = TrainConfig.load(str(tmp_path))
+    assert (old.blend_mode, *learned(old)) == ("smoe_eq7", 0.03, 1, 0.01)
+
+
+@pytest.mark.parametrize("mode, expected", [("smoe_eq7", 0.0), ("alpha", 1.0), ("smoe_tn", 0.0)])
 def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypatch, mode, expected):
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")  # must not fill the gap
     TrainConfig(scene="s", output=str(tmp_path), blend_mode=mode).save(str(tmp_path))
     values = json.loads((tmp_path / "config.json").read_text())
-    assert values.pop("background_gate") == (0.7 if mode == "smoe" else expected), "the resolved one"
+    assert values.pop("background_gate") == (0.7 if mode == "smoe_eq7" else expected), "the resolved one"
     (tmp_path / "config.json").write_text(json.dumps(values))
     assert TrainConfig.load(str(tmp_path)).background_gate == expected
 
@@ -96,6 +118,10 @@ def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypa
 @pytest.mark.parametrize("option, value, words", [
     ("background_gate_bound", 1.0, "--background-gate-bound is 1.0; it must be at least 0 and below 1"),
     ("background_gate_bound", -0.1, "--background-gate-bound is -0.1"),
+    ("background_gate_bound", "0", "--background-gate-bound is '0'; it must be a number"),
+    ("background_gate_start", 0.03, "--background-gate-start is 0.03; it must be above --background-gate-bound, 0.03"),
+    ("background_gate_start", float("inf"), "--background-gate-start is inf"),
+    ("background_gate_lr", 0.0, "--background-gate-lr is 0.0; it must be a positive number"),
     ("iterations", 0, "--iterations is 0; it must be at least 1"),
     ("resolution", 0, "--resolution is 0"),
     ("resolution", -2, "--resolution is -2"),
@@ -125,7 +151,7 @@ def test_file_round_trip(tmp_path, mode):
     config = TrainConfig(scene="s", output=str(tmp_path), blend_mode=mode, iterations=5, white_background=True)
     config.save(str(tmp_path))
     assert TrainConfig.load(str(tmp_path)) == dataclasses.replace(config, scene=os.path.abspath("s"))
-    assert json.loads((tmp_path / "config.json").read_text())["blend_mode"] == mode
+    assert json.loads((tmp_path / "config.json").read_text())["blend_mode"] == record_of(mode)
 
 
 @pytest.mark.parametrize("edit, words", [
@@ -171,7 +197,7 @@ def test_a_folder_without_a_run(tmp_path):
 def test_differences_ignore_where_and_when_things_are_written():
     one = TrainConfig(scene="a", output="b", seed=1, checkpoint_every=5)
     assert one.differences(TrainConfig(scene="c", output="d", seed=1, eval_every=7)) == []
-    texts = one.differences(TrainConfig(seed=2, blend_mode="smoe"))
+    texts = one.differences(TrainConfig(seed=2, blend_mode="smoe_eq7"))
     assert len(texts) == 3 and any("--seed is 1, not 2" in text for text in texts)
 
 

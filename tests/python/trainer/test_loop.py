@@ -13,6 +13,7 @@ from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.results.rendering import package_rasterizer
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.training import strategy
+from diff_smoe_rasterization.trainer.training.background_gate import LearnedGate
 from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
 from diff_smoe_rasterization.trainer.training.strategies import STRATEGIES
 from diff_smoe_rasterization.trainer.training.strategy import Strategy
@@ -47,18 +48,33 @@ def test_the_position_rate_follows_the_iteration(tiny_config, scene):
     assert rates == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_learned_gate_is_stepped_by_adam_from_1(tiny_config, scene):
-    trainer = Trainer(tiny_config.changed(background_gate="learned", background_gate_bound=0.2), scene)
-    assert trainer.background_gate == pytest.approx(1, abs=1e-6)  # float32
+@pytest.mark.parametrize("options, start, bound, rate", [
+    ({}, 0.1, 0.0, 0.01), ({"blend_mode": "smoe_eq7"}, 1.0, 0.03, 0.01),
+    ({"background_gate_bound": 0.2, "background_gate_start": 2.0, "background_gate_lr": 0.04}, 2.0, 0.2, 0.04)])
+def test_a_learned_gate_is_stepped_by_adam_from_its_start(tiny_config, scene, options, start, bound, rate):
+    trainer = Trainer(tiny_config.changed(background_gate="learned", **options), scene)
+    assert trainer.background_gate == pytest.approx(start, abs=1e-6)  # float32
     trainer.step()
-    # Adam's first step is its rate, 0.01, in the logarithm of what lies above the bound.
-    expected = [0.2 + 0.8 * math.exp(sign * 0.01) for sign in (-1, 1)]
+    # Adam's first step is its rate, in the logarithm of what lies above the bound.
+    expected = [bound + (start - bound) * math.exp(sign * rate) for sign in (-1, 1)]
     assert min(abs(trainer.background_gate - value) for value in expected) < 1e-5  # float32
     assert trainer.gate.logarithm.grad is None and not trainer.renderer.background_gate.requires_grad
 
 
+@pytest.mark.parametrize("push", [1, -1])
+def test_a_learned_gate_without_a_bound_stays_positive_and_finite(tiny_config, push):
+    """Whatever the gradient: a hundred steps of a rate of 10 would leave float32 behind."""
+    gate = LearnedGate(tiny_config.changed(background_gate="learned", background_gate_lr=10.0), "cpu")
+    for _ in range(100):
+        gate.logarithm.grad = torch.full((1,), float(push))
+        gate.step()
+    assert 0 < float(gate.value) < math.inf
+    assert (float(gate.value) < 1e-20) if push > 0 else (float(gate.value) > 1e20)
+
+
 @pytest.mark.parametrize("mode, gate, expected", [
-    ("smoe", "learned", 1.0), ("smoe", 0.3, 0.3), ("smoe", 0.0, 0.0), ("alpha", None, None), ("smoe_tn", None, None)])
+    ("smoe", "learned", 0.1), ("smoe_eq7", "learned", 1.0), ("smoe", 0.3, 0.3), ("smoe", 0.0, 0.0),
+    ("alpha", None, None), ("smoe_tn", None, None)])
 def test_the_rasterizer_is_told_the_gate(tiny_config, scene, mode, gate, expected):
     seen = []
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from diff_smoe_rasterization import io
+from diff_smoe_rasterization.settings import GATED_MODES
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.model import PARAMETERS, GaussianModel, GaussianOptimizer, exponential_rate
@@ -114,7 +115,7 @@ def test_ply_round_trip(tmp_path, mode, sh_degree):
     path = str(tmp_path / "deep" / "model.ply")
     save_model(path, model, mode, 0.1)
     loaded, recorded = load_model(path, "cpu")
-    assert recorded == (mode, 0.1 if mode == "smoe" else None), "the other modes have no choice"
+    assert recorded == (mode, 0.1 if mode in GATED_MODES else None, ""), "the other modes have no choice"
     assert loaded.sh_degree == loaded.active_sh_degree == sh_degree
     for name in PARAMETERS:
         assert torch.equal(loaded.raw[name], model.raw[name]), name
@@ -135,8 +136,8 @@ def test_blend_mode_of_a_file_is_never_guessed():
     ("smoe", ("smoe", 0.1), None, 0.1),
     ("smoe", ("smoe", 0.1), 0.1, 0.1),
     ("smoe", ("smoe", 0.1), 0.2, r"a\.ply was trained with the background gate 0\.1, not 0\.2"),
-    ("smoe", ("smoe", None), None, 0.0),  # older files are of Eq. 7
-    ("smoe", ("smoe", None), 0.05, "background gate 0.0, not 0.05"),
+    ("smoe_eq7", ("smoe_eq7", None), None, 0.0),  # older files are of Eq. 7
+    ("smoe_eq7", ("smoe_eq7", None), 0.05, "background gate 0.0, not 0.05"),
     ("smoe", (None, None), None, r"a\.ply does not say which background gate.*--background-gate"),
     ("smoe", (None, None), 0.2, 0.2),
     ("smoe", (None, None), -1.0, "background_gate is -1.0"),
@@ -170,4 +171,4 @@ def test_files_of_other_programs_load_without_a_mode(tmp_path):
     raw = {name: tensor.detach().numpy() for name, tensor in model.raw.items()}
     io.write_gaussians(str(tmp_path / "a.ply"), io.Gaussians(
         raw["means3D"], raw["dc"], raw["shs"], raw["opacities"], raw["scales"], raw["rotations"]))
-    assert load_model(str(tmp_path / "a.ply"), "cpu")[1] == (None, None)
+    assert load_model(str(tmp_path / "a.ply"), "cpu")[1] == (None, None, "")

@@ -14,6 +14,7 @@ from PIL import Image
 
 from diff_smoe_rasterization import cli
 from diff_smoe_rasterization.io import read_gaussians
+from diff_smoe_rasterization.settings import record_of
 from diff_smoe_rasterization.trainer import quickstart, short_run
 from diff_smoe_rasterization.trainer.results.pictures import busiest_window, comparison, evenly_spaced
 from diff_smoe_rasterization.trainer.system import files
@@ -32,7 +33,7 @@ def test_both_modes_are_trained_with_the_same_settings(output):
     assert [row["blend_mode"] for row in rows] == ["alpha", "smoe"]
     for row in rows:
         assert {"psnr", "ssim", "num_gaussians", "train_seconds", "fps"} <= set(row)
-    learned = {"background_gate_learned": True, "background_gate_bound": 0.03}
+    learned = {"background_gate_learned": True, "background_gate_bound": 0.0, "background_gate_start": 0.1}
     assert rows[1]["protocol"] == {**rows[0]["protocol"], **learned}
     assert (rows[0]["protocol"]["iterations"], rows[0]["protocol"]["seed"]) == (30, 4)
 
@@ -40,8 +41,8 @@ def test_both_modes_are_trained_with_the_same_settings(output):
 def test_the_models_record_their_modes(output):
     for mode in ("alpha", "smoe"):
         model = read_gaussians(str(output / f"{mode}.ply"))
-        assert model.blend_mode == mode
-        assert model.background_gate is None if mode == "alpha" else 0.03 < model.background_gate < 1
+        assert model.blend_mode == record_of(mode)
+        assert model.background_gate is None if mode == "alpha" else 0.05 < model.background_gate < 0.2
 
 
 def test_pictures_show_truth_and_both_modes(output):

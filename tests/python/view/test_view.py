@@ -16,6 +16,7 @@ from tiny_scene import one_thread, tiny_scene  # noqa: F401
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.settings import BLEND_MODES
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.inspection import to_image
 from diff_smoe_rasterization.trainer.opening import open_trained
@@ -34,7 +35,8 @@ def model(tmp_path):
     random, path = np.random.RandomState(0), str(tmp_path / "model.ply")
     io.write_gaussians(path, io.Gaussians(
         random.normal(0, 1, (60, 3)), random.normal(0, 1, (60, 1, 3)), np.zeros((60, 0, 3)),
-        random.normal(0, 2, (60, 1)), random.normal(-1.5, 0.5, (60, 3)), random.normal(0, 1, (60, 4)), "smoe", 0.03))
+        random.normal(0, 2, (60, 1)), random.normal(-1.5, 0.5, (60, 3)), random.normal(0, 1, (60, 4)), "smoe_eq7",
+        0.03))
     return path
 
 
@@ -50,12 +52,12 @@ def camera_of(opened):
 def test_a_picture_is_the_rendering(opened):
     with torch.no_grad():
         expected = np.asarray(to_image(opened.renderer(camera_of(opened)).color))
-    assert str(Blend.of(opened.renderer)) == "smoe 0.03"
+    assert str(Blend.of(opened.renderer)) == "smoe_eq7 0.03"
     assert np.array_equal(picture(opened.renderer, camera_of(opened), Look(Blend.of(opened.renderer))), expected)
 
 
 def test_two_blends_share_a_picture(opened):
-    camera, left, right = camera_of(opened), Blend("smoe", 0.03), Blend("alpha")
+    camera, left, right = camera_of(opened), Blend("smoe_eq7", 0.03), Blend("alpha")
     whole = {blend: picture(opened.renderer, camera, Look(blend)).astype(int) for blend in (left, right)}
     both = picture(opened.renderer, camera, Look(left, beside=right, split=0.25))
     assert np.array_equal(both[:, :15], whole[left][:, :15]) and np.array_equal(both[:, 17:], whole[right][:, 17:])
@@ -64,7 +66,7 @@ def test_two_blends_share_a_picture(opened):
 
 
 @pytest.mark.parametrize("shown", SHOWN)
-@pytest.mark.parametrize("mode", ["alpha", "smoe", "smoe_tn", "smoe_std"])
+@pytest.mark.parametrize("mode", BLEND_MODES)
 def test_everything_can_be_shown_in_every_mode(opened, mode, shown):
     image = picture(opened.renderer, camera_of(opened), Look(Blend(mode, 0.5), shown))
     assert image.shape == (48, 64, 3) and image.dtype == np.uint8 and image.std() > 5
@@ -81,8 +83,8 @@ def test_gates_have_distinct_colours_and_show_the_one_that_is_open(opened):
     assert len(center) > 20
 
 
-@pytest.mark.parametrize("mode, gate", [("alpha", 1.0), ("smoe", 0.0), ("smoe", 0.03), ("smoe_tn", 0.0),
-                                        ("smoe_std", 0.0)])
+@pytest.mark.parametrize("mode, gate", [("alpha", 1.0), ("smoe", 0.0), ("smoe", 0.03), ("smoe_eq7", 0.03),
+                                        ("smoe_tn", 0.0), ("smoe_std", 0.0)])
 def test_the_gate_map_has_the_largest_weight_of_each_pixel(opened, mode, gate):
     """A rendering with a channel for each Gaussian says all weights, but for what divides them."""
     model, camera = opened.renderer.model, opened.cameras[0].resized(100, 75)  # more than one block
