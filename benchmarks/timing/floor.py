@@ -20,7 +20,8 @@ import torch
 _EXPONENT = 2  # quadratic in dy: two multiply-adds
 _EXPONENTIAL = 14  # clamp; n: multiply-add, subtract; remainder: 2; polynomial: 6; 2^n: shift, add, multiply
 _LOGIT = 2  # o G; min with 0.99
-_TESTS = {"alpha": 2, "smoe": 3, "smoe_tn": 3, "smoe_std": 3}  # power <= 0; alpha >= 1/255, or G and alpha_min
+# power <= 0; alpha >= 1/255 or 1/2040, or G and alpha_min
+_TESTS = {"alpha": 2, "smoe": 2, "smoe_eq7": 3, "smoe_tn": 3, "smoe_std": 3}
 _GATE = {mode: _EXPONENT + _EXPONENTIAL + _LOGIT + tests for mode, tests in _TESTS.items()}
 _FEATURES = 3  # a multiply-add a channel
 

@@ -28,7 +28,8 @@ STATE = 2 * FLOAT + INT  # gate sum, transmittance, last contributor of a pixel
 
 _EXPONENT = 2  # the quadratic form; what one coordinate gives is shared by a row of pixels
 _GATE = _EXPONENT + 1 + 2  # exponential; opacity, clamp
-_TESTS = {"alpha": 2, "smoe": 3, "smoe_tn": 3, "smoe_std": 3}  # power <= 0; alpha >= 1/255, or G and alpha_min
+# power <= 0; alpha >= 1/255 or 1/2040, or G and alpha_min
+_TESTS = {"alpha": 2, "smoe": 2, "smoe_eq7": 3, "smoe_tn": 3, "smoe_std": 3}
 _TRANSMITTANCE = 5  # 1 - alpha; its product with T; its test; weight; T
 _SUMS = 3 + 1 + 1  # colour; gate sum; last contributor
 FORWARD = {mode: _GATE + tests + _SUMS + (0 if mode == "smoe_std" else _TRANSMITTANCE)

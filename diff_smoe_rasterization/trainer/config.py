@@ -77,7 +77,8 @@ class TrainConfig:
     background_gate_start: float = _option(
         None, "a learned background gate starts with this (default: 1; smoe: 0.1)", kind=float)
     background_gate_lr: float = _option(
-        0.01, "learning rate of the logarithm of what a learned background gate has above its bound")
+        None, "learning rate of the logarithm of what a learned background gate has above its bound (default: 0.01; "
+              "smoe: 0.03)", kind=float)
     iterations: int = _option(30_000, "views to train on, a view each step; with --batch B, B each step")
     batch: int = _option(
         1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
@@ -347,7 +348,8 @@ def _recipe_of(schedule: str) -> Dict[str, Any]:
 def _learned_gate_of(blend_mode: str) -> Dict[str, float]:
     """How a background gate is learned by default, where blend modes differ."""
     tails = blend_mode == "smoe"
-    return {"background_gate_bound": 0.0 if tails else 0.03, "background_gate_start": 0.1 if tails else 1.0}
+    return {"background_gate_bound": 0.0 if tails else 0.03, "background_gate_start": 0.1 if tails else 1.0,
+            "background_gate_lr": 0.03 if tails else 0.01}
 
 
 def holds_run(folder: str) -> bool:
@@ -358,7 +360,7 @@ def holds_run(folder: str) -> bool:
 def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:
     """The background gate that a training takes: a number, 1 in `alpha` and 0 in the ablations, or LEARNED.
 
-    asked: None means in GATED_MODES $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is no gate,
+    asked: None means in GATED_MODES $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is none,
     and for one that the mode does not know.
     """
     if blend_mode not in GATED_MODES:

@@ -28,10 +28,10 @@ def needles(mode, length, covariance, antialiasing, count=40):
     settings = camera_settings(WIDTH, HEIGHT, position=(0, 0, -DEPTH), fov_x=2 * math.atan(WIDTH / 2 / FOCAL), degree=0,
                                dtype=torch.float32, blend_mode=mode, antialiasing=antialiasing)
     pixel = DEPTH / FOCAL
-    scales = pixel * torch.cat([torch.full((count, 1), float(length)), uniform(0.3, 1.0, count, 2)
+    scales = pixel * torch.cat([torch.full((count, 1), float(length), device="cpu"), uniform(0.3, 1.0, count, 2)
                                 * (1 if antialiasing else 0.2)], 1)
     half = uniform(0, math.pi, count)
-    turned = torch.stack([half.cos(), torch.zeros(count), torch.zeros(count), half.sin()], 1)
+    turned = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], 1)
     rotations = turned + uniform(-0.1, 0.1, count, 4)
     inputs = {"means3D": torch.cat([uniform(-0.6, 0.6, count, 1), uniform(-0.4, 0.4, count, 1),
                                     uniform(-0.5, 0.5, count, 1)], 1),

@@ -5,7 +5,7 @@ import pytest
 import torch
 from comparison import assert_close
 from devices import random_normal
-from scenes import gate_of, random_scene, with_gate, with_gates
+from scenes import blend_of, gate_of, random_scene, transmittance_of, with_gate, with_gates
 from test_cuda_against_cpu import SCENES, selected
 from test_cuda_graphs import SLEEP, graph_of, list_size, own_width, result_while_busy, scene_of
 
@@ -66,7 +66,10 @@ def test_the_sums_account_for_every_pair_of_the_image(mode, dtype, gpu):
     scene = random_scene(mode, 3000, 160, 107, scale=0.03, channels=1, bg=torch.zeros(1)).with_inputs(
         colors_precomp=torch.ones(3000, 1, dtype=torch.float64)).to(dtype).to(gpu)
     rendering, splats = rasterize_with_splats(settings=scene.settings, outputs=("alpha",), **scene.inputs)
-    weights = rendering.color[0] * (rendering.alpha[0] + gate_of(mode) * (1 - rendering.alpha[0]))
+    denominator = rendering.alpha[0] + gate_of(mode) * (1 - rendering.alpha[0])
+    if blend_of(mode) == "smoe":  # whose alpha is W / D, with W = 1 - T
+        denominator = (1 - transmittance_of(scene)) / rendering.alpha[0].clamp(min=1e-30)
+    weights = rendering.color[0] * denominator
     pixel_weights = map_for(scene.settings).to(gpu, dtype)
     sums = splats.contributions(pixel_weights)
     # Sums of some hundred thousand positive numbers.

@@ -454,7 +454,7 @@ def test_a_learned_background_gate_is_recorded_and_rendered_with(scene, tmp_path
     row, = results_of(output)
     protocol = row["protocol"]
     assert protocol["background_gate_learned"] is True and protocol["background_gate_bound"] == 0
-    assert protocol["background_gate_start"] == 0.1 and "background_gate_lr" not in protocol, "as usual"
+    assert protocol["background_gate_start"] == 0.1 and protocol["background_gate_lr"] == 0.03
     gate = row["background_gate"]
     assert 0.05 < gate < 0.2 and gate != 0.1
     text = capsys.readouterr().out

@@ -88,7 +88,7 @@ def test_how_a_gate_is_learned_follows_the_mode_unless_given(tmp_path):
     def learned(config):
         return config.background_gate_bound, config.background_gate_start, config.background_gate_lr
 
-    assert learned(parse("--blend-mode", "smoe")) == (0, 0.1, 0.01)
+    assert learned(parse("--blend-mode", "smoe")) == (0, 0.1, 0.03)
     assert learned(parse("--blend-mode", "smoe_eq7")) == learned(parse("--blend-mode", "alpha")) == (0.03, 1, 0.01)
     given = parse("--blend-mode", "smoe", "--background-gate-start", "0.5", "--background-gate-lr", "0.02")
     assert learned(given) == (0, 0.5, 0.02)
