@@ -1,9 +1,10 @@
 """Builds libdsmoe.so, which needs no Python, and the extension _C over it. Metadata: pyproject.toml; files and compiler
 flags: sources.txt.
 
-Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA), TORCH_CUDA_ARCH_LIST, MAX_JOBS;
-DSMOE_CUDA_ARCH=all compiles for every card where none is seen; DSMOE_CORE_FOLDER=DIR links the libraries that CMake has
-built in DIR (libdsmoe_core.a, libdsmoe_io.a, libdsmoe_cuda.a) in place of compiling their sources once more.
+Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA; unset: where also a GPU is seen, or
+cards are named), TORCH_CUDA_ARCH_LIST, MAX_JOBS; DSMOE_CUDA_ARCH=all compiles for every card where none is seen;
+DSMOE_CORE_FOLDER=DIR links the libraries that CMake has built in DIR (libdsmoe_core.a, libdsmoe_io.a, libdsmoe_cuda.a)
+in place of compiling their sources once more.
 """
 import os
 import re
@@ -24,6 +25,8 @@ LIBRARY_PATHS = ("$ORIGIN/../torch/lib", "$ORIGIN/../nvidia/cu13/lib", "$ORIGIN/
 # the oldest that the toolkit knows, for its major number, and these.
 EVERY_CARD = (70, 75, 80, 86, 90, 100, 110, 120)
 USUAL_CARDS = (80, 90)
+# On one core of an AMD EPYC; a kernel's file for the usual cards.
+SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
 FOLDERS_INSTALLED_INSIDE = ("integrations", "patches", "benchmarks")
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
 
@@ -75,8 +78,8 @@ def answer(*command):
 
 def reasons_against_cuda(cuda_sources, torch, cuda_home):
     """Returns why the CUDA backend is not built, as a list; empty where it is."""
-    wish = os.environ.get("DSMOE_BUILD_CUDA", "auto")
-    if wish not in ("auto", "0", "1"):
+    wish = os.environ.get("DSMOE_BUILD_CUDA", "")
+    if wish not in ("", "auto", "0", "1"):
         sys.exit(f"DSMOE_BUILD_CUDA is {wish!r}; it must be auto, 0 or 1")
     if wish == "0":
         return ["it was built with DSMOE_BUILD_CUDA=0"]
@@ -94,7 +97,31 @@ def reasons_against_cuda(cuda_sources, torch, cuda_home):
             reasons.append(f"{nvcc} is of CUDA {release}, but torch {torch.__version__} of {torch.version.cuda}")
     if wish == "1" and reasons:
         sys.exit("DSMOE_BUILD_CUDA=1, but " + "; ".join(reasons))
+    named = os.environ.get("TORCH_CUDA_ARCH_LIST") or os.environ.get("DSMOE_CUDA_ARCH")
+    if not reasons and not wish and not named and torch.cuda.device_count() == 0:
+        reasons.append("no GPU was seen when it was built; with DSMOE_BUILD_CUDA=1 it is built for one all the same")
     return reasons
+
+
+def announcement(sources, without_cuda):
+    """What is compiled, and about how long that takes at most: where some of it has been compiled before, less."""
+    jobs = int(os.environ.get("MAX_JOBS") or os.cpu_count() or 1)
+    seconds = sum(SECONDS_OF_A_KERNEL if path.endswith(".cu") else SECONDS_OF_A_FILE for path in sources) / jobs
+    why = "; ".join(without_cuda)
+    target = "for the CPU" if why else "for CPU and GPU"
+    return (f"{PACKAGE}: compiling {len(sources)} files, {jobs} at once, {target}: "
+            f"about {max(1, round(seconds / 60))} min" + (f" (without CUDA: {why})" if why else ""))
+
+
+def tell(text):
+    """Prints a line, and shows it on the terminal where pip keeps what a build prints."""
+    print(text, flush=True)
+    if not sys.stdout.isatty():
+        try:
+            with open("/dev/tty", "w") as terminal:
+                terminal.write(f"\n  {text}\n")
+        except OSError:  # there is none
+            pass
 
 
 def architecture_flags(nvcc, torch):
@@ -173,6 +200,7 @@ def extension():
 
     class BuildExtension(cpp_extension.BuildExtension):
         def run(self):
+            tell(announcement(library.sources + module.sources, without_cuda))
             self.parallel = None  # _C links the library: one after the other, also under `build_ext -j`
             module.extra_objects = [os.path.join(self.build_lib, self.get_ext_filename(library.name))]
             super().run()

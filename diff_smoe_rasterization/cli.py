@@ -1,8 +1,9 @@
-"""The `dsmoe` command: train, eval, render, patch, run, bench, info; a few lines each over what does the work."""
+"""The `dsmoe` command: scene, train, eval, render, patch, run, bench, info; a few lines each over what does it."""
 from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
 
@@ -10,6 +11,8 @@ from ._version import __version__
 from .patches import TRAINERS, PatchError
 from .settings import BLEND_MODES
 from .trainer.config import (
+    CHECKPOINT_NAME,
+    DEVICES,
     PRINCIPAL_POINTS,
     TrainConfig,
     add_arguments,
@@ -26,6 +29,12 @@ if TYPE_CHECKING:
     from .trainer.system.group import Group
 
 
+TRAIN_EXAMPLES = """examples:
+  dsmoe train garden -o garden_model                              the recipe of 3DGS
+  dsmoe train garden -o small --blend-mode smoe --budget 30000    a model of 30,000 Gaussians
+  dsmoe train garden -o quick --iterations 3000 --scale-recipe --resolution 4    minutes on a processor"""
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     parser = argparse.ArgumentParser(prog="dsmoe", description="Gaussian splatting with alpha and SMoE blending.")
@@ -33,25 +42,46 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     train = commands.add_parser("train", help="train Gaussians on a scene",
-                                description="Trains Gaussians on a COLMAP or NeRF-synthetic scene.")
+                                usage="%(prog)s SCENE -o OUT [OPTION ...]\n       %(prog)s --resume OUT [OPTION ...]",
+                                description="Trains Gaussians on a scene: photographs whose cameras are known.",
+                                formatter_class=argparse.RawDescriptionHelpFormatter, epilog=TRAIN_EXAMPLES)
     train.add_argument("scene", metavar="SCENE", nargs="?", default=argparse.SUPPRESS,
-                       help="folder of a COLMAP or NeRF-synthetic scene; --resume finds it in OUT")
+                       help="folder of a COLMAP scene, of a transforms.json (nerfstudio, instant-ngp, Polycam) or of a "
+                            "NeRF-synthetic scene; --resume finds it in OUT")
     train.add_argument("-o", "--output", metavar="OUT", default=argparse.SUPPRESS, help="folder to write")
-    add_arguments(train, skip=("scene", "output"))
-    train.add_argument("--scale-recipe", action="store_true",
-                       help="squeeze the recipe into --iterations: its milestones (densification, resets, learning "
-                            "rate, SH degrees) keep their share of 30,000 steps, unless they are given")
-    earlier_run = train.add_mutually_exclusive_group()
+    groups = add_arguments(train, skip=("scene", "output"))
+    groups["length, and number of Gaussians"].add_argument(
+        "--scale-recipe", action="store_true",
+        help="squeeze the recipe into --iterations: its milestones (densification, resets, learning rate, SH degrees) "
+             "keep their share of 30,000 steps, unless they are given")
+    earlier_run = groups["run"].add_mutually_exclusive_group()
     earlier_run.add_argument("--resume", action="store_true",
                              help="continue the run in OUT from its last checkpoint with its own options; more "
                                   "--iterations extend it")
     earlier_run.add_argument("--overwrite", action="store_true",
                              help="replace the run in OUT, once this one can start")
-    train.add_argument("--gpus", type=int, metavar="N",
-                       help="train on so many GPUs of this machine: torchrun starts this command once for each; with "
-                            "--batch N or more")
-    train.add_argument("--quiet", action="store_true", help="no progress bars")
+    groups["run"].add_argument(
+        "--gpus", type=int, metavar="N",
+        help="train on so many GPUs of this machine: torchrun starts this command once for each; with --batch N or "
+             "more")
+    groups["run"].add_argument("--quiet", action="store_true", help="no progress bars")
     train.set_defaults(run=_train)
+
+    scene = commands.add_parser("scene", help="make a scene of photographs",
+                                description="Finds where photographs were taken, by COLMAP, and writes a scene for "
+                                            "`dsmoe train`: images without lens distortion, cameras and points. It "
+                                            "needs pycolmap. Started again it goes on with what it has found.")
+    scene.add_argument("photos", metavar="PHOTOS", help="folder of photographs; subfolders are read too")
+    scene.add_argument("-o", "--output", metavar="SCENE", required=True,
+                       help="folder to write: new, empty, or of the same photographs")
+    scene.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto",
+                       help="which photographs are compared. exhaustive: all pairs; sequential: neighbours by name, as "
+                            "of a video; auto: all pairs of up to 200 (default: auto)")
+    scene.add_argument("--camera-model", default="OPENCV",
+                       choices=("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"),
+                       help="of the lens, by COLMAP's names (default: OPENCV)")
+    scene.add_argument("--quiet", action="store_true", help="no progress bars")
+    scene.set_defaults(run=_scene)
 
     evaluate = commands.add_parser("eval", help="measure a trained run again",
                                    description="Measures PSNR, SSIM and FPS of a finished run.")
@@ -84,21 +114,29 @@ def build_parser() -> argparse.ArgumentParser:
                         help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
     render.add_argument("--alpha", action="store_true",
                         help="also NAME.alpha.png: how much of a pixel Gaussians cover, 8 bits")
+    render.add_argument("--overwrite", action="store_true",
+                        help="write into any folder, and replace files of the same names; a VIDEO that is there too")
     _add_device(render)
     render.set_defaults(run=_render)
 
     export = commands.add_parser("export", help="write a trained model for other programs, or as a page to look at",
                                  description="Writes a trained model as one file. A page (.html) shows it in a "
-                                             "browser by the blend that it was trained with; other viewers show a .ply "
-                                             "or a .splat by alpha.")
+                                             "browser by the blend that it was trained with; other viewers show the "
+                                             "other formats by alpha.")
     export.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
     export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
-    export.add_argument("--format", choices=("html", "ply", "splat"),
-                        help="default: by the ending of FILE, else html")
+    export.add_argument("--format", choices=("html", "ply", "splat", "spz", "glb"),
+                        help="default: by the ending of FILE, else html; spz needs gsply")
     export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
                         help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
                              "holds degree 0)")
-    _add_model_options(export, "whose test views the page begins with (default: the run's)")
+    export.add_argument("--bake", choices=("alpha",),
+                        help="first fine-tune the model to this blend, which every viewer shows; needs the scene's "
+                             "images, and prints the dB that it costs")
+    export.add_argument("--bake-iterations", type=int, default=5000, metavar="N", help="(default: 5000)")
+    _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
+    _add_device(export)
+    export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
     export.set_defaults(run=_export)
 
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
@@ -146,7 +184,7 @@ def build_parser() -> argparse.ArgumentParser:
                                                  "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
     completion.add_argument("shell", choices=("bash", "zsh"))
     completion.set_defaults(run=_completion)
-    for command in (train, evaluate, render, export, view, run, info, completion):
+    for command in (train, scene, evaluate, render, export, view, run, info, completion):
         command.set_defaults(command_parser=command)
     return parser
 
@@ -173,18 +211,25 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"dsmoe {arguments.command}: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        from .trainer.training.checkpoint import CHECKPOINT_NAME
-
         continues = arguments.command == "train" and os.path.isfile(os.path.join(arguments.output, CHECKPOINT_NAME))
         hint = "; continue it with --resume" if continues else ""
-        if arguments.command == "bench" and arguments.action == "run":
+        if arguments.command == "scene" or arguments.command == "bench" and arguments.action == "run":
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return exit_status(stop)
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to render (default: cpu)")
+    parser.add_argument("--device", choices=DEVICES, default="auto",
+                        help="where to render; auto: $DSMOE_DEVICE, else the GPU if it can be used (default: auto)")
+
+
+def _choose_device(arguments: argparse.Namespace) -> None:
+    """Replaces `auto` by a device, and says which it is."""
+    from .trainer.system.device import chosen_device, device_line
+
+    arguments.device = chosen_device(arguments.device)
+    print(device_line(arguments.device), flush=True)
 
 
 def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
@@ -225,6 +270,8 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                                                     "fig4, fig5, captures, captures_ablation, captures_baselines, "
                                                     "gate, gate_equal, budgets")
     run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
+    run.add_argument("--device", choices=DEVICES,
+                     help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
     run.add_argument("--jobs", type=int, metavar="N",
                      help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
                           "FPS stay out of the report)")
@@ -280,7 +327,7 @@ def _bench_run(arguments: argparse.Namespace) -> int:
 
     rows = run_suite(arguments.suite, results=arguments.output, jobs=arguments.jobs, slurm=arguments.slurm,
                      retry_failed=arguments.retry_failed, dry_run=arguments.dry_run, only=arguments.only,
-                     per_gpu=arguments.per_gpu, rows=arguments.rows)
+                     per_gpu=arguments.per_gpu, rows=arguments.rows, device=arguments.device)
     if rows:
         print(rows_table(rows))
     failed = sum(not row["ok"] for row in rows)
@@ -320,7 +367,7 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
     if gpus is not None:
         if launched_by_torchrun():
             raise TrainerError("--gpus is given to a process that torchrun has started; leave out one of the two")
-        if not arguments.resume and not hasattr(arguments, "device"):
+        if not arguments.resume and getattr(arguments, "device", "auto") == "auto":
             arguments.device = "cuda"
             arguments.command_words += ["--device", "cuda"]
     config = _train_config(arguments)
@@ -348,12 +395,16 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
 
 
 def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) -> None:
+    from .trainer.results.modelfile import model_path
     from .trainer.results.rows import blend_name, results_table, viewer_warning
+    from .trainer.system.device import device_line
+    from .trainer.system.process import command
     from .trainer.training.loop import train
 
     if not group.leads:
         train(config, arguments.resume, arguments.overwrite, progress=False, group=group)
         return
+    print(device_line(config.device), flush=True)
     blend = blend_name(config.blend_mode, config.background_gate)
     budget = f" to {config.budget} Gaussians" if config.budget else ""
     batch = f", {config.batch} views a step" if config.batch > 1 else ""
@@ -366,12 +417,15 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     if config.schedule == "gate" and 4 * config.densify_until_iter >= 3 * config.iterations:
         print(f"note: --densify-until-iter {config.densify_until_iter} leaves no iterations to settle; below three "
               "quarters of --iterations it does, and --scale-recipe makes it half of them")
-    row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group)
+    row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
+                say=lambda text: print(text, flush=True))
     print(results_table([row]))
     if row["psnr"] is None:
         print("the scene has no test images: nothing was measured")
     if viewer_warning(row):
         print(viewer_warning(row))
+    print(f"model: {printable(model_path(config.output, config.iterations))}")
+    print(f"to look at it in a browser: {command()} export {shlex.quote(config.output)} -o model.html")
 
 
 def _train_config(arguments: argparse.Namespace) -> TrainConfig:
@@ -385,9 +439,23 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
     if arguments.resume and arguments.scale_recipe and "scene" not in given:
         arguments.command_parser.error("--scale-recipe needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")
+    if given.get("device", "auto") == "auto":
+        from .trainer.system.device import chosen_device
+
+        earlier = TrainConfig.load(run).device if arguments.resume and holds_run(run) else None
+        given["device"] = arguments.device = earlier or chosen_device()
     if not arguments.resume or "scene" in given and (arguments.scale_recipe or not holds_run(run)):
         return config_from_arguments(arguments, TrainConfig.load(run) if arguments.resume and holds_run(run) else None)
     return TrainConfig.of_run(run, "SCENE", resumes=True, **given)
+
+
+def _scene(arguments: argparse.Namespace) -> None:
+    from .trainer.photos import make_scene
+    from .trainer.system.process import command
+
+    print(make_scene(arguments.photos, arguments.output, arguments.matching, arguments.camera_model,
+                     not arguments.quiet, say=lambda text: print(text, flush=True)))
+    print(f"to train on it: {command()} train {shlex.quote(arguments.output)} -o MODEL")
 
 
 def _eval(arguments: argparse.Namespace) -> None:
@@ -395,6 +463,7 @@ def _eval(arguments: argparse.Namespace) -> None:
     from .trainer.results.metrics import image_metrics
     from .trainer.results.rows import results_table
 
+    _choose_device(arguments)
     measure = _with_lpips(arguments.lpips, arguments.device) if arguments.lpips else image_metrics
     row = evaluate_run(arguments.output, arguments.device, arguments.split, arguments.scene, measure=measure)
     print(f"{arguments.split} views")
@@ -428,6 +497,7 @@ def _with_lpips(net: str, device: str) -> Measure:
 def _render(arguments: argparse.Namespace) -> None:
     from .trainer.inspection import render_images
 
+    _choose_device(arguments)
     overrides = _overrides(arguments)
     outputs = [name for name in ("depth", "alpha") if getattr(arguments, name)]
     if arguments.orbit:
@@ -443,7 +513,8 @@ def _render(arguments: argparse.Namespace) -> None:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
-                          background_gate=arguments.background_gate, outputs=outputs)
+                          background_gate=arguments.background_gate, outputs=outputs,
+                          overwrite=arguments.overwrite)
     print(f"{len(paths)} images in {arguments.output}")
 
 
@@ -453,7 +524,7 @@ def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outp
 
     trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
                            **overrides)
-    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs))
+    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs, arguments.overwrite))
 
 
 def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
@@ -465,8 +536,12 @@ def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
 def _export(arguments: argparse.Namespace) -> None:
     from .export.command import export
 
+    if arguments.bake:
+        _choose_device(arguments)
     path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
-                           arguments.blend_mode, arguments.background_gate, **_overrides(arguments))
+                           arguments.blend_mode, arguments.background_gate, arguments.overwrite, bake=arguments.bake,
+                           bake_iterations=arguments.bake_iterations,
+                           device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)
@@ -476,6 +551,7 @@ def _view(arguments: argparse.Namespace) -> None:
     from .view.following import Followed
     from .view.server import Viewer
 
+    _choose_device(arguments)
     viewer = Viewer(Followed(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
                              **_overrides(arguments)), arguments.host, arguments.port)
     print(f"{viewer.address}: open it in a browser; Ctrl-C ends", flush=True)

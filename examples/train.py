@@ -17,7 +17,7 @@ from diff_smoe_rasterization.trainer.scenes.synthetic import write_synthetic_sce
 RATES = {"means3D": 5e-4, "dc": 0.01, "opacities": 0.05, "scales": 0.01, "rotations": 0.002}  # of Adam, as in 3DGS
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--scene", help="COLMAP or NeRF-synthetic folder")
+parser.add_argument("--scene", help="folder of a scene, as dsmoe train takes it")
 parser.add_argument("--blend-mode", default="smoe", choices=["alpha", "smoe"])
 parser.add_argument("--iterations", type=int, default=300)
 parser.add_argument("-o", "--output", default="model.ply")

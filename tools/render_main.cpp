@@ -35,6 +35,7 @@ Where the result goes: the end of the name says what it becomes
   -o picture.png      one camera, 8 bits a channel
   -o picture.exr      one camera, numbers as they are (float32)
   -o folder/          a file for each camera, named after its image; --format png (the default) or exr
+  --overwrite         replace such files where they are there
 
 What is drawn: --show
   color               what the model looks like (the default)
@@ -46,7 +47,7 @@ In PNG and MP4 depth and count become colours from blue (least) to red (most); t
 picture, and is printed. In EXR they are numbers, and gates the Gaussian's number, -1 where there is none.
 
 Further options
-  --view NAME|NUMBER  only this camera: its image name, or its place in the list from 0
+  --view NAME|NUMBER  only this camera: its image name, or its place in the list or on the orbit, from 0
   --size WxH          of the pictures in pixels; only W keeps the shape. Default: as the cameras say; orbit 1280x720
   --blend NAME        alpha, smoe, smoe_eq7, smoe_tn or smoe_std. Default: what the model was trained with, if the file says
   --background-gate X of smoe. Default: likewise, else 0
@@ -69,6 +70,7 @@ Example: dsmoe_render point_cloud.ply --orbit -o orbit.mp4
 
 const std::vector<OptionRule> kOptions = {{"help", 'h', false},
                                           {"output", 'o'},
+                                          {"overwrite", 0, false},
                                           {"cameras"},
                                           {"orbit", 0, false},
                                           {"show"},
@@ -128,9 +130,9 @@ Orbit read_orbit(const CommandLine& line, const Extent& extent, ImageSize size) 
 std::vector<View> choose_views(const CommandLine& line, const Model& model) {
   const ImageSize size = read_size(line);
   if (line.has("cameras") == line.has("orbit")) throw UsageError("one of --cameras and --orbit is needed");
-  if (line.has("orbit")) return orbit_views(read_orbit(line, extent_of(model), size));
-
-  std::vector<View> views = read_views(line.text("cameras", ""), size.height > 0 ? size : ImageSize{});
+  const bool orbit = line.has("orbit");
+  std::vector<View> views = orbit ? orbit_views(read_orbit(line, extent_of(model), size))
+                                  : read_views(line.text("cameras", ""), size.height > 0 ? size : ImageSize{});
   if (line.has("view")) {
     const std::string wanted = line.text("view", "");
     auto found = std::find_if(views.begin(), views.end(), [&](const View& view) { return view.name == wanted; });
@@ -139,6 +141,7 @@ std::vector<View> choose_views(const CommandLine& line, const Model& model) {
     }
     views = {*found};
   }
+  if (orbit) return views;  // they have their size
   for (View& view : views) {
     const int width = size.width > 0 ? size.width : view.width;
     const double shape = double(view.height) / view.width;
@@ -219,7 +222,6 @@ std::string picture_path(const fs::path& folder, const View& view, const std::st
   }
   if (path == folder) path /= "view";
   path.replace_extension("." + format);
-  fs::create_directories(path.parent_path());
   return path.string();
 }
 
@@ -267,6 +269,10 @@ int run(int argc, char** argv) {
                      " cameras and one picture; --view chooses one, or "
                      "-o names a folder or an .mp4");
   }
+  if (is_video || is_picture) line.check_output(output);
+  for (const View& view : views) {
+    if (!is_video && !is_picture) line.check_output(picture_path(output, view, format), output);
+  }
   const std::unique_ptr<Renderer> renderer = make_renderer(line, model, options);
   Painter paint(show, format == "exr" && !is_video);
   std::unique_ptr<VideoFile> video;
@@ -278,7 +284,9 @@ int run(int argc, char** argv) {
     if (is_video) {
       video->write(picture);
     } else {
-      write_picture(is_picture ? output : picture_path(output, view, format), picture);
+      const std::string path = is_picture ? output : picture_path(output, view, format);
+      if (!is_picture) fs::create_directories(fs::path(path).parent_path());
+      write_picture(path, picture);
     }
     progress.show(static_cast<int>(i) + 1);
   }

@@ -3,10 +3,15 @@ from __future__ import annotations
 
 import importlib.util
 
+# The extra `bench` of pyproject.toml.
+PACKAGES = ("'snakemake>=8'", "pyyaml", "'pydantic>=2'", "torchmetrics", "matplotlib", "jinja2")
+
 
 def require(*libraries: str) -> None:
     """Raises ImportError, which says what to type, where one of these libraries is not installed."""
-    for name in libraries:
-        if importlib.util.find_spec(name) is None:
-            raise ImportError(f"{name} is not installed; pip install '.[bench]' in the source folder brings it"
-                              + (" (it needs Python 3.11 or later)" if name == "snakemake" else ""))
+    missing = [name for name in libraries if importlib.util.find_spec(name) is None]
+    if missing:
+        from ...trainer.system.process import pip_install  # it loads torch
+
+        raise ImportError(f"dsmoe bench needs {', '.join(missing)}: {pip_install(*PACKAGES)}"
+                          + (" (Snakemake needs Python 3.11 or later)" if "snakemake" in missing else ""))

@@ -8,7 +8,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, List, Sequence, Tuple
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import yaml
 
@@ -45,16 +45,20 @@ def find_suite(name: str) -> str:
     return name if is_file else SHIPPED[name]
 
 
-def load_suite(path: str) -> Suite:
+def load_suite(path: str, device: Optional[str] = None) -> Suite:
+    """device: in place of the suite's protocol.device. Raises BenchError."""
     content = read_yaml(path)
     try:
-        return expand(content, os.path.dirname(os.path.abspath(path)))
+        return expand(content, os.path.dirname(os.path.abspath(path)), device)
     except BenchError as error:
         raise BenchError(f"{path}: {error}") from error
 
 
-def expand(content: Any, folder: str) -> Suite:
-    """A suite from what its file says; relative paths are taken from `folder`. Raises BenchError."""
+def expand(content: Any, folder: str, device: Optional[str] = None) -> Suite:
+    """A suite from what its file says; relative paths are taken from `folder`. Raises BenchError.
+
+    device: in place of protocol.device; `auto` becomes the device of this machine.
+    """
     if isinstance(content, dict) and isinstance(content.get("scenes"), str):
         path = os.path.join(folder, content["scenes"])
         refuse(not os.path.isfile(path), f"scenes: {path}: no such file")
@@ -63,6 +67,11 @@ def expand(content: Any, folder: str) -> Suite:
     content = {**schema.defaults(schema.Axes), **schema.defaults(schema.SuiteFile), **content}
     protocol = {**schema.defaults(schema.Protocol), **(content["protocol"] or {})}
     protocol = {name: value for name, value in protocol.items() if value is not None}
+    protocol["device"] = device or protocol["device"]
+    if protocol["device"] == "auto":
+        from ...trainer.system.device import chosen_device  # it loads torch, which a suite does without
+
+        protocol["device"] = chosen_device()
     scenes = [_scene(scene, f"scenes[{index}]", protocol, folder) for index, scene in enumerate(content["scenes"])]
     methods = [_method(method, f"methods[{index}]", protocol, folder)
                for index, method in enumerate(content["methods"])]

@@ -7,6 +7,7 @@ from typing import Callable, Dict, List, Sequence
 import numpy as np
 import torch
 
+from ...trainer.system.process import pip_install
 from .names import VARIABLES, net_of
 
 Distance = Callable[[torch.Tensor, torch.Tensor], float]  # of two images [3, H, W] in [0, 1]
@@ -28,8 +29,8 @@ def lpips_network(kind: str, device: str) -> Distance:
     try:
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     except ImportError as error:
-        raise ImportError("torchmetrics with torchvision is not installed (pip install torchmetrics "
-                          "torchvision)") from error
+        raise ImportError(f"LPIPS needs torchmetrics and torchvision: {pip_install('torchmetrics', 'torchvision')}"
+                          ) from error
     network = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=normalise).to(device)
     return torch.no_grad()(lambda image, target: float(network(image[None], target[None])))
 

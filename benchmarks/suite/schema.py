@@ -85,7 +85,7 @@ class Protocol(Part):
     iterations: Positive = 30_000
     batch: Positive = None  # views a step; this and gpus stand only where they are given, as in earlier rows
     gpus: Positive = None  # of each cell
-    device: Literal["cpu", "cuda"] = "cuda"
+    device: Literal["auto", "cpu", "cuda"] = "cuda"  # auto is resolved before the cells are made
     background: Background = "black"
     principal_point: one_of(PRINCIPAL_POINTS) = "centre"
     lpips: Annotated[List[one_of(LPIPS_KINDS)], DIFFERENT] = list(LPIPS_KINDS)

@@ -24,10 +24,22 @@ from .gate_options import GateOptions, parse_gate_options
 from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
+CHECKPOINT_NAME = "checkpoint.pt"  # beside it
 SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
 BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")
-KINDS = {bool: "true or false", int: "a whole number", float: "a number"}  # what an option of this type must be
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
+LARGEST = 2**53  # of whole numbers, up to which floats hold each
+DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
+# How `--help` groups the options; those that no group names are of the last one.
+GROUPS = {
+    "scene": ("images", "resolution", "test_every", "principal_point", "init_points", "white_background",
+              "random_background"),
+    "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
+    "length, and number of Gaussians": ("iterations", "batch", "budget", "schedule", "strategy_options"),
+    "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
+    "recipe": (),
+}
 LEARNED = "learned"  # the background gate that a training finds
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
@@ -52,7 +64,7 @@ class TrainConfig:
     Raises ConfigError from `validate` with the option's name, its value and what it must be.
     """
 
-    scene: str = _option("", "folder of a COLMAP or NeRF-synthetic scene", positional=True)
+    scene: str = _option("", "folder of a scene: COLMAP, transforms.json or NeRF-synthetic", positional=True)
     output: str = _option("", "folder to write", flags=("-o", "--output"), required=True)
     blend_mode: Optional[str] = _option(
         None, "how Gaussians make a pixel (default: $DSMOE_BLEND_MODE, else alpha)", choices=BLEND_MODES)
@@ -75,6 +87,9 @@ class TrainConfig:
     principal_point: str = _option(
         "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
         choices=PRINCIPAL_POINTS)
+    test_every: int = _option(
+        8, "every so many images, sorted by name, one is kept for testing, the first among them; 0: none. A scene that "
+           "lists its test images itself keeps those")
     white_background: bool = _option(False, "white background instead of black")
     random_background: bool = _option(
         False, "each step's image with transparency lies over a colour of its own; measured over black or white")
@@ -89,12 +104,14 @@ class TrainConfig:
         choices=SCHEDULES, flags=("--strategy", "--schedule"))
     strategy_options: str = _option("", "settings of `gate`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
-    device: str = _option("cpu", "where tensors live", choices=("cpu", "cuda"))
+    device: str = _option("cpu", "where to train; auto: $DSMOE_DEVICE, else the GPU if it can be used",
+                          choices=DEVICES[1:], typed_choices=DEVICES, typed_default=DEVICES[0])
     sh_degree: int = _option(3, "highest spherical-harmonics degree, 0 to 3")
     sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
     deterministic: bool = _option(
-        False, "cuda: gradients of a step equal bit for bit from run to run, and for any number of GPUs; slower")
+        False, "cuda: gradients of a step, and the scores of `gate`, equal bit for bit from run to run, and for any "
+               "number of GPUs; slower")
 
     lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
     position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
@@ -123,7 +140,8 @@ class TrainConfig:
         try:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
-            self.schedule = self.schedule or ("gate" if self.budget else "3dgs")
+            if self.schedule is None:
+                self.schedule = "gate" if self.budget else "3dgs"
             for name, value in {**_recipe_of(self.schedule), **_learned_gate_of(self.blend_mode)}.items():
                 if getattr(self, name) is None:
                     setattr(self, name, value)
@@ -135,8 +153,11 @@ class TrainConfig:
         for option in dataclasses.fields(self):
             value, choices = getattr(self, option.name), option.metadata.get("choices")
             kind = option.metadata.get("kind") or type(option.metadata.get("published", option.default))
-            if kind in KINDS and not isinstance(value, (int, float) if kind is float else kind):
+            fits = isinstance(value, (int, float) if kind is float else kind)
+            if kind in KINDS and (not fits or isinstance(value, bool) != (kind is bool)):
                 raise ConfigError(f"{_flag(option)} is {value!r}; it must be {KINDS[kind]}")
+            if isinstance(value, int) and abs(value) > LARGEST:
+                raise ConfigError(f"{_flag(option)} is {value}; it must be at most 2^53")
             if choices and value not in choices:
                 raise ConfigError(f"{_flag(option)} is {value!r}; it must be one of {', '.join(choices)}")
         self._require("iterations", self.iterations >= 1, "at least 1")
@@ -146,6 +167,7 @@ class TrainConfig:
             raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.schedule}: only "
                               f"{' and '.join(BATCHED)} know batches")
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
+        self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
         self._require("budget", self.budget >= 0, "at least 0")
         needs_budget = self.schedule in ("gate", "mcmc")
@@ -259,7 +281,7 @@ class TrainConfig:
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: not valid json ({error})") from error
         if not isinstance(values, dict):
             raise ConfigError(f"{path}: expected a json object of options")
@@ -274,7 +296,7 @@ class TrainConfig:
         values["output"] = folder  # the folder may have been moved
         try:
             return cls.of_record(values).validate()
-        except (TypeError, ConfigError) as error:
+        except (TypeError, OverflowError, ConfigError) as error:
             raise ConfigError(f"{path}: {error}") from error
 
     @classmethod
@@ -372,12 +394,15 @@ def flags_text(options: Dict[str, Any]) -> str:
 _TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
 
 
-def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), defaults: bool = True) -> None:
-    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser.
+def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
+                  defaults: bool = True) -> Dict[str, argparse._ArgumentGroup]:
+    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser; returns their groups.
 
     Options that are not given are absent from the parsed arguments. defaults: whether the help text names what they
     are then.
     """
+    groups = {title: parser.add_argument_group(title) for title in GROUPS}
+    titles = {name: title for title, names in GROUPS.items() for name in names}
     for option in dataclasses.fields(TrainConfig):
         if option.name in skip:
             continue
@@ -385,21 +410,22 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (), def
         if option.metadata.get("positional"):
             parser.add_argument(option.name, metavar=option.name.upper(), help=text)
             continue
-        flags = _flags(option)
+        flags, group = _flags(option), groups[titles.get(option.name, "recipe")]
         if option.type == "bool":
-            parser.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
+            group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue
         keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": argparse.SUPPRESS}
         if option.metadata.get("required"):
             keywords["required"] = True
         elif option.default is not None and defaults:
-            text += f" (default: {option.default})"
+            text += f" (default: {option.metadata.get('typed_default', option.default)})"
         if option.metadata.get("choices"):
-            keywords["choices"] = option.metadata["choices"]
+            keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
         else:
             kind = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
             keywords["metavar"] = option.metadata.get("metavar", kind)
-        parser.add_argument(*flags, help=text, dest=option.name, **keywords)
+        group.add_argument(*flags, help=text, dest=option.name, **keywords)
+    return groups
 
 
 def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:

@@ -11,8 +11,8 @@ from .results.rendering import Renderer
 from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points
 from .scenes.scene import load_cameras
+from .system.device import check_device
 from .system.files import is_folder
-from .training.loop import check_device
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ python -m diff_smoe_rasterization.trainer.quickstart [SCENE] [--iterations N] [-
 from __future__ import annotations
 
 import argparse
-import math
+import itertools
 import os
 import shlex
 import shutil
@@ -24,23 +24,21 @@ from .results.rows import RESULTS_NAME, results_table, viewer_warning, write_res
 from .scenes.images import View, image_size
 from .scenes.scene import Scene, load_scene, read_layout
 from .scenes.synthetic import write_synthetic_scene
+from .short_run import short_run
+from .system.device import chosen_device, device_line
 from .system.interrupt import exit_status
-from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
-from .system.process import set_up_process
-from .training.loop import check_device, train
+from .system.output_folder import Record, make_folder, only_one, own_record, read_record, remove_files, write_record
+from .system.process import command, set_up_process
+from .training.loop import train
 
 MODES = ("alpha", "smoe")
 PICTURES = 3  # test views that are shown
-DEFAULT_OUTPUT = "quickstart_output"
+DEFAULT_FOLDER = "quickstart_output"  # has a folder for each scene
 PROGRAM = "quickstart"  # in its folder's record
 MADE_UP = "the one that it makes itself"
-
-# A few thousand steps are too few to recover from an opacity reset, so neither kind of scene gets one. The threshold
-# is higher than that of full-size images: in NDC units, small images have larger gradients.
-SHORT_RUN = {"iterations": 2000, "schedule": "steady", "densify_grad_threshold": 0.001}
-# Larger scenes are reduced to what two processor cores train in minutes.
-MAX_PIXELS = 70_000  # of an image
-MAX_POINTS = 30_000
+MADE_UP_NAME = "room"
+# On a GPU the scene that it makes is larger too.
+MADE_UP_ON_GPU = {"views": 64, "width": 480, "height": 360, "points": 30_000}
 
 # Offered by `dsmoe train` and fixed here.
 FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "background_gate_start",
@@ -68,11 +66,14 @@ def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="quickstart", argument_default=argparse.SUPPRESS,
         description="Trains a scene twice, with alpha blending and with SMoE gating, and compares the results. "
-                    "Options that are not given are chosen so that a processor finishes in minutes.")
+                    "Options that are not given are chosen so that a processor finishes in minutes; on a GPU it "
+                    "trains at full size for about a minute.")
     parser.add_argument("scene", nargs="?", metavar="SCENE", default=None,
-                        help="folder of a COLMAP or NeRF-synthetic scene (default: a small one made on the spot)")
-    parser.add_argument("-o", "--output", metavar="OUT", default=DEFAULT_OUTPUT,
-                        help=f"folder to write: new, empty, or of the same scene (default: {DEFAULT_OUTPUT})")
+                        help="folder of a scene: COLMAP, transforms.json or NeRF-synthetic (default: one made on the "
+                             "spot)")
+    parser.add_argument("-o", "--output", metavar="OUT", default=None,
+                        help="folder to write: new, empty, or of the same scene (default: "
+                             f"{DEFAULT_FOLDER}/NAME, with the scene's name)")
     parser.add_argument("--quiet", action="store_true", default=False, help="no progress bars")
     add_arguments(parser, skip=FIXED, defaults=False)
     return parser.parse_args(argv)
@@ -81,9 +82,12 @@ def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
 def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     """Makes the scene where none is named, trains both modes, writes results and pictures; returns the rows."""
     given = {name: value for name, value in vars(arguments).items() if name not in ("scene", "output", "quiet")}
-    output, progress = arguments.output, not arguments.quiet
+    progress = not arguments.quiet
+    given["device"] = chosen_device(given.get("device"))
+    print(device_line(given["device"]), flush=True)
     config = choose_options(arguments.scene, given) if arguments.scene else None
     subject = os.path.abspath(arguments.scene) if arguments.scene else MADE_UP
+    output = arguments.output or default_output(subject)
     _earlier_files(output, subject)
     make_folder(output)  # a folder that cannot be made is told before images are read
     with only_one(output):
@@ -92,11 +96,12 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
             folder = os.path.join(output, "scene")
             print(f"making a scene in {folder}", flush=True)
             write_record(output, PROGRAM, Record(subject, earlier), earlier)  # the scene is its own
-            write_synthetic_scene(folder)
+            write_synthetic_scene(folder, **({} if given["device"] == "cpu" else MADE_UP_ON_GPU))
             config = choose_options(folder, given)
-        check_device(config.device)
         set_up_process(config.device)
         scene = load_scene(config, progress)
+        if scene.note:
+            print(scene.note, flush=True)
         views = shown_views(scene)
         files = [RESULTS_NAME, *(mode + ".ply" for mode in MODES), *views]
         write_record(output, PROGRAM, Record(subject, files), earlier)
@@ -118,17 +123,20 @@ def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
     return rows
 
 
-def command() -> str:
-    """What to type for `dsmoe`, of the environment that this process runs in."""
-    script = os.path.join(os.path.dirname(sys.executable), "dsmoe")
-    if not os.path.isfile(script):
-        return f"{shlex.quote(sys.executable)} -m {__name__.partition('.')[0]}"
-    return shlex.quote(min(script, os.path.relpath(script), key=len))
+def default_output(subject: str) -> str:
+    """The folder for a scene where none is named: by its name, with a number where that is another scene's."""
+    name = MADE_UP_NAME if subject == MADE_UP else os.path.basename(subject)
+    for number in itertools.count(1):
+        folder = os.path.join(DEFAULT_FOLDER, name if number == 1 else f"{name}_{number}")
+        record = read_record(folder, PROGRAM)
+        if record is None or record.subject in ("", subject):
+            break
+    return folder
 
 
 def _earlier_files(output: str, subject: str) -> List[str]:
     """What an earlier comparison on the same scene has written. Raises TrainerError where `output` holds another's."""
-    record = own_record(output, PROGRAM)
+    record = own_record(output, PROGRAM, folders=("scene", *MODES))
     if record.subject not in ("", subject):
         raise TrainerError(f"{output} holds the models and pictures of another scene, {record.subject}; choose another "
                            "folder with -o, or remove it")
@@ -136,20 +144,17 @@ def _earlier_files(output: str, subject: str) -> List[str]:
 
 
 def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
-    """The given options, and for the others what a processor finishes in minutes; prints what it chose.
+    """The given options, and for the others a short training (`short_run`); prints what it chose.
 
     The recipe's milestones keep their share of the iterations (`TrainConfig.shortened`).
     """
-    chosen: Dict[str, Any] = dict(SHORT_RUN)
     layout = read_layout(TrainConfig(scene=folder))
-    width, height = image_size(layout.train[0].path)
-    if width * height > MAX_PIXELS:
-        chosen["resolution"] = int(math.sqrt(MAX_PIXELS * width / height))
-    if len(layout.points.positions) > MAX_POINTS:
-        chosen["init_points"] = MAX_POINTS
+    device = given.get("device", "cpu")
+    chosen = short_run(device, *image_size(layout.train[0].path), len(layout.points.positions))
     chosen = {name: value for name, value in chosen.items() if name not in given}
     if chosen:
-        print(f"chosen for a run of some minutes: {flags_text(chosen)}", flush=True)
+        lasts = "some minutes" if device == "cpu" else "about a minute"
+        print(f"chosen for a run of {lasts}: {flags_text(chosen)}", flush=True)
     base = TrainConfig(scene=folder, blend_mode=MODES[0], checkpoint_every=0)
     return base.changed(**{**chosen, **given}).shortened().changed(**given)
 

@@ -1,8 +1,10 @@
-"""Fixtures of all tests: the four blend modes, the devices, and an environment that selects no mode.
+"""Fixtures of all tests: the five blend modes, the devices, and an environment that selects no mode.
 
 A test that uses the fixture `device` runs once on the CPU and, where there is a GPU and a build for it, once there.
 """
 from __future__ import annotations
+
+import os
 
 import pytest
 import torch
@@ -18,6 +20,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    os.environ["DSMOE_DEVICE"] = "cpu"  # what commands take by themselves, also on a machine with a GPU
     if config.getoption("--device") == "cuda" and without_cuda_because():
         raise pytest.UsageError(f"--device cuda: {without_cuda_because()}")
 

@@ -136,7 +136,7 @@ def test_without_a_card_kernels_are_built_for_all(tmp_path, monkeypatch, capsys,
 
 @pytest.mark.parametrize("torch_cuda, built", [("12.8", True), ("12.1", True), ("11.8", False), (None, False)])
 def test_cuda_is_built_where_torch_and_the_toolkit_fit(tmp_path, monkeypatch, torch_cuda, built):
-    monkeypatch.delenv("DSMOE_BUILD_CUDA", raising=False)
+    monkeypatch.setenv("DSMOE_BUILD_CUDA", "auto")
     setup, (folder, _) = load_setup(), toolkit(tmp_path, "12.8", 80)
     reasons = setup.reasons_against_cuda(["a.cu"], torch_of(torch_cuda), folder)
     assert len(reasons) == (0 if built else 1)
@@ -147,6 +147,29 @@ def test_cuda_is_built_where_torch_and_the_toolkit_fit(tmp_path, monkeypatch, to
     else:
         with pytest.raises(SystemExit, match="DSMOE_BUILD_CUDA=1, but " + re.escape(reasons[0])):
             setup.reasons_against_cuda(["a.cu"], torch_of(torch_cuda), folder)
+
+
+def test_without_a_card_no_kernels_are_built_unless_asked(tmp_path, monkeypatch):
+    """As ./quickstart decides."""
+    asking = {"DSMOE_BUILD_CUDA": "auto", "TORCH_CUDA_ARCH_LIST": "8.6", "DSMOE_CUDA_ARCH": "all"}
+    for name in asking:
+        monkeypatch.delenv(name, raising=False)
+    setup, (folder, _) = load_setup(), toolkit(tmp_path, "12.8", 80)
+    assert setup.reasons_against_cuda(["a.cu"], torch_of("12.8", cards=1), folder) == []
+    reason, = setup.reasons_against_cuda(["a.cu"], torch_of("12.8"), folder)
+    assert "no GPU was seen" in reason and "DSMOE_BUILD_CUDA=1" in reason
+    for name, value in asking.items():
+        with monkeypatch.context() as patch:
+            patch.setenv(name, value)
+            assert setup.reasons_against_cuda(["a.cu"], torch_of("12.8"), folder) == [], name
+
+
+def test_the_build_says_how_long_it_takes(monkeypatch):
+    monkeypatch.setenv("MAX_JOBS", "2")
+    setup = load_setup()
+    said = setup.announcement(["a.cpp"] * 40, ["no GPU was seen"])  # 40 files of 6 s on 2 cores
+    assert "40 files, 2 at once, for the CPU: about 2 min (without CUDA: no GPU was seen)" in said
+    assert "for CPU and GPU: about 5 min" in setup.announcement(["a.cpp"] * 40 + ["b.cu"] * 18, [])
 
 
 def environment_sh(folder, commands):

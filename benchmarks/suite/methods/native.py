@@ -6,7 +6,7 @@ from typing import Any, Dict
 
 import torch
 
-from ....trainer.config import TrainConfig, holds_run
+from ....trainer.config import CHECKPOINT_NAME, TrainConfig, holds_run
 from ....trainer.errors import TrainerError
 from ....trainer.inspection import open_renderer
 from ....trainer.results.evaluation import evaluate
@@ -15,7 +15,6 @@ from ....trainer.results.pictures import evenly_spaced
 from ....trainer.results.rows import read_results
 from ....trainer.system import torchrun
 from ....trainer.system.process import set_up_process
-from ....trainer.training.checkpoint import CHECKPOINT_NAME
 from ....trainer.training.loop import HISTORY_NAME, train
 from ..measure import Measures
 from ..names import read_json

@@ -75,14 +75,15 @@ struct RasterizeArguments {
 struct Rendering {
   at::Tensor color;          // [C, H, W]
   at::Tensor radii;          // [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
-  at::Tensor alpha;          // [1, H, W]; the gate sum W = sum alpha_i T_i; smoe_tn, smoe_std: sum alpha_i
+  at::Tensor alpha;          // [1, H, W]; W = sum alpha_i T_i; smoe: W / D; smoe_tn, smoe_std: sum alpha_i
   at::Tensor depth;          // [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
   at::Tensor inverse_depth;  // [1, H, W]; 1 / z blended as a colour, over background 0
 };
 
 /// Renders N Gaussians. means3D: [N, 3] centres, world. opacities: [N, 1] or [N]; may exceed 1. All tensors have one
 /// type, float32 or float64, and one device. Gradients reach every tensor, those of the settings too; second
-/// derivatives do not exist. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
+/// derivatives do not exist. A Gaussian with a NaN or infinite attribute, or an opacity above 1e20, is
+/// culled: radius 0, gradients 0.
 Rendering rasterize(const at::Tensor& means3D, const at::Tensor& opacities,
                     const GaussianRasterizationSettings& settings, const RasterizeArguments& arguments = {});
 

@@ -46,7 +46,9 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["recipe"] = config.unusual_recipe()
     if config.random_background:
         unusual["random_background"] = True
-    if views[0].mask is not None:
+    if scene.note:
+        unusual["undistortion"] = "by OpenCV, bicubic; focal lengths, principal points and sizes stay"
+    if any(view.mask is not None for view in views):
         unusual["masks"] = "metrics over the kept pixels; SSIM of images times their masks"
     return {
         "scene": os.path.basename(os.path.abspath(config.scene)),
@@ -94,10 +96,14 @@ def read_results(folder: str) -> List[Dict[str, Any]]:
     try:
         with open(path, encoding="utf-8") as file:
             rows = json.load(file)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise TrainerError(f"{path}: not valid json ({error}); remove the file to measure anew") from error
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise TrainerError(f"{path}: expected a list of rows; remove the file to measure anew")
+    for row in rows:
+        for name, kind in (("protocol", dict), ("train_seconds", (int, float, type(None)))):  # what is read of it
+            if name in row and not isinstance(row[name], kind):
+                raise TrainerError(f"{path}: `{name}` is {row[name]!r}; remove the file to measure anew")
     return rows
 
 

@@ -9,10 +9,10 @@ from typing import List, Optional, Sequence, Tuple
 from ..errors import SceneError
 from ..system.files import is_file, is_folder
 from .cameras import Camera
+from .lens import Lens
 from .pointcloud import PointCloud
 
 MASKS = "masks"  # folder of a scene, beside its images
-HOLD_OUT = 8  # every 8th image of a COLMAP scene, by sorted name, is a test image
 
 
 @dataclass(frozen=True)
@@ -22,24 +22,31 @@ class PosedImage:
     camera: Camera
     path: str
     mask: Optional[str] = None  # the file that says which pixels count
+    lens: Optional[Lens] = None  # what bends the image; the camera is the pinhole camera without it
 
 
 @dataclass(frozen=True)
 class Layout:
     """What a scene folder says, images unread."""
 
-    kind: str  # "colmap" or "nerf-synthetic"
+    kind: str  # "colmap", "transforms" or "nerf-synthetic"
     train: Sequence[PosedImage]
     test: Sequence[PosedImage]
     points: PointCloud
     split: str  # how test images are chosen, for the protocol
 
 
-def hold_out(images: Sequence[PosedImage]) -> Tuple[List[PosedImage], List[PosedImage]]:
-    """Training and test images: sorted by name, every 8th from the first on is a test image."""
+def hold_out(images: Sequence[PosedImage], every: int = 8) -> Tuple[List[PosedImage], List[PosedImage], str]:
+    """Training and test images: sorted by name, every so many from the first on is a test image. And this in words.
+
+    every: 0, no test images.
+    """
     ordered = sorted(images, key=lambda image: image.camera.name)
-    train = [image for index, image in enumerate(ordered) if index % HOLD_OUT != 0]
-    return train, ordered[::HOLD_OUT]
+    if every == 0:
+        return ordered, [], "no image is kept for testing"
+    train = [image for index, image in enumerate(ordered) if index % every != 0]
+    ordinal = {2: "2nd", 3: "3rd"}.get(every, f"{every}th")
+    return train, ordered[::every], f"sorted by name, every {ordinal} is a test image"
 
 
 def check_files(paths: Sequence[str]) -> None:
@@ -56,6 +63,8 @@ def with_masks(folder: str, layout: Layout) -> Layout:
     Raises SceneError where an image has none.
     """
     masks = os.path.join(folder, MASKS)
+    if any(image.mask for image in [*layout.train, *layout.test]):  # the scene's own file names them
+        return layout
     if not is_folder(masks):
         if os.path.lexists(masks):
             raise SceneError(f"{masks} is no folder; masks must lie in one, one image each")

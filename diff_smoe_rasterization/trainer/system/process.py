@@ -2,6 +2,10 @@
 from __future__ import annotations
 
 import ctypes
+import os
+import shlex
+import shutil
+import sys
 
 import torch
 
@@ -20,6 +24,24 @@ def set_up_process(device: str) -> None:
     keep_freed_memory()
     if device == "cuda":
         torch.set_num_threads(1)
+
+
+def command() -> str:
+    """What to type for `dsmoe`, of the environment that this process runs in."""
+    script = os.path.join(os.path.dirname(sys.executable), "dsmoe")
+    if not os.path.isfile(script):
+        return f"{shlex.quote(sys.executable)} -m {__name__.partition('.')[0]}"
+    if shutil.which("dsmoe") == script:
+        return "dsmoe"
+    return shlex.quote(min(script, os.path.relpath(script), key=len))
+
+
+def pip_install(*packages: str) -> str:
+    """What to type to bring packages into the environment that this process runs in."""
+    pip = os.path.join(os.path.dirname(sys.executable), "pip")
+    if shutil.which("pip") == pip:
+        return f"pip install {' '.join(packages)}"
+    return f"{shlex.quote(sys.executable)} -m pip install {' '.join(packages)}"
 
 
 def return_spare_memory(device: torch.device) -> None:

@@ -1,10 +1,12 @@
 """Suites: what they expand to, and which mistakes are refused with the name of the field."""
+import re
 from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import yaml
 
+from diff_smoe_rasterization.benchmarks import suite as suite_package
 from diff_smoe_rasterization.benchmarks.errors import BenchError
 from diff_smoe_rasterization.benchmarks.suite import engine
 from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite, read_yaml
@@ -45,6 +47,24 @@ def test_gates_are_of_smoe_alone(content):
     names = [cell["id"] for cell in cells]
     assert [cell["id"] for cell in expand(content, "").cells] == [names[4], names[2]]
     assert names[1].startswith("native_tiny_smoe-learned_3dgs_") and names[3].startswith("native_tiny_smoe-0.05_3dgs_")
+
+
+def test_missing_libraries_are_named_with_what_to_type(monkeypatch):
+    monkeypatch.setattr(suite_package.importlib.util, "find_spec", lambda name: None if name == "snakemake" else name)
+    suite_package.require("pyyaml")
+    with pytest.raises(ImportError) as error:
+        suite_package.require("snakemake", "pyyaml")
+    assert str(error.value).startswith("dsmoe bench needs snakemake: ")
+    extra = re.search(r"^bench = (\[.*\])$", (BENCHMARKS.parent / "pyproject.toml").read_text(), re.MULTILINE).group(1)
+    for name in re.findall(r"[\"](\w+)", extra):
+        assert re.search(rf"pip install .*\b{name}\b", str(error.value)), name
+
+
+def test_auto_becomes_the_device_of_this_machine(content):
+    """And the command's --device goes before the suite's."""
+    protocol = {**content["protocol"], "device": "auto"}
+    assert expand(dict(content, protocol=protocol), "").protocol["device"] == "cpu"
+    assert expand(dict(content, protocol=protocol), "", device="cuda").cells[0]["protocol"]["device"] == "cuda"
 
 
 def test_the_name_of_a_cell_is_that_of_its_figures(content, tmp_path):

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shlex
 import shutil
 import subprocess
@@ -14,7 +15,7 @@ from PIL import Image
 from diff_smoe_rasterization import cli
 from diff_smoe_rasterization.io import read_gaussians
 from diff_smoe_rasterization.settings import record_of
-from diff_smoe_rasterization.trainer import quickstart
+from diff_smoe_rasterization.trainer import quickstart, short_run
 from diff_smoe_rasterization.trainer.results.pictures import busiest_window, comparison, evenly_spaced
 from diff_smoe_rasterization.trainer.system import files
 
@@ -99,6 +100,18 @@ def test_another_scene_is_refused_and_no_picture_is_stale(tiny_scene, output, tm
                                                                   "mine.png"]
 
 
+@pytest.mark.parametrize("name", ["alpha", "scene"])
+def test_nothing_is_written_where_a_link_in_the_folder_leads(tiny_scene, tmp_path, capsys, name):
+    output, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    output.mkdir()
+    elsewhere.mkdir()
+    (output / name).symlink_to(elsewhere)
+    files.write_json_atomically(str(output / ".dsmoe.json"), {"command": "quickstart", "of": tiny_scene, "files": []})
+    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "10", "--quiet"]) == 1
+    assert f"{output / name} leads to {elsewhere} by a link" in capsys.readouterr().err
+    assert not list(elsewhere.iterdir())
+
+
 def test_given_options_win_over_chosen_ones(tiny_scene):
     chosen = quickstart.choose_options(tiny_scene, {})
     assert (chosen.iterations, chosen.densify_until_iter, chosen.schedule) == (2000, 1000, "steady")
@@ -109,14 +122,35 @@ def test_given_options_win_over_chosen_ones(tiny_scene):
 
 
 def test_large_scenes_are_reduced_and_told(monkeypatch, tiny_scene, capsys):
-    monkeypatch.setattr(quickstart, "MAX_PIXELS", 200)  # of 32x24: width 16.3
-    monkeypatch.setattr(quickstart, "MAX_POINTS", 50)
+    monkeypatch.setattr(short_run, "MAX_PIXELS", 200)  # of 32x24: width 16.3
+    monkeypatch.setattr(short_run, "MAX_POINTS", 50)
     config = quickstart.choose_options(tiny_scene, {})
     assert (config.resolution, config.init_points) == (16, 50)
     text = capsys.readouterr().out
     assert "--resolution 16" in text and "--init-points 50" in text
     config = quickstart.choose_options(tiny_scene, {"resolution": 1})
     assert (config.resolution, config.init_points) == (1, 50)
+
+
+def test_a_gpu_trains_at_full_size(monkeypatch, tiny_scene, capsys):
+    monkeypatch.setattr(short_run, "MAX_PIXELS", 200)
+    config = quickstart.choose_options(tiny_scene, {"device": "cuda"})
+    assert (config.resolution, config.init_points, config.device) == (-1, 0, "cuda")
+    assert config.iterations > 2000 and config.densify_until_iter == config.iterations // 2
+    assert "about a minute: --iterations" in capsys.readouterr().out
+
+
+def test_each_scene_has_a_folder_of_its_name(tiny_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    scenes = [shutil.copytree(tiny_scene, str(tmp_path / parent / "garden")) for parent in ("one", "two")]
+    for scene in [*scenes, scenes[0]]:
+        assert quickstart.main([scene, "--iterations", "10", "--quiet"]) == 0
+        assert capsys.readouterr().out.startswith("device: cpu (")
+    assert sorted(os.listdir("quickstart_output")) == ["garden", "garden_2"]
+    subjects = [json.loads((tmp_path / "quickstart_output" / name / ".dsmoe.json").read_text())["of"]
+                for name in ("garden", "garden_2")]
+    assert subjects == scenes
+    assert quickstart.default_output(quickstart.MADE_UP) == "quickstart_output/room"
 
 
 def test_errors_are_one_line(tmp_path, capsys):

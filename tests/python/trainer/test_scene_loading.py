@@ -1,6 +1,7 @@
 """Scene folders, good and damaged: what is loaded, and which error names which file."""
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.trainer.config import TrainConfig
@@ -19,7 +21,8 @@ from diff_smoe_rasterization.trainer.scenes.cameras import Camera
 from diff_smoe_rasterization.trainer.scenes.images import target_size
 from diff_smoe_rasterization.trainer.scenes.layout import PosedImage, hold_out
 from diff_smoe_rasterization.trainer.scenes.pointcloud import PointCloud
-from diff_smoe_rasterization.trainer.scenes.scene import load_cameras, load_scene
+from diff_smoe_rasterization.trainer.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
+from diff_smoe_rasterization.trainer.training.loop import Trainer
 
 
 def load(folder, **options):
@@ -60,10 +63,17 @@ def test_every_eighth_image_by_sorted_name_is_a_test_image():
     shuffled = [names[(7 * index) % 20] for index in range(20)]
     camera = Camera("", np.eye(3), np.zeros(3), 1, 1, 1, 1, 2, 2)
     images = [PosedImage(Camera(**{**camera.__dict__, "name": name}), name) for name in shuffled]
-    train, test = hold_out(images)
+    train, test, _ = hold_out(images)
     assert [image.camera.name for image in test] == ["00.png", "08.png", "16.png"]
     assert [image.camera.name for image in train] == [name for name in names if name not in
                                                       ("00.png", "08.png", "16.png")]
+
+
+@pytest.mark.parametrize("every, tests, words", [(3, [0, 3, 6], "every 3rd"), (0, [], "no image"), (8, [0, 8], "8th")])
+def test_how_many_images_are_kept_for_testing(tiny_scene, every, tests, words):
+    scene = load(tiny_scene, test_every=every)
+    assert [view.camera.name for view in scene.test] == [f"view_{index:03d}.png" for index in tests]
+    assert len(scene.train) == 9 - len(tests) and words in scene.split
 
 
 @pytest.mark.parametrize("size, resolution, expected", [
@@ -132,6 +142,34 @@ def test_simple_pinhole(colmap_folder):
     io.write_colmap(model.folder, model, text=True)
     camera = load(colmap_folder).train[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 30, 15, 11)
+
+
+def test_several_cameras_and_sizes(colmap_folder):
+    """Every other view has a camera of its own: 48x30 pixels, another focal length."""
+    model = io.read_colmap(colmap_folder)
+    model.cameras[2] = io.ColmapCamera(2, "PINHOLE", 48, 30, np.array([50.0, 51.0, 24.0, 15.0]))
+    images = [dataclasses.replace(image, camera_id=1 + index % 2) for index, image in enumerate(model.images)]
+    io.write_colmap(model.folder, dataclasses.replace(model, images=images), text=True)
+    for image in images[1::2]:
+        path = os.path.join(colmap_folder, "images", image.name)
+        Image.open(path).resize((48, 30)).save(path)
+    config = TrainConfig(scene=colmap_folder, iterations=8)
+    scene = load_scene(config, progress=False)
+    assert {view.camera.name: (view.camera.width, view.camera.fx) for view in scene.train + scene.test} == {
+        image.name: (48, 50.0) if image.camera_id == 2 else (32, 28.8) for image in images}
+    assert "32x24 to 48x30 pixels" in describe_scene(scene, read_layout(config), config)
+    trainer = Trainer(config, scene)
+    for _ in range(7):  # each view once
+        trainer.step()
+    assert math.isfinite(trainer.evaluate().metrics["psnr"])
+
+
+def test_rigs_and_frames_of_colmap_4_change_nothing(colmap_folder):
+    expected = load(colmap_folder)
+    for name in ("rigs.bin", "frames.bin", "rigs.txt", "frames.txt"):
+        with open(os.path.join(colmap_folder, "sparse", "0", name), "wb") as file:
+            file.write(b"\x01" * 40)
+    assert [view.camera.name for view in load(colmap_folder).train] == [view.camera.name for view in expected.train]
 
 
 def test_images_smaller_than_their_camera(colmap_folder):
@@ -215,6 +253,102 @@ def test_nerf_explicit_intrinsics(nerf_folder):
 def test_nerf_without_a_test_set(nerf_folder):
     (nerf_folder / "transforms_test.json").unlink()
     assert len(load(nerf_folder).test) == 0
+
+
+@pytest.fixture
+def transforms_folder(tmp_path):
+    """transforms.json as nerfstudio writes it: 10 frames on a circle, 20x10 pixels, intrinsics of each frame."""
+    os.makedirs(tmp_path / "images")
+    frames = []
+    for index in range(10):
+        name = f"images/frame_{index:05d}.jpg"
+        Image.new("RGB", (20, 10), (25 * index, 0, 0)).save(tmp_path / name, quality=100)
+        turn = Rotation.from_euler("y", 36 * index, degrees=True).as_matrix()
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn, turn @ [0, 0, 2]  # looks at the origin from a distance of 2
+        frames.append({"file_path": name, "transform_matrix": matrix.tolist(), "fl_x": 20.0 + index,
+                       "fl_y": 21.0 + index, "cx": 10.5, "cy": 5.0, "w": 20, "h": 10})
+    (tmp_path / "transforms.json").write_text(json.dumps(
+        {"camera_model": "OPENCV", "k1": 0.0, "k2": 0, "p1": 0, "p2": 0, "applied_transform": np.eye(4)[:3].tolist(),
+         "frames": frames}))
+    return tmp_path
+
+
+def test_transforms_with_intrinsics_of_each_frame(transforms_folder):
+    edit_json(transforms_folder / "transforms.json", lambda content: content["frames"][3].update(
+        file_path="images/frame_00003"))  # the ending is found
+    scene = load(transforms_folder)
+    assert (scene.kind, len(scene.train), len(scene.test)) == ("transforms", 8, 2)
+    assert scene.train[2].camera.name == "images/frame_00003.jpg"
+    assert [view.camera.name for view in scene.test] == ["images/frame_00000.jpg", "images/frame_00008.jpg"]
+    camera = scene.train[0].camera  # of frame 1
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (21, 22, 10.5, 5)
+    np.testing.assert_allclose(camera.rotation @ [0, 0, 0] + camera.translation, [0, 0, 2], rtol=0, atol=1e-12)
+    # Without a file of points they fill a cube about what the cameras look at, and reach behind it.
+    assert scene.points.positions.shape == (100_000, 3)
+    np.testing.assert_allclose(np.abs(scene.points.positions).max(axis=0), 3.0, rtol=0, atol=0.01)
+
+
+def test_transforms_of_a_colmap_scene_are_that_scene(colmap_folder, tmp_path):
+    """nerfstudio's conversion, written out: camera to world, with y up and z backward."""
+    expected, model, frames = load(colmap_folder), io.read_colmap(colmap_folder), []
+    shutil.copytree(os.path.join(colmap_folder, "images"), str(tmp_path / "json" / "images"))
+    for image in model.images:
+        w, x, y, z = image.qvec
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation.T * [1, -1, -1]
+        matrix[:3, 3] = -rotation.T @ image.tvec
+        frames.append({"file_path": f"images/{image.name}", "transform_matrix": matrix.tolist()})
+    fx, fy, cx, cy = model.cameras[1].params
+    io.write_points(str(tmp_path / "json" / "points.ply"), model.points)
+    (tmp_path / "json" / "transforms.json").write_text(json.dumps(
+        {"camera_model": "PINHOLE", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": 32, "h": 24,
+         "ply_file_path": "points.ply", "frames": frames}))
+    scene = load(tmp_path / "json")
+    for views, theirs in ((scene.train, expected.train), (scene.test, expected.test)):
+        assert [view.camera.name for view in views] == [f"images/{view.camera.name}" for view in theirs]
+        for view, other in zip(views, theirs):
+            np.testing.assert_allclose(view.camera.rotation, other.camera.rotation, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(view.camera.translation, other.camera.translation, rtol=0, atol=1e-12)
+            assert torch.equal(view.image, other.image) and view.camera.fx == other.camera.fx
+    np.testing.assert_allclose(scene.points.positions, expected.points.positions, rtol=1e-6, atol=1e-6)  # float32
+    assert scene.split == expected.split and scene.extent == pytest.approx(expected.extent)
+
+
+def test_transforms_with_points_masks_and_listed_images(transforms_folder):
+    positions = np.arange(15.0).reshape(5, 3)
+    io.write_points(str(transforms_folder / "sparse_pc.ply"), io.Points(positions, np.full((5, 3), 51, np.uint8)))
+    os.makedirs(transforms_folder / "masks")
+    Image.new("L", (20, 10), 255).save(transforms_folder / "masks" / "one.png")
+
+    def edit(content):
+        names = [frame["file_path"] for frame in content["frames"]]
+        content.update(ply_file_path="./sparse_pc.ply", train_filenames=["./" + name for name in names[:6]],
+                       val_filenames=names[6:7], test_filenames=names[7:9])
+        for frame in content["frames"]:
+            frame["mask_path"] = "masks/one.png"
+
+    edit_json(transforms_folder / "transforms.json", edit)
+    scene = load(transforms_folder, test_every=2)
+    np.testing.assert_array_equal(scene.points.positions, positions)
+    assert [view.camera.name[-5] for view in scene.train] == list("012345")
+    assert [view.camera.name[-5] for view in scene.test] == list("78")
+    assert scene.split == "transforms.json lists the test images" and scene.train[0].mask.shape == (1, 10, 20)
+    for names, train, test in ((["train"], "012345", "6789"), (["test"], "0123456" + "9", "78"),
+                               (["val"], "012345" + "789", "6")):
+        left = json.loads((transforms_folder / "transforms.json").read_text())
+        for kind in {"train", "test", "val"} - {*names}:
+            left.pop(f"{kind}_filenames")
+        other = transforms_folder / f"only_{names[0]}"
+        other.mkdir()
+        for name in ("images", "masks", "sparse_pc.ply"):
+            os.symlink(transforms_folder / name, other / name)
+        (other / "transforms.json").write_text(json.dumps(left))
+        scene = load(other)
+        assert ["".join(view.camera.name[-5] for view in views) for views in (scene.train, scene.test)] == [train, test]
+    edit_json(transforms_folder / "transforms.json", lambda content: content.update(test_filenames=["images/no.jpg"]))
+    refused(transforms_folder, "transforms.json", "`test_filenames` names images/no.jpg, which is no frame")
 
 
 def write_masks(folder, size=(32, 24), name="{}.png", value=255):
@@ -323,6 +457,17 @@ def test_an_unreadable_image(colmap_folder):
     refused(colmap_folder, "view_004.png", "not a readable image")
 
 
+def test_a_format_that_runs_another_program_is_refused(colmap_folder, monkeypatch):
+    """EPS, on which Pillow runs Ghostscript, under the name of a PNG; JPEG under that name is read."""
+    path, ran = os.path.join(colmap_folder, "images", "view_004.png"), []
+    monkeypatch.setattr("PIL.EpsImagePlugin.Ghostscript", lambda *arguments, **more: ran.append(arguments))
+    Image.new("RGB", (32, 24)).save(path, format="EPS")
+    refused(colmap_folder, "view_004.png", "not a readable image")
+    assert not ran
+    Image.new("RGB", (32, 24)).save(path, format="JPEG")
+    load(colmap_folder)
+
+
 @pytest.mark.parametrize("dtype, kind", [(np.uint16, "PNG"), (np.int32, "TIFF"), (np.float32, "TIFF")])
 def test_more_than_8_bits(colmap_folder, dtype, kind):
     path = os.path.join(colmap_folder, "images", "view_004.png")
@@ -367,11 +512,11 @@ def test_a_model_with_one_image(colmap_folder):
     refused(colmap_folder, "no training image is left")
 
 
-def test_a_camera_with_distortion(colmap_folder):
+def test_a_camera_model_that_opencv_does_not_have(colmap_folder):
     model = io.read_colmap(colmap_folder)
-    model.cameras[1] = io.ColmapCamera(1, "OPENCV", 32, 24, np.array([30.0, 30, 16, 12, 0.1, 0, 0, 0]))
+    model.cameras[1] = io.ColmapCamera(1, "FOV", 32, 24, np.array([30.0, 30, 16, 12, 0.1]))
     io.write_colmap(model.folder, model, text=True)
-    refused(colmap_folder, "camera 1", "OPENCV", "PINHOLE", "colmap image_undistorter")
+    refused(colmap_folder, "camera 1", "FOV", "PINHOLE", "OPENCV_FISHEYE", "colmap image_undistorter")
 
 
 def test_a_focal_length_of_zero(colmap_folder):
@@ -381,10 +526,35 @@ def test_a_focal_length_of_zero(colmap_folder):
     refused(colmap_folder, "cameras.txt", "camera 1", "focal length")
 
 
+def test_an_image_that_is_listed_twice(colmap_folder, nerf_folder):
+    """The second one, with a pose of its own, would be trained on too, or be a test image that was trained on."""
+    model = io.read_colmap(colmap_folder)
+    double = io.ColmapImage(99, "./view_003.png", 1, model.images[5].qvec, model.images[5].tvec)
+    for text in (True, False):
+        io.write_colmap(model.folder, io.ColmapModel(model.cameras, [*model.images, double], model.points), text=text)
+        refused(colmap_folder, "view_003.png is listed twice")
+    edit_json(nerf_folder / "transforms_train.json", lambda content: content["frames"].extend(content["frames"]))
+    refused(nerf_folder, "r_0.png is listed twice")
+
+
+@pytest.mark.parametrize("large", [1e300, -2e9])
+def test_cameras_that_float32_cannot_hold(colmap_folder, large):
+    model = io.read_colmap(colmap_folder)
+    model.images[3].tvec[1] = large
+    io.write_colmap(model.folder, model, text=True)
+    refused(colmap_folder, "camera of view_003.png", "above 1e+09")
+    model.images[3].tvec[1], model.cameras[1].params[2] = 0.0, large
+    io.write_colmap(model.folder, model, text=True)
+    refused(colmap_folder, "cx", "above 1e+09")
+
+
 def test_points_that_are_not_finite():
     positions = np.zeros((5, 3))
     positions[3, 1] = math.nan
     with pytest.raises(SceneError, match="cloud.ply: point 3 .*NaN"):
+        PointCloud(positions, np.zeros((5, 3))).checked("cloud.ply")
+    positions[3, 1] = -1e39
+    with pytest.raises(SceneError, match="cloud.ply: point 3 .*float32 cannot hold"):
         PointCloud(positions, np.zeros((5, 3))).checked("cloud.ply")
 
 
@@ -402,7 +572,9 @@ def frame(**values):
     (without("camera_angle_x"), ["camera_angle_x", "None"]),
     (lambda content: content.update(camera_angle_x="wide"), ["camera_angle_x", "wide"]),
     (lambda content: content.update(camera_angle_x=4.0), ["camera_angle_x", "4.0"]),
-    (lambda content: content.update(k1=0.1), ["k1", "undistort"]),
+    (lambda content: content.update(k4=0.1), ["`k4` is of a fisheye's lens", "OPENCV"]),
+    (frame(camera_model="EQUIRECTANGULAR"), ["frame 0", "EQUIRECTANGULAR", "OPENCV_FISHEYE"]),
+    (frame(mask_path="masks/none.png"), ["frame 0", "`mask_path`", "no such file"]),
     (lambda content: content.update(cx="middle"), ["cx", "middle"]),
     (frame(file_path=None), ["frame 0", "file_path"]),
     (frame(file_path="./train/r_9"), ["r_9.png", "no such image"]),

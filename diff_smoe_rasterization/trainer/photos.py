@@ -1,0 +1,253 @@
+"""Photographs to a scene: COLMAP, by pycolmap, finds where each was taken and removes the lens distortion."""
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sqlite3
+import threading
+import time
+import urllib.parse
+from dataclasses import dataclass
+from typing import Any, Callable, List, Optional, Sequence, Tuple
+
+from PIL import Image
+
+from .errors import SceneError, TrainerError
+from .scenes.images import UNREADABLE, image_size
+from .system.files import is_folder
+from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
+from .system.process import pip_install
+from .system.progress import progress_bar
+
+SCENE = "dsmoe scene"  # in its folder's record
+WORK = "colmap"  # folder in the scene's: the database, which a second run goes on with
+ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
+VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
+MOST_EXHAUSTIVE = 200  # photographs, up to which "auto" compares all pairs
+MIN_PHOTOS = 3
+POLL_SECONDS = 0.5
+FOCAL_LENGTH, EXIF = 37386, 0x8769  # tags
+ADVICE = ("Neighbouring photographs should show two thirds of the same things, sharply, with texture, from places that "
+          "differ: walk around, do not only turn the camera. ")
+
+
+@dataclass(frozen=True)
+class Made:
+    """What became of the photographs."""
+
+    folder: str
+    photos: int
+    registered: int
+    points: int
+    error: float  # mean reprojection error, pixels
+    left_out: List[str]
+
+    def __str__(self) -> str:
+        more = ", ..." if self.left_out[3:] else ""
+        left = f" (left out: {', '.join(self.left_out[:3])}{more})" if self.left_out else ""
+        return (f"{self.registered} of {self.photos} photographs are placed{left}; {self.points:,} points, mean "
+                f"reprojection error {self.error:.2f} pixels")
+
+
+def make_scene(photos: str, output: str, matching: str = "auto", camera_model: str = "OPENCV", progress: bool = True,
+               say: Callable[[str], None] = lambda text: None) -> Made:
+    """Writes a COLMAP scene of the photographs in a folder: pinhole images, and where each was taken.
+
+    matching: "exhaustive" compares all pairs, "sequential" neighbours by name, "auto" all pairs of up to
+    MOST_EXHAUSTIVE. say: is called with a line before each step. Raises SceneError, also where the photographs do not
+    connect, and TrainerError without pycolmap.
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise TrainerError(f"dsmoe scene needs COLMAP's Python package: {pip_install('pycolmap')}") from error
+    names = photo_names(photos, output)
+    own_record(output, SCENE)  # refused before anything is made
+    make_folder(output)
+    with only_one(output):
+        earlier = own_record(output, SCENE)
+        subject = os.path.abspath(photos)
+        if earlier.subject not in ("", subject):
+            raise SceneError(f"{output} holds the scene of other photographs, {earlier.subject}; choose another folder "
+                             "with -o, or remove it")
+        work = os.path.join(output, WORK)
+        os.makedirs(work, exist_ok=True)
+        write_record(output, SCENE, Record(subject, earlier.files), earlier.files)
+        pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # from now on it says errors alone
+        best = _placed(pycolmap, photos, names, work, matching, camera_model, progress, say)
+        say("undistorting")
+        pinhole = os.path.join(work, "undistorted")
+        shutil.rmtree(pinhole, ignore_errors=True)
+        _while_counting(pycolmap, lambda token: pycolmap.undistort_images(
+            pinhole, os.path.join(work, "best"), photos, cancellation_token=token),
+            lambda: _count_files(os.path.join(pinhole, "images")), best.num_reg_images(), "undistortion", progress)
+        files = _taken_over(pinhole, output, subject, earlier.files)
+        write_record(output, SCENE, Record(subject, files), files)
+    placed = {best.images[number].name for number in best.reg_image_ids()}
+    return Made(output, len(names), len(placed), best.num_points3D(), best.compute_mean_reprojection_error(),
+                sorted({*names} - placed))
+
+
+def photo_names(folder: str, output: str) -> List[str]:
+    """The photographs below a folder, by their paths in it; hidden files and the folder `output` are left out.
+
+    Raises SceneError where they are too few.
+    """
+    if not is_folder(folder):
+        kind = " is a file; of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
+        raise SceneError(f"{folder}{kind if os.path.isfile(folder) else ': no such folder of photographs'}")
+    made = os.path.join(os.path.realpath(output), "")
+    names = sorted(os.path.relpath(os.path.join(place, name), folder) for place, _, files in os.walk(folder)
+                   if not os.path.join(os.path.realpath(place), "").startswith(made)
+                   for name in files if not name.startswith("."))
+    found = [name for name in names if name.lower().endswith(ENDINGS)]
+    if len(found) < MIN_PHOTOS:
+        other = next((name for name in names if name.lower().endswith(UNKNOWN_ENDINGS + VIDEO_ENDINGS)), None)
+        hint = f"; {other} is of a kind that COLMAP does not read: convert it to JPEG" if other else ""
+        raise SceneError(f"{folder}: {len(found)} photographs ({', '.join(ENDINGS)}) are in it; at least {MIN_PHOTOS} "
+                         f"are needed{hint}")
+    return found
+
+
+def _placed(pycolmap: Any, photos: str, names: List[str], work: str, matching: str, camera_model: str,
+            progress: bool, say: Callable[[str], None]) -> Any:
+    """The largest model that COLMAP makes of the photographs, which it also writes to WORK/best. Raises SceneError."""
+    database, count = os.path.join(work, "database.db"), len(names)
+    one_camera = _are_of_one_camera(photos, names)
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = camera_model
+    mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
+    say(f"finding features in {count} photographs of {'one camera' if one_camera else 'several cameras'}, on the "
+        f"{'GPU' if pycolmap.has_cuda else 'CPU'}")
+    _while_counting(pycolmap, lambda token: pycolmap.extract_features(
+        database, photos, names, mode, reader, cancellation_token=token),
+        lambda: _count_rows(database, "descriptors"), count, "features", progress)
+    if matching == "auto":
+        matching = "exhaustive" if count <= MOST_EXHAUSTIVE else "sequential"
+    pairs = count * (count - 1) // 2
+    if matching == "exhaustive":
+        say(f"comparing all {pairs:,} pairs")
+        _while_counting(pycolmap, lambda token: pycolmap.match_exhaustive(database, cancellation_token=token),
+                        lambda: _count_rows(database, "two_view_geometries"), pairs, "pairs", progress)
+    else:
+        say("comparing neighbours, as sorted by name; --matching exhaustive compares all pairs, which takes longer")
+        _while_counting(pycolmap, lambda token: pycolmap.match_sequential(database, cancellation_token=token),
+                        lambda: _count_rows(database, "two_view_geometries"), None, "pairs", progress)
+    say("placing them")
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = max(MIN_PHOTOS, min(10, count // 2))
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
+    models = os.path.join(work, "models")
+    shutil.rmtree(models, ignore_errors=True)
+    os.makedirs(models)
+    with progress_bar(total=count, desc="photographs", unit="photograph", leave=False, disable=not progress) as bar:
+        made = _in_thread(pycolmap, lambda token: pycolmap.incremental_mapping(
+            database, photos, models, options, initial_image_pair_callback=lambda: bar.update(2),
+            next_image_callback=lambda: bar.update(1), cancellation_token=token))
+    best = max(made.values(), key=lambda model: model.num_reg_images(), default=None)
+    registered = best.num_reg_images() if best else 0
+    if registered < max(MIN_PHOTOS, count / 2):
+        more = "" if matching == "exhaustive" else "Only neighbours by name were compared: try --matching exhaustive. "
+        raise SceneError(f"{photos}: only {registered} of {count} photographs connect to each other. {more}{ADVICE}"
+                         "Remove blurred ones, add some between those that do not connect, and type the same command "
+                         "again")
+    shutil.rmtree(os.path.join(work, "best"), ignore_errors=True)
+    os.makedirs(os.path.join(work, "best"))
+    best.write(os.path.join(work, "best"))
+    return best
+
+
+def _are_of_one_camera(photos: str, names: Sequence[str]) -> bool:
+    """Whether all have one size, and one focal length where they record it."""
+    kinds = set()
+    for name in names:
+        path = os.path.join(photos, name)
+        kinds.add((image_size(path), _recorded_focal_length(path)))
+    return len(kinds) == 1
+
+
+def _recorded_focal_length(path: str) -> Optional[float]:
+    try:
+        with Image.open(path) as file:
+            return float(file.getexif().get_ifd(EXIF)[FOCAL_LENGTH])
+    except (*UNREADABLE, KeyError, TypeError, ZeroDivisionError):
+        return None
+
+
+def _taken_over(made: str, output: str, subject: str, earlier: Sequence[str]) -> List[str]:
+    """Moves images and model of COLMAP's undistortion to where a scene has them; returns their paths in `output`."""
+    moves: List[Tuple[str, str]] = []
+    for folder, place in (("images", "images"), ("sparse", os.path.join("sparse", "0"))):
+        for where, _, files in os.walk(os.path.join(made, folder)):
+            for name in files:
+                source = os.path.join(where, name)
+                moves.append((source, os.path.join(place, os.path.relpath(source, os.path.join(made, folder)))))
+    files = sorted(target for _, target in moves)
+    write_record(output, SCENE, Record(subject, files), earlier)
+    remove_files(output, files)
+    for source, target in moves:
+        os.makedirs(os.path.dirname(os.path.join(output, target)), exist_ok=True)
+        shutil.move(source, os.path.join(output, target))
+    shutil.rmtree(made)
+    return files
+
+
+def _while_counting(pycolmap: Any, work: Callable[[Any], Any], done: Callable[[], int], total: Optional[int], what: str,
+                    progress: bool) -> None:
+    """Does the work, as `_in_thread`, and shows meanwhile how much of it is done."""
+    with progress_bar(total=total, desc=what, leave=False, disable=not progress) as bar:
+        def show() -> None:
+            bar.update(max(0, done() - bar.n))
+
+        _in_thread(pycolmap, work, show)
+
+
+def _in_thread(pycolmap: Any, work: Callable[[Any], Any], show: Callable[[], None] = lambda: None) -> Any:
+    """The result of the work, which another thread does, so that this one can show how far it is.
+
+    work: is given a token that cancels it, which Ctrl-C does. COLMAP's errors become SceneErrors.
+    """
+    outcome: List[Any] = []
+    token = pycolmap.CancellationToken()
+
+    def run() -> None:
+        try:
+            outcome.append(work(token))
+        except Exception as error:
+            outcome.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    shown = 0.0
+    try:
+        while thread.is_alive():
+            thread.join(0.05)
+            if time.monotonic() - shown > POLL_SECONDS:
+                shown = time.monotonic()
+                show()
+    except KeyboardInterrupt:
+        token.cancel()
+        thread.join()  # it must not outlive Python
+        raise
+    if isinstance(outcome[0], Exception):
+        raise SceneError(f"COLMAP: {outcome[0]}") from outcome[0]
+    return outcome[0]
+
+
+def _count_rows(database: str, table: str) -> int:
+    """How many rows are in the file, without what is in its journal yet; 0 where it cannot be read at the moment.
+
+    immutable: no lock is taken, on which COLMAP would end the process.
+    """
+    try:
+        address = f"file:{urllib.parse.quote(os.path.abspath(database))}?immutable=1"
+        with contextlib.closing(sqlite3.connect(address, uri=True)) as connection:
+            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+def _count_files(folder: str) -> int:
+    return sum(len(files) for _, _, files in os.walk(folder))

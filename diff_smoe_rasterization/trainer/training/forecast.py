@@ -1,0 +1,61 @@
+"""How long a training on a processor will take, said as soon as its first steps show it."""
+from __future__ import annotations
+
+import time
+from typing import Optional
+
+from ..config import TrainConfig, flags_text
+from ..scenes.scene import Scene
+from ..short_run import short_run
+
+STEPS = 10  # that are measured, behind the first one, which is slower
+ENOUGH_SECONDS = 20.0  # or as many steps as take so long
+LONG_SECONDS = 900.0  # from which on a shorter training is proposed
+
+
+class Forecast:
+    """Call it after each step; it returns what to say once, else None."""
+
+    def __init__(self, config: TrainConfig, scene: Scene) -> None:
+        self.config = config
+        camera = scene.train[0].camera
+        chosen = short_run("cpu", camera.width, camera.height, len(scene.points.positions))
+        self.shorter = chosen if config.iterations > chosen["iterations"] or len(chosen) > 3 else {}
+        self.begun: Optional[float] = None
+        self.first = 0
+        self.said = False
+
+    def __call__(self, iteration: int) -> Optional[str]:
+        if self.said:
+            return None
+        now = time.monotonic()
+        if self.begun is None:
+            self.begun, self.first = now, iteration
+            return None
+        steps = (iteration - self.first) // self.config.batch
+        if steps < STEPS and now - self.begun < ENOUGH_SECONDS:
+            return None
+        self.said = True
+        left = self.config.iterations - iteration
+        seconds = left * (now - self.begun) / (iteration - self.first)
+        return self.text(left, seconds) if left else None
+
+    def text(self, left: int, seconds: float) -> str:
+        """left: iterations."""
+        line = (f"at this speed the other {left:,} iterations take about {duration(seconds)}, longer as Gaussians are "
+                "added")
+        if seconds < LONG_SECONDS or not self.shorter:
+            return line
+        options = flags_text(self.shorter)
+        return f"{line}. A GPU takes minutes. For minutes on this processor: --overwrite --scale-recipe {options}"
+
+
+def duration(seconds: float) -> str:
+    """In words, to two digits or so."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 90 * 60:
+        return f"{seconds / 60:.0f} min"
+    if seconds < 48 * 3600:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 86400:.1f} days"

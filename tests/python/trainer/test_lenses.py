@@ -1,0 +1,200 @@
+"""Distorted images are loaded as those of a pinhole camera: every model against its formula, masks, and the cache."""
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.optimize import brentq
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.cli import main
+from diff_smoe_rasterization.trainer.config import TrainConfig
+from diff_smoe_rasterization.trainer.errors import SceneError
+from diff_smoe_rasterization.trainer.scenes import undistortion
+from diff_smoe_rasterization.trainer.scenes.lens import lens_of
+from diff_smoe_rasterization.trainer.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
+
+WIDTH, HEIGHT = 96, 72
+FX, FY, CX, CY = 70.0, 72.0, 46.5, 37.0
+needs_opencv = pytest.mark.skipif(undistortion._opencv() is None, reason="pip install opencv-python-headless")
+
+
+def bend(model, x, y, k):
+    """COLMAP's formulas: from the plane at depth 1 to the one that the lens makes of it."""
+    r2 = x * x + y * y
+    if "FISHEYE" in model:
+        r = np.sqrt(r2)
+        angle = np.arctan(r)
+        k = [*k, 0, 0, 0, 0][:4]
+        bent = angle * (1 + sum(value * angle ** (2 * power) for power, value in enumerate(k, 1)))
+        scale = np.where(r > 1e-9, bent / np.maximum(r, 1e-9), 1)
+        return x * scale, y * scale
+    k = {"SIMPLE_RADIAL": [*k, 0, 0, 0], "RADIAL": [*k, 0, 0]}.get(model, list(k))
+    k1, k2, p1, p2, k3, k4, k5, k6 = [*k, 0, 0, 0, 0][:8]
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+
+
+def colour(x, y):
+    """[..., 3] of the ray through (x, y) on the plane at depth 1: smooth, and different everywhere."""
+    return 127 + 100 * np.stack([np.sin(6 * x) * np.cos(5 * y), np.sin(4 * x + 3 * y), np.cos(5 * x - 4 * y)], axis=-1)
+
+
+def bent_image(model, k):
+    """What a camera with that lens sees of `colour`: the ray of each pixel by inverting the formula step by step."""
+    columns, rows = np.meshgrid((np.arange(WIDTH) + 0.5 - CX) / FX, (np.arange(HEIGHT) + 0.5 - CY) / FY)
+    x, y = columns.copy(), rows.copy()
+    for _ in range(200):
+        u, v = bend(model, x, y, k)
+        x, y = x + 0.7 * (columns - u), y + 0.7 * (rows - v)
+    assert np.abs(np.stack(bend(model, x, y, k)) - [columns, rows]).max() < 1e-9
+    return Image.fromarray(colour(x, y).round().astype(np.uint8))
+
+
+def write_scene(folder, model, params, image, count=3):
+    """A COLMAP scene of so many equal images, with 12 points."""
+    os.makedirs(folder / "images", exist_ok=True)
+    for index in range(count):
+        image.save(folder / "images" / f"{index}.png")
+    points = io.Points(np.random.RandomState(0).normal(0, 1, (12, 3)) + [0, 0, 4], np.full((12, 3), 128, np.uint8))
+    images = [io.ColmapImage(index + 1, f"{index}.png", 1, np.array([1.0, 0, 0, 0]), np.array([0.1 * index, 0, 0]))
+              for index in range(count)]
+    cameras = {1: io.ColmapCamera(1, model, WIDTH, HEIGHT, np.array(params, np.float64))}
+    io.write_colmap(str(folder / "sparse" / "0"), io.ColmapModel(cameras, images, points))
+    return str(folder)
+
+
+def load(folder, **options):
+    return load_scene(TrainConfig(scene=str(folder), **options), progress=False)
+
+
+LENSES = [
+    ("SIMPLE_RADIAL", False, [-0.12]), ("RADIAL", False, [-0.1, 0.03]), ("OPENCV", True, [-0.15, 0.04, 0.004, -0.006]),
+    ("OPENCV", True, [0.2, 0.05, 0, 0]),
+    ("FULL_OPENCV", True, [-0.1, 0.05, 0.003, 0.002, 0.01, 0.02, -0.01, 0.005]),
+    ("OPENCV_FISHEYE", True, [0.03, -0.01, 0.004, -0.001]), ("RADIAL_FISHEYE", False, [0.03, -0.01]),
+    ("SIMPLE_RADIAL_FISHEYE", False, [0.05]), ("FISHEYE", True, []),
+]
+
+
+@needs_opencv
+@pytest.mark.parametrize("model, two_focals, k", LENSES)
+def test_every_model_becomes_a_pinhole_camera(tmp_path, monkeypatch, model, two_focals, k):
+    monkeypatch.setitem(globals(), "FY", FY if two_focals else FX)
+    params = [*([FX, FY] if two_focals else [FX]), CX, CY, *k]
+    folder = write_scene(tmp_path, model, params, bent_image(model, k))
+    view = load(folder).train[0]
+    camera = view.camera
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (WIDTH, HEIGHT, FX, FY, CX, CY)
+    x, y = np.meshgrid((np.arange(WIDTH) + 0.5 - CX) / FX, (np.arange(HEIGHT) + 0.5 - CY) / FY)
+    u, v = bend(model, x, y, k)
+    columns, rows = u * FX + CX, v * FY + CY  # in the bent image; its border pixels have no neighbours beyond
+    shown = (columns >= 0) & (columns <= WIDTH) & (rows >= 0) & (rows <= HEIGHT)
+    inner = (columns >= 2) & (columns <= WIDTH - 2) & (rows >= 2) & (rows <= HEIGHT - 2)
+    valid = np.ones_like(shown) if view.mask is None else view.mask[0].numpy() == 255
+    # OpenCV rounds positions to 1/32 pixel.
+    doubtful = np.abs(np.stack([columns, columns - WIDTH, rows, rows - HEIGHT])).min(axis=0) < 1 / 16
+    assert (valid == shown)[~doubtful].all()
+    # Rounding twice, 1 level, and a half 32nd pixel of at most 10 levels; a shift by half a pixel would be 4 levels.
+    difference = np.abs(view.image.permute(1, 2, 0).numpy() - colour(x, y))[inner]
+    assert difference.max() < 2.5 and inner.mean() > 0.6
+
+
+@needs_opencv
+def test_what_a_lens_would_show_twice_is_masked(tmp_path):
+    """r (1 - 0.5 r^2) grows up to r = 0.816: further out the image would come back."""
+    lens = lens_of("RADIAL", False, {"k1": -0.5})
+    assert undistortion._last_radius(lens, 2.0) == pytest.approx(math.sqrt(2 / 3), abs=2 * 2 / 4096)
+    assert undistortion._last_radius(lens, 0.8) == math.inf
+    fisheye = lens_of("OPENCV_FISHEYE", True, {"k1": -0.3, "k2": 0.01})
+    highest = brentq(lambda angle: 1 - 3 * 0.3 * angle**2 + 5 * 0.01 * angle**4, 0.5, 1.4)
+    assert undistortion._last_radius(fisheye, 10.0) == pytest.approx(math.tan(highest), rel=0.01)
+    folder = write_scene(tmp_path, "RADIAL", [FX, CX, CY, -1.2, 0.0], Image.new("RGB", (WIDTH, HEIGHT), (200, 90, 30)))
+    mask = load(folder).train[0].mask[0].numpy()
+    x, y = np.meshgrid((np.arange(WIDTH) + 0.5 - CX) / FX, (np.arange(HEIGHT) + 0.5 - CY) / FX)
+    far = np.hypot(x, y) > math.sqrt(1 / 3.6) + 0.01
+    assert far.any() and not mask[far].any() and (mask[~far] == 255).mean() > 0.95
+
+
+@needs_opencv
+def test_undistorted_images_are_kept_and_made_anew_where_something_changes(tmp_path, monkeypatch, capsys):
+    scene = tmp_path / "scene"
+    image = bent_image("OPENCV", [0.2, 0.05, 0, 0])
+    folder = write_scene(scene, "OPENCV", [FX, FY, CX, CY, 0.2, 0.05, 0, 0], image)
+    config = TrainConfig(scene=folder)
+    first = load(folder)
+    kept = sorted(os.listdir(scene / ".dsmoe_cache"))
+    assert len(kept) == 4 and sum(name.startswith("mask-") for name in kept) == 1, "images of a camera share a mask"
+    told = describe_scene(first, read_layout(config), config).splitlines()[1]
+    assert told == ("3 images of camera model OPENCV are undistorted by OpenCV (3 of them now) in "
+                    f"{scene}/.dsmoe_cache, pixels beyond the lens are masked")
+    again = load(folder)
+    assert "(0 of them now)" in again.note and sorted(os.listdir(scene / ".dsmoe_cache")) == kept
+    assert (again.train[0].image == first.train[0].image).all() and (again.train[0].mask == first.train[0].mask).all()
+    Image.new("RGB", (WIDTH, HEIGHT), (9, 9, 9)).save(scene / "images" / "1.png")
+    changed = load(folder)
+    assert "(1 of them now)" in changed.note and (changed.train[0].image == 9).all()
+    monkeypatch.setenv("DSMOE_CACHE", str(tmp_path / "elsewhere"))
+    assert "(3 of them now)" in load(folder).note and len(os.listdir(tmp_path / "elsewhere")) == 1
+    known, loaded = load_cameras(config, "train")[0], changed.train[0].camera
+    assert (known.name, known.fx, known.cy, known.width) == (loaded.name, loaded.fx, loaded.cy, loaded.width)
+
+
+@needs_opencv
+def test_a_scene_of_masks_and_distortion_trains(tmp_path, capsys):
+    folder = write_scene(tmp_path, "SIMPLE_RADIAL_FISHEYE", [FX, CX, CY, 0.05], bent_image(
+        "SIMPLE_RADIAL_FISHEYE", [0.05]), count=4)
+    os.makedirs(tmp_path / "masks")
+    for index in range(4):
+        mask = Image.new("L", (WIDTH // 2, HEIGHT // 2), 0)
+        mask.paste(255, (WIDTH // 4, 0, WIDTH // 2, HEIGHT // 2))  # the right half
+        mask.save(tmp_path / "masks" / f"{index}.png")
+    mask = load(folder, resolution=2).train[0].mask[0].numpy()
+    assert mask.shape == (HEIGHT // 2, WIDTH // 2) and not mask[:, :20].any() and (mask[:, 28:] == 255).all()
+    run = str(tmp_path / "run")
+    assert main(["train", folder, "-o", run, "--resolution", "2", "--iterations", "3", "--test-every", "3"]) == 0
+    assert "4 images of camera model SIMPLE_RADIAL_FISHEYE are undistorted" in capsys.readouterr().out
+    with open(os.path.join(run, "results.json"), encoding="utf-8") as file:
+        row, = json.load(file)
+    assert {"masks", "undistortion"} <= set(row["protocol"]) and row["psnr"] > 3
+    assert main(["eval", run]) == 0 and f"{row['psnr']:.2f}" in capsys.readouterr().out
+
+
+@needs_opencv
+@pytest.mark.parametrize("model, fields, k", [
+    ("OPENCV", {"camera_model": "OPENCV"}, {"k1": -0.15, "k2": 0.04, "p1": 0.004, "p2": -0.006}),
+    ("OPENCV", {}, {"k1": -0.15, "k2": 0.04, "p1": 0.004, "p2": -0.006}),  # instant-ngp names no model
+    ("OPENCV_FISHEYE", {"camera_model": "OPENCV_FISHEYE"}, {"k1": 0.03, "k2": -0.01, "k3": 0.004, "k4": -0.001}),
+    ("OPENCV_FISHEYE", {"is_fisheye": True}, {"k1": 0.03, "k2": -0.01, "k3": 0.004, "k4": -0.001}),
+])
+def test_transforms_have_the_lenses_of_colmap(tmp_path, model, fields, k):
+    """The same image by both kinds of file is the same, bit for bit."""
+    image = bent_image(model, list(k.values()))
+    colmap = load(write_scene(tmp_path / "colmap", model, [FX, FY, CX, CY, *k.values()], image))
+    os.makedirs(tmp_path / "json")
+    frames = []
+    for index in range(2):
+        image.save(tmp_path / "json" / f"{index}.png")
+        frames.append({"file_path": f"{index}.png", "transform_matrix": np.eye(4).tolist()})
+    (tmp_path / "json" / "transforms.json").write_text(json.dumps(
+        {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": WIDTH, "h": HEIGHT, **fields, **k, "frames": frames}))
+    view = load(tmp_path / "json").train[0]
+    assert (view.image == colmap.train[0].image).all()
+    assert (view.mask is None) == (colmap.train[0].mask is None)
+
+
+def test_without_opencv_it_is_named(tmp_path, monkeypatch):
+    folder = write_scene(tmp_path, "OPENCV", [FX, FY, CX, CY, 0.1, 0, 0, 0], Image.new("RGB", (WIDTH, HEIGHT)))
+    monkeypatch.setattr(undistortion, "_opencv", lambda: None)
+    with pytest.raises(SceneError) as error:
+        load(folder)
+    assert "3 images have lens distortion (camera model OPENCV)" in str(error.value)
+    assert "pip install opencv-python-headless" in str(error.value)
+    shutil.rmtree(tmp_path / "sparse")
+    write_scene(tmp_path, "OPENCV", [FX, FY, CX, CY, 0, 0, 0, 0], Image.new("RGB", (WIDTH, HEIGHT)))
+    assert load(folder).note == "", "with coefficients of 0 nothing is to be done"
