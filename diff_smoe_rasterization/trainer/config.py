@@ -360,8 +360,8 @@ def holds_run(folder: str) -> bool:
 def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:
     """The background gate that a training takes: a number, 1 in `alpha` and 0 in the ablations, or LEARNED.
 
-    asked: None means in GATED_MODES $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is none,
-    and for one that the mode does not know.
+    asked: None means in GATED_MODES $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is no
+    gate, and for one that the mode does not know.
     """
     if blend_mode not in GATED_MODES:
         fixed = float(resolve_background_gate(blend_mode, None))

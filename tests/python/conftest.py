@@ -1,4 +1,4 @@
-"""Fixtures of all tests: the four blend modes, the devices, and an environment that selects no mode.
+"""Fixtures of all tests: the five blend modes, the devices, and an environment that selects no mode.
 
 A test that uses the fixture `device` runs once on the CPU and, where there is a GPU and a build for it, once there.
 """

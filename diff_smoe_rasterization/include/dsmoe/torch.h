@@ -75,7 +75,7 @@ struct RasterizeArguments {
 struct Rendering {
   at::Tensor color;          // [C, H, W]
   at::Tensor radii;          // [N] int32; 3-sigma radius in pixels, 0 where the Gaussian touches nothing
-  at::Tensor alpha;          // [1, H, W]; the gate sum W = sum alpha_i T_i; smoe_tn, smoe_std: sum alpha_i
+  at::Tensor alpha;          // [1, H, W]; W = sum alpha_i T_i; smoe: W / D; smoe_tn, smoe_std: sum alpha_i
   at::Tensor depth;          // [1, H, W]; expected view depth sum(w z) / sum(w), 0 where nothing is hit
   at::Tensor inverse_depth;  // [1, H, W]; 1 / z blended as a colour, over background 0
 };
