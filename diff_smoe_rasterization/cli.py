@@ -91,17 +91,22 @@ def build_parser() -> argparse.ArgumentParser:
 
     export = commands.add_parser("export", help="write a trained model for other programs, or as a page to look at",
                                  description="Writes a trained model as one file. A page (.html) shows it in a "
-                                             "browser by the blend that it was trained with; other viewers show a .ply "
-                                             "or a .splat by alpha.")
+                                             "browser by the blend that it was trained with; other viewers show the "
+                                             "other formats by alpha.")
     export.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
     export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
-    export.add_argument("--format", choices=("html", "ply", "splat"),
-                        help="default: by the ending of FILE, else html")
+    export.add_argument("--format", choices=("html", "ply", "splat", "spz", "glb"),
+                        help="default: by the ending of FILE, else html; spz needs gsply")
     export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
                         help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
                              "holds degree 0)")
-    _add_model_options(export, "whose test views the page begins with (default: the run's)")
+    export.add_argument("--bake", choices=("alpha",),
+                        help="first fine-tune the model to this blend, which every viewer shows; needs the scene's "
+                             "images, and prints the dB that it costs")
+    export.add_argument("--bake-iterations", type=int, default=5000, metavar="N", help="(default: 5000)")
+    _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
     export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
+    _add_device(export)
     export.set_defaults(run=_export)
 
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
@@ -470,8 +475,9 @@ def _export(arguments: argparse.Namespace) -> None:
     from .export.command import export
 
     path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
-                           arguments.blend_mode, arguments.background_gate, arguments.overwrite,
-                           **_overrides(arguments))
+                           arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
+                           bake=arguments.bake, bake_iterations=arguments.bake_iterations,
+                           device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

@@ -285,7 +285,7 @@ class Run:
         """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
         trainer, config = self.trainer, self.trainer.config
         self.scalars = Scalars(config.output, trainer.iteration, wanted=trainer.leads)
-        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
+        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=self.title, unit="it",
                                disable=not self.progress, dynamic_ncols=True)
         patience = DelayedInterrupt(patient=trainer.is_divided)
         with contextlib.closing(self.scalars), new_bar as bar, patience as interrupt:
@@ -373,6 +373,11 @@ class Run:
         if self.lock:
             check_there(output, self.lock)
         return os.path.join(output, name)
+
+    @property
+    def title(self) -> str:
+        """Of the progress bar."""
+        return str(self.trainer.config.blend_mode)
 
 
 def _check_loss(step: AnyStep) -> float:
