@@ -135,8 +135,8 @@ def build_parser() -> argparse.ArgumentParser:
                              "images, and prints the dB that it costs")
     export.add_argument("--bake-iterations", type=int, default=5000, metavar="N", help="(default: 5000)")
     _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
-    _add_device(export)
     export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
+    _add_device(export)
     export.set_defaults(run=_export)
 
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
@@ -539,8 +539,8 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.bake:
         _choose_device(arguments)
     path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
-                           arguments.blend_mode, arguments.background_gate, arguments.overwrite, bake=arguments.bake,
-                           bake_iterations=arguments.bake_iterations,
+                           arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
+                           bake=arguments.bake, bake_iterations=arguments.bake_iterations,
                            device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:

@@ -13,7 +13,7 @@ from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.settings import resolve_blend
 
-from ._walk import median_of
+from ._walk import median_of, weights_of
 from .contracts import RESULTS, contract_of
 
 ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",),
@@ -78,8 +78,9 @@ def median_places(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
     """Returns which Gaussian [H, W] makes a pixel half full, front to back, by its weights; -1 where none does."""
     with torch.no_grad():
         given = {name: tensor for name, tensor in inputs.items() if name != "means2D"}
-        gate_sum = rasterize(settings=settings, outputs=("alpha",), **given).alpha[0]
-        share = share_of_gaussians(gate_sum, settings)
+        alpha = rasterize(settings=settings, outputs=("alpha",), **given).alpha[0]
+        share = share_of_gaussians(alpha, settings)
+        gate_sum = weights_of(settings, given) if resolve_blend(settings)[0] == "smoe" else alpha
         total = torch.where(share > 0, gate_sum / torch.where(share > 0, share, 1), torch.zeros_like(share))
         return median_of(settings, given, total)
 

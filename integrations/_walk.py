@@ -27,7 +27,7 @@ class Walk:
         self.height, self.width = settings.image_height, settings.image_width
         grid = torch.tensor([-(-self.width // TILE), -(-self.height // TILE)], device=footprints.radii.device)
         self.columns, self.rows = grid.tolist()
-        self.order, self.tile_of, self.places = _lists(footprints, grid, self.mode == "alpha")
+        self.order, self.tile_of, self.places = _lists(footprints, grid, self.mode in ("alpha", "smoe"))
         self.gates = footprints.gates[self.order]
 
     def image_of_tiles(self, value: float) -> torch.Tensor:
@@ -78,6 +78,16 @@ class Walk:
                 weight.masked_fill_(behind < FULL, 0)
                 transmittance[tiles] = behind[:, -1]
             yield tiles, self.order[which], weight
+
+
+@torch.no_grad()
+def weights_of(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
+    """Returns the sum of the weights of each pixel [H, W]."""
+    walk = Walk(settings, inputs)
+    summed = walk.image_of_tiles(0.0)
+    for tiles, _, weight in walk.steps():
+        summed[tiles] += weight.sum(1)
+    return walk.untiled(summed)
 
 
 @torch.no_grad()

@@ -25,7 +25,7 @@ BAKE_ITERATIONS = 5000
 
 
 def export(source: str, path: Optional[str] = None, form: Optional[str] = None, sh_degree: Optional[int] = None,
-           blend_mode: Optional[str] = None, background_gate: Optional[float] = None, overwrite: bool = False, *,
+           blend_mode: Optional[str] = None, background_gate: Optional[float] = None, *, overwrite: bool = False,
            bake: Optional[str] = None, bake_iterations: int = BAKE_ITERATIONS, device: str = "cpu",
            **options: Any) -> Tuple[str, str]:
     """Writes the model of a run's folder or of a .ply; returns the file's path and a note, which may be empty.

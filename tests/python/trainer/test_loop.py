@@ -49,7 +49,7 @@ def test_the_position_rate_follows_the_iteration(tiny_config, scene):
 
 
 @pytest.mark.parametrize("options, start, bound, rate", [
-    ({}, 0.1, 0.0, 0.01), ({"blend_mode": "smoe_eq7"}, 1.0, 0.03, 0.01),
+    ({}, 0.1, 0.0, 0.03), ({"blend_mode": "smoe_eq7"}, 1.0, 0.03, 0.01),
     ({"background_gate_bound": 0.2, "background_gate_start": 2.0, "background_gate_lr": 0.04}, 2.0, 0.2, 0.04)])
 def test_a_learned_gate_is_stepped_by_adam_from_its_start(tiny_config, scene, options, start, bound, rate):
     trainer = Trainer(tiny_config.changed(background_gate="learned", **options), scene)

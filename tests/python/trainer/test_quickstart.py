@@ -33,7 +33,8 @@ def test_both_modes_are_trained_with_the_same_settings(output):
     assert [row["blend_mode"] for row in rows] == ["alpha", "smoe"]
     for row in rows:
         assert {"psnr", "ssim", "num_gaussians", "train_seconds", "fps"} <= set(row)
-    learned = {"background_gate_learned": True, "background_gate_bound": 0.0, "background_gate_start": 0.1}
+    learned = {"background_gate_learned": True, "background_gate_bound": 0.0, "background_gate_start": 0.1,
+               "background_gate_lr": 0.03}
     assert rows[1]["protocol"] == {**rows[0]["protocol"], **learned}
     assert (rows[0]["protocol"]["iterations"], rows[0]["protocol"]["seed"]) == (30, 4)
 
