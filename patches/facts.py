@@ -42,7 +42,7 @@ OF_ALL = "integrations/README.md lists all, and `dsmoe run --trainer list` their
 
 
 def of_checkout(files: Mapping[str, bytes], script: str = "") -> Set[str]:
-    """Returns the facts of a checkout: of its trainer and renderer, if it is like 3DGS, and of what they import.
+    """Returns the facts of a checkout: of its trainer and renderer, if it is like 3DGS, and of what they import of it.
 
     script: the file that is run, in place of trainer and renderer. Where they reach no rasterizer, as by a name that is
     made up while they run, every file that imports one counts.
