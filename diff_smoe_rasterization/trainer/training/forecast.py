@@ -47,7 +47,7 @@ class Forecast:
         if seconds < LONG_SECONDS or not self.shorter:
             return line
         options = flags_text(self.shorter)
-        return f"{line}. A GPU takes minutes. For minutes on this processor: --overwrite --scale-recipe {options}"
+        return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: --overwrite --scale-recipe {options}"
 
 
 def duration(seconds: float) -> str:
