@@ -34,6 +34,9 @@ def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
 def op_options(settings, outputs, blend_mode, fixed_gate):
     """Returns the options of a rendering in the order of the op, all but the last one."""
     options = [kind(getattr(settings, name)) for name, kind in _SETTING_OPTIONS]
+    for place, name in _WHOLE_OPTIONS:
+        if options[place] != getattr(settings, name):  # int() has cut digits off
+            raise ValueError(f"{name} is {getattr(settings, name)!r}; it must be a whole number")
     computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
                 **{name: name in outputs for name in FEATURE_OUTPUTS}}
     for name, place in _COMPUTED_OPTIONS.items():
@@ -49,6 +52,7 @@ assert list(OPTIONS)[-1] == "for_backward"
 _COMPUTED_OPTIONS = {name: place for place, name in enumerate(OPTIONS)
                      if name in ("fixed_background_gate", "blend_mode", *FEATURE_OUTPUTS)}
 _SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
+_WHOLE_OPTIONS = [(place, name) for place, (name, kind) in enumerate(_SETTING_OPTIONS) if kind is int]
 
 
 def tensor_checks(function, first_name, first):

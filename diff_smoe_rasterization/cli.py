@@ -114,21 +114,29 @@ def build_parser() -> argparse.ArgumentParser:
                         help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
     render.add_argument("--alpha", action="store_true",
                         help="also NAME.alpha.png: how much of a pixel Gaussians cover, 8 bits")
+    render.add_argument("--overwrite", action="store_true",
+                        help="write into any folder, and replace files of the same names; a VIDEO that is there too")
     _add_device(render)
     render.set_defaults(run=_render)
 
     export = commands.add_parser("export", help="write a trained model for other programs, or as a page to look at",
                                  description="Writes a trained model as one file. A page (.html) shows it in a "
-                                             "browser by the blend that it was trained with; other viewers show a .ply "
-                                             "or a .splat by alpha.")
+                                             "browser by the blend that it was trained with; other viewers show the "
+                                             "other formats by alpha.")
     export.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
     export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
-    export.add_argument("--format", choices=("html", "ply", "splat"),
-                        help="default: by the ending of FILE, else html")
+    export.add_argument("--format", choices=("html", "ply", "splat", "spz", "glb"),
+                        help="default: by the ending of FILE, else html; spz needs gsply")
     export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
                         help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
                              "holds degree 0)")
-    _add_model_options(export, "whose test views the page begins with (default: the run's)")
+    export.add_argument("--bake", choices=("alpha",),
+                        help="first fine-tune the model to this blend, which every viewer shows; needs the scene's "
+                             "images, and prints the dB that it costs")
+    export.add_argument("--bake-iterations", type=int, default=5000, metavar="N", help="(default: 5000)")
+    _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
+    _add_device(export)
+    export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
     export.set_defaults(run=_export)
 
     view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
@@ -505,7 +513,8 @@ def _render(arguments: argparse.Namespace) -> None:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
     paths = render_images(config, ply, arguments.output, arguments.split, arguments.blend_mode, arguments.device,
-                          background_gate=arguments.background_gate, outputs=outputs)
+                          background_gate=arguments.background_gate, outputs=outputs,
+                          overwrite=arguments.overwrite)
     print(f"{len(paths)} images in {arguments.output}")
 
 
@@ -515,7 +524,7 @@ def _render_orbit(arguments: argparse.Namespace, overrides: Dict[str, Any], outp
 
     trained = open_trained(arguments.source, arguments.blend_mode, arguments.background_gate, arguments.device,
                            **overrides)
-    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs))
+    print(film(trained, arguments.output, arguments.frames, arguments.fps, outputs, arguments.overwrite))
 
 
 def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
@@ -527,8 +536,12 @@ def _overrides(arguments: argparse.Namespace) -> Dict[str, Any]:
 def _export(arguments: argparse.Namespace) -> None:
     from .export.command import export
 
+    if arguments.bake:
+        _choose_device(arguments)
     path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
-                           arguments.blend_mode, arguments.background_gate, **_overrides(arguments))
+                           arguments.blend_mode, arguments.background_gate, arguments.overwrite, bake=arguments.bake,
+                           bake_iterations=arguments.bake_iterations,
+                           device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

@@ -47,8 +47,9 @@ class DirectRendering:
 
     @torch.no_grad()
     def render(self) -> Rendering:
-        """The images, without gradient. They must not be changed before `backward`."""
+        """The images, without gradient. Neither they nor the arguments may be changed in place before `backward`."""
         *self._images, self._saved = _OPS.rasterize(*self._inputs, *self._options, True)
+        self._versions = [_version(tensor) for tensor in (*self._inputs, *self._images)]
         return as_rendering(self._images, self._outputs)
 
     def splats(self) -> Splats:
@@ -61,8 +62,13 @@ class DirectRendering:
 
         dL_dimages: by name, `color` and OUTPUTS. gradients: for the arguments whose gradients are wanted, by name, also
         bg and background_gate; dense and of their shape. Of those with a row for each Gaussian only the rows are
-        written whose radius is above 0. The others stay as they are.
+        written whose radius is above 0. The others stay as they are. Raises RuntimeError where an argument or an image
+        was changed in place since `render`.
         """
+        for name, tensor, version in zip((*INPUTS, *IMAGES), (*self._inputs, *self._images), self._versions):
+            if _version(tensor) != version:
+                raise RuntimeError(f"DirectRendering.backward: {name} was changed in place since render; change it "
+                                   "after backward, or change a copy")
         unknown = set(gradients) - {name for name, value in zip(INPUTS, self._inputs) if value is not None}
         if unknown or not set(dL_dimages) <= set(_GRADIENTS):
             raise ValueError(f"DirectRendering.backward: dL_dimages has {', '.join(dL_dimages)} and gradients has "
@@ -74,3 +80,8 @@ class DirectRendering:
             [value for value in self._inputs if value is not None], [value is not None for value in self._inputs],
             self._images, self._saved, *self._options, True, [name in gradients for name in INPUTS],
             [gradients[name] for name in INPUTS if name in gradients])
+
+
+def _version(tensor: Optional[torch.Tensor]) -> int:
+    """How often a tensor was changed in place; 0 where torch does not count, as of inference tensors."""
+    return 0 if tensor is None or tensor.is_inference() else tensor._version

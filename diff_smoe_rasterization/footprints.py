@@ -8,18 +8,21 @@ to where they are blended. Both halves are differentiable.
 """
 from __future__ import annotations
 
-from typing import Any, List, NamedTuple, Optional, Sequence, Tuple
+import math
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 
 from .arguments import as_rendering, op_arguments, op_options, tensor_checks
-from .autograd import INPUTS, refuse_forward_mode
-from .settings import OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
+from .autograd import INPUTS, OPTIONS, refuse_forward_mode
+from .extension import _C
+from .settings import BLEND_MODES, OUTPUTS, GaussianRasterizationSettings, Rendering, resolve_blend
 
 _OPS = torch.ops.diff_smoe_rasterization
 _GATE_NUMBERS = 8  # centre (2), conic (3), opacity, squared reach, depth
 GATE_GRADIENTS = 6
 """Numbers of a gate that have a gradient from the pixels: the first six."""
+_OPACITY, _REACH = 5, 6
 
 
 class Footprints(NamedTuple):
@@ -75,7 +78,8 @@ def project_gaussians(means3D: torch.Tensor, opacities: torch.Tensor, settings: 
                       cov3D_precomp: Optional[torch.Tensor] = None, outputs: Sequence[str] = ()) -> Footprints:
     """The first half of `rasterize`, whose arguments these are, but means2D_abs; it raises as `rasterize` does.
 
-    Gradients reach every tensor, but settings.bg and settings.background_gate, which belong to the second half.
+    Gradients reach every tensor, but settings.bg and settings.background_gate, which belong to the second half. They
+    come from all numbers of the footprints, the reach included.
     """
     inputs, options = op_arguments("project_gaussians", settings, outputs, means3D, opacities, means2D=means2D, dc=dc,
                                    shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations,
@@ -127,6 +131,27 @@ def _wants_gradient(tensors: Sequence[Optional[torch.Tensor]]) -> bool:
     return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
 
 
+def _spread(tensors: Sequence[torch.Tensor], present: Sequence[bool]) -> List[Optional[torch.Tensor]]:
+    """The tensors in their places, None where none was given."""
+    given = iter(tensors)
+    return [next(given) if here else None for here in present]
+
+
+def _reach_moves(opacities: torch.Tensor, options: Dict[str, Any], gate: Optional[torch.Tensor]) -> torch.Tensor:
+    """[N] bool: where the squared reach is 2 log(opacity / least alpha) and the least alpha is constant.
+
+    Elsewhere the reach is constant. The rule is that of `squared_reach` and `AlphaCut` in include/dsmoe/gate.h.
+    """
+    positive, constants = opacities > 0, _C.constants
+    if options["blend_mode"] == BLEND_MODES.index("alpha"):
+        return positive
+    faint = constants["alpha_cut"] * (options["fixed_background_gate"] if gate is None else gate.reshape(()))
+    core = opacities * constants["core_kernel"]
+    least = core.minimum(torch.as_tensor(faint).to(core)).clamp(min=options["alpha_min"])
+    widest = -2 * math.log(constants["gate_cut"])
+    return positive & (least > 0) & (least != core) & (2 * (opacities / least).log() < widest)
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, options: Tuple[Any, ...], *inputs: Any) -> Tuple[torch.Tensor, ...]:
@@ -134,19 +159,24 @@ class _Project(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         ctx.options, ctx.present = options, [tensor is not None for tensor in inputs]
-        # The caller may edit the features, so they are copied.
-        ctx.save_for_backward(*(tensor for tensor in inputs if tensor is not None), features.clone(), radii)
+        # The caller may edit gates and features, so they are copied.
+        ctx.save_for_backward(*(tensor for tensor in inputs if tensor is not None), features.clone(),
+                              gates[:, _OPACITY].clone(), radii)
         return gates, features, radii
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, dL_dgates: Any, dL_dfeatures: Any, _: Any) -> Tuple[Any, ...]:  # type: ignore[override]
-        *inputs, features, radii = ctx.saved_tensors
+        *inputs, features, opacities, radii = ctx.saved_tensors
         wanted = list(ctx.needs_input_grad[1:])
         belongs = [want and name not in ("bg", "background_gate") for want, name in zip(wanted, INPUTS)]
         by_gates = features.new_zeros(len(features), _GATE_NUMBERS) if dL_dgates is None else dL_dgates
         by_features = torch.zeros_like(features) if dL_dfeatures is None else dL_dfeatures
         records = torch.cat([by_gates[:, :GATE_GRADIENTS], by_features], 1)
+        if dL_dgates is not None:
+            given = dict(zip(INPUTS, _spread(inputs, ctx.present)))
+            moves = (radii > 0) & _reach_moves(opacities, dict(zip(OPTIONS, ctx.options)), given["background_gate"])
+            records[:, _OPACITY] += (2 * by_gates[:, _REACH] / opacities).masked_fill(~moves, 0)
         results = iter(_OPS.project_backward(records, None if dL_dgates is None else by_gates[:, -1].contiguous(),
                                              inputs, ctx.present, features, radii, *ctx.options, belongs))
         return (None, *(next(results) if want else None for want in belongs))

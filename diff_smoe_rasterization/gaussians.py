@@ -6,6 +6,7 @@ from typing import Any, Tuple
 import torch
 
 from .autograd import refuse_forward_mode
+from .checks import check_tensors, checked_number
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -19,6 +20,7 @@ def activate(opacities: torch.Tensor, scales: torch.Tensor,
     sigmoid(.), scales exp(.), rotations of length 1 (a quaternion shorter than 1e-12 is divided by that).
     Raises ValueError or TypeError where shapes, types or devices do not fit.
     """
+    check_tensors("activate", opacities=opacities, scales=scales, rotations=rotations)
     refuse_forward_mode("activate", (opacities, scales, rotations))
     if torch.is_grad_enabled() and (opacities.requires_grad or scales.requires_grad or rotations.requires_grad):
         return _Activate.apply(opacities, scales, rotations)
@@ -32,6 +34,7 @@ def add_view(dL_dmeans2D: torch.Tensor, radii: torch.Tensor, gradient_sum: torch
     Where radii [N] (int32) is positive, gradient_sum [N] grows by the length of the first two components of
     dL_dmeans2D [N, 3], and view_count [N] by 1. Raises ValueError or TypeError where shapes or types do not fit.
     """
+    check_tensors("add_view", dL_dmeans2D=dL_dmeans2D, radii=radii, gradient_sum=gradient_sum, view_count=view_count)
     _OPS.add_view(dL_dmeans2D, radii, gradient_sum, view_count)
 
 
@@ -60,6 +63,11 @@ def divided(opacities: torch.Tensor, copies: torch.Tensor,
     That is Equation 9 of 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv:2404.09591).
     opacities: [M] of the one; copies: [M] n, taken as 50 where it is more. least_opacity: the scale factor follows it.
     """
+    check_tensors("divided", opacities=opacities, copies=copies)
+    if opacities.dim() != 1 or copies.shape != opacities.shape:
+        raise ValueError(f"divided: opacities has shape {list(opacities.shape)} and copies {list(copies.shape)}; both "
+                         "must be [M]")
+    least_opacity = checked_number("divided", "least_opacity", least_opacity)
     old, n = opacities.double().unsqueeze(1), copies.double().clamp(1, MOST_COPIES).unsqueeze(1)
     new = (1 - (1 - old) ** (1 / n)).clamp(min=least_opacity)
     j = torch.arange(1.0, MOST_COPIES + 1, dtype=torch.float64, device=opacities.device)

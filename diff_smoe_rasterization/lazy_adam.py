@@ -9,10 +9,11 @@ step and all that it has missed since are made at once, in registers.
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
+from .checks import check_tensors
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 from .optimizers import FusedAdam
 
@@ -30,45 +31,87 @@ class LazyAdam:
         lazy.step(radii)        # the step is made on these rows when they are next caught up
 
     The parameters, and their moments in the FusedAdam, are up to date after `catch_up()`. They may be changed then, in
-    place; where one gets another number of rows, make a new LazyAdam. Learning rates may change between steps.
+    place or by load_state_dict, and so may betas and eps; where a parameter gets another number of rows, make a new
+    LazyAdam. Learning rates may change between steps.
+
+    Both functions raise RuntimeError where something else than a learning rate has changed while steps waited, and
+    ValueError where the groups do not fit, as the constructor does.
     """
 
     def __init__(self, adam: FusedAdam, parameters: Sequence[torch.Tensor]) -> None:
         """parameters: of `adam`, 1 to 4, [N, ...] dense, which the caller does not let it step. They have one age."""
-        groups = {id(parameter): group for group in adam.param_groups for parameter in group["params"]}
-        if any(id(parameter) not in groups for parameter in parameters):
-            raise ValueError("LazyAdam: a parameter is not among those of adam")
+        if not isinstance(adam, FusedAdam):
+            raise TypeError(f"LazyAdam: adam is of type {type(adam).__name__}; it must be a FusedAdam")
         self.adam = adam
         self.parameters = list(parameters)
-        self._groups: List[Dict[str, Any]] = [groups[id(parameter)] for parameter in parameters]
-        first = self._groups[0]
-        if any(group["betas"] != first["betas"] or group["eps"] != first["eps"] for group in self._groups):
-            raise ValueError("LazyAdam: the parameters' groups differ in betas or eps; they must be the same")
-        if any(group.get(option) for group in self._groups for option in ("weight_decay", "amsgrad", "maximize")):
-            raise ValueError("LazyAdam: a group asks for weight_decay, amsgrad or maximize, which it does not have")
-        for parameter in self.parameters:
-            if not adam.state[parameter]:
-                adam.state[parameter].update(step=0, exp_avg=torch.zeros_like(parameter),
-                                             exp_avg_sq=torch.zeros_like(parameter))
-        self._states = [adam.state[parameter] for parameter in self.parameters]
-        if len({int(state["step"]) for state in self._states}) != 1:
-            raise ValueError("LazyAdam: the parameters have made different numbers of steps; they must be the same")
+        if not self.parameters:
+            raise ValueError("LazyAdam: parameters is empty; it must be 1 to 4 tensors")
+        check_tensors("LazyAdam", **{f"parameters[{index}]": value for index, value in enumerate(self.parameters)})
+        self._steps = 0  # since all rows were up to date
+        self._constants: List[float] = []  # betas and eps
+        self._left: List[Tuple[torch.Tensor, int]] = []
+        self._left_ages: List[int] = []
+        self._look_up()
         self.gradients = [torch.empty_like(parameter, requires_grad=False) for parameter in self.parameters]
         """Where the gradients of the rows that are seen go; a row keeps its gradient until it is caught up."""
         rows = len(self.parameters[0])
         self._marks = torch.zeros(rows, dtype=torch.int32, device=self.parameters[0].device)
         self._rates = self.parameters[0].new_zeros(_CAPACITY, len(self.parameters), 2)
-        self._steps = 0  # since all rows were up to date
+
+    def _look_up(self) -> None:
+        """Takes groups and states as the FusedAdam has them now: load_state_dict puts others in their place."""
+        groups = {id(parameter): group for group in self.adam.param_groups for parameter in group["params"]}
+        if any(id(parameter) not in groups for parameter in self.parameters):
+            raise ValueError("LazyAdam: a parameter is not among those of adam")
+        self._groups: List[Dict[str, Any]] = [groups[id(parameter)] for parameter in self.parameters]
+        constants, *others = [[*group["betas"], group["eps"]] for group in self._groups]
+        if any(other != constants for other in others):
+            raise ValueError("LazyAdam: the parameters' groups differ in betas or eps; they must be the same")
+        if any(group.get(option) for group in self._groups for option in ("weight_decay", "amsgrad", "maximize")):
+            raise ValueError("LazyAdam: a group asks for weight_decay, amsgrad or maximize, which it does not have")
+        if self._steps and (constants != self._constants or not self._is_as_left()):
+            raise RuntimeError(
+                f"LazyAdam: a parameter, its state in adam, betas or eps have changed while {self._steps} steps wait "
+                "to be made on rows; call catch_up() before such a change, or make a new LazyAdam after it")
+        self._constants = constants
+        for parameter in self.parameters:
+            if not self.adam.state[parameter]:
+                self.adam.state[parameter].update(step=0, exp_avg=torch.zeros_like(parameter),
+                                                  exp_avg_sq=torch.zeros_like(parameter))
+        self._states = [self.adam.state[parameter] for parameter in self.parameters]
+        if len({int(state["step"]) for state in self._states}) != 1:
+            raise ValueError("LazyAdam: the parameters have made different numbers of steps; they must be the same")
+
+    def _tensors(self) -> List[Optional[torch.Tensor]]:
+        """What a step that waits will change."""
+        states = [self.adam.state.get(parameter, {}) for parameter in self.parameters]
+        return [*self.parameters, *(state.get(name) for state in states for name in ("exp_avg", "exp_avg_sq"))]
+
+    def _ages(self) -> List[int]:
+        return [int(self.adam.state.get(parameter, {}).get("step", 0)) for parameter in self.parameters]
+
+    def _leave(self) -> None:
+        """Notes how everything is, for `_is_as_left`."""
+        self._left = [(tensor, tensor._version) for tensor in self._tensors() if tensor is not None]
+        self._left_ages = self._ages()
+
+    def _is_as_left(self) -> bool:
+        return self._ages() == self._left_ages and all(
+            left._version == version and tensor is left for tensor, (left, version) in zip(self._tensors(), self._left))
 
     @torch.no_grad()
     def catch_up(self, radii: Optional[torch.Tensor] = None) -> None:
         """Brings rows up to date: all, or those where radii [N] (int32) is above 0."""
+        if radii is not None:
+            check_tensors("LazyAdam.catch_up", radii=radii)
         if self._steps == 0:
             return
+        self._look_up()
         group = self._groups[0]
         _OPS.lazy_adam_catch_up(self.parameters, [state["exp_avg"] for state in self._states],
                                 [state["exp_avg_sq"] for state in self._states], self.gradients, self._marks,
                                 self._rates, self._steps, *group["betas"], group["eps"], radii)
+        self._leave()
         if radii is None:
             self._marks.zero_()
             self._steps = 0
@@ -76,13 +119,17 @@ class LazyAdam:
     @torch.no_grad()
     def step(self, radii: torch.Tensor) -> None:
         """Makes a step. Rows where radii [N] (int32) is above 0 are up to date, and `gradients` has theirs."""
+        check_tensors("LazyAdam.step", radii=radii)
         if self._steps == len(self._rates):
             self.catch_up()
-        rates, root_scales = [], []
-        for group, state in zip(self._groups, self._states):
+        self._look_up()
+        rates, root_scales, age = [], [], int(self._states[0]["step"]) + 1
+        for group in self._groups:
             beta1, beta2 = group["betas"]
-            age = state["step"] = int(state["step"]) + 1
             rates.append(group["lr"] / (1 - beta1**age))
             root_scales.append(1 / math.sqrt(1 - beta2**age))
         _OPS.lazy_adam_step(self._marks, self._rates, self._steps, rates, root_scales, radii)
+        for state in self._states:  # behind the op: where it refuses radii no step is counted
+            state["step"] = age
         self._steps += 1
+        self._leave()

@@ -6,6 +6,7 @@ from typing import Any, Tuple
 import torch
 
 from .autograd import refuse_forward_mode
+from .checks import check_tensors, checked_number
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 from .images import as_float
 
@@ -21,6 +22,8 @@ def l1_ssim_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float 
     gradient. SSIM is that of `fused_ssim`.
     Raises ValueError or TypeError where shapes, types or devices do not fit.
     """
+    check_tensors("l1_ssim_loss", image=image, target=target)
+    lambda_dssim = checked_number("l1_ssim_loss", "lambda_dssim", lambda_dssim)
     _refuse_gradient("l1_ssim_loss", "target", target)
     return _image_loss(image, target, 1 - lambda_dssim, -lambda_dssim, lambda_dssim, 0)
 
@@ -28,12 +31,17 @@ def l1_ssim_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float 
 def l1_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor,
                               lambda_dssim: float = 0.2) -> Tuple[torch.Tensor, torch.Tensor]:
     """`l1_ssim_loss` and its gradient by the image, without autograd."""
+    check_tensors("l1_ssim_loss_and_gradient", image=image, target=target)
+    lambda_dssim = checked_number("l1_ssim_loss_and_gradient", "lambda_dssim", lambda_dssim)
     return _OPS.image_loss(image.detach(), target, 1 - lambda_dssim, -lambda_dssim, lambda_dssim, 0, True)
 
 
 def l2_ssim_loss_and_gradient(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float,
                               weight: float) -> Tuple[torch.Tensor, torch.Tensor]:
     """As `l1_ssim_loss_and_gradient`, with weight times the mean squared error in place of the mean absolute one."""
+    check_tensors("l2_ssim_loss_and_gradient", image=image, target=target)
+    lambda_dssim = checked_number("l2_ssim_loss_and_gradient", "lambda_dssim", lambda_dssim)
+    weight = checked_number("l2_ssim_loss_and_gradient", "weight", weight)
     image = image.detach()
     loss, gradient = _OPS.image_loss(image, target, 0.0, -lambda_dssim, lambda_dssim, 0, True)
     difference = image - as_float(target, image.dtype)
@@ -50,7 +58,8 @@ def fused_ssim(img1: torch.Tensor, img2: torch.Tensor, padding: str = "same", tr
     alone gets. The call is that of the package `fused_ssim`.
     Raises ValueError or TypeError where arguments do not fit.
     """
-    if padding not in _MARGINS:
+    check_tensors("fused_ssim", img1=img1, img2=img2)
+    if not isinstance(padding, str) or padding not in _MARGINS:
         raise ValueError(f"fused_ssim: padding is {padding!r}; it must be one of {', '.join(_MARGINS)}")
     _refuse_gradient("fused_ssim", "img2", img2)
     return _image_loss(img1 if train else img1.detach(), img2, 0.0, 1.0, 0.0, _MARGINS[padding])

@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import torch
 
+from .checks import check_tensors
+
 
 def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     """Mean squared distance of each point to its three nearest others: the function of the package simple-knn.
@@ -11,6 +13,7 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     0 for a single one. Coinciding points are at distance 0. Returns: [N] of the same type. Exact but for rounding.
     Raises ValueError where the shape does not fit or a coordinate is not finite, TypeError for another type.
     """
+    check_tensors("distCUDA2", points=points)
     if points.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"distCUDA2: points is {points.dtype}; it must be torch.float32 or torch.float64")
     if points.dim() != 2 or points.shape[1] != 3:

@@ -6,6 +6,7 @@ from typing import Any, Callable, Dict, Iterable, List, Optional
 
 import torch
 
+from .checks import check_tensors, checked_number
 from .extension import _C  # noqa: F401  (loading it registers the ops)
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -20,11 +21,12 @@ class FusedAdam(torch.optim.Adam):
     """
 
     def __init__(self, params: Iterable[Any], lr: float = 1e-3, betas: Any = (0.9, 0.999), eps: float = 1e-8) -> None:
-        if not lr >= 0:
-            raise ValueError(f"FusedAdam: lr is {lr}; it must be 0 or more")
-        if not eps >= 0:
-            raise ValueError(f"FusedAdam: eps is {eps}; it must be 0 or more")
-        if not all(0 <= beta < 1 for beta in betas):
+        for name, value in (("lr", lr), ("eps", eps)):
+            if not checked_number("FusedAdam", name, value) >= 0:
+                raise ValueError(f"FusedAdam: {name} is {value}; it must be 0 or more")
+        if not isinstance(betas, (tuple, list)) or len(betas) != 2:
+            raise TypeError(f"FusedAdam: betas is {betas!r}; it must be two numbers")
+        if not all(0 <= checked_number("FusedAdam", "betas", beta) < 1 for beta in betas):
             raise ValueError(f"FusedAdam: betas is {betas}; both must be in [0, 1)")
         super().__init__(params, lr=lr, betas=tuple(betas), eps=eps)
 
@@ -66,12 +68,15 @@ class SparseGaussianAdam(torch.optim.Adam):
     """
 
     def __init__(self, params: Iterable[Any], lr: float, eps: float) -> None:
+        for name, value in (("lr", lr), ("eps", eps)):
+            checked_number("SparseGaussianAdam", name, value)
         super().__init__(params=params, lr=lr, eps=eps)
 
     @torch.no_grad()
     def step(self, visibility: torch.Tensor, N: int) -> None:  # type: ignore[override]
         """Steps the rows where visibility [N] (bool) is set, of every parameter that has a gradient."""
-        if visibility.numel() != N:
+        check_tensors("SparseGaussianAdam.step", visibility=visibility)
+        if visibility.numel() != checked_number("SparseGaussianAdam.step", "N", N):
             raise ValueError(f"SparseGaussianAdam.step: visibility has shape {list(visibility.shape)}; "
                              f"it must be [N] with N = {N}")
         launches: Dict[Any, _Launch] = {}

@@ -21,7 +21,7 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
 
     Args:
         means3D: [N, 3] centres, world.
-        opacities: [N, 1] or [N]; may exceed 1.
+        opacities: [N, 1] or [N]; may exceed 1, up to 1e20.
         settings: camera and options. Its viewmatrix, projmatrix, campos, bg and, as a tensor, background_gate are
             differentiable too, each on its own.
         means2D: [N, 3], of which only the gradient is of use: dL/d(pixel) times (width / 2, height / 2), z = 0.
@@ -37,7 +37,8 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
     All tensors have one type, float32 or float64, and one device. Absent is None, or any tensor without elements;
     where N is 0, None or one of shape [0].
 
-    Returns: Rendering. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
+    Returns: Rendering. A Gaussian with a NaN or infinite attribute, or an opacity above 1e20, is culled: radius 0,
+    gradients 0.
     Raises:
         ValueError: a shape or a value does not fit; both or neither of shs and colors_precomp, or of scales with
             rotations and cov3D_precomp, are given; background_gate does not fit the blend mode; under

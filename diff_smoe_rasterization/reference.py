@@ -8,10 +8,10 @@ What the paper leaves open is decided here:
 
 - Gaussians are sorted by view depth; equal depths keep the order of the input.
 - A Gaussian is culled (radius 0, gradients exactly 0) where any value of its attributes, used or not, is NaN or
-  infinite, its view depth is not beyond `near`, its projected covariance is not positive definite, its pixel position,
-  conic or colour is not finite, or its footprint misses the image.
+  infinite, its opacity is above 1e20, its view depth is not beyond `near`, its projected covariance is not positive
+  definite, its pixel position, conic or colour is not finite, or its footprint misses the image.
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
-- Opacity plays no part in culling or in the radius; pairs with opacity <= 0 do not count.
+- Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
 - The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
 - In `smoe` a background gate that is the number 1 is the mode `alpha`, with its tile rectangle and its cut; a tensor of
@@ -39,6 +39,7 @@ W_EPSILON = 1e-7  # added to the clip w before dividing (3DGS)
 EIGENVALUE_SPREAD_MIN = _float32(0.1)  # px^4 under the root of the radius rule (3DGS)
 TILE = 16  # px; the tiles of 3DGS, whose rectangle is part of its image
 ALPHA_MAX = _float32(0.99)  # no Gaussian is opaque, else T would reach 0 (3DGS)
+OPACITY_MAX = _float32(1e20)  # beyond, gradients by a place overflow in float32
 ALPHA_MIN = _float32(1 / 255)  # less changes no 8-bit image (3DGS)
 KERNEL_MIN = _float32(1e-5)  # SMoE modes cut on G, not on alpha: faint tails decide where gates are weak (paper)
 KERNEL_KEPT = _float32(math.exp(-4.5))  # G at 3 sigma: nearer, a background gate cuts nothing, or gradients would end
@@ -86,7 +87,7 @@ def rasterize(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussian
 
     Args:
         means3D: [N, 3] centres, world.
-        opacities: [N, 1] or [N]; may exceed 1.
+        opacities: [N, 1] or [N]; may exceed 1, up to 1e20.
         settings: GaussianRasterizationSettings; viewmatrix, projmatrix, campos, bg and a tensor background_gate are
             differentiable.
         means2D: [N, 3]; its gradient is dL/d(pixel) times (0.5 width, 0.5 height), z = 0.
@@ -210,7 +211,7 @@ def visible(gaussians, settings, mode):
     for name, column in zip(gaussians._fields, gaussians):
         if column is None or name == "means2D":
             continue
-        column_finite = torch.isfinite(column).flatten(1).all(1) if column.dim() > 1 else torch.isfinite(column)
+        column_finite = torch.isfinite(column).flatten(1).all(1) if column.dim() > 1 else column.abs() <= OPACITY_MAX
         if settings.strict and not column_finite.all():
             index = (~column_finite).nonzero()[0].item()
             raise ValueError(f"rasterize: {name}[{index}] is not finite")

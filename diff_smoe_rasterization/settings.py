@@ -66,7 +66,8 @@ class GaussianRasterizationSettings(NamedTuple):
     alpha_min: float = 0.0  # SMoE modes: also skip alpha below this; 0 is the paper's rule
     strict: bool = False  # raise where an attribute is NaN or infinite, instead of culling that Gaussian
     blend_mode: Optional[str] = None  # one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha"
-    # CUDA: gradients equal bit for bit from run to run; slower. The CPU's always are, at one SIMD level.
+    # CUDA: gradients and sums of `Splats` equal bit for bit from run to run; slower. The CPU's always are, at one SIMD
+    # level.
     deterministic: bool = False
     clamp_color: bool = True  # colours from shs are at least 0; False: as the harmonics give them, with their gradient
     # `smoe`: how much the background weighs against the Gaussians, 0 or more; None: $DSMOE_BACKGROUND_GATE, else 0

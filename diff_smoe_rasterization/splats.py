@@ -6,6 +6,7 @@ from typing import Any, Optional, Sequence
 import torch
 
 from .autograd import INPUTS  # which also registers the ops
+from .checks import check_tensors
 from .settings import Contributions, Importance
 
 _OPS = torch.ops.diff_smoe_rasterization
@@ -44,11 +45,11 @@ class Splats:
         """Sums a map over the pixels of each Gaussian, and what else `Contributions` names.
 
         pixel_weights: [H, W], any numbers, of the Gaussians' type and device. On the CPU the sums are equal bit for bit
-        from call to call and for any number of threads; on CUDA real numbers are added by atomics in any order, and
-        the host does not wait.
+        from call to call and for any number of threads. On CUDA real numbers are added by atomics in any order, unless
+        the settings had `deterministic`, and the host does not wait.
         Raises ValueError or TypeError where pixel_weights does not fit.
         """
-        _check_map("contributions", "pixel_weights", pixel_weights)
+        check_tensors("contributions", pixel_weights=pixel_weights)
         return Contributions(*_OPS.contributions(pixel_weights.detach(), self._radii, self._saved,
                                                  self._background_gate, *self._options))
 
@@ -72,8 +73,7 @@ class Splats:
             pixel_weights = torch.ones_like(self._gate_sum[0])
         if share_weights is None:
             share_weights = pixel_weights
-        _check_map("importance", "pixel_weights", pixel_weights)
-        _check_map("importance", "share_weights", share_weights)
+        check_tensors("importance", pixel_weights=pixel_weights, share_weights=share_weights)
         return Importance(*_OPS.importance(pixel_weights.detach(), share_weights.detach(), self._color, self._gate_sum,
                                            self._background, self._radii, self._saved, self._background_gate,
                                            *self._options))
@@ -82,8 +82,3 @@ class Splats:
         """Returns a copy with zeros for culled Gaussians, whose rows may hold anything."""
         culled = self._radii <= 0
         return values.masked_fill(culled if values.dim() == 1 else culled[:, None], 0)
-
-
-def _check_map(function: str, name: str, value: Any) -> None:
-    if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")

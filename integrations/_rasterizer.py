@@ -13,6 +13,7 @@ from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 from diff_smoe_rasterization.settings import resolve_blend
 
+from ._walk import median_of
 from .contracts import RESULTS, contract_of
 
 ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), "alpha": ("alpha",),
@@ -67,7 +68,28 @@ def results_of(names: Sequence[str], settings: Settings, inputs: Dict[str, Any])
         found["alpha"] = found["opacity"] = share_of_gaussians(rendering.alpha, settings)
     if "depth" in outputs:
         found["depth"] = rendering.depth * found["alpha"]
+    if "median_depth" in names:
+        found["median_depth"] = _median_depth(settings, inputs)
     return tuple(found[name] for name in names)
+
+
+def median_places(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
+    """Returns which Gaussian [H, W] makes a pixel half full, front to back, by its weights; -1 where none does."""
+    with torch.no_grad():
+        given = {name: tensor for name, tensor in inputs.items() if name != "means2D"}
+        gate_sum = rasterize(settings=settings, outputs=("alpha",), **given).alpha[0]
+        share = share_of_gaussians(gate_sum, settings)
+        total = torch.where(share > 0, gate_sum / torch.where(share > 0, share, 1), torch.zeros_like(share))
+        return median_of(settings, given, total)
+
+
+def _median_depth(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
+    """Returns z [1, H, W] of the Gaussians that make pixels half full, 0 where none does; differentiable."""
+    which, means = median_places(settings, inputs), inputs["means3D"]
+    if not len(means):
+        return means.new_zeros(1, *which.shape)
+    view = settings.viewmatrix.to(means)
+    return (means @ view[:3, 2] + view[3, 2])[which.clamp(min=0)].masked_fill(which < 0, 0)[None]
 
 
 def results_with_features(names: Sequence[str], settings: Settings, inputs: Dict[str, Any], feature: str,

@@ -21,6 +21,12 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "inverse_depth": ("[1, H, W], 1 / z blended as a colour over 0", ""),
     "depth": ("[1, H, W], z blended as a colour over 0", "depth"),
     "alpha": ("[1, H, W], the share of the pixel that the background does not have", "alpha"),
+    "median_depth": ("[1, H, W], z of the Gaussian where the weights, front to back, reach half a pixel", "med"),
+    "coord": ("[3, H, W], the point of plane_depth in the camera's frame", ""),
+    "median_coord": ("[3, H, W], the point of median_plane_depth there", ""),
+    "plane_depth": ("[1, H, W], the mean z of the Gaussians' planes on the pixel's ray", "depth"),
+    "median_plane_depth": ("[1, H, W], that of the Gaussian that makes the pixel half full", "depth"),
+    "normal": ("[3, H, W], of length 1, towards the camera, in its frame", ""),
     "depth_alpha": ("[2, H, W], the depth, and the share of the pixel that the background has", "depth_alpha"),
     "opacity": ("[1, H, W], the same as alpha", "opac"),
     "is_used": ("[N] int32, 1 where the radius is positive", "used"),
@@ -38,6 +44,15 @@ RESULTS = {  # what a result is, and a word that is in the name that callers giv
     "language_feature": ("[F, H, W], language_feature_precomp blended as a colour over 0", "feature"),
 }
 
+# What names of results have in them, for callers of a rasterizer that returns these in an order of its own.
+WORDS = (("radii", "radi"), ("median_depth", "med.*depth|depth.*med"), ("inverse_depth", "inv.*depth"),
+         ("depth", "depth"), ("alpha", "alpha|opac|acc"), ("color", "image|colou?r|rgb|render|^im$"))
+# What is in the names of packages that have Inria's names and compute something else: surfels, planes, opacity fields,
+# other lenses, rays of light or sound, other kernels.
+FOREIGN = ("surf", "plan", "gof", "^rade|_rade", "omni", "pano", "spher", "fisheye", "360", "op43", "ortho", "ray",
+           "2d", "4d", "mesh", "triang", "convex", "beta", "gabor", "sonar", "radar", "_rf", "event", "voxel", "normal",
+           "light")
+
 
 class Contract(NamedTuple):
     """What callers of a rasterizer rely on, beside SETTINGS, ARGUMENTS, NAMES and METHODS, which all of a kind have."""
@@ -52,7 +67,8 @@ class Contract(NamedTuple):
     module: str = RASTERIZER  # what callers import
     other_results: Tuple[Tuple[str, ...], ...] = ()  # of calls by other settings, or of a rasterizer beside it
     methods: Tuple[str, ...] = ()  # of a rasterizer, beside METHODS
-    absolute: int = 0  # columns of means2D behind x and y that get sums of absolute gradients: of both axes, or of each
+    absolute: int = 2  # columns of means2D behind x and y that get sums of absolute gradients, if there are so many:
+    # one for both axes, or one for each
 
 
 def _behind(name: str, *further: str) -> Tuple[str, ...]:
@@ -74,6 +90,9 @@ CONTRACTS = (
              signs=("sets clamp_color", "imports GaussianRasterizerIndexed")),
     Contract("taming", "Taming-3DGS", TAMING, ("pixel_weights",), WITH_DC, ("SparseGaussianAdam",),
              ("sets pixel_weights",)),
+    Contract("rade_gs", "RaDe-GS", ("color", "radii", "coord", "median_coord", "plane_depth", "median_plane_depth",
+                                    "alpha", "normal"), ("kernel_size", "require_depth", "require_coord"),
+             signs=("sets require_depth",), methods=("integrate",)),
     Contract("mip_splatting", "Mip-Splatting, TRELLIS", settings=("kernel_size", "subpixel_offset"),
              signs=("sets kernel_size",), absolute=1),
     Contract("monogs", "MonoGS", ("color", "radii", "depth", "opacity", "n_touched"), ("projmatrix_raw",),
@@ -97,7 +116,7 @@ CONTRACTS = (
     Contract("light_gaussian", "LightGaussian", settings=("f_count",), signs=("sets f_count",),
              other_results=(("counts", "opacity_sums", "color", "radii"),)),
     Contract("inria_2024", "3DGS of 2024 (`antialiasing`, sparse Adam)", ("color", "radii", "inverse_depth"),
-             ("antialiasing",), WITH_DC, ("SparseGaussianAdam",),
+             ("antialiasing",), WITH_DC, ("SparseGaussianAdam", "compute_relocation"),
              ("sets antialiasing", "takes dc", "imports SparseGaussianAdam", "reads invdepthmap")),
     Contract("inria", "3DGS of 2023, GaussianPro, InstantSplat, Compact-3DGS, SuGaR"),
     Contract("depth", "4DGaussians, Deformable 3D Gaussians, GaussianEditor, SplaTAM", ("color", "radii", "depth"),
@@ -106,9 +125,9 @@ CONTRACTS = (
              settings=("confidence",)),
     Contract("lucid_dreamer", "LucidDreamer, InfiniteScene", ("color", "radii", "depth_alpha")),
     Contract("mcmc", "3DGS-MCMC", ("color", "radii", "is_used"), names=("compute_relocation",)),
-    Contract("absgs", "AbsGS", ("color", "radii", "weights"), module=RASTERIZER + "_abs", absolute=2),
+    Contract("absgs", "AbsGS", ("color", "radii", "weights"), module=RASTERIZER + "_abs"),
     Contract("fastgs", "FastGS", ("color", "radii", "metric_counts"), ("mult", "get_flag", "metric_map"), WITH_DC,
-             ("SparseGaussianAdam",), module=RASTERIZER + "_fastgs", absolute=2),
+             ("SparseGaussianAdam",), module=RASTERIZER + "_fastgs"),
     Contract("mini_splatting", "Mini-Splatting", ("color", "radii", "weights", "counts", "largest"),
              methods=("render_depth",), module=RASTERIZER + "_ms",
              other_results=(("color", "radii"),)),  # of Inria's, which its trainer calls too
@@ -117,6 +136,17 @@ CONTRACTS = (
 )
 
 
+def ordered(results: Tuple[str, ...]) -> Contract:
+    """Returns the entry of a rasterizer like Inria's whose results come in another order: names of WORDS, each once.
+
+    Raises KeyError where they are others, or without `color` and `radii`.
+    """
+    if len(set(results)) < len(results) or not {"color", "radii"} <= set(results) <= {name for name, _ in WORDS}:
+        raise KeyError(",".join(results))
+    return Contract(",".join(results), "rasterizers whose results come in this order", results, ("antialiasing",),
+                    (*WITH_DC, "means2D_densify"))
+
+
 def contract_of(name: str) -> Contract:
-    """Returns the entry of a name. Raises KeyError where there is none."""
-    return {contract.name: contract for contract in CONTRACTS}[name]
+    """Returns the entry of a name, or of results with commas between them. Raises KeyError where there is none."""
+    return ordered(tuple(name.split(","))) if "," in name else {contract.name: contract for contract in CONTRACTS}[name]

@@ -6,19 +6,16 @@ these go through the pixels' centres.
 """
 from __future__ import annotations
 
-from typing import Any, Dict, Tuple
+from typing import Any, Dict
 
 import torch
 
-from diff_smoe_rasterization import Footprints, project_gaussians
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
-from diff_smoe_rasterization.settings import resolve_blend
 
 from ._rasterizer import classes_of, results_of
+from ._walk import Walk
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
-TILE, STEP = 16, 8  # pixels of a tile's side; Gaussians of its list that are taken at once
-FULL = 1e-4  # a pixel of less transmittance takes no more
 
 
 def _render(settings, inputs):
@@ -77,73 +74,14 @@ class GaussianRasterizer(_Rasterizer):
 
 @torch.no_grad()
 def _strongest(settings: Settings, inputs: Dict[str, Any]) -> torch.Tensor:
-    """Returns which Gaussian has the largest weight in each pixel [H, W], -1 where none has one.
-
-    A weight is that in the numerator of the pixel's colour. The tiles' lists are walked side by side, front to back.
-    """
-    mode, _ = resolve_blend(settings)
-    given = {name: tensor for name, tensor in inputs.items() if name != "means2D"}
-    footprints = project_gaussians(settings=settings, **given)
-    height, width = settings.image_height, settings.image_width
-    grid = torch.tensor([-(-width // TILE), -(-height // TILE)], device=footprints.radii.device)
-    columns, rows = grid.tolist()
-    order, tile_of, places = _lists(footprints, grid, mode == "alpha")
-    gates = footprints.gates[order]
-    place = torch.arange(TILE, device=gates.device)
-    best = gates.new_zeros(rows * columns, TILE, TILE)
-    strongest = torch.full_like(best, -1, dtype=torch.int64)
-    transmittance = torch.ones_like(best)
-    counts = torch.bincount(tile_of, minlength=rows * columns)
-    begins = counts.cumsum(0) - counts
-    for seen in range(0, int(counts.max()), STEP):
-        unfinished = counts > seen
-        if mode != "smoe_std":
-            unfinished &= transmittance.flatten(1).amax(1) >= FULL
-        tiles = unfinished.nonzero()[:, 0]
-        at = begins[tiles, None] + seen + torch.arange(STEP, device=gates.device)
-        listed = at < (begins + counts)[tiles, None]
-        which = places[at.clamp(max=len(places) - 1)]
-        x, y, xx, xy, yy, opacity, reach, _ = gates[which][..., None].unbind(2)  # [tiles, STEP, 1]
-        dx = (tiles % columns * TILE)[:, None, None] + place - x
-        dy = ((tiles // columns * TILE)[:, None, None] + place - y)[..., None]
-        squared = (2 * xy * dx)[:, :, None] * dy + (xx * dx * dx)[:, :, None] + yy[..., None] * dy * dy
-        alpha = torch.exp(-0.5 * squared).mul_((opacity * listed[..., None])[..., None]).clamp_(max=0.99)
-        alpha.masked_fill_((squared > reach[..., None]) | (squared < 0), 0)
-        if mode == "smoe_std":
-            weight = alpha
-        else:
-            before = transmittance[tiles, None]
-            behind = torch.cumprod(1 - alpha, 1).mul_(before)
-            weight = alpha * torch.cat([before, behind[:, :-1]], 1)
-            weight.masked_fill_(behind < FULL, 0)
-            transmittance[tiles] = behind[:, -1]
+    """Returns which Gaussian has the largest weight in each pixel [H, W], -1 where none has one."""
+    walk = Walk(settings, inputs)
+    best = walk.image_of_tiles(0.0)
+    strongest = walk.image_of_tiles(-1)
+    for tiles, which, weight in walk.steps():
         largest, index = weight.max(1)
         better = largest > best[tiles]
         best[tiles] = torch.where(better, largest, best[tiles])
-        found = order[which].gather(1, index.flatten(1)).reshape(index.shape)
+        found = which.gather(1, index.flatten(1)).reshape(index.shape)
         strongest[tiles] = torch.where(better, found, strongest[tiles])
-    image = strongest.unflatten(0, (rows, columns)).transpose(1, 2).reshape(rows * TILE, columns * TILE)
-    return image[:height, :width]
-
-
-def _lists(footprints: Footprints, grid: torch.Tensor, within_radius: bool) -> Tuple[torch.Tensor, ...]:
-    """Returns the visible Gaussians, nearest first, and of sorted pairs the tile and the place in that order.
-
-    within_radius: a Gaussian is only in tiles that the square of its radius meets, as Inria's rule has it.
-    """
-    visible = footprints.radii.nonzero()[:, 0]
-    order = visible[footprints.gates[visible, 7].sort(stable=True).indices]
-    gates, radii = footprints.gates[order], footprints.radii[order, None]
-    determinant = gates[:, 2] * gates[:, 4] - gates[:, 3] ** 2
-    reach = (gates[:, [4, 2]] / determinant[:, None] * gates[:, 6:7].clamp(min=0)).sqrt() + 1
-    reach = torch.minimum(reach, radii.to(reach)) if within_radius else reach
-    zero = torch.zeros_like(grid)
-    first = ((gates[:, :2] - reach) / TILE).floor().long().clamp(zero, grid)
-    past = ((gates[:, :2] + reach + TILE - 1) / TILE).floor().long().clamp(zero, grid)
-    size = (past - first).clamp(min=0)
-    number = size.prod(1)
-    place = torch.arange(len(order), device=order.device).repeat_interleave(number)
-    inside = torch.arange(len(place), device=order.device) - (number.cumsum(0) - number)[place]
-    tile = first[place, 0] + inside % size[place, 0] + (first[place, 1] + inside // size[place, 0]) * grid[0]
-    tile, by_tile = tile.sort(stable=True)
-    return order, tile, place[by_tile]
+    return walk.untiled(strongest)

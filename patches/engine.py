@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Union
 
 from . import facts
-from .rules import OPTIONS, SETTINGS, import_rasterizer, rules_of, settings_blend, start
+from .rules import OPTIONS, SETTINGS, entries_in, import_rasterizer, rules_of, settings_blend, start
 from .source import MARK, NO_STANDARD, STANDARD, PatchError, Source, leftover, tree_of, unpatched
 from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Trainer
 
 UNFINISHED = ".dsmoe_unfinished"  # begins the name of a folder of new files, until all are written
 # Signs of an environment, of a run's output and of another checkout or package.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
+CALLS = r"|\b(?:chosen_blend|default_blend|blend_of|saved_blend_of)\("  # what nothing imports without the patch
 PathLike = Union[str, Path]
 
 
@@ -52,19 +53,26 @@ class Plan(NamedTuple):
 class Patched:
     """What a patch makes of files."""
 
-    def __init__(self, before: Mapping[str, bytes], trainer: Trainer, options: Sequence[str]) -> None:
+    def __init__(self, before: Mapping[str, bytes], trainer: Trainer, options: Sequence[str],
+                 sparse_adam: bool) -> None:
         self.before, self.after = before, dict(before)
         self.rules: Dict[str, List[str]] = {}  # of each file
-        self.problems = [f"{name}: {leftover(data)}; change that line, by which `revert` takes a patch out"
-                         for name, data in before.items() if leftover(data)]  # why it cannot be patched
+        # Why it cannot be patched.
+        self.problems = [f"{name}: {leftover(data)}, which is not as a patch writes it; change that line back, or "
+                         "take the mark out of it" for name, data in before.items() if leftover(data)]
         scripts = [name for name, data in before.items() if "/" not in name and b"__main__" in data]
         self.notes = [f"--{one}: fits no script: no .py beside train.py has __main__" for one in options if not scripts]
-        for rule in rules_of(trainer):
+        rendering = [entry for entry in trainer.entries if entry.blend != "blend_of"]
+        if rendering and not entries_in(before, rendering):  # it may render by other means
+            self.notes += [f"{rendering[-1].file}: there is none, nor a function {rendering[-1].function}; a script "
+                           "that renders needs `pipe.blend = saved_blend_of(dataset)`, and says so where it has not"]
+        for rule in rules_of(trainer, before, sparse_adam):
             why = self.apply(rule.file, rule.name, rule.edit)
             self.problems += [f"{rule.file}: rule {rule.name}: {why}; right would be {rule.says}"] if why else []
         for name, data in before.items():  # a script of the user's must not get another rasterizer
             if name != GR and RASTERIZER.encode() in data and not name.startswith("submodules/"):
-                self.apply(name, "import-rasterizer", partial(import_rasterizer, trainer=trainer))
+                edit = partial(import_rasterizer, trainer=trainer, sparse_adam=sparse_adam)
+                self.apply(name, "import-rasterizer", edit)
                 self.notes += [f"{name}: {note}" for note in self.notes_on(name, trainer)]
         for option in options:
             for name, data in before.items():
@@ -116,16 +124,29 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
     if name not in by_name:
         raise PatchError(f"there is no trainer {name!r}; it must be one of {', '.join(TRAINER_NAMES)}")
     chosen = by_name[name]
-    others = facts.those(found, "from ") - {RASTERIZER} or facts.those(found, "defines ")
-    if chosen is not None and (not chosen.entries or others):
-        reason = reason or f"its rasterizer is {chosen.flavour}, for which there is no patch: use `dsmoe run`"
+    renamed = facts.those(found, "renamed ")
+    others = facts.those(found, "from ") - {RASTERIZER} or facts.those(found, "defines ") or renamed
+    callers = facts.importers(before)
+    below = facts.below(root)
+    if below:
+        reason, chosen = below[0], None
+    elif chosen is not None and (not chosen.entries or others):
+        by = f" ({', '.join(sorted(renamed))})" if renamed else ""
+        reason = reason or f"its rasterizer is {chosen.flavour}{by}, for which there is no patch: {_by_run(before)}"
         chosen = None
-    if GR not in now or chosen is None or facts.those(found, "uses "):
-        return Plan(root, "unknown", None, [reason if GR in now else f"there is no {GR} in it"], applied)
+    elif callers and GR not in callers and known:
+        reason = (f"{GR} {'does not import' if GR in now else 'is not there to import'} the rasterizer, but "
+                  f"{', '.join(callers[:3])}, and a patch is of {GR} alone: {_by_run(before)}")
+        chosen = None
+    elif GR not in now:
+        reason, chosen = f"there is no {GR} in it", None
+    if chosen is None or facts.those(found, "uses "):
+        return Plan(root, "unknown", None, [reason], applied)
     wanted = {"modernise": modernise, "fuse": fuse}
     options = [name for name in OPTIONS if wanted[name] or name in applied]
-    patched = Patched(before, chosen, options)
-    as_it_was = (patched if options == applied else Patched(before, chosen, applied)).after
+    sparse_adam = facts.is_for_sparse_adam(root, before, found)
+    patched = Patched(before, chosen, options, sparse_adam)
+    as_it_was = (patched if options == applied else Patched(before, chosen, applied, sparse_adam)).after
     wrong = [f"{name}: is not as this version patches it: `apply` finishes the patch, `revert` takes it back"
              for name, data in now.items() if data != as_it_was[name]]
     state, reasons = (("unpatchable" if now == before else "drifted", patched.problems) if patched.problems else
@@ -135,6 +156,13 @@ def check(path: PathLike, modernise: bool = False, trainer: Optional[str] = None
         reason = f"by what it imports and calls it is {known.name}, which has another API" if known else reason
         patched.notes.insert(0, f"--trainer {trainer}: {reason}")
     return Plan(root, state, chosen.name, reasons, applied, now, before, patched.after, patched.rules, patched.notes)
+
+
+def _by_run(files: Mapping[str, bytes]) -> str:
+    """Says how a checkout is run without a patch."""
+    trains = [name for name, data in files.items() if b"def training(" in data and b"__main__" in data]
+    script = min(trains or ["train.py"], key=lambda name: (name.count("/"), name != "train.py", name))
+    return f"type `dsmoe run --blend-mode smoe -- python {script} ...` in it, which needs none"
 
 
 def diff(path: PathLike, **options: Any) -> str:
@@ -155,7 +183,7 @@ def apply(path: PathLike, **options: Any) -> Plan:
     """
     planned = check(path, **options).possible()
     todo = {name: data for name, data in planned.after.items() if data != planned.now[name]}
-    _write(planned.root, todo)
+    _write(planned.root, todo, planned.now)
     return planned._replace(written=bool(todo))
 
 
@@ -169,7 +197,7 @@ def revert(path: PathLike) -> List[str]:
     back = {name: data for name, data in before.items() if data != now[name]}
     for name, data in before.items():
         try:
-            why = leftover(data, f"|{INTEGRATIONS}" if name in back and name == GR else "")
+            why = leftover(data, "" if name not in back else f"|{INTEGRATIONS}{CALLS}" if name == GR else CALLS)
             if name in back and not why:
                 tree_of(data)
         except PatchError as error:
@@ -179,7 +207,7 @@ def revert(path: PathLike) -> List[str]:
                              "again; nothing was touched")
     if not back and not any(root.glob(UNFINISHED + "*")):
         raise PatchError(f"{root}: no file has a line of a patch, so nothing can be taken back")
-    _write(root, back)
+    _write(root, back, now)
     return list(back)
 
 
@@ -196,8 +224,11 @@ def _files(root: Path) -> Dict[str, bytes]:
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(paths) if path.is_file()}
 
 
-def _write(root: Path, files: Mapping[str, bytes]) -> None:
-    """Writes files, each at once: a kill leaves every one as it was or as it becomes. Modes, owners and links stay."""
+def _write(root: Path, files: Mapping[str, bytes], now: Mapping[str, bytes]) -> None:
+    """Writes files, each at once: a kill leaves every one as it was or as it becomes. Modes, owners and links stay.
+
+    now: what they were read as. Raises PatchError where one is another one by now, as an editor has saved it.
+    """
     targets = {name: (root / name).resolve() for name in files}
     for name, target in targets.items():
         if root.resolve() not in target.parents:
@@ -212,8 +243,13 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
             shutil.copymode(targets[name], unfinished / name)
             with contextlib.suppress(PermissionError):
                 os.chown(unfinished / name, targets[name].stat().st_uid, targets[name].stat().st_gid)
+        there = {target: now[name] for name, target in targets.items()}  # of two names of one file once
+        for name, target in targets.items():  # all of them before the first is replaced
+            _check_unchanged(name, target, there)
         for name, target in targets.items():
+            _check_unchanged(name, target, there)
             os.replace(unfinished / name, target)
+            there[target] = files[name]
     except OSError as error:
         raise PatchError(f"{error.filename or root}: cannot be written: {error}; `dsmoe patch check {root}` says how "
                          "the checkout is") from None
@@ -221,3 +257,9 @@ def _write(root: Path, files: Mapping[str, bytes]) -> None:
         for folder in root.glob(UNFINISHED + "*"):  # but those of other processes that still run
             if folder.suffix[1:] == str(os.getpid()) or not os.path.exists(f"/proc/{folder.suffix[1:]}/fd"):
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _check_unchanged(name: str, target: Path, there: Mapping[Path, bytes]) -> None:
+    if target.read_bytes() != there[target]:
+        raise PatchError(f"{name}: another program has saved it meanwhile, and it is left as it is now; the same "
+                         "command again finishes")

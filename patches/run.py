@@ -6,40 +6,47 @@ starts has them. That nothing was rendered is an error.
 """
 from __future__ import annotations
 
+import contextlib
 import os
-import re
 import signal
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Dict, List, NoReturn, Optional, Sequence, Tuple
+from typing import Dict, List, NoReturn, Optional, Sequence, Set, Tuple
 
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_of
 from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
+from diff_smoe_rasterization.trainer.system.children import die_with_parent
 
 from . import facts
 from .runtime import RASTERIZER_VARIABLE, SHIMS, STAND_INS, USED_VARIABLE, WITHOUT_VARIABLE
 from .source import PatchError
 from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
 
+RENAMED = "DSMOE_RUN_RENAMED"  # the names under which the trainer imports a rasterizer that is known
 FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
-SPARSE_ADAM = "SparseGaussianAdam"
 
 
 def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
         background_gate: Optional[float] = None) -> NoReturn:
     """Runs the command, and ends with its exit status, or 128 + N where signal N ended it.
 
-    Raises PatchError where the command would not run, or did not, with this rasterizer.
+    Where this process is killed, the command gets a SIGTERM. Raises PatchError where the command would not run, or did
+    not, with this rasterizer.
     """
     environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
     for line in lines:
         print("dsmoe run: " + line, file=sys.stderr)
     with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
         used = Path(folder, "used")
+        for name in filter(None, environment.pop(RENAMED, "").split(os.pathsep)):
+            Path(folder, "shims", name).mkdir(parents=True)
+            Path(folder, "shims", name, "__init__.py").write_text((SHIMS / RASTERIZER / "__init__.py").read_text())
+            environment["PYTHONPATH"] = os.pathsep.join([str(Path(folder, "shims")), environment["PYTHONPATH"]])
         try:
-            child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)})
+            child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)},
+                                     preexec_fn=die_with_parent)
         except OSError as error:
             raise PatchError(f"{words[0]}: {error.strerror}") from None
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the command too
@@ -62,76 +69,104 @@ def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
         raise PatchError(str(error)) from None
     if not words:
         raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
-    folders = _folders(words)
+    script = _script(words)
+    folders = _folders(script)
     files = {folder: _read(folder, everywhere=folder == folders[0]) for folder in folders}
-    flavour, found, warnings = _flavour(files, trainer)
+    flavour, where, warnings, found = _flavour(files, trainer, script)
     module = contract_of(flavour).module
-    named = flavour if module == RASTERIZER else "inria"  # beside another, such as gsplat's wrapper, stands Inria's
+    known_names = {name for name in facts.MODULES if module == RASTERIZER and "from " + name in found}
+    renamed = sorted(facts.those(found, "renamed ") | known_names)
+    named = flavour if module == RASTERIZER else "inria"  # beside another stands Inria's
+    if flavour == facts.OF_GSPLAT:  # unless what is beside it is known
+        beside = facts.contract_of(found - {"from " + facts.OF_GSPLAT})[0]
+        named = beside.name if beside and beside.module == RASTERIZER else named
     path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
     environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: named,
                    BACKGROUND_GATE_VARIABLE: "" if gate is None else str(gate), "PYTHONPATH": os.pathsep.join(path),
-                   "PYTHONDONTWRITEBYTECODE": "1"}  # else Python leaves __pycache__ in the checkout
+                   "PYTHONDONTWRITEBYTECODE": "1", RENAMED: os.pathsep.join(renamed)}  # no __pycache__ in the checkout
     warnings += facts.of_one_name(folders[0])
-    if _cannot_use_sparse_adam(files):
-        environment[WITHOUT_VARIABLE] = SPARSE_ADAM
-        warnings += [f"{SPARSE_ADAM} is not offered: where it is found, the trainer reads get_features_dc of its model,"
-                     " which has none"]
+    if named == "inria_2024" and not _may_use_sparse_adam(words, files, found):
+        environment[WITHOUT_VARIABLE] = facts.SPARSE_ADAM
+    if renamed:
+        why = "as --trainer says" if trainer else "since its calls fit"
+        warnings += [f"{', '.join(renamed)} is taken for {RASTERIZER} under another name, {why}; if it computes "
+                     "something else, that is not computed here"]
+        module = ", ".join([*renamed, *[module] * ("from " + module in found)])
+    if "," in flavour and flavour not in ("color,radii", trainer):
+        warnings += [f"the results are told by what the trainer calls them: {flavour}"]
     blend = blend_mode if gate is None else f"{blend_mode}, background gate {gate}"
-    return environment, [f"{found}: {module} will be {flavour} of this package, blend mode {blend}; each process that "
+    return environment, [f"{where}: {module} will be {flavour} of this package, blend mode {blend}; each process that "
                          "imports it says so", *(f"warning: {warning}" for warning in warnings)]
 
 
-def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str]) -> Tuple[str, str, List[str]]:
-    """Returns the flavour, for which trainer it was chosen, and what speaks against it."""
+def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script: Optional[Path]
+             ) -> Tuple[str, str, List[str], Set[str]]:
+    """Returns the flavour, for which trainer it was chosen, what speaks against it, and the facts."""
     by_name = {"": "", **{name: name for name in FLAVOURS}, **{known.name: known.flavour for known in TRAINERS}}
+    with contextlib.suppress(KeyError):
+        by_name.setdefault(trainer or "", contract_of(trainer or "").name)
     if (trainer or "") not in by_name:
         raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
-                         f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}")
-    reasons, seen = [], False
+                         f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}, or what a call "
+                         "returns, such as color,depth,median_depth,alpha,radii")
+    reasons, everything = [], set()
     for path in (next(iter(files)) / name for name in (RASTERIZER, f"{RASTERIZER}.py")):
         if path.exists():  # where Python looks first
             raise PatchError(f"{path} would be imported before this package's; move it away")
     for folder, texts in files.items():
-        found = facts.of_checkout(texts) if GR in texts else facts.of_files(texts)
-        seen = seen or bool(found)
+        inside = script is not None and folder in script.parents
+        name = script.relative_to(folder).as_posix() if script and inside else ""
+        found = facts.of_checkout(texts, name)
+        everything |= found
         if facts.PATCHED in found:
             raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
                              "without (render.py, which reads it from cfg_args)")
         known, reason = facts.recognise(found)
         if known and not trainer:
-            return known.flavour, f"{known.name if GR in texts else 'the trainer'} in {folder}", []
-        if trainer and (facts.those(found, "uses ") or found and not facts.those(found, "from ")):
+            return known.flavour, f"{known.name if GR in texts else 'the trainer'} in {folder}", [], found
+        is_hidden = by_name[trainer or ""] == facts.OF_GSPLAT and "has gsplat" in found
+        if trainer and (facts.those(found, "uses ") or found and not facts.calls_some(found) and not is_hidden):
             raise PatchError(f"{folder}: {reason}; --trainer {trainer} cannot help")
         if known and known.flavour != by_name[trainer or ""]:
             reason = f"by what it imports and calls this is {known.flavour}"
         reasons += [f"{folder}: {reason}"] if found and reason else []
     if trainer:
         module = contract_of(by_name[trainer]).module
-        return by_name[trainer], trainer, reasons or [f"no file that imports {module} was found"] * (not seen)
-    raise PatchError("no trainer that is known was found; name it with --trainer, or the rasterizer whose API it calls "
-                     f"({', '.join(FLAVOURS)}):\n  " + "\n  ".join(
-                         reasons or [f"there is no {GR} in {', '.join(map(str, files))}"]))
+        return by_name[trainer], trainer, reasons or [f"no file that imports {module} was found"] * (
+            not everything), everything
+    nearest = dict.fromkeys([next(iter(files)), Path.cwd()])
+    below = [f"{folder}: {hint}" for folder in nearest for hint in facts.below(folder)]
+    raise PatchError("no trainer that is known was found; --trainer names it, or the rasterizer whose API it calls "
+                     "(--trainer list prints the names):\n  " + "\n  ".join(
+                         [*reasons, *below] or [f"there is no {GR} in {', '.join(map(str, files))}"]))
 
 
-def _folders(words: Sequence[str]) -> List[Path]:
+def _script(words: Sequence[str]) -> Optional[Path]:
+    """Returns the file that a command runs: the first .py, or that of `-m`; None where there is none."""
+    modules = [after.replace(".", "/") + ".py" for word, after in zip(words, words[1:]) if word == "-m"]
+    return next((Path(word).resolve() for word in [*words, *modules]
+                 if word.endswith(".py") and Path(word).is_file()), None)
+
+
+def _folders(script: Optional[Path]) -> List[Path]:
     """Returns where the checkout may be: the script's folder, those above it, the current folder."""
-    script = next((Path(word).resolve() for word in words if word.endswith(".py") and Path(word).is_file()), None)
     folders = [script.parent, *list(script.parent.parents)[:2]] if script else []
     return list(dict.fromkeys([*folders, Path.cwd()]))
 
 
 def _read(folder: Path, everywhere: bool) -> Dict[str, bytes]:
-    """Returns the files of a checkout like that of 3DGS, else, if so asked, all that import a rasterizer."""
-    of_3dgs = (folder / GR).is_file()
-    patterns = ("*.py", "*/*.py", "*/*/*.py")[:2 if of_3dgs else 3 * everywhere]
+    """Returns the Python files in a folder and two levels below it; {} where none imports a rasterizer.
+
+    everywhere: also where it is no checkout like that of 3DGS.
+    """
+    patterns = ("*.py", "*/*.py", "*/*/*.py") if everywhere or (folder / GR).is_file() else ()
     paths = (path for pattern in patterns for path in folder.glob(pattern) if path.is_file())
     files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths
              if not {"submodules", "site-packages"} & set(path.parts)}
-    return {name: data for name, data in files.items() if of_3dgs or re.search(
-        rb"^\s*(from|import) (diff_(gauss|surfel)|gsplat\b)", data, re.MULTILINE)}
+    return files if GR in files or any(map(facts.IMPORTS_RASTERIZER.search, files.values())) else {}
 
 
-def _cannot_use_sparse_adam(files: Dict[Path, Dict[str, bytes]]) -> bool:
-    """Whether the trainer reads get_features_dc, as 3DGS does where it finds SparseGaussianAdam, and defines none."""
-    text = b"\n".join(next((texts for texts in files.values() if GR in texts), {}).values())
-    return b".get_features_dc" in text and not re.search(rb"def get_features_dc|\bget_features_dc *=", text)
+def _may_use_sparse_adam(words: Sequence[str], files: Dict[Path, Dict[str, bytes]], found: Set[str]) -> bool:
+    """Whether the trainer was written for SparseGaussianAdam, or the command asks for it."""
+    return any(facts.ASKS_FOR_SPARSE_ADAM in word for word in words) or any(
+        facts.is_for_sparse_adam(folder, texts, found) for folder, texts in files.items())

@@ -97,19 +97,36 @@ def _noting(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _say_rasterizer(flavour: str) -> None:
+    """Says which rasterizer it is, and at the first step of an optimizer if nothing has been rendered by then."""
     mode = resolve_blend_mode(None)
     gate = f", background gate {settings.resolve_background_gate(mode, None)}" if mode == "smoe" else ""
     say(f"the rasterizer is {flavour} of this package, blend mode {mode}{gate}")
+
+    def look(*_: Any) -> None:
+        used = os.environ.get(USED_VARIABLE, "")  # until the first rendering of this process
+        if used and not os.path.exists(used):
+            say(f"the first step of an optimizer, and this rasterizer has rendered nothing yet: if what is trained now "
+                f"are Gaussians, another one renders them, not {mode}")
+
+    steps = importlib.import_module("torch.optim.optimizer")
+    if USED_VARIABLE in os.environ and hasattr(steps, "register_optimizer_step_pre_hook"):  # torch 2.0
+        steps.register_optimizer_step_pre_hook(look)
 
 
 def rasterizer_of_run(flavour: Optional[str] = None) -> Dict[str, Any]:
     """Returns what a trainer imports from its rasterizer under `dsmoe run`, and says so on stderr.
 
-    flavour: the module of integrations, where the name that is imported says it; None: the one that the trainer needs.
+    flavour: the module of integrations, where the name that is imported says it; None: the one that the trainer needs,
+        or what a call returns, with commas.
     """
     from diff_smoe_rasterization import GaussianRasterizer
+    from diff_smoe_rasterization.integrations._rasterizer import classes_of
     flavour = flavour or os.environ[RASTERIZER_VARIABLE]
-    module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
+    if "," in flavour:
+        names = "GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"
+        module: Any = types.SimpleNamespace(__all__=names, **dict(zip(names, classes_of(flavour, __name__))))
+    else:
+        module = importlib.import_module("diff_smoe_rasterization.integrations." + flavour)
     GaussianRasterizer.__init__ = _noting(GaussianRasterizer.__init__)  # type: ignore[method-assign]
     _say_rasterizer(flavour)
     offered = {name: getattr(module, name) for name in module.__all__ if name != os.environ.get(WITHOUT_VARIABLE)}

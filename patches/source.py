@@ -1,26 +1,31 @@
 """A Python file: its tree, lines that are put into it, and the file as it was before.
 
 Whatever a patch puts into a file carries a mark, by which it is taken out again. So the files themselves say whether
-they are patched, also in a copy, a clone or another commit of the checkout.
+they are patched, also in a copy, a clone or another commit of the checkout. A mark ends with a digest of what the patch
+wrote: where that was edited, the mark stays, and `leftover` names it.
 
-    text  # dsmoe patch                      a line of the patch
-    # dsmoe patch TRAINER: MODULE            the line below it imported from MODULE
-    f(**chosen_blend(pipe),  # dsmoe patch   up to the next word
+    text  # dsmoe patch DIGEST                      a line of the patch
+    # dsmoe patch TRAINER: MODULE DIGEST            the line below it imported from MODULE, and now from another one
+    f(**chosen_blend(pipe),  # dsmoe patch DIGEST   up to the next word
 """
 from __future__ import annotations
 
 import ast
 import codecs
+import hashlib
 import re
 import warnings
-from typing import Any, Iterator
+from typing import Any, Iterator, Match
 
 MARK = "# dsmoe patch"
 # A flag of compilers in the place of one that asks for an old standard.
 STANDARD, NO_STANDARD = b"-std=c++14", b"-DDSMOE_PATCH_STD=14"
-# No more than what the rules write, so that a line to which the user has added something is not taken for the patch's.
-LINE = re.compile(rb"(?m)^(\xef\xbb\xbf)?[ \t#]*(from diff_smoe_\S+ import (\w+|(\w+); \4\.start\(\))"
-                  rb"|[\w., ]+ = (\w+_blend_of|blend_of|default_blend)\(\w*\))[ \t]+# dsmoe patch[ \t]*\r?\n")
+# Each with the groups `text`, which the patch wrote, and `digest`.
+END = rb"[ \t]+# dsmoe patch (?P<digest>\w+)[ \t]*\r?\n"
+LINE = re.compile(rb"(?m)^(?P<kept>\xef\xbb\xbf)?[ \t]*(?P<text>\S.*?)" + END)
+ARGUMENT = re.compile(rb"(?m)^(?P<kept>[^#\n]*)(?P<text>\*\*\w+\(\w+\),)" + END + rb"[ \t]*")
+IMPORT = re.compile(rb"(?m)^[ \t]*# dsmoe patch [\w-]+: (?P<module>\w+) (?P<digest>\w+)\r?\n"
+                    rb"(?P<kept>[ \t]*from[ \t]+)(?P<text>[\w.]+)")
 
 
 class PatchError(RuntimeError):
@@ -37,16 +42,33 @@ def tree_of(data: bytes) -> ast.Module:
         raise PatchError(f"is not Python that can be parsed: {str(error).replace('<unknown>, ', '')}") from None
 
 
+def digest(text: bytes) -> str:
+    """What a mark says of a text that the patch wrote."""
+    return hashlib.sha256(text).hexdigest()[:8]
+
+
+def marked(text: str) -> str:
+    """A line of the patch."""
+    return f"{text}  {MARK} {digest(text.encode())}"
+
+
 def unpatched(data: bytes) -> bytes:
-    """Returns a file without what a patch put into it."""
-    data = re.sub(rb"(?m)^[ \t]*# dsmoe patch [\w-]+: (\w+)\r?\n([ \t]*from[ \t]+)[\w.]+", rb"\2\1", data)
-    data = re.sub(rb"(?m)^([^#\n]*)\*\*chosen_blend\(\w+\),[ \t]+# dsmoe patch[ \t]*\r?\n[ \t]*", rb"\1", data)
-    return LINE.sub(rb"\1", data).replace(NO_STANDARD, STANDARD)
+    """Returns a file without what a patch put into it; what was edited of that stays, with its mark."""
+    for pattern in (IMPORT, ARGUMENT, LINE):
+        data = pattern.sub(_as_it_was, data)
+    return data.replace(NO_STANDARD, STANDARD)
+
+
+def _as_it_was(found: Match[bytes]) -> bytes:
+    parts = found.groupdict()
+    if digest(parts["text"]) != parts["digest"].decode():
+        return found[0]
+    return (parts["kept"] or b"") + parts.get("module", b"")
 
 
 def leftover(data: bytes, more: str = "") -> str:
     """Says which line still has the mark (or `more`): an edited line of the patch, or one of the user's; "" if none."""
-    found = re.search(rf".*(?:{MARK}{more}).*".encode(), data)
+    found = re.search(rf".*(?:{MARK}|-DDSMOE_PATCH_STD{more}).*".encode(), data)
     return f"still has `{found[0].decode(errors='replace').strip()}`" if found else ""
 
 

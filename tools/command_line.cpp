@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <filesystem>
 
 #include "errors.h"
 #include "io/cursor.h"
@@ -79,6 +80,28 @@ std::vector<double> CommandLine::numbers(const std::string& name, const std::vec
                      " numbers with commas between them");
   }
   return values;
+}
+
+void CommandLine::check_output(const std::string& file, const std::string& folder) const {
+  namespace fs = std::filesystem;
+  std::error_code ignored;
+  if (!folder.empty()) {
+    fs::path place = folder;
+    for (const fs::path& part : fs::path(file).lexically_relative(folder).parent_path()) {
+      place /= part;
+      if (fs::is_symlink(place, ignored)) {
+        throw UsageError(io::printable(place.string()) + " is a link, and nothing is written there; -o names another");
+      }
+    }
+  }
+  const fs::file_status status = fs::symlink_status(file, ignored);
+  if (!fs::exists(status)) return;
+  if (!fs::is_regular_file(status)) {
+    throw UsageError(io::printable(file) + " is no regular file, which is never replaced; -o names another");
+  }
+  if (!has("overwrite")) {
+    throw UsageError(io::printable(file) + " is there already; --overwrite replaces it, -o names another");
+  }
 }
 
 std::vector<std::string> split(const std::string& text, char separator) {

@@ -33,6 +33,10 @@ class CommandLine {
   /// `count` finite numbers with commas between them.
   std::vector<double> numbers(const std::string& name, const std::vector<double>& missing, std::size_t count) const;
 
+  /// The rule for a file that a program writes: it is not there, or it is a regular file and --overwrite is given, and
+  /// no link lies between `folder` and it. Throws UsageError.
+  void check_output(const std::string& file, const std::string& folder = "") const;
+
  private:
   std::map<std::string, std::string> values_;
   std::vector<std::string> arguments_;

@@ -25,6 +25,7 @@ Fits Gaussian kernels to a picture by gradient descent, and shows what each of t
   PICTURE             any file that OpenCV reads
   --edge SIZE         a made-up picture instead: red above the diagonal, blue below, SIZE pixels a side
   -o FOLDER           for the results; it is made where it is missing
+  --overwrite         replace results that are there
 
 Options
   --kernels N         how many. Default: 2
@@ -52,9 +53,19 @@ Figure 3:                dsmoe_fit2d --edge 128 --kernels 6 --mixture sum --rate
 Figure 10:               dsmoe_fit2d photo.jpg --width 300 --kernels 2000 --iterations 1000 -o figure10
 )";
 
-const std::vector<OptionRule> kOptions = {
-    {"help", 'h', false}, {"output", 'o'}, {"edge"}, {"kernels"}, {"shape"}, {"mixture"},
-    {"iterations"},       {"rate"},        {"seed"}, {"width"},   {"line"},  {"threads"}};
+const std::vector<OptionRule> kOptions = {{"help", 'h', false},
+                                          {"output", 'o'},
+                                          {"overwrite", 0, false},
+                                          {"edge"},
+                                          {"kernels"},
+                                          {"shape"},
+                                          {"mixture"},
+                                          {"iterations"},
+                                          {"rate"},
+                                          {"seed"},
+                                          {"width"},
+                                          {"line"},
+                                          {"threads"}};
 
 constexpr int kMostShown = 16;  // kernels whose gates are drawn one by one
 
@@ -150,6 +161,9 @@ Picture choose_picture(const CommandLine& line) {
   return width == picture.width ? picture : scaled_to_width(picture, width);
 }
 
+constexpr const char* kResults[] = {"reconstruction.png", "segments.png", "gates.png",
+                                    "profile.csv",        "profile.png",  "kernels.csv"};
+
 int run(int argc, char** argv) {
   const CommandLine line(argc, argv, kOptions);
   if (line.has("help") || argc == 1) {
@@ -158,6 +172,8 @@ int run(int argc, char** argv) {
   }
   const std::string output = line.text("output", "");
   if (output.empty()) throw UsageError("-o FOLDER is needed");
+  const auto file = [&](const char* name) { return (fs::path(output) / name).string(); };
+  for (const char* name : kResults) line.check_output(file(name));
   const Picture picture = choose_picture(line);
   FitOptions options;
   options.kernels = line.whole("kernels", options.kernels, 1, 1000000);
@@ -188,7 +204,6 @@ int run(int argc, char** argv) {
   for (std::size_t i = 0; i < drawing.color.size(); ++i) error += std::pow(drawing.color[i] - picture.values[i], 2);
 
   fs::create_directories(output);
-  const auto file = [&](const char* name) { return (fs::path(output) / name).string(); };
   write_picture(file("reconstruction.png"), {picture.width, picture.height, 3, drawing.color});
   write_picture(file("segments.png"), label_colors(drawing.greatest, picture.width, picture.height));
   if (options.kernels <= kMostShown) write_picture(file("gates.png"), draw_gates(fit.model()));

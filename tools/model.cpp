@@ -28,6 +28,29 @@ std::string file_extension(const std::string& path) {
   return extension;
 }
 
+io::GaussianModel read_any(const std::string& path) {
+  const std::string extension = file_extension(path);
+  if (extension == ".splat") return io::read_splat(path);
+  if (extension == ".spz") {
+    throw UsageError(path + ": .spz is not read, as its library is in no Debian package; convert it to .ply first");
+  }
+  return io::read_gaussians(path);
+}
+
+bool is_finite_row(const std::vector<float>& numbers, std::size_t count, std::size_t row) {
+  const std::size_t size = numbers.size() / count;
+  const auto begin = numbers.begin() + static_cast<std::ptrdiff_t>(row * size);
+  return std::all_of(begin, begin + static_cast<std::ptrdiff_t>(size), [](float x) { return std::isfinite(x); });
+}
+
+bool is_finite_gaussian(const io::GaussianModel& model, std::size_t row) {
+  for (const auto* numbers :
+       {&model.means3D, &model.dc, &model.shs, &model.opacity_logits, &model.log_scales, &model.rotations}) {
+    if (!is_finite_row(*numbers, model.count, row)) return false;
+  }
+  return true;
+}
+
 }  // namespace
 
 Model activated(io::GaussianModel raw) {
@@ -48,12 +71,14 @@ Model activated(io::GaussianModel raw) {
 }
 
 io::GaussianModel read_model(const std::string& path) {
-  const std::string extension = file_extension(path);
-  if (extension == ".splat") return io::read_splat(path);
-  if (extension == ".spz") {
-    throw UsageError(path + ": .spz is not read, as its library is in no Debian package; convert it to .ply first");
+  io::GaussianModel model = read_any(path);
+  std::size_t row = 0;
+  while (row < model.count && !is_finite_gaussian(model, row)) ++row;
+  if (model.count > 0 && row == model.count) {
+    throw io::FormatError(path + ": each of its " + std::to_string(model.count) +
+                          " Gaussians has a number that is NaN or infinite, so none can be shown");
   }
-  return io::read_gaussians(path);
+  return model;
 }
 
 std::vector<std::string> blend_names() {

@@ -27,7 +27,7 @@ struct Model {
 
 Model activated(io::GaussianModel raw);
 
-/// Reads a .ply of Inria's layout or a .splat, by its name. Throws io::IoError.
+/// Reads a .ply of Inria's layout or a .splat, by its name. Throws io::IoError, also where no Gaussian is finite.
 io::GaussianModel read_model(const std::string& path);
 
 /// How a model is blended.

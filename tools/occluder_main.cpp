@@ -24,16 +24,19 @@ Options
   --blends A,B,...  which, in this order. Default: smoe,smoe_tn,smoe_std; alpha is the fourth
   --size N          pixels a side. Default: 256
   --threads N       Default: all processors
+  --overwrite       replace PICTURE.png where it is there
 )";
 
 int run(int argc, char** argv) {
-  const CommandLine line(argc, argv, {{"help", 'h', false}, {"output", 'o'}, {"blends"}, {"size"}, {"threads"}});
+  const CommandLine line(
+      argc, argv, {{"help", 'h', false}, {"output", 'o'}, {"blends"}, {"size"}, {"threads"}, {"overwrite", 0, false}});
   if (line.has("help") || argc == 1) {
     std::fputs(kHelp, stdout);
     return 0;
   }
   const std::string output = line.text("output", "");
   if (output.empty() || !line.arguments().empty()) throw UsageError("-o PICTURE.png is needed, and nothing else");
+  line.check_output(output);
   const int size = line.whole("size", 256, 16, 4096);
   const int threads = line.whole("threads", static_cast<int>(std::thread::hardware_concurrency()), 1, 4096);
   const std::vector<std::string> names = blend_names();

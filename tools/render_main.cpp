@@ -35,6 +35,7 @@ Where the result goes: the end of the name says what it becomes
   -o picture.png      one camera, 8 bits a channel
   -o picture.exr      one camera, numbers as they are (float32)
   -o folder/          a file for each camera, named after its image; --format png (the default) or exr
+  --overwrite         replace such files where they are there
 
 What is drawn: --show
   color               what the model looks like (the default)
@@ -69,6 +70,7 @@ Example: dsmoe_render point_cloud.ply --orbit -o orbit.mp4
 
 const std::vector<OptionRule> kOptions = {{"help", 'h', false},
                                           {"output", 'o'},
+                                          {"overwrite", 0, false},
                                           {"cameras"},
                                           {"orbit", 0, false},
                                           {"show"},
@@ -220,7 +222,6 @@ std::string picture_path(const fs::path& folder, const View& view, const std::st
   }
   if (path == folder) path /= "view";
   path.replace_extension("." + format);
-  fs::create_directories(path.parent_path());
   return path.string();
 }
 
@@ -268,6 +269,10 @@ int run(int argc, char** argv) {
                      " cameras and one picture; --view chooses one, or "
                      "-o names a folder or an .mp4");
   }
+  if (is_video || is_picture) line.check_output(output);
+  for (const View& view : views) {
+    if (!is_video && !is_picture) line.check_output(picture_path(output, view, format), output);
+  }
   const std::unique_ptr<Renderer> renderer = make_renderer(line, model, options);
   Painter paint(show, format == "exr" && !is_video);
   std::unique_ptr<VideoFile> video;
@@ -279,7 +284,9 @@ int run(int argc, char** argv) {
     if (is_video) {
       video->write(picture);
     } else {
-      write_picture(is_picture ? output : picture_path(output, view, format), picture);
+      const std::string path = is_picture ? output : picture_path(output, view, format);
+      if (!is_picture) fs::create_directories(fs::path(path).parent_path());
+      write_picture(path, picture);
     }
     progress.show(static_cast<int>(i) + 1);
   }

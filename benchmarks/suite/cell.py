@@ -9,7 +9,6 @@ OUT/log.txt is what it printed.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import itertools
 import os
 import re
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import IO, Any, Dict, List, Optional, Tuple
 
 from ...trainer.errors import TrainerError
+from ...trainer.system.children import die_with_parent
 from ...trainer.system.files import write_json_atomically
 from ...trainer.system.output_folder import locked
 from .names import ROW_NAME, read_json
@@ -137,14 +137,6 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device
     if not os.path.isfile(row_path):
         write_json_atomically(row_path, failed_row(cell, how_it_ended(status, log_path), time.time() - started))
     return read_json(row_path)
-
-
-def die_with_parent(end: int = signal.SIGTERM) -> None:
-    """Sends this process the signal `end` when the one that started it has ended, in whatever way (Linux)."""
-    import ctypes
-
-    with contextlib.suppress(AttributeError, OSError):
-        ctypes.CDLL(None).prctl(1, int(end), 0, 0, 0)  # 1 is PR_SET_PDEATHSIG
 
 
 def last_line(path: str) -> str:

@@ -10,17 +10,27 @@ import sys
 from functools import partial
 from typing import IO, Any, Dict, List, Mapping, Optional, Sequence
 
+from ...trainer.system.children import die_with_parent
 from ...trainer.system.files import write_json_atomically, write_text_atomically
-from ...trainer.system.output_folder import make_folder, only_one
+from ...trainer.system.output_folder import (
+    Record,
+    check_inside,
+    make_folder,
+    only_one,
+    own_record,
+    read_record,
+    write_record,
+)
 from ..errors import BenchError
 from . import require
-from .cell import die_with_parent, identity
+from .cell import identity
 from .expansion import AXIS_OF, NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
 from .names import CELL_NAME, CELLS_FOLDER, NATIVE, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
 from .preparation import made_scene, prepared_method, what_is_missing
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .rows import CellFile, CellRow, Row, at_once, cell_folders, read_object, read_rows
 
+COMMAND = "dsmoe bench run"  # in its folders' records
 SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 
@@ -42,6 +52,7 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
     results = os.path.abspath(results or os.path.join("bench_results", suite.name))
     earlier = earlier_rows(rows, suite.cells) if rows else {}
     check_folder(suite, results)
+    check_own(results)
     done: Dict[str, Row] = {}
     for name in (cell["id"] for cell in cells):
         for row in (earlier.get(name), read_row(results, name)):  # the folder's own goes first
@@ -58,12 +69,14 @@ def run_suite(name: str, results: Optional[str] = None, jobs: Optional[int] = No
         more = f" ({len(absent) - 1} more: --dry-run names them)" if absent[1:] else ""
         raise BenchError(f"{absent[0]}, or leave it out with --only{more}")
     if to_do and slurm is None:
-        from ...trainer.system.device import device_line  # it loads torch
+        from ...trainer.system.device import device_line  # it loads torch, which a suite does without
 
         print(device_line(suite.protocol["device"]), flush=True)
     words = command(suite, to_do, results, jobs, slurm, per_gpu) if to_do else None
     make_folder(results)
     with only_one(results) as lock:
+        check_own(results)  # again: another command may have been at work there
+        write_record(results, COMMAND, Record(suite.name, []), [])
         write_cells(suite, cells, results, done)
         try:
             status = run_snakemake(words, lock, is_queued=slurm is not None) if words else 0
@@ -142,6 +155,14 @@ def check_folder(suite: Suite, results: str) -> None:
                    if there.get(field) != here[what].get(field)]
     refuse(differ, f"{results}: holds rows of another suite or of another protocol, which are not put together: "
                    f"{'; '.join(dict.fromkeys(differ))}. Choose another folder with -o")
+
+
+def check_own(results: str) -> None:
+    """Raises TrainerError where the folder has something in it, and no suite was run there."""
+    cells = (os.path.join(results, CELLS_FOLDER, name, CELL_NAME) for name in cell_folders(results))
+    if read_record(results, COMMAND) is None and not any(map(os.path.isfile, cells)):
+        own_record(results, COMMAND)
+    check_inside(results, [os.path.join(name, "a") for name in (CELLS_FOLDER, "scenes", "checkouts")])
 
 
 def run_snakemake(words: List[str], lock: IO[str], is_queued: bool) -> int:

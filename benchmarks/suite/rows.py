@@ -75,7 +75,7 @@ def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
     place of the text."""
     try:
         found = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ReportError(f"{place}: not valid json, as `dsmoe bench run` writes it ({error})") from error
     if not isinstance(found, dict):
         raise ReportError(f"{place}: expected one object, as `dsmoe bench run` writes it")

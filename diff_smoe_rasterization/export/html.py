@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Dict, Sequence, Tuple
 
 import numpy as np
+from scipy.special import expit
 
 from ..io import Gaussians
 from ..trainer.errors import TrainerError
@@ -67,10 +68,10 @@ def pack(gaussians: Gaussians) -> Tuple[int, bytes, bytes]:
     position, logit, log_scales, rotations, dc, harmonics = finite_rows(gaussians)
     records = np.zeros(len(position), RECORD)
     records["position"] = position
-    records["opacity"] = 1 / (1 + np.exp(-logit[:, 0].astype(np.float64)))
-    records["log_scales"] = log_scales
+    records["opacity"] = expit(logit[:, 0].astype(np.float64))
+    records["log_scales"] = log_scales.clip(-65504)  # of float16
     records["rotation"] = np.rint(_rotation_vectors(rotations) * np.sqrt(2) * 32767)
-    records["dc"] = dc.clip(-65504, 65504)  # of float16
+    records["dc"] = dc.clip(-65504, 65504)
 
     coefficients = harmonics.shape[1]
     texels = -(-(coefficients + 2) // 16) if coefficients else 0

@@ -5,7 +5,7 @@ import numpy as np
 
 from ..io import Gaussians
 from ..trainer.model import SH_C0
-from .rows import finite_rows
+from .rows import rotatable_rows
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
@@ -17,9 +17,7 @@ def splat_bytes(gaussians: Gaussians) -> bytes:
     and its quaternion (w, x, y, z) as 128 + 128 q in 8 bits. Left out are Gaussians that are not finite, and those
     whose quaternion is 0, which viewers cannot turn into a rotation.
     """
-    rows = finite_rows(gaussians)
-    turned = rows[3].any(axis=1)
-    position, logit, log_scales, rotations, dc, _ = (array[turned] for array in rows)
+    position, logit, log_scales, rotations, dc, _ = rotatable_rows(gaussians)
     opacity = 1 / (1 + np.exp(-logit.astype(np.float64)))
     scale = np.exp(log_scales.astype(np.float64))
     colour = 0.5 + SH_C0 * dc.astype(np.float64)

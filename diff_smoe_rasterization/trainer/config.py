@@ -19,6 +19,8 @@ CHECKPOINT_NAME = "checkpoint.pt"  # beside it
 SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
 BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
+LARGEST = 2**53  # of whole numbers, up to which floats hold each
 DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
 # How `--help` groups the options; those that no group names are of the last one.
 GROUPS = {
@@ -29,7 +31,6 @@ GROUPS = {
     "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
     "recipe": (),
 }
-KINDS = {bool: "true or false", int: "a whole number", float: "a number"}  # what an option of this type must be
 LEARNED = "learned"  # the background gate that a training finds
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
@@ -95,7 +96,8 @@ class TrainConfig:
     sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
     deterministic: bool = _option(
-        False, "cuda: gradients of a step equal bit for bit from run to run, and for any number of GPUs; slower")
+        False, "cuda: gradients of a step, and the scores of `gate`, equal bit for bit from run to run, and for any "
+               "number of GPUs; slower")
 
     lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
     position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
@@ -124,7 +126,8 @@ class TrainConfig:
         try:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
-            self.schedule = self.schedule or ("gate" if self.budget else "3dgs")
+            if self.schedule is None:
+                self.schedule = "gate" if self.budget else "3dgs"
             for name, value in _recipe_of(self.schedule).items():
                 if getattr(self, name) is None:
                     setattr(self, name, value)
@@ -136,8 +139,11 @@ class TrainConfig:
         for option in dataclasses.fields(self):
             value, choices = getattr(self, option.name), option.metadata.get("choices")
             kind = type(option.metadata.get("published", option.default))
-            if kind in KINDS and not isinstance(value, (int, float) if kind is float else kind):
+            fits = isinstance(value, (int, float) if kind is float else kind)
+            if kind in KINDS and (not fits or isinstance(value, bool) != (kind is bool)):
                 raise ConfigError(f"{_flag(option)} is {value!r}; it must be {KINDS[kind]}")
+            if isinstance(value, int) and abs(value) > LARGEST:
+                raise ConfigError(f"{_flag(option)} is {value}; it must be at most 2^53")
             if choices and value not in choices:
                 raise ConfigError(f"{_flag(option)} is {value!r}; it must be one of {', '.join(choices)}")
         self._require("iterations", self.iterations >= 1, "at least 1")
@@ -248,7 +254,7 @@ class TrainConfig:
         try:
             with open(path, encoding="utf-8") as file:
                 values = json.load(file)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: not valid json ({error})") from error
         if not isinstance(values, dict):
             raise ConfigError(f"{path}: expected a json object of options")
@@ -263,7 +269,7 @@ class TrainConfig:
         values["output"] = folder  # the folder may have been moved
         try:
             return cls.of_record(values).validate()
-        except (TypeError, ConfigError) as error:
+        except (TypeError, OverflowError, ConfigError) as error:
             raise ConfigError(f"{path}: {error}") from error
 
     @classmethod

@@ -14,11 +14,12 @@ from .scenes.cameras import Camera
 from .system.progress import progress_bar
 
 
-def film(trained: Trained, path: str, frames: int = 120, fps: float = 30.0, outputs: Sequence[str] = ()) -> str:
+def film(trained: Trained, path: str, frames: int = 120, fps: float = 30.0, outputs: Sequence[str] = (),
+         overwrite: bool = False) -> str:
     """Goes once around the scene and writes what is seen; returns a line that says what was written.
 
     path: a file that ends in .mp4 or .gif, else a folder for PNGs as `render_images` takes it. outputs: further images
-    in such a folder. Raises TrainerError.
+    in such a folder. overwrite: files that are there may be replaced. Raises TrainerError.
     """
     if frames < 1:
         raise TrainerError(f"--frames is {frames}; it must be at least 1")
@@ -27,11 +28,11 @@ def film(trained: Trained, path: str, frames: int = 120, fps: float = 30.0, outp
     cameras = trained.orbit.cameras(frames, trained.cameras[0])
     if not is_video(path):
         of = f"{said_of_images(trained.config, trained.ply, trained.renderer)}, an orbit of {frames}"
-        return f"{len(write_images(trained.renderer, cameras, path, of, outputs))} images in {path}"
+        return f"{len(write_images(trained.renderer, cameras, path, of, outputs, overwrite))} images in {path}"
     if outputs:
         raise TrainerError(f"{path}: a video has room for colours only; with --{outputs[0]} -o names a folder")
     check_video(path)
-    write_video(path, _images(trained, cameras), fps)
+    write_video(path, _images(trained, cameras), fps, overwrite)
     return f"{path}: {frames} frames, {frames / fps:.3g} s"
 
 

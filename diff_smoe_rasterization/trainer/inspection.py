@@ -97,10 +97,11 @@ def _gate_of(config: TrainConfig) -> Optional[float]:
 def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
                   blend_mode: Optional[str] = None, device: str = "cpu",
                   rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None,
-                  outputs: Sequence[str] = ()) -> List[str]:
+                  outputs: Sequence[str] = (), overwrite: bool = False) -> List[str]:
     """Writes a PNG per camera of config.scene into `folder`; returns the paths.
 
-    folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed.
+    folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed; with
+    `overwrite` any, whose files of the same names are replaced.
     outputs: "depth" and "alpha" are written beside each, as NAME.depth.npy [H, W] float32, which is the expected view
     depth in the scene's units, 0 where nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
 
@@ -108,7 +109,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     run that config is of, whose record these two must not contradict. Raises TrainerError.
     """
     check_device(device)
-    own_record(folder, RENDER)  # refused before anything is read
+    own_record(folder, RENDER, overwrite)  # refused before anything is read
     if ply is None:
         renderer, ply = open_run(config, blend_mode, background_gate, device, rasterize)
     else:
@@ -116,14 +117,14 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     cameras = load_cameras(config, split)
     if not cameras:
         raise TrainerError(f"scene {config.scene} has no {split} views")
-    return write_images(renderer, cameras, folder, said_of_images(config, ply, renderer), outputs)
+    return write_images(renderer, cameras, folder, said_of_images(config, ply, renderer), outputs, overwrite)
 
 
 def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, subject: str,
-                 outputs: Sequence[str] = ()) -> List[str]:
+                 outputs: Sequence[str] = (), overwrite: bool = False) -> List[str]:
     """Writes a PNG per camera into `folder`; returns the paths.
 
-    subject: what they show, for the folder's record: images of something else are removed. folder and outputs are as in
+    subject: what they show, for the folder's record: images of something else are removed. The rest is as in
     `render_images`. Raises TrainerError.
     """
     endings = {"depth": ".depth.npy", "alpha": ".alpha.png"}
@@ -131,13 +132,13 @@ def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, sub
     written = [stem + ending for stem in stems for ending in (".png", *map(endings.get, outputs))]
     if len({*written}) < len(written):
         raise TrainerError(f"{subject}: names of cameras differ only by {' or '.join(endings.values())}; rename one")
-    own_record(folder, RENDER)  # refused before the folder is made
+    own_record(folder, RENDER, overwrite)  # refused before the folder is made
     make_folder(folder)
     with only_one(folder), torch.no_grad():
-        earlier = own_record(folder, RENDER)
+        earlier = own_record(folder, RENDER, overwrite)
         kept = earlier.files if subject == earlier.subject else []  # those of another split
-        write_record(folder, RENDER, Record(subject, sorted({*kept, *written})), earlier.files)
-        remove_files(folder, written)  # a link in their place would be followed
+        write_record(folder, RENDER, Record(subject, sorted({*kept, *written})), earlier.files, overwrite)
+        remove_files(folder, written)
         paths = [os.path.join(folder, stem) for stem in stems]
         for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
             rendering = renderer(camera, outputs=tuple(outputs))

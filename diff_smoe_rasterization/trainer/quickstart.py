@@ -135,7 +135,7 @@ def default_output(subject: str) -> str:
 
 def _earlier_files(output: str, subject: str) -> List[str]:
     """What an earlier comparison on the same scene has written. Raises TrainerError where `output` holds another's."""
-    record = own_record(output, PROGRAM)
+    record = own_record(output, PROGRAM, folders=("scene", *MODES))
     if record.subject not in ("", subject):
         raise TrainerError(f"{output} holds the models and pictures of another scene, {record.subject}; choose another "
                            "folder with -o, or remove it")

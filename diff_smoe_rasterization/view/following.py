@@ -2,12 +2,12 @@
 from __future__ import annotations
 
 import os
-from typing import Any, List, Optional
+from typing import Any, List, Optional, Tuple
 
 from ..trainer.config import CHECKPOINT_NAME, LEARNED, TrainConfig
 from ..trainer.errors import TrainerError
 from ..trainer.model import GaussianModel
-from ..trainer.opening import open_trained, places
+from ..trainer.opening import Trained, open_trained, places
 from ..trainer.results.modelfile import model_path
 from ..trainer.results.rendering import Renderer, background_color
 from ..trainer.scenes.cameras import Camera
@@ -31,46 +31,49 @@ class Followed:
         """Arguments as in `open_trained`. Raises TrainerError, also where a run has no checkpoint yet."""
         self._arguments = (source, blend_mode, background_gate, device)
         self._options = options
-        self._seen: Optional[float] = None  # when the checkpoint was written that is shown; None: the run has ended
+        self._config: Optional[TrainConfig] = None  # of the run that is shown
+        self._seen: Optional[Tuple[str, int]] = None  # the file that is shown, and when it was written
+        self._is_run = is_folder(source)
         check_device(device)
-        self._config = TrainConfig.load(source).changed(**options) if is_folder(source) else None
-        if self._config is None or self._has_ended():
-            self._show_trained()
+        if self._is_run:
+            self.poll()
         else:
-            self._show_checkpoint(self._checkpoint_time())
-            self.cameras, self.orbit = places(self._config, self.renderer.model, needed="scene" in options)
+            self._take(open_trained(*self._arguments, **options))
 
     def poll(self) -> bool:
-        """Looks for a newer checkpoint, or the end; returns whether the Gaussians have changed."""
-        if self._seen is None:
+        """Looks for a newer checkpoint, the end, or another run in the folder; returns whether there is one.
+
+        What was shown stays where this raises: TrainerError, or what a file that is being replaced causes.
+        """
+        if not self._is_run:
             return False
-        if self._has_ended():
-            self._show_trained()
-            return True
-        time = self._checkpoint_time()
-        if time == self._seen:
+        config = TrainConfig.load(self._arguments[0]).changed(**self._options)
+        newest = self._newest(config)
+        if (config, newest) == (self._config, self._seen):
             return False
-        self._show_checkpoint(time)
+        if newest[0] == CHECKPOINT_NAME:
+            self._take_checkpoint(config)
+        else:
+            self._take(open_trained(*self._arguments, **self._options))
+            self.progress = f"trained, {config.iterations:,} iterations"
+        self._config, self._seen = config, newest
         return True
 
-    def _has_ended(self) -> bool:
-        return is_file(model_path(self._config.output, self._config.iterations))
+    def _newest(self, config: TrainConfig) -> Tuple[str, int]:
+        """The file in the run's folder that has the Gaussians, and when it was written."""
+        for name in (model_path("", config.iterations), CHECKPOINT_NAME):
+            path = os.path.join(config.output, name)
+            if is_file(path):
+                return name, os.stat(path).st_mtime_ns
+        raise TrainerError(f"{path}: no such file yet; the training writes it every --checkpoint-every "
+                           f"{config.checkpoint_every} iterations")
 
-    def _checkpoint_time(self) -> float:
-        path = os.path.join(self._config.output, CHECKPOINT_NAME)
-        if not is_file(path):
-            raise TrainerError(f"{path}: no such file yet; the training writes it every --checkpoint-every "
-                               f"{self._config.checkpoint_every} iterations")
-        return os.stat(path).st_mtime
-
-    def _show_trained(self) -> None:
-        trained = open_trained(*self._arguments, **self._options)
-        self._seen = None
+    def _take(self, trained: Trained) -> None:
         self.renderer, self.cameras, self.orbit = trained.renderer, trained.cameras, trained.orbit
-        self.progress = "" if self._config is None else f"trained, {self._config.iterations:,} iterations"
+        self.progress = ""
 
-    def _show_checkpoint(self, time: float) -> None:
-        config, device = self._config, self._arguments[-1]
+    def _take_checkpoint(self, config: TrainConfig) -> None:
+        device = self._arguments[-1]
         state = load_checkpoint(os.path.join(config.output, CHECKPOINT_NAME), device)
         model = GaussianModel(state["raw"], config.sh_degree)
         model.active_sh_degree = state["active_sh_degree"]
@@ -80,7 +83,9 @@ class Followed:
             gate = float(learned.value)
         else:
             gate = float(config.background_gate)
-        self.renderer = Renderer(model, str(config.blend_mode), background_color(config.white_background, device),
-                                 config.antialiasing, background_gate=gate)
+        renderer = Renderer(model, str(config.blend_mode), background_color(config.white_background, device),
+                            config.antialiasing, background_gate=gate)
+        if config != self._config:
+            self.cameras, self.orbit = places(config, model, needed="scene" in self._options)
+        self.renderer = renderer
         self.progress = f"training, iteration {state['iteration']:,} of {config.iterations:,}"
-        self._seen = time

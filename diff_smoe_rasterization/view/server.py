@@ -1,10 +1,15 @@
-"""The viewer's server: viser moves the camera in the browser, and each picture is rendered here."""
+"""The viewer's server: viser moves the camera in the browser, and each picture is rendered here.
+
+Whatever a browser sends may be wrong, and viser passes it on. So numbers are clamped where they are read (`Controls`,
+`camera_of`), and what still fails for one browser is said in its panel, while the others go on.
+"""
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
-from typing import Any, Dict, Optional
+from typing import Any, Dict, Optional, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,11 +20,15 @@ from ..trainer.scenes.cameras import Camera
 from ..trainer.system.process import pip_install
 from ..trainer.system.stopwatch import synchronised_time
 from .following import Followed
+from .guard import only_own_pages
 from .picture import SHOWN, Blend, Look, picture
 
 MOVING_SECONDS = 0.1  # what a picture may take while the camera moves: it is made smaller
 REST_SECONDS = 0.2  # from the last move to the picture of full size
 MOST_PIXELS = 1920 * 1080
+LEAST_SIDE = 16  # px
+LEAST_ANGLE = 1e-3  # radians: a field of view lies between this and pi less this
+FARTHEST = 1e9  # world units
 POLL_SECONDS = 1.0  # between two looks at a training's checkpoint
 
 
@@ -28,7 +37,6 @@ class Controls:
 
     def __init__(self, gui: Any, blend: Blend, changed: Any) -> None:
         """gui: viser's. changed(): called whenever something else is to be shown."""
-        self.text = gui.add_markdown("")
         self.shown = gui.add_dropdown("show", SHOWN)
         self.mode = gui.add_dropdown("blend", BLEND_MODES, initial_value=blend.mode)
         self.gate = self._gate(gui, "background gate", blend.background_gate)
@@ -64,8 +72,23 @@ class Controls:
                 gate.value = after.background_gate
 
     def look(self) -> Look:
-        beside = Blend(self.other_mode.value, self.other_gate.value) if self.beside.value else None
-        return Look(Blend(self.mode.value, self.gate.value), self.shown.value, beside, self.split.value)
+        """What is asked for, each value in its range."""
+        beside = self._blend(self.other_mode, self.other_gate) if self.beside.value else None
+        return Look(self._blend(self.mode, self.gate), _one_of(SHOWN, self.shown.value), beside,
+                    _between(0.0, self.split.value, 1.0))
+
+    @staticmethod
+    def _blend(mode: Any, gate: Any) -> Blend:
+        return Blend(_one_of(BLEND_MODES, mode.value), _between(0.0, gate.value, MAX_BACKGROUND_GATE))
+
+
+def _one_of(names: Sequence[str], value: Any) -> str:
+    return value if value in names else names[0]
+
+
+def _between(least: float, value: Any, most: float) -> float:
+    """The number of the range that is nearest to the value, and the least one for NaN."""
+    return min(max(least, float(value)), most)
 
 
 class Viewer:
@@ -78,7 +101,8 @@ class Viewer:
         except ImportError as error:
             raise TrainerError(f"the viewer needs viser: {pip_install('viser')}") from error
         self.followed = followed
-        self.server = viser.ViserServer(host=host, port=port, label="dsmoe view", verbose=False)
+        with only_own_pages(host):
+            self.server = viser.ViserServer(host=host, port=port, label="dsmoe view", verbose=False)
         self.server.scene.set_up_direction(tuple(followed.orbit.up.tolist()))
         self.server.gui.configure_theme(show_share_button=False)
         self.controls = Controls(self.server.gui, Blend.of(followed.renderer), self._all_changed)
@@ -86,6 +110,7 @@ class Viewer:
         self._wake = threading.Event()
         self._ends = False
         self._polled = time.monotonic()
+        self._trouble = ""  # why a training cannot be followed
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(lambda client: self._clients.pop(client.client_id, None) and None)
         self._error: Optional[BaseException] = None
@@ -110,15 +135,16 @@ class Viewer:
             raise self._error
 
     def _connected(self, handle: Any) -> None:
+        client = self._clients[handle.client_id] = _Client(handle)
+        handle.camera.on_update(lambda _: self._moved(client))
         first, orbit = self.followed.cameras[0], self.followed.orbit
         forward = first.rotation[2]
         distance = max(float(forward @ (orbit.target - first.center)), 0.1)
-        handle.camera.fov = 2 * math.atan(first.height / (2 * first.fy))
-        handle.camera.up_direction = orbit.up
-        handle.camera.position = first.center
-        handle.camera.look_at = first.center + distance * forward
-        client = self._clients[handle.client_id] = _Client(handle)
-        handle.camera.on_update(lambda _: self._moved(client))
+        with contextlib.suppress(Exception):  # viser goes from the browser's camera, which may be anything
+            handle.camera.fov = 2 * math.atan(first.height / (2 * first.fy))
+            handle.camera.up_direction = orbit.up
+            handle.camera.position = first.center
+            handle.camera.look_at = first.center + distance * forward
         self._moved(client)
 
     def _moved(self, client: _Client) -> None:
@@ -145,21 +171,28 @@ class Viewer:
                 self._polled = time.monotonic()
                 self._follow()
             look = self.controls.look()
-            for client in list(self._clients.values()):
-                if client.wants_picture():
-                    text = client.show(self.followed, look)
-                    self.controls.text.content = text
+            connected = self.server.get_clients()
+            for number, client in list(self._clients.items()):
+                if number not in connected:  # it may have gone before it was noted
+                    self._clients.pop(number, None)
+                elif client.wants_picture():
+                    client.show(self.followed, look, self._trouble)
 
     def _follow(self) -> None:
-        before = Blend.of(self.followed.renderer)
+        before, changed, trouble = Blend.of(self.followed.renderer), False, ""
         try:
-            if self.followed.poll():
+            changed = self.followed.poll()
+            if changed:
                 self.controls.follow(before, Blend.of(self.followed.renderer))
-                self._all_changed()
-        except TrainerError as error:  # as where the run is being replaced: what was there stays in sight
-            if self.followed.progress != str(error):
-                self.followed.progress = str(error)
-                self._all_changed()
+        except Exception as error:  # as where the run is being replaced: what was there stays in sight
+            trouble = str(error) if isinstance(error, TrainerError) else _said_of(error)
+        if changed or trouble != self._trouble:
+            self._trouble = trouble
+            self._all_changed()
+
+
+def _said_of(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 class _Client:
@@ -167,6 +200,7 @@ class _Client:
 
     def __init__(self, handle: Any) -> None:
         self.handle = handle
+        self.text = handle.gui.add_markdown("", order=-1)  # above the controls
         self.due = True  # something is to be shown that is not
         self.sharp = False  # the last picture had full size
         self.moved = 0.0  # when the camera moved last
@@ -175,8 +209,17 @@ class _Client:
     def wants_picture(self) -> bool:
         return self.due or not self.sharp and time.monotonic() - self.moved > REST_SECONDS
 
-    def show(self, followed: Followed, look: Look) -> str:
-        """Renders and sends a picture; returns what the panel says of it."""
+    def show(self, followed: Followed, look: Look, trouble: str = "") -> None:
+        """Renders and sends a picture; the panel says what it shows, or why there is none. Raises nothing."""
+        try:
+            said = self._show(followed, look)
+        except Exception as error:
+            self.sharp = True  # not again before something changes
+            said = f"no picture: {_said_of(error)}"
+        with contextlib.suppress(Exception):  # the browser may be gone
+            self.text.content = "  \n".join(filter(None, [said, trouble]))
+
+    def _show(self, followed: Followed, look: Look) -> str:
         self.due = False
         camera = camera_of(self.handle.camera, MOST_PIXELS)
         if camera is None:  # the browser has not said its size yet
@@ -204,13 +247,15 @@ class _Client:
 
 def camera_of(handle: Any, most_pixels: int) -> Optional[Camera]:
     """The pinhole camera of a viser camera, at its browser's size or so many pixels; None before that is known."""
-    width, height = handle.image_width, handle.image_height
-    if not width or not height:
+    if not handle.image_width or not handle.image_height:
         return None
-    share = min(1.0, math.sqrt(most_pixels / (width * height)))
-    width, height = max(16, round(width * share)), max(16, round(height * share))
+    # A side that is clamped for an image 1 pixel wide leaves less for the other one.
+    sides = [_between(1, side, 1e9) for side in (handle.image_width, handle.image_height)]
+    share = min(1.0, math.sqrt(most_pixels / (sides[0] * sides[1])))
+    width, height = (round(_between(LEAST_SIDE, side * share, most_pixels // LEAST_SIDE)) for side in sides)
+    width, height = min(width, most_pixels // height), min(height, most_pixels // width)
     w, x, y, z = handle.wxyz
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
-    focal = height / (2 * math.tan(handle.fov / 2))
-    return Camera("viewer", rotation, -rotation @ np.asarray(handle.position), focal, focal, width / 2, height / 2,
-                  width, height)
+    position = np.asarray([_between(-FARTHEST, number, FARTHEST) for number in handle.position])
+    focal = height / (2 * math.tan(_between(LEAST_ANGLE, handle.fov, math.pi - LEAST_ANGLE) / 2))
+    return Camera("viewer", rotation, -rotation @ position, focal, focal, width / 2, height / 2, width, height)

@@ -37,9 +37,13 @@ template <class S> void expect_stable_sort_of_everything() {
   const S smallest = std::numeric_limits<S>::denorm_min(), largest = std::numeric_limits<S>::max();
   expect_stable_sort<S>({largest, S(1), smallest, S(0), std::nextafter(S(1), S(2)), std::numeric_limits<S>::infinity(),
                          std::numeric_limits<S>::min(), std::nextafter(S(1), S(0))});
+  expect_stable_sort<S>({S(2), S(-4), -smallest, S(0), S(-0.0), S(0), smallest, -largest, largest, S(-4.5), S(-4),
+                         -std::numeric_limits<S>::infinity(), std::numeric_limits<S>::infinity()});
   Random random(1);
   std::vector<S> depths;
   for (int i = 0; i < 20000; ++i) depths.push_back(S(random.log_uniform(1e-30, 1e30)));
+  expect_stable_sort<S>(depths);
+  for (size_t i = 0; i < depths.size(); i += 3) depths[i] = -depths[i];
   expect_stable_sort<S>(depths);
   for (S& depth : depths) depth = S(static_cast<int>(random.uniform(1, 50)));  // many ties
   expect_stable_sort<S>(depths);

@@ -519,15 +519,6 @@ TEST(MarkVisible, IsTheNearPlaneTest) {
   EXPECT_LT(behind, 190);
 }
 
-TEST(FirstNonFinite, NamesTheFirstOrNone) {
-  Scene<double> scene = make_scene(35, 20, 37, 29);
-  EXPECT_EQ(cpu::first_non_finite(scene.inputs(), 3), -1);
-  scene.shs[12 * 17] = HUGE_VAL;
-  EXPECT_EQ(cpu::first_non_finite(scene.inputs(), 3), 17);
-  scene.rotations[4 * 6 + 3] = std::nan("");
-  EXPECT_EQ(cpu::first_non_finite(scene.inputs(), 3), 6);
-}
-
 TEST(StageTimes, CountThePairsThatWereEvaluated) {
   Scene<float> scene = convert<float>(make_scene(36, 60, 37, 29));
   Rendering<float> r = project_and_bin(scene);

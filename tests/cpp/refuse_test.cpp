@@ -178,9 +178,7 @@ TEST(Refuse, EveryOtherPassNamesWhatItLacks) {
       {[&](Frame& f) { cpu::gate_map(f, forget(gates, &GateMap::counts)); },
        "cpu::gate_map: counts is null; it must point to an array [H, W]"},
       {[&](Frame& f) { f.inputs.means3D = nullptr, cpu::mark_visible(f, visible); },
-       "cpu::mark_visible: means3D is null; it must point to an array [N, 3]"},
-      {[&](Frame& f) { f.inputs.opacities = nullptr, cpu::first_non_finite(f.inputs, 3); },
-       "cpu::first_non_finite: opacities is null; it must point to an array [N]"}};
+       "cpu::mark_visible: means3D is null; it must point to an array [N, 3]"}};
   for (const auto& c : cases) {
     Frame frame = frame_of(scene, rendering);
     expect_refusal([&] { c.call(frame); }, c.message);

@@ -130,10 +130,17 @@ def test_something_that_is_no_tensor():
 @pytest.mark.parametrize("field, value", [
     ("image_height", 0), ("image_width", 0), ("image_height", -5), ("image_width", -1), ("tanfovx", 0.0),
     ("tanfovy", -1.0), ("tanfovx", float("nan")), ("sh_degree", 4), ("sh_degree", -1),
+    ("image_height", 1.5), ("image_width", 20.25), ("sh_degree", 0.5),
 ])
 def test_settings_out_of_range_are_named(field, value):
     with pytest.raises(ValueError, match=rf"{field}.*{value:g}"):
         render(scene_of().with_settings(**{field: value}))
+
+
+def test_settings_may_be_whole_numbers_of_any_type():
+    scene = scene_of()
+    floats = scene.with_settings(image_width=20.0, image_height=torch.tensor(18), sh_degree=1.0)
+    assert torch.equal(render(floats).color, render(scene).color)
 
 
 @pytest.mark.parametrize("width, height", [(2 ** 31, 16), (16, 2 ** 31), (2 ** 20, 2 ** 20), (2 ** 63, 1)])

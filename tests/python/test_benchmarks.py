@@ -122,6 +122,16 @@ def test_the_gpu_command_refuses_what_does_not_fit(capsys, tmp_path):
 
 
 @pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
+def test_frames_without_room_are_slower(capsys):
+    import gpu_overflow
+    assert gpu_overflow.main(["--synthetic", "100000", "--repeats", "2"]) == 0
+    lines = capsys.readouterr().out.splitlines()[1:]
+    times = {name: float(value.split()[0]) for name, value in (line.split(": ") for line in lines)}
+    for name in ("forward", "forward + backward"):
+        assert times[name + ", no room"] > 2 * times[name + ", room"] > 0  # they look at all Gaussians in every tile
+
+
+@pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
 def test_the_gpu_command_measures(tmp_path, capsys):
     path = tmp_path / "out.json"
     assert gpu_rasterizer.main(["--synthetic", "3000", "--repeats", "2", "--warmup", "1", "--renderers",

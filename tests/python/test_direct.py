@@ -102,3 +102,19 @@ def test_what_does_not_fit_is_refused(device):
         direct.backward({"color": color}, {"means3D": means[1:].clone()})
     with pytest.raises(ValueError, match="the gradient of means3D"):
         direct.backward({"color": color}, {"means3D": torch.zeros(3, 20, dtype=means.dtype).t()})
+
+
+@pytest.mark.parametrize("name", ["means3D", "opacities", "shs", "bg", "color", "gate_sum"])
+def test_what_changes_between_rendering_and_gradients_is_refused(device, name):
+    scene = random_scene("smoe", 50)
+    direct = DirectRendering(settings=scene.settings, outputs=("alpha",), **scene.inputs)
+    scene.inputs["means3D"].mul_(1.0)  # before the rendering anything may change
+    rendering = direct.render()
+    tensors = {**scene.inputs, "bg": scene.settings.bg, "color": rendering.color, "gate_sum": rendering.alpha}
+    weights, gradients = {"color": torch.ones_like(rendering.color)}, {"means3D": torch.zeros(50, 3).double()}
+    direct.backward(weights, gradients)
+    tensors[name].add_(0.1)
+    with pytest.raises(RuntimeError, match=f"backward: {name} was changed in place since render"):
+        direct.backward(weights, gradients)
+    direct.render()
+    direct.backward(weights, gradients)

@@ -90,6 +90,21 @@ def test_of_equal_depths_the_first_is_in_front():
     assert center[0] > 0.8 and center[2] < 0.3  # 0.9, and what is left of 1
 
 
+@pytest.mark.parametrize("depths", [(-4.0, 2.0), (-2.0, -1.0), (-0.5, 0.0)])
+def test_footprints_of_negative_depths_are_in_front(depths):
+    """Depths that a caller makes may be negative. Red is nearer, and the second footprint."""
+    scene = random_scene("alpha", 1, scale=0.5, opacity=(0.9, 0.9))
+    scene.inputs["means3D"][:] = 0
+    footprint = project_gaussians(settings=scene.settings, **scene.inputs)
+    twice = Footprints.joined([footprint, footprint])
+    gates = twice.gates.clone()
+    gates[:, 7] = gates.new_tensor(depths[::-1])
+    green, red = (twice.features.new_tensor(color) for color in ([0, 1, 0], [1, 0, 0]))
+    center = blend_footprints(Footprints(gates, torch.stack([green, red]), twice.radii),
+                              scene.settings).color[:, 18, 25]
+    assert center[0] > 0.8 and center[1] < 0.3  # 0.9, and what is left of 1
+
+
 def test_gradients_by_footprints_are_those_of_finite_differences(mode):
     """In double, with steps of 1e-6: 1e-7 of rounding, and 1e-5 of the largest gradient for what curves."""
     scene = random_scene(mode, 40)
@@ -122,6 +137,29 @@ def test_a_gradient_by_depths_reaches_the_means():
     footprints.depths[seen].sum().backward()
     expected = torch.where(seen[:, None], scene.settings.viewmatrix[:3, 2], torch.zeros(3).to(scene.settings.bg))
     torch.testing.assert_close(scene.inputs["means3D"].grad, expected.detach())
+
+
+@pytest.mark.parametrize("options", [
+    dict(blend_mode="alpha", antialiasing=True), dict(blend_mode="smoe", background_gate=0.5),
+    dict(blend_mode="smoe", background_gate=torch.tensor(0.5, dtype=torch.float64)), dict(alpha_min=0.02),
+    dict(blend_mode="smoe_tn")])
+def test_a_gradient_by_the_reach_reaches_what_the_opacity_is_made_of(options):
+    """In double, with steps of 1e-6, against finite differences of what the projection returns."""
+    scene = random_scene("smoe", 60, opacity=(0.001, 0.9), scale=0.1).with_settings(**options).requiring_grad()
+    weights = torch.linspace(0.5, 1.5, 60, dtype=torch.float64)
+
+    def loss(opacities):
+        footprints = project_gaussians(settings=scene.settings, **{**scene.inputs, "opacities": opacities})
+        return (weights * footprints.gates[:, 6]).masked_fill(footprints.radii <= 0, 0)
+
+    opacities = scene.inputs["opacities"]
+    actual, = torch.autograd.grad(loss(opacities).sum(), opacities)
+    with torch.no_grad():
+        expected = (loss(opacities + 1e-6) - loss(opacities - 1e-6)) / 2e-6
+    moving = expected.abs() > 1e-9
+    assert moving.any() == (options.get("blend_mode") != "smoe_tn") and (~moving).any()
+    # An opacity within the step of where another rule begins may differ: none is here.
+    torch.testing.assert_close(actual.reshape(-1), expected, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("change, error, text", [

@@ -61,6 +61,21 @@ def test_a_gaussian_that_is_not_finite_is_culled(mode, name, options, value):
             assert_close(values, expected_gradient[attribute], REORDERED, attribute)
 
 
+def test_an_opacity_has_a_limit_below_which_gradients_are_finite(mode):
+    scene, visible = scene_and_visible(mode)
+    index, others = visible[4], torch.arange(COUNT) != visible[4]
+    rendering, gradient = gradients(rasterize, broken(scene, "opacities", index, 1e20))
+    assert rendering.radii[index] > 0 and all(values.isfinite().all() for values in gradient.values())
+    for value in (1.1e20, 1e38, -1e38):
+        rendering = rasterize(settings=scene.settings, **broken(scene, "opacities", index, value).inputs)
+        assert rendering.radii[index] == 0
+        expected = rasterize(settings=scene.settings, **scene.rows(others).inputs)
+        assert_close(rendering.color, expected.color, REORDERED, "image")
+    strict = broken(scene.with_settings(strict=True), "opacities", index, 1e38)
+    with pytest.raises(ValueError, match=rf"opacities\[{index}\] is not finite or above 1e20"):
+        rasterize(settings=strict.settings, **strict.inputs)
+
+
 def test_every_gaussian_not_finite_leaves_the_background(mode):
     scene, _ = scene_and_visible(mode)
     scene = scene.with_inputs(means3D=torch.full((COUNT, 3), math.nan))

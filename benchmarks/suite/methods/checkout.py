@@ -22,8 +22,9 @@ from ....trainer.results.evaluation import Evaluation, summary
 from ....trainer.results.pictures import evenly_spaced
 from ....trainer.scenes.images import View
 from ....trainer.scenes.scene import Scene
+from ....trainer.system.children import die_with_parent
 from ...errors import BenchError
-from ..cell import die_with_parent, last_line
+from ..cell import last_line
 from ..measure import Measures
 from ..names import COUNTED_BY, RECIPE, read_json
 from ..protocol import commit_of, config_of

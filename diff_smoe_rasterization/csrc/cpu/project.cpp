@@ -77,19 +77,10 @@ template <class S> void mark_visible(const Frame<S>& frame, bool* visible) {
   }
 }
 
-template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int num_channels) {
-  refuse_inputs("cpu::first_non_finite", inputs, num_channels);
-  for (int64_t i = 0; i < inputs.num_gaussians; ++i) {
-    if (!is_finite(load_gaussian(inputs, i)) || !is_finite(colors_of(inputs, num_channels, i), num_channels)) return i;
-  }
-  return -1;
-}
-
 #define DSMOE_INSTANTIATE(S)                                      \
   template int64_t project(const Frame<S>&, StageTimes*);         \
   template int64_t count_instances(const Frame<S>&, StageTimes*); \
-  template void mark_visible(const Frame<S>&, bool*);             \
-  template int64_t first_non_finite(const GaussianInputs<S>&, int);
+  template void mark_visible(const Frame<S>&, bool*);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

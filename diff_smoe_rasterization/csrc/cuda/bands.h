@@ -6,7 +6,7 @@
 #include <stdexcept>
 #include <vector>
 
-#include "capacity.h"
+#include "capture.h"
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "scratch.h"

@@ -1,4 +1,4 @@
-// Stage 2, the tile lists: how many instances there are. macro_lists.cu makes the lists.
+// Stage 2, the tile lists: how much room they need. macro_lists.cu makes the lists.
 #include "../dispatch.h"
 #include "bands.h"
 #include "device.cuh"
@@ -53,6 +53,11 @@ __global__ void __launch_bounds__(kListBlock)
   if (lane == 0 && count > 0) atomicAdd(sum, count);
 }
 
+// Makes the count of instances the room that they and the entries of macro tiles need.
+__global__ void take_larger_kernel(int64_t* num_instances, const int64_t* num_entries) {
+  *num_instances = max(*num_instances, *num_entries);
+}
+
 }  // namespace
 
 bool needs_depth_order(BlendMode mode) {
@@ -74,11 +79,18 @@ template <class S> void count_instances(const Frame<S>& frame, const Work& work)
   arguments.grid = TileGrid(frame.camera.width, frame.camera.height);
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
-  check(cudaMemsetAsync(frame.saved.num_instances, 0, sizeof(int64_t), work.stream), "counting instances");
+  int64_t* num_entries = allocate<int64_t>(*work.scratch, 1);
+  const auto clear = [&](int64_t* count) {
+    check(cudaMemsetAsync(count, 0, sizeof(*count), work.stream), "counting instances");
+  };
+  clear(frame.saved.num_instances), clear(num_entries);
   const unsigned blocks = blocks_for(num_gaussians, kListWarps * arguments.gaussians_per_warp);
   if (blocks == 0) return;
   count_instances_kernel<<<blocks, kListBlock, 0, work.stream>>>(arguments);
   DSMOE_CHECK_LAUNCH("count_instances");
+  count_macro_entries(frame, num_entries, work);
+  take_larger_kernel<<<1, 1, 0, work.stream>>>(frame.saved.num_instances, num_entries);
+  DSMOE_CHECK_LAUNCH("take_larger");
 }
 
 template <class S> void bin(const Frame<S>& frame, const Work& work) { bin_by_macro_tiles(frame, work); }

@@ -424,6 +424,7 @@ template <class S> void blend_backward(const Frame<S>& frame, const BackwardPass
     for_each_band(frame, work, [&](const Frame<S>& band) {
       BackwardArguments<S> arguments = {};
       static_cast<BlendArguments<S>&>(arguments) = blend_arguments(band, work);
+      if (pass.deterministic) arguments.saved.segments = nullptr;
       arguments.dL_dimages = pass.gradients.images;
       arguments.dL_dbackground_rows = band_rows;
       arguments.scaled = scaled;

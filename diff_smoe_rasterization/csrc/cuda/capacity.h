@@ -1,6 +1,6 @@
 // How much memory the tile instances of a rendering get, before the GPU has counted them. The counts of earlier
-// renderings of the same size, mode and order of N are a good guess; a bad one costs time, never correctness
-// (rasterize_cuda.h). The background's gate is no part of the key: of a tensor the host does not know it.
+// renderings of the same size, mode and order of N, per Gaussian, are a good guess; a bad one costs time, never
+// correctness (rasterize_cuda.h). The background's gate is no part of the key: of a tensor the host does not know it.
 // A count is forgotten after a thousand renderings or two, so that one large view does not enlarge the key sort and the
 // memory for ever. This table of sizes is all that outlives a call.
 #pragma once
@@ -23,28 +23,34 @@ class InstanceCapacities {
   using Key = std::tuple<int, int64_t, int64_t, int64_t, int>;  // device, width, height, blend mode, bits of N
   static Key key(int device, int64_t width, int64_t height, int64_t blend_mode, int64_t num_gaussians);
 
-  // What is likely to be enough, or -1 where nothing is known of the key.
-  int64_t likely(const Key& key);
+  static constexpr size_t kMostKeys = 1024;  // that are remembered; each pins a few bytes for ever
 
-  // Learns the count of a rendering that has just been launched, as soon as the device has it.
-  void learn(const Key& key, const int64_t* num_instances, cudaStream_t stream);
+  // What is likely to be enough for so many Gaussians, or -1 where nothing is known of the key.
+  int64_t likely(const Key& key, int64_t num_gaussians);
+
+  // Learns the count of a rendering that has just been launched, as soon as the device has it. Where the table is full,
+  // the key that was longest not used is forgotten.
+  void learn(const Key& key, int64_t num_gaussians, const int64_t* num_instances, cudaStream_t stream);
 
   static InstanceCapacities& shared();
 
  private:
   struct Count {
     // Of the latest rendering that the device has finished. Pinned memory, which the device writes. It is never freed,
-    // because a captured graph may write it at any time.
+    // because a captured graph may write it at any time; another key may get it.
     int64_t* latest = nullptr;
-    RecentGreatest recent;  // counts of earlier renderings
-    int64_t calls = 0;      // how often `likely` has read it
+    int64_t num_gaussians = 0;  // of the latest rendering that was launched; `latest` may be of the one before
+    RecentGreatest recent;      // counts per Gaussian of earlier renderings
+    int64_t calls = 0;          // how often `likely` has read it
+    int64_t used = 0;           // number of the last use
   };
+
+  int64_t* pinned_count();  // memory that no key has
 
   std::mutex mutex_;
   std::map<Key, Count> counts_;
+  int64_t uses_ = 0;
 };
-
-bool is_capturing(cudaStream_t stream);
 
 }  // namespace cuda
 }  // namespace dsmoe

@@ -1,10 +1,14 @@
 // Sums over the pixels of each Gaussian. The kernel repeats the blend's walk, without features. A warp sums over its
-// pixels, then adds the four numbers to those of the Gaussian by atomics.
+// pixels, then adds the four numbers to those of the Gaussian by atomics, or exactly where the sums must be the same
+// bits every time.
+#include <type_traits>
+
 #include "../dispatch.h"
 #include "../refuse.h"
 #include "bands.h"
 #include "dsmoe/contribution.h"
 #include "dsmoe/params.h"
+#include "exact_sums.cuh"
 #include "reduce.cuh"
 #include "tile_walk.cuh"
 
@@ -12,19 +16,29 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-template <class S> struct ContributionArguments : BlendArguments<S> {
-  const S* pixel_weights;    // [H, W] a map of the caller's
-  ContributionSums<S> sums;  // [N] each
+// Where the sums of a Gaussian go, in any order of their terms. number: of a Contribution, but for the pixels.
+template <class S> struct AtomicSums {
+  ContributionSums<S> sums;
+  __device__ void add(int number, int32_t gaussian, S term) const {
+    S* const of_number = number == 0 ? sums.pixel_weights : number == 1 ? sums.blend_weights : sums.distances;
+    atomicAdd(of_number + gaussian, term);
+  }
 };
 
-// Adds number `number` of a Contribution to its Gaussian's sums.
-template <class S> __device__ void add_number(const ContributionSums<S>& sums, int32_t gaussian, int number, S value) {
-  if (number == 1) {
-    atomicAdd(sums.pixels + gaussian, static_cast<int32_t>(value));
-  } else {
-    atomicAdd((number == 0 ? sums.pixel_weights : number == 2 ? sums.blend_weights : sums.distances) + gaussian, value);
+template <class S, class Sums> struct ContributionArguments : BlendArguments<S> {
+  const S* pixel_weights;  // [H, W] a map of the caller's
+  int32_t* pixels;         // [N] sums; null where another walk counts them
+  Sums sums;               // AtomicSums or ExactSums
+
+  // Adds number `number` of a Contribution to its Gaussian's sums.
+  __device__ void add_number(int32_t gaussian, int number, S value) const {
+    if (number != 1) {
+      sums.add(number == 0 ? 0 : number - 1, gaussian, value);
+    } else if (pixels != nullptr) {
+      atomicAdd(pixels + gaussian, static_cast<int32_t>(value));
+    }
   }
-}
+};
 
 // What the walk knows of a lane's pixels.
 template <class S> struct ScoredPixels {
@@ -34,7 +48,7 @@ template <class S> struct ScoredPixels {
 };
 
 // Walks front to back, as the blend does, up to the last pair that the blend took.
-template <class S, BlendMode kMode> struct ContributionVisitor {
+template <class S, BlendMode kMode, class Sums> struct ContributionVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
   static constexpr bool kReadsFeatures = false, kInSegments = false;
   static constexpr int kUnroll = 1;
@@ -59,19 +73,20 @@ template <class S, BlendMode kMode> struct ContributionVisitor {
     if (!__any_sync(kAllLanes, any)) return;
     S numbers[kNumContributions] = {sum.pixel_weight, sum.pixels, sum.blend_weight, sum.distance};
     sum_pixels(numbers);
-    if (sum_pixels.holds) add_number(arguments.sums, number, sum_pixels.number, numbers[0]);
+    if (sum_pixels.holds) arguments.add_number(number, sum_pixels.number, numbers[0]);
   }
 
-  const ContributionArguments<S>& arguments;
+  const ContributionArguments<S, Sums>& arguments;
   const WarpTile<S>& tile;
   ScoredPixels<S>& pixels;
   TransposedSum<kNumContributions> sum_pixels;
 };
 
-template <class S, BlendMode kMode>
+template <class S, BlendMode kMode, class Sums>
 __global__ void __launch_bounds__(kWalkBlock)
-    contributions_kernel(const __grid_constant__ ContributionArguments<S> arguments) {
-  __shared__ WarpStage<S, ContributionVisitor<S, kMode>> stages[kWarpsPerTile];
+    contributions_kernel(const __grid_constant__ ContributionArguments<S, Sums> arguments) {
+  using Visitor = ContributionVisitor<S, kMode, Sums>;
+  __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
   const WarpTile<S> tile(arguments);
   if (tile.empty) return;
 
@@ -85,7 +100,6 @@ __global__ void __launch_bounds__(kWalkBlock)
     pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
     seen = seen > pixels.last[k] ? seen : pixels.last[k];
   }
-  using Visitor = ContributionVisitor<S, kMode>;
   Visitor visitor = {arguments, tile, pixels, TransposedSum<kNumContributions>(tile.lane)};
   walk_tile(stages[threadIdx.x / kWarp], {0, max_over_lanes(seen)}, visitor);
 }
@@ -102,17 +116,29 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
     if (num_gaussians == 0) return;
     check(cudaMemsetAsync(numbers, 0, num_gaussians * sizeof(*numbers), stream), "clearing the contributions");
   };
-  clear(sums.pixel_weights), clear(sums.pixels), clear(sums.blend_weights), clear(sums.distances);
-  for_each_band(frame, work, [&](const Frame<S>& band) {
-    ContributionArguments<S> arguments{blend_arguments(band, work)};
-    arguments.pixel_weights = map.pixel_weights;
-    arguments.sums = sums;
-    const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
-    dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
-      contributions_kernel<S, decltype(mode)::value><<<tiles, kWalkBlock, 0, stream>>>(arguments);
-      DSMOE_CHECK_LAUNCH("contributions");
+  const auto walk = [&](const auto& to, int32_t* pixels) {
+    using Sums = std::decay_t<decltype(to)>;
+    for_each_band(frame, work, [&](const Frame<S>& band) {
+      ContributionArguments<S, Sums> arguments = {};
+      static_cast<BlendArguments<S>&>(arguments) = blend_arguments(band, work);
+      arguments.pixel_weights = map.pixel_weights;
+      arguments.pixels = pixels;
+      arguments.sums = to;
+      const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
+      dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
+        contributions_kernel<S, decltype(mode)::value, Sums><<<tiles, kWalkBlock, 0, stream>>>(arguments);
+        DSMOE_CHECK_LAUNCH("contributions");
+      });
     });
-  });
+  };
+  clear(sums.pixels);
+  if (work.deterministic) {
+    const SumTargets<S> targets = {{sums.pixel_weights, sums.blend_weights, sums.distances}, 3};
+    return sum_exactly(frame, targets, work,
+                       [&](const ExactSums<S>& to) { walk(to, to.sums == nullptr ? sums.pixels : nullptr); });
+  }
+  clear(sums.pixel_weights), clear(sums.blend_weights), clear(sums.distances);
+  walk(AtomicSums<S>{sums}, sums.pixels);
 }
 
 #define DSMOE_INSTANTIATE(S) template void contributions(const Frame<S>&, const ContributionMap<S>&, const Work&);

@@ -1,10 +1,14 @@
 // What each Gaussian is worth to an image. The kernel repeats the blend's walk beside the finished pixels. A warp sums
-// over its pixels, a batch of Gaussians at a time, and adds their numbers by atomics.
+// over its pixels, a batch of Gaussians at a time, and adds their numbers by atomics, or exactly where the sums must be
+// the same bits every time.
+#include <type_traits>
+
 #include "../dispatch.h"
 #include "../refuse.h"
 #include "bands.h"
 #include "dsmoe/params.h"
 #include "dsmoe/removal.h"
+#include "exact_sums.cuh"
 #include "reduce.cuh"
 #include "segments.cuh"
 
@@ -21,6 +25,19 @@ template <class S> struct ImportanceArguments : BlendArguments<S> {
   ImportanceMap<S> map;
   S* fronts;  // [C, H, W] the sums A, where the number of channels is not known
   int tiles;  // of the band
+};
+
+// Where the sums of a Gaussian go, in any order of their terms.
+template <class S> struct AtomicSums {
+  ImportanceSums<S> sums;
+  __device__ void add(int number, int32_t gaussian, S term) const {
+    S* const of_number = number == 0 ? sums.shares : number == 1 ? sums.squared_shares : sums.removal_costs;
+    atomicAdd(of_number + gaussian, term);
+  }
+};
+
+template <class S, class Sums> struct ImportanceWithSums : ImportanceArguments<S> {
+  Sums sums;  // AtomicSums or ExactSums
 };
 
 // C and A of one lane's pixels, a channel at a time: in registers where the number of channels is known, else in
@@ -78,9 +95,9 @@ template <class S> struct ImportanceRow {
 };
 
 // Sums the rows of up to kVisitsPerCheck Gaussians, and adds them to the sums of these.
-template <class S>
-__device__ void add_rows(const ImportanceSums<S>& sums, const ImportanceRow<S>* rows, const int32_t* gaussians,
-                         int count, int lane) {
+template <class S, class Sums>
+__device__ void add_rows(const Sums& sums, const ImportanceRow<S>* rows, const int32_t* gaussians, int count,
+                         int lane) {
   constexpr int kParts = kWarp / kVisitsPerCheck, kPart = kWarp / kParts;
   const int g = lane / kParts, part = lane % kParts;
   S totals[kNumImportances];
@@ -99,12 +116,11 @@ __device__ void add_rows(const ImportanceSums<S>& sums, const ImportanceRow<S>* 
     for (int step = kParts / 2; step > 0; step /= 2) totals[n] += __shfl_xor_sync(kAllLanes, totals[n], step);
   }
   if (g >= count || part >= kNumImportances) return;
-  S* const of_part = part == 0 ? sums.shares : part == 1 ? sums.squared_shares : sums.removal_costs;
-  atomicAdd(of_part + gaussians[g], part == 0 ? totals[0] : part == 1 ? totals[1] : totals[2]);
+  sums.add(part, gaussians[g], part == 0 ? totals[0] : part == 1 ? totals[1] : totals[2]);
 }
 
 // Walks front to back, as the blend does.
-template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
+template <class S, BlendMode kMode, int kChannels, class Sums> struct ImportanceVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kInSegments = false;
   static constexpr int kUnroll = kChannels != kAnyFeatures ? kUnrolledVisits : 1;
@@ -145,11 +161,11 @@ template <class S, BlendMode kMode, int kChannels> struct ImportanceVisitor {
   __device__ __forceinline__ void end_visits(const StagedGaussian<S, true>*, const int32_t* gaussians, int count) {
     __syncwarp();
     row -= count;
-    add_rows(arguments.map.sums, row, gaussians, count, tile.lane);
+    add_rows(arguments.sums, row, gaussians, count, tile.lane);
     __syncwarp();
   }
 
-  const ImportanceArguments<S>& arguments;
+  const ImportanceWithSums<S, Sums>& arguments;
   const WarpTile<S>& tile;
   WeighedPixels<S, kChannels>& pixels;
   ImportanceRow<S>* row;  // for the next Gaussian
@@ -210,11 +226,11 @@ __device__ __forceinline__ void move_to_segment(const ImportanceArguments<S>& ar
   }
 }
 
-template <class S, BlendMode kMode, int kChannels>
+template <class S, BlendMode kMode, int kChannels, class Sums>
 __global__ void __launch_bounds__(kWalkBlock,
                                   sizeof(S) == 4 && kChannels != kAnyFeatures ? kBlocks : kGeneralWalkBlocks)
-    importance_kernel(const __grid_constant__ ImportanceArguments<S> arguments) {
-  using Visitor = ImportanceVisitor<S, kMode, kChannels>;
+    importance_kernel(const __grid_constant__ ImportanceWithSums<S, Sums> arguments) {
+  using Visitor = ImportanceVisitor<S, kMode, kChannels, Sums>;
   __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
   __shared__ ImportanceRow<S> rows[kWarpsPerTile][kVisitsPerCheck];
   WarpSegment place = {};
@@ -258,30 +274,42 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
   const int64_t num_gaussians = frame.inputs.num_gaussians;
   const int width = frame.camera.width, height = frame.camera.height;
   if (num_gaussians == 0) return;
-  const auto clear = [&](S* numbers) {
-    check(cudaMemsetAsync(numbers, 0, num_gaussians * sizeof(S), work.stream), "clearing the importance");
-  };
-  clear(map.sums.shares), clear(map.sums.squared_shares), clear(map.sums.removal_costs);
   const int num_channels = frame.config.num_channels;
   S* fronts = nullptr;
   if (num_channels != 3) fronts = allocate<S>(*work.scratch, int64_t(num_channels) * width * height);
-  for_each_band(frame, work, [&](const Frame<S>& band) {
-    ImportanceArguments<S> arguments{blend_arguments(band, work)};
-    arguments.map = map;
-    arguments.fronts = fronts;
-    arguments.tiles = static_cast<int>(num_band_tiles(band));
-    dispatch_blend(frame.config.mode, num_channels, [&](auto mode, auto channels) {
-      constexpr BlendMode kMode = decltype(mode)::value;
-      constexpr int kChannels = decltype(channels)::value;
-      if constexpr (kRemovable<kMode>) {
-        const bool segments = kWeighsSegments<S, kMode, kChannels> && band.saved.segments != nullptr;
-        const int64_t blocks = arguments.tiles + (segments ? num_segment_rows(band.saved.capacity) : 0);
-        importance_kernel<S, kMode, kChannels>
-            <<<static_cast<unsigned>(blocks), kWalkBlock, 0, work.stream>>>(arguments);
-        DSMOE_CHECK_LAUNCH("importance");
-      }
+  const auto walk = [&](const auto& sums) {
+    using Sums = std::decay_t<decltype(sums)>;
+    for_each_band(frame, work, [&](const Frame<S>& band) {
+      ImportanceWithSums<S, Sums> arguments = {};
+      static_cast<BlendArguments<S>&>(arguments) = blend_arguments(band, work);
+      arguments.map = map;
+      arguments.fronts = fronts;
+      arguments.tiles = static_cast<int>(num_band_tiles(band));
+      arguments.sums = sums;
+      // Whether lists have segments depends on earlier renderings, as in the backward pass.
+      if (work.deterministic) arguments.saved.segments = nullptr;
+      dispatch_blend(frame.config.mode, num_channels, [&](auto mode, auto channels) {
+        constexpr BlendMode kMode = decltype(mode)::value;
+        constexpr int kChannels = decltype(channels)::value;
+        if constexpr (kRemovable<kMode>) {
+          const bool segments = kWeighsSegments<S, kMode, kChannels> && arguments.saved.segments != nullptr;
+          const int64_t blocks = arguments.tiles + (segments ? num_segment_rows(band.saved.capacity) : 0);
+          importance_kernel<S, kMode, kChannels, Sums>
+              <<<static_cast<unsigned>(blocks), kWalkBlock, 0, work.stream>>>(arguments);
+          DSMOE_CHECK_LAUNCH("importance");
+        }
+      });
     });
-  });
+  };
+  const ImportanceSums<S>& sums = map.sums;
+  if (work.deterministic) {
+    return sum_exactly(frame, SumTargets<S>{{sums.shares, sums.squared_shares, sums.removal_costs}, 3}, work, walk);
+  }
+  const auto clear = [&](S* numbers) {
+    check(cudaMemsetAsync(numbers, 0, num_gaussians * sizeof(S), work.stream), "clearing the importance");
+  };
+  clear(sums.shares), clear(sums.squared_shares), clear(sums.removal_costs);
+  walk(AtomicSums<S>{sums});
 }
 
 #define DSMOE_INSTANTIATE(S) template void importance(const Frame<S>&, const ImportanceMap<S>&, const Work&);

@@ -17,24 +17,11 @@
 #include "../dispatch.h"
 #include "dsmoe/features.h"
 #include "dsmoe/tiles.h"
+#include "exponents.cuh"
 #include "reduce.cuh"
 
 namespace dsmoe {
 namespace cuda {
-
-// The least e with |x| < 2^e.
-constexpr int kNoExponent = -4096;  // of 0
-template <class S> __device__ int exponent_of(S x) {
-  int exponent = 0;
-  frexp(x, &exponent);
-  return x == S(0) ? kNoExponent : exponent;
-}
-
-// 2^e, or the nearest power of two that is a normal number.
-inline __device__ float power_of_two(int e, float) { return __int_as_float((min(max(e, -126), 127) + 127) << 23); }
-inline __device__ double power_of_two(int e, double) {
-  return __hiloint2double((min(max(e, -1022), 1023) + 1023) << 20, 0);
-}
 
 // The most that a sum can be is this many units. Three bits are left for the sign and for rounding.
 constexpr int kSumBits = 60;
@@ -78,8 +65,7 @@ template <class S> struct IntegerSums {
 
   __device__ void add(int32_t gaussian, const SumExtent& extent, int number, S term) const {
     const int64_t at = int64_t(gaussian) * length + number;
-    const int up = -unit(extent, number);  // in two steps: 2^up alone may be beyond the type
-    const S units = term * power_of_two(up / 2, S()) * power_of_two(up - up / 2, S());
+    const S units = scaled_by_power(term, -unit(extent, number));
     if (!(abs(units) <= power_of_two(kSumBits + 2, S()))) {
       refused[at] = 1;
       return;

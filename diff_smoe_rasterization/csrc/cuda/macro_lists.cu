@@ -15,6 +15,7 @@
 #include "look_back.cuh"
 #include "macro_lists.h"
 #include "radix_sort.cuh"
+#include "reduce.cuh"
 #include "tile_rows.cuh"
 
 namespace dsmoe {
@@ -152,6 +153,18 @@ __global__ void __launch_bounds__(kListBlock)
     }
     slot += line.total;
   }
+}
+
+template <class S>
+__global__ void __launch_bounds__(kListBlock)
+    count_macro_entries_kernel(const __grid_constant__ SavedForward<S> saved, MacroGrid grid,
+                               unsigned long long* num_entries) {
+  const int64_t position = int64_t(blockIdx.x) * kListBlock + threadIdx.x;
+  const int32_t gaussian = position < *saved.num_ordered ? saved.order[position] : -1;
+  unsigned long long count = 0;
+  if (gaussian >= 0) count = macro_rect(in_band(saved.projected[gaussian], saved.band), grid).count();
+  count = sum_lanes(count);
+  if (threadIdx.x % kWarp == 0 && count > 0) atomicAdd(num_entries, count);
 }
 
 template <class Key> struct MacroOffsetArguments {
@@ -338,7 +351,7 @@ struct TileOffsetArguments {
   LookBack look_back;      // zero before
   EntryCount entries;      // of macro tiles
   int64_t* offsets;        // [tiles + 1] written
-  int64_t* num_instances;  // [1] written; where the entries did not fit, it is their number
+  int64_t* num_instances;  // [1] written: the room that instances and entries need; where the entries did not fit, they
   uint32_t* longer;        // [kLengthClasses] tiles of longer classes are added; zero before
   int32_t* segment_queue;  // its counter is set to 0; or null
 };
@@ -346,18 +359,18 @@ struct TileOffsetArguments {
 // Adds up the tiles before each tile, and those that come before each class of lengths.
 __global__ void __launch_bounds__(kSortBlock)
     add_up_tiles_kernel(const __grid_constant__ TileOffsetArguments arguments) {
-  __shared__ uint32_t warp_sums[kSortBlock / kWarp], classes[kLengthClasses];
-  __shared__ unsigned long long shared_before;
+  __shared__ uint32_t classes[kLengthClasses];
+  __shared__ unsigned long long warp_sums[kSortBlock / kWarp], shared_before;
   __shared__ unsigned shared_block;
   if (threadIdx.x == 0) shared_block = take_block_number(arguments.look_back);
   if (threadIdx.x < kLengthClasses) classes[threadIdx.x] = 0;
   __syncthreads();
   const unsigned block = shared_block;
   const int64_t tile = int64_t(block) * kSortBlock + threadIdx.x;
-  uint32_t total;
-  const uint32_t own = tile < arguments.tiles ? arguments.counts[tile] : 0;
-  if (tile < arguments.tiles) atomicAdd(&classes[length_class(own)], 1u);
-  const uint32_t before = sum_before_thread(own, warp_sums, total);  // waits for the classes too
+  unsigned long long total;  // 256 tiles may have more than 2^32 instances
+  const unsigned long long own = tile < arguments.tiles ? arguments.counts[tile] : 0;
+  if (tile < arguments.tiles) atomicAdd(&classes[length_class(static_cast<int64_t>(own))], 1u);
+  const unsigned long long before = sum_before_thread(own, warp_sums, total);  // waits for the classes too
   if (threadIdx.x < kLengthClasses) {
     uint32_t longer = 0;
     for (unsigned c = 0; c < threadIdx.x; ++c) longer += classes[c];
@@ -371,8 +384,7 @@ __global__ void __launch_bounds__(kSortBlock)
   const auto offset = static_cast<int64_t>(shared_before + before);
   if (tile <= arguments.tiles) arguments.offsets[tile] = offset;
   if (tile == arguments.tiles) {
-    const int64_t listed = *arguments.entries.listed;
-    *arguments.num_instances = listed > arguments.entries.capacity ? listed : offset;
+    *arguments.num_instances = max(*arguments.entries.listed, offset);
     if (arguments.segment_queue != nullptr) arguments.segment_queue[0] = 0;
   }
 }
@@ -466,7 +478,7 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   const TileGrid image(frame.camera.width, frame.camera.height), tiles = band_grid(frame);
   const MacroGrid grid(tiles);
   const int64_t num_tiles = int64_t(tiles.columns) * tiles.rows, macros = grid.count();
-  // Where a list of macro tiles is longer than all lists of tiles, it does not fit; num_instances then says so.
+  // For each kind of list. Seldom are those of macro tiles longer, by macro tiles that long Gaussians only pass by.
   const int64_t capacity = max<int64_t>(1, min<int64_t>(saved.capacity, std::numeric_limits<uint32_t>::max()));
   const int64_t list_blocks = max<int64_t>(1, blocks_for(frame.inputs.num_gaussians, kListBlock * kListedPerLane));
   const int64_t offset_blocks = blocks_for(num_tiles + 1, kSortBlock);
@@ -571,12 +583,22 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
 
 }  // namespace
 
+template <class S> void count_macro_entries(const Frame<S>& frame, int64_t* num_entries, const Work& work) {
+  const unsigned blocks = blocks_for(frame.inputs.num_gaussians, kListBlock);
+  if (blocks == 0) return;
+  count_macro_entries_kernel<S><<<blocks, kListBlock, 0, work.stream>>>(
+      frame.saved, MacroGrid(band_grid(frame)), reinterpret_cast<unsigned long long*>(num_entries));
+  DSMOE_CHECK_LAUNCH("count_macro_entries");
+}
+
 template <class S> void bin_by_macro_tiles(const Frame<S>& frame, const Work& work) {
   const MacroGrid grid(band_grid(frame));
   grid.count() <= std::numeric_limits<uint16_t>::max() ? bin_by<uint16_t>(frame, work) : bin_by<uint32_t>(frame, work);
 }
 
-#define DSMOE_INSTANTIATE(S) template void bin_by_macro_tiles(const Frame<S>&, const Work&);
+#define DSMOE_INSTANTIATE(S)                                                 \
+  template void count_macro_entries(const Frame<S>&, int64_t*, const Work&); \
+  template void bin_by_macro_tiles(const Frame<S>&, const Work&);
 DSMOE_INSTANTIATE(float)
 DSMOE_INSTANTIATE(double)
 #undef DSMOE_INSTANTIATE

@@ -4,6 +4,7 @@
 
 #include "../refuse.h"
 #include "capacity.h"
+#include "capture.h"
 #include "check.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "event_clock.h"
@@ -41,7 +42,7 @@ template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
 template <class S>
 int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& key, const Run& run, const Work& work) {
   const int64_t most = frame.config.most_instances;
-  int64_t capacity = InstanceCapacities::shared().likely(key);
+  int64_t capacity = InstanceCapacities::shared().likely(key, frame.inputs.num_gaussians);
   if (is_capturing(run.stream)) {  // nothing can be counted then
     if (capacity < 0) capacity = 8 * frame.inputs.num_gaussians + 1024;
     return std::max<int64_t>(1, std::min(capacity, most));
@@ -50,7 +51,7 @@ int64_t choose_capacity(const Frame<S>& frame, const InstanceCapacities::Key& ke
   count_instances(frame, work);
   const auto count = read(frame.saved.num_instances, "projecting Gaussians", run.stream);
   if (count > most) return 0;
-  // The lists of macro tiles must fit too. Seldom are they longer, by macro tiles that long Gaussians only pass by.
+  // Some more, because the lists are made by squares of 8x8 pixels, which round elsewhere than the count by tiles.
   return std::min(most, count + count / 8 + 1);
 }
 
@@ -81,7 +82,7 @@ void draw(Frame<S>& frame, SavedSizes sizes, const DepthBits<S>* depths, const R
   complete(saved, sizes);
   if (sizes.capacity > 0) bin(frame, work);
   memory.release();
-  InstanceCapacities::shared().learn(key, saved.num_instances, run.stream);
+  InstanceCapacities::shared().learn(key, frame.inputs.num_gaussians, saved.num_instances, run.stream);
   clock.end(&StageTimes::bin);
 
   if (run.times != nullptr) work.pairs = allocate_zeros<unsigned long long>(memory, 1, run.stream);

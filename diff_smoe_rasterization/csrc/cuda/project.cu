@@ -130,8 +130,10 @@ __global__ void __launch_bounds__(kStoreBlock) pack_footprints_kernel(const __gr
   const int column = static_cast<int>(at - row * width), feature = column - kProjectedGaussianSize;
   if (row >= pack.count) return;
   const int64_t i = pack.gaussians[row];
-  float number = 0;
-  if (feature < 0) {
+  float number = NAN;
+  if (i < 0 || i >= pack.num_gaussians) {
+    // no footprint
+  } else if (feature < 0) {
     number = pack.projected[i * kProjectedGaussianSize + column];
   } else if (feature < pack.num_features) {
     number = pack.features[i * feature_stride(pack.num_features) + feature];

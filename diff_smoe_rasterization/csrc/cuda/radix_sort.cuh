@@ -81,19 +81,19 @@ __global__ void __launch_bounds__(kSortBlock) count_digits_kernel(const __grid_c
 
 // What a block's thread gets of a sum over the threads before it, in the order of threads. All threads must call it.
 // warp_sums: [kSortBlock / kWarp] in shared memory. Returns the sum over all threads in `total`.
-inline __device__ uint32_t sum_before_thread(uint32_t own, uint32_t* warp_sums, uint32_t& total) {
+template <class T> __device__ T sum_before_thread(T own, T* warp_sums, T& total) {
   constexpr int kWarps = kSortBlock / kWarp;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  uint32_t sum = own;
+  T sum = own;
 #pragma unroll
   for (int step = 1; step < kWarp; step *= 2) {
-    const uint32_t before = __shfl_up_sync(kAllLanes, sum, step);
+    const T before = __shfl_up_sync(kAllLanes, sum, step);
     if (lane >= step) sum += before;
   }
   __syncthreads();  // of an earlier call nobody reads any more
   if (lane == kWarp - 1) warp_sums[warp] = sum;
   __syncthreads();
-  uint32_t before = 0;
+  T before = 0;
   total = 0;
 #pragma unroll
   for (int w = 0; w < kWarps; ++w) {

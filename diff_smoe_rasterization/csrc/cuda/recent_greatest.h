@@ -2,7 +2,6 @@
 #pragma once
 
 #include <algorithm>
-#include <cstdint>
 
 namespace dsmoe {
 
@@ -12,7 +11,7 @@ class RecentGreatest {
   // More frames than a training has views, so that the largest view of each round is remembered until the next.
   static constexpr int kWindow = 1024;
 
-  void add(int64_t number) {
+  void add(double number) {
     if (in_window_ == kWindow) {
       last_window_ = this_window_;
       this_window_ = -1;
@@ -23,10 +22,10 @@ class RecentGreatest {
   }
 
   // -1 where nothing was added.
-  int64_t greatest() const { return std::max(last_window_, this_window_); }
+  double greatest() const { return std::max(last_window_, this_window_); }
 
  private:
-  int64_t last_window_ = -1, this_window_ = -1;
+  double last_window_ = -1, this_window_ = -1;
   int in_window_ = 0;
 };
 

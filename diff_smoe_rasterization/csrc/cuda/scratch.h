@@ -5,6 +5,7 @@
 
 #include <cstdint>
 
+#include "capture.h"
 #include "check.h"
 #include "dsmoe/allocator.h"
 
@@ -21,6 +22,7 @@ template <class T> T* allocate(Scratch& scratch, int64_t count) {
 // Waits for a number of the device.
 template <class T> T read(const T* number, const char* what, cudaStream_t stream) {
   T value = 0;
+  const BesideCaptures beside;
   check(cudaMemcpyAsync(&value, number, sizeof(value), cudaMemcpyDeviceToHost, stream), what);
   check(cudaStreamSynchronize(stream), what);
   return value;

@@ -198,15 +198,18 @@ void check_positions(const at::Tensor& positions, const at::Tensor& viewmatrix) 
 void refuse_non_finite(const char* function, const Inputs& inputs) {
   at::Tensor finite = at::ones({num_gaussians(inputs)}, inputs[kMeans3D].options().dtype(at::kBool));
   const auto is_read = [&](int i) { return i != kMeans2D && inputs[i].defined() && inputs[i].numel() > 0; };
+  const auto is_sound = [](int i, const at::Tensor& values) {
+    return i == kOpacities ? values.abs().le(kMaxOpacity) : at::isfinite(values);
+  };
   for (int i = kMeans3D; i <= kCov3DPrecomp; ++i) {
-    if (is_read(i)) finite = finite.logical_and(at::isfinite(inputs[i]).reshape({finite.size(0), -1}).all(1));
+    if (is_read(i)) finite = finite.logical_and(is_sound(i, inputs[i]).reshape({finite.size(0), -1}).all(1));
   }
   const at::Tensor indices = at::logical_not(finite).nonzero();
   if (indices.numel() == 0) return;
   const int64_t index = indices[0][0].item<int64_t>();
   for (int i = kMeans3D; i <= kCov3DPrecomp; ++i) {
-    TORCH_CHECK_VALUE(!is_read(i) || at::isfinite(inputs[i][index]).all().item<bool>(), function, ": ", kInputNames[i],
-                      "[", index, "] is not finite (strict=True)");
+    TORCH_CHECK_VALUE(!is_read(i) || is_sound(i, inputs[i][index]).all().item<bool>(), function, ": ", kInputNames[i],
+                      "[", index, "] is not finite", i == kOpacities ? " or above 1e20" : "", " (strict=True)");
   }
 }
 

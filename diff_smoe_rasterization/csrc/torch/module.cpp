@@ -21,10 +21,11 @@ py::dict constants() {
   using namespace py::literals;
   return py::dict("alpha_max"_a = dsmoe::kAlphaMax, "alpha_cut"_a = dsmoe::kAlphaCut, "gate_cut"_a = dsmoe::kGateCut,
                   "core_kernel"_a = dsmoe::kCoreKernel, "transmittance_cut"_a = dsmoe::kTransmittanceCut,
-                  "gate_sum_cut"_a = dsmoe::kGateSumCut, "radius_root_floor"_a = dsmoe::kRadiusRootFloor,
-                  "compensation_floor"_a = dsmoe::kCompensationFloor, "low_pass"_a = dsmoe::kLowPass,
-                  "frustum_margin"_a = dsmoe::kFrustumMargin, "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon,
-                  "tile_size"_a = dsmoe::kTileSize, "segment_length"_a = dsmoe::cuda::kSegmentLength);
+                  "gate_sum_cut"_a = dsmoe::kGateSumCut, "max_opacity"_a = dsmoe::kMaxOpacity,
+                  "radius_root_floor"_a = dsmoe::kRadiusRootFloor, "compensation_floor"_a = dsmoe::kCompensationFloor,
+                  "low_pass"_a = dsmoe::kLowPass, "frustum_margin"_a = dsmoe::kFrustumMargin,
+                  "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon, "tile_size"_a = dsmoe::kTileSize,
+                  "segment_length"_a = dsmoe::cuda::kSegmentLength);
 }
 
 // The lists of fields.h: names in the order of the ops' arguments and results; the options with their types.

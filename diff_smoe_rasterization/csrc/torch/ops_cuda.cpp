@@ -159,7 +159,7 @@ struct Cuda {
     sizes.num_features = -1;
     own.saved = unpack<S>("contributions", saved, sizes, radii.device());
     TensorMemory memory(pixel_weights);
-    cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream, &memory});
+    cuda::contributions(own, {data<S>(pixel_weights), sums}, {how.stream, &memory, nullptr, how.deterministic});
   }
 
   template <class S>
@@ -170,7 +170,7 @@ struct Cuda {
     own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
     own.saved.gate_sum = mutable_data<S>(gate_sum);
     TensorMemory memory(gate_sum);
-    cuda::importance(own, map, {how.stream, &memory});
+    cuda::importance(own, map, {how.stream, &memory, nullptr, how.deterministic});
   }
 
   static at::Tensor pack_footprints(const at::Tensor& gates, const at::Tensor& features, const at::Tensor& radii,
@@ -181,6 +181,7 @@ struct Cuda {
     const at::Tensor rows = in_rows ? features : padded(features, columns), dense = gates.contiguous();
     const at::Tensor out = at::empty({visible.numel(), kProjectedGaussianSize + num_features + 1}, gates.options());
     cuda::FootprintRows pack;
+    pack.num_gaussians = gates.size(0);
     pack.count = visible.numel();
     pack.gaussians = visible.data_ptr<int64_t>();
     pack.projected = dense.data_ptr<float>();

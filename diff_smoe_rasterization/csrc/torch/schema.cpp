@@ -66,7 +66,8 @@ const std::string kProjectBackward =
     kOptions + "bool[] wanted) -> Tensor[]";
 
 // Some footprints, those of the Gaussians `visible` [M], as rows to be sent: [M, 8 + F + 1] float32, of which the last
-// number has the bits of the radius.
+// number has the bits of the radius. An index out of range is an error on the CPU. On CUDA, where the host does not
+// wait, it gives a row of NaN.
 const char* const kPackFootprints =
     "pack_footprints(Tensor gates, Tensor features, Tensor radii, Tensor visible) -> Tensor";
 

@@ -225,7 +225,7 @@ void gaussian_adam(at::TensorList raw, at::TensorList values, at::TensorList dL_
                          static_cast<int>(kSizes[i]),
                          kActivations[i],
                          {static_cast<scalar_t>(rates[i]), static_cast<scalar_t>(root_scales[i])}};
-      for (const at::Tensor* tensor : {&raw[i], &dL_dvalues[i], &moments[i], &squares[i]}) {
+      for (const at::Tensor* tensor : {&raw[i], &values[i > 0 ? i - 1 : 0], &dL_dvalues[i], &moments[i], &squares[i]}) {
         TORCH_CHECK_VALUE(i < 3 || reinterpret_cast<uintptr_t>(tensor->data_ptr()) % (4 * sizeof(scalar_t)) == 0,
                           function, ": rotations must begin at a multiple of a quaternion's size");
       }
@@ -233,6 +233,16 @@ void gaussian_adam(at::TensorList raw, at::TensorList values, at::TensorList dL_
     Backend::step_gaussians(adam);
   });
   for (at::TensorList list : {raw, values, moments, squares}) note_change(list);
+}
+
+// Indices of rows that a tensor does not have. On a GPU the host waits for the smallest and the largest one.
+inline void check_rows(const char* function, const at::Tensor& rows, const at::Tensor& of) {
+  if (rows.numel() == 0 || of.dim() == 0) return;
+  const auto [smallest, largest] = at::aminmax(rows);
+  const at::Tensor ends = at::stack({smallest, largest}).cpu();
+  const auto first = ends[0].item<int64_t>(), last = ends[1].item<int64_t>();
+  TORCH_CHECK_INDEX(0 <= first && last < of.size(0), function, ": rows has indices from ", first, " to ", last,
+                    "; the tensors have ", of.size(0), " rows");
 }
 
 template <class Backend> std::vector<at::Tensor> gather_rows(at::TensorList tensors, const at::Tensor& rows) {
@@ -244,6 +254,7 @@ template <class Backend> std::vector<at::Tensor> gather_rows(at::TensorList tens
   check_device(function, "rows", rows, "tensors[0]", tensors[0]);
   const c10::DeviceGuard guard(rows.device());
   const at::Tensor list = rows.contiguous();
+  check_rows(function, list, tensors[0]);
   std::vector<at::Tensor> dense, results;
   for (size_t i = 0; i < tensors.size(); ++i) {
     const std::string name = item_name("tensors", i);

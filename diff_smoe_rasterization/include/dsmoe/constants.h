@@ -12,6 +12,7 @@ constexpr float kGateCut = 1e-5f;           // SMoE modes skip smaller kernels (
 // has no gradient, and would never come back.
 constexpr float kCoreKernel = 0.011108996538242306f;
 constexpr float kTransmittanceCut = 1e-4f;     // a pixel is full where the next pair would leave less
+constexpr float kMaxOpacity = 1e20f;           // with a larger opacity, gradients by a place overflow in float
 constexpr float kGateSumCut = 1e-30f;          // below it no gate is open: the pixel takes the background
 constexpr float kRadiusRootFloor = 0.1f;       // keeps the larger eigenvalue's root real for round Gaussians
 constexpr float kCompensationFloor = 2.5e-5f;  // antialiasing: the determinant ratio is not taken below this

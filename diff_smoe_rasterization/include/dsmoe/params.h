@@ -44,7 +44,7 @@ inline std::optional<BlendMode> blend_mode_of(std::string_view name) {
 template <class S> struct GaussianInputs {
   int64_t num_gaussians = 0;
   const S* means3D = nullptr;         // [N, 3] world
-  const S* opacities = nullptr;       // [N] may exceed 1
+  const S* opacities = nullptr;       // [N] may exceed 1, up to kMaxOpacity
   const S* scales = nullptr;          // [N, 3], null with cov3D_precomp
   const S* rotations = nullptr;       // [N, 4] (w, x, y, z), used as given; null with cov3D_precomp
   const S* cov3D_precomp = nullptr;   // [N, 6] (xx, xy, xz, yy, yz, zz), or null

@@ -14,7 +14,7 @@ namespace dsmoe {
 // What a Gaussian is made of, except its colours. Its covariance is given, or made of scale and rotation.
 template <class S> struct Gaussian {
   Vec3<S> mean;  // world
-  S opacity;     // may exceed 1
+  S opacity;     // may exceed 1, up to kMaxOpacity
   bool has_covariance;
   Vec3<S> scale;
   Vec4<S> rotation;  // quaternion (w, x, y, z), used as given
@@ -45,16 +45,19 @@ template <class S> struct Projection {
   ProjectedGaussian<S> gaussian;
 };
 
-// A Gaussian with an attribute that is NaN or infinite is culled.
+template <class S> DSMOE_HD bool in_range(S opacity) { return abs(opacity) <= S(kMaxOpacity); }
+
+// A Gaussian with an attribute that is NaN or infinite is culled, and so is one of a larger opacity than kMaxOpacity.
 template <class S> DSMOE_HD bool is_finite(const Gaussian<S>& g) {
-  const S place[] = {g.mean.x, g.mean.y, g.mean.z, g.opacity};
+  const S place[] = {g.mean.x, g.mean.y, g.mean.z};
+  if (!in_range(g.opacity) || !all_finite(place, 3)) return false;
   if (g.has_covariance) {
     const auto& c = g.covariance;
     const S shape[] = {c.xx, c.xy, c.xz, c.yy, c.yz, c.zz};
-    return all_finite(place, 4) && all_finite(shape, 6);
+    return all_finite(shape, 6);
   }
   const S shape[] = {g.scale.x, g.scale.y, g.scale.z, g.rotation.x, g.rotation.y, g.rotation.z, g.rotation.w};
-  return all_finite(place, 4) && all_finite(shape, 7);
+  return all_finite(shape, 7);
 }
 
 // The tiles that may hold pairs of a Gaussian. mean and radius: pixels. The radius is only read where the mode is
@@ -99,7 +102,7 @@ DSMOE_HD Projection<S> project(const Gaussian<S>& gaussian, const Camera<S>& cam
   Projection<S> out;
   out.radius = 0;
   const Vec3<S> view = transform_point(camera.view, gaussian.mean);
-  if (!(view.z > camera.near) || !is_finite(gaussian.opacity)) return out;
+  if (!(view.z > camera.near) || !in_range(gaussian.opacity)) return out;
   const auto made = covariances(gaussian, camera, view, rules);
   const Conic<S>& conic = made.conic;
   const Vec2<S> pixel = project_to_pixel(camera, gaussian.mean);

@@ -120,9 +120,6 @@ template <class S> void gate_map(const Frame<S>& frame, const GateMap& map);
 // visible: [N].
 template <class S> void mark_visible(const Frame<S>& frame, bool* visible);
 
-// The first Gaussian with an attribute that is NaN or infinite, or -1.
-template <class S> int64_t first_non_finite(const GaussianInputs<S>& inputs, int num_channels);
-
 // The instruction set that the blend uses: "avx512", "avx2" or "baseline". DSMOE_SIMD=name asks for a lower one.
 const char* simd_level();
 

@@ -48,7 +48,8 @@ template <class S> struct DeviceCamera {
 DSMOE_HD constexpr int feature_stride(int num_features) { return (num_features + 3) / 4 * 4; }
 
 // The backward pass of float and kFastFeatures features walks lists longer than this in segments. All others it walks
-// whole.
+// whole, and all lists where Run::deterministic is set: a segment begins with another rounding of T than a whole walk
+// has there, and lists that do not fit their memory have no segments.
 constexpr int kSegmentLength = 512;
 constexpr int kSegmentRow = kTileSize * kTileSize * (1 + kFastFeatures);  // numbers
 DSMOE_HD constexpr int64_t num_segment_rows(int64_t capacity) { return capacity / kSegmentLength + 1; }
@@ -116,7 +117,8 @@ template <class S> using Frame = RenderingFrame<S, DeviceCamera<S>, SavedForward
 // How a pass runs.
 struct Run {
   cudaStream_t stream = nullptr;
-  bool deterministic = false;   // backward: gradients are equal bit for bit from run to run; slower
+  bool deterministic = false;   // backward: gradients are equal bit for bit from run to run, whatever was rendered
+                                // before; slower
   bool for_backward = true;     // false: what only makes a backward pass faster is left out
   StageTimes* times = nullptr;  // is added to, or null; the pass then waits for its kernels
 };
@@ -160,7 +162,8 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run)
   sizes.num_features = frame.config.num_features();
   sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
   sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
-  sizes.segments = run.for_backward && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
+  sizes.segments =
+      run.for_backward && !run.deterministic && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
   return sizes;
 }
 
@@ -191,6 +194,7 @@ struct Work {
   cudaStream_t stream = nullptr;
   Scratch* scratch = nullptr;           // for memory between its kernels
   unsigned long long* pairs = nullptr;  // in device memory; (Gaussian, pixel) pairs evaluated are added to it; or null
+  bool deterministic = false;  // sums of `contributions` and `importance` are equal bit for bit from run to run
 };
 
 // Fills frame.saved.projected, frame.saved.features, frame.images.radii and depths. depths: [N] what the depth sort
@@ -207,7 +211,9 @@ template <class S> void key_footprints(const Frame<S>& frame, DepthBits<S>* dept
 // Fills frame.saved.order and frame.saved.num_ordered.
 template <class S> void sort_by_depth(const Frame<S>& frame, const DepthBits<S>* depths, const Work& work);
 
-// Fills only frame.saved.num_instances, for a caller that wants exactly as much memory as is needed.
+// Fills only frame.saved.num_instances, for a caller that wants as much memory as is needed: with the number of
+// instances or, where that is more, of entries in the lists of macro tiles (csrc/cuda/macro_lists.cu). work.scratch is
+// needed.
 template <class S> void count_instances(const Frame<S>& frame, const Work& work);
 
 // Fills saved.num_instances, instances, tile_offsets and tile_order of the frame, and empties segment_queue.
@@ -237,9 +243,10 @@ template <class S> void finish_records(const Frame<S>& frame, const BackwardPass
 template <class S> void project_backward(const Frame<S>& frame, const BackwardPass<S>& pass, const Work& work);
 
 // Walks the tile lists once more, and sums what the pixels of each Gaussian say, by atomics: the sums of real numbers
-// may differ in their last digits from call to call. Of the frame it reads the number of Gaussians, the image's size,
-// of config the mode, alpha_min, the background's gate and most_instances, of images the radii, and of saved neither
-// features nor images but last_contributor. work.scratch is needed, here and in the next two.
+// may differ in their last digits from call to call, unless work.deterministic is set. Then it walks twice, and takes
+// 36 bytes more for each Gaussian. Of the frame it reads the number of Gaussians, the image's size, of config the mode,
+// alpha_min, the background's gate and most_instances, of images the radii, and of saved neither features nor images
+// but last_contributor. work.scratch is needed, here and in the next two.
 template <class S> void contributions(const Frame<S>& frame, const ContributionMap<S>& map, const Work& work);
 
 // Walks the tile lists once more, and sums what each Gaussian is worth to the image, by atomics as `contributions`.
@@ -252,8 +259,9 @@ template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, cons
 
 // Some footprints as rows of numbers, to be sent.
 struct FootprintRows {
+  int64_t num_gaussians = 0;           // N
   int64_t count = 0;                   // M
-  const int64_t* gaussians = nullptr;  // [M] which footprints
+  const int64_t* gaussians = nullptr;  // [M] which footprints; of others than 0 to N - 1 the row is NaN
   const float* projected = nullptr;    // [N, kProjectedGaussianSize]
   const float* features = nullptr;     // [N, feature_stride(F)]
   int num_features = 0;                // F

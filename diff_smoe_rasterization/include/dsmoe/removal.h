@@ -19,7 +19,8 @@
 // The ablations divide by sum alpha, of which alpha_k goes; in smoe_std nothing is seen through anything, so q_k is 0.
 // A pixel that no other Gaussian and no background's gate is in shows the background's colour. This is exact but for
 // what lies behind a pixel's early stop, of which nothing is known, and for owners behind a pair that have less than
-// 1e-6 of W in float: their weights are lost in the rounding of W.
+// 1e-6 of W in float: their weights are lost in the rounding of W. In smoe_tn that is 1e-6 of sum alpha, divided by
+// 1 - alpha_k.
 #pragma once
 
 #include "dsmoe/pixel.h"
@@ -52,12 +53,12 @@ template <class Real> struct Removal {
 };
 
 // total - part. Nothing where that may be the rounding of two sums of equal terms, since a pixel's only owner has to be
-// known: two kernels may contract operations otherwise.
-template <class Real> DSMOE_HD Real rest_of(Real total, Real part) {
+// known: two kernels may contract operations otherwise. magnified: how many times that rounding.
+template <class Real> DSMOE_HD Real rest_of(Real total, Real part, Real magnified) {
   using S = Scalar<Real>;
   constexpr S kRounding = sizeof(S) == sizeof(float) ? S(0x1p-20) : S(0x1p-49);  // of 8 operations
   const Real rest = total - part;
-  return select(rest > total * Real(kRounding), rest, Real(S(0)));
+  return select(rest > total * Real(kRounding) * magnified, rest, Real(S(0)));
 }
 
 // Whether the algebra above holds in the mode. Where it does not, `importance` refuses the mode.
@@ -88,7 +89,9 @@ DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>
     out.scale = -gate.alpha * reciprocal(rest);
     return out;
   }
-  const Real behind = rest_of(end.gate_sum, state.gate_sum) + by.weight;
+  // In smoe_tn the sums of the numerator are multiplied by 1 / (1 - alpha), and the one that divides them is not.
+  const Real inverse_rest = reciprocal(rest), magnified = kSeesThrough && !kCountsWeights ? inverse_rest : one;
+  const Real behind = rest_of(end.gate_sum, state.gate_sum, magnified) + by.weight;
   const Real sum = kCountsWeights ? fma(rest, before.gate_sum, behind) : before.gate_sum + behind;
   out.left = sum >= (kCountsWeights ? Real(S(kGateSumCut)) * rest : Real(S(kGateSumCut)));
   const Real inverse = reciprocal(select(out.left, sum, one));
@@ -98,10 +101,14 @@ DSMOE_HD Removal<Real> remove_pair(PixelState<Real>& state, const PixelEnd<Real>
     out.own = select(hides, before.transmittance, zero);
     out.scale = select(hides, -gate.alpha, rest) * inverse;
   } else if constexpr (kSeesThrough) {
-    const Real odds = select(blended, gate.alpha * reciprocal(rest), zero);
-    out.own = -fma(odds, out.weight, out.weight);
-    out.front = -odds;
-    out.value = fma(odds, end.gate_sum - one, gate.alpha);
+    const Real odds = select(blended, gate.alpha * inverse_rest, zero), front = before.gate_sum;
+    // With nothing behind, C' is A + C sum_{j<k} w_j, divided by F = sum_{j<k} alpha_j. That sum of w is 1 - T, which
+    // is in F - F^2 / 2 to F. For a faint F the difference would be the rounding of T.
+    const Real by_front = one - abs(before.transmittance) - front;
+    out.own = select(hides, -fma(odds, out.weight, out.weight), zero);
+    out.front = select(hides, -odds, one);
+    out.value =
+        select(hides, fma(odds, end.gate_sum - one, gate.alpha), clamp(by_front, Real(S(-0.5)) * front * front, zero));
     out.scale = inverse;
   } else {
     out.own = select(hides, -out.weight, zero);

@@ -81,7 +81,8 @@ struct Rendering {
 
 /// Renders N Gaussians. means3D: [N, 3] centres, world. opacities: [N, 1] or [N]; may exceed 1. All tensors have one
 /// type, float32 or float64, and one device. Gradients reach every tensor, those of the settings too; second
-/// derivatives do not exist. A Gaussian with a NaN or infinite attribute is culled: radius 0, gradients 0.
+/// derivatives do not exist. A Gaussian with a NaN or infinite attribute, or an opacity above 1e20, is
+/// culled: radius 0, gradients 0.
 Rendering rasterize(const at::Tensor& means3D, const at::Tensor& opacities,
                     const GaussianRasterizationSettings& settings, const RasterizeArguments& arguments = {});
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 import os
 from typing import NamedTuple, Optional, Tuple
 
+import numpy as np
 import torch
 
 from ... import io
 from ...settings import BLEND_MODES, resolve_background_gate
 from ..errors import TrainerError
 from ..model import GaussianModel
-from ..system.files import is_file
+from ..system.files import is_file, new_file
 
+LARGEST_LOG = 88.7  # exp of more is infinite in float32
 FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
 
 
@@ -37,18 +39,19 @@ def trained_model_path(output: str, iterations: int) -> str:
 
 def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float) -> None:
     """Writes the raw parameters, `comment blend_mode NAME` and in `smoe` `comment background_gate VALUE`."""
-    os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
     raw = {name: tensor.detach().cpu().numpy() for name, tensor in model.raw.items()}
-    io.write_gaussians(path, io.Gaussians(
+    gaussians = io.Gaussians(
         means3D=raw["means3D"], dc=raw["dc"], shs=raw["shs"], opacity_logits=raw["opacities"],
         log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=blend_mode,
-        background_gate=background_gate if blend_mode == "smoe" else None))
+        background_gate=background_gate if blend_mode == "smoe" else None)
+    with new_file(path) as temporary:
+        io.write_gaussians(temporary, gaussians)
 
 
 def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
     """Reads a .ply; returns the model, all its SH degrees active, and what the file says of its blend.
 
-    Raises TrainerError naming file and reason.
+    Raises TrainerError naming file and reason, also where no Gaussian can be shown.
     """
     try:
         stored = io.read_gaussians(path)
@@ -56,10 +59,21 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
         raise TrainerError(str(error)) from error
     arrays = {"means3D": stored.means3D, "dc": stored.dc, "shs": stored.shs, "opacities": stored.opacity_logits,
               "scales": stored.log_scales, "rotations": stored.rotations}
+    shown = finite_gaussians(stored)
+    if len(shown) and not shown.any():
+        raise TrainerError(f"{path}: each of its {len(shown):,} Gaussians has a number that is NaN or infinite, so the "
+                           "rasterizer shows none; was the training diverging?")
     raw = {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
     model = GaussianModel(raw, stored.sh_degree)
     model.active_sh_degree = stored.sh_degree
     return model, Recorded(stored.blend_mode, stored.background_gate)
+
+
+def finite_gaussians(gaussians: io.Gaussians) -> np.ndarray:
+    """[N] bool: which Gaussians have finite numbers, their scales included. Others cannot be shown."""
+    g = gaussians
+    arrays = (g.means3D, g.dc, g.shs, g.opacity_logits, g.rotations, np.where(g.log_scales < LARGEST_LOG, 0, np.nan))
+    return np.all([np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in arrays], axis=0)
 
 
 def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:

@@ -57,6 +57,11 @@ class Renderer:
 
         return self._render(rasterize_with_splats, camera, background, background_gate, **arguments)
 
+    def blend_by(self, blend_mode: str, background_gate: BackgroundGate) -> None:
+        """Changes the blend of the images to come."""
+        self.blend_mode, self.background_gate = blend_mode, background_gate
+        self._settings.clear()
+
     def _render(self, function: Callable[..., Any], camera: Camera, background: Optional[torch.Tensor] = None,
                 background_gate: Optional[torch.Tensor] = None, **arguments: Any) -> Any:
         model = self.model

@@ -92,10 +92,14 @@ def read_results(folder: str) -> List[Dict[str, Any]]:
     try:
         with open(path, encoding="utf-8") as file:
             rows = json.load(file)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise TrainerError(f"{path}: not valid json ({error}); remove the file to measure anew") from error
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise TrainerError(f"{path}: expected a list of rows; remove the file to measure anew")
+    for row in rows:
+        for name, kind in (("protocol", dict), ("train_seconds", (int, float, type(None)))):  # what is read of it
+            if name in row and not isinstance(row[name], kind):
+                raise TrainerError(f"{path}: `{name}` is {row[name]!r}; remove the file to measure anew")
     return rows
 
 

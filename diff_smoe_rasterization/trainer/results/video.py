@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import TrainerError
+from ..system.files import new_file
 from ..system.process import pip_install
 
 FORMATS = (".mp4", ".gif")
@@ -28,17 +29,13 @@ def check_video(path: str) -> None:
                                "a folder of PNGs need nothing") from error
 
 
-def write_video(path: str, images: Iterable[Image.Image], fps: float) -> None:
-    """Writes RGB images of one size, with so many a second. The file is whole or absent. Raises OSError."""
-    folder, name = os.path.split(os.path.abspath(path))
-    os.makedirs(folder, exist_ok=True)
-    partial = os.path.join(folder, ".part-" + name)  # the ending says which format
-    try:
-        (_write_gif if partial.lower().endswith(".gif") else _write_mp4)(partial, iter(images), fps)
-        os.replace(partial, path)
-    finally:
-        if os.path.exists(partial):
-            os.remove(partial)
+def write_video(path: str, images: Iterable[Image.Image], fps: float, overwrite: bool = False) -> None:
+    """Writes RGB images of one size, with so many a second. The file is whole or absent.
+
+    overwrite: a file that is there may be replaced. Raises OSError, and TrainerError as `check_output`.
+    """
+    with new_file(path, overwrite) as temporary:
+        (_write_gif if path.lower().endswith(".gif") else _write_mp4)(temporary, iter(images), fps)
 
 
 def _write_gif(path: str, images: Iterable[Image.Image], fps: float) -> None:

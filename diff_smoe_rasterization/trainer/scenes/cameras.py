@@ -11,6 +11,8 @@ import torch
 from ...camera import settings_from_camera
 from ...settings import GaussianRasterizationSettings
 
+LARGEST = 1e9  # of all numbers of a camera, pixels or world units: with larger ones float32 overflows
+
 
 @dataclass(frozen=True)
 class Camera:

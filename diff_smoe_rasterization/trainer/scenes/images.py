@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ MAX_ASPECT_ERROR = 0.02
 # What Pillow raises for damaged files.
 UNREADABLE = (OSError, ValueError, SyntaxError, NotImplementedError, Image.DecompressionBombError)
 DOWNSCALER = "pillow bicubic"
+# Of files of images, whatever their names end in. Pillow knows more, and runs Ghostscript on EPS.
+FORMATS = ("PNG", "JPEG", "MPO", "JPEG2000", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "GIF", "PPM", "TGA")
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class View:
     image: torch.Tensor  # [3, H, W] uint8, over black or white
     opacity: Optional[torch.Tensor] = None  # [1, H, W] uint8; --random-background: the alpha plane, if there is one
     mask: Optional[torch.Tensor] = None  # [1, H, W] uint8: 255, the pixel counts, to 0; None: all count
+    checksum: str = ""  # of the image's file and the mask's; empty where there is no file
 
     def image_float(self) -> torch.Tensor:
         """[3, H, W] in [0, 1]"""
@@ -54,6 +58,12 @@ class View:
         planes = {name: getattr(self, name) for name in ("image", "opacity", "mask")}
         return dataclasses.replace(self, **{name: plane.to(device) for name, plane in planes.items()
                                             if plane is not None})
+
+
+def open_image(path: str) -> Image.Image:
+    """The image in a file of one of the FORMATS, not read yet. Raises one of UNREADABLE."""
+    Image.init()
+    return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
 
 
 def target_size(width: int, height: int, resolution: int) -> Tuple[int, int]:
@@ -82,7 +92,7 @@ def load_views(images: Sequence[PosedImage], config: TrainConfig, progress: bool
 def load_view(posed: PosedImage, config: TrainConfig) -> View:
     """Reads one image: transparency composited, then resized; the camera follows the size."""
     try:
-        with Image.open(posed.path) as file:
+        with open_image(posed.path) as file:
             image = composited(file, config.white_background)
             opacity = _opacity(file) if config.random_background else None
     except UNREADABLE as error:
@@ -90,10 +100,21 @@ def load_view(posed: PosedImage, config: TrainConfig) -> View:
     camera = fitted_camera(posed, image.size, config)
     mask = None if posed.mask is None else _mask(posed.mask, posed.path, image.size, camera)
     try:
-        return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask)
+        return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask,
+                    _checksum(posed.path, posed.mask))
     except MemoryError as error:  # Pillow's says nothing
         raise SceneError(f"{posed.path}: the machine is out of memory at {camera.width}x{camera.height}; take smaller "
                          "images (--resolution)") from error
+
+
+def _checksum(path: str, mask: Optional[str]) -> str:
+    """Of the files, not of the pixels: another release of Pillow may decode the same JPEG to other pixels."""
+    hashed = hashlib.sha256()
+    for name in (path, mask):
+        if name is not None:
+            with open(name, "rb") as file:
+                hashed.update(file.read())
+    return hashed.hexdigest()
 
 
 def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -> torch.Tensor:
@@ -106,7 +127,7 @@ def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -
 def _mask(path: str, image_path: str, size: Tuple[int, int], camera: Camera) -> torch.Tensor:
     """[1, H, W] uint8: the mask of an image file of that size (width, height)."""
     try:
-        with Image.open(path) as file:
+        with open_image(path) as file:
             mask = composited(file, white=False).convert("L")
     except UNREADABLE as error:
         raise SceneError(f"{path}: not a readable image ({error})") from error
@@ -159,7 +180,7 @@ def _opacity(image: Image.Image) -> Optional[Image.Image]:
 def image_size(path: str) -> Tuple[int, int]:
     """(width, height) from an image's header. Raises SceneError."""
     try:
-        with Image.open(path) as file:
+        with open_image(path) as file:
             return file.size
     except UNREADABLE as error:
         raise SceneError(f"{path}: not a readable image ({error})") from error

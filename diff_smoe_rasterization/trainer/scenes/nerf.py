@@ -17,7 +17,7 @@ from ..config import TrainConfig
 from ..errors import SceneError
 from ..model import SH_C0
 from ..system.files import is_file
-from .cameras import Camera
+from .cameras import LARGEST, Camera
 from .images import image_size
 from .layout import Layout, PosedImage, hold_out
 from .lens import Lens, lens_of
@@ -28,7 +28,6 @@ TRANSFORMS = "transforms.json"
 RANDOM_POINTS = 100_000  # as 3DGS
 HALF_SIDE = 1.3  # of the cube that random points fill: the extent of the NeRF-synthetic scenes
 DISTANCES = 1.5  # half the side of that cube in a capture, times the distance of its farthest camera
-LARGEST = 1e9  # of all numbers, pixels or world units: with larger ones float32 overflows
 MAX_SKEW = 1e-3  # of a rotation, as far as rounded json numbers may leave it
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")

@@ -8,7 +8,8 @@ from typing import List, Sequence
 
 import numpy as np
 
-from .cameras import Camera
+from ..errors import SceneError
+from .cameras import LARGEST, Camera
 
 FIELD_OF_VIEW = 0.9  # radians, of a camera that no scene gives
 SIZE = (800, 600)  # pixels, likewise
@@ -80,9 +81,14 @@ def orbit_of_cameras(cameras: Sequence[Camera]) -> Orbit:
 def orbit_of_points(positions: np.ndarray) -> Orbit:
     """An orbit about the middle of points [N, 3], for a model without a scene; -y is up, as COLMAP mostly has it.
 
-    Without points it is about the origin.
+    Points that are not finite or too far away are left out. Without points it is about the origin. Raises SceneError
+    where all of several are left out.
     """
-    positions = positions if len(positions) else np.zeros((1, 3))
+    near = positions[(np.abs(positions) <= LARGEST).all(axis=1)]
+    if len(near) < 1 <= len(positions):
+        raise SceneError(f"none of the {len(positions):,} Gaussians lies within {LARGEST:g} of the origin: there is no "
+                         "place to look at them from; name one with --scene")
+    positions = near if len(near) else np.zeros((1, 3))
     target = np.median(positions, axis=0)
     size = float(np.percentile(np.linalg.norm(positions - target, axis=1), 90)) or 1.0
     distance = size / math.tan(FIELD_OF_VIEW / 2)

@@ -25,10 +25,13 @@ class PointCloud:
         return PointCloud(self.positions[chosen], self.colors[chosen])
 
     def checked(self, source: str) -> PointCloud:
-        """Returns self; raises SceneError naming `source` where there are too few points or not all are finite."""
+        """Returns self; raises SceneError naming `source` where there are too few points or float32 cannot hold one."""
         if len(self.positions) < MIN_POINTS:
             raise SceneError(f"{source}: {len(self.positions)} points; training needs at least {MIN_POINTS} to start")
         finite = np.isfinite(self.positions).all(axis=1)
         if not finite.all():
             raise SceneError(f"{source}: point {int(np.argmin(finite))} has a coordinate that is NaN or infinite")
+        small = (np.abs(self.positions) <= np.finfo(np.float32).max).all(axis=1)
+        if not small.all():
+            raise SceneError(f"{source}: point {int(np.argmin(small))} has a coordinate that float32 cannot hold")
         return self

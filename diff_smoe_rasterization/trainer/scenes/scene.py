@@ -10,14 +10,14 @@ import dataclasses
 import hashlib
 import os
 from dataclasses import dataclass
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, Iterable, List, Optional, Sequence
 
 import numpy as np
 
 from ..config import TrainConfig
 from ..errors import SceneError
 from ..system.files import is_file, is_folder
-from .cameras import Camera, scene_extent
+from .cameras import LARGEST, Camera, scene_extent
 from .colmap import read_colmap_layout
 from .images import MAX_WIDTH, View, fitted_camera, image_size, load_views
 from .layout import Layout, check_files, with_masks
@@ -76,6 +76,7 @@ def read_layout(config: TrainConfig) -> Layout:
     if not layout.train:
         raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split}); "
                          "--test-every 0 keeps none for testing")
+    _check_images(folder, layout)
     check_files([image.path for image in list(layout.train) + list(layout.test)])
     return with_masks(folder, layout)
 
@@ -97,21 +98,45 @@ def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
 def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
     """Plain values that differ between scenes and stay when a folder is moved: what a resumed run must find again."""
 
-    def names_and_sizes(views: Sequence[View]) -> str:
-        lines = sorted(f"{view.camera.name} {view.camera.width}x{view.camera.height}" for view in views)
-        return _checksum("\n".join(lines).encode("utf-8"))
+    def lines(texts: Iterable[str]) -> str:
+        return _checksum("\n".join(sorted(texts)).encode("utf-8", "surrogateescape"))  # a name may be no UTF-8
 
+    def names_and_sizes(views: Sequence[View]) -> str:
+        return lines(f"{view.camera.name} {view.camera.width}x{view.camera.height}" for view in views)
+
+    def files(views: Sequence[View]) -> str:
+        return lines(f"{view.camera.name} {view.checksum}" for view in views)
+
+    views = [*scene.train, *scene.test]
     return {
         "number of training views": len(scene.train),
         "number of test views": len(scene.test),
-        "number of masks": sum(view.mask is not None for view in [*scene.train, *scene.test]),
+        "number of masks": sum(view.mask is not None for view in views),
         "number of points": len(scene.points.positions),
         # Six digits, since another numpy may sum in another order.
         "extent": f"{scene.extent:.6g}",
         "checksum of the training views' names and sizes": names_and_sizes(scene.train),
         "checksum of the test views' names and sizes": names_and_sizes(scene.test),
         "checksum of the points": _checksum(scene.points.positions.tobytes() + scene.points.colors.tobytes()),
+        "checksum of the poses": _checksum(b"".join(_pose(view.camera, scene.extent) for view in views)),
+        "checksum of the intrinsics": _checksum(b"".join(_intrinsics(view.camera) for view in views)),
+        "checksum of the training images": files(scene.train),
+        "checksum of the test images": files(scene.test),
     }
+
+
+def _pose(camera: Camera, extent: float) -> bytes:
+    """A camera's pose, to a millionth of the scene's extent: another scipy may round the last digits otherwise."""
+    return _rounded([*camera.rotation.reshape(-1), *(camera.translation / extent)], 6)
+
+
+def _intrinsics(camera: Camera) -> bytes:
+    """To a 10,000th of a pixel."""
+    return _rounded([camera.fx, camera.fy, camera.cx, camera.cy], 4)
+
+
+def _rounded(values: Sequence[float], digits: int) -> bytes:
+    return (np.round(np.asarray(values, "<f8"), digits) + 0.0).tobytes()  # + 0.0 makes 0 of -0
 
 
 def _checksum(content: bytes) -> str:
@@ -123,3 +148,23 @@ def load_cameras(config: TrainConfig, split: str) -> List[Camera]:
     layout = read_layout(config)
     posed = {"train": layout.train, "test": layout.test, "all": list(layout.train) + list(layout.test)}[split]
     return [fitted_camera(image, image_size(image.path), config) for image in posed]
+
+
+def _check_images(folder: str, layout: Layout) -> None:
+    """Raises SceneError for an image that is listed twice, and for a camera that float32 cannot hold."""
+    every = [*layout.train, *layout.test]
+    # The two files of NeRF-synthetic may list the same images.
+    for images in (every,) if layout.kind == "colmap" else (layout.train, layout.test):
+        seen = set()
+        for image in images:
+            path = os.path.normpath(image.path)
+            if path in seen:
+                raise SceneError(f"scene {folder}: the image {image.camera.name} is listed twice, with a pose each")
+            seen.add(path)
+    for image in every:
+        camera = image.camera
+        numbers = [*camera.translation, camera.fx, camera.fy, camera.cx, camera.cy]
+        if not np.abs(numbers).max() <= LARGEST:
+            raise SceneError(f"scene {folder}: the camera of {camera.name} has the translation "
+                             f"{camera.translation.tolist()} and fx, fy, cx, cy {numbers[3:]}; no number may be above "
+                             f"{LARGEST:g}")

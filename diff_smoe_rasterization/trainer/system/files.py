@@ -2,13 +2,16 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import math
 import os
 import stat
-from typing import Any, BinaryIO, Callable, Optional
+from typing import Any, BinaryIO, Callable, Iterator, Optional
 
 from ..errors import TrainerError
+
+PART = ".dsmoe_part-"  # begins the name of a file that is not whole yet; the number of its process follows
 
 
 def is_file(path: str) -> bool:
@@ -49,31 +52,79 @@ class _PatientFile:
         """Nothing: the file is flushed when it is whole."""
 
 
-def write_atomically(path: str, write: Callable[[Any], None]) -> None:
+def check_output(path: str, overwrite: bool = True) -> None:
+    """The rule for every file that a command writes: `path` is free, or a regular file that may be replaced.
+
+    overwrite: whether it may. Links, pipes and devices never are. Raises TrainerError.
+    """
+    try:
+        mode = os.lstat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except (OSError, ValueError) as error:
+        raise TrainerError(f"{path}: cannot be written ({getattr(error, 'strerror', error)})") from error
+    if not stat.S_ISREG(mode):
+        what = "a link" if stat.S_ISLNK(mode) else "a folder" if stat.S_ISDIR(mode) else "no regular file"
+        raise TrainerError(f"{path} is {what}, which is never replaced; move it, or choose another name with -o")
+    if not overwrite:
+        raise TrainerError(f"{path} is there already; --overwrite replaces it, or choose another name with -o")
+
+
+@contextlib.contextmanager
+def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
+    """Gives the name of a file to write beside `path`, with its ending; without an error it becomes `path`.
+
+    No two processes get the same name. What a killed process left is removed. Raises TrainerError as `check_output`,
+    also where the file has come meanwhile.
+    """
+    check_output(path, overwrite)
+    folder, name = os.path.split(os.path.abspath(path))
+    os.makedirs(folder, exist_ok=True)
+    for left in glob.glob(os.path.join(glob.escape(folder), f"{PART}*-{glob.escape(name)}")):
+        number = os.path.basename(left)[len(PART):].partition("-")[0]
+        if number.isdigit() and not _runs(int(number)):
+            _remove(left)
+    temporary = os.path.join(folder, f"{PART}{os.getpid()}-{name}")
+    _remove(temporary)  # of a process that had this number
+    try:
+        yield temporary
+        check_output(path, overwrite)
+        os.replace(temporary, path)
+    finally:
+        _remove(temporary)
+
+
+def _remove(path: str) -> None:
+    with contextlib.suppress(OSError):
+        os.remove(path)
+
+
+def _runs(number: int) -> bool:
+    """Whether this machine has a process of that number."""
+    try:
+        os.kill(number, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it is somebody else's
+        pass
+    return True
+
+
+def write_atomically(path: str, write: Callable[[Any], None], overwrite: bool = True) -> None:
     """Calls `write` with an object that has `write` and `flush`; what it is given becomes `path` once it is complete.
 
-    Where that fails, an earlier `path` stays as it was. Raises OSError, which names `path`.
+    Where that fails, an earlier `path` stays as it was. Raises OSError, which names `path`, and TrainerError as
+    `check_output`.
     """
-    folder = os.path.dirname(os.path.abspath(path))
-    os.makedirs(folder, exist_ok=True)
-    temporary = path + ".part"
-    if os.path.lexists(temporary):  # of a killed run, or a link to another file, which stays
-        os.remove(temporary)
     try:
-        with open(temporary, "xb") as file:  # a new file: "x" follows no link
+        with new_file(path, overwrite) as temporary, open(temporary, "xb") as file:  # a new file: "x" follows no link
             patient = _PatientFile(file)
             write(patient)
             if patient.error:
                 raise patient.error
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        if not isinstance(error, FileExistsError):
-            with contextlib.suppress(OSError):
-                os.remove(temporary)
-        if not isinstance(error, OSError):
-            raise
+    except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), path) from error
 
 

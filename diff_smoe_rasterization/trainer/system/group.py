@@ -1,6 +1,7 @@
 """The processes of one training, and what they send each other. All of it is torch.distributed: NCCL or gloo."""
 from __future__ import annotations
 
+import contextlib
 import datetime
 import os
 import time
@@ -10,9 +11,11 @@ import torch
 import torch.distributed
 
 from ..errors import TrainerError
+from .children import die_with_parent
+from .heartbeat import Heartbeat
 
 # Longer than a checkpoint of any size takes to write: the others wait meanwhile. A process that has died is noticed by
-# torchrun, not by this.
+# torchrun, one that is stopped by Heartbeat.
 TIMEOUT = datetime.timedelta(hours=2)
 
 
@@ -60,6 +63,13 @@ class DistributedGroup(Group):
     def __init__(self) -> None:
         self.rank = torch.distributed.get_rank()
         self.size = torch.distributed.get_world_size()
+        self.closing = contextlib.ExitStack()
+        # Connections may be refused, as by a firewall: then nobody says who does not answer.
+        with contextlib.suppress(RuntimeError, OSError, ValueError):
+            store = torch.distributed.TCPStore(
+                os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), is_master=False, wait_for_workers=False,
+                timeout=datetime.timedelta(seconds=30))
+            self.closing.enter_context(Heartbeat(store, self.rank, self.size))
 
     def gather_numbers(self, numbers: Sequence[int], device: str) -> List[List[int]]:
         own = torch.tensor(list(numbers), dtype=torch.int64, device=device)
@@ -113,6 +123,8 @@ def join_group(device: str) -> Group:
     """
     if not launched_by_torchrun():
         return ALONE
+    if "TORCHELASTIC_RUN_ID" in os.environ:  # a torchrun that is killed ends nobody
+        die_with_parent()
     if device == "cuda":
         place, gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
         if place >= gpus:
@@ -125,7 +137,8 @@ def join_group(device: str) -> Group:
 
 def leave_group(group: Group) -> None:
     """Ends what `join_group` began."""
-    if group is not ALONE:
+    if isinstance(group, DistributedGroup):
+        group.closing.close()
         # gloo's threads need Python's lock to let go of the last tensors. In torch 2.4 destroy_process_group holds
         # that lock while it waits for these threads: for ever, but for this moment without it.
         time.sleep(0.2)

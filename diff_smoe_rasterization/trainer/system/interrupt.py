@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM that wait for the end of a training step, so that what is saved then is whole."""
+"""Ctrl-C, SIGTERM and SIGHUP that wait for the end of a training step, so that what is saved then is whole."""
 from __future__ import annotations
 
 import signal
@@ -7,19 +7,23 @@ from typing import Any, Dict, Optional
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM has asked for the end, as a queue's time limit does."""
+    """A signal has asked for the end: SIGTERM, as a queue's time limit does, or SIGHUP, as a terminal that closes."""
+
+    def __init__(self, number: int = signal.SIGTERM) -> None:
+        super().__init__()
+        self.number = number
 
 
 def exit_status(stop: KeyboardInterrupt) -> int:
-    """What a command returns that ends so: 130 after Ctrl-C, 143 after SIGTERM."""
-    return 143 if isinstance(stop, Terminated) else 130
+    """What a command returns that ends so: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP."""
+    return 128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT)
 
 
 class DelayedInterrupt:
-    """A context in which the first Ctrl-C or SIGTERM sets `asked`; a second one acts at once, as it does elsewhere.
+    """A context in which the first Ctrl-C, SIGTERM or SIGHUP sets `asked`; a second one acts at once, as elsewhere.
 
     Does nothing outside the main thread, which alone may handle signals, and leaves a signal that has a handler of
-    somebody else's.
+    somebody else's, as SIGHUP under nohup.
     """
 
     def __init__(self, patient: bool = False) -> None:
@@ -33,6 +37,8 @@ class DelayedInterrupt:
     def __enter__(self) -> DelayedInterrupt:
         if threading.current_thread() is threading.main_thread():
             usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+            if hasattr(signal, "SIGHUP"):
+                usual[signal.SIGHUP] = signal.SIG_DFL
             self._usual = {number: handler for number, handler in usual.items() if signal.getsignal(number) == handler}
         for number in self._usual:
             signal.signal(number, self._ask)
@@ -43,6 +49,6 @@ class DelayedInterrupt:
             signal.signal(number, handler)
 
     def _ask(self, number: int, frame: Any) -> None:
-        self.asked = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+        self.asked = KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)
         if not self.patient:
             self.__exit__()

@@ -1,7 +1,8 @@
 """A command's output folder: new, empty or its own; one run at a time is at work there; what it wrote is recorded.
 
 OUT/.dsmoe.lock is locked while a run is at work and free after it, however it ended. OUT/.dsmoe.json says which command
-wrote which files: no others are replaced or removed.
+wrote which files: no others are replaced or removed, unless --overwrite asks for it. Only regular files ever are, and
+none to which a link leads out of OUT.
 """
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from contextlib import contextmanager
 from typing import IO, Collection, Iterator, List, NamedTuple, Optional
 
 from ..errors import TrainerError
-from .files import is_file, write_json_atomically
+from .files import check_output, is_file, write_json_atomically
 
 try:
     import fcntl
@@ -71,10 +72,29 @@ def only_one(folder: str) -> Iterator[IO[str]]:
         yield file
 
 
+def check_there(folder: str, lock: IO[str]) -> None:
+    """Raises TrainerError where the folder is no longer the one whose lock is held: moved, removed or replaced."""
+    path = os.path.join(folder, LOCK_NAME)
+    try:
+        if os.path.samestat(os.stat(path), os.fstat(lock.fileno())):
+            return
+    except OSError:
+        pass
+    try:  # Linux knows where the lock is now
+        now = os.readlink(f"/proc/self/fd/{lock.fileno()}")
+    except OSError:
+        now = ""
+    if os.path.isfile(now):
+        now = os.path.dirname(now)
+        raise TrainerError(f"{folder} has been moved to {now} during the training; `dsmoe train --resume -o {now}` "
+                           "continues from its last checkpoint there")
+    raise TrainerError(f"{folder} has been removed during the training; what is not saved is lost")
+
+
 def read_record(folder: str, command: str) -> Optional[Record]:
     """What the command recorded in the folder; None where there is no record.
 
-    Raises TrainerError where it is another command's, or damaged.
+    Raises TrainerError where it is another command's, or damaged, or names a file to which a link leads.
     """
     path = os.path.join(folder, RECORD_NAME)
     if not is_file(path):
@@ -82,37 +102,58 @@ def read_record(folder: str, command: str) -> Optional[Record]:
     try:
         with open(path, encoding="utf-8") as file:
             found = json.load(file)
+        if not (isinstance(found, dict) and isinstance(found.get("command"), str) and isinstance(found.get("of"), str)
+                and isinstance(found.get("files"), list) and all(isinstance(name, str) for name in found["files"])):
+            raise ValueError("it must hold `command`, `of` and a list `files` of texts")
         writer, record = found["command"], Record(found["of"], found["files"])
-        if not all(os.path.normpath(os.path.join(os.sep, name)) == os.sep + name for name in record.files):
+        if not all(os.path.normpath(os.path.join(os.sep, name)) == os.sep + name and "\0" not in name
+                   for name in record.files):
             raise ValueError("it names files elsewhere")
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, RecursionError) as error:
         raise TrainerError(f"{path}: not a record of what was written ({error}); choose another folder") from error
     if writer != command:
         raise TrainerError(f"{folder} holds what {writer} wrote; choose another folder with -o")
+    check_inside(folder, record.files)
     return record
 
 
-def own_record(folder: str, command: str) -> Record:
+def check_inside(folder: str, names: Collection[str]) -> None:
+    """Raises TrainerError where a link lies on the way from the folder to one of its files."""
+    for parent in sorted({os.path.dirname(name) for name in names}):
+        path = os.path.join(folder, parent)
+        real = os.path.realpath(path)
+        if real != os.path.normpath(os.path.join(os.path.realpath(folder), parent)):
+            raise TrainerError(f"{path} leads to {real} by a link; nothing is written or removed there: choose another "
+                               "folder with -o")
+
+
+def own_record(folder: str, command: str, overwrite: bool = False, folders: Collection[str] = ()) -> Record:
     """What the command recorded in the folder; an empty record where there is no folder, or nothing in it.
 
-    Raises TrainerError where something is in it and the command has not recorded it as its own.
+    overwrite: other things may be in it. folders: those in it that the command writes into. Raises TrainerError where
+    something is in it that the command has not recorded as its own, and where a link stands for one of the folders.
     """
     record = read_record(folder, command)
+    check_inside(folder, [os.path.join(name, "a") for name in folders])
     there = sorted({*os.listdir(folder)} - {LOCK_NAME}) if os.path.isdir(folder) else []
-    if record is None and there:
+    if record is None and there and not overwrite:
         raise TrainerError(f"{folder} is not empty ({there[0]}), and nothing says that {command} wrote it; "
                            "choose a new or empty folder with -o")
     return record or Record("", [])
 
 
-def write_record(folder: str, command: str, record: Record, earlier: Collection[str]) -> None:
+def write_record(folder: str, command: str, record: Record, earlier: Collection[str], overwrite: bool = False) -> None:
     """Records what is about to be written, and removes what of `earlier` is not.
 
-    earlier: files that the command has written before. Raises TrainerError where another file is in the way.
+    earlier: files that the command has written before. Raises TrainerError where another file is in the way, which
+    `overwrite` lets be replaced, and where what is there is no regular file.
     """
+    check_inside(folder, record.files)
     for name in record.files:
-        if name not in earlier and os.path.lexists(os.path.join(folder, name)):
-            raise TrainerError(f"{os.path.join(folder, name)} is there, and nothing says that {command} wrote it; "
+        path = os.path.join(folder, name)
+        check_output(path)
+        if name not in earlier and os.path.lexists(path) and not overwrite:
+            raise TrainerError(f"{path} is there, and nothing says that {command} wrote it; "
                                "move it, or choose another folder with -o")
     remove_files(folder, {*earlier} - {*record.files})
     write_json_atomically(os.path.join(folder, RECORD_NAME),
@@ -120,10 +161,14 @@ def write_record(folder: str, command: str, record: Record, earlier: Collection[
 
 
 def remove_files(folder: str, names: Collection[str]) -> None:
-    """Removes files of the folder that are there, and folders in it that are empty then; links to folders stay."""
+    """Removes regular files of the folder that are there, and folders in it that are empty then; links stay.
+
+    Raises TrainerError, and removes nothing, where a link leads to one of them.
+    """
+    check_inside(folder, names)
     for name in names:
         path = os.path.join(folder, name)
-        if os.path.lexists(path) and not os.path.isdir(path):
+        if not os.path.islink(path) and os.path.isfile(path):
             os.remove(path)
         parent = os.path.dirname(name)
         while parent:

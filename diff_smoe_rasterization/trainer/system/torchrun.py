@@ -7,6 +7,7 @@ import sys
 from typing import List, Sequence
 
 from ..errors import ConfigError
+from .children import die_with_parent
 
 GPUS = "--gpus"
 
@@ -44,11 +45,14 @@ def torchrun_command(gpus: int, words: Sequence[str]) -> List[str]:
 
 
 def launch(gpus: int, words: Sequence[str]) -> int:
-    """Runs the command in so many processes; returns torchrun's exit status once all have ended."""
+    """Runs the command in so many processes; returns torchrun's exit status once all have ended.
+
+    Where this process is killed, torchrun gets a SIGTERM, which it passes on: the processes save a checkpoint and end.
+    """
     package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
     path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)
     environment = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": path}
-    process = subprocess.Popen(torchrun_command(gpus, words), env=environment)
+    process = subprocess.Popen(torchrun_command(gpus, words), env=environment, preexec_fn=die_with_parent)
     while True:
         try:
             return process.wait()

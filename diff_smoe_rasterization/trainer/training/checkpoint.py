@@ -11,6 +11,7 @@ import torch
 
 from ..errors import TrainerError, out_of_memory
 from ..system.files import write_atomically
+from .state_check import Misfit
 
 TENSOR = "__tensor__"  # marks where a tensor was
 # Before torch 2.6 a file can get around weights_only=True (CVE-2025-32434).
@@ -57,6 +58,8 @@ def damage_named(path: str) -> Iterator[None]:
         if out_of_memory(error):
             raise
         text = f"{path}: not a readable checkpoint; remove it, and --resume starts the run anew"
+        if isinstance(error, Misfit):
+            text = f"{path}: no state of this run: {error}. Remove the file, and --resume starts the run anew"
         if not SAFE_LOAD:
             text += (f" (load no stranger's: torch {torch.__version__} may run code from a file that was made for it, "
                      "2.6 and later do not)")

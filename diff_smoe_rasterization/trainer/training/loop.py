@@ -6,7 +6,7 @@ import dataclasses
 import math
 import os
 import re
-from typing import Any, Callable, Dict, List, Optional, Tuple, Union
+from typing import IO, Any, Callable, Dict, List, Optional, Tuple, Union
 
 import torch
 
@@ -20,6 +20,7 @@ from ..results.modelfile import FOLDER, model_path, save_model
 from ..results.pictures import loss_plot
 from ..results.rendering import Rasterize, Renderer, background_color
 from ..results.rows import RESULTS_NAME, result_row, write_results
+from ..results.scalars import FOLDER as SCALARS_FOLDER
 from ..results.scalars import Scalars, scalar_files
 from ..scenes.images import View
 from ..scenes.scene import Scene, describe_scene, load_scene, read_layout, scene_fingerprint
@@ -27,7 +28,16 @@ from ..system.device import check_device
 from ..system.files import is_file, write_atomically, write_json_atomically
 from ..system.group import ALONE, Group
 from ..system.interrupt import DelayedInterrupt
-from ..system.output_folder import Record, make_folder, only_one, read_record, remove_files, write_record
+from ..system.output_folder import (
+    Record,
+    check_inside,
+    check_there,
+    make_folder,
+    only_one,
+    read_record,
+    remove_files,
+    write_record,
+)
 from ..system.progress import progress_bar
 from ..system.stopwatch import Stopwatch
 from .background_gate import LearnedGate
@@ -37,6 +47,7 @@ from .order import ViewOrder
 from .passes import AutogradPasses, DirectPasses
 from .randomness import random_state, restore_random_state, seed_everything
 from .shards import Shards
+from .state_check import check_state
 from .strategies import STRATEGIES
 from .strategy import AnyStep, Step, StrategyContext, is_due
 
@@ -198,16 +209,20 @@ class Trainer:
             "random": random_state(),
         }
 
-    def load_state_dict(self, state: Dict[str, Any]) -> None:
-        """Takes what `state_dict` gave. Raises TrainerError where it was another run's."""
+    def check_state(self, state: Dict[str, Any]) -> None:
+        """Raises TrainerError where a state is another run's, Misfit and others where it can be none's."""
         differences = TrainConfig.of_record(state["config"]).differences(self.config)
         if differences:
             raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
         for name, here in scene_fingerprint(self.scene).items():
-            there = state["scene"][name]
+            there = state["scene"].get(name, here)  # earlier versions recorded fewer of them
             if here != there:
                 raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
                                    f"and {here} in {self.config.scene}")
+        check_state(state, self.config, self.strategy.state_dict(), self.order.count)
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        """Takes what `state_dict` gave, and `check_state` found to fit."""
         self.iteration = state["iteration"]
         self.watch.seconds = state["train_seconds"]
         self.optimizer.replace_all(state["raw"])
@@ -223,10 +238,12 @@ class Trainer:
 class Run:
     """A Trainer with an output folder: progress, evaluations on the way, checkpoints."""
 
-    def __init__(self, trainer: Trainer, progress: bool = True, forecast: Optional[Forecast] = None) -> None:
-        """forecast: says how long it will take, where that is to be said."""
+    def __init__(self, trainer: Trainer, progress: bool = True, lock: Optional[IO[str]] = None,
+                 forecast: Optional[Forecast] = None) -> None:
+        """lock: the folder's, where this process leads. forecast: says how long it will take, where it is to."""
         self.trainer = trainer
         self.progress = progress
+        self.lock = lock
         self.forecast = forecast
         self.history: List[Dict[str, Any]] = []
         self.losses: List[Tuple[int, float]] = []  # iteration and loss, as often as the loss is looked at
@@ -239,9 +256,14 @@ class Run:
             return False
         with damage_named(path):
             state = load_checkpoint(path, self.trainer.checkpoint_device)
+            self.trainer.check_state(state)
             self.trainer.load_state_dict(state)
             self.history = list(state["history"])
             self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
+        unknown = [name for name in scene_fingerprint(self.trainer.scene) if name not in state["scene"]]
+        if unknown and self.trainer.leads:
+            print(f"note: {path} is of an earlier version and lacks the {', the '.join(unknown)}: whether these have "
+                  "changed since is not known")
         before, config = state["config"]["iterations"], self.trainer.config
         if before < config.iterations and self.trainer.leads:
             print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
@@ -253,7 +275,7 @@ class Run:
         """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
         trainer, config = self.trainer, self.trainer.config
         self.scalars = Scalars(config.output, trainer.iteration, wanted=trainer.leads)
-        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=config.blend_mode, unit="it",
+        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=self.title, unit="it",
                                disable=not self.progress, dynamic_ncols=True)
         patience = DelayedInterrupt(patient=trainer.is_divided)
         with contextlib.closing(self.scalars), new_bar as bar, patience as interrupt:
@@ -294,12 +316,12 @@ class Run:
         trainer, config = self.trainer, self.trainer.config
         gate, model = trainer.background_gate, trainer.whole_model()
         if trainer.leads:
-            save_model(model_path(config.output, trainer.iteration), model, str(config.blend_mode), gate)
+            save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate)
         evaluation = trainer.evaluate(self.progress)
         row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation, gate)
         if not trainer.leads:
             return row
-        write_results(config.output, [row])
+        write_results(os.path.dirname(self._path(RESULTS_NAME)), [row])
         write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
         if self.losses:
             write_atomically(self._path(LOSS_NAME), lambda file: loss_plot(self.losses).save(file, "PNG"))
@@ -339,7 +361,16 @@ class Run:
         trainer.watch.start()
 
     def _path(self, name: str) -> str:
-        return os.path.join(self.trainer.config.output, name)
+        """A file to write. Raises TrainerError where the folder is no longer the one in which the run has begun."""
+        output = self.trainer.config.output
+        if self.lock:
+            check_there(output, self.lock)
+        return os.path.join(output, name)
+
+    @property
+    def title(self) -> str:
+        """Of the progress bar."""
+        return str(self.trainer.config.blend_mode)
 
 
 def _check_loss(step: AnyStep) -> float:
@@ -355,8 +386,8 @@ def _model_name(iterations: int) -> str:
     return model_path("", iterations).replace(os.sep, "/")
 
 
-def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = False) -> List[str]:
-    """The models that earlier runs have written into config.output, their paths in it.
+def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = False) -> List[str]:
+    """Products and models that earlier runs have written into config.output, their paths in it.
 
     Raises TrainerError where something is there that this run must not go on with, or replace.
     """
@@ -364,7 +395,9 @@ def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = 
     record = read_record(output, TRAIN)
     models = os.path.join(output, FOLDER)
     if not holds_run(output):
-        there = [name for name in (*PRODUCTS, FOLDER) if os.path.lexists(os.path.join(output, name))]
+        recorded = {name.partition("/")[0] for name in record.files} if record else set()
+        there = [name for name in (*PRODUCTS, FOLDER)
+                 if os.path.lexists(os.path.join(output, name)) and name not in recorded]
         if there:
             raise TrainerError(f"{output} holds {', '.join(there)} but no {CONFIG_NAME}: no run of {TRAIN} "
                                "is known to have written them; choose another folder")
@@ -378,9 +411,11 @@ def earlier_models(config: TrainConfig, resume: bool = False, overwrite: bool = 
         record = record or Record(earlier.scene, [_model_name(earlier.iterations)])
     if os.path.lexists(models) and not os.path.isdir(models):
         raise TrainerError(f"{models} is no folder; a run writes its model there")
-    # A record may be a stranger's, and point_cloud a link: nothing but models is removed by it.
+    check_inside(output, [_model_name(config.iterations), os.path.join(SCALARS_FOLDER, "events")])
+    # A record may be a stranger's: nothing but products and models is removed by it.
     model = _model_name(0).replace("0", r"\d+").replace(".", r"\.")
-    return [name for name in record.files if re.fullmatch(model, name)] if record else []
+    known = [*(record.files if record else ()), *(PRODUCTS if holds_run(output) else ())]
+    return sorted({name for name in known if name in PRODUCTS or re.fullmatch(model, name)})
 
 
 def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
@@ -405,11 +440,11 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         if resume:
             run.resume()
         return run.train()
-    earlier_models(config, resume, overwrite)
+    earlier_files(config, resume, overwrite)
     layout = None if scene else read_layout(config)
     make_folder(config.output)  # a folder that cannot be made is told before images are read
-    with only_one(config.output):
-        models = earlier_models(config, resume, overwrite)  # again: another run may have been at work there
+    with only_one(config.output) as lock:
+        earlier = earlier_files(config, resume, overwrite)  # again: another run may have been at work there
         scene = scene or load_scene(config, progress, layout)
         if config.random_background and config.background_gate == 0:
             print("warning: --random-background with a background gate of 0: the background is seen only where no "
@@ -417,15 +452,17 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         if say and layout:
             say(describe_scene(scene, layout, config))
         forecast = Forecast(config, scene) if say and config.device == "cpu" else None
-        run = Run(_new_trainer(config, scene, rasterize, group), progress, forecast)
+        run = Run(_new_trainer(config, scene, rasterize, group), progress, lock, forecast)
         if resume:
             resumed = run.resume()
             print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
-        model = _model_name(config.iterations)
-        record = Record(os.path.abspath(config.scene), sorted({*(models if resume else ()), model}))
-        write_record(config.output, TRAIN, record, models)
-        if overwrite:
-            remove_files(config.output, [*PRODUCTS, model, *scalar_files(config.output)])
+        models = {name for name in earlier if name not in PRODUCTS} if resume else set()
+        files = sorted({*PRODUCTS, *models, _model_name(config.iterations)})
+        write_record(config.output, TRAIN, Record(os.path.abspath(config.scene), files), earlier)
+        if not resume:
+            # First the old options: what is left where this is killed is no run, and --resume does not go on with it.
+            remove_files(config.output, [CONFIG_NAME])
+            remove_files(config.output, [*files, *(scalar_files(config.output) if overwrite else ())])
         config.save(config.output)
         return run.train()
 

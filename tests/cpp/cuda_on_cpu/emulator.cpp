@@ -21,6 +21,7 @@ namespace emulator {
 
 alignas(256) char dynamic_shared[kSharedBytes];
 int multiprocessors = 10;
+bool other_captures = false;
 
 namespace {
 

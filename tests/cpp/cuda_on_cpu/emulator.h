@@ -47,6 +47,7 @@ constexpr int kLanes = 32;
 constexpr size_t kSharedBytes = 48 << 10;  // what every card gives a block
 extern char dynamic_shared[kSharedBytes];
 extern int multiprocessors;  // that the card says it has
+extern bool other_captures;  // another thread captures a graph, and forbids others what might disturb it
 
 // Where something is called, as an argument that is left out.
 struct Place {
@@ -193,11 +194,13 @@ enum cudaError_t {
   cudaSuccess,
   cudaErrorMemoryAllocation,
   cudaErrorNoKernelImageForDevice,
-  cudaErrorInvalidDeviceFunction
+  cudaErrorInvalidDeviceFunction,
+  cudaErrorStreamCaptureUnsupported
 };
 enum cudaMemcpyKind { cudaMemcpyDeviceToHost };
 enum cudaDeviceAttr { cudaDevAttrMultiProcessorCount };
 enum cudaStreamCaptureStatus { cudaStreamCaptureStatusNone };
+enum cudaStreamCaptureMode { cudaStreamCaptureModeGlobal, cudaStreamCaptureModeRelaxed };
 constexpr unsigned cudaHostAllocPortable = 0;
 struct cudaDeviceProp {
   const char* name;
@@ -212,13 +215,28 @@ inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr, int) {
   return *value = emulator::multiprocessors, cudaSuccess;
 }
 inline cudaError_t cudaStreamIsCapturing(cudaStream_t, cudaStreamCaptureStatus* is) { return *is = {}, cudaSuccess; }
-inline cudaError_t cudaStreamSynchronize(cudaStream_t) { return cudaSuccess; }
+namespace emulator {
+inline thread_local cudaStreamCaptureMode capture_mode = cudaStreamCaptureModeGlobal;
+inline cudaError_t unless_forbidden() {
+  const bool forbidden = other_captures && capture_mode != cudaStreamCaptureModeRelaxed;
+  return forbidden ? cudaErrorStreamCaptureUnsupported : cudaSuccess;
+}
+}  // namespace emulator
+inline cudaError_t cudaThreadExchangeStreamCaptureMode(cudaStreamCaptureMode* mode) {
+  const cudaStreamCaptureMode before = emulator::capture_mode;
+  emulator::capture_mode = *mode;
+  return *mode = before, cudaSuccess;
+}
+inline cudaError_t cudaStreamSynchronize(cudaStream_t) { return emulator::unless_forbidden(); }
 inline cudaError_t cudaMallocAsync(void** memory, size_t bytes, cudaStream_t) {
   *memory = aligned_alloc(256, (bytes + 255) / 256 * 256);
   if (*memory == nullptr) return cudaErrorMemoryAllocation;
   return emulator::fill(*memory, bytes), cudaSuccess;
 }
-inline cudaError_t cudaHostAlloc(void** memory, size_t bytes, unsigned) { return cudaMallocAsync(memory, bytes, {}); }
+inline cudaError_t cudaHostAlloc(void** memory, size_t bytes, unsigned) {
+  const cudaError_t status = emulator::unless_forbidden();
+  return status != cudaSuccess ? status : cudaMallocAsync(memory, bytes, {});
+}
 inline cudaError_t cudaFreeAsync(void* memory, cudaStream_t) { return free(memory), cudaSuccess; }
 inline cudaError_t cudaMemsetAsync(void* to, int byte, size_t n, cudaStream_t) {
   return memset(to, byte, n), cudaSuccess;

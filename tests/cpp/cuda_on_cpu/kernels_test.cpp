@@ -100,6 +100,7 @@ struct How {
   int64_t most_instances = kMostInstances;
   bool overflows = false;  // the lists do not fit their memory
   StageTimes* times = nullptr;
+  bool weighs = true;  // contributions and importance too
 };
 
 Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& unsure, const How& how) {
@@ -125,11 +126,13 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   }
   const TileGrid grid(camera.width, camera.height);
   if (frame.saved.capacity > 0) expect_longest_first(frame.saved, int64_t(grid.columns) * grid.rows);
-  const cuda::Work work = {nullptr, &memory};
-  out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
-    cuda::contributions(frame, contributions, work);
-    if (is_removable(frame.config.mode)) cuda::importance(frame, importance, work);
-  });
+  const cuda::Work work = {nullptr, &memory, nullptr, how.deterministic};
+  if (how.weighs) {
+    out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
+      cuda::contributions(frame, contributions, work);
+      if (is_removable(frame.config.mode)) cuda::importance(frame, importance, work);
+    });
+  }
   cuda::backward(frame, out.gradients(), run, memory);
   return out;
 }
@@ -203,14 +206,24 @@ Scene<double> with_degree_3(Scene<double> scene, bool dc_apart) {
   return scene;
 }
 
-// Four tiles whose lists have two or three segments.
-Scene<double> long_lists() {
+// Four tiles whose lists have two or three segments, or other numbers.
+Scene<double> long_lists(int count = 1300, int width = 19, int height = 18) {
   Random random(6);
-  Scene<double> scene = make_scene(6, 1300, 19, 18);
+  Scene<double> scene = make_scene(6, count, width, height);
   for (double& x : scene.means3D) x = random.uniform(-0.6, 0.6);
   for (double& scale : scene.scales) scale = random.uniform(0.2, 0.4);
   for (double& opacity : scene.opacities) opacity = random.uniform(0.004, 0.02);
   return scene;
+}
+
+// Moves a Gaussian to a place that the camera sees.
+void put(Scene<double>& scene, int64_t i, double x, double y, double z) {
+  const double* view = scene.camera.view;
+  const double from_camera[] = {x - view[12], y - view[13], z - view[14]};
+  for (int axis = 0; axis < 3; ++axis) {
+    double& mean = scene.means3D[3 * i + axis] = 0;
+    for (int k = 0; k < 3; ++k) mean += view[4 * axis + k] * from_camera[k];
+  }
 }
 
 // One list of five segments and two squares of pixels. All pixels of a half of a square leave in the first segment: of
@@ -218,15 +231,10 @@ Scene<double> long_lists() {
 Scene<double> list_of_unlike_halves() {
   Random random(7);
   Scene<double> scene = make_scene(7, 2300, 16, 8);
-  const double* view = scene.camera.view;
   for (int64_t i = 0; i < scene.count; ++i) {
     const double x = random.uniform(-2.2, 2.2), y = random.uniform(-1.3, 1.3), z = random.uniform(2.7, 3.3);
-    const double from_camera[] = {x - view[12], y - view[13], z - view[14]};
-    for (int axis = 0; axis < 3; ++axis) {
-      double& mean = scene.means3D[3 * i + axis] = 0;
-      for (int k = 0; k < 3; ++k) mean += view[4 * axis + k] * from_camera[k];
-      scene.scales[3 * i + axis] = random.uniform(0.2, 0.3);
-    }
+    put(scene, i, x, y, z);
+    for (int axis = 0; axis < 3; ++axis) scene.scales[3 * i + axis] = random.uniform(0.2, 0.3);
     scene.opacities[i] = random.uniform(0.5, 1) * ((x < 0) == (y < 0) ? 0.6 : 0.05);
   }
   return scene;
@@ -277,12 +285,111 @@ TYPED_TEST(KernelsIn, EqualTheCpuInBands) { this->expect(crowd(), {false, 60}); 
 
 TYPED_TEST(KernelsIn, EqualTheCpuWhereListsDoNotFit) { this->expect(crowd(), {false, kMostInstances, true}); }
 
+TYPED_TEST(KernelsIn, EqualTheCpuDeterministically) { this->expect(crowd(), {true}); }
+
+TYPED_TEST(KernelsIn, GiveTheSameBitsDeterministicallyWhetherListsFitOrNot) {
+  const Scene<float> scene = convert<float>(in_mode<TypeParam::value>(long_lists(700, 16, 8)).back());
+  const std::vector<bool> all_sure(scene.pixels(), false);
+  Results<float> fit = by_kernels(scene, all_sure, {true});
+  Results<float> overflow = by_kernels(scene, all_sure, {true, kMostInstances, true});
+  EXPECT_EQ(overflow.rendering.color, fit.rendering.color);
+  EXPECT_EQ(overflow.all_gradients(), fit.all_gradients());
+  EXPECT_EQ(overflow.worth, fit.worth);
+}
+
 TYPED_TEST(KernelsIn, EqualTheCpuWhereLittleIsSeen) {
   this->expect(make_scene(8, 3, 1, 1));
   Scene<double> unseen = make_scene(8, 5, 33, 17);  // tiles of one row and one column of pixels, and no list
   for (int64_t i = 0; i < unseen.count; ++i) unseen.means3D[3 * i + 2] = -9;
   this->expect(unseen);
   this->expect(make_scene(8, 0, 33, 17));
+}
+
+// A needle along the diagonal passes by macro tiles whose tiles it does not meet.
+TEST(Kernels, CountTheRoomThatListsOfMacroTilesNeed) {
+  ProjectedGaussian<float> needle = {};
+  const double length = 500, width = 2;  // standard deviations, pixels
+  const auto along = static_cast<float>(1 / (length * length)), across = static_cast<float>(1 / (width * width));
+  needle.mean = {512, 512};
+  needle.conic = {(along + across) / 2, (along - across) / 2, (along + across) / 2};
+  needle.opacity = 0.5f, needle.squared_reach = 4;
+  int32_t order = 0, radius = 1000;
+  const int64_t tiles = 64 * 64;
+  std::vector<int64_t> tile_offsets(tiles + 3);
+  std::vector<int32_t> tile_order(tiles), instances(1000);
+  cuda::Frame<float> frame = {};
+  frame.inputs.num_gaussians = 1;
+  frame.camera.width = frame.camera.height = 1024;
+  frame.images.radii = &radius;
+  frame.saved.projected = &needle, frame.saved.order = &order;
+  frame.saved.tile_offsets = tile_offsets.data(), frame.saved.tile_order = tile_order.data();
+  frame.saved.instances = instances.data();
+  cuda::SavedSizes sizes;
+  sizes.tiles = tiles, sizes.capacity = static_cast<int64_t>(instances.size());
+  cuda::complete(frame.saved, sizes);
+  *frame.saved.num_ordered = 1;
+  cuda::StreamMemory memory(nullptr);
+  cuda::count_instances(frame, {nullptr, &memory});
+  const int64_t room = *frame.saved.num_instances;
+  EXPECT_EQ(room, 16 * 16) << "macro tiles";
+  cuda::bin(frame, {nullptr, &memory});
+  EXPECT_EQ(*frame.saved.num_instances, room);
+  EXPECT_LT(tile_offsets[tiles], room) << "else this is no such needle";
+  frame.saved.capacity = room;
+  cuda::bin(frame, {nullptr, &memory});
+  EXPECT_GT(tile_offsets[tiles], 0) << "the lists fit";
+}
+
+TEST(Kernels, OrderFootprintsByTheirDepthsAlsoNegativeOnes) {
+  std::vector<ProjectedGaussian<float>> projected;
+  for (const float depth : {2.0f, -4.0f, 0.0f, 5.0f, -0.0f, -4.5f, 1e-40f, 2.0f}) {
+    projected.push_back({}), projected.back().depth = depth;
+  }
+  const auto count = static_cast<int64_t>(projected.size());
+  std::vector<int32_t> radii(count, 1), order(count, -1);
+  std::vector<DepthBits<float>> keys(count);
+  int64_t ordered = -1;
+  radii[3] = 0;  // culled
+  cuda::Frame<float> frame = {};
+  frame.inputs.num_gaussians = count;
+  frame.saved.projected = projected.data(), frame.saved.order = order.data(), frame.saved.num_ordered = &ordered;
+  frame.images.radii = radii.data();
+  cuda::StreamMemory memory(nullptr);
+  cuda::key_footprints(frame, keys.data(), {nullptr, &memory});
+  cuda::sort_by_depth(frame, keys.data(), {nullptr, &memory});
+  ASSERT_EQ(ordered, count - 1);
+  order.resize(ordered);
+  EXPECT_EQ(order, (std::vector<int32_t>{5, 1, 2, 4, 6, 0, 7}));
+}
+
+TEST(Kernels, PackNoFootprintsThatAreNotThere) {
+  // Three footprints of three features, between numbers that belong to nobody.
+  std::vector<float> projected(5 * kProjectedGaussianSize, -1), features(5 * 4, -1);
+  std::vector<int32_t> radii(5, -1);
+  const std::vector<int64_t> gaussians = {2, -1, 3, int64_t(1) << 40, 0};
+  const int width = kProjectedGaussianSize + 4;
+  std::vector<float> rows(gaussians.size() * width);
+  for (int i = 1; i < 4; ++i) {
+    for (int k = 0; k < kProjectedGaussianSize; ++k) projected[i * kProjectedGaussianSize + k] = static_cast<float>(i);
+    for (int f = 0; f < 3; ++f) features[4 * i + f] = static_cast<float>(i);
+    radii[i] = 0;
+  }
+  cuda::FootprintRows pack;
+  pack.num_gaussians = 3, pack.count = static_cast<int64_t>(gaussians.size());
+  pack.gaussians = gaussians.data(), pack.num_features = 3, pack.rows = rows.data();
+  pack.projected = projected.data() + kProjectedGaussianSize, pack.features = features.data() + 4;
+  pack.radii = radii.data() + 1;
+  cuda::pack_footprints(pack, {});
+  for (size_t row = 0; row < gaussians.size(); ++row) {
+    for (int k = 0; k < width; ++k) {
+      const float number = rows[row * width + k];
+      if (gaussians[row] != 0 && gaussians[row] != 2) {
+        EXPECT_TRUE(std::isnan(number)) << row << " " << k;
+      } else {
+        EXPECT_EQ(number, k + 1 < width ? gaussians[row] + 1 : 0) << row << " " << k;
+      }
+    }
+  }
 }
 
 // Where pixels do not stop, both passes evaluate all pairs of the entries that meet a square.
@@ -305,8 +412,39 @@ TEST(Kernels, GiveTheSameBitsInEveryOrder) {
       Results<float> other = by_kernels(scene, all_sure, {true});
       EXPECT_EQ(other.rendering.color, first.rendering.color);
       EXPECT_EQ(other.all_gradients(), first.all_gradients());
+      EXPECT_EQ(other.worth, first.worth);
     }
     emulator::run_in(emulator::Order::kForward);
+  }
+}
+
+// Faint Gaussians that cover the image: more instances than a view of small ones leaves room for. Walls hide them but
+// in the tiles on the right, which saves time.
+Scene<double> view_of_large_ones() {
+  Random random(10);
+  Scene<double> scene = make_scene(10, 3000, 96, 64);
+  for (int64_t i = 0; i < scene.count; ++i) {
+    const bool wall = i < 10;
+    put(scene, i, wall ? -0.7 * (i % 2) : random.uniform(-0.5, 0.5), random.uniform(-0.5, 0.5), wall ? 1.5 : 3);
+    for (int axis = 0; axis < 3; ++axis) scene.scales[3 * i + axis] = wall ? 0.3 : random.uniform(0.8, 1.2);
+    scene.opacities[i] = wall ? 0.95 : random.uniform(0.01, 0.02);
+  }
+  return scene;
+}
+
+TEST(Kernels, GiveTheSameBitsWhateverWasRenderedBefore) {
+  const Scene<float> large = convert<float>(in_mode<BlendMode::kSmoe>(view_of_large_ones()).back());
+  Scene<float> small = large;
+  for (float& scale : small.scales) scale *= 0.01f;
+  const std::vector<bool> all_sure(large.pixels(), false);
+  How deterministic = {true};
+  deterministic.weighs = false;
+  for (int i = 0; i < 2; ++i) by_kernels(small, all_sure, deterministic);
+  Results<float> first = by_kernels(large, all_sure, deterministic);  // its lists do not fit
+  for (int i = 0; i < 2; ++i) {
+    Results<float> later = by_kernels(large, all_sure, deterministic);
+    EXPECT_EQ(later.rendering.color, first.rendering.color);
+    EXPECT_EQ(later.all_gradients(), first.all_gradients());
   }
 }
 

@@ -97,6 +97,18 @@ TEST(RadixPass, SortsNothingThatDoesNotFit) {
   EXPECT_EQ(total, 0);
 }
 
+// As the tiles of an image are added up, where config.most_instances allows more than 2^32 of their instances.
+TEST(SumBeforeThread, CountsBeyond32Bits) {
+  const unsigned long long own = 1ull << 30;
+  unsigned long long warp_sums[kSortBlock / kWarp], sums[kSortBlock], totals[kSortBlock];
+  const auto thread = [&] { sums[threadIdx.x] = sum_before_thread(own, warp_sums, totals[threadIdx.x]); };
+  emulator::launch(thread, 1, kSortBlock, 0, nullptr);
+  for (unsigned long long i = 0; i < kSortBlock; ++i) {
+    EXPECT_EQ(sums[i], i * own);
+    EXPECT_EQ(totals[i], kSortBlock * own);
+  }
+}
+
 }  // namespace
 }  // namespace cuda
 }  // namespace dsmoe

@@ -23,6 +23,7 @@ from diff_smoe_rasterization.benchmarks.suite.expansion import expand
 from diff_smoe_rasterization.benchmarks.suite.names import blend_of
 from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer.errors import TrainerError
+from diff_smoe_rasterization.trainer.system.output_folder import Record, write_record
 
 pytest.importorskip("snakemake", reason="the engine is Snakemake: pip install snakemake")
 
@@ -41,6 +42,7 @@ def finished(tmp_path_factory, tiny_scene):
     shadow = folder / "results" / "diff_smoe_rasterization" / "__init__.py"  # is not what cells import
     shadow.parent.mkdir(parents=True)
     shadow.write_text("raise ImportError('of the folder in which cells are run')\n")
+    write_record(str(folder / "results"), engine.COMMAND, Record("two", []), [])  # else the folder is refused
     content = {**tiny_suite(tiny_scene), "name": "two", "blend_modes": ["smoe"], "images": 1}
     content["scenes"].append({"name": "absent", "path": str(folder / "nothing")})
     suite = write_suite(content, folder)
@@ -142,6 +144,16 @@ def test_where_all_is_done_nothing_is_needed(finished, tmp_path, monkeypatch):
     assert said["cells"] == [cell["id"] for cell in wanted] and len(wanted) == 2 and said["name"] == "two"
     assert main([*words, "--only", "scene=tiny"]) == 0  # without --rows: it is there
     assert main(words) == 1  # the other one is not
+
+
+@pytest.mark.parametrize("mine", ["scenes/tiny/photo.jpg", "suite.json", "cells/notes"])
+def test_a_folder_with_something_else_is_refused(finished, tmp_path, bench, mine):
+    (tmp_path / "results" / mine).parent.mkdir(parents=True)
+    (tmp_path / "results" / mine).write_text("mine")
+    status, told = bench(write_suite(finished[0], tmp_path), tmp_path / "results")
+    assert status == 1 and "is not empty" in told and "nothing says that dsmoe bench run wrote it" in told
+    files = [path for path in (tmp_path / "results").rglob("*") if path.is_file()]
+    assert files == [tmp_path / "results" / mine] and files[0].read_text() == "mine"
 
 
 def done_row(cell):

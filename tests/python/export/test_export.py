@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import struct
 
 import numpy as np
@@ -67,7 +68,7 @@ def test_a_splat_file_has_32_bytes_a_gaussian_the_largest_first(model, tmp_path,
 
 @pytest.mark.parametrize("arrays", [
     {"rotations": [[0, 0, 0, 0], [0, 1, 0, 0]]}, {"means3D": [[np.nan, 2, 3], [4, 5, 6]]},
-    {"opacity_logits": [[np.inf], [np.log(3)]]}])
+    {"opacity_logits": [[np.inf], [np.log(3)]]}, {"log_scales": [[1e4, 0, 0], np.log([1, 2, 3])]}])
 def test_a_splat_file_leaves_out_what_no_viewer_can_show(arrays):
     whole = splat_bytes(gaussians())
     assert splat_bytes(gaussians(**arrays)) == whole[:32], "the second, which is first in the file"
@@ -122,6 +123,32 @@ def test_a_page_leaves_out_what_the_rasterizer_culls():
     assert count == 1 and np.frombuffer(first, html.RECORD)["position"].tolist() == [[4, 5, 6]]
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_page_holds_extreme_numbers():
+    extreme = gaussians(opacity_logits=[[-1e38], [1e38]], log_scales=[[-1e38, 0, 1], [1, 2, 3]])
+    count, first, _ = html.pack(extreme)
+    records = np.frombuffer(first, html.RECORD)
+    assert count == 2 and records["opacity"].tolist() == [0, 1]
+    assert np.isfinite(records["log_scales"]).all() and records["log_scales"][0, 0] < -60_000
+
+
+@pytest.mark.parametrize("lost", [[np.nan, 2, 3], [1, -np.inf, 3], [1e30, 2, 3]])
+def test_one_gaussian_without_a_place_spoils_no_page(tmp_path, lost):
+    path, page = str(tmp_path / "model.ply"), tmp_path / "page.html"
+    io.write_gaussians(path, gaussians(means3D=[[4, 5, 6], lost]))
+    assert main(["export", path, "-o", str(page)]) == 0
+    assert '"target": [4.0, 5.0, 6.0]' in page.read_text()
+
+
+@pytest.mark.parametrize("array", ["means3D", "opacity_logits", "log_scales", "shs"])
+def test_a_model_of_which_nothing_can_be_shown_is_refused(tmp_path, capsys, array):
+    path, value = str(tmp_path / "model.ply"), np.inf if array == "log_scales" else np.nan
+    io.write_gaussians(path, gaussians(**{array: np.full(getattr(gaussians(), array).shape, value)}))
+    for arguments in (["export"], ["render", "--orbit"]):
+        assert main([*arguments, path, "-o", str(tmp_path / "out.html")]) == 1
+        assert f"{path}: each of its 2 Gaussians has a number that is NaN or infinite" in capsys.readouterr().err
+
+
 def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
     path = tmp_path / "page.html"
     assert main(["export", model, "-o", str(path)]) == 0
@@ -133,7 +160,8 @@ def test_a_page_is_one_file_that_loads_nothing(model, tmp_path):
 @pytest.mark.parametrize("arguments, text", [
     (["-o", "model.obj"], "model.obj: its ending is none of html, ply, splat"),
     (["-o", "model.PLY", "--format", "splat"], "model.PLY: its ending says ply, and --format says splat"),
-    (["-o", "trained.ply"], "is the model itself"),
+    (["-o", "trained.ply"], "trained.ply is there already; --overwrite replaces it"),
+    *((["-o", "trained.ply", "--overwrite", *form], "is the model itself") for form in ([], ["--format", "ply"])),
     (["-o", "a.html", "--blend-mode", "alpha"], "trained with the blend mode smoe, not alpha"),
     (["-o", "a.html", "--background-gate", "0.5"], "trained with the background gate 0.25, not 0.5"),
 ])
@@ -142,6 +170,21 @@ def test_what_cannot_be_written_is_refused(model, tmp_path, monkeypatch, capsys,
     assert main(["export", model, *arguments]) == 1
     assert text in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["trained.ply"]
+
+
+@pytest.mark.parametrize("name", ["thesis.html", "thesis.ply", "thesis.splat"])
+def test_a_file_that_is_there_is_replaced_only_where_asked(model, tmp_path, capsys, name):
+    path = tmp_path / name
+    path.write_text("mine")
+    assert main(["export", model, "-o", str(path)]) == 1
+    assert f"{name} is there already; --overwrite replaces it" in capsys.readouterr().err
+    assert path.read_text() == "mine"
+    assert main(["export", model, "-o", str(path), "--overwrite"]) == 0
+    assert path.stat().st_size > 50 and sorted(os.listdir(tmp_path)) == sorted([name, "trained.ply"])
+    path.unlink()
+    os.mkfifo(path)
+    assert main(["export", model, "-o", str(path), "--overwrite"]) == 1
+    assert "is no regular file" in capsys.readouterr().err and not path.is_file()
 
 
 def test_a_page_refuses_the_ablations(tmp_path, capsys):

@@ -277,3 +277,29 @@ def test_a_gpu_and_the_cpu_agree(device):
             optimizer.step()
     # Ten roundings of numbers up to 5 in float32.
     torch.testing.assert_close(gpu.detach().cpu().double(), cpu.detach(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [None, "a", [1.0], {}])
+def test_settings_that_are_no_numbers_are_named(wrong):
+    parameter, kind = torch.zeros(4, 3, requires_grad=True), type(wrong).__name__
+    for optimizer in (FusedAdam, SparseGaussianAdam):
+        for name in ("lr", "eps"):
+            with pytest.raises(TypeError, match=f"{optimizer.__name__}: {name} is of type {kind}; it must be a number"):
+                optimizer([parameter], **{"lr": 0.1, "eps": 1e-15, name: wrong})
+    with pytest.raises(TypeError, match="FusedAdam: betas is "):
+        FusedAdam([parameter], betas=wrong)
+    with pytest.raises(TypeError, match=f"FusedAdam: betas is of type {kind}; it must be a number"):
+        FusedAdam([parameter], betas=(0.9, wrong))
+    sparse = SparseGaussianAdam([parameter], lr=0.1, eps=1e-15)
+    with pytest.raises(TypeError, match=f"SparseGaussianAdam.step: visibility is of type {kind}; it must be a torch"):
+        sparse.step(wrong, 4)
+    with pytest.raises(TypeError, match=f"SparseGaussianAdam.step: N is of type {kind}; it must be a number"):
+        sparse.step(torch.ones(4, dtype=torch.bool), wrong)
+
+
+def test_a_learning_rate_may_be_a_tensor(device):
+    first, second = (torch.ones(3, requires_grad=True) for _ in range(2))
+    for parameter, rate in ((first, 0.1), (second, torch.tensor(0.1, dtype=torch.float64))):
+        set_gradients([parameter], 0)
+        FusedAdam([parameter], lr=rate).step()
+    assert torch.equal(first, second) and float(first.detach()[0]) != 1

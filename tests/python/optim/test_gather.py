@@ -30,3 +30,9 @@ def test_what_does_not_fit_is_refused(device):
         gather_rows([torch.zeros(4)], torch.zeros(2, dtype=torch.int32))
     with pytest.raises(TypeError, match=r"tensors\[1\] is float64"):
         gather_rows([torch.zeros(4), torch.zeros(4, dtype=torch.float64)], torch.tensor([0]))
+
+
+@pytest.mark.parametrize("rows, ends", [([3, -1, 0], "from -1 to 3"), ([0, 4], "from 0 to 4"), ([2 ** 40], "")])
+def test_rows_that_are_not_there_are_refused(rows, ends, device):
+    with pytest.raises(IndexError, match=f"gather_rows: rows has indices {ends}.*; the tensors have 4 rows"):
+        gather_rows([torch.zeros(4, 3), torch.zeros(4)], torch.tensor(rows))

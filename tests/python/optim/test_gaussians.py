@@ -5,7 +5,8 @@ import pytest
 import torch
 from devices import random_normal
 
-from diff_smoe_rasterization.gaussians import activate, add_view
+from diff_smoe_rasterization.gaussians import activate, add_view, divided
+from diff_smoe_rasterization.neighbors import distCUDA2
 
 SHAPES = ((1,), (3,), (4,))  # opacities, scales, rotations of one Gaussian
 
@@ -89,6 +90,41 @@ def test_statistics_that_were_saved_for_a_backward_pass_are_not_changed_unseen(d
         add_view(torch.ones(4, 3), torch.ones(4, dtype=torch.int32), *statistics)
         with pytest.raises(RuntimeError, match="modified by an inplace operation"):
             product.backward()
+
+
+@pytest.mark.parametrize("wrong", [None, 1, "a", [1.0]])
+def test_what_is_no_tensor_is_named(wrong):
+    row, radii = torch.ones(4), torch.ones(4, dtype=torch.int32)
+    words = f"is of type {type(wrong).__name__}; it must be"
+    for function, arguments in ((activate, {"opacities": row, "scales": row, "rotations": row}),
+                                (add_view, {"dL_dmeans2D": row, "radii": radii, "gradient_sum": row,
+                                            "view_count": row}), (divided, {"opacities": row, "copies": row})):
+        for name in arguments:
+            with pytest.raises(TypeError, match=f"{function.__name__}: {name} {words} a torch.Tensor"):
+                function(**{**arguments, name: wrong})
+    with pytest.raises(ValueError, match=r"divided: opacities has shape \[4\] and copies \[3\]; both must be"):
+        divided(row, row[:3])
+    with pytest.raises(TypeError, match=f"distCUDA2: points {words} a torch.Tensor"):
+        distCUDA2(wrong)
+
+
+@pytest.mark.parametrize("name", ["raw", "values", "dL_dvalues", "moments", "squares"])
+def test_rotations_that_do_not_begin_where_a_quaternion_may_are_refused(name, device):
+    """On a GPU a thread reads a quaternion at once."""
+    shapes = ((7, 3), (7, 1), (7, 3), (7, 4))
+    lists = {each: [torch.zeros(shape) for shape in shapes] for each in ("raw", "dL_dvalues", "moments", "squares")}
+    lists["values"] = [torch.zeros(shape) for shape in shapes[1:]]
+    radii = torch.zeros(7, dtype=torch.int32)
+
+    def step():
+        torch.ops.diff_smoe_rasterization.gaussian_adam(
+            *(lists[each] for each in ("raw", "values", "dL_dvalues", "moments", "squares")), radii, [0.1] * 4,
+            [1.0] * 4, 0.9, 0.999, 1e-15)
+
+    step()
+    lists[name][-1] = torch.zeros(29)[1:].view(7, 4)
+    with pytest.raises(ValueError, match="rotations must begin at a multiple of a quaternion's size"):
+        step()
 
 
 def test_what_does_not_fit_is_refused(device):

@@ -117,6 +117,55 @@ def test_a_break_with_a_checkpoint_and_other_rates_on_the_way(device):
     assert_equal(resumed, densely, (resumed_parameters, dense_parameters))
 
 
+def test_state_that_is_loaded_between_steps_is_taken(device):
+    """What load_state_dict puts in place of groups and moments: here learning rates of 0, 0.1 and other moments."""
+    lazy_parameters, dense_parameters = parameters_of(torch.float32), parameters_of(torch.float32)
+    lazily, densely = adam_of(lazy_parameters), adam_of(dense_parameters)
+    lazy = LazyAdam(lazily, lazy_parameters)
+    lazy_steps(lazy, range(3))
+    dense_steps(densely, dense_parameters, range(3))
+    lazy.catch_up()
+    for adam in (lazily, densely):
+        state = copy.deepcopy(adam.state_dict())
+        state["param_groups"][0]["lr"], state["param_groups"][1]["lr"] = 0.0, 0.1
+        state["state"][0]["exp_avg"].fill_(1.0)
+        adam.load_state_dict(state)
+    before = lazy_parameters[0].detach().clone()
+    lazy_steps(lazy, range(3, 6))
+    dense_steps(densely, dense_parameters, range(3, 6))
+    lazy.catch_up()
+    assert torch.equal(lazy_parameters[0], before)
+    assert_equal(lazily, densely, (lazy_parameters, dense_parameters))
+
+
+def fill_moments(lazy):
+    lazy.adam.state[lazy.parameters[0]]["exp_avg"].fill_(0.5)
+
+
+def replace_state(lazy):
+    lazy.adam.state[lazy.parameters[1]] = copy.deepcopy(lazy.adam.state[lazy.parameters[1]])
+
+
+@torch.no_grad()
+def move(lazy):
+    lazy.parameters[1][3] = 2.0
+
+
+@pytest.mark.parametrize("change", [
+    lambda lazy: lazy.adam.load_state_dict(copy.deepcopy(lazy.adam.state_dict())), fill_moments, replace_state, move,
+    lambda lazy: lazy.adam.state.clear(),
+    lambda lazy: [group.update(betas=(0.8, 0.99)) for group in lazy.adam.param_groups]])
+def test_a_change_while_steps_wait_is_refused(device, change):
+    parameters = parameters_of(torch.float32)
+    lazy = LazyAdam(adam_of(parameters), parameters)
+    lazy_steps(lazy, range(2))
+    change(lazy)
+    for call in (lazy.catch_up, lambda: lazy.step(radii_of(2, 700))):
+        with pytest.raises(RuntimeError, match="changed while 2 steps wait.*catch_up"):
+            call()
+    lazy_steps(LazyAdam(lazy.adam, parameters), range(2, 4))
+
+
 def test_a_long_wait(device):
     """Momentum fades to nothing, and so does the second moment, in as many roundings as dense Adam makes."""
     lazy_parameters, dense_parameters = parameters_of(torch.float32, [(3, 2)]), parameters_of(torch.float32, [(3, 2)])
@@ -151,3 +200,13 @@ def test_what_does_not_fit_is_refused(device):
         lazy.step(torch.ones(3, dtype=torch.int32))
     with pytest.raises(TypeError, match="radii is bool"):
         lazy.step(torch.ones(4, dtype=torch.bool))
+    for function in (lazy.step, lazy.catch_up):
+        with pytest.raises(TypeError, match=f"LazyAdam.{function.__name__}: radii is of type list; it must be a torch"):
+            function([1, 1, 1, 1])
+    assert lazy.adam.state[first]["step"] == 0, "what was refused is no step"
+    with pytest.raises(TypeError, match="LazyAdam: adam is of type SGD; it must be a FusedAdam"):
+        LazyAdam(torch.optim.SGD([first], lr=0.1), [first])
+    with pytest.raises(TypeError, match=r"LazyAdam: parameters\[1\] is of type int; it must be a torch.Tensor"):
+        LazyAdam(adam_of([first]), [first, 1])
+    with pytest.raises(ValueError, match="LazyAdam: parameters is empty"):
+        LazyAdam(adam_of([first]), [])

@@ -1,6 +1,7 @@
 """SSIM and the training loss against a direct two-dimensional convolution in double, on every device."""
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from devices import on_the_cpu
@@ -187,3 +188,23 @@ def test_what_does_not_fit_is_refused(device):
         fused_ssim(image[:, :10], image[:, :10], padding="valid")
     with pytest.raises(ValueError, match="at least one pixel"):
         l1_ssim_loss(image[:0], image[:0])
+
+
+@pytest.mark.parametrize("wrong", [None, 1, "a", [1.0], np.zeros((3, 20, 20), np.float32)])
+def test_what_is_no_tensor_or_no_number_is_named(wrong):
+    image, kind = torch.rand(3, 20, 20), type(wrong).__name__
+    for function, names in ((l1_ssim_loss, ("image", "target")), (fused_ssim, ("img1", "img2")),
+                            (l1_ssim_loss_and_gradient, ("image", "target")),
+                            (l2_ssim_loss_and_gradient, ("image", "target"))):
+        numbers = (0.2, 1.0) if function is l2_ssim_loss_and_gradient else ()
+        for name, arguments in zip(names, ((wrong, image), (image, wrong))):
+            with pytest.raises(TypeError, match=f"{function.__name__}: {name} is of type {kind}; it must be a torch"):
+                function(*arguments, *numbers)
+        if function is not fused_ssim and not isinstance(wrong, int):
+            with pytest.raises(TypeError, match=f"{function.__name__}: lambda_dssim is of type {kind}; it must be a n"):
+                function(image, image, wrong, *numbers[1:])
+    if not isinstance(wrong, int):
+        with pytest.raises(TypeError, match=f"l2_ssim_loss_and_gradient: weight is of type {kind}; it must be a n"):
+            l2_ssim_loss_and_gradient(image, image, 0.2, wrong)
+    with pytest.raises(ValueError, match="fused_ssim: padding is "):
+        fused_ssim(image, image, padding=wrong)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from checkouts import contents
-from tiny import ARGS, CHECKOUT, GR, MARK, PATCHED, RENDER, RENDERER, TRAIN, make, refused
+from tiny import ARGS, CHECKOUT, GR, PATCHED, RENDER, RENDERER, TRAIN, digest, make, marked, refused
 
 from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.patches import engine
@@ -21,7 +21,7 @@ def test_only_the_statements_change(tmp_path):
     """Comments, blanks, the unusual colons and the missing last newline are where they were. A copy can be reverted."""
     checkout, copy = make(tmp_path / "checkout"), tmp_path / "copy"
     text, before = patches.diff(checkout), contents(checkout)
-    assert "+    pipe.blend = blend_of(dataset)  # dsmoe patch\n" in text and "No newline at end of file" in text
+    assert "+    " + marked("pipe.blend = blend_of(dataset)") in text and "No newline at end of file" in text
     assert patches.check(checkout)[1:3] == ("patchable", "3dgs-2023")
     assert patches.apply(checkout).written and not patches.apply(checkout).written
     for name, expected in PATCHED.items():
@@ -72,7 +72,7 @@ def test_settings_in_one_line_and_imports_in_a_try_come_back(tmp_path):
     patches.apply(tmp_path)
     after = (tmp_path / GR).read_text()
     compile(after, GR, "exec")
-    assert "Settings(**chosen_blend(pipe),  # dsmoe patch\n        image_height=(" in after
+    assert f"Settings({marked('**chosen_blend(pipe),')}        image_height=(" in after
     patches.revert(tmp_path)
     assert (tmp_path / GR).read_text() == text
 
@@ -100,7 +100,7 @@ def test_drift_is_refused_by_file_and_rule(tmp_path, name, old, new, rule, dsmoe
 
 
 def test_what_is_no_trainer_or_none_that_is_known_is_refused(tmp_path):
-    refused(make(tmp_path / "missing", {"render.py": None}), "render.py: rule pipe-blend-mode: there is no such file")
+    refused(make(tmp_path / "missing", {"train.py": None}), "train.py: rule pipe-blend-mode: there is no such file")
     refused(make(tmp_path / "broken", {"train.py": TRAIN + "def\n"}), "train.py: rule pipe-blend-mode: is not Python",
             "(line 11)")
     refused(make(tmp_path / "none", {GR: "def render():\n    pass\n"}), "unknown", "nothing imports Gaussian")
@@ -175,8 +175,9 @@ def test_options_are_added_to_a_patch_and_stay_with_it(tmp_path, dsmoe):
         assert said.status == 0 and f"metrics.py: {', '.join(options)}" in said.out
         assert patches.check(tmp_path).applied == options and not patches.apply(tmp_path).written
     first, second, *rest = (tmp_path / "metrics.py").read_text().splitlines(keepends=True)
-    assert first == "from diff_smoe_rasterization.patches import modernise; modernise.start()" + MARK
-    assert second == "from diff_smoe_rasterization.patches import fuse; fuse.start()" + MARK and "".join(rest) == SCRIPT
+    assert first == marked("from diff_smoe_rasterization.patches import modernise; modernise.start()")
+    assert second == marked("from diff_smoe_rasterization.patches import fuse; fuse.start()")
+    assert "".join(rest) == SCRIPT
     assert (tmp_path / setup).read_text() == "flags = ['-O2', '-DDSMOE_PATCH_STD=14']\n"
     assert (tmp_path / "utils/x.py").read_text() == SCRIPT
     assert "patched (3dgs-2023, --fuse, --modernise)" in dsmoe("patch", "check", tmp_path).out
@@ -195,22 +196,69 @@ def test_edits_stay_when_the_patch_goes(tmp_path, dsmoe):
     assert (tmp_path / GR).read_text() == RENDERER
 
 
+INRIA = "diff_smoe_rasterization.integrations.inria"
+OF_DATASET = digest("pipe.blend = blend_of(dataset)")
+
+
 @pytest.mark.parametrize("name, old, new, words", [
     ("train.py", "    pipe.blend", "    if 1:\n        pipe.blend", "train.py: without the lines of the patch it is"),
     (GR, "\nfrom diff_smoe", "\n\nfrom diff_smoe", "it still has `# dsmoe patch 3dgs-2023: diff"),
-    (GR, "# dsmoe patch 3dgs-2023: diff_gaussian_rasterization\n", "", "still has `from diff_smoe_rasterization."),
+    (GR, f"# dsmoe patch 3dgs-2023: diff_gaussian_rasterization {digest(INRIA)}\n", "",
+     "still has `from diff_smoe_rasterization."),
+    (GR, f"from {INRIA}", "from mine.rasterizer", "it still has `# dsmoe patch 3dgs-2023: diff"),
+    (GR, f"from {INRIA}", f"from {INRIA}_2024", "it still has `# dsmoe patch 3dgs-2023: diff"),
     # Code and words of the user's on a line of the patch.
-    (GR, "(pipe),  #", "(pipe), sh_degree=3,  #", "still has `**chosen_blend(pipe), sh_degree=3,  # dsmoe patch`"),
+    (GR, "(pipe),  #", "(pipe), sh_degree=3,  #", "still has `**chosen_blend(pipe), sh_degree=3,  # dsmoe patch"),
+    (GR, "(pipe),  #", "(mine),  #", "still has `**chosen_blend(mine),  # dsmoe patch"),
     ("train.py", "blend_of(dataset)", "blend_of(dataset); lr = 5", "still has `pipe.blend = blend_of(dataset); lr = 5"),
+    ("train.py", "blend_of(dataset)", "blend_of(args)", "still has `pipe.blend = blend_of(args)"),
+    ("train.py", "    pipe.blend", "    # pipe.blend", "still has `# pipe.blend = blend_of(dataset)"),
+    ("train.py", "pipe.blend =", "pipe.mode = pipe.blend =", "still has `pipe.mode = pipe.blend = blend_of(dataset)"),
     ("train.py", "blend_of(dataset)", "{'blend_mode': 'smoe'}", "still has `pipe.blend = {'blend_mode': 'smoe'}"),
-    ("train.py", "import blend_of", "import blend_of; import wandb", "import wandb  # dsmoe patch`"),
-    ("train.py", "# dsmoe patch\n    first", "# dsmoe patch, mine\n    first", "  # dsmoe patch, mine`")])
+    ("train.py", f"  # dsmoe patch {OF_DATASET}", "", "without the lines of the patch it still has `pipe.blend ="),
+    ("train.py", "import blend_of", "import blend_of; import wandb", "import wandb  # dsmoe patch"),
+    ("train.py", f"{OF_DATASET}\n", f"{OF_DATASET}, mine\n", f"  # dsmoe patch {OF_DATASET}, mine`")])
 def test_an_edit_without_which_no_file_comes_back_is_named(tmp_path, name, old, new, words):
     patches.apply(make(tmp_path))
+    assert (tmp_path / name).read_text().count(old) == 1
     (tmp_path / name).write_text((tmp_path / name).read_text().replace(old, new))
     refused(tmp_path, "nothing was touched", words, call=patches.revert)
     if "without" not in words:
-        refused(tmp_path, "drifted")
+        said = "imports mine, another rasterizer" if "mine.rasterizer" in new else "drifted"
+        refused(tmp_path, said)
+        refused(tmp_path, said, fuse=True)
+
+
+def test_an_edit_of_a_flag_of_the_patchs_is_named(tmp_path):
+    make(tmp_path, {"submodules/grid/setup.py": "flags = ['-std=c++14']\n"})
+    patches.apply(tmp_path, modernise=True)
+    (tmp_path / "submodules/grid/setup.py").write_text("flags = ['-DDSMOE_PATCH_STD=17']\n")
+    refused(tmp_path, "setup.py: without the lines of the patch it still has `flags = ['-DDSMOE_PATCH_STD=17']`",
+            call=patches.revert)
+
+
+@pytest.mark.parametrize("call", [patches.apply, patches.revert])
+@pytest.mark.parametrize("step", [1, 5])
+def test_what_an_editor_saves_meanwhile_stays(tmp_path, monkeypatch, call, step):
+    """Before the first file is replaced, and behind it: four files are written, then each takes its place."""
+    make(tmp_path)
+    if call is patches.revert:
+        patches.apply(tmp_path)
+    before, done, write, replace = contents(tmp_path), [], Path.write_bytes, os.replace
+
+    def save_at_step(act, *arguments):
+        done.append(arguments)
+        act(*arguments)
+        if len(done) == step:
+            write(tmp_path / "train.py", b"# mine\n")
+
+    with monkeypatch.context() as patch, pytest.raises(patches.PatchError, match="train.py: another program has saved"):
+        patch.setattr(Path, "write_bytes", lambda *arguments: save_at_step(write, *arguments))
+        patch.setattr(os, "replace", lambda *arguments: save_at_step(replace, *arguments))
+        call(tmp_path)
+    assert (tmp_path / "train.py").read_text() == "# mine\n"
+    written = [name for name, content in contents(tmp_path).items() if content != before[name]]
+    assert len(written) == (1 if step == 1 else 4) and "train.py" in written
 
 
 def test_an_argument_does_not_become_a_part_of_a_comment(tmp_path):
@@ -298,7 +346,7 @@ def test_files_of_another_commit_are_patched_anew(tmp_path):
 
 def test_lines_of_another_version_are_replaced(tmp_path):
     patches.apply(make(tmp_path))
-    former = PATCHED["train.py"].replace("pipe.blend = blend_of", "pipe.mode = blend_of")
+    former = PATCHED["train.py"].replace(*map(marked, ("pipe.blend = blend_of(dataset)", "pipe.mode = blend_of(pipe)")))
     (tmp_path / "train.py").write_text(former)
     assert patches.check(tmp_path).state == "half-patched" and patches.apply(tmp_path).written
     assert (tmp_path / "train.py").read_text() == PATCHED["train.py"]
@@ -377,7 +425,7 @@ def test_the_readme_has_every_trainer_rule_and_state():
     cells = {line.split(" | ")[0].strip(" |`"): line for line in text.splitlines() if line.startswith("| `")}
     for trainer in TRAINERS:
         assert f"`{trainer.flavour}`" in cells[trainer.name]
-        assert {rule.name for rule in rules_of(trainer)} <= set(cells)
+        assert {rule.name for rule in rules_of(trainer, {}, False)} <= set(cells)
         assert all(f"`{rule.function}`" in cells[trainer.name] for rule in trainer.entries)
     assert all(f"## --{option}\n" in text for option in OPTIONS)
     assert all(f"`{state}`" in text for state in "unknown unpatchable patchable patched half-patched drifted".split())

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from checkouts import PACKAGE_PARENT, contents, environment
-from tiny import GR, RENDERER, make
+from tiny import GR, RENDERER, make, refused
 
 from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES
@@ -59,6 +59,32 @@ def test_it_ends_as_the_command_unless_nothing_was_rendered(code, tmp_path, pyth
     result = python("-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py", cwd=tmp_path)
     status, said = ENDS[code]
     assert result.status == status and said in result.err, result.err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
+def test_the_command_ends_where_dsmoe_run_is_killed(tmp_path):
+    make(tmp_path, {"x.py": "import signal, sys, time\n"
+                            "signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('told to end', flush=True)))\n"
+                            "print('ready', flush=True)\ntime.sleep(60)\n"})
+    words = [sys.executable, "-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py"]
+    with subprocess.Popen(words, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.kill()
+        assert process.stdout.read() == "told to end\n", "read to its end, at which the command has ended"
+
+
+@pytest.mark.parametrize("renders", [False, True])
+def test_that_nothing_was_rendered_is_said_at_the_first_step(renders, tmp_path, python):
+    """Not only at the end: gsplat's own function, taken from where no rasterizer of this package is put."""
+    call = "import torch, gsplat\nfrom gsplat import rasterization\n"
+    script = call + ("gsplat.rasterization and None\n" if not renders else CALL_GSPLAT) + (
+        "w = torch.ones(1, requires_grad=True)\nw.sum().backward()\nadam = torch.optim.Adam([w])\n"
+        "adam.step()\nadam.step()\nprint('trained')\n")
+    make(tmp_path, {GR: None, "x.py": script})
+    result = python("-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py", cwd=tmp_path,
+                    PYTHONPATH=str(PACKAGE_PARENT))
+    assert result.out.endswith("trained\n") and result.status == (0 if renders else 1), result.err
+    assert result.err.count("the first step of an optimizer, and this rasterizer has rendered nothing") == (not renders)
 
 
 @pytest.mark.parametrize("number, ignored", [(signal.SIGTERM, False), (signal.SIGUSR1, False), (signal.SIGHUP, True)])
@@ -122,7 +148,8 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({}, [*RUN, "--"], "there is no command"), ({}, ["run", "--blend_mode", "smoe", "--"], "there is no command"),
     ({}, [*RUN, "--", "no-such-command"], "no-such-command: No such file"),
     ({"tool.py": ""}, [*RUN, "--", "./tool.py"], "./tool.py: Permission denied"),
-    ({GR: None}, PYTHON, "name it with --trainer, or the rasterizer whose API it calls (absgs, c3dgs, cob_gs"),
+    ({GR: None}, PYTHON, f"--trainer list prints the names):\n  there is no {GR} in"),
+    ({}, [*RUN, "--trainer", "list", "--", sys.executable], "absgs, c3dgs, cob_gs"),
     ({}, [*RUN, "--trainer", "nerf", "--", sys.executable], "there is no trainer 'nerf'; it must be one of 3dgs-2023"),
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
@@ -144,6 +171,7 @@ def test_what_would_not_use_the_rasterizer_is_refused(files, words, said, tmp_pa
 
 CALLS = {  # what a checkout sets, calls with and names the results of, and the rasterizer that it needs
     "mip_splatting": ("kernel_size=1, subpixel_offset=2", "", "image, radii"),
+    "rade_gs": ("kernel_size=1, require_depth=1, require_coord=1", "", "image, radii, a, b, depth, m_depth, alpha, n"),
     "mcmc": ("", "", "image, radii, is_used"), "dngaussian": ("", "", "image, radii, depth, alpha"),
     "monogs": ("projmatrix_raw=1", "theta=1", "image, radii, depth, opacity"),
     "grouping": ("", "sh_objs=1", "image, radii, rendered_objects"),
@@ -176,6 +204,111 @@ def test_a_rasterizer_is_recognised_by_its_settings_keywords_results_and_name(fl
     made, lines = run.prepare(*words)
     named = flavour if module == "diff_gaussian_rasterization" else "inria"  # beside another name
     assert made["DSMOE_RASTERIZER"] == named and f"{module} will be {flavour} of this package" in lines[0]
+
+
+RENAMED = ("from {0} import GaussianRasterizationSettings as Settings, GaussianRasterizer as Draw\n"
+           "draw = Draw(raster_settings=Settings(bg=1))\n{1} = draw(means3D=1)\n")
+
+
+@pytest.mark.parametrize("name, results, flavour", [
+    ("diff_gaussian_rasterization_w_depth", "image, radii, depth", "depth"),
+    ("depth_diff_gaussian_rasterization", "image, _, depth, alpha", "depth_alpha"),
+    ("diff_gaussian_rasterization_depth", "image, radii, depth", "depth"),  # not the one that is known by that name
+    ("diff_gaussian_rasterization", "color, depth, median_depth, alpha, radii", "color,depth,median_depth,alpha,radii"),
+    ("diff_gauss_own", "rendered_depth, opacity, render, radii", "depth,alpha,color,radii"),
+    ("diff_gaussian_rasterization", "inv_depth, image, radii", "inverse_depth,color,radii"),
+    ("diff_gaussian_rasterization_w_depth", "out", "what a call returns is not seen"),
+    ("diff_gauss", "image, depth, normal, alpha, radii, extra", "returns 6 results"),
+    ("diff_gaussian_rasterization", "depth, depth_2, image, radii", "returns 4 results"),
+    ("diff_gaussian_rasterization_panorama", "image, radii", "another rasterizer, which would render"),
+    ("triangle_rasterizer", "image, radii", "another rasterizer, which would render")])
+def test_another_name_or_order_is_told_by_what_callers_show(name, results, flavour, tmp_path, monkeypatch):
+    monkeypatch.chdir(make(tmp_path, {GR: RENAMED.format(name, results)}))
+    words = [sys.executable, "train.py"], "smoe", None, environment()
+    if " " in flavour:
+        with pytest.raises(patches.PatchError, match=flavour):
+            run.prepare(*words)
+        return
+    made, lines = run.prepare(*words)
+    assert made["DSMOE_RASTERIZER"] == flavour and f"{name} will be {flavour} of this package" in lines[0]
+    is_renamed, is_ordered = name != "diff_gaussian_rasterization", "," in flavour
+    assert [word in "".join(lines) for word in ("is taken for", "the results are told")] == [is_renamed, is_ordered]
+    refused(tmp_path, "for which there is no patch: type `dsmoe run" if is_renamed or is_ordered else "unpatchable")
+
+
+def test_results_that_are_kept_before_they_are_unpacked_count(tmp_path, monkeypatch):
+    """Code that looks how many there are gets the most that are known."""
+    text = RENAMED.format("diff_gaussian_rasterization", "out").split("out = ")[0]
+    own = "def render(draw):\n    out = draw(means3D=1)\n    image, radii, depth, alpha = out\n"
+    monkeypatch.chdir(make(tmp_path, {GR: text + own}))
+    words = [sys.executable, "train.py"], "smoe", None, environment()
+    assert run.prepare(*words)[0]["DSMOE_RASTERIZER"] == "depth_alpha"
+    more = "    if len(out) == 2:\n        image, radii = out\n"
+    for made, flavour in ((own, "depth_alpha"), (own.replace("radii, depth", "radii, normals, depth"), "inria")):
+        make(tmp_path, {GR: text + made + more})
+        assert run.prepare(*words)[0]["DSMOE_RASTERIZER"] == flavour
+
+
+def test_a_renamed_rasterizer_with_results_in_another_order_renders(tmp_path, python):
+    script = """import torch
+from diff_gaussian_rasterization_named import GaussianRasterizationSettings, GaussianRasterizer
+draw = GaussianRasterizer(raster_settings=GaussianRasterizationSettings(
+    image_height=8, image_width=8, tanfovx=1.0, tanfovy=1.0, bg=torch.zeros(3), scale_modifier=1.0,
+    viewmatrix=torch.eye(4), projmatrix=torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, -0.01, 0]]),
+    sh_degree=0, campos=torch.zeros(3), prefiltered=False, debug=False))
+color, depth, median_depth, alpha, radii = draw(
+    means3D=torch.tensor([[0.0, 0, 2]]), means2D=None, opacities=torch.ones(1, 1), colors_precomp=torch.ones(1, 3),
+    scales=torch.full((1, 3), 2.0), rotations=torch.tensor([[1.0, 0, 0, 0]]))
+print(list(color.shape), [round(one[0, 4, 4].item(), 1) for one in (depth, median_depth, alpha)], radii.dtype)
+"""
+    make(tmp_path, {GR: None, "x.py": script})
+    before = contents(tmp_path)
+    result = python("-m", "diff_smoe_rasterization", "run", "--blend-mode", "alpha", "--", sys.executable, "x.py",
+                    cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+    assert result.out == "[3, 8, 8] [2.0, 2.0, 1.0] torch.int32\n", result.err
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("columns, flavour", [("zeros_like(pc.xyz)", "inria"), ("zeros(pc.xyz.shape[0], 3)", "inria"),
+                                              ("zeros((pc.xyz.shape[0], 4), requires_grad=True) + 0", "color,radii")])
+def test_points_of_four_columns_need_what_has_absolute_gradients(columns, flavour, tmp_path, monkeypatch):
+    """AbsGS's rule in a fork of Inria's, whose own module takes three."""
+    text = RENAMED.format("diff_gaussian_rasterization", "image, radii")
+    monkeypatch.chdir(make(tmp_path, {GR: f"{text}screenspace_points = torch.{columns}\n"}))
+    assert run.prepare([sys.executable, "train.py"], "smoe", None, environment())[0]["DSMOE_RASTERIZER"] == flavour
+
+
+@pytest.mark.parametrize("like_3dgs", [True, False])
+def test_the_script_that_is_run_says_which_renderer_counts(like_3dgs, tmp_path, monkeypatch):
+    """Two renderers, of which each script has one; and what the rest imports has to be there."""
+    files = {"gaussian_renderer/a.py": RENAMED.format("diff_gaussian_rasterization", "image, radii, depth, alpha"),
+             GR: "", "gaussian_renderer/b.py": RENAMED.format("diff_surfel_rasterization", "image, radii, allmap"),
+             "train_a.py": "from gaussian_renderer.a import render\n", "scene/gaussian_model.py": "import utils.more\n",
+             "train_b.py": "def later():\n    import gaussian_renderer.b\n", "train.py": None, "render.py": None,
+             "train_c.py": "from scene.gaussian_model import M\nfrom gaussian_renderer.a import render\n",
+             "utils/more.py": "from diff_gaussian_rasterization import cuda_knn\n"}
+    if not like_3dgs:  # the same in another layout
+        files = {name.replace("gaussian_renderer", "draw"): text and text.replace("gaussian_renderer", "draw")
+                 for name, text in {**files, GR: None}.items()}
+        files[GR] = None
+    monkeypatch.chdir(make(tmp_path, files))
+
+    def of(script):
+        return run.prepare([sys.executable, *script], "smoe", None, environment())[0]["DSMOE_RASTERIZER"]
+
+    assert of(["train_a.py"]) == of(["-m", "train_a"]) == "depth_alpha"
+    for script, said in (("train_b.py", "diff_surfel_rasterization, another"), ("train_c.py", "it imports cuda_knn")):
+        with pytest.raises(patches.PatchError, match=said):
+            of([script])
+
+
+def test_a_folder_of_checkouts_is_told_which_they_are(tmp_path, monkeypatch):
+    make(tmp_path / "one", {GR: GOF})
+    monkeypatch.chdir(make(tmp_path, {GR: None, "train.py": None}))
+    with pytest.raises(patches.PatchError, match="but in one: name that folder"):
+        run.prepare([sys.executable, "x.py"], "smoe", None, environment())
+    make(tmp_path / "deep/two")
+    refused(tmp_path, f"there is no {GR} in it, but in deep/two, one: name one of these")
 
 
 def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(tmp_path, python):
@@ -243,6 +376,42 @@ def test_gsplat_gets_this_rasterizer_and_keeps_its_strategies(version, radii, tm
     assert "gsplat will be gsplat of this package, blend mode smoe" in result.err
 
 
+INRIA_2024 = ("from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer\n"
+              "draw = GaussianRasterizer(raster_settings=GaussianRasterizationSettings(bg=1, antialiasing=1))\n"
+              "image, radii, depth = draw(means3D=1, dc=1)\n")
+
+
+@pytest.mark.parametrize("imported, called, said", [
+    ("from gsplat import rasterization", "rasterization(means=1, packed=True)", ""),
+    ("import gsplat as g", "g.rendering.rasterization(means=1)", ""),
+    ("from gsplat.rendering import rasterization as draw", "fn = draw", ""),
+    ("from gsplat import rasterization", "rasterization(means=1, colors0=2)", "rasterization with colors0, which"),
+    ("def later():\n    from gsplat.cuda._torch_impl import quat_to_rotmat", "quat_to_rotmat(1)",
+     "it imports gsplat and does not call its rasterization"),
+    ("import gsplat", "gsplat.rasterization_2dgs(means=1)",
+     "does not call its rasterization; it calls rasterization_2dgs"),
+    ("from gsplat import rasterization", INRIA_2024.replace("dc=1", "rays=1") + "rasterization(means=1)",
+     "its rasterizer is called with rays")])
+def test_gsplat_is_recognised_by_the_call_of_rasterization(imported, called, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(make(tmp_path, {GR: None, "x.py": f"{imported}\n{called}\n"}))
+    words = [sys.executable, "x.py"], "smoe", None, environment()
+    if said:
+        with pytest.raises(patches.PatchError, match=said):
+            run.prepare(*words)
+    else:
+        assert "gsplat will be gsplat of this package" in run.prepare(*words)[1][0]
+
+
+def test_what_is_imported_from_gsplat_does_not_hide_the_rasterizer_that_is_called(tmp_path, monkeypatch):
+    lazily = "def later():\n    from gsplat.cuda._torch_impl import quat_to_rotmat\n"
+    monkeypatch.chdir(make(tmp_path, {GR: None, "x.py": INRIA_2024 + lazily}))
+    words = [sys.executable, "x.py"], "smoe", None, environment()
+    assert "will be inria_2024 of this package" in run.prepare(*words)[1][0]
+    make(tmp_path, {GR: None, "x.py": INRIA_2024 + "import gsplat\ngsplat.rasterization(means=1)\n"})
+    made, lines = run.prepare(*words)
+    assert "gsplat will be gsplat of this package" in lines[0] and made["DSMOE_RASTERIZER"] == "inria_2024"
+
+
 def test_what_speaks_against_a_trainer_that_is_named_is_said(tmp_path, dsmoe, monkeypatch):
     """reduced-3dgs: its call has other keywords."""
     one_line = "    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)\n"
@@ -275,10 +444,9 @@ def test_a_trainer_of_another_layout_is_recognised_by_its_rasterizer(tmp_path, m
     assert made["DSMOE_RASTERIZER"] == "depth_alpha" and lines[0].startswith(f"the trainer in {tmp_path}: ")
 
 
-@pytest.mark.parametrize("model, is_offered", [("", False), ("    def get_features_dc(self): ...\n", True)])
-def test_sparse_adam_is_offered_to_models_that_can_be_rendered_for_it(model, is_offered, tmp_path, python):
-    """Where 3DGS of 2024 finds it, it renders with get_features_dc; forks of other models break there."""
-    train = """from diff_gaussian_rasterization import GaussianRasterizer
+OF_2024 = RENDERER.replace("bg=bg_color", "antialiasing=False, bg=bg_color")
+IMPORT_SPARSE = "from diff_gaussian_rasterization import SparseGaussianAdam\n"
+TRY_SPARSE = """from diff_gaussian_rasterization import GaussianRasterizer
 try:
     from diff_gaussian_rasterization import SparseGaussianAdam
 except ImportError:
@@ -286,12 +454,19 @@ except ImportError:
 print(SparseGaussianAdam is not None)
 GaussianRasterizer(None)
 """
-    renderer = RENDERER.replace("bg=bg_color", "antialiasing=False") + "\n\ndef dc(pc): return pc.get_features_dc\n"
-    model = "class GaussianModel:\n    x = 1\n" + model
-    make(tmp_path, {GR: renderer, "train.py": train, "scene/gaussian_model.py": model})
-    result = python("-m", "diff_smoe_rasterization", *PYTHON, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+
+
+@pytest.mark.parametrize("files, words, is_offered", [
+    ({}, [], False),  # the model can be rendered for it, and still the rest of a fork may not know it
+    ({}, ["--optimizer_type", "sparse_adam"], True), ({"train.py": IMPORT_SPARSE + TRY_SPARSE}, [], True),
+    ({"arguments/__init__.py": "class A:\n    optimizer_type: str = 'sparse_adam'\n"}, [], True),
+    ({"submodules/own/diff_gaussian_rasterization/__init__.py": "class SparseGaussianAdam: 0\n"}, [], True)])
+def test_sparse_adam_is_offered_to_what_was_written_for_it(files, words, is_offered, tmp_path, python):
+    """Where 3DGS of 2024 finds it, it renders another way; forks for the branch without it break there."""
+    model = "class GaussianModel:\n    def get_features_dc(self): ...\n"
+    make(tmp_path, {GR: OF_2024, "train.py": TRY_SPARSE, "scene/gaussian_model.py": model, **files})
+    result = python("-m", "diff_smoe_rasterization", *PYTHON, *words, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert (result.status, result.out) == (0, f"{is_offered}\n"), result.err
-    assert ("SparseGaussianAdam is not offered" in result.err) == (not is_offered)
 
 
 def test_rasterizers_of_one_name_are_named(tmp_path):

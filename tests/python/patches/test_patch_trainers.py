@@ -4,11 +4,12 @@ from __future__ import annotations
 import ast
 import os
 import re
+import shutil
 from pathlib import Path
 
 import pytest
-from checkouts import contents
-from tiny import GR, RENDERER, TRAIN, make, refused
+from checkouts import PACKAGE_PARENT, contents
+from tiny import ARGS, GR, RENDERER, TRAIN, make, refused
 
 from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.patches import facts
@@ -19,8 +20,8 @@ def only_statements_change(diff):
     lines = [line for line in diff.splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")]
     removed, added = ([line[1:].strip() for line in lines if line[0] == sign] for sign in "-+")
     assert removed and all(line.startswith("from diff_gaussian_rasterization import") for line in removed), removed
-    assert all("# dsmoe patch" in line or line.startswith("from diff_smoe_rasterization.integrations.")
-               for line in added), added
+    ours = "from diff_smoe_rasterization.integrations.", "from diff_smoe_rasterization.patches.sparse_adam "
+    assert all("# dsmoe patch" in line or line.startswith(ours) for line in added), added
 
 
 @pytest.mark.parametrize("name", patches.TRAINERS)
@@ -46,6 +47,7 @@ def test_recognised_by_structure_alone():
 ONE_LINE = "    return GaussianRasterizer(raster_settings=settings)(means3D=pc.get_xyz)\n"
 BY_NAME = "    draw = GaussianRasterizer(raster_settings=settings)\n    {} = draw(means3D=pc.get_xyz)\n"
 DEPTH_LOSS = TRAIN + "\n\ndef depth_loss(view, depth):\n    return abs(depth - view.invdepthmap).mean()\n"
+SPARSE_ADAM = "from diff_gaussian_rasterization import SparseGaussianAdam\n"
 ANTIALIASED = RENDERER.replace("prefiltered=False,", "antialiasing=pipe.antialiasing, prefiltered=False,")
 
 
@@ -67,8 +69,10 @@ def test_versions_and_forks_are_what_they_are_or_unknown(tmp_path, renderer, res
     if trainer:
         assert patches.apply(tmp_path).trainer == trainer and patches.check(tmp_path).state == "patched"
         return
-    said = {"kernel_size": "its rasterizer is mip_splatting, for which there is no patch: use `dsmoe run`",
-            "blur": "its GaussianRasterizationSettings have blur"}
+    run = "for which there is no patch: type `dsmoe run --blend-mode smoe -- python train.py ...`"
+    said = {"kernel_size": f"its rasterizer is mip_splatting, {run}",
+            "inv_depth": f"its rasterizer is color,radii,inverse_depth, {run}",
+            "blur": "its GaussianRasterizationSettings have blur, which no rasterizer has that is known here"}
     refused(tmp_path, "unknown", next((said[name] for name in said if name in renderer),
                                       f"its rasterizer returns {count} "))
 
@@ -107,6 +111,21 @@ def test_trainers_of_other_files_get_the_mode_in_each_function(name, files, entr
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize("more, is_offered", [({}, False), ({"scene/gaussian_model.py": SPARSE_ADAM}, True)])
+def test_a_patched_trainer_finds_sparse_adam_where_it_asks_or_was_written_for_it(more, is_offered, tmp_path, python):
+    train = TRAIN + f"try:\n    {SPARSE_ADAM}    print(True)\nexcept ImportError:\n    print(False)\n"
+    make(tmp_path, {GR: ANTIALIASED, "train.py": train.replace("from gaussian_renderer", "# "), **more})
+    before = contents(tmp_path)
+    only_statements_change(patches.diff(tmp_path))
+    assert not patches.apply(tmp_path).notes
+    for words, offered in (([], is_offered), (["--optimizer_type=sparse_adam"], True)):
+        result = python("train.py", *words, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+        assert result.out == f"{offered}\n", result.err
+    patches.revert(tmp_path)
+    shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)
+    assert contents(tmp_path) == before
+
+
 def test_a_trainer_that_it_does_not_look_like_is_warned_of(tmp_path):
     make(tmp_path, {GR: ANTIALIASED})
     (note,) = patches.apply(tmp_path, trainer="3dgs-2023").notes
@@ -128,3 +147,25 @@ def test_a_fork_that_no_contract_fits_is_patched_with_a_warning_and_one_of_anoth
     for trainer in (None, "3dgs-2023"):  # one beside Inria's, as in gaussian-opacity-fields
         refused(make(tmp_path / "both", {GR: both}), "it imports diff_gaussian_rasterization_gof, another rasterizer",
                 trainer=trainer)
+
+
+def test_a_training_script_of_another_name_is_found_by_its_function(tmp_path):
+    """Each script that has the function gets the mode; without one that renders, a note says what is missing."""
+    more = {"train_masks.py": TRAIN, "train_other.py": TRAIN.replace("def training(dataset", "def training(scene")}
+    make(tmp_path / "beside", more)
+    assert set(patches.apply(tmp_path / "beside").rules) == {GR, ARGS, "train.py", "train_masks.py", "render.py"}
+    make(tmp_path / "alone", {**more, "train.py": None, "render.py": None})
+    planned = patches.apply(tmp_path / "alone")
+    assert set(planned.rules) == {GR, ARGS, "train_masks.py"}
+    assert ["render.py: there is none, nor a function render_sets" in note for note in planned.notes] == [True]
+    assert "pipe.blend = blend_of(dataset)" in (tmp_path / "alone/train_masks.py").read_text()
+    patches.revert(tmp_path / "alone")
+
+
+@pytest.mark.parametrize("renderer", [None, "", "from .other import render\n"])
+def test_a_renderer_in_another_file_is_named(renderer, tmp_path):
+    """Not that nothing imports a rasterizer."""
+    make(tmp_path, {GR: renderer, "draw/other.py": RENDERER, "train_1.py": TRAIN + "if __name__ == '__main__': 0\n",
+                    "train.py": TRAIN.replace("gaussian_renderer", "draw.other")})
+    refused(tmp_path, "the rasterizer, but draw/other.py, and a patch is of gaussian_renderer/__init__.py alone: type "
+                      "`dsmoe run --blend-mode smoe -- python train_1.py ...`")

@@ -1,6 +1,8 @@
 """A checkout of a few lines, what a patch makes of it, and what tests ask about it."""
 from __future__ import annotations
 
+import hashlib
+
 import pytest
 from checkouts import contents
 
@@ -50,26 +52,36 @@ def render_sets(dataset : object, iteration : int, pipeline : object):
     "Renders both sets."
     return render(None, None, pipeline, None)'''
 CHECKOUT = {GR: RENDERER, ARGS: ARGUMENTS, "train.py": TRAIN, "render.py": RENDER}
-MARK = "  # dsmoe patch\n"
+
+
+def digest(text):
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def marked(text):
+    """A line of the patch: a mark, and eight digits by which an edit is noticed."""
+    return f"{text}  # dsmoe patch {digest(text)}\n"
 
 
 def imported(name):
     """The line by which a patched file gets a name."""
-    return f"from diff_smoe_rasterization.patches.runtime import {name}{MARK}"
+    return marked(f"from diff_smoe_rasterization.patches.runtime import {name}")
 
 
+INRIA = "diff_smoe_rasterization.integrations.inria"
 PATCHED = {
     GR: imported("chosen_blend") + RENDERER.replace(
-        "from diff_gaussian_rasterization", "# dsmoe patch 3dgs-2023: diff_gaussian_rasterization\n"
-        "from diff_smoe_rasterization.integrations.inria").replace(
-        "        image_height", f"        **chosen_blend(pipe),{MARK}        image_height"),
+        "from diff_gaussian_rasterization",
+        f"# dsmoe patch 3dgs-2023: diff_gaussian_rasterization {digest(INRIA)}\nfrom {INRIA}").replace(
+        "        image_height", f"        {marked('**chosen_blend(pipe),')}        image_height"),
     ARGS: imported("default_blend") + ARGUMENTS.replace(
-        '        super().__init__(parser, "Loading', "        self.blend_mode, self.background_gate = default_blend()"
-        f'{MARK}        super().__init__(parser, "Loading'),
+        '        super().__init__(parser, "Loading',
+        f"        {marked('self.blend_mode, self.background_gate = default_blend()')}"
+        '        super().__init__(parser, "Loading'),
     "train.py": imported("blend_of") + TRAIN.replace(
-        "    first_iter = 0\n", f"    pipe.blend = blend_of(dataset){MARK}    first_iter = 0\n"),
+        "    first_iter = 0\n", f"    {marked('pipe.blend = blend_of(dataset)')}    first_iter = 0\n"),
     "render.py": imported("saved_blend_of") + RENDER.replace(
-        "    return", f"    pipeline.blend = saved_blend_of(dataset){MARK}    return")}
+        "    return", f"    {marked('pipeline.blend = saved_blend_of(dataset)')}    return")}
 
 
 def make(folder, changes=None):

@@ -186,10 +186,30 @@ def test_a_splat_is_drawn_as_its_ply(tmp_path):
     pictures = []
     for name in ("model.ply", "model.splat"):
         tool("dsmoe_render", tmp_path / name, "--cameras", write_cameras(tmp_path, "cameras.json"), "--device", "cpu",
-             "-o", tmp_path / "out.png")
+             "--overwrite", "-o", tmp_path / "out.png")
         pictures.append(np.asarray(Image.open(tmp_path / "out.png")).astype(int))
     # 8 bits of a quaternion turn a Gaussian by up to half a degree, and 30 Gaussians lie on a pixel.
     assert np.abs(pictures[0] - pictures[1]).mean() < 1 and np.abs(pictures[0] - pictures[1]).max() < 12
+
+
+@pytest.mark.parametrize("name", ["view.png", "out.mp4", "out.png"])
+def test_a_file_that_is_there_is_replaced_only_where_asked(tmp_path, name):
+    io.write_gaussians(tmp_path / "model.ply", model("alpha"))
+    (tmp_path / name).write_text("mine")
+    words = [tmp_path / "model.ply", "--cameras", write_cameras(tmp_path, "cameras.json"), "--device", "cpu", "-o",
+             tmp_path if name == "view.png" else tmp_path / name]
+    said = tool("dsmoe_render", *words, status=2)
+    assert f'{name}" is there already; --overwrite' in said and (tmp_path / name).read_text() == "mine"
+    tool("dsmoe_render", *words, "--overwrite")
+    assert (tmp_path / name).stat().st_size > 100
+
+
+@pytest.mark.parametrize("name, file", [("dsmoe_fit2d", "profile.csv"), ("dsmoe_occluder", "a.png")])
+def test_results_that_are_there_stay(tmp_path, name, file):
+    (tmp_path / file).write_text("mine")
+    words = ["--edge", 64, "--kernels", 2, "-o", tmp_path] if name == "dsmoe_fit2d" else ["-o", tmp_path / file]
+    assert f'{file}" is there already' in tool(name, *words, status=2)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
 @pytest.mark.parametrize("name", ["dsmoe_render", "dsmoe_fit2d"])

@@ -1,6 +1,7 @@
 """The `dsmoe` command from end to end, on a tiny ray-traced scene."""
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -221,12 +222,23 @@ def test_render_writes_into_its_own_folder_alone(trained, scene, tmp_path, capsy
     assert [path.name for path in sorted(own.glob("*.png"))] == ["view_000.png", "view_008.png"], "no other model's"
 
 
-def test_records_that_name_files_elsewhere_are_refused(trained, tmp_path, capsys):
-    (tmp_path / "own").mkdir()
-    for name in ("../mine", "/mine"):
-        (tmp_path / "own" / ".dsmoe.json").write_text(json.dumps(
-            {"command": "dsmoe render", "of": "a scene", "files": [name]}))
-        assert "names files elsewhere" in fails(capsys, "render", trained, "-o", str(tmp_path / "own"))
+@pytest.mark.parametrize("content, words", [
+    *((json.dumps({"command": "dsmoe render", "of": "a scene", "files": [name]}), "names files elsewhere")
+      for name in ("../mine", "/mine", "a\0b")),
+    (json.dumps({"command": "dsmoe render", "of": "a scene", "files": ["link/thesis.pdf"]}), "by a link"),
+    ('{"command": "dsmoe render", "of": 1, "files": []}', "not a record"), ("[]", "not a record"),
+    ('{"command": "dsmoe render", "of": "", "files": [1]}', "not a record"), ("[" * 100_000, "not a record"),
+    ('{"command": ["dsmoe render"], "of": "", "files": "a"}', "not a record"), ("\udcff", "not a record")])
+def test_records_of_strangers_remove_nothing(trained, tmp_path, capsys, content, words):
+    own, elsewhere = tmp_path / "own", tmp_path / "elsewhere"
+    own.mkdir()
+    elsewhere.mkdir()
+    (elsewhere / "thesis.pdf").write_text("mine")
+    (own / "link").symlink_to(elsewhere)
+    (own / ".dsmoe.json").write_bytes(content.encode(errors="surrogateescape"))
+    for options in ([], ["--overwrite"], ["--orbit", "--frames", "1"]):
+        assert words in fails(capsys, "render", trained, "-o", str(own), *options)
+    assert (elsewhere / "thesis.pdf").read_text() == "mine"
 
 
 def test_eval_of_a_moved_run_and_a_moved_scene(trained, scene, tmp_path, capsys):
@@ -267,28 +279,37 @@ def test_eval_measures_lpips_where_asked(trained, tmp_path, capsys, monkeypatch)
     assert asked == [("lpips_vgg_std", "cpu")] and results_of(run)[0]["lpips_vgg"] == 0.25
 
 
-def test_render_follows_no_link_and_keeps_no_image_of_another_size(trained, tmp_path):
+def test_render_follows_no_link_and_keeps_no_image_of_another_size(trained, tmp_path, capsys):
     images, photo = tmp_path / "images", tmp_path / "photo.png"
     assert main(["render", trained, "-o", str(images), "--depth"]) == 0
     os.replace(images / "view_000.png", photo)
     os.symlink(photo, images / "view_000.png")
     before = photo.read_bytes()
+    for option in ([], ["--overwrite"]):
+        assert "view_000.png is a link" in fails(capsys, "render", trained, "-o", str(images), "--resolution", "2",
+                                                 *option)
+    assert photo.read_bytes() == before and (images / "view_000.png").is_symlink()
+    (images / "view_000.png").unlink()
     assert main(["render", trained, "-o", str(images), "--resolution", "2"]) == 0
-    assert photo.read_bytes() == before and not (images / "view_000.png").is_symlink()
     assert not (images / "view_000.depth.npy").exists(), "of another size"
 
 
-def test_overwrite_removes_models_alone_whatever_a_record_names(scene, tmp_path):
-    output, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+def test_overwrite_removes_products_alone_whatever_a_record_names(scene, tmp_path):
+    output = tmp_path / "out"
     assert main(["train", scene, "-o", str(output), *SMOE]) == 0
-    os.replace(output / "point_cloud", elsewhere)
-    os.symlink(elsewhere, output / "point_cloud")
-    (elsewhere / "key").write_text("mine")
+    (output / "point_cloud" / "key").write_text("mine")
     record = json.loads((output / ".dsmoe.json").read_text())
     record["files"].append("point_cloud/key")
     (output / ".dsmoe.json").write_text(json.dumps(record))
     assert main(["train", scene, "-o", str(output), *SMOE, "--overwrite"]) == 0
-    assert (elsewhere / "key").read_text() == "mine"
+    assert (output / "point_cloud" / "key").read_text() == "mine"
+
+
+def test_render_replaces_files_that_it_has_not_written_where_asked(trained, tmp_path):
+    (tmp_path / "view_000.png").write_text("mine")
+    (tmp_path / "notes").write_text("mine")
+    assert main(["render", trained, "-o", str(tmp_path), "--overwrite"]) == 0
+    assert Image.open(tmp_path / "view_000.png").size == (32, 24) and (tmp_path / "notes").read_text() == "mine"
 
 
 def test_eval_measures_the_pixels_that_training_did(trained, scene, tmp_path, capsys):
@@ -526,7 +547,10 @@ def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
 def test_damaged_results_are_named(trained, tmp_path, capsys):
     run = str(tmp_path / "run")
     shutil.copytree(trained, run)
-    for content, words in (("[{", "not valid json"), ("[1]", "list of rows")):
+    row = '[{"blend_mode": "smoe", "%s": %s}]'
+    for content, words in (("[{", "not valid json"), ("[1]", "list of rows"), ("[" * 100_000, "not valid json"),
+                           (row % ("protocol", 1), "`protocol` is 1"), (row % ("protocol", "[]"), "`protocol` is []"),
+                           (row % ("train_seconds", '"1"'), "`train_seconds` is '1'")):
         with open(os.path.join(run, "results.json"), "w", encoding="utf-8") as file:
             file.write(content)
         text = fails(capsys, "eval", run)
@@ -553,13 +577,14 @@ def interrupt_at(monkeypatch, iteration, number):
 
 @pytest.fixture
 def ctrl_c_works():
-    """Programs that a shell starts in the background inherit that Ctrl-C is ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Programs that a shell starts in the background inherit that Ctrl-C is ignored, under nohup SIGHUP."""
+    before = [signal.signal(signal.SIGINT, signal.default_int_handler), signal.signal(signal.SIGHUP, signal.SIG_DFL)]
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in zip((signal.SIGINT, signal.SIGHUP), before):
+        signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, monkeypatch, capsys, ctrl_c_works, number,
                                                    status):
     output = str(tmp_path / "out")
@@ -574,6 +599,24 @@ def test_an_interrupted_run_continues_where_it_was(trained, scene, tmp_path, mon
     for path in (ply_of, lambda run: os.path.join(run, "loss.png")):
         with open(path(output), "rb") as mine, open(path(trained), "rb") as theirs:
             assert mine.read() == theirs.read()
+
+
+def test_names_of_images_need_not_be_utf_8(scene, tmp_path, capsys):
+    """One of the training and one of the test, as an old camera's disk has them: each command takes them."""
+    folder, output = str(tmp_path / "scene"), str(tmp_path / "out")
+    shutil.copytree(scene, folder)
+    model, names = io.read_colmap(folder), {"view_000.png": os.fsdecode(b"view_000\xe9.png"),
+                                            "view_001.png": os.fsdecode(b"view_001\xff.png")}
+    images = [dataclasses.replace(image, name=names.get(image.name, image.name)) for image in model.images]
+    io.write_colmap(model.folder, dataclasses.replace(model, images=images))
+    for before, name in names.items():
+        os.rename(os.path.join(folder, "images", before), os.path.join(folder, "images", name))
+    assert main(["train", folder, "-o", output, *SMOE]) == 0
+    assert main(["train", "--resume", "-o", output, "--iterations", "13", "--quiet"]) == 0
+    assert "extended" in capsys.readouterr().out
+    assert main(["eval", output]) == 0 and main(["render", output, "-o", str(tmp_path / "images")]) == 0
+    assert "view_000\\udce9.png" in os.listdir(tmp_path / "images"), "in letters that every system has"
+    assert main(["export", output, "-o", str(tmp_path / "a.html")]) == 0
 
 
 def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monkeypatch, capsys):

@@ -134,6 +134,13 @@ def test_file_round_trip(tmp_path, mode):
     (lambda values: values.update(blend_mode=None), "blend_mode is None"),
     (lambda values: values.update(colour="red"), "unknown option colour"),
     (lambda values: values.update(iterations=0), "--iterations is 0"),
+    (lambda values: values.update(iterations=True), "--iterations is True; it must be a whole number"),
+    (lambda values: values.update(iterations=10**400), "it must be at most 2^53"),
+    (lambda values: values.update(feature_lr=10**400), "it must be at most 2^53"),
+    *((lambda values, name=name, value=value: values.update({name: value}), words) for value in ([], {}, [5])
+      for name, words in (("scene", "--scene is"), ("images", "--images is"), ("device", "--device is"),
+                          ("background_gate", "background_gate"), ("schedule", "--strategy is"),
+                          ("strategy_options", "--strategy-options is"))),
 ])
 def test_a_wrong_file_is_refused(tmp_path, monkeypatch, edit, words):
     monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe")  # must not fill the gap
@@ -144,6 +151,13 @@ def test_a_wrong_file_is_refused(tmp_path, monkeypatch, edit, words):
     with pytest.raises(ConfigError) as error:
         TrainConfig.load(str(tmp_path))
     assert "config.json" in str(error.value) and words in str(error.value)
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"a":' * 100_000, "{", "[]", "\0", ""])
+def test_what_is_no_file_of_options_is_named(tmp_path, content):
+    (tmp_path / "config.json").write_text(content)
+    with pytest.raises(ConfigError, match="config.json: (not valid json|expected a json object)"):
+        TrainConfig.load(str(tmp_path))
 
 
 def test_a_folder_without_a_run(tmp_path):

@@ -4,8 +4,10 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import time
 
 import pytest
 import torch
@@ -72,6 +74,30 @@ def test_processes_die_and_others_resume_bit_for_bit(tiny_config, tmp_path):
     torch.manual_seed(77)
     assert train(alone, resume=True, progress=False)["psnr"] == row["psnr"]
     assert model_of(alone) == model_of(straight)
+
+
+@needs_gloo
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
+def test_a_process_saves_and_ends_where_torchrun_is_killed(tiny_config):
+    """A program stands for torchrun that starts one process; it is killed as torchrun would be."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    worker = [sys.executable, "-m", "diff_smoe_rasterization", "train", tiny_config.scene, "-o", tiny_config.output,
+              "--iterations", "1000000", "--batch", "1", "--quiet", "--checkpoint-every", "0"]
+    launcher = f"import subprocess, sys; sys.exit(subprocess.call({worker!r}))"
+    environment = {"PYTHONPATH": os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")]), "RANK": "0",
+                   "WORLD_SIZE": "1", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port,
+                   "TORCHELASTIC_RUN_ID": "none", "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen([sys.executable, "-c", launcher], env={**os.environ, **environment}, text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.readline()
+        while process.poll() is None and not os.path.isfile(os.path.join(tiny_config.output, "config.json")):
+            time.sleep(0.1)
+        process.kill()
+        errors = process.stderr.read()  # to its end, at which the worker has ended
+    assert "interrupted; continue it with --resume" in errors, errors
+    assert os.path.isfile(os.path.join(tiny_config.output, "checkpoint.pt"))
 
 
 @pytest.mark.slow

@@ -55,6 +55,11 @@ def test_a_gif_has_every_frame(model, tiny_scene, tmp_path, capsys):
     with Image.open(tmp_path / "a.gif") as film:
         assert (film.n_frames, film.size, film.info["duration"]) == (3, (32, 24), 100)
     assert sorted(os.listdir(tmp_path)) == ["a.gif", "model.ply"]
+    (tmp_path / "a.gif").write_text("mine")
+    assert orbit(model, tmp_path / "a.gif", "--scene", tiny_scene) == 1
+    assert "a.gif is there already" in capsys.readouterr().err and (tmp_path / "a.gif").read_text() == "mine"
+    assert orbit(model, tmp_path / "a.gif", "--scene", tiny_scene, "--overwrite") == 0
+    assert Image.open(tmp_path / "a.gif").n_frames == 3
 
 
 def test_an_mp4_plays_every_frame(tmp_path):

@@ -140,6 +140,19 @@ def test_a_deterministic_training_over_batches_repeats_bit_for_bit(config, scene
         assert torch.equal(results[0][name], results[1][name]), name
 
 
+def test_a_deterministic_training_to_a_budget_repeats_bit_for_bit(config, scene):
+    """`gate` removes and moves by importance, so the sums of importance must repeat too."""
+    results = []
+    for _ in range(2):
+        trainer = Trainer(config.changed(deterministic=True, schedule="gate", budget=60), scene)
+        for _ in range(config.iterations):
+            trainer.step()
+        results.append({name: tensor.detach().clone() for name, tensor in trainer.model.raw.items()})
+    assert len(results[0]["means3D"]) == 60
+    for name in PARAMETERS:
+        assert torch.equal(results[0][name], results[1][name]), name
+
+
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 def test_two_gpus_train_the_bits_of_one(config, tmp_path):
     config = config.changed(batch=4, deterministic=True, output=str(tmp_path / "one"))

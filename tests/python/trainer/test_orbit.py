@@ -2,10 +2,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
+from diff_smoe_rasterization.trainer.errors import SceneError
 from diff_smoe_rasterization.trainer.scenes.orbit import default_camera, look_at, orbit_of_cameras, orbit_of_points
 
 
@@ -49,9 +51,12 @@ def test_one_camera_is_enough():
 
 def test_points_are_seen_from_outside_upright():
     points = np.random.RandomState(0).normal(5, 1, (500, 3))
-    for camera in orbit_of_points(points).cameras(5, default_camera()):
+    lost = np.array([[math.nan, 0, 0], [0, math.inf, 0], [0, 0, -1e30]])
+    for camera in orbit_of_points(np.concatenate([lost, points])).cameras(5, default_camera()):
         seen = points @ camera.rotation.T + camera.translation
         pixels = camera.fx * seen[:, :2] / seen[:, 2:] + [camera.cx, camera.cy]
         inside = (seen[:, 2] > 0.2) & (pixels > 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
         assert inside.mean() > 0.7
         assert camera.rotation[1] @ [0, -1, 0] < 0, "the image's y is down"
+    with pytest.raises(SceneError, match="none of the 3 Gaussians lies within 1e[+]09 of the origin"):
+        orbit_of_points(lost)

@@ -2,10 +2,13 @@
 from __future__ import annotations
 
 import io
+import threading
+import time
 
 import torch
 
 from diff_smoe_rasterization.trainer.system import process, progress
+from diff_smoe_rasterization.trainer.system.heartbeat import Heartbeat
 
 
 def test_a_training_on_a_gpu_has_one_thread_of_the_host_and_one_on_the_cpu_has_all(monkeypatch):
@@ -32,3 +35,39 @@ def test_a_bar_in_a_file_is_a_line_a_minute(monkeypatch):
             now[0] += 1
     lines = log.getvalue().splitlines()
     assert len(lines) == 4 and all(line.startswith("images: ") and "/150" in line for line in lines)
+
+
+class Store:
+    """Stands for torch.distributed's store: numbers by name. A process that is stopped adds nothing."""
+
+    def __init__(self):
+        self.numbers, self.lock, self.stopped = {}, threading.Lock(), ()
+
+    def add(self, key, number):
+        with self.lock:
+            if not (number and key.endswith(self.stopped)):
+                self.numbers[key] = self.numbers.get(key, 0) + number
+            return self.numbers.get(key, 0)
+
+
+def test_a_process_that_does_not_answer_is_named_and_one_that_answers_again(capsys):
+    """By the first one that answers, which a stopped first process is not."""
+    store, said = Store(), ""
+
+    def wait_for(words):
+        nonlocal said
+        for _ in range(1000):
+            said += capsys.readouterr().err
+            if words in said:
+                return
+            time.sleep(0.01)
+        raise AssertionError(f"{words} is not in {said}")
+
+    with Heartbeat(store, 1, 3, 0.01, 0.5), Heartbeat(store, 2, 3, 0.01, 0.5):  # process 0 is stopped
+        wait_for("process 0 of 3 has not answered for 0.5 s: stopped, or without a connection; the others wait\n")
+        store.stopped = "2"
+        wait_for("processes 0, 2 of 3 have not answered")
+        store.stopped = ()
+        with Heartbeat(store, 0, 3, 0.01, 0.5):
+            wait_for("all processes answer again")
+    assert said.count("\n") in (3, 4), "a line for each change; 0 and 2 need not answer again at once"

@@ -99,6 +99,18 @@ def test_another_scene_is_refused_and_no_picture_is_stale(tiny_scene, output, tm
                                                                   "mine.png"]
 
 
+@pytest.mark.parametrize("name", ["alpha", "scene"])
+def test_nothing_is_written_where_a_link_in_the_folder_leads(tiny_scene, tmp_path, capsys, name):
+    output, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    output.mkdir()
+    elsewhere.mkdir()
+    (output / name).symlink_to(elsewhere)
+    files.write_json_atomically(str(output / ".dsmoe.json"), {"command": "quickstart", "of": tiny_scene, "files": []})
+    assert quickstart.main([tiny_scene, "-o", str(output), "--iterations", "10", "--quiet"]) == 1
+    assert f"{output / name} leads to {elsewhere} by a link" in capsys.readouterr().err
+    assert not list(elsewhere.iterdir())
+
+
 def test_given_options_win_over_chosen_ones(tiny_scene):
     chosen = quickstart.choose_options(tiny_scene, {})
     assert (chosen.iterations, chosen.densify_until_iter, chosen.schedule) == (2000, 1000, "steady")

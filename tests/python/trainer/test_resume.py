@@ -6,16 +6,19 @@ import json
 import os
 import resource
 import shutil
+import subprocess
 
 import pytest
 import torch
+from PIL import Image
 
 from diff_smoe_rasterization import io
+from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import TrainerError
 from diff_smoe_rasterization.trainer.results.modelfile import model_path
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
 from diff_smoe_rasterization.trainer.system import files
-from diff_smoe_rasterization.trainer.training import checkpoint
+from diff_smoe_rasterization.trainer.training import checkpoint, loop
 from diff_smoe_rasterization.trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from diff_smoe_rasterization.trainer.training.loop import Trainer, train
 from diff_smoe_rasterization.trainer.training.order import ViewOrder
@@ -162,9 +165,35 @@ def remove_a_point(folder):
         model.cameras, model.images, io.Points(points.positions[1:], points.colors[1:])), text=True)
 
 
+def move_a_test_camera(folder):
+    model = io.read_colmap(folder)
+    model.images[8].tvec[0] += 0.001  # of a training view would change the extent too
+    io.write_colmap(model.folder, model, text=True)
+
+
+def change_the_focal_length(folder):
+    model = io.read_colmap(folder)
+    model.cameras[1].params[0] += 0.01
+    io.write_colmap(model.folder, model, text=True)
+
+
+def darken(name):
+    """An edit that makes one pixel of an image black."""
+    def edit(folder):
+        path = os.path.join(folder, "images", name)
+        with Image.open(path) as image:
+            image.load()
+        image.putpixel((5, 5), (0, 0, 0))
+        image.save(path)
+
+    return edit
+
+
 @pytest.mark.parametrize("edit, words", [
     (rename_a_view, "training views' names"), (move_a_point, "checksum of the points"),
-    (remove_a_point, "number of points")])
+    (remove_a_point, "number of points"), (move_a_test_camera, "checksum of the poses"),
+    (change_the_focal_length, "checksum of the intrinsics"), (darken("view_003.png"), "of the training images"),
+    (darken("view_008.png"), "of the test images")])
 def test_another_scene_cannot_be_resumed(tiny_scene, tiny_config, tmp_path, edit, words):
     config = dataclasses.replace(tiny_config, iterations=2)
     train(config, progress=False)
@@ -172,6 +201,22 @@ def test_another_scene_cannot_be_resumed(tiny_scene, tiny_config, tmp_path, edit
     edit(other)
     with pytest.raises(TrainerError, match=f"another scene: .*{words}.*other"):
         train(dataclasses.replace(config, scene=other), resume=True, progress=False)
+
+
+def test_a_checkpoint_without_checksums_of_images_resumes_and_says_so(tiny_config, capsys):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    train(config, progress=False)
+    path = os.path.join(config.output, "checkpoint.pt")
+    state = load_checkpoint(path, "cpu")
+    newer = [f"checksum of the {name}" for name in ("poses", "intrinsics", "training images", "test images")]
+    for name in newer:
+        del state["scene"][name]
+    save_checkpoint(path, state)
+    train(config, resume=True, progress=False)
+    assert f"lacks the {', the '.join(newer)}: whether these have changed" in capsys.readouterr().out
+    train(config, overwrite=True, progress=False)
+    train(config, resume=True, progress=False)
+    assert "lacks" not in capsys.readouterr().out
 
 
 def test_a_moved_scene_resumes(tiny_scene, tiny_config, tmp_path):
@@ -228,21 +273,17 @@ def test_the_output_of_another_program_is_not_written_over(tiny_config, name):
 
 def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tiny_config, tmp_path):
     config = dataclasses.replace(tiny_config, iterations=3)
-    output, elsewhere = config.output, tmp_path / "elsewhere"
-    (elsewhere / "iteration_7000").mkdir(parents=True)
-    os.makedirs(output)
+    output = config.output
     train(config, progress=False)
-    shutil.move(os.path.join(output, "point_cloud", "iteration_3"), str(elsewhere))
-    os.rmdir(os.path.join(output, "point_cloud"))
-    os.symlink(str(elsewhere), os.path.join(output, "point_cloud"))
-    mine = [str(elsewhere / "iteration_7000" / "point_cloud.ply"), str(elsewhere / "notes.txt"),
-            os.path.join(output, "notes.txt")]
+    mine = [os.path.join(output, "point_cloud", "iteration_7000", "point_cloud.ply"),
+            os.path.join(output, "point_cloud", "notes.txt"), os.path.join(output, "notes.txt")]
     for path in mine:
         files.write_text_atomically(path, "mine")
     before = {name: os.path.getmtime(os.path.join(output, name)) for name in ("checkpoint.pt", "results.json")}
     with pytest.raises(TrainerError, match="no such folder"):
         train(dataclasses.replace(config, scene=str(tmp_path / "nowhere")), overwrite=True, progress=False)
     broken = copied_scene(config.scene, tmp_path / "broken")
+    os.remove(os.path.join(broken, "images", "view_001.png"))
     files.write_text_atomically(os.path.join(broken, "images", "view_001.png"), "no image")
     with pytest.raises(TrainerError, match="view_001.png: not a readable image"):
         train(dataclasses.replace(config, scene=broken), overwrite=True, progress=False)
@@ -250,15 +291,88 @@ def test_overwrite_removes_what_a_run_wrote_and_nothing_else(tiny_config, tmp_pa
         train(dataclasses.replace(config, iterations=7000), overwrite=True, progress=False)
     assert before == {name: os.path.getmtime(os.path.join(output, name)) for name in before}
     train(dataclasses.replace(config, iterations=2), overwrite=True, progress=False)
-    assert os.path.islink(os.path.join(output, "point_cloud"))
-    assert sorted(os.listdir(elsewhere)) == ["iteration_2", "iteration_7000", "notes.txt"]
+    assert sorted(os.listdir(os.path.join(output, "point_cloud"))) == ["iteration_2", "iteration_7000", "notes.txt"]
     for path in mine:
         with open(path, encoding="utf-8") as file:
             assert file.read() == "mine"
-    os.remove(os.path.join(output, "point_cloud"))
-    os.symlink(str(tmp_path / "nowhere"), os.path.join(output, "point_cloud"))
-    with pytest.raises(TrainerError, match="point_cloud is no folder"):
+
+
+@pytest.mark.parametrize("name", ["point_cloud", "tensorboard"])
+def test_nothing_is_written_or_removed_where_a_link_leads_out_of_the_folder(tiny_config, tmp_path, name):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    output, elsewhere = config.output, tmp_path / "elsewhere"
+    train(config, progress=False)
+    elsewhere.mkdir()
+    path = os.path.join(output, name)
+    if os.path.isdir(path):
+        os.rename(path, str(elsewhere / name))
+    os.symlink(str(elsewhere / name), path)
+    (elsewhere / name).mkdir(exist_ok=True)
+    before = {path: os.path.getmtime(path) for path, _, _ in os.walk(elsewhere)}
+    for options in ({"overwrite": True}, {"resume": True}):
+        with pytest.raises(TrainerError, match=f"leads to {elsewhere / name}.* by a link"):
+            train(config, progress=False, **options)
+    assert before == {path: os.path.getmtime(path) for path, _, _ in os.walk(elsewhere)}
+    os.remove(path)
+    os.symlink(str(tmp_path / "nowhere"), path)
+    with pytest.raises(TrainerError, match="nowhere.* by a link|point_cloud is no folder"):
         train(config, overwrite=True, progress=False)
+    os.rename(output, str(tmp_path / "real"))
+    os.symlink(str(tmp_path / "real"), output)  # the folder itself may be one
+    os.remove(path)
+    train(config, overwrite=True, progress=False)
+
+
+def test_a_link_in_the_place_of_a_product_is_named(tiny_config, tmp_path):
+    config = dataclasses.replace(tiny_config, iterations=2)
+    train(config, progress=False)
+    path = os.path.join(config.output, "results.json")
+    os.rename(path, str(tmp_path / "precious"))
+    os.symlink(str(tmp_path / "precious"), path)
+    with pytest.raises(TrainerError, match="results.json is a link, which is never replaced"):
+        train(config, overwrite=True, progress=False)
+    assert os.path.islink(path)
+
+
+@pytest.mark.parametrize("step", [0, 1, 2])
+def test_what_an_overwriting_run_leaves_that_is_killed_as_it_begins_is_not_gone_on_with(tiny_config, monkeypatch, step):
+    """After 0, 1 or 2 of its removals: the old run whole, or none."""
+    config, removals, remove = dataclasses.replace(tiny_config, iterations=4), [], loop.remove_files
+    train(config, progress=False)
+
+    def killed(*arguments):
+        if len(removals) == step:
+            raise Killed
+        removals.append(arguments)
+        remove(*arguments)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(loop, "remove_files", killed)
+        patch.setattr(TrainConfig, "save", killed)
+        train(dataclasses.replace(config, seed=1), overwrite=True, progress=False)
+    assert os.path.isfile(os.path.join(config.output, "config.json")) == (step == 0)
+    assert os.path.isfile(os.path.join(config.output, "checkpoint.pt")) == (step < 2)
+    train(dataclasses.replace(config, seed=1), overwrite=step == 0, progress=False)
+    assert TrainConfig.load(config.output).seed == 1
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_a_folder_that_goes_during_the_training_ends_it(tiny_config, tmp_path, monkeypatch, moved):
+    config, new, step = dataclasses.replace(tiny_config, checkpoint_every=2), str(tmp_path / "new"), Trainer.step
+
+    def step_without_folder(self, *arguments):
+        if self.iteration == 2:
+            os.rename(config.output, new)
+            if not moved:
+                shutil.rmtree(new)
+                os.mkdir(config.output)  # such as another run's
+        return step(self, *arguments)
+
+    monkeypatch.setattr(Trainer, "step", step_without_folder)
+    words = f"out has been moved to {new} .* --resume -o {new}" if moved else "out has been removed"
+    with pytest.raises(TrainerError, match=words):
+        train(config, progress=False)
+    assert not os.path.isdir(config.output) or not os.listdir(config.output)
 
 
 def test_a_run_has_its_folder_alone(tiny_config, monkeypatch):
@@ -321,6 +435,60 @@ def test_a_damaged_checkpoint_is_named(tiny_config, tmp_path, monkeypatch):
         train(tiny_config, resume=True, progress=False)
 
 
+def altered(state, path, value):
+    """A copy of nested dictionaries and lists with another value, or value(the old one), at a/b/0."""
+    name, _, rest = path.partition("/")
+    key = int(name) if isinstance(state, list) else name
+    copy = list(state) if isinstance(state, list) else dict(state)
+    copy[key] = altered(copy[key], rest, value) if rest else value(copy.get(key) if isinstance(copy, dict)
+                                                                   else copy[key]) if callable(value) else value
+    return copy
+
+
+ALTERATIONS = [
+    *(("iteration", value) for value in (-5, 0, 10**9, float("nan"), "10", None, True, [10], 39.5)),
+    *(("train_seconds", value) for value in (float("nan"), float("inf"), -1, "1", None)),
+    *(("active_sh_degree", value) for value in (-1, 4, 1.5, "1", None)),
+    *((f"raw/{name}", change) for name in ("means3D", "shs", "rotations") for change in (
+        lambda rows: rows[1:], lambda rows: rows[:, :2], lambda rows: rows.double(),
+        lambda rows: rows.tolist(), lambda rows: None)),
+    ("raw", lambda raw: {name: rows[:0] for name, rows in raw.items()}),
+    ("raw", lambda raw: {name: rows for name, rows in raw.items() if name != "dc"}), ("raw/more", torch.ones(3)),
+    ("optimizer/more", {}), ("optimizer/dc", {}), ("optimizer/dc/step", -1), ("optimizer/dc/step", float("nan")),
+    ("optimizer/dc/step", "many"), ("optimizer/dc/exp_avg", lambda rows: rows[1:]), ("optimizer", [1]),
+    ("optimizer/scales/exp_avg_sq", lambda rows: rows.half()), ("optimizer/scales/exp_avg_sq", 1.0),
+    ("strategy", {}), ("strategy/more", 1), ("strategy/view_count", lambda rows: rows[1:]),
+    ("strategy/gradient_sum", lambda rows: rows.int()), ("strategy/gradient_sum", None), ("strategy", None),
+    ("gate", None), ("gate/logarithm", torch.ones(2)), ("gate/logarithm", 1.0),
+    ("gate/logarithm", torch.full((1,), float("nan"))), ("gate/logarithm", torch.full((1,), 1e3)),
+    ("gate/adam/exp_avg", torch.ones(2)),
+    ("order/left", [0, 0]), ("order/left", [7]), ("order/left", [-1]), ("order/left", ["0"]), ("order/left", None),
+    ("order/random/1", lambda numbers: numbers[1:]), ("order/random/1/624", 10**6), ("order/random/2", "1"),
+    ("random/python/1/0", -1), ("random/python/0", 9), ("random/numpy/0", "other"), ("random/numpy/1", [1, 2]),
+    ("random/torch", torch.ones(3)), ("random/torch", lambda numbers: numbers[1:]), ("random/torch", "1"),
+    ("random/cuda", [1]), ("random/cuda", None), ("random", {}),
+    ("history", None), ("history", [1]), ("losses", [1]), ("losses", [[1, "2"]]), ("losses", [[1, float("nan")]]),
+    ("config/iterations", 10**6), ("config/iterations", "40"), ("config", None), ("config", {}), ("config/seed", "0"),
+    ("config/more", 1), ("scene", None)]
+
+
+def test_a_checkpoint_that_is_no_state_of_the_run_is_named_and_not_begun_with(tiny_config, monkeypatch):
+    config = dataclasses.replace(tiny_config, iterations=20)
+    train(config, progress=False)
+    path, begun = os.path.join(config.output, "checkpoint.pt"), []
+    state = load_checkpoint(path, "cpu")
+    run = loop.Run(Trainer(config, load_scene(config, progress=False)), progress=False)
+    monkeypatch.setattr(run.trainer, "load_state_dict", begun.append)
+    assert run.resume() and len(begun) == 1 and state["gate"]["adam"]
+    for place, value in ALTERATIONS:
+        save_checkpoint(path, altered(state, place, value))
+        with pytest.raises(TrainerError, match="checkpoint.pt: (not a readable checkpoint|no state of this run: its `.*"
+                                               "it must be )|of a run with other options") as error:
+            run.resume()
+        assert len(begun) == 1, place
+        assert "weights_only" not in str(error.value)
+
+
 def test_a_checkpoint_returns_what_it_was_given(tmp_path):
     path = str(tmp_path / "checkpoint.pt")
     state = {"a": {"b": [1, 0.1, None, torch.arange(3)], "c": "text"}, "d": torch.ones(2, dtype=torch.uint8)}
@@ -355,10 +523,45 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
 def test_no_unfinished_file_is_written_through_a_link(tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("mine")
-    os.symlink(precious, tmp_path / "file.part")
+    os.symlink(precious, tmp_path / f"{files.PART}{os.getpid()}-file")
     files.write_text_atomically(str(tmp_path / "file"), "new")
     assert precious.read_text() == "mine" and (tmp_path / "file").read_text() == "new"
     assert sorted(os.listdir(tmp_path)) == ["file", "precious"]
+
+
+def test_processes_do_not_share_an_unfinished_file_and_what_a_killed_one_left_goes(tmp_path, monkeypatch):
+    """A file FILE.part may be the user's."""
+    with subprocess.Popen(["true"]) as ended:
+        pass
+    path, left, others = str(tmp_path / "file"), tmp_path / f"{files.PART}{ended.pid}-file", tmp_path / "file.part"
+    left.write_text("half")
+    others.write_text("the user's")
+    with files.new_file(path) as mine:
+        assert not left.exists()
+        files.write_text_atomically(mine, "mine, the later one")
+        with monkeypatch.context() as patch:
+            parent = os.getppid()
+            patch.setattr(os, "getpid", lambda: parent)  # as that of another process
+            files.write_text_atomically(path, "the other's")
+        assert (tmp_path / "file").read_text() == "the other's"
+    assert (tmp_path / "file").read_text() == "mine, the later one"
+    (tmp_path / "file").unlink()
+    with pytest.raises(TrainerError, match="file is there already"), files.new_file(path, overwrite=False) as mine:
+        files.write_text_atomically(mine, "mine")
+        files.write_text_atomically(path, "the other's, which is first")
+    assert (tmp_path / "file").read_text() == "the other's, which is first"
+    assert sorted(os.listdir(tmp_path)) == ["file", "file.part"]
+
+
+@pytest.mark.parametrize("what, make", [
+    ("a link", lambda path: os.symlink("precious", path)), ("no regular file", os.mkfifo), ("a folder", os.mkdir)])
+def test_what_is_no_regular_file_is_never_replaced(tmp_path, what, make):
+    path = str(tmp_path / "file")
+    make(path)
+    for overwrite in (True, False):
+        with pytest.raises(TrainerError, match=f"file is {what}, which is never replaced"):
+            files.write_atomically(path, lambda file: file.write(b"new"), overwrite)
+    assert os.listdir(tmp_path) == ["file"] and not os.path.isfile(path)
 
 
 def test_json_holds_null_where_it_has_no_number(tmp_path):

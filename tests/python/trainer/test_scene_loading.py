@@ -457,6 +457,17 @@ def test_an_unreadable_image(colmap_folder):
     refused(colmap_folder, "view_004.png", "not a readable image")
 
 
+def test_a_format_that_runs_another_program_is_refused(colmap_folder, monkeypatch):
+    """EPS, on which Pillow runs Ghostscript, under the name of a PNG; JPEG under that name is read."""
+    path, ran = os.path.join(colmap_folder, "images", "view_004.png"), []
+    monkeypatch.setattr("PIL.EpsImagePlugin.Ghostscript", lambda *arguments, **more: ran.append(arguments))
+    Image.new("RGB", (32, 24)).save(path, format="EPS")
+    refused(colmap_folder, "view_004.png", "not a readable image")
+    assert not ran
+    Image.new("RGB", (32, 24)).save(path, format="JPEG")
+    load(colmap_folder)
+
+
 @pytest.mark.parametrize("dtype, kind", [(np.uint16, "PNG"), (np.int32, "TIFF"), (np.float32, "TIFF")])
 def test_more_than_8_bits(colmap_folder, dtype, kind):
     path = os.path.join(colmap_folder, "images", "view_004.png")
@@ -515,10 +526,35 @@ def test_a_focal_length_of_zero(colmap_folder):
     refused(colmap_folder, "cameras.txt", "camera 1", "focal length")
 
 
+def test_an_image_that_is_listed_twice(colmap_folder, nerf_folder):
+    """The second one, with a pose of its own, would be trained on too, or be a test image that was trained on."""
+    model = io.read_colmap(colmap_folder)
+    double = io.ColmapImage(99, "./view_003.png", 1, model.images[5].qvec, model.images[5].tvec)
+    for text in (True, False):
+        io.write_colmap(model.folder, io.ColmapModel(model.cameras, [*model.images, double], model.points), text=text)
+        refused(colmap_folder, "view_003.png is listed twice")
+    edit_json(nerf_folder / "transforms_train.json", lambda content: content["frames"].extend(content["frames"]))
+    refused(nerf_folder, "r_0.png is listed twice")
+
+
+@pytest.mark.parametrize("large", [1e300, -2e9])
+def test_cameras_that_float32_cannot_hold(colmap_folder, large):
+    model = io.read_colmap(colmap_folder)
+    model.images[3].tvec[1] = large
+    io.write_colmap(model.folder, model, text=True)
+    refused(colmap_folder, "camera of view_003.png", "above 1e+09")
+    model.images[3].tvec[1], model.cameras[1].params[2] = 0.0, large
+    io.write_colmap(model.folder, model, text=True)
+    refused(colmap_folder, "cx", "above 1e+09")
+
+
 def test_points_that_are_not_finite():
     positions = np.zeros((5, 3))
     positions[3, 1] = math.nan
     with pytest.raises(SceneError, match="cloud.ply: point 3 .*NaN"):
+        PointCloud(positions, np.zeros((5, 3))).checked("cloud.ply")
+    positions[3, 1] = -1e39
+    with pytest.raises(SceneError, match="cloud.ply: point 3 .*float32 cannot hold"):
         PointCloud(positions, np.zeros((5, 3))).checked("cloud.ply")
 
 

@@ -3,6 +3,10 @@ from __future__ import annotations
 
 import math
 import os
+import time
+import urllib.error
+import urllib.request
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,9 +21,11 @@ from diff_smoe_rasterization.trainer.inspection import to_image
 from diff_smoe_rasterization.trainer.opening import open_trained
 from diff_smoe_rasterization.trainer.results.rendering import Renderer
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training.loop import Run, Trainer
+from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
+from diff_smoe_rasterization.view import server
 from diff_smoe_rasterization.view.following import Followed
 from diff_smoe_rasterization.view.gate_map import largest_gates
+from diff_smoe_rasterization.view.guard import CAMERA, is_wanted, refusal
 from diff_smoe_rasterization.view.picture import SHOWN, Blend, Look, own_colours, picture
 
 
@@ -123,6 +129,169 @@ def test_a_training_is_followed_to_its_end(tiny_scene, tmp_path):  # noqa: F811
     assert len(followed.cameras) == 2
 
 
+def test_a_training_that_is_replaced_is_followed(tiny_scene, tmp_path):  # noqa: F811
+    """Another run in the same folder: fewer harmonics, another blend, and a gate that is not learned."""
+    config = TrainConfig(scene=tiny_scene, output=str(tmp_path / "out"), blend_mode="smoe", iterations=4,
+                         densify_from_iter=100)
+    train(config, progress=False)
+    followed = Followed(config.output)
+    assert followed.progress == "trained, 4 iterations" and not followed.poll()
+    other = TrainConfig(scene=tiny_scene, output=config.output, blend_mode="alpha", iterations=9, sh_degree=1,
+                        densify_from_iter=100)
+    os.remove(os.path.join(config.output, "checkpoint.pt"))
+    other.save(config.output)
+    with pytest.raises(ValueError, match="no such file yet"):
+        followed.poll()
+    assert followed.renderer.blend_mode == "smoe", "what was shown stays"
+    run = Run(Trainer(other, load_scene(other, False)), progress=False)
+    run.trainer.step()
+    run.save_checkpoint()
+    assert followed.poll() and followed.progress == "training, iteration 1 of 9" and not followed.poll()
+    assert followed.renderer.blend_mode == "alpha" and followed.renderer.model.sh_degree == 1
+    train(other, overwrite=True, progress=False)
+    assert followed.poll() and followed.progress == "trained, 9 iterations"
+    train(other, overwrite=True, progress=False)
+    assert followed.poll(), "the same options again"
+
+
+@pytest.mark.parametrize("origin, host, words", [
+    ("http://127.0.0.1:8080", "127.0.0.1:8080", None),
+    ("http://localhost:9000", "localhost:9000", None),  # through ssh -L 9000:localhost:8080
+    ("https://[::1]:8080", "[::1]:8080", None),
+    ("http://gpu7:8080", "gpu7:8080", None),  # --host gpu7
+    (None, "127.0.0.1:8080", None),  # no browser
+    ("http://evil.example", "127.0.0.1:8080", "a page of 'http://evil.example' asks"),
+    ("http://localhost:3000", "localhost:8080", "a page of 'http://localhost:3000' asks"),
+    ("null", "localhost:8080", "a page of 'null' asks"),
+    ("http://evil.example:8080", "evil.example:8080", "'evil.example:8080' is no name of this machine"),
+    ("http://localhost.evil.example", "localhost.evil.example", "no name of this machine"),
+    (None, None, "None is no name of this machine")])
+def test_pages_of_others_are_refused(origin, host, words):
+    why = refusal(origin, host, "gpu7")
+    assert why is None if words is None else words in why
+
+
+def test_only_cameras_and_values_are_passed_on():
+    camera = {"type": "ViewerCameraMessage", **{name: 1.0 if count == 1 else [1, 0.5, math.nan, 0][:count]
+                                                for name, count in CAMERA.items()}}
+    update = {"type": "GuiUpdateMessage", "uuid": "1", "updates": {"value": True}}
+    assert is_wanted(camera) and is_wanted({**camera, "near": 1}) and is_wanted(update)
+    for other in (None, [], {}, {"type": "ShareUrlRequest"}, {**camera, "fov": None}, {**camera, "wxyz": [1, 0, 0]},
+                  {**camera, "position": "abc"}, {**camera, "up_direction": [0, "1", 0]},
+                  {**update, "updates": {"value": {}}}, {**update, "updates": {"sync_cb": 1}}, {**update, "uuid": 1}):
+        assert not is_wanted(other), other
+
+
+def handle_of(**changes):
+    """What viser knows of a browser's camera."""
+    return SimpleNamespace(**{"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, -4.0), "fov": 0.9,
+                              "image_width": 900, "image_height": 500, **changes})
+
+
+@pytest.mark.parametrize("width, height", [(1, 10**7), (10**7, 1), (1e300, 1e300), (1, 1), (3000, 2000), (-5, 700)])
+def test_no_window_asks_for_too_many_pixels(width, height):
+    camera = server.camera_of(handle_of(image_width=width, image_height=height), 10**6)
+    assert camera.width * camera.height <= 10**6 and min(camera.width, camera.height) >= 16
+    if (width, height) == (3000, 2000):
+        assert abs(camera.width / camera.height - 1.5) < 0.01 and camera.width * camera.height > 0.99e6
+
+
+@pytest.mark.parametrize("changes", [dict(fov=0.0), dict(fov=math.nan), dict(fov=-1.0), dict(fov=4.0), dict(fov=1e300),
+                                     dict(position=(math.nan, 1e300, -math.inf))])
+def test_every_camera_can_be_rendered(opened, changes):
+    camera = server.camera_of(handle_of(**changes), 10**4)
+    assert picture(opened.renderer, camera, Look(Blend("smoe"))).shape == (camera.height, camera.width, 3)
+    assert server.camera_of(handle_of(image_width=0, **changes), 10**4) is None
+
+
+class Panel:
+    """viser's panel: what is added has a value."""
+
+    def __getattr__(self, name):
+        return lambda *arguments, **options: SimpleNamespace(
+            value=options.get("initial_value", arguments[1] if name == "add_number" else False), content="",
+            on_update=lambda _: None)
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf, 1e300, 0.5])
+def test_whatever_the_panel_says_can_be_shown(opened, value):
+    controls = server.Controls(Panel(), Blend("smoe", 0.03), lambda: None)
+    controls.beside.value, controls.shown.value, controls.other_mode.value = True, "passwords", ["smoe"]
+    controls.gate.value = controls.other_gate.value = controls.split.value = value
+    look = controls.look()
+    assert picture(opened.renderer, camera_of(opened), look).shape == (48, 64, 3)
+    assert look.shown == "colour" and look.beside.mode == "alpha"
+    assert value != 0.5 or (look.blend.background_gate, look.split) == (0.5, 0.5)
+
+
+def test_an_error_of_one_browser_is_said_in_its_panel(model):
+    pictures = []
+    scene = SimpleNamespace(set_background_image=lambda image, **_: pictures.append(image))
+    bad, good = (server._Client(SimpleNamespace(gui=Panel(), scene=scene, camera=handle_of(**changes)))
+                 for changes in (dict(wxyz=(0.0, 0.0, 0.0, 0.0)), {}))
+    for client in (bad, good):
+        client.show(Followed(model), Look(Blend("smoe")), "a trouble")
+        assert not client.wants_picture()
+    assert bad.text.content.startswith("no picture: ValueError:") and len(pictures) == 1
+    assert good.text.content.startswith("60 Gaussians") and good.text.content.endswith("a trouble")
+
+
+def test_the_server_refuses_other_pages_and_outlives_bad_messages(model, capsys):
+    viser = pytest.importorskip("viser")
+    import msgspec
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    viewer = server.Viewer(Followed(model), port=0)
+    own, protocol = viewer.address, f"viser-v{viser.__version__}"
+
+    def page(origin):
+        return connect(own.replace("http", "ws"), origin=origin, subprotocols=[protocol], max_size=None)
+
+    def camera(**changes):
+        fields = vars(handle_of(near=0.1, far=100.0, look_at=(0.0, 0.0, 0.0), up_direction=(0.0, -1.0, 0.0),
+                                image_width=90, image_height=50, **changes))
+        return msgspec.msgpack.encode({"type": "ViewerCameraMessage", **fields})
+
+    def until(holds):
+        end = time.monotonic() + 20
+        while not holds():
+            assert time.monotonic() < end and viewer._thread.is_alive()
+            time.sleep(0.02)
+
+    try:
+        for origin in ("http://evil.example", own.replace("127.0.0.1", "localhost"), "null"):
+            with pytest.raises(InvalidStatus, match="403"):
+                page(origin)
+        assert "refused: a page of 'http://evil.example' asks" in capsys.readouterr().out
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(urllib.request.Request(own, headers={"Host": "evil.example"}))
+        with urllib.request.urlopen(own) as answer:
+            assert b"<html" in answer.read()
+        with page(own) as first, page(own) as second:
+            first.send(camera())
+            second.send(camera())
+            until(lambda: len(viewer._clients) == 2)
+            bad, good = (viewer._clients[number] for number in sorted(viewer._clients))
+            gate = viewer.controls.gate._impl
+            for updates in ({"update_cb": "x" * 99}, {"visible": 0, "value": 0.7}, {"value": [1]}, {"value": 0.25}):
+                first.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": gate.uuid, "updates": updates}))
+            until(lambda: gate.value == 0.25)
+            assert isinstance(gate.update_cb, list) and viewer.controls.gate.visible
+            for message in (b"no message", camera(fov=0.0), camera(fov=math.nan), camera(wxyz=(0.0, 0.0, 0.0, 0.0))):
+                first.send(message)
+            until(lambda: bad.text.content.startswith("no picture"))
+            viewer.controls.gate.value = -1.0
+            good.due = True
+            until(lambda: not good.due and good.text.content.startswith("60 Gaussians"))
+            first.close()
+            until(lambda: len(viewer._clients) == 1)
+            second.send(camera(fov=0.5))
+            until(lambda: good.handle.camera.fov == 0.5 and not good.due and good.text.content)
+    finally:
+        viewer.close()
+
+
 def test_without_viser_the_command_says_what_to_install(model, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
     assert main(["view", model]) == 1
@@ -159,8 +328,6 @@ PART = (slice(190, 420), slice(0, 560))
 
 def settled(browser, client, viewer):  # noqa: F811
     """The part of the window that shows the model, once it stays as it is."""
-    import time
-
     before = None
     for _ in range(60):
         time.sleep(0.5)

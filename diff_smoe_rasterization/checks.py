@@ -1,0 +1,22 @@
+"""Types of arguments: what torch would refuse without the function's name, or with an AttributeError."""
+from __future__ import annotations
+
+import numbers
+from typing import Any
+
+import torch
+
+
+def check_tensors(function: str, **values: Any) -> None:
+    """Raises TypeError where one of the named arguments of a function is no tensor."""
+    for name, value in values.items():
+        if not isinstance(value, torch.Tensor):
+            raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a torch.Tensor")
+
+
+def checked_number(function: str, name: str, value: Any) -> float:
+    """The value of a named argument, a number or a tensor [], as a float. Raises TypeError where it is neither."""
+    is_scalar = isinstance(value, torch.Tensor) and value.dim() == 0 and not value.is_complex()
+    if not is_scalar and not isinstance(value, numbers.Real):
+        raise TypeError(f"{function}: {name} is of type {type(value).__name__}; it must be a number")
+    return float(value)
