@@ -99,7 +99,7 @@ def reasons_against_cuda(cuda_sources, torch, cuda_home):
         sys.exit("DSMOE_BUILD_CUDA=1, but " + "; ".join(reasons))
     named = os.environ.get("TORCH_CUDA_ARCH_LIST") or os.environ.get("DSMOE_CUDA_ARCH")
     if not reasons and not wish and not named and torch.cuda.device_count() == 0:
-        reasons.append("no GPU was seen when it was built; with DSMOE_BUILD_CUDA=1 it is built for one all the same")
+        reasons.append("no GPU was seen during the build; DSMOE_BUILD_CUDA=1 compiles for a GPU anyway")
     return reasons
 
 

@@ -5,7 +5,7 @@ from typing import Any, Optional
 
 import torch
 
-from .settings import GaussianRasterizationSettings
+from .settings import GaussianRasterizationSettings, resolve_blend_mode
 
 # Clip range of the projection matrix. Nothing reads clip z (culling uses view depth), so it only has to be finite.
 CLIP_NEAR = 0.01
@@ -28,8 +28,9 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
     K, R and t are tensors, arrays or lists. The matrices have gradients with respect to R, t and, in the projection, K.
 
     Returns: GaussianRasterizationSettings. Raises ValueError where a shape does not fit, K has skew or focal lengths
-    that are not positive, or R is no rotation.
+    that are not positive, R is no rotation, or a blend mode is not known.
     """
+    resolve_blend_mode(options.get("blend_mode"))  # refused where it is given, not at the first rendering
     dtype = dtype or (torch.float32 if bg is None else bg.dtype)
     bg = torch.zeros(3, dtype=dtype) if bg is None else bg
     device = R.device if isinstance(R, torch.Tensor) else "cpu"  # computed there: elsewhere to check values would wait

@@ -46,8 +46,8 @@ class Forecast:
                 "added")
         if seconds < LONG_SECONDS or not self.shorter:
             return line
-        options = flags_text(self.shorter)
-        return f"{line}. A GPU takes minutes. For minutes on this processor: --overwrite --scale-recipe {options}"
+        options = f"--overwrite --scale-recipe {flags_text(self.shorter)}"
+        return f"{line}. A GPU takes minutes. For a result in minutes on this CPU add: {options}"
 
 
 def duration(seconds: float) -> str:

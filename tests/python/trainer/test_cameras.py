@@ -69,6 +69,11 @@ def test_settings_of_tensors_have_gradients_and_bad_ones_are_named(camera):
             settings_from_camera(*arguments, 534, 948)
 
 
+def test_an_unknown_blend_mode_is_refused_where_it_is_given(camera):
+    with pytest.raises(ValueError, match="blend_mode is 'smo'; it must be one of alpha, smoe, smoe_tn, smoe_std"):
+        settings_from_camera([[1, 0, 2], [0, 1, 2], [0, 0, 1]], torch.eye(3), torch.zeros(3), 4, 4, blend_mode="smo")
+
+
 def test_tangents_give_back_the_focal_lengths(camera):
     settings = camera.settings(torch.zeros(3), 0, "alpha")
     assert settings.image_width / (2 * settings.tanfovx) == pytest.approx(camera.fx, rel=1e-12)
