@@ -11,10 +11,8 @@ import urllib.parse
 from dataclasses import dataclass
 from typing import Any, Callable, List, Optional, Sequence, Tuple
 
-from PIL import Image
-
 from .errors import SceneError, TrainerError
-from .scenes.images import UNREADABLE, image_size
+from .scenes.images import UNREADABLE, image_size, open_image
 from .system.files import is_folder
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.process import pip_install
@@ -22,6 +20,7 @@ from .system.progress import progress_bar
 
 SCENE = "dsmoe scene"  # in its folder's record
 WORK = "colmap"  # folder in the scene's: the database, which a second run goes on with
+WRITTEN = ("images", "sparse/0", *(f"{WORK}/{name}" for name in ("models", "best", "undistorted")))
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -64,10 +63,10 @@ def make_scene(photos: str, output: str, matching: str = "auto", camera_model: s
     except ImportError as error:
         raise TrainerError(f"dsmoe scene needs COLMAP's Python package: {pip_install('pycolmap')}") from error
     names = photo_names(photos, output)
-    own_record(output, SCENE)  # refused before anything is made
+    own_record(output, SCENE, folders=WRITTEN)  # refused before anything is made
     make_folder(output)
     with only_one(output):
-        earlier = own_record(output, SCENE)
+        earlier = own_record(output, SCENE, folders=WRITTEN)
         subject = os.path.abspath(photos)
         if earlier.subject not in ("", subject):
             raise SceneError(f"{output} holds the scene of other photographs, {earlier.subject}; choose another folder "
@@ -170,7 +169,7 @@ def _are_of_one_camera(photos: str, names: Sequence[str]) -> bool:
 
 def _recorded_focal_length(path: str) -> Optional[float]:
     try:
-        with Image.open(path) as file:
+        with open_image(path) as file:
             return float(file.getexif().get_ifd(EXIF)[FOCAL_LENGTH])
     except (*UNREADABLE, KeyError, TypeError, ZeroDivisionError):
         return None

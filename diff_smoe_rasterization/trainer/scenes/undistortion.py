@@ -17,7 +17,7 @@ from ..system.files import is_file
 from ..system.process import pip_install
 from ..system.progress import progress_bar
 from .cameras import Camera
-from .images import UNREADABLE, image_size
+from .images import UNREADABLE, image_size, open_image
 from .layout import Layout, PosedImage
 from .lens import Lens
 
@@ -120,7 +120,7 @@ def _undistorted_image(image: PosedImage, folder: str) -> PosedImage:
 
 def _read(path: str) -> Image.Image:
     try:
-        with Image.open(path) as file:
+        with open_image(path) as file:
             if file.mode == "F" or file.mode.startswith("I"):
                 raise ValueError(f"its pixels have more than 8 bits (Pillow's mode {file.mode}); convert it to 8 bits")
             has_alpha = file.mode in ("RGBA", "LA", "PA") or "transparency" in file.info

@@ -16,6 +16,7 @@ from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.trainer import photos
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from diff_smoe_rasterization.trainer.system.output_folder import Record, write_record
 
 
 def fails(capsys, *words):
@@ -113,6 +114,10 @@ def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("")
     assert "mine is not empty (letter.txt)" in fails(capsys, tmp_path, "-o", tmp_path / "mine")
+    (tmp_path / "own" / "colmap").mkdir(parents=True)
+    (tmp_path / "own" / "colmap" / "models").symlink_to(tmp_path / "mine")  # whose content a second run removes
+    write_record(str(tmp_path / "own"), photos.SCENE, Record(str(tmp_path), []), [])
+    assert f"models leads to {tmp_path / 'mine'} by a link" in fails(capsys, tmp_path, "-o", tmp_path / "own")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert "pip install pycolmap" in fails(capsys, tmp_path, "-o", tmp_path / "scene")
     assert not (tmp_path / "scene").exists()

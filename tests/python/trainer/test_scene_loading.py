@@ -17,6 +17,7 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.trainer.config import TrainConfig
 from diff_smoe_rasterization.trainer.errors import SceneError
 from diff_smoe_rasterization.trainer.results.pictures import file_names
+from diff_smoe_rasterization.trainer.scenes import undistortion
 from diff_smoe_rasterization.trainer.scenes.cameras import Camera
 from diff_smoe_rasterization.trainer.scenes.images import target_size
 from diff_smoe_rasterization.trainer.scenes.layout import PosedImage, hold_out
@@ -463,6 +464,8 @@ def test_a_format_that_runs_another_program_is_refused(colmap_folder, monkeypatc
     monkeypatch.setattr("PIL.EpsImagePlugin.Ghostscript", lambda *arguments, **more: ran.append(arguments))
     Image.new("RGB", (32, 24)).save(path, format="EPS")
     refused(colmap_folder, "view_004.png", "not a readable image")
+    with pytest.raises(SceneError, match="view_004.png: not a readable image"):
+        undistortion._read(path)
     assert not ran
     Image.new("RGB", (32, 24)).save(path, format="JPEG")
     load(colmap_folder)
