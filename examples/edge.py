@@ -34,7 +34,7 @@ def start(count):
 
 def fit(target, count, blend_mode, steps):
     """The image of so many Gaussians, trained on the target."""
-    raw, log_gate = start(count), torch.tensor(-2.0)
+    raw, log_gate = start(count), torch.tensor(0.0)
     for tensor in (*raw.values(), log_gate):
         tensor.requires_grad_()
     adam = torch.optim.Adam([{"params": list(raw.values()), "lr": 0.01}, {"params": [log_gate], "lr": 0.05}])
