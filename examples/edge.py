@@ -34,10 +34,11 @@ def start(count):
 
 def fit(target, count, blend_mode, steps):
     """The image of so many Gaussians, trained on the target."""
-    raw, log_gate = start(count), torch.tensor(0.0)
+    raw, log_gate = start(count), torch.tensor(-5.0)
     for tensor in (*raw.values(), log_gate):
         tensor.requires_grad_()
-    adam = torch.optim.Adam([{"params": list(raw.values()), "lr": 0.01}, {"params": [log_gate], "lr": 0.05}])
+    adam = torch.optim.Adam([{"params": list(raw.values()), "lr": 0.01}, {"params": [log_gate], "lr": 0.01}])
+    rates = torch.optim.lr_scheduler.ExponentialLR(adam, 0.1 ** (1 / steps))  # to a tenth
     for _ in range(steps):
         settings = settings_from_camera(K, torch.eye(3), torch.zeros(3), SIZE, SIZE, blend_mode=blend_mode,
                                         background_gate=log_gate.exp() if blend_mode == "smoe" else None)
@@ -48,6 +49,7 @@ def fit(target, count, blend_mode, steps):
         adam.zero_grad()
         loss.backward()
         adam.step()
+        rates.step()
     return image.detach()
 
 
