@@ -54,8 +54,8 @@
   X(kInverseDepth, inverse_depth)
 
 // All images: X(enumerator, name). All but the radii are differentiable.
-#define DSMOE_IMAGES(X)                                                  \
-  X(kColor, color)      /* [C, H, W] */                                  \
-  X(kRadii, radii)      /* [N] int32; no image, but the caller's too */  \
-  X(kGateSum, gate_sum) /* [1, H, W] the alpha image */                  \
+#define DSMOE_IMAGES(X)                                                 \
+  X(kColor, color)      /* [C, H, W] */                                 \
+  X(kRadii, radii)      /* [N] int32; no image, but the caller's too */ \
+  X(kGateSum, gate_sum) /* [1, H, W] the alpha image */                 \
   DSMOE_FEATURE_IMAGES(X)

@@ -11,9 +11,9 @@
 //   smoe_tn   Eq. 8   C = sum c_i w_i / sum alpha_i
 //   smoe_std  Eq. 6   C = sum c_i alpha_i / sum alpha_i
 //
-// `smoe` is Eq. 7 as the paper's authors compute it. Their pairs are strong or tails (Cut::kStrong). The sums over i are
-// of strong pairs. B is the sum of alpha T over the tails, which takes nothing from T. So where Gaussians end, those that
-// almost reach a pixel draw it to the background.
+// `smoe` is Eq. 7 as the paper's authors compute it. Their pairs are strong or tails (Cut::kStrong). The sums over i
+// are of strong pairs. B is the sum of alpha T over the tails, which takes nothing from T. So where Gaussians end,
+// those that almost reach a pixel draw it to the background.
 //
 // The first three are of one family, in which the background is one more expert, with the gate lambda:
 //
@@ -65,9 +65,9 @@ DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
 
 // A pixel behind its last pair.
 template <class Real> struct PixelEnd {
-  Real transmittance;            // T
-  Real gate_sum;                 // W; ablations: sum alpha
-  Scalar<Real> background_gate;  // lambda
+  Real transmittance;                  // T
+  Real gate_sum;                       // W; ablations: sum alpha
+  Scalar<Real> background_gate;        // lambda
   Real tails = Real(Scalar<Real>(0));  // B, where the mode has tails
 };
 

@@ -8,12 +8,12 @@ constexpr float kAlphaMax = 0.99f;          // alpha never reaches 1, so that tr
 constexpr float kAlphaCut = 1.0f / 255.0f;  // `alpha` mode skips fainter pairs: invisible in 8 bits
 constexpr float kGateCut = 1e-5f;           // `smoe_eq7` and the ablations skip smaller kernels G (the paper's text)
 // `smoe`, the rule of the paper's authors: a pair of alpha >= kStrongAlpha is strong. A weaker one is a tail: it only
-// adds to the background's weight. A float32 pixel cannot feel a tail below kTailAlpha: where a tail matters some pair is
-// strong, so that the denominator is at least kStrongAlpha, and half a unit of its last digit is 2^-24 of that.
+// adds to the background's weight. A float32 pixel cannot feel a tail below kTailAlpha: where a tail matters some pair
+// is strong, so that the denominator is at least kStrongAlpha, and half a unit of its last digit is 2^-24 of that.
 constexpr float kStrongAlpha = 1.0f / 2040.0f;
 constexpr float kTailAlpha = 0x1p-35f;
-// Tails count where the gate sum is below this, unless a caller says otherwise. With more, they move a pixel by less than
-// `alpha` mode's own cut does.
+// Tails count where the gate sum is below this, unless a caller says otherwise. With more, they move a pixel by less
+// than `alpha` mode's own cut does.
 constexpr float kTailsBelow = 0.9f;
 // exp(-4.5), G at 3 sigma. Under a background gate lambda a pair changes a pixel by at most alpha / lambda. So pairs
 // with alpha < lambda / 255 do not count, as in `alpha` mode. Inside 3 sigma they do: a Gaussian that is cut everywhere

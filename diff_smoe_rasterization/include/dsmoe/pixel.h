@@ -66,8 +66,8 @@ DSMOE_HD FeatureBackward<Real> add_feature(FeatureRule rule, PixelBackward<Real>
   return {scaled, select(by.open, weighted, dL_dvalue), learns ? end.transmittance * scaled * distance : zero};
 }
 
-// The alpha image: the gate sum. In a mode with tails it is the share of the pixel that is not the background's, which is
-// what a feature of 1 over a background of 0 would be.
+// The alpha image: the gate sum. In a mode with tails it is the share of the pixel that is not the background's, which
+// is what a feature of 1 over a background of 0 would be.
 template <BlendMode kMode, class Real> DSMOE_HD Real finish_alpha(const PixelEnd<Real>& end) {
   const Real zero = Scalar<Real>(0);
   if constexpr (!Blend<kMode>::kTails) return end.gate_sum;

@@ -90,6 +90,7 @@ def test_a_process_saves_and_ends_where_torchrun_is_killed(tiny_config):
                    "WORLD_SIZE": "1", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port,
                    "TORCHELASTIC_RUN_ID": "none", "OMP_NUM_THREADS": "1"}
     with subprocess.Popen([sys.executable, "-c", launcher], env={**os.environ, **environment}, text=True,
+                          cwd=os.path.dirname(tiny_config.output),  # -m would find the sources in that of the tests
                           stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.readline()
         while process.poll() is None and not os.path.isfile(os.path.join(tiny_config.output, "config.json")):
