@@ -145,8 +145,11 @@ def test_a_gradient_by_depths_reaches_the_means():
     dict(blend_mode="smoe_tn")])
 def test_a_gradient_by_the_reach_reaches_what_the_opacity_is_made_of(options):
     """In double, with steps of 1e-6, against finite differences of what the projection returns."""
-    scene = random_scene("smoe", 60, opacity=(0.001, 0.9), scale=0.1).with_settings(**options).requiring_grad()
-    weights = torch.linspace(0.5, 1.5, 60, dtype=torch.float64)
+    scene = random_scene("smoe", 60, opacity=(0.001, 0.9), scale=0.1)
+    options = {name: value.to(scene.inputs["means3D"]) if torch.is_tensor(value) else value
+               for name, value in options.items()}
+    scene = scene.with_settings(**options).requiring_grad()
+    weights = torch.linspace(0.5, 1.5, 60).to(scene.inputs["means3D"])
 
     def loss(opacities):
         footprints = project_gaussians(settings=scene.settings, **{**scene.inputs, "opacities": opacities})

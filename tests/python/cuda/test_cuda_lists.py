@@ -20,23 +20,17 @@ def test_more_macro_tiles_than_one_pass_sorts(mode, gpu):
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
 def test_needles_that_pass_by_more_macro_tiles_than_they_meet_tiles(mode, gpu):
-    """Their boxes outgrow the room that the count of their tiles suggests. Then the lists are not used, and the next
-    rendering has more room.
-
-    Far from its centre the exponent of such a needle is rounding in float32. So the two ways to find a pixel's pairs
-    may differ in some of them: the images are held to each other in the mean.
+    """Their boxes outgrow the room that the count of their tiles suggests. So the entries of the macro tiles' lists are
+    counted too, and the first rendering has room. It had not while tiles alone were counted.
     """
     scene = random_scene(mode, 300, 2391, 2377, scale=0.01, degree=0, dtype=torch.float32)
     needle = torch.tensor([6.0, 0.001, 0.001])
     scene = scene.with_inputs(scales=needle.expand_as(scene.inputs["scales"]).contiguous()).to(gpu)
-    images = []
-    for fits in (False, True):
+    for _ in range(2):
         outputs, saved = op_results(scene)
         torch.cuda.synchronize()  # the count is there for the next call
-        assert (len(saved["instances"]) >= int(saved["tile_offsets"][-1])) is fits
-        images.append(outputs["color"])
-    assert images[0].std() > 0.01, "nothing is seen"
-    assert (images[0] - images[1]).abs().mean() < 1e-3
+        assert len(saved["instances"]) >= int(saved["tile_offsets"][-1])
+        assert outputs["color"].std() > 0.01, "nothing is seen"
 
 
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
