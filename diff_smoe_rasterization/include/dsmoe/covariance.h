@@ -154,9 +154,9 @@ DSMOE_HD Sym2<S> opacity_compensation_backward(const Sym2<S>& cov2d, const Conic
 // by it, and E comes from antialiasing. H itself is never formed: that of a long thin Gaussian is large, and its
 // rounding is no longer orthogonal to what H multiplies next. So K meets that first.
 template <class S> struct ImageGradient {
-  Sym2<S> conic;        // K
-  Sym2<S> by_conic;     // G, by the three stored numbers
-  Sym2<S> direct;       // of E, likewise
+  Sym2<S> conic;         // K
+  Sym2<S> by_conic;      // G, by the three stored numbers
+  Sym2<S> direct;        // of E, likewise
   S by_adjugate = S(0);  // the rest of E is this times adj(Sigma2D); for scale and rotation, whose minors it is made of
 };
 
@@ -229,7 +229,7 @@ DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3
     const int k = (j + 1) % 3, l = (j + 2) % 3;
     // The cross product of t_c and M_i, the same bits as the minor where M is t.
     const auto across = [&](int c) {
-      const Vec2<S> &p = t.of[c], &q = m.of[i];
+      const Vec2<S>&p = t.of[c], &q = m.of[i];
       const bool forward = i == (c + 1) % 3;
       return forward ? difference_of_products(p.x, q.y, q.x, p.y) : -difference_of_products(q.x, p.y, p.x, q.y);
     };
