@@ -221,7 +221,8 @@ def visible(gaussians, settings, mode):
         column_finite = torch.isfinite(column).flatten(1).all(1) if column.dim() > 1 else column.abs() <= OPACITY_MAX
         if settings.strict and not column_finite.all():
             index = (~column_finite).nonzero()[0].item()
-            raise ValueError(f"rasterize: {name}[{index}] is not finite")
+            limit = " or above 1e20" if name == "opacities" else ""
+            raise ValueError(f"rasterize: {name}[{index}] is not finite{limit} (strict=True)")
         finite &= column_finite
     finite = finite.nonzero()[:, 0]
 
@@ -234,7 +235,7 @@ def visible(gaussians, settings, mode):
     det = xx * yy - xy * xy
     kept = in_front & (xx > 0) & (det > 0) & torch.isfinite(det)
     for column in splats:
-        kept &= torch.isfinite(column).reshape(len(column), -1).all(1)
+        kept &= torch.isfinite(column if column.dim() > 1 else column[:, None]).flatten(1).all(1)
     kept &= footprint_meets(splats, 0, 0, settings.image_width - 1, settings.image_height - 1, settings, mode)
     kept = kept.nonzero()[:, 0]
 

@@ -35,7 +35,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
                   sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: str = "classic",
                   channel_chunk: int = 32, distributed: bool = False, camera_model: str = "pinhole",
                   segmented: bool = False, covars: Optional[torch.Tensor] = None, blend_mode: Optional[str] = None,
-                  background_gate: Optional[BackgroundGate] = None,
+                  background_gate: Optional[BackgroundGate] = None, tails_below: float = 0.9,
                   **others: Any) -> Tuple[torch.Tensor, torch.Tensor, Dict[str, Any]]:
     """Renders N Gaussians with C pinhole cameras.
 
@@ -59,14 +59,16 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         rasterize_mode: "classic" or "antialiased".
         covars: [N, 3, 3] in place of quats and scales, which are then ignored.
         blend_mode: one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha".
-        background_gate: `smoe`: how much the background weighs, a number or a tensor of one element, which gets a
-            gradient; None: $DSMOE_BACKGROUND_GATE, else 0.
+        background_gate: `smoe` and `smoe_eq7`: how much the background weighs, a number or a tensor of one element,
+            which gets a gradient; None: $DSMOE_BACKGROUND_GATE, else 0.
+        tails_below: `smoe`: tails count in pixels whose gate sum is below this.
         tile_size, channel_chunk, segmented: taken and without effect, as they change no image.
 
     Returns:
         renders: [C, H, W, X], X = D, 1 or D + 1 by render_mode.
         alphas: [C, H, W, 1], the share of the pixel that the background does not have, by which callers composite:
-            sum(w) in `alpha`, and 1 wherever a gate is open where the background has no gate.
+            sum(w) in `alpha`, W / (W + B + lambda T) in `smoe`. In the others without a background gate, 1 wherever a
+            gate is open.
         meta: means2d [C, N, 2], pixels, which receives the gradient of the images by them (also in pixels) and passes
             none on; radii [C, N, 2] int32, 3 sigma of the longer axis twice, 0 where not seen; depths [C, N]; width,
             height, n_cameras, n_batches; batch_ids, camera_ids and gaussian_ids are None. With `packed` means2d,
@@ -112,7 +114,8 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         image_height=height, image_width=width, tanfovx=width / (2 * focal_x), tanfovy=height / (2 * focal_y),
         bg=backgrounds[camera], scale_modifier=1.0, viewmatrix=viewmats[camera].T, projmatrix=projections[camera],
         sh_degree=sh_degree or 0, campos=centres[camera], antialiasing=rasterize_mode == "antialiased",
-        near=near_plane, blend_mode=blend_mode, background_gate=background_gate, low_pass=eps2d)
+        near=near_plane, blend_mode=blend_mode, background_gate=background_gate, low_pass=eps2d,
+        tails_below=tails_below)
         for camera, (focal_x, focal_y) in enumerate(focal_lengths)]
     clips = far_plane < EVERYTHING_NEARER or radius_clip > 0
     if packed or clips:  # else the radii come with the images

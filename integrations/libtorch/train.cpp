@@ -9,22 +9,24 @@
 namespace {
 
 // Blend mode, and the background's gate lambda: a number, or learned with the scene as bound + exp(p). As in `dsmoe
-// train` it starts at 0.1 without a bound in `smoe`, and at 1 with the bound 0.03 in `smoe_eq7`.
+// train` it starts at 0.1 without a bound in `smoe`, with the rate 0.03, and at 1 with the bound 0.03 and the rate 0.01
+// in `smoe_eq7`.
 struct Blend {
   std::string mode;
   bool has_gate;
-  double number = 0, bound, start;
+  double number = 0, bound, start, rate;
   std::vector<dsmoe::AdamParameter> logarithm;  // p, where it is learned
 
   Blend(const std::string& mode, const std::string& gate, torch::Device device)
       : mode(mode),
         has_gate(mode == "smoe" || mode == "smoe_eq7"),
         bound(mode == "smoe" ? 0 : 0.03),
-        start(mode == "smoe" ? 0.1 : 1) {
+        start(mode == "smoe" ? 0.1 : 1),
+        rate(mode == "smoe" ? 0.03 : 0.01) {
     if (!has_gate) return;
     if (gate != "learned") number = std::stod(gate);
     if (gate != "learned") return;
-    logarithm.push_back({torch::full({1}, std::log(start - bound), device).requires_grad_(), 0.01});
+    logarithm.push_back({torch::full({1}, std::log(start - bound), device).requires_grad_(), rate});
   }
 
   dsmoe::GaussianRasterizationSettings settings(const View& view) const {

@@ -123,18 +123,61 @@ TEST(ImageFactor, BackwardIsTheDerivative) {
   expect_gradient(actual, loss, x);
 }
 
+// A loss of the determinant before the low-pass filter alone, which is what by_adjugate is the derivative of.
+TEST(ImageFactor, BackwardOfTheDeterminantIsTheDerivative) {
+  const Vector x = Random(14).uniforms(18);
+  auto loss = [&](const Vector& v) { return 1.7 * conic_of(factor_of(v)).unfiltered; };
+  const auto g = image_factor_backward(mat23(&x[0]), vec3(&x[6]), mat3(&x[9]), factor_of(x),
+                                       ImageGradient<double>{conic_of(factor_of(x)).inverse, {}, {}, 1.7});
+  Vector actual = flat(g.axes);
+  append(actual, g.scale);
+  for (const double entry : flat(g.rotation)) actual.push_back(entry);
+  expect_gradient(actual, loss, x);
+}
+
+// The factor on the opacity of a needle of 100 x 0.1 px: in float too its gradients have nearly all digits.
+TEST(ImageFactor, KeepsTheDigitsOfANeedlesCompensation) {
+  const auto backward = [](auto zero) {
+    using S = decltype(zero);
+    const Mat23<S> axes = {{S(62.5f), S(0), S(-3.25f)}, {S(0), S(62.5f), S(1.5f)}};
+    const Vec3<S> scale = {S(1.6f), S(0.0016f), S(0.0011f)};
+    const Mat3<S> rotation = quaternion_to_rotation<S>({S(0.8f), S(0.05f), S(-0.03f), S(0.5971599f)});
+    const auto factor = image_factor(axes, scale, rotation);
+    const auto conic = conic_of(factor);
+    const auto by = opacity_compensation_backward(conic, S(kLowPass), S(1));
+    const auto g = image_factor_backward(
+        axes, scale, rotation, factor,
+        ImageGradient<S>{conic.inverse, {}, {by.by_identity, S(0), by.by_identity}, by.by_adjugate});
+    return std::make_pair(Mat23<double>{{double(g.axes.r0.x), double(g.axes.r0.y), double(g.axes.r0.z)},
+                                        {double(g.axes.r1.x), double(g.axes.r1.y), double(g.axes.r1.z)}},
+                          Mat3<double>{{double(g.rotation.r0.x), double(g.rotation.r0.y), double(g.rotation.r0.z)},
+                                       {double(g.rotation.r1.x), double(g.rotation.r1.y), double(g.rotation.r1.z)},
+                                       {double(g.rotation.r2.x), double(g.rotation.r2.y), double(g.rotation.r2.z)}});
+  };
+  const auto found = backward(0.0f), exact = backward(0.0);
+  const auto compare = [](const Vector& actual, const Vector& expected) {
+    double error = 0, size = 0;
+    for (size_t i = 0; i < actual.size(); ++i) {
+      error += std::pow(actual[i] - expected[i], 2), size += std::pow(expected[i], 2);
+    }
+    EXPECT_LT(std::sqrt(error / size), 2e-6);  // some 10 roundings
+  };
+  compare(flat(found.first), flat(exact.first));
+  compare(flat(found.second), flat(exact.second));
+}
+
 // Adam makes a whole step of any gradient, of rounding too: a sphere must not be turned before it has another shape.
 TEST(ImageFactor, DoesNotTurnASphereInFloat) {
   Random random(5);
   const Vec4<float> unturned = {1, 0, 0, 0};
   const Mat3<float> rotation = quaternion_to_rotation(unturned);
   for (int i = 0; i < 100; ++i) {
-    const Vector x = random.uniforms(13);
+    const Vector x = random.uniforms(14);
     const std::vector<float> f(x.begin(), x.end());
     const Mat23<float> axes = {{f[0], f[1], f[2]}, {f[3], f[4], f[5]}};
     const Vec3<float> scale = {f[6], f[6], f[6]};
     const auto factor = image_factor(axes, scale, rotation);
-    const ImageGradient<float> by_image = {conic_of(factor).inverse, {f[7], f[8], f[9]}, {f[10], f[11], f[12]}};
+    const ImageGradient<float> by_image = {conic_of(factor).inverse, {f[7], f[8], f[9]}, {f[10], f[11], f[12]}, f[13]};
     const auto g = image_factor_backward(axes, scale, rotation, factor, by_image);
     const auto q = quaternion_to_rotation_backward(unturned, g.rotation);
     EXPECT_EQ(q.y, 0.0f);
@@ -273,7 +316,7 @@ TEST(OpacityCompensation, BackwardIsTheDerivative) {
     const auto c = sym2(cov.data());
     auto loss = [](const Vector& v) { return 1.7 * compensation(v); };
     // The small covariance is 0.02 across, so the steps must be smaller too: 1e-4.
-    expect_gradient(flat(opacity_compensation_backward(make_conic(c), kLowPass, 1.7)), loss, cov, 1e-4);
+    expect_gradient(flat(opacity_compensation_backward(make_conic(c), kLowPass, 1.7).dense(c)), loss, cov, 1e-4);
   }
 }
 
@@ -282,7 +325,7 @@ TEST(OpacityCompensation, HasAFloorWithoutGradient) {
        {Vector{1e-4, 0, 1e-4}, Vector{4, 2, 1}, Vector{0.1, 0.15, 0.1}}) {  // tiny; a needle; indefinite
     const auto c = sym2(cov.data());
     EXPECT_DOUBLE_EQ(compensation(cov), std::sqrt(static_cast<double>(2.5e-5f)));
-    for (const double g : flat(opacity_compensation_backward(make_conic(c), kLowPass, 1.7))) EXPECT_EQ(g, 0);
+    for (const double g : flat(opacity_compensation_backward(make_conic(c), kLowPass, 1.7).dense(c))) EXPECT_EQ(g, 0);
   }
 }
 

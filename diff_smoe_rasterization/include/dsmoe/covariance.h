@@ -154,9 +154,10 @@ DSMOE_HD Sym2<S> opacity_compensation_backward(const Sym2<S>& cov2d, const Conic
 // by it, and E comes from antialiasing. H itself is never formed: that of a long thin Gaussian is large, and its
 // rounding is no longer orthogonal to what H multiplies next. So K meets that first.
 template <class S> struct ImageGradient {
-  Sym2<S> conic;     // K
-  Sym2<S> by_conic;  // G, by the three stored numbers
-  Sym2<S> direct;    // E, likewise
+  Sym2<S> conic;         // K
+  Sym2<S> by_conic;      // G, by the three stored numbers
+  Sym2<S> direct;        // of E, likewise
+  S by_adjugate = S(0);  // the rest of E is this times adj(Sigma2D); for scale and rotation, whose minors it is made of
 };
 
 // p^T G q, where the off-diagonal number of G stands for two entries. In kernels too it is the same number, to the last
@@ -209,14 +210,36 @@ template <class S> struct ImageFactorGradient {
 template <class S>
 DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3<S> scale, const Mat3<S>& rotation,
                                                       const ImageFactor<S>& factor, const ImageGradient<S>& h) {
-  const Mat23<S> by_half = h * factor.half;
+  Mat23<S> by_half = h * factor.half;
+  // adj(Sigma2D) = sum_k n_k n_k^T, where n_k is column k of L = M R S, turned by 90 degrees: n_k^T p is the cross
+  // product of that column and p. Of columns of L the cross products are its minors, and that of a column and itself is
+  // 0. A formed adj(Sigma2D) would lose all digits of what it makes of a needle's long column.
+  const Vec3<S> minors = cross(factor.turned.r0, factor.turned.r1);  // of columns 1 and 2, 2 and 0, 0 and 1
+  const S variance[] = {product(scale.x, scale.x), product(scale.y, scale.y), product(scale.z, scale.z)};
+  if (h.by_adjugate != S(0)) {
+    const Vec3<S> z = {scale.y * scale.z * minors.x, scale.z * scale.x * minors.y, scale.x * scale.y * minors.z};
+    by_half.r0 = by_half.r0 + h.by_adjugate * cross(factor.half.r1, z);
+    by_half.r1 = by_half.r1 + h.by_adjugate * cross(z, factor.half.r0);
+  }
   const Vec3<S> dL_da = S(2) * by_half.r0, dL_db = S(2) * by_half.r1;
   const Columns<S> m(axes), km(h.conic * axes), t(factor.turned), kt(h.conic * factor.turned);
-  const S twice_variance[] = {product(S(2) * scale.x, scale.x), product(S(2) * scale.y, scale.y),
-                              product(S(2) * scale.z, scale.z)};
+  const S minor[] = {minors.x, minors.y, minors.z};
+  // M_i^T adj(Sigma2D) t_j
+  const auto adjugate = [&](int i, int j) {
+    const int k = (j + 1) % 3, l = (j + 2) % 3;
+    // The cross product of t_c and M_i, the same bits as the minor where M is t.
+    const auto across = [&](int c) {
+      const Vec2<S>&p = t.of[c], &q = m.of[i];
+      const bool forward = i == (c + 1) % 3;
+      return forward ? difference_of_products(p.x, q.y, q.x, p.y) : -difference_of_products(q.x, p.y, p.x, q.y);
+    };
+    // The columns k, j have the minor -minor[l], and l, j have minor[k].
+    return product(variance[l], product(minor[k], across(l))) - product(variance[k], product(minor[l], across(k)));
+  };
   const auto entry = [&](int i, int j) {
-    const S by_cov = bilinear(h.direct, m.of[i], t.of[j]) - bilinear(h.by_conic, km.of[i], kt.of[j]);
-    return product(twice_variance[j], by_cov);
+    S by_cov = bilinear(h.direct, m.of[i], t.of[j]) - bilinear(h.by_conic, km.of[i], kt.of[j]);
+    if (h.by_adjugate != S(0)) by_cov += product(h.by_adjugate, adjugate(i, j));
+    return product(S(2) * variance[j], by_cov);
   };
   return {factor.turned.r0 * dL_da + factor.turned.r1 * dL_db,
           {{entry(0, 0), entry(0, 1), entry(0, 2)},
@@ -225,15 +248,27 @@ DSMOE_HD ImageFactorGradient<S> image_factor_backward(const Mat23<S>& axes, Vec3
           {rotation * (scale * dL_da), rotation * (scale * dL_db)}};
 }
 
-// dL/dopacity times the opacity before, on its way to Sigma2D: what ImageGradient calls E.
-template <class S> DSMOE_HD Sym2<S> opacity_compensation_backward(const Conic<S>& conic, S low_pass, S dL_dfactor) {
+// dL/dopacity times the opacity before, on its way to Sigma2D: what ImageGradient calls E, by_adjugate adj(Sigma2D) +
+// by_identity I.
+template <class S> struct CompensationGradient {
+  S by_adjugate, by_identity;
+
+  // By the three stored numbers of Sigma2D.
+  DSMOE_HD Sym2<S> dense(const Sym2<S>& cov2d) const {
+    return {by_adjugate * cov2d.yy + by_identity, S(-2) * by_adjugate * cov2d.xy, by_adjugate * cov2d.xx + by_identity};
+  }
+};
+
+template <class S>
+DSMOE_HD CompensationGradient<S> opacity_compensation_backward(const Conic<S>& conic, S low_pass, S dL_dfactor) {
   const S ratio = conic.unfiltered / conic.determinant;
-  if (!(ratio > S(kCompensationFloor))) return {S(0), S(0), S(0)};
-  // ratio = det A / det C, C = A + low_pass: its derivative by A is (adj A - ratio adj C) / det C.
+  if (!(ratio > S(kCompensationFloor))) return {S(0), S(0)};
+  // ratio = det A / det C, C = A + low_pass: its derivative by A is (adj A - ratio adj C) / det C, and adj C is
+  // adj A + low_pass.
   const auto& c = conic.filtered;
   const S less = low_pass * (c.xx + c.yy - low_pass) / conic.determinant;  // 1 - ratio
   const S by_ratio = dL_dfactor * S(0.5) / (sqrt(ratio) * conic.determinant);
-  return {by_ratio * (less * c.yy - low_pass), S(-2) * by_ratio * less * c.xy, by_ratio * (less * c.xx - low_pass)};
+  return {by_ratio * less, -by_ratio * ratio * low_pass};
 }
 
 // The 3-sigma radius in pixels that the trainers prune and count by, whatever the blend mode.

@@ -152,7 +152,12 @@ DSMOE_HD GaussianGradient<S> project_backward(const Gaussian<S>& gaussian, const
   ImageGradient<S> by_image = {conic.inverse, g.gate.conic, {S(0), S(0), S(0)}};
   out.opacity = g.gate.opacity;
   if (rules.antialiasing) {
-    by_image.direct = opacity_compensation_backward(conic, rules.low_pass, g.gate.opacity * gaussian.opacity);
+    const auto by = opacity_compensation_backward(conic, rules.low_pass, g.gate.opacity * gaussian.opacity);
+    if (gaussian.has_covariance) {
+      by_image.direct = by.dense(made.image);
+    } else {
+      by_image.direct = {by.by_identity, S(0), by.by_identity}, by_image.by_adjugate = by.by_adjugate;
+    }
     out.opacity *= opacity_compensation(conic);
   }
   Mat23<S> dL_daxes;

@@ -11,6 +11,8 @@
 //
 //   C'_k - C = -((1 + q_k) w_k (c_k - C) + q_k A_k) / D'_k
 //
+// In `smoe` the sum B of the tails is held constant. So B (bg - C) and B stand in front of all pairs, in A_k and D'_k.
+//
 // Where the denominator counts weights, (1 + q_k) w_k is q_k T_k with T_k in front of the pair. So all channels share a
 // factor, and its reciprocal needs no other one:
 //
