@@ -225,8 +225,8 @@ template <class S> void count_instances(const Frame<S>& frame, const Work& work)
 template <class S> void bin(const Frame<S>& frame, const Work& work);
 
 // Fills frame.images but the radii, and what saved has for each pixel. This pass and those below make the lists, band
-// by band, where frame.saved.capacity is 0. In a mode with tails saved.sums is the caller's, and set_sums makes gate_sum
-// and tails of it.
+// by band, where frame.saved.capacity is 0. In a mode with tails saved.sums is the caller's, and set_sums makes
+// gate_sum and tails of it.
 template <class S> void blend(const Frame<S>& frame, const Work& work);
 
 // What goes through both stages of a backward pass.
