@@ -323,6 +323,10 @@ class TrainConfig:
         harmless = {"scene", "output", "eval_every", "checkpoint_every"}
         if later.iterations > self.iterations:
             harmless.add("iterations")
+        if self.blend_mode != later.blend_mode:  # what follows from that needs no text of its own
+            before, after = _learned_gate_of(self.blend_mode), _learned_gate_of(later.blend_mode)
+            harmless |= {name for name in before
+                         if getattr(self, name) == before[name] and getattr(later, name) == after[name]}
         texts = []
         for option in dataclasses.fields(self):
             mine, theirs = getattr(self, option.name), getattr(later, option.name)

@@ -58,6 +58,7 @@ def make_scene(photos: str, output: str, matching: str = "auto", camera_model: s
     MOST_EXHAUSTIVE. say: is called with a line before each step. Raises SceneError, also where the photographs do not
     connect, and TrainerError without pycolmap.
     """
+    _check_folder(photos)
     try:
         import pycolmap
     except ImportError as error:
@@ -89,14 +90,19 @@ def make_scene(photos: str, output: str, matching: str = "auto", camera_model: s
                 sorted({*names} - placed))
 
 
+def _check_folder(photos: str) -> None:
+    """Raises SceneError where it is no folder."""
+    if not is_folder(photos):
+        kind = " is a file; of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
+        raise SceneError(f"{photos}{kind if os.path.isfile(photos) else ': no such folder of photographs'}")
+
+
 def photo_names(folder: str, output: str) -> List[str]:
     """The photographs below a folder, by their paths in it; hidden files and the folder `output` are left out.
 
     Raises SceneError where they are too few.
     """
-    if not is_folder(folder):
-        kind = " is a file; of a video take pictures first, such as: ffmpeg -i VIDEO -vf fps=2 PHOTOS/%04d.jpg"
-        raise SceneError(f"{folder}{kind if os.path.isfile(folder) else ': no such folder of photographs'}")
+    _check_folder(folder)
     made = os.path.join(os.path.realpath(output), "")
     names = sorted(os.path.relpath(os.path.join(place, name), folder) for place, _, files in os.walk(folder)
                    if not os.path.join(os.path.realpath(place), "").startswith(made)

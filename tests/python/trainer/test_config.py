@@ -93,6 +93,9 @@ def test_how_a_gate_is_learned_follows_the_mode_unless_given(tmp_path):
     given = parse("--blend-mode", "smoe", "--background-gate-start", "0.5", "--background-gate-lr", "0.02")
     assert learned(given) == (0, 0.5, 0.02)
     assert learned(given.changed(blend_mode="smoe_eq7")) == (0.03, 0.5, 0.02), "what is given stays"
+    texts = parse("--blend-mode", "smoe").differences(parse("--blend-mode", "smoe_eq7"))
+    assert texts == ["--blend-mode is 'smoe', not 'smoe_eq7'"], "no text for what follows from the mode"
+    assert len(given.differences(parse("--blend-mode", "smoe_eq7"))) == 3
     given.changed(scene="s", output=str(tmp_path)).save(str(tmp_path))
     assert learned(TrainConfig.load(str(tmp_path))) == (0, 0.5, 0.02)
 

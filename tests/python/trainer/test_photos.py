@@ -102,8 +102,9 @@ def test_an_interrupted_command_says_that_it_continues(tmp_path, capsys, monkeyp
 
 
 def test_what_is_no_folder_of_photographs(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycolmap", sys)  # it is asked for first
+    monkeypatch.setitem(sys.modules, "pycolmap", None)  # it is asked for later
     assert "nowhere: no such folder of photographs" in fails(capsys, tmp_path / "nowhere", "-o", tmp_path / "scene")
+    monkeypatch.setitem(sys.modules, "pycolmap", sys)
     (tmp_path / "walk.mp4").write_text("")
     assert "ffmpeg -i VIDEO" in fails(capsys, tmp_path / "walk.mp4", "-o", tmp_path / "scene")
     (tmp_path / "IMG_1.HEIC").write_text("")
