@@ -6,6 +6,7 @@ import struct
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
 import numpy as np
+from scipy.special import expit
 
 from .._version import __version__
 from ..io import Gaussians
@@ -85,7 +86,7 @@ def _attributes(gaussians: Gaussians, fallback: bool) -> Dict[str, np.ndarray]:
     fallback: with colours for viewers that know no Gaussians and show points.
     """
     position, logit, log_scales, rotations, dc, harmonics = rotatable_rows(y_up(gaussians))
-    opacity = 1 / (1 + np.exp(-logit.astype(np.float64).clip(-700)))
+    opacity = expit(logit.astype(np.float64))
     scales = np.exp(log_scales.astype(np.float64)).clip(max=np.finfo(np.float32).max)
     unit = rotations / np.linalg.norm(rotations.astype(np.float64), axis=1, keepdims=True)
     attributes = {"POSITION": position, f"{SPLATTING}:ROTATION": unit[:, [1, 2, 3, 0]], f"{SPLATTING}:SCALE": scales,

@@ -16,19 +16,10 @@ namespace dsmoe {
 namespace cuda {
 namespace {
 
-// Where the sums of a Gaussian go, in any order of their terms. number: of a Contribution, but for the pixels.
-template <class S> struct AtomicSums {
-  ContributionSums<S> sums;
-  __device__ void add(int number, int32_t gaussian, S term) const {
-    S* const of_number = number == 0 ? sums.pixel_weights : number == 1 ? sums.blend_weights : sums.distances;
-    atomicAdd(of_number + gaussian, term);
-  }
-};
-
 template <class S, class Sums> struct ContributionArguments : BlendArguments<S> {
   const S* pixel_weights;  // [H, W] a map of the caller's
   int32_t* pixels;         // [N] sums; null where another walk counts them
-  Sums sums;               // AtomicSums or ExactSums
+  Sums sums;               // AtomicSums or ExactSums, of the numbers but the pixels
 
   // Adds number `number` of a Contribution to its Gaussian's sums.
   __device__ void add_number(int32_t gaussian, int number, S value) const {
@@ -112,17 +103,16 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
   const RasterConfig<S>& config = frame.config;
   const ContributionSums<S>& sums = map.sums;
   const cudaStream_t stream = work.stream;
-  const auto clear = [&](auto* numbers) {
-    if (num_gaussians == 0) return;
-    check(cudaMemsetAsync(numbers, 0, num_gaussians * sizeof(*numbers), stream), "clearing the contributions");
-  };
-  const auto walk = [&](const auto& to, int32_t* pixels) {
+  if (num_gaussians > 0) {
+    check(cudaMemsetAsync(sums.pixels, 0, num_gaussians * sizeof(int32_t), stream), "clearing the pixel counts");
+  }
+  const auto walk = [&](const auto& to) {
     using Sums = std::decay_t<decltype(to)>;
     for_each_band(frame, work, [&](const Frame<S>& band) {
       ContributionArguments<S, Sums> arguments = {};
       static_cast<BlendArguments<S>&>(arguments) = blend_arguments(band, work);
       arguments.pixel_weights = map.pixel_weights;
-      arguments.pixels = pixels;
+      arguments.pixels = to.is_first_walk() ? sums.pixels : nullptr;
       arguments.sums = to;
       const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
       dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
@@ -131,14 +121,7 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
       });
     });
   };
-  clear(sums.pixels);
-  if (work.deterministic) {
-    const SumTargets<S> targets = {{sums.pixel_weights, sums.blend_weights, sums.distances}, 3};
-    return sum_exactly(frame, targets, work,
-                       [&](const ExactSums<S>& to) { walk(to, to.sums == nullptr ? sums.pixels : nullptr); });
-  }
-  clear(sums.pixel_weights), clear(sums.blend_weights), clear(sums.distances);
-  walk(AtomicSums<S>{sums}, sums.pixels);
+  sum_terms(frame, SumTargets<S>{{sums.pixel_weights, sums.blend_weights, sums.distances}, 3}, work, walk);
 }
 
 #define DSMOE_INSTANTIATE(S) template void contributions(const Frame<S>&, const ContributionMap<S>&, const Work&);

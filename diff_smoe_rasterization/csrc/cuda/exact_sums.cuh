@@ -1,7 +1,8 @@
-// Sums of a few numbers for each Gaussian that are the same bits in any order of their terms, where nothing bounds a
-// term beforehand. A walk over the pixels finds the largest term of each sum, and a second walk adds the terms as
-// integers. Their unit is a power of two, so far below the largest term that the sum of as many terms as there may be
-// just fits 64 bits: a term of 2^-40 of the largest one still counts in an image of some megapixels.
+// Sums of a few numbers for each Gaussian, in any order of their terms by atomics, or exactly: then they are the same
+// bits in any order, where nothing bounds a term beforehand. For these a walk over the pixels finds the largest term of
+// each sum, and a second walk adds the terms as integers. Their unit is a power of two, so far below the largest term
+// that the sum of as many terms as there may be just fits 64 bits: a term of 2^-40 of the largest one still counts in
+// an image of some megapixels.
 #pragma once
 
 #include <type_traits>
@@ -12,6 +13,20 @@
 namespace dsmoe {
 namespace cuda {
 
+// Up to four arrays of sums.
+template <class S> struct SumTargets {
+  static constexpr int kMost = 4;
+  S* numbers[kMost];  // [N] each
+  int count;
+};
+
+template <class S> struct AtomicSums {
+  SumTargets<S> to;
+
+  bool is_first_walk() const { return true; }
+  __device__ void add(int number, int32_t gaussian, S term) const { atomicAdd(to.numbers[number] + gaussian, term); }
+};
+
 // A warp adds one term to each sum of a Gaussian that it meets.
 template <class S> struct ExactSums {
   int64_t num_gaussians;     // N
@@ -21,6 +36,7 @@ template <class S> struct ExactSums {
 
   static constexpr int32_t kNotFinite = INT32_MAX;
 
+  bool is_first_walk() const { return sums == nullptr; }
   __device__ void add(int number, int32_t gaussian, S term) const {
     const int64_t at = number * num_gaussians + gaussian;
     if (sums == nullptr) {
@@ -44,13 +60,6 @@ template <class S> struct ExactSums {
   __device__ int unit(int32_t exponent) const { return exponent + term_bits - 62; }
 };
 
-// Up to four arrays of sums.
-template <class S> struct SumTargets {
-  static constexpr int kMost = 4;
-  S* numbers[kMost];  // [N] each
-  int count;
-};
-
 template <class S>
 __global__ void __launch_bounds__(kStoreBlock)
     store_exact_sums_kernel(const __grid_constant__ ExactSums<S> sums, const __grid_constant__ SumTargets<S> to) {
@@ -59,12 +68,11 @@ __global__ void __launch_bounds__(kStoreBlock)
   for (int number = 0; number < to.count; ++number) to.numbers[number][i] = sums.sum(number, i);
 }
 
-// Calls walk(sums) twice, and writes the sums that it has added up.
+// Calls walk(sums) twice, with ExactSums, and writes the sums that it has added up.
 template <class S, class Walk>
 void sum_exactly(const Frame<S>& frame, const SumTargets<S>& to, const Work& work, Walk walk) {
   ExactSums<S> sums = {};
   sums.num_gaussians = frame.inputs.num_gaussians;
-  if (sums.num_gaussians == 0) return;
   const int64_t size = sums.num_gaussians * to.count;
   const int64_t most_terms = num_tiles(frame.camera.width, frame.camera.height) * kWarpsPerTile;
   while (int64_t(1) << sums.term_bits < most_terms) ++sums.term_bits;
@@ -80,6 +88,18 @@ void sum_exactly(const Frame<S>& frame, const SumTargets<S>& to, const Work& wor
   walk(sums);
   store_exact_sums_kernel<S><<<blocks_for(sums.num_gaussians, kStoreBlock), kStoreBlock, 0, work.stream>>>(sums, to);
   DSMOE_CHECK_LAUNCH("store_exact_sums");
+}
+
+// Calls walk(sums) with AtomicSums, or as `sum_exactly` does where work.deterministic asks for it.
+template <class S, class Walk>
+void sum_terms(const Frame<S>& frame, const SumTargets<S>& to, const Work& work, Walk walk) {
+  const size_t bytes = frame.inputs.num_gaussians * sizeof(S);
+  if (bytes == 0) return;
+  if (work.deterministic) return sum_exactly(frame, to, work, walk);
+  for (int number = 0; number < to.count; ++number) {
+    check(cudaMemsetAsync(to.numbers[number], 0, bytes, work.stream), "clearing sums");
+  }
+  walk(AtomicSums<S>{to});
 }
 
 }  // namespace cuda

@@ -27,15 +27,6 @@ template <class S> struct ImportanceArguments : BlendArguments<S> {
   int tiles;  // of the band
 };
 
-// Where the sums of a Gaussian go, in any order of their terms.
-template <class S> struct AtomicSums {
-  ImportanceSums<S> sums;
-  __device__ void add(int number, int32_t gaussian, S term) const {
-    S* const of_number = number == 0 ? sums.shares : number == 1 ? sums.squared_shares : sums.removal_costs;
-    atomicAdd(of_number + gaussian, term);
-  }
-};
-
 template <class S, class Sums> struct ImportanceWithSums : ImportanceArguments<S> {
   Sums sums;  // AtomicSums or ExactSums
 };
@@ -309,14 +300,7 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
     });
   };
   const ImportanceSums<S>& sums = map.sums;
-  if (work.deterministic) {
-    return sum_exactly(frame, SumTargets<S>{{sums.shares, sums.squared_shares, sums.removal_costs}, 3}, work, walk);
-  }
-  const auto clear = [&](S* numbers) {
-    check(cudaMemsetAsync(numbers, 0, num_gaussians * sizeof(S), work.stream), "clearing the importance");
-  };
-  clear(sums.shares), clear(sums.squared_shares), clear(sums.removal_costs);
-  walk(AtomicSums<S>{sums});
+  sum_terms(frame, SumTargets<S>{{sums.shares, sums.squared_shares, sums.removal_costs}, 3}, work, walk);
 }
 
 #define DSMOE_INSTANTIATE(S) template void importance(const Frame<S>&, const ImportanceMap<S>&, const Work&);
