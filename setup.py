@@ -27,7 +27,6 @@ EVERY_CARD = (70, 75, 80, 86, 90, 100, 110, 120)
 USUAL_CARDS = (80, 90)
 # On one core of an AMD EPYC; a kernel's file for the usual cards.
 SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
-FOLDERS_INSTALLED_INSIDE = ("integrations", "patches", "benchmarks")
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
 
 
@@ -230,22 +229,7 @@ def commit():
         return None
 
 
-def packages():
-    """Returns the arguments of setup() that say which folder is which package."""
-    inside = [name for name in FOLDERS_INSTALLED_INSIDE if (ROOT / name / "__init__.py").is_file()]
-    folders = {PACKAGE: PACKAGE, **{f"{PACKAGE}.{name}": name for name in inside}}
-    names = list(folders)
-    for name, folder in folders.items():
-        names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
-    data = {PACKAGE: ["include/dsmoe/*.h", "csrc/io/*.h", "cmake/*.cmake", "py.typed"],
-            f"{PACKAGE}.export": ["page/*"],
-            f"{PACKAGE}.patches": ["shims/*/*.py", "stand_ins/*/*.py"],  # no packages of ours
-            f"{PACKAGE}.benchmarks.suite": ["Snakefile", "shipped/*.yaml", "shipped/scenes/*.yaml"],
-            f"{PACKAGE}.benchmarks.suite.report": ["*.json", "page.*", "table.*"]}
-    return {"packages": names, "package_dir": folders, "package_data": data}
-
-
 if __name__ == "__main__":
     if int(setuptools.__version__.split(".")[0]) < 61:  # it would ignore pyproject.toml and install "UNKNOWN 0.0.0"
         sys.exit(f"setuptools {setuptools.__version__} is too old; type: pip install 'setuptools>=61,<82'; build again")
-    setuptools.setup(**packages(), **(extension() if COMMANDS_THAT_COMPILE & set(sys.argv) else {}))
+    setuptools.setup(**(extension() if COMMANDS_THAT_COMPILE & set(sys.argv) else {}))

@@ -38,11 +38,9 @@ def _load() -> Any:
     except ModuleNotFoundError as error:
         if error.name != f"{__package__}._C":
             raise
-        folder = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-        elsewhere = (f" ({folder} was imported; a package installed elsewhere is found from another folder, or by "
-                     "python -I)") if os.path.isfile(os.path.join(folder, "sources.txt")) else ""
-        _fail(f"its extension _C is not built for this Python{elsewhere}; in the source folder type: "
-              "pip install --no-build-isolation .", error)
+        folder = os.path.dirname(os.path.abspath(__file__))
+        _fail(f"its extension _C is not built for this Python in {folder}; in the source folder type: "
+              "pip install --no-build-isolation -e .", error)
     except ImportError as error:
         _fail((f"its extension does not load ({error}); it was built against torch "
                f"{built_against or 'of another build'}, and torch {torch.__version__} is running; ") + _BUILD_AGAIN,

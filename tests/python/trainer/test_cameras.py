@@ -7,8 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import rasterize, settings_from_camera
-from diff_smoe_rasterization.trainer.scenes.cameras import Camera, scene_extent
-from diff_smoe_rasterization.trainer.scenes.orbit import look_at
+from dsmoe.scenes.cameras import Camera, scene_extent
+from dsmoe.scenes.orbit import look_at
 
 
 @pytest.fixture
