@@ -6,14 +6,13 @@ import struct
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
 import numpy as np
-from scipy.special import expit
 
 from diff_smoe_rasterization._version import __version__
 from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
 from ..model import SH_C0
-from .rows import rotatable_rows, y_up
+from .rows import rotatable_rows, sigmoid, y_up
 
 SPLATTING = "KHR_gaussian_splatting"
 BLEND = "DSMOE_gaussian_splatting_blend"
@@ -87,7 +86,7 @@ def _attributes(gaussians: Gaussians, fallback: bool) -> Dict[str, np.ndarray]:
     fallback: with colours for viewers that know no Gaussians and show points.
     """
     position, logit, log_scales, rotations, dc, harmonics = rotatable_rows(y_up(gaussians))
-    opacity = expit(logit.astype(np.float64))
+    opacity = sigmoid(logit)
     scales = np.exp(log_scales.astype(np.float64)).clip(max=np.finfo(np.float32).max)
     unit = rotations / np.linalg.norm(rotations.astype(np.float64), axis=1, keepdims=True)
     attributes = {"POSITION": position, f"{SPLATTING}:ROTATION": unit[:, [1, 2, 3, 0]], f"{SPLATTING}:SCALE": scales,

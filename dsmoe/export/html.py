@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Any, Dict, Sequence, Tuple
 
 import numpy as np
-from scipy.special import expit
 
 from diff_smoe_rasterization.io import Gaussians
 
 from ..errors import TrainerError
 from ..scenes.cameras import Camera
 from ..scenes.orbit import Orbit
-from .rows import finite_rows
+from .rows import finite_rows, sigmoid
 
 PAGE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "page")
 MODES = ("alpha", "smoe", "smoe_eq7")
@@ -69,7 +68,7 @@ def pack(gaussians: Gaussians) -> Tuple[int, bytes, bytes]:
     position, logit, log_scales, rotations, dc, harmonics = finite_rows(gaussians)
     records = np.zeros(len(position), RECORD)
     records["position"] = position
-    records["opacity"] = expit(logit[:, 0].astype(np.float64))
+    records["opacity"] = sigmoid(logit[:, 0])
     records["log_scales"] = log_scales.clip(-65504)  # of float16
     records["rotation"] = np.rint(_rotation_vectors(rotations) * np.sqrt(2) * 32767)
     records["dc"] = dc.clip(-65504, 65504)

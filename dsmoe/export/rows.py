@@ -15,6 +15,12 @@ TURNED_AXES = np.array([1, -1, -1], np.float32)
 TURNED_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Opacities of logits, in float64."""
+    with np.errstate(over="ignore"):  # exp(1000) is infinite, and the opacity 0
+        return 1 / (1 + np.exp(-logits.astype(np.float64)))
+
+
 def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:
     """Positions [M, 3], opacity logits [M, 1], log scales [M, 3], quaternions [M, 4], dc [M, 3] and the other harmonics
     [M, 3 (K - 1)] of the M Gaussians all of whose numbers are finite."""

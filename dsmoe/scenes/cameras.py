@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Optional
+from typing import Optional, Sequence
 
 import numpy as np
 import torch
@@ -56,6 +56,31 @@ class Camera:
         K = [[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]]
         return settings_from_camera(K, self.rotation, self.translation, self.width, self.height, background, sh_degree,
                                     scale_modifier, dtype, antialiasing=antialiasing, blend_mode=blend_mode)
+
+
+def quaternion_to_rotation(quaternion: Sequence[float]) -> np.ndarray:
+    """[3, 3] float64 for a quaternion (w, x, y, z), normalised here. Raises ValueError where all of it is 0."""
+    w, x, y, z = np.asarray(quaternion, np.float64)
+    length = np.sqrt(x * x + y * y + z * z + w * w)
+    if length == 0:
+        raise ValueError("the quaternion is 0, which is no rotation; one of its numbers must not be 0")
+    w, x, y, z = w / length, x / length, y / length, z / length
+    return np.array([[x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                     [2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)],
+                     [2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w]])
+
+
+def rotation_to_quaternion(rotation: np.ndarray) -> np.ndarray:
+    """[4] float64: a unit quaternion (w, x, y, z) of a rotation [3, 3]."""
+    m, trace = rotation, rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    # 4 q q^T for q = (x, y, z, w): each column is a multiple of q. That of the largest diagonal element rounds least.
+    products = np.empty((4, 4))
+    products[:3, :3] = m + m.T
+    products[range(3), range(3)] = 1 - trace + 2 * np.diag(m)
+    products[:3, 3] = products[3, :3] = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
+    products[3, 3] = 1 + trace
+    x, y, z, w = products[np.argmax(np.diag(products))]
+    return np.array([w, x, y, z]) / np.sqrt(x * x + y * y + z * z + w * w)
 
 
 def scene_extent(centers: np.ndarray) -> float:

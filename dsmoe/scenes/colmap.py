@@ -4,14 +4,13 @@ from __future__ import annotations
 import os
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import io
 
 from ..config import TrainConfig
 from ..errors import SceneError
 from ..system.files import is_folder
-from .cameras import Camera
+from .cameras import Camera, quaternion_to_rotation
 from .layout import Layout, PosedImage, hold_out
 from .lens import MODELS, colmap_intrinsics
 from .pointcloud import PointCloud
@@ -48,7 +47,6 @@ def _refuse_other_models(folder: str, camera: io.ColmapCamera) -> None:
 
 def _posed(image: io.ColmapImage, intrinsics: io.ColmapCamera, folder: str) -> PosedImage:
     fx, fy, cx, cy, lens = colmap_intrinsics(intrinsics)
-    w, x, y, z = image.qvec
-    camera = Camera(image.name, Rotation.from_quat([x, y, z, w]).as_matrix(), np.asarray(image.tvec, np.float64),
+    camera = Camera(image.name, quaternion_to_rotation(image.qvec), np.asarray(image.tvec, np.float64),
                     fx, fy, cx, cy, int(intrinsics.width), int(intrinsics.height))
     return PosedImage(camera, os.path.join(folder, image.name), lens=lens)

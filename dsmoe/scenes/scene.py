@@ -126,7 +126,7 @@ def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
 
 
 def _pose(camera: Camera, extent: float) -> bytes:
-    """A camera's pose, to a millionth of the scene's extent: another scipy may round the last digits otherwise."""
+    """A camera's pose, to a millionth of the scene's extent: another version may round the last digits otherwise."""
     return _rounded([*camera.rotation.reshape(-1), *(camera.translation / extent)], 6)
 
 

@@ -13,11 +13,10 @@ from typing import Callable, List, Sequence, Tuple
 
 import numpy as np
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import io
 
-from .cameras import Camera
+from .cameras import Camera, rotation_to_quaternion
 from .orbit import look_at
 
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (u [R], v [R]) -> colours [R, 3]
@@ -252,8 +251,8 @@ def _colmap_model(cameras: Sequence[Camera], positions: np.ndarray, colors: np.n
     intrinsics = np.array([first.fx, first.fy, first.cx, first.cy])
     images = []
     for index, camera in enumerate(cameras, start=1):
-        qx, qy, qz, qw = Rotation.from_matrix(camera.rotation).as_quat()
-        images.append(io.ColmapImage(index, camera.name, 1, np.array([qw, qx, qy, qz]), camera.translation))
+        images.append(io.ColmapImage(index, camera.name, 1, rotation_to_quaternion(camera.rotation),
+                                     camera.translation))
     return io.ColmapModel(
         cameras={1: io.ColmapCamera(1, "PINHOLE", first.width, first.height, intrinsics)},
         images=images,

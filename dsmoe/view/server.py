@@ -12,12 +12,11 @@ import time
 from typing import Any, Dict, Optional, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES, MAX_BACKGROUND_GATE
 
 from ..errors import TrainerError
-from ..scenes.cameras import Camera
+from ..scenes.cameras import Camera, quaternion_to_rotation
 from ..system.process import pip_install
 from ..system.stopwatch import synchronised_time
 from .following import Followed
@@ -255,8 +254,7 @@ def camera_of(handle: Any, most_pixels: int) -> Optional[Camera]:
     share = min(1.0, math.sqrt(most_pixels / (sides[0] * sides[1])))
     width, height = (round(_between(LEAST_SIDE, side * share, most_pixels // LEAST_SIDE)) for side in sides)
     width, height = min(width, most_pixels // height), min(height, most_pixels // width)
-    w, x, y, z = handle.wxyz
-    rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    rotation = quaternion_to_rotation(handle.wxyz).T
     position = np.asarray([_between(-FARTHEST, number, FARTHEST) for number in handle.position])
     focal = height / (2 * math.tan(_between(LEAST_ANGLE, handle.fov, math.pi - LEAST_ANGLE) / 2))
     return Camera("viewer", rotation, -rotation @ position, focal, focal, width / 2, height / 2, width, height)

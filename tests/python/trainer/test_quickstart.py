@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from diff_smoe_rasterization import cli
+from dsmoe import cli
 from diff_smoe_rasterization.io import read_gaussians
 from diff_smoe_rasterization.settings import record_of
 from dsmoe import quickstart, short_run
