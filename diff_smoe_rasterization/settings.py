@@ -23,7 +23,7 @@ smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               wh
 
 W = sum alpha_i T_i. In `smoe` the sums are of strong pairs, those of alpha >= 1/2040. A weaker pair in the tiles of its
 Gaussian's 3-sigma square is a tail: B is the sum of the tails' alpha T, and gets no gradient. B counts in pixels where
-W < `tails_below`. `smoe_eq7` sums all pairs of G >= 1e-5.
+W < `faint_below`. `smoe_eq7` sums all pairs of G >= 1e-5.
 
 With a `background_gate` lambda > 0 the background is one more expert of both, behind all others:
 
@@ -86,7 +86,7 @@ class GaussianRasterizationSettings(NamedTuple):
     background_gate: Optional[BackgroundGate] = None
     low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
     # `smoe`: tails count in pixels whose gate sum is below this. 2: in all, as in the authors' program; slower
-    tails_below: float = 0.9
+    faint_below: float = 0.9
 
 
 class Rendering(NamedTuple):

@@ -151,7 +151,7 @@ def blend_tile(rows, x, y, settings, mode):
             with torch.no_grad():
                 tails = raw.masked_fill(~skipped | (power > 0) | (raw < reference.TAIL_MIN) | stopped, 0)
                 tails = (tails * transmittance).sum(1, keepdim=True)
-                background = background + tails.masked_fill(gate_sum >= settings.tails_below, 0)
+                background = background + tails.masked_fill(gate_sum >= settings.faint_below, 0)
         total = gate_sum + background
         has_gate = gate_sum >= reference.GATE_SUM_MIN
         blended = weight @ color + background * settings.bg

@@ -77,7 +77,7 @@ class Scene(NamedTuple):
 
 def without_tails(scene):
     """Returns the scene without the tails of `smoe`, whose sum the gradients hold constant: for finite differences."""
-    return scene.with_settings(tails_below=0.0)
+    return scene.with_settings(faint_below=0.0)
 
 
 def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, principal_point=(0.0, 0.0), degree=0, bg=None,
@@ -183,8 +183,8 @@ def gradients(function, scene, outputs=(), camera=True):
 
 
 def transmittance_of(scene):
-    """Returns T behind the last pair of each pixel [H, W]."""
-    return op_results(scene)[1]["final_transmittance"].reshape(scene.settings.image_height, -1)
+    """Returns T behind the last pair of each pixel [H, W]; what is saved of it is negative in wide pixels."""
+    return op_results(scene)[1]["final_transmittance"].abs().reshape(scene.settings.image_height, -1)
 
 
 def op_arguments(scene, op="rasterize", **others):

@@ -83,7 +83,7 @@ template <class S> struct RasterConfig {
   S alpha_min = 0;           // SMoE modes: also skip alpha below this; kSmoe: such pairs are no strong ones
   S background_gate = 0;     // lambda of kSmoe and kSmoeEq7, 0 or more
   const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
-  S tails_below = S(kTailsBelow);  // kSmoe: the tails count where the gate sum is below this; above 1: everywhere
+  S faint_below = S(kFaintBelow);  // kSmoe: faint pairs and tails count where near ones sum to less; 2: everywhere
   bool antialiasing = false;
   bool clamp_color = true;  // colours from shs are at least 0
   bool depth = false;       // the expected depth is asked for
@@ -97,6 +97,8 @@ template <class S> struct RasterConfig {
   DSMOE_HD AlphaCut<S> alpha_cut() const {
     return {alpha_min, cut_of(mode) == Cut::kKernel ? gate_of_background() : S(0)};
   }
+  // Whether a pixel is first blended with its near pairs only.
+  DSMOE_HD bool blends_near_first() const { return near_first(mode) && faint_below <= S(1); }
   // What the tails reach beyond the strong pairs: is added to the squared reach of a footprint where tiles are listed.
   DSMOE_HD S tail_reach() const {
     return has_tails(mode) ? S(2) * log(max(alpha_min, S(kStrongAlpha)) / S(kTailAlpha)) : S(0);
@@ -121,7 +123,7 @@ template <class S> struct SavedForward {
   int64_t* instance_offsets = nullptr;        // [N + 1] first slot of each Gaussian; the last entry: how many there are
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
   TileInstance* instances = nullptr;          // [I], or null: no lists are kept, each pass makes them band by band
-  S* final_transmittance = nullptr;           // [H, W] T_{N+1}
+  S* final_transmittance = nullptr;           // [H, W] T_{N+1}; negative in wide pixels
   S* gate_sum = nullptr;                      // [H, W] W; the caller's alpha image but in a mode with tails
   S* tails = nullptr;                         // [H, W] B, in a mode with tails
   S* sums = nullptr;                          // [2, H, W] gate_sum and tails, in a mode with tails
