@@ -434,8 +434,8 @@ def leaves_out_faint(settings, mode):
 def wide_pixels(splats, x, y, near, settings, mode):
     """Returns which pixels are wide [pixels]: those whose near pairs alone have a gate sum below faint_below.
 
-    In the others no faint pair and no tail counts. Where alpha < 1/255, and W is the gate sum, a pair moves its pixel by
-    less than 1/255/W. near: [n, pixels], of `near_pairs`.
+    In the others no faint pair and no tail counts. There a pair of alpha < 1/255 would move its pixel by less than
+    1/255/W, with W the gate sum. near: [n, pixels], of `near_pairs`.
     """
     with torch.no_grad():
         weight, _ = numerator(pair_alphas(splats, x, y, near), mode)

@@ -29,6 +29,13 @@ class Walk:
         self.columns, self.rows = grid.tolist()
         self.order, self.tile_of, self.places = _lists(footprints, grid, self.mode in ("alpha", "smoe"))
         self.gates = footprints.gates[self.order]
+        self.wide = None  # [tiles, 16, 16]: in `smoe`, faint pairs count in these pixels only
+        if self.mode == "smoe" and settings.faint_below <= 1:
+            self.wide = self.image_of_tiles(0) > 0
+            gate_sum = self.image_of_tiles(0.0)
+            for tiles, _, weight in self.steps():
+                gate_sum[tiles] += weight.sum(1)
+            self.wide = gate_sum < settings.faint_below
 
     def image_of_tiles(self, value: float) -> torch.Tensor:
         """Returns [tiles, 16, 16] of one value, int64 where it is an int."""
@@ -69,6 +76,9 @@ class Walk:
             squared = (2 * xy * dx)[:, :, None] * dy + (xx * dx * dx)[:, :, None] + yy[..., None] * dy * dy
             alpha = torch.exp(-0.5 * squared).mul_((opacity * listed[..., None])[..., None]).clamp_(max=0.99)
             alpha.masked_fill_((squared > reach[..., None]) | (squared < 0), 0)
+            if self.wide is not None:
+                near = torch.clamp(2 * torch.log(opacity * 255), min=9)[..., None]  # alpha >= 1/255, or within 3 sigma
+                alpha.masked_fill_((squared > near) & ~self.wide[tiles, None], 0)
             if self.mode == "smoe_std":
                 weight = alpha
             else:
