@@ -15,7 +15,7 @@ What the paper leaves open is decided here:
 - Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
 - `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `tail_sum`.
-- Where the near pairs of a pixel cover it, `smoe` blends no others: see `wide_pixels`.
+- Where the near pairs of a pixel cover it, `smoe` blends no others, and `smoe_eq7` on request: see `wide_pixels`.
 - The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
 - In `smoe_eq7` a background gate that is the number 1 is the mode `alpha`, with its tile rectangle and its cut; a
   tensor of value 1 keeps the footprints. Where the background has a gate, opacity cuts pairs too: see `pair_counts`.
@@ -29,7 +29,16 @@ from typing import NamedTuple, Optional, Sequence, Tuple
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from .settings import OUTPUTS, Contributions, GaussianRasterizationSettings, Importance, Rendering, resolve_blend
+from .settings import (
+    OUTPUTS,
+    Contributions,
+    GaussianRasterizationSettings,
+    Importance,
+    Rendering,
+    leaves_out_faint,
+    resolve_blend,
+    resolve_faint_below,
+)
 
 
 def _float32(value):
@@ -426,11 +435,6 @@ def near_pairs(splats, x, y, counts):
     return counts & ((splats.opacity[:, None] * kernel >= ALPHA_MIN) | (kernel >= KERNEL_KEPT))
 
 
-def leaves_out_faint(settings, mode):
-    """Returns whether the mode has pixels without faint pairs."""
-    return mode == "smoe" and settings.faint_below <= 1
-
-
 def wide_pixels(splats, x, y, near, settings, mode):
     """Returns which pixels are wide [pixels]: those whose near pairs alone have a gate sum below faint_below.
 
@@ -439,13 +443,13 @@ def wide_pixels(splats, x, y, near, settings, mode):
     """
     with torch.no_grad():
         weight, _ = numerator(pair_alphas(splats, x, y, near), mode)
-        return weight.sum(0) < _float32(settings.faint_below)
+        return weight.sum(0) < _float32(resolve_faint_below(mode, settings.faint_below))
 
 
 def blended_pairs(splats, x, y, settings, mode, gate):
     """Returns which pairs are blended [n, pixels], and which pixels are wide [pixels]."""
     counts = pair_counts(splats, x, y, settings, mode, gate)
-    if not leaves_out_faint(settings, mode):
+    if not leaves_out_faint(mode, settings.faint_below):
         return counts, torch.ones_like(x, dtype=torch.bool)
     near = near_pairs(splats, x, y, counts)
     wide = wide_pixels(splats, x, y, near, settings, mode)

@@ -13,6 +13,7 @@ import math
 import torch
 
 from diff_smoe_rasterization import reference
+from diff_smoe_rasterization.settings import leaves_out_faint, resolve_faint_below
 
 TILE = reference.TILE
 
@@ -135,13 +136,13 @@ def blend_tile(rows, x, y, settings, mode):
             least = float(torch.tensor(gate, dtype=torch.float32) * reference.ALPHA_MIN)  # rounded as float32
             skipped |= raw < (opacity * reference.KERNEL_KEPT).clamp(max=least)
         wide = torch.ones_like(raw[:, :1], dtype=torch.bool)
-        if reference.leaves_out_faint(settings, mode):
+        if leaves_out_faint(mode, settings.faint_below):
             near = raw >= (opacity * reference.KERNEL_KEPT).clamp(max=reference.ALPHA_MIN)
             near_alpha = raw.masked_fill(skipped | ~near, 0).clamp(max=reference.ALPHA_MAX)
             behind = torch.cumprod(1 - near_alpha, 1)
             in_front = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], 1)
             gate_sum = (near_alpha * in_front).masked_fill(behind < reference.TRANSMITTANCE_MIN, 0).sum(1, keepdim=True)
-            wide = gate_sum < settings.faint_below
+            wide = gate_sum < resolve_faint_below(mode, settings.faint_below)
             skipped |= ~near & ~wide
     alpha = reference._PassThroughClamp.apply(raw.masked_fill(skipped, 0))
 

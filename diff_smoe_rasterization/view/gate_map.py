@@ -6,7 +6,7 @@ from typing import Any, Iterator, List, Tuple
 import torch
 
 from .. import reference
-from ..settings import GaussianRasterizationSettings
+from ..settings import GaussianRasterizationSettings, leaves_out_faint, resolve_faint_below
 from ..trainer.model import GaussianModel
 
 BLOCK = 32  # px; pixels are taken in squares of this side
@@ -76,13 +76,13 @@ def _largest(splats: Any, order: torch.Tensor, left: int, top: int, right: int, 
             yield begin, weight[1:], transmittance
 
     wide = torch.ones_like(x, dtype=torch.bool)
-    if reference.leaves_out_faint(settings, mode):
-        gate_sum = torch.zeros_like(x)
+    if leaves_out_faint(mode, settings.faint_below):
+        gate_sum, least = torch.zeros_like(x), resolve_faint_below(mode, settings.faint_below)
         for _, weight, _ in chunks(~wide):
             gate_sum += weight.sum(0)
-            if (gate_sum >= settings.faint_below).all():
+            if (gate_sum >= least).all():
                 break
-        wide = gate_sum < settings.faint_below
+        wide = gate_sum < least
     for begin, weight, transmittance in chunks(wide):
         best, row = weight.max(dim=0)
         better = best > largest

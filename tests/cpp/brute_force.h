@@ -108,8 +108,8 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
         decide_stop(state, gate);
         Blend<kMode>::accumulate(state, gate);
       });
-      decide(state.gate_sum, config.faint_below);
-      wide = state.gate_sum < config.faint_below;
+      decide(state.gate_sum, config.wide_below());
+      wide = state.gate_sum < config.wide_below();
     }
     auto state = PixelState<S>::open();
     S tails = S(0);

@@ -14,6 +14,7 @@ from diff_smoe_rasterization.settings import (
     FEATURE_OUTPUTS,
     GaussianRasterizationSettings,
     resolve_background_gate,
+    resolve_faint_below,
 )
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
@@ -193,6 +194,7 @@ def op_arguments(scene, op="rasterize", **others):
     gate = resolve_background_gate(mode, scene.settings.background_gate)
     learned = isinstance(gate, torch.Tensor)
     values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode),
+              "faint_below": resolve_faint_below(mode, scene.settings.faint_below),
               **dict.fromkeys(FEATURE_OUTPUTS, True),
               "background_gate": gate if learned else None, "fixed_background_gate": 0.0 if learned else gate,
               "for_backward": True, **scene.inputs, **others}

@@ -84,11 +84,12 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   // Closes the pixels that their near pairs cover, and opens the others anew, with their cells. Returns whether there
   // is one.
   DSMOE_HD bool open_wide(bool near_first) {
+    const S wide_below = tile_.config.wide_below();
     open_ = 0;
     for (int y = 0; y < extent_.rows; ++y) {
       for (int x = 0; x < extent_.columns; ++x) {
         S& transmittance = transmittance_.pixel(x, y);
-        if (near_first && !(gate_sum_.pixel(x, y) < tile_.config.faint_below)) {
+        if (near_first && !(gate_sum_.pixel(x, y) < wide_below)) {
           transmittance = -abs(transmittance);
           continue;
         }

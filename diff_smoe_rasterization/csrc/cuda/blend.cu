@@ -107,8 +107,8 @@ __device__ bool open_wide(const BlendArguments<S>& arguments, const WarpTile<S>&
   bool any = false;
   for (int k = 0; k < kPixels; ++k) {
     auto& state = pixels.state[k];
-    pixels.wide[k] = tile.inside(arguments, pixels.first + k) &&
-                     (!arguments.near_first || state.gate_sum < arguments.config.faint_below);
+    pixels.wide[k] =
+        tile.inside(arguments, pixels.first + k) && (!arguments.near_first || state.gate_sum < arguments.wide_below);
     any |= pixels.wide[k];
     state.transmittance = pixels.wide[k] ? S(1) : -abs(state.transmittance);
     state.gate_sum = pixels.wide[k] ? S(0) : state.gate_sum;

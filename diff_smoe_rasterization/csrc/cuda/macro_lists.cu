@@ -315,8 +315,8 @@ template <class S> struct TestArguments {
   S tail_reach;           // of RasterConfig
   bool near_first;        // squares are those that near pairs meet
   uint64_t* squares;      // [entries] written: which squares the footprint meets
-  uint64_t* listed;       // [entries] written: those too that only wide pixels have pairs or tails in; null where the
-                          // mode has no wide pixels
+  uint64_t* listed;       // [entries] written: those too that only wide pixels have pairs or tails in; null where
+                          // they are the same
   uint32_t* tile_counts;  // [tiles] entries of each tile; zero before
 };
 
@@ -605,7 +605,8 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   test.tail_reach = list.bounds.tail_reach;
   test.squares = allocate<uint64_t>(scratch, capacity);
   test.near_first = frame.config.blends_near_first();
-  test.listed = near_first(frame.config.mode) ? allocate<uint64_t>(scratch, capacity) : nullptr;
+  const bool marks_some = has_tails(frame.config.mode) || test.near_first;  // of the pairs for which tiles are listed
+  test.listed = marks_some ? allocate<uint64_t>(scratch, capacity) : nullptr;
   test.tile_counts = tile_counts;
   test_squares_kernel<<<resident_blocks(most_chunks), kChunk, 0, stream>>>(test);
   DSMOE_CHECK_LAUNCH("test_squares");

@@ -34,7 +34,7 @@ template <class S> struct BlendArguments {
   ImageOutputs<S> images;     // [features, H, W], and the radii [N]
   bool marked;                // entries of lists are marked with quarters
   bool near_first;            // marks are by near pairs, and so are walks that are not wide
-  S tail_reach;               // of RasterConfig
+  S wide_below, tail_reach;   // of RasterConfig
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
@@ -49,6 +49,7 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   arguments.images = frame.images;
   arguments.marked = marks_quarters(frame.inputs.num_gaussians);
   arguments.near_first = frame.config.blends_near_first();
+  arguments.wide_below = frame.config.wide_below();
   arguments.tail_reach = frame.config.tail_reach();
   arguments.pairs = work.pairs;
   return arguments;

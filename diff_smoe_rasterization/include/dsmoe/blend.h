@@ -14,7 +14,8 @@
 // `smoe` is Eq. 7 as the paper's authors compute it. Their pairs are strong or tails (Cut::kStrong). The sums over i
 // are of strong pairs. B is the sum of alpha T over the tails, which takes nothing from T. So where Gaussians end,
 // those that almost reach a pixel draw it to the background. That is the rule of wide pixels. A pixel is wide where its
-// near pairs (gate.h) have a gate sum below `faint_below`. In the others only near pairs count, and B is 0.
+// near pairs (gate.h) have a gate sum below `faint_below`. In the others only near pairs count, and B is 0. smoe_eq7
+// has that as an option.
 //
 // The first three are of one family, in which the background is one more expert, with the gate lambda:
 //
@@ -158,7 +159,8 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   static constexpr bool kDivides = true;                     // a pixel is divided by D; else D is 1
   static constexpr bool kLearnsGate = false;                 // the caller gives lambda, and may learn it
   static constexpr bool kTails = false;                      // pairs that do not count may be tails
-  static constexpr bool kNearFirst = false;                  // faint pairs and tails count in wide pixels only
+  static constexpr bool kNearFirst = false;                  // faint pairs and tails may count in wide pixels only
+  static constexpr float kFaintBelow = kFaintEverywhere;     // which pixels are wide, unless a caller says otherwise
   template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda
 
   // Reads alpha and counts, and no logit: not every walk has one here.
@@ -201,13 +203,14 @@ template <> struct Blend<BlendMode::kSmoe> : GateBlend<true, true> {
   static constexpr Law kLaw = Law::kGates;
   static constexpr Cut kCut = Cut::kStrong;
   static constexpr bool kWithinRadius = true, kLearnsGate = true, kTails = true, kNearFirst = true;
+  static constexpr float kFaintBelow = ::dsmoe::kFaintBelow;
   template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
 
 template <> struct Blend<BlendMode::kSmoeEq7> : GateBlend<true, true> {
   static constexpr const char* kName = "smoe_eq7";
   static constexpr Law kLaw = Law::kGates;
-  static constexpr bool kLearnsGate = true;
+  static constexpr bool kLearnsGate = true, kNearFirst = true;
   template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
 
@@ -245,6 +248,13 @@ DSMOE_HD constexpr bool near_first(BlendMode mode) {
   BlendModes::for_each(
       [&](auto of) { first |= decltype(of)::value == mode && Blend<decltype(of)::value>::kNearFirst; });
   return first;
+}
+
+DSMOE_HD constexpr float faint_below_of(BlendMode mode) {
+  float below = kFaintEverywhere;
+  BlendModes::for_each(
+      [&](auto of) { below = decltype(of)::value == mode ? Blend<decltype(of)::value>::kFaintBelow : below; });
+  return below;
 }
 
 // Adds a pair to the sum of a pixel's tails, B, where it is a tail and the pixel is open. state: of the pixel in front
