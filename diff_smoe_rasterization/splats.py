@@ -63,7 +63,7 @@ class Splats:
         be as they were rendered: an image that was edited in place since gives other numbers.
 
         The removal's image is that of a rendering without the Gaussian, but for two things. In `smoe` the sum of a
-        pixel's tails stays as it is, and where there was none by `tails_below`, there is none. And behind a pixel that
+        pixel's tails stays as it is, and where there was none by `faint_below`, there is none. And behind a pixel that
         was full (T < 1e-4) nothing is known. Without one of its Gaussians such a pixel may take more, of a weight below
         T / (1 - alpha). Where nothing else is in a pixel, it shows the background's colour.
 

@@ -65,7 +65,7 @@ py::dict saved() {
 
 // The core's list: names in the order of their numbers, each with the facts that Python asks for. `divides`: the
 // backward pass reads the images of the forward pass. `removable`: `importance` takes the mode. `background_gate`: the
-// mode's own, or None where the caller gives it.
+// mode's own, or None where the caller gives it. `faint_below`: what is usual in the mode.
 py::dict blend_modes() {
   using namespace py::literals;
   py::dict modes;
@@ -76,7 +76,7 @@ py::dict blend_modes() {
     modes[Policy::kName] =
         py::dict("number"_a = static_cast<int>(decltype(mode)::value), "divides"_a = Policy::kDivides,
                  "removable"_a = dsmoe::kRemovable<decltype(mode)::value>, "background_gate"_a = gate,
-                 "tails"_a = Policy::kTails);
+                 "tails"_a = Policy::kTails, "faint_below"_a = Policy::kFaintBelow);
   });
   return modes;
 }
