@@ -22,8 +22,12 @@ smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               wh
 ========== ====================== =========================================== ==========
 
 W = sum alpha_i T_i. In `smoe` the sums are of strong pairs, those of alpha >= 1/2040. A weaker pair in the tiles of its
-Gaussian's 3-sigma square is a tail: B is the sum of the tails' alpha T, and gets no gradient. B counts in pixels where
-W < `faint_below`. `smoe_eq7` sums all pairs of G >= 1e-5.
+Gaussian's 3-sigma square is a tail: B is the sum of the tails' alpha T, and gets no gradient. `smoe_eq7` sums all pairs
+of G >= 1e-5.
+
+A pair that counts is near where alpha >= 1/255, and everywhere within 3 sigma; else it is faint. Where the near pairs
+of a pixel have a gate sum of `faint_below` or more, only they are blended, and B is 0. That is 0.9 in `smoe`, and in
+`smoe_eq7` on request.
 
 With a `background_gate` lambda > 0 the background is one more expert of both, behind all others:
 
@@ -88,8 +92,8 @@ class GaussianRasterizationSettings(NamedTuple):
     # `smoe` and `smoe_eq7`: the background's weight, 0 or more; None: $DSMOE_BACKGROUND_GATE, else 0
     background_gate: Optional[BackgroundGate] = None
     low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
-    # `smoe` and `smoe_eq7`: faint pairs and tails count in pixels whose near pairs have a gate sum below this. 2: in all,
-    # as in the authors' program and in the text; slower. 0: in none. None: 0.9 in `smoe`, 2 in `smoe_eq7`
+    # `smoe` and `smoe_eq7`: faint pairs and tails count in pixels whose near pairs have a gate sum below this. 2: in
+    # all, as in the authors' program and in the text; slower. 0: in none. None: 0.9 in `smoe`, 2 in `smoe_eq7`
     faint_below: Optional[float] = None
 
 
