@@ -90,7 +90,8 @@ def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") ->
     mode, gate = (getattr(dataset, option, None) for option in OPTIONS)  # a gate that is typed is a string
     saved = _saved(dataset)
     if not mode and unrecorded == "smoe":
-        say("this model's cfg_args records no blend mode, so it is smoe with the gate 0, as its authors' program renders")
+        say("this model's cfg_args records no blend mode, so it is smoe with the gate 0, as the program of the paper's "
+            "authors renders")
         mode, gate = unrecorded, 0.0 if gate is None else gate
     elif not mode:
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "

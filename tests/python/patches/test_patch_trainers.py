@@ -116,7 +116,8 @@ AUTHORS = {
     "scene/__init__.py": "class Scene:\n    def __init__(self, args, gaussians):\n        gaussians.load_init()\n",
     "train.py": "import types\nfrom scene import Scene\n" + TRAIN.replace("import torch\n", "") + (
         "def render(camera, pc, pipe, bg):\n    return pipe.blend\n"
-        "print(training(types.SimpleNamespace(blend_mode='smoe', background_gate=''), 0, types.SimpleNamespace(), 0))\n"),
+        "dataset = types.SimpleNamespace(blend_mode='smoe', background_gate='')\n"
+        "print(training(dataset, 0, types.SimpleNamespace(), 0))\n"),
     "render.py": f"try:\n    {SPARSE_ADAM}    AVAILABLE = True\nexcept:\n    AVAILABLE = False\n" + (
         "from gaussian_renderer import render\nfrom scene import Scene\n\n\n"
         "def images_to_video(folder, path, fps=30):\n    pass\n\n\n"
