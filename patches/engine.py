@@ -23,7 +23,7 @@ from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Tra
 UNFINISHED = ".dsmoe_unfinished"  # begins the name of a folder of new files, until all are written
 # Signs of an environment, of a run's output and of another checkout or package.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
-CALLS = r"|\b(?:chosen_blend|default_(?:blend|smoe)|(?:saved_)?(?:blend|smoe)_of)\("  # without the patch, nowhere imported
+CALLS = r"|\b(?:chosen_blend|default_(?:blend|smoe)|(?:saved_)?(?:blend|smoe)_of)\("  # nowhere imported without it
 PathLike = Union[str, Path]
 
 
