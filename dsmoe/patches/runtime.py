@@ -25,7 +25,7 @@ from diff_smoe_rasterization.settings import (
 
 SHIMS, STAND_INS = (Path(__file__).resolve().parent / name for name in ("shims", "stand_ins"))
 OPTIONS = ("blend_mode", "background_gate")
-TAILS_EVERYWHERE = 2.0  # no gate sum is above 1
+FAINT_EVERYWHERE = 2.0  # no gate sum is above 1
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
 WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
@@ -49,7 +49,7 @@ def smoe_of(dataset: Any, of_saved: bool = False) -> Dict[str, Any]:
     In `smoe` tails count in every pixel, as in their program. A model without a recorded mode is of that program.
     """
     blend = blend_of(dataset, of_saved, unrecorded="smoe")
-    return {**blend, "tails_below": TAILS_EVERYWHERE} if blend["blend_mode"] == "smoe" else blend
+    return {**blend, "faint_below": FAINT_EVERYWHERE} if blend["blend_mode"] == "smoe" else blend
 
 
 def saved_smoe_of(dataset: Any) -> Dict[str, Any]:

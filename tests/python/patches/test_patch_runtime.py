@@ -107,7 +107,7 @@ def test_smoe_of_an_earlier_cfg_args_is_smoe_eq7_and_says_so(monkeypatch, tmp_pa
         "blend_mode": "smoe", "background_gate": 0.5}
 
 
-AUTHORS = {"blend_mode": "smoe", "background_gate": 0, "tails_below": 2}  # as the paper's authors' program renders
+AUTHORS = {"blend_mode": "smoe", "background_gate": 0, "faint_below": 2}  # as the paper's authors' program renders
 
 
 def test_the_authors_trainer_blends_by_smoe_with_all_tails_unless_told_otherwise(monkeypatch):

@@ -139,7 +139,7 @@ def test_the_checkout_of_the_papers_authors_blends_by_smoe_with_tails_in_every_p
                         ("render.py", "pipeline.blend = saved_smoe_of(dataset)")):
         assert words in (tmp_path / file).read_text()
     result = python("train.py", cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
-    assert "{'blend_mode': 'smoe', 'background_gate': 0.0, 'tails_below': 2.0}" in result.out, result.err
+    assert "{'blend_mode': 'smoe', 'background_gate': 0.0, 'faint_below': 2.0}" in result.out, result.err
     rendered = python("-c", "import render; print(render.AVAILABLE)", cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert rendered.out == "False\n", rendered.err
     patches.revert(tmp_path)
