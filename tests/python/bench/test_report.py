@@ -149,7 +149,7 @@ def test_packed_rows_are_read_as_they_were_and_say_once_what_they_share(tmp_path
     assert rows.read_rows(str(tmp_path)) == sorted(kept, key=lambda entry: entry["cell"])
     assert text.count("abc1234") == 1 and "per_view" not in text and "history" not in text
     (tmp_path / "rows.jsonl").write_text(text + '{"cell": "more"}\n{"cell": "wrong", "seed": "0"}', encoding="utf-8")
-    with pytest.raises(rows.ReportError, match=r"rows.jsonl, line 7: .*seed"):  # that of more is the shared one
+    with pytest.raises(rows.ReportError, match=r"rows.jsonl, line 8: .*seed"):  # line 7 takes all from the shared line
         rows.read_rows(str(tmp_path))
 
 
