@@ -1,4 +1,4 @@
-// The fuzzers' corpus (fuzz/corpus.tar.gz), by every compiler: each file is read, or refused with a message that names it.
+// The fuzzers' corpus (fuzz/corpus.tar.gz), by every compiler: each file is read, or refused with its name.
 #include <gtest/gtest.h>
 
 #include <filesystem>
