@@ -197,3 +197,9 @@ def test_gradients_hold_the_tails_constant():
     assert_all_close({name: value.cpu() for name, value in actual.items()}, expected, EXACT)
     _, plain = gradients(rasterize, without_tails(scene), ("alpha",))
     assert (plain["opacities"] - actual["opacities"]).abs().max() > 1e-3
+
+
+def test_refuses_a_faint_below_that_is_negative():
+    scene = random_scene("smoe", 3).with_settings(faint_below=-1.0)
+    with pytest.raises(ValueError, match="faint_below is -1.0; it must be 0 or more"):
+        rasterize(settings=scene.settings, **scene.inputs)
