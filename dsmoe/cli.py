@@ -16,6 +16,7 @@ from .config import (
     PRINCIPAL_POINTS,
     TrainConfig,
     add_arguments,
+    blend_mode_typed,
     config_from_arguments,
     given_options,
     holds_run,
@@ -23,7 +24,7 @@ from .config import (
 from .errors import TrainerError, in_one_line, is_lost, printable
 from .patches import TRAINERS, PatchError
 from .system.files import is_folder
-from .system.interrupt import exit_status
+from .system.interrupt import PromptInterrupt, exit_status
 
 if TYPE_CHECKING:
     from .results.evaluation import Measure
@@ -160,7 +161,7 @@ def build_parser() -> argparse.ArgumentParser:
                               usage="dsmoe run --blend-mode MODE [--background-gate V] [--trainer NAME] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
+    run.add_argument("--blend-mode", "--blend_mode", type=blend_mode_typed, choices=BLEND_MODES, required=True,
                      help="nothing records it: give the same where a trained model is rendered")
     run.add_argument("--background-gate", "--background_gate", type=float, metavar="V",
                      help="in smoe, how much the background weighs; 0 is the paper's Eq. 7 (default: "
@@ -236,7 +237,7 @@ def _choose_device(arguments: argparse.Namespace) -> None:
 def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     """What says how a trained model is opened; scene: what its folder is for."""
     parser.add_argument("--scene", help="folder " + scene)
-    parser.add_argument("--blend-mode", choices=BLEND_MODES,
+    parser.add_argument("--blend-mode", type=blend_mode_typed, choices=BLEND_MODES,
                         help="needed for a .ply that does not record it; must agree where it does")
     parser.add_argument("--background-gate", type=float, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
@@ -361,6 +362,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> Optional[int]:
+    from .system.device import check_device
     from .system.group import join_group, launched_by_torchrun, leave_group
     from .system.process import set_up_process
 
@@ -377,6 +379,7 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
 
         check_gpus(gpus, config.device)
         return launch(gpus, without_gpus(arguments.command_words))
+    check_device(config.device)
     set_up_process(config.device)
     group = join_group(config.device)
     try:
@@ -497,6 +500,7 @@ def _with_lpips(net: str, device: str) -> Measure:
 
 def _render(arguments: argparse.Namespace) -> None:
     from .inspection import render_images
+    from .opening import check_source
 
     _choose_device(arguments)
     overrides = _overrides(arguments)
@@ -507,9 +511,7 @@ def _render(arguments: argparse.Namespace) -> None:
     if is_folder(arguments.source):
         config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
     else:
-        if not os.path.isfile(arguments.source):
-            raise TrainerError(f"{arguments.source}: no such file or folder; name the output folder of `dsmoe train`, "
-                               "or a .ply and --scene")
+        check_source(arguments.source, "and --scene")
         if not arguments.scene:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
@@ -539,10 +541,11 @@ def _export(arguments: argparse.Namespace) -> None:
 
     if arguments.bake:
         _choose_device(arguments)
-    path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
-                           arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
-                           bake=arguments.bake, bake_iterations=arguments.bake_iterations,
-                           device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
+    with PromptInterrupt():
+        path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
+                               arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
+                               bake=arguments.bake, bake_iterations=arguments.bake_iterations,
+                               device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

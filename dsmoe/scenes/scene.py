@@ -45,13 +45,15 @@ class Scene:
                                    test=[view.to(device) for view in self.test])
 
 
-def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None) -> Scene:
+def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None,
+               checksums: bool = True) -> Scene:
     """Reads the folder config.scene with the config's resolution, background, principal point and initial points.
 
-    layout: what `read_layout` gave, where it is at hand. Raises SceneError naming the file and the reason.
+    layout: what `read_layout` gave, where it is at hand. checksums: whether `scene_fingerprint` is to know the images'
+    content, as a training must, which can be resumed. Raises SceneError naming the file and the reason.
     """
     layout, note = undistorted(layout or read_layout(config), config.scene, progress)
-    images = load_views(list(layout.train) + list(layout.test), config, progress)
+    images = load_views(list(layout.train) + list(layout.test), config, progress, checksums)
     train, test = images[:len(layout.train)], images[len(layout.train):]
     points = layout.points.subset(config.init_points, config.seed).subset(config.most_points, config.seed)
     extent = scene_extent(np.stack([view.camera.center for view in train]))
