@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import shlex
 import sys
@@ -198,7 +199,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     arguments, unknown = parser.parse_known_args(argv)
     arguments.command_words = list(sys.argv[1:] if argv is None else argv)
     if unknown:  # argparse would show the usage of `dsmoe` alone
-        getattr(arguments, "command_parser", parser).error("unrecognized arguments: " + " ".join(unknown))
+        _refuse(unknown, getattr(arguments, "command_parser", parser))
     try:
         status = arguments.run(arguments) or 0
         sys.stdout.flush()
@@ -219,6 +220,15 @@ def main(argv: Optional[List[str]] = None) -> int:
             hint = "; the same command continues"
         print(f"\ndsmoe {arguments.command}: interrupted{hint}", file=sys.stderr)
         return exit_status(stop)
+
+
+def _refuse(unknown: List[str], parser: argparse.ArgumentParser) -> None:
+    """Ends the command with its usage, the words that it does not know, and the options that may be meant."""
+    options = [option for action in parser._actions for option in action.option_strings]
+    meant = [name for word in unknown if word.startswith("--")
+             for name in difflib.get_close_matches(word.partition("=")[0], options, n=1)]
+    parser.error("unrecognized arguments: " + " ".join(unknown)
+                 + (f" (is {', '.join(meant)} meant?)" if meant else ""))
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:

@@ -277,6 +277,8 @@ class TrainConfig:
     def load(cls, folder: str) -> TrainConfig:
         """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
+        if not is_folder(folder):
+            raise ConfigError(f"{folder}: no such folder; name the output folder of `dsmoe train`")
         if not holds_run(folder):
             runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
             raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"

@@ -19,6 +19,7 @@ from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mo
 from .results.pictures import file_names
 from .results.rendering import Rasterize, Renderer, background_color
 from .results.rows import RESULTS_NAME, read_results, result_row, write_results
+from .results.video import check_folder
 from .scenes.cameras import Camera
 from .scenes.scene import Scene, load_cameras, load_scene, scene_fingerprint
 from .system.device import check_device
@@ -142,6 +143,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     run that config is of, whose record these two must not contradict. Raises TrainerError.
     """
     check_device(device)
+    check_folder(folder, orbit=False)
     own_record(folder, RENDER, overwrite)  # refused before anything is read
     if ply is None:
         renderer, ply = open_run(config, blend_mode, background_gate, device, rasterize)

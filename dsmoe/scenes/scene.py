@@ -64,7 +64,8 @@ def read_layout(config: TrainConfig) -> Layout:
     """Reads everything of a scene folder but its images, whose presence it checks."""
     folder = config.scene
     if not is_folder(folder):
-        raise SceneError(f"scene {folder}: no such folder")
+        is_one = "is a file; a scene is a folder" if is_file(folder) else "no such folder"
+        raise SceneError(f"scene {folder}: {is_one}")
     if is_file(os.path.join(folder, "transforms_train.json")):
         layout = read_nerf_layout(folder, config)
     elif is_folder(os.path.join(folder, "sparse")):
