@@ -160,6 +160,12 @@ def said_of_record(record: Optional[str]) -> str:
             f"{record} has another rule, and files record it as {record_of(record)}")
 
 
+def said_of_name_in_files(name: str) -> str:
+    """Returns what to give instead of a name that only files use, as a part of an error; empty for other names."""
+    mode = mode_of_record(name)
+    return f"{mode}, which files call {name}" if name not in BLEND_MODES and mode in BLEND_MODES else ""
+
+
 def resolve_blend_mode(blend_mode: Optional[str]) -> str:
     """Returns the blend mode that a rendering uses.
 
@@ -172,7 +178,8 @@ def resolve_blend_mode(blend_mode: Optional[str]) -> str:
         blend_mode = os.environ.get(BLEND_MODE_VARIABLE) or "alpha"
         source = BLEND_MODE_VARIABLE
     if blend_mode not in BLEND_MODES:
-        raise ValueError(f"{source} is {blend_mode!r}; it must be one of {', '.join(BLEND_MODES)}")
+        raise ValueError(f"{source} is {blend_mode!r}; it must be " + (
+            said_of_name_in_files(blend_mode) or f"one of {', '.join(BLEND_MODES)}"))
     return blend_mode
 
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import shlex
 import sys
@@ -16,6 +17,7 @@ from .config import (
     PRINCIPAL_POINTS,
     TrainConfig,
     add_arguments,
+    blend_mode_typed,
     config_from_arguments,
     given_options,
     holds_run,
@@ -23,7 +25,7 @@ from .config import (
 from .errors import TrainerError, in_one_line, is_lost, printable
 from .patches import TRAINERS, PatchError
 from .system.files import is_folder
-from .system.interrupt import exit_status
+from .system.interrupt import PromptInterrupt, exit_status
 
 if TYPE_CHECKING:
     from .results.evaluation import Measure
@@ -160,7 +162,7 @@ def build_parser() -> argparse.ArgumentParser:
                               usage="dsmoe run --blend-mode MODE [--background-gate V] [--trainer NAME] -- COMMAND ...",
                               description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
                                           "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", "--blend_mode", choices=BLEND_MODES, required=True,
+    run.add_argument("--blend-mode", "--blend_mode", type=blend_mode_typed, choices=BLEND_MODES, required=True,
                      help="nothing records it: give the same where a trained model is rendered")
     run.add_argument("--background-gate", "--background_gate", type=float, metavar="V",
                      help="in smoe, how much the background weighs; 0 is the paper's Eq. 7 (default: "
@@ -197,7 +199,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     arguments, unknown = parser.parse_known_args(argv)
     arguments.command_words = list(sys.argv[1:] if argv is None else argv)
     if unknown:  # argparse would show the usage of `dsmoe` alone
-        getattr(arguments, "command_parser", parser).error("unrecognized arguments: " + " ".join(unknown))
+        _refuse(unknown, getattr(arguments, "command_parser", parser))
     try:
         status = arguments.run(arguments) or 0
         sys.stdout.flush()
@@ -220,6 +222,15 @@ def main(argv: Optional[List[str]] = None) -> int:
         return exit_status(stop)
 
 
+def _refuse(unknown: List[str], parser: argparse.ArgumentParser) -> None:
+    """Ends the command with its usage, the words that it does not know, and the options that may be meant."""
+    options = [option for action in parser._actions for option in action.option_strings]
+    meant = [name for word in unknown if word.startswith("--")
+             for name in difflib.get_close_matches(word.partition("=")[0], options, n=1)]
+    parser.error("unrecognized arguments: " + " ".join(unknown)
+                 + (f" (is {', '.join(meant)} meant?)" if meant else ""))
+
+
 def _add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", choices=DEVICES, default="auto",
                         help="where to render; auto: $DSMOE_DEVICE, else the GPU if it can be used (default: auto)")
@@ -236,7 +247,7 @@ def _choose_device(arguments: argparse.Namespace) -> None:
 def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     """What says how a trained model is opened; scene: what its folder is for."""
     parser.add_argument("--scene", help="folder " + scene)
-    parser.add_argument("--blend-mode", choices=BLEND_MODES,
+    parser.add_argument("--blend-mode", type=blend_mode_typed, choices=BLEND_MODES,
                         help="needed for a .ply that does not record it; must agree where it does")
     parser.add_argument("--background-gate", type=float, metavar="X",
                         help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
@@ -361,6 +372,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> Optional[int]:
+    from .system.device import check_device
     from .system.group import join_group, launched_by_torchrun, leave_group
     from .system.process import set_up_process
 
@@ -377,6 +389,7 @@ def _train(arguments: argparse.Namespace) -> Optional[int]:
 
         check_gpus(gpus, config.device)
         return launch(gpus, without_gpus(arguments.command_words))
+    check_device(config.device)
     set_up_process(config.device)
     group = join_group(config.device)
     try:
@@ -497,6 +510,7 @@ def _with_lpips(net: str, device: str) -> Measure:
 
 def _render(arguments: argparse.Namespace) -> None:
     from .inspection import render_images
+    from .opening import check_source
 
     _choose_device(arguments)
     overrides = _overrides(arguments)
@@ -507,9 +521,7 @@ def _render(arguments: argparse.Namespace) -> None:
     if is_folder(arguments.source):
         config, ply = TrainConfig.of_run(arguments.source, "--scene", **overrides), None
     else:
-        if not os.path.isfile(arguments.source):
-            raise TrainerError(f"{arguments.source}: no such file or folder; name the output folder of `dsmoe train`, "
-                               "or a .ply and --scene")
+        check_source(arguments.source, "and --scene")
         if not arguments.scene:
             raise TrainerError("a .ply holds no cameras; name the folder that has them with --scene")
         config, ply = TrainConfig(blend_mode="alpha", **overrides).validate(), arguments.source
@@ -539,10 +551,11 @@ def _export(arguments: argparse.Namespace) -> None:
 
     if arguments.bake:
         _choose_device(arguments)
-    path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
-                           arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
-                           bake=arguments.bake, bake_iterations=arguments.bake_iterations,
-                           device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
+    with PromptInterrupt():
+        path, warning = export(arguments.source, arguments.output, arguments.format, arguments.sh_degree,
+                               arguments.blend_mode, arguments.background_gate, overwrite=arguments.overwrite,
+                               bake=arguments.bake, bake_iterations=arguments.bake_iterations,
+                               device=arguments.device if arguments.bake else "cpu", **_overrides(arguments))
     print(f"{path}: {os.path.getsize(path):,} bytes")
     if warning:
         print(warning)

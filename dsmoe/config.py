@@ -18,6 +18,7 @@ from diff_smoe_rasterization.settings import (
     record_of,
     resolve_background_gate,
     resolve_blend_mode,
+    said_of_name_in_files,
 )
 
 from .errors import ConfigError
@@ -276,6 +277,8 @@ class TrainConfig:
     def load(cls, folder: str) -> TrainConfig:
         """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
         path = os.path.join(folder, CONFIG_NAME)
+        if not is_folder(folder):
+            raise ConfigError(f"{folder}: no such folder; name the output folder of `dsmoe train`")
         if not holds_run(folder):
             runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
             raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"
@@ -385,6 +388,13 @@ def _number_or_learned(text: str) -> Union[float, str]:
         raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
 
 
+def blend_mode_typed(text: str) -> str:
+    """What --blend-mode takes: `choices` refuses what is no blend mode, this says more of names that files use."""
+    if said_of_name_in_files(text):
+        raise argparse.ArgumentTypeError(f"is {text!r}; it must be {said_of_name_in_files(text)}")
+    return text
+
+
 def _flags(option: dataclasses.Field[Any]) -> Sequence[str]:
     """How an option is typed; texts have the first of these."""
     return option.metadata.get("flags", ("--" + option.name.replace("_", "-"),))
@@ -423,7 +433,8 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
         if option.type == "bool":
             group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
             continue
-        keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": argparse.SUPPRESS}
+        kind = blend_mode_typed if option.name == "blend_mode" else _TYPES[str(option.type)]
+        keywords: Dict[str, Any] = {"type": kind, "default": argparse.SUPPRESS}
         if option.metadata.get("required"):
             keywords["required"] = True
         elif option.default is not None and defaults:
@@ -431,8 +442,8 @@ def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
         if option.metadata.get("choices"):
             keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
         else:
-            kind = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
-            keywords["metavar"] = option.metadata.get("metavar", kind)
+            letter = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
+            keywords["metavar"] = option.metadata.get("metavar", letter)
         group.add_argument(*flags, help=text, dest=option.name, **keywords)
     return groups
 
@@ -455,4 +466,20 @@ def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[Train
         config = dataclasses.replace(config.shortened(), **options)
     if earlier:
         earlier.check_continued_by(config)
+    _check_learned(config, options)
     return config.validate()
+
+
+def _check_learned(config: TrainConfig, given: Dict[str, Any]) -> None:
+    """Raises ConfigError where it is given how the background gate is learned, and the gate is not learned."""
+    useless = [option for option in dataclasses.fields(TrainConfig)
+               if option.name in _learned_gate_of(config.blend_mode) and option.name in given]
+    if not useless or config.background_gate == LEARNED:
+        return
+    if config.blend_mode in GATED_MODES:
+        asked = "--background-gate" if "background_gate" in given else "$" + BACKGROUND_GATE_VARIABLE
+        why = f"{asked} fixes the background gate at {config.background_gate}; --background-gate {LEARNED} learns it"
+    else:
+        why = (f"in the blend mode {config.blend_mode} no background gate is learned; --blend-mode "
+               f"{' or '.join(GATED_MODES)} learns one")
+    raise ConfigError(f"{_flag(useless[0])} is given, but {why}")

@@ -1,6 +1,7 @@
 """The errors a user can cause; the command prints their text and no traceback."""
 from __future__ import annotations
 
+import os
 import re
 from typing import Optional
 
@@ -27,6 +28,8 @@ class ConfigError(TrainerError):
 
 def in_one_line(error: BaseException) -> Optional[str]:
     """What a command prints of an error in place of a traceback; None where the error is no user's."""
+    if isinstance(error, OSError) and error.strerror:  # whose text begins with a number
+        return printable(f"{os.fsdecode(error.filename)}: {error.strerror}" if error.filename else error.strerror)
     if isinstance(error, (TrainerError, ImportError, OSError)):
         return str(error)
     return out_of_memory(error)

@@ -9,7 +9,7 @@ from PIL import Image
 from .errors import TrainerError
 from .inspection import said_of_images, to_image, write_images
 from .opening import Trained
-from .results.video import check_video, is_video, write_video
+from .results.video import check_folder, check_video, is_video, write_video
 from .scenes.cameras import Camera
 from .system.progress import progress_bar
 
@@ -25,6 +25,8 @@ def film(trained: Trained, path: str, frames: int = 120, fps: float = 30.0, outp
         raise TrainerError(f"--frames is {frames}; it must be at least 1")
     if not 0 < fps <= 1000:
         raise TrainerError(f"--fps is {fps:g}; it must be above 0 and at most 1000")
+    if not is_video(path):
+        check_folder(path, orbit=True)
     cameras = trained.orbit.cameras(frames, trained.cameras[0])
     if not is_video(path):
         of = f"{said_of_images(trained.config, trained.ply, trained.renderer)}, an orbit of {frames}"

@@ -11,20 +11,22 @@ from PIL import Image
 
 from diff_smoe_rasterization.settings import mode_of_record
 
-from .config import LEARNED, TrainConfig
+from .config import CHECKPOINT_NAME, LEARNED, TrainConfig
 from .errors import TrainerError
 from .results.evaluation import Measure, evaluate
 from .results.metrics import image_metrics, quantised
 from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
 from .results.pictures import file_names
 from .results.rendering import Rasterize, Renderer, background_color
-from .results.rows import read_results, result_row, write_results
+from .results.rows import RESULTS_NAME, read_results, result_row, write_results
+from .results.video import check_folder
 from .scenes.cameras import Camera
-from .scenes.scene import load_cameras, load_scene
+from .scenes.scene import Scene, load_cameras, load_scene, scene_fingerprint
 from .system.device import check_device
 from .system.files import write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.progress import progress_bar
+from .training.checkpoint import damage_named, load_checkpoint
 from .training.loop import PER_VIEW_NAME
 
 RENDER = "dsmoe render"  # in its folders' records
@@ -35,15 +37,19 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
                  measure: Measure = image_metrics) -> Dict[str, Any]:
     """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
 
-    scene_folder: where the scene lies, if not where it was trained. measure: as in `evaluate`. A folder that cannot be
-    written to is told, no error. Raises TrainerError.
+    scene_folder: where the scene lies, if not where it was trained. Where it is another scene, or that is not known, a
+    line says so; another scene's row is not written. measure: as in `evaluate`. A folder that cannot be written to is
+    told, no error. Raises TrainerError.
     """
     options = {"scene": scene_folder} if scene_folder else {}
     config = TrainConfig.of_run(output, "--scene", device=device, **options)
     check_device(device)
     ply = trained_model_path(output, config.iterations)
     earlier = [row for row in read_results(output) if _is_of(row, config)]
-    scene = load_scene(config, progress).to(device)
+    scene = load_scene(config, progress, checksums=bool(scene_folder)).to(device)
+    note, is_other = _compared(scene, config) if scene_folder else ("", False)
+    if note:
+        print(note)
     renderer = open_renderer(config, ply, config.blend_mode, device, rasterize, _gate_of(config))
     views = {"test": scene.test, "train": scene.train}[split]
     if not views:
@@ -56,7 +62,7 @@ def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_fo
     evaluation = evaluate(renderer, views, device, progress, measure)
     seconds = earlier[0].get("train_seconds") if earlier else None
     row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
-    if split == "test":
+    if split == "test" and not is_other:
         try:
             write_results(output, [row])
             write_json_atomically(os.path.join(output, PER_VIEW_NAME), evaluation.per_view)
@@ -95,6 +101,22 @@ def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: O
     return open_renderer(config, ply, mode, device, rasterize, asked_gate), ply
 
 
+def _compared(scene: Scene, config: TrainConfig) -> Tuple[str, bool]:
+    """What to say of a scene that the run's checkpoint does not record, and whether it is another one; else nothing."""
+    path = os.path.join(config.output, CHECKPOINT_NAME)
+    try:
+        with damage_named(path):
+            recorded = dict(load_checkpoint(path, "cpu")["scene"])
+    except TrainerError as error:
+        return f"note: whether {config.scene} is the scene that the run was trained on is not known: {error}", False
+    for name, here in scene_fingerprint(scene).items():
+        there = recorded.get(name, here)  # earlier versions recorded fewer of them
+        if there != here:
+            return (f"note: {config.scene} is not the scene that {config.output} was trained on: {name} {there} there "
+                    f"and {here} here; {RESULTS_NAME} stays"), True
+    return "", False
+
+
 def _is_of(row: Dict[str, Any], config: TrainConfig) -> bool:
     """Whether a row is of the run's blend mode, whichever version wrote both."""
     mode = row.get("blend_mode")
@@ -121,6 +143,7 @@ def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: s
     run that config is of, whose record these two must not contradict. Raises TrainerError.
     """
     check_device(device)
+    check_folder(folder, orbit=False)
     own_record(folder, RENDER, overwrite)  # refused before anything is read
     if ply is None:
         renderer, ply = open_run(config, blend_mode, background_gate, device, rasterize)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, List, Optional, Tuple
 
 from .config import TrainConfig
+from .errors import TrainerError
 from .inspection import open_renderer, open_run
 from .model import GaussianModel
 from .results.rendering import Renderer
@@ -12,7 +13,7 @@ from .scenes.cameras import Camera
 from .scenes.orbit import Orbit, default_camera, orbit_of_cameras, orbit_of_points
 from .scenes.scene import load_cameras
 from .system.device import check_device
-from .system.files import is_folder
+from .system.files import is_file, is_folder
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
     run's scene is not there. Raises TrainerError.
     """
     check_device(device)
+    check_source(source)
     if is_folder(source):
         config = TrainConfig.load(source).changed(**options)
         renderer, ply = open_run(config, blend_mode, background_gate, device)
@@ -43,6 +45,13 @@ def open_trained(source: str, blend_mode: Optional[str] = None, background_gate:
         renderer = open_renderer(config, ply, blend_mode, device, asked_gate=background_gate)
     cameras, orbit = places(config, renderer.model, needed="scene" in options)
     return Trained(config, ply, renderer, cameras, orbit)
+
+
+def check_source(source: str, besides: str = "") -> None:
+    """Raises TrainerError where there is no such folder or file. besides: what a .ply needs, for that error."""
+    if not is_folder(source) and not is_file(source):
+        raise TrainerError(f"{source}: no such file or folder; name the output folder of `dsmoe train`, or a .ply"
+                           + (f" {besides}" if besides else ""))
 
 
 def places(config: TrainConfig, model: GaussianModel, needed: bool = False) -> Tuple[List[Camera], Orbit]:

@@ -64,8 +64,11 @@ def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
     """
     try:
         stored = io.read_gaussians(path)
-    except (OSError, ValueError) as error:
-        raise TrainerError(str(error)) from error
+    except OSError as error:
+        raise TrainerError(f"{path}: {error.strerror or error}") from error
+    except ValueError as error:
+        other = "; it is no model of Gaussians, as `dsmoe train` and other 3DGS programs write it"
+        raise TrainerError(f"{error}{other if 'no scalar property' in str(error) else ''}") from error
     arrays = {"means3D": stored.means3D, "dc": stored.dc, "shs": stored.shs, "opacities": stored.opacity_logits,
               "scales": stored.log_scales, "rotations": stored.rotations}
     shown = finite_gaussians(stored)

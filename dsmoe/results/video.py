@@ -12,11 +12,21 @@ from ..system.files import new_file
 from ..system.process import pip_install
 
 FORMATS = (".mp4", ".gif")
+OTHER_FORMATS = (".avi", ".mkv", ".mov", ".webm")  # which nobody means as a folder's name
 
 
 def is_video(path: str) -> bool:
     """Whether the path's ending is one that `write_video` writes."""
     return os.path.splitext(path)[1].lower() in FORMATS
+
+
+def check_folder(path: str, orbit: bool) -> None:
+    """Raises TrainerError where a folder for images has the name of a video. orbit: whether a video could be made."""
+    ending = os.path.splitext(path)[1].lower()
+    if ending in FORMATS and not orbit:
+        raise TrainerError(f"{path}: a video is written with --orbit; without it -o names a folder")
+    if ending in OTHER_FORMATS:
+        raise TrainerError(f"{path}: a video can end in {' or '.join(FORMATS)}; {ending} is not written")
 
 
 def check_video(path: str) -> None:

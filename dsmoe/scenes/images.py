@@ -3,14 +3,15 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import List, Optional, Sequence, Tuple
+from typing import Any, BinaryIO, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from diff_smoe_rasterization.images import as_float
 
@@ -39,7 +40,7 @@ class View:
     image: torch.Tensor  # [3, H, W] uint8, over black or white
     opacity: Optional[torch.Tensor] = None  # [1, H, W] uint8; --random-background: the alpha plane, if there is one
     mask: Optional[torch.Tensor] = None  # [1, H, W] uint8: 255, the pixel counts, to 0; None: all count
-    checksum: str = ""  # of the image's file and the mask's; empty where there is no file
+    checksum: str = ""  # of the image's file and the mask's, where it was asked for; else empty
 
     def image_float(self) -> torch.Tensor:
         """[3, H, W] in [0, 1]"""
@@ -61,10 +62,17 @@ class View:
                                             if plane is not None})
 
 
-def open_image(path: str) -> Image.Image:
+def open_image(file: Union[str, BinaryIO]) -> Image.Image:
     """The image in a file of one of the FORMATS, not read yet. Raises one of UNREADABLE."""
     Image.init()
-    return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
+    return Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN])
+
+
+def unreadable(path: str, error: Exception) -> SceneError:
+    """The error for a file whose reading raised one of UNREADABLE."""
+    if isinstance(error, UnidentifiedImageError):  # which names a buffer
+        return SceneError(f"{path}: not a readable image (it is none of {', '.join(FORMATS)})")
+    return SceneError(f"{path}: not a readable image ({getattr(error, 'strerror', None) or error})")
 
 
 def target_size(width: int, height: int, resolution: int) -> Tuple[int, int]:
@@ -82,40 +90,41 @@ def target_size(width: int, height: int, resolution: int) -> Tuple[int, int]:
     return max(1, int(width / factor)), max(1, int(height / factor))
 
 
-def load_views(images: Sequence[PosedImage], config: TrainConfig, progress: bool) -> List[View]:
+def load_views(images: Sequence[PosedImage], config: TrainConfig, progress: bool, checksums: bool) -> List[View]:
     """Reads images in parallel threads, in order, with a progress bar."""
     with ThreadPoolExecutor(min(16, 2 * (os.cpu_count() or 1))) as pool:
-        loading = pool.map(lambda image: load_view(image, config), images)
+        loading = pool.map(lambda image: load_view(image, config, checksums), images)
         return list(progress_bar(loading, total=len(images), desc="images", unit="image", disable=not progress,
                                  leave=False))
 
 
-def load_view(posed: PosedImage, config: TrainConfig) -> View:
+def load_view(posed: PosedImage, config: TrainConfig, checksum: bool) -> View:
     """Reads one image: transparency composited, then resized; the camera follows the size."""
+    # Of the files, not of the pixels: another release of Pillow may decode the same JPEG to other pixels.
+    hashed = hashlib.sha256() if checksum else None
     try:
-        with open_image(posed.path) as file:
+        with open_image(_content(posed.path, hashed)) as file:
             image = composited(file, config.white_background)
             opacity = _opacity(file) if config.random_background else None
     except UNREADABLE as error:
-        raise SceneError(f"{posed.path}: not a readable image ({error})") from error
+        raise unreadable(posed.path, error) from error
     camera = fitted_camera(posed, image.size, config)
-    mask = None if posed.mask is None else _mask(posed.mask, posed.path, image.size, camera)
+    mask = None if posed.mask is None else _mask(posed.mask, hashed, posed.path, image.size, camera)
     try:
         return View(camera, _planes(image, camera), None if opacity is None else _planes(opacity, camera), mask,
-                    _checksum(posed.path, posed.mask))
+                    hashed.hexdigest() if hashed else "")
     except MemoryError as error:  # Pillow's says nothing
         raise SceneError(f"{posed.path}: the machine is out of memory at {camera.width}x{camera.height}; take smaller "
                          "images (--resolution)") from error
 
 
-def _checksum(path: str, mask: Optional[str]) -> str:
-    """Of the files, not of the pixels: another release of Pillow may decode the same JPEG to other pixels."""
-    hashed = hashlib.sha256()
-    for name in (path, mask):
-        if name is not None:
-            with open(name, "rb") as file:
-                hashed.update(file.read())
-    return hashed.hexdigest()
+def _content(path: str, hashed: Any) -> BinaryIO:
+    """The content of a file, read once and added to the checksum, if there is one."""
+    with open(path, "rb") as file:
+        content = file.read()
+    if hashed:
+        hashed.update(content)
+    return io.BytesIO(content)
 
 
 def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -> torch.Tensor:
@@ -125,13 +134,13 @@ def _planes(image: Image.Image, camera: Camera, resample: int = Image.BICUBIC) -
     return torch.from_numpy(np.atleast_3d(np.array(image))).permute(2, 0, 1).contiguous()
 
 
-def _mask(path: str, image_path: str, size: Tuple[int, int], camera: Camera) -> torch.Tensor:
+def _mask(path: str, hashed: Any, image_path: str, size: Tuple[int, int], camera: Camera) -> torch.Tensor:
     """[1, H, W] uint8: the mask of an image file of that size (width, height)."""
     try:
-        with open_image(path) as file:
+        with open_image(_content(path, hashed)) as file:
             mask = composited(file, white=False).convert("L")
     except UNREADABLE as error:
-        raise SceneError(f"{path}: not a readable image ({error})") from error
+        raise unreadable(path, error) from error
     if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > MAX_ASPECT_ERROR:
         raise SceneError(f"{path}: the mask is {mask.width}x{mask.height}, its image {image_path} "
                          f"{size[0]}x{size[1]}: another shape")
@@ -184,4 +193,4 @@ def image_size(path: str) -> Tuple[int, int]:
         with open_image(path) as file:
             return file.size
     except UNREADABLE as error:
-        raise SceneError(f"{path}: not a readable image ({error})") from error
+        raise unreadable(path, error) from error

@@ -45,13 +45,15 @@ class Scene:
                                    test=[view.to(device) for view in self.test])
 
 
-def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None) -> Scene:
+def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None,
+               checksums: bool = True) -> Scene:
     """Reads the folder config.scene with the config's resolution, background, principal point and initial points.
 
-    layout: what `read_layout` gave, where it is at hand. Raises SceneError naming the file and the reason.
+    layout: what `read_layout` gave, where it is at hand. checksums: whether `scene_fingerprint` is to know the images'
+    content, as a training must, which can be resumed. Raises SceneError naming the file and the reason.
     """
     layout, note = undistorted(layout or read_layout(config), config.scene, progress)
-    images = load_views(list(layout.train) + list(layout.test), config, progress)
+    images = load_views(list(layout.train) + list(layout.test), config, progress, checksums)
     train, test = images[:len(layout.train)], images[len(layout.train):]
     points = layout.points.subset(config.init_points, config.seed).subset(config.most_points, config.seed)
     extent = scene_extent(np.stack([view.camera.center for view in train]))
@@ -62,7 +64,8 @@ def read_layout(config: TrainConfig) -> Layout:
     """Reads everything of a scene folder but its images, whose presence it checks."""
     folder = config.scene
     if not is_folder(folder):
-        raise SceneError(f"scene {folder}: no such folder")
+        is_one = "is a file; a scene is a folder" if is_file(folder) else "no such folder"
+        raise SceneError(f"scene {folder}: {is_one}")
     if is_file(os.path.join(folder, "transforms_train.json")):
         layout = read_nerf_layout(folder, config)
     elif is_folder(os.path.join(folder, "sparse")):

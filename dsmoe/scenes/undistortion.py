@@ -17,7 +17,7 @@ from ..system.files import is_file
 from ..system.process import pip_install
 from ..system.progress import progress_bar
 from .cameras import Camera
-from .images import UNREADABLE, image_size, open_image
+from .images import UNREADABLE, image_size, open_image, unreadable
 from .layout import Layout, PosedImage
 from .lens import Lens
 
@@ -126,7 +126,7 @@ def _read(path: str) -> Image.Image:
             has_alpha = file.mode in ("RGBA", "LA", "PA") or "transparency" in file.info
             return file.convert("RGBA" if has_alpha else "RGB")
     except UNREADABLE as error:
-        raise SceneError(f"{path}: not a readable image ({error})") from error
+        raise unreadable(path, error) from error
 
 
 def _write(image: Image.Image, path: str) -> None:

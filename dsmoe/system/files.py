@@ -74,8 +74,8 @@ def check_output(path: str, overwrite: bool = True) -> None:
 def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
     """Gives the name of a file to write beside `path`, with its ending; without an error it becomes `path`.
 
-    No two processes get the same name. What a killed process left is removed. Raises TrainerError as `check_output`,
-    also where the file has come meanwhile.
+    No two processes get the same name. What a killed process left is removed. Raises OSError, which names `path`, and
+    TrainerError as `check_output`, also where the file has come meanwhile.
     """
     check_output(path, overwrite)
     folder, name = os.path.split(os.path.abspath(path))
@@ -90,6 +90,10 @@ def new_file(path: str, overwrite: bool = True) -> Iterator[str]:
         yield temporary
         check_output(path, overwrite)
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is not None and os.fsdecode(error.filename) == temporary:
+            raise OSError(error.errno, error.strerror, path) from error
+        raise
     finally:
         _remove(temporary)
 

@@ -19,6 +19,28 @@ def exit_status(stop: KeyboardInterrupt) -> int:
     return 128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT)
 
 
+class PromptInterrupt:
+    """A context in which SIGTERM and SIGHUP end a command as Ctrl-C does: what removes unfinished files still runs.
+
+    It leaves alone what `DelayedInterrupt` does.
+    """
+
+    def __enter__(self) -> None:
+        self._usual: Dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+                if signal.getsignal(number) == signal.SIG_DFL:
+                    self._usual[number] = signal.signal(number, self._stop)
+
+    def __exit__(self, *error: Any) -> None:
+        for number, handler in self._usual.items():
+            signal.signal(number, handler)
+
+    def _stop(self, number: int, frame: Any) -> None:
+        self.__exit__()  # a second one ends the process
+        raise Terminated(number)
+
+
 class DelayedInterrupt:
     """A context in which the first Ctrl-C, SIGTERM or SIGHUP sets `asked`; a second one acts at once, as elsewhere.
 

@@ -99,7 +99,7 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
         # Trained positions move little: they start at the geometric mean of the run's rates.
         position_lr_init=math.sqrt(config.position_lr_init * config.position_lr_final),
         position_lr_final=config.position_lr_final)
-    trainer = Trainer(config, load_scene(config, progress))
+    trainer = Trainer(config, load_scene(config, progress, checksums=False))
     trainer.optimizer.replace_all(renderer.model.raw)
     trainer.model.active_sh_degree = renderer.model.active_sh_degree
     strategy = RisingGate if _takes_gate(mode) else FixedGaussians

@@ -96,6 +96,8 @@ class Viewer:
 
     def __init__(self, followed: Followed, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Starts the server; where the port is taken, it takes the next free one. Raises TrainerError without viser."""
+        if not 0 <= port < 2**16:
+            raise TrainerError(f"--port is {port}; it must be between 0 and {2**16 - 1}")
         try:
             import viser
         except ImportError as error:

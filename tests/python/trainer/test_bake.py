@@ -2,7 +2,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
+import signal
 
 import pytest
 
@@ -104,6 +106,29 @@ def test_a_mode_without_a_gate_is_baked_in_alpha_alone(smoe_run, tiny_scene, tmp
     assert main(["export", ablation, "-o", path, "--scene", tiny_scene, "--bake", "alpha", "--bake-iterations",
                  "5"]) == 0
     assert "dB in smoe_tn," in capsys.readouterr().out and io.read_gaussians(path).blend_mode == "alpha"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_an_export_that_is_ended_leaves_nothing(smoe_run, tmp_path, capsys, monkeypatch, number):
+    """Neither a part of the file nor the baked model, whose folder is temporary."""
+    temporary, output = tmp_path / "temporary", tmp_path / "output"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+
+    def write_half(path, gaussians):
+        with open(path, "wb") as file:
+            file.write(b"ply")
+        if os.path.dirname(path) == str(output):
+            assert len(list(temporary.iterdir())) == 1
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(io, "write_gaussians", write_half)
+    monkeypatch.setattr(io, "read_gaussians", lambda path, read=io.read_gaussians: read(
+        model_path(smoe_run.output, 250)))
+    words = ["export", smoe_run.output, "-o", str(output / "new.ply"), "--bake", "alpha", "--bake-iterations", "1"]
+    assert main(words) == 128 + number and "interrupted" in capsys.readouterr().err
+    assert not [*temporary.iterdir(), *output.iterdir()]
+    assert signal.getsignal(number) == signal.SIG_DFL
 
 
 def test_what_cannot_be_baked_is_refused(smoe_run, tmp_path, capsys):

@@ -126,6 +126,13 @@ def test_help_has_groups_and_a_wrong_mode_is_named_where_it_is_given(scene, caps
     usage, error = capsys.readouterr().err.rsplit("\n", 2)[:2]
     assert usage.count("\n") <= 1, "the error is not behind a page of options"
     assert "argument --blend-mode: invalid choice: 'smo' (choose from" in error and "smoe_tn" in error
+    for words in (["train", scene, "-o", "out"], ["view", "out"], ["run"]):
+        with pytest.raises(SystemExit):
+            main([*words, "--blend-mode", "smoe_tails"])
+        assert "is 'smoe_tails'; it must be smoe, which files call smoe_tails" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["train", scene, "-o", "out", "--itertions", "5"])
+    assert "unrecognized arguments: --itertions 5 (is --iterations meant?)" in capsys.readouterr().err
 
 
 def test_eval_measures_the_same_again(trained, capsys):
@@ -246,9 +253,25 @@ def test_eval_of_a_moved_run_and_a_moved_scene(trained, scene, tmp_path, capsys)
     shutil.copytree(trained, run)
     shutil.copytree(scene, moved)
     assert main(["eval", run, "--scene", moved, "--split", "train"]) == 0
-    assert "train views" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "train views" in said and "note" not in said
     assert results_of(run) == results_of(trained), "only the test views' figures are results"
     assert "nowhere" in fails(capsys, "eval", run, "--scene", str(tmp_path / "nowhere"))
+
+
+def test_eval_says_where_it_measures_another_scene(trained, scene, tmp_path, capsys):
+    run, other = str(tmp_path / "run"), str(tmp_path / "scene")
+    shutil.copytree(trained, run)
+    shutil.copytree(scene, other)
+    image = os.path.join(other, "images", "view_003.png")
+    Image.open(image).point(lambda value: value // 2).save(image)
+    assert main(["eval", run, "--scene", other]) == 0
+    said = capsys.readouterr().out
+    assert f"note: {other} is not the scene that {run} was trained on: checksum of the training images" in said
+    assert "test views" in said and results_of(run) == results_of(trained), "figures, which are not the run's"
+    os.remove(os.path.join(run, "checkpoint.pt"))
+    assert main(["eval", run, "--scene", scene]) == 0
+    assert f"note: whether {scene} is the scene that the run was trained on is not known" in capsys.readouterr().out
 
 
 def test_render_writes_what_eval_measures(trained, scene, tmp_path):
@@ -527,7 +550,7 @@ def test_resume_of_a_folder_alone_has_the_options_of_the_run(trained, tmp_path, 
     with open(ply_of(output), "rb") as mine, open(ply_of(trained), "rb") as theirs:
         assert mine.read() == theirs.read()
     assert "--seed is 0, not 7" in fails(capsys, "train", *words, output, "--seed", "7")
-    assert "config.json" in fails(capsys, "train", *words, str(tmp_path / "none"))
+    assert "no such folder" in fails(capsys, "train", *words, str(tmp_path / "none"))
     with pytest.raises(SystemExit):
         main(["train", "-o", output])
     assert "SCENE and -o OUT are needed" in capsys.readouterr().err
@@ -564,10 +587,19 @@ def test_errors_come_before_anything_is_written(scene, tmp_path, capsys):
     assert "no such folder" in fails(capsys, "train", str(tmp_path / "nowhere"), "-o", output)
     assert "--iterations is 0" in fails(capsys, "train", scene, "-o", output, "--iterations", "0")
     if not torch.cuda.is_available():
-        assert "no CUDA device" in fails(capsys, "train", scene, "-o", output, "--device", "cuda")
+        assert main(["train", scene, "-o", output, "--device", "cuda"]) == 1
+        said = capsys.readouterr()
+        assert "no CUDA device" in said.err and not said.out, "the error alone"
     assert not os.path.exists(output)
     assert "config.json" in fails(capsys, "eval", str(tmp_path))
+    cloud = str(tmp_path / "points.ply")
+    io.write_points(cloud, io.Points(np.zeros((3, 3))))
+    assert "a video is written with --orbit" in fails(capsys, "render", cloud, "-o", output + ".mp4", "--scene", scene)
+    assert "points.ply" in fails(capsys, "export", cloud) and "no model of Gaussians" in fails(capsys, "export", cloud)
     assert "--scene" in fails(capsys, "render", "model.ply", "-o", output)
+    for words in (["view", "model.ply"], ["export", "model.ply"], ["render", "model.ply", "-o", output, "--orbit"]):
+        said = fails(capsys, *words)
+        assert "model.ply: no such file or folder; name the output folder of `dsmoe train`, or a .ply" in said
     assert "model.ply" in fails(capsys, "render", "model.ply", "-o", output, "--scene", scene)
 
 

@@ -108,6 +108,22 @@ def test_how_a_gate_is_learned_follows_the_mode_unless_given(tmp_path):
     assert (old.blend_mode, *learned(old)) == ("smoe_eq7", 0.03, 1, 0.01)
 
 
+@pytest.mark.parametrize("option", ["start", "bound", "lr"])
+def test_how_a_gate_is_learned_is_refused_where_none_is(monkeypatch, option):
+    given = [f"--background-gate-{option}", "0.05"]
+    for mode in ("alpha", "smoe_tn"):
+        with pytest.raises(ConfigError, match=f"{given[0]} is given, but in the blend mode {mode} no background gate "
+                                              "is learned; --blend-mode smoe or smoe_eq7 learns one"):
+            parse("--blend-mode", mode, *given)
+    learns = "fixes the background gate at 0.2; --background-gate learned learns it"
+    with pytest.raises(ConfigError, match=f"{given[0]} is given, but --background-gate {learns}"):
+        parse("--blend-mode", "smoe", "--background-gate", "0.2", *given)
+    monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.2")
+    with pytest.raises(ConfigError, match=f"{given[0]} is given, but .DSMOE_BACKGROUND_GATE {learns}"):
+        parse("--blend-mode", "smoe", *given)
+    parse("--blend-mode", "smoe", "--background-gate", "learned", *given)
+
+
 @pytest.mark.parametrize("mode, expected", [("smoe_eq7", 0.0), ("alpha", 1.0), ("smoe_tn", 0.0)])
 def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypatch, mode, expected):
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")  # must not fill the gap
@@ -192,6 +208,8 @@ def test_what_is_no_file_of_options_is_named(tmp_path, content):
 def test_a_folder_without_a_run(tmp_path):
     with pytest.raises(ConfigError, match="dsmoe train"):
         TrainConfig.load(str(tmp_path))
+    with pytest.raises(ConfigError, match="nowhere: no such folder; name the output folder of `dsmoe train`"):
+        TrainConfig.load(str(tmp_path / "nowhere"))
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(ConfigError, match="config.json: not valid json"):
         TrainConfig.load(str(tmp_path))

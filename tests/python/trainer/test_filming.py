@@ -76,7 +76,7 @@ def test_an_mp4_plays_every_frame(tmp_path):
 
 @pytest.mark.parametrize("output, arguments, text", [
     ("a.gif", ["--depth"], "a video has room for colours only"), ("a", ["--frames", "0"], "--frames is 0"),
-    ("a.gif", ["--fps", "0"], "--fps is 0")])
+    ("a.gif", ["--fps", "0"], "--fps is 0"), ("a.mov", [], "a video can end in .mp4 or .gif; .mov is not written")])
 def test_what_cannot_be_filmed_is_refused(model, tmp_path, capsys, output, arguments, text):
     assert orbit(model, tmp_path / output, *arguments) == 1
     assert text in capsys.readouterr().err and not (tmp_path / output).exists()

@@ -14,7 +14,7 @@ from PIL import Image
 
 from diff_smoe_rasterization import io
 from dsmoe.config import TrainConfig
-from dsmoe.errors import TrainerError
+from dsmoe.errors import TrainerError, in_one_line
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system import files
@@ -518,6 +518,15 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     with open(path, encoding="utf-8") as file:
         assert file.read() == "old"
     assert os.listdir(tmp_path) == ["file"]
+
+
+def test_an_error_of_an_unfinished_file_names_the_file(tmp_path):
+    path = str(tmp_path / "model.ply")
+    with pytest.raises(OSError) as error, files.new_file(path) as temporary:
+        os.mkdir(temporary)
+        with open(temporary, "wb"):
+            pass
+    assert in_one_line(error.value) == f"{path}: Is a directory"
 
 
 def test_no_unfinished_file_is_written_through_a_link(tmp_path):

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 import os
@@ -415,6 +416,8 @@ def refused(folder, *words, **options):
 def test_no_folder_and_no_scene(tmp_path):
     refused(tmp_path / "nowhere", "nowhere", "no such folder")
     refused(tmp_path, str(tmp_path), "COLMAP", "transforms_train.json")
+    (tmp_path / "model.ply").write_text("ply")
+    refused(tmp_path / "model.ply", "model.ply: is a file; a scene is a folder")
 
 
 def test_a_missing_image(colmap_folder):
@@ -456,6 +459,20 @@ def test_an_unreadable_image(colmap_folder):
     with open(path, "r+b") as file:
         file.truncate(60)
     refused(colmap_folder, "view_004.png", "not a readable image")
+
+
+def test_an_image_that_is_trained_on_is_read_once(colmap_folder, monkeypatch):
+    names, usual = [], open
+    monkeypatch.setattr("builtins.open", lambda path, *more, **options: names.append(path) or usual(
+        path, *more, **options))
+    scene = load(colmap_folder)
+    names = [name for name in names if str(name).endswith(".png")]
+    assert len(names) == len(set(names)) == len(scene.train) + len(scene.test)
+    with open(names[0], "rb") as file:
+        checksum = hashlib.sha256(file.read()).hexdigest()
+    assert checksum in [view.checksum for view in [*scene.train, *scene.test]]
+    measured = load_scene(TrainConfig(scene=str(colmap_folder)), progress=False, checksums=False)
+    assert not any(view.checksum for view in [*measured.train, *measured.test])
 
 
 def test_a_format_that_runs_another_program_is_refused(colmap_folder, monkeypatch):

@@ -298,6 +298,8 @@ def test_without_viser_the_command_says_what_to_install(model, monkeypatch, caps
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
     assert main(["view", model]) == 1
     assert capsys.readouterr().err.endswith("pip install viser\n")
+    assert main(["view", model, "--port", "65536"]) == 1
+    assert "--port is 65536; it must be between 0 and 65535" in capsys.readouterr().err
 
 
 @pytest.mark.slow
