@@ -6,7 +6,7 @@ from typing import Any, Callable, Dict, Optional, Tuple
 
 import torch
 
-from diff_smoe_rasterization.gaussians import activate
+from diff_smoe_rasterization.gaussians import activate, quaternion_to_matrix
 from diff_smoe_rasterization.lazy_adam import LazyAdam
 from diff_smoe_rasterization.neighbors import distCUDA2
 from diff_smoe_rasterization.optimizers import FusedAdam
@@ -29,14 +29,9 @@ def inverse_sigmoid(x: torch.Tensor) -> torch.Tensor:
     return torch.log(x / (1 - x))
 
 
-def quaternion_to_matrix(rotations: torch.Tensor) -> torch.Tensor:
-    """[N, 4] quaternions (w, x, y, z), normalised here -> [N, 3, 3]."""
-    w, x, y, z = torch.nn.functional.normalize(rotations).unbind(1)
-    return torch.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ], dim=1).view(-1, 3, 3)
+def rotation_matrices(rotations: torch.Tensor) -> torch.Tensor:
+    """[N, 3, 3] of quaternions (w, x, y, z) of any length [N, 4]."""
+    return quaternion_to_matrix(torch.nn.functional.normalize(rotations))
 
 
 class GaussianModel:

@@ -15,7 +15,7 @@ from diff_smoe_rasterization.losses import l2_ssim_loss_and_gradient
 from diff_smoe_rasterization.splats import Splats
 
 from ..errors import ConfigError
-from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
+from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from ..scenes.images import View
 from .drawing import draw
 from .strategy import SteadyStrategy, Step, StrategyContext
@@ -146,7 +146,7 @@ class GateStrategy(SteadyStrategy):
         raw = {name: self.context.model.raw[name].detach().index_select(0, parents) for name in PARAMETERS}
         scales = raw["scales"].exp()
         axis = scales.argmax(dim=1, keepdim=True)
-        directions = quaternion_to_matrix(raw["rotations"]).gather(2, axis.unsqueeze(1).expand(-1, 3, 1)).squeeze(2)
+        directions = rotation_matrices(raw["rotations"]).gather(2, axis.unsqueeze(1).expand(-1, 3, 1)).squeeze(2)
         offsets = CHILD_OFFSET * scales.gather(1, axis) * directions
         opacities = raw["opacities"].sigmoid()
         children = torch.minimum(opacities, (1 - (1 - opacities).sqrt()) / CHILD_COVER)

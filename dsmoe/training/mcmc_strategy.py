@@ -11,7 +11,7 @@ import torch
 
 from diff_smoe_rasterization.gaussians import divided
 
-from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
+from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from .drawing import draw
 from .strategy import Step, Strategy, StrategyContext
 
@@ -81,7 +81,7 @@ class MCMCStrategy(Strategy):
         """Adds noise to the positions, in the shape of each Gaussian and where it is faint (Eq. 8)."""
         opacities, scales, rotations = self.context.model.activated()
         means = self.context.model.stored["means3D"]
-        axes = quaternion_to_matrix(rotations) * scales.unsqueeze(1)
+        axes = rotation_matrices(rotations) * scales.unsqueeze(1)
         faint = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - opacities))
         noise = faint * (NOISE_RATE * self.context.optimizer.position_rate) * torch.randn_like(means)
         means += torch.bmm(axes, torch.bmm(axes.transpose(1, 2), noise.unsqueeze(2))).squeeze(2)

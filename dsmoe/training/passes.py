@@ -6,7 +6,6 @@ spherical harmonics lazily, makes one pass of activations and Adam, and writes n
 """
 from __future__ import annotations
 
-import math
 import weakref
 from typing import Callable, Dict, List, Optional, Set, Tuple
 
@@ -15,6 +14,7 @@ import torch
 from diff_smoe_rasterization.direct import DirectRendering
 from diff_smoe_rasterization.extension import _C  # noqa: F401  (loading it registers the ops)
 from diff_smoe_rasterization.gaussians import activate
+from diff_smoe_rasterization.optimizers import corrected_rates
 from diff_smoe_rasterization.settings import GATED_MODES, Rendering
 from diff_smoe_rasterization.splats import Splats
 
@@ -145,19 +145,17 @@ class DirectPasses:
 
     def _step_geometry(self) -> None:
         raw = [self.model.stored[name] for name in GEOMETRY]
-        states, rates, root_scales = [], [], []
+        states, rates = [], []
         for name, tensor in zip(GEOMETRY, raw):
             state, group = self.optimizer.adam.state[tensor], self.optimizer.group(name)
             if not state:
                 state.update(step=0, exp_avg=torch.zeros_like(tensor), exp_avg_sq=torch.zeros_like(tensor))
-            beta1, beta2 = group["betas"]
-            age = state["step"] = int(state["step"]) + 1
-            rates.append(group["lr"] / (1 - beta1**age))
-            root_scales.append(1 / math.sqrt(1 - beta2**age))
+            state["step"] = int(state["step"]) + 1
+            rates.append(corrected_rates(group, state["step"]))
             states.append(state)
         _OPS.gaussian_adam(raw, self._values, [self._gradients[name] for name in GEOMETRY],
                            [state["exp_avg"] for state in states], [state["exp_avg_sq"] for state in states],
-                           self._stepped, rates, root_scales, beta1, beta2, group["eps"])
+                           self._stepped, *map(list, zip(*rates)), *group["betas"], group["eps"])
         self._made_of = [(tensor, tensor._version) for tensor in raw[1:]]
 
     def _step_some(self, same: Set[str]) -> None:

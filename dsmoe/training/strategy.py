@@ -16,7 +16,7 @@ from diff_smoe_rasterization.settings import Rendering
 from diff_smoe_rasterization.splats import Splats
 
 from ..config import TrainConfig
-from ..model import GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
+from ..model import GaussianModel, GaussianOptimizer, inverse_sigmoid, rotation_matrices
 from ..results.rendering import Renderer
 from ..scenes.images import View
 from .shards import Shards
@@ -224,7 +224,7 @@ class ThreeDGSStrategy(Strategy):
                                           len(parents) // CHILDREN)
         offsets = normal.reshape(-1, 3) * scales
         # No torch.bmm: it may round otherwise for another number of rows, of which a process has only some.
-        turned = (quaternion_to_matrix(raw["rotations"]) * offsets.unsqueeze(1)).sum(2)
+        turned = (rotation_matrices(raw["rotations"]) * offsets.unsqueeze(1)).sum(2)
         return raw["means3D"] + turned, torch.log(scales / SPLIT_SHRINK)
 
     def prune(self, large_too: bool) -> torch.Tensor:
