@@ -282,7 +282,7 @@ def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
                      help="submit cells to Slurm; resources of each, such as slurm_partition=gpu runtime=120 "
                           "mem_mb=32000 cpus_per_task=8")
     run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
-                     help="only such cells; fields: method, scene, blend_mode, background_gate, schedule, "
+                     help="only such cells; fields: method, scene, blend_mode, background_gate, strategy, "
                           "densify_grad_threshold, budget, seed, headline")
     run.add_argument("--rows", metavar="FILE|RESULTS",
                      help="a file of rows (.jsonl), or a folder of results, whose cells are not run again")
@@ -411,11 +411,11 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     batch = f", {config.batch} views a step" if config.batch > 1 else ""
     processes = f", in {group.size} processes" if group.size > 1 else ""
     print(f"{printable(config.scene)} -> {printable(config.output)}: blend mode {blend}, strategy "
-          f"{config.schedule}{budget}, {config.iterations} iterations{batch}{processes}, seed {config.seed}")
+          f"{config.strategy}{budget}, {config.iterations} iterations{batch}{processes}, seed {config.seed}")
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
-    if config.schedule == "gate" and 4 * config.densify_until_iter >= 3 * config.iterations:
+    if config.strategy == "importance" and 4 * config.densify_until_iter >= 3 * config.iterations:
         print(f"note: --densify-until-iter {config.densify_until_iter} leaves no iterations to settle; below three "
               "quarters of --iterations it does, and --scale-recipe makes it half of them")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,

@@ -21,13 +21,13 @@ from diff_smoe_rasterization.settings import (
 )
 
 from .errors import ConfigError
-from .gate_options import GateOptions, parse_gate_options
+from .importance_options import ImportanceOptions, parse_importance_options
 from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.pt"  # beside it
-SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
-BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
+STRATEGY_NAMES = ("3dgs", "steady", "importance", "mcmc")
+BATCHED = ("3dgs", "steady")  # the strategies that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
 LARGEST = 2**53  # of whole numbers, up to which floats hold each
@@ -37,7 +37,7 @@ GROUPS = {
     "scene": ("images", "resolution", "test_every", "principal_point", "init_points", "white_background",
               "random_background"),
     "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
-    "length, and number of Gaussians": ("iterations", "batch", "budget", "schedule", "strategy_options"),
+    "length, and number of Gaussians": ("iterations", "batch", "budget", "strategy", "strategy_options"),
     "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
     "recipe": (),
 }
@@ -53,9 +53,10 @@ def _option(default: Any, text: str, **extra: Any) -> Any:
     return field(default=default, metadata={"help": text, **extra})
 
 
-def _recipe(published: Any, gate: Any, text: str) -> Any:
-    """A field of the recipe that --strategy gate sets otherwise: None until `__post_init__` knows the strategy."""
-    return _option(None, f"{text} (default: {published}; gate: {gate})", published=published, gate=gate)
+def _recipe(published: Any, importance: Any, text: str) -> Any:
+    """A field of the recipe that `importance` sets otherwise: None until `__post_init__` knows the strategy."""
+    return _option(None, f"{text} (default: {published}; importance: {importance})", published=published,
+                   importance=importance)
 
 
 @dataclass
@@ -99,12 +100,12 @@ class TrainConfig:
         0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
            "0: all points, respectively 100,000")
     budget: int = _option(0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed; 0: none")
-    schedule: Optional[str] = _option(
+    strategy: Optional[str] = _option(
         None, "how Gaussians are added and removed. 3dgs: the original recipe; steady: no opacity reset and no size "
-              "prune; gate: grow beyond the budget, remove what changes the images least, move the rest to where the "
-              "error is; mcmc: relocation and noise (default: gate with --budget, else 3dgs)",
-        choices=SCHEDULES, flags=("--strategy", "--schedule"))
-    strategy_options: str = _option("", "settings of `gate`: NAME=X,...", metavar="NAME=X,...")
+              "prune; importance: grow beyond the budget, remove what changes the images least, move the rest to where "
+              "the error is; mcmc: relocation and noise (default: importance with --budget, else 3dgs)",
+        choices=STRATEGY_NAMES, flags=("--strategy", "--schedule"))
+    strategy_options: str = _option("", "settings of `importance`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
     device: str = _option("cpu", "where to train; auto: $DSMOE_DEVICE, else the GPU if it can be used",
                           choices=DEVICES[1:], typed_choices=DEVICES, typed_default=DEVICES[0])
@@ -112,15 +113,15 @@ class TrainConfig:
     sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
     deterministic: bool = _option(
-        False, "cuda: gradients of a step, and the scores of `gate`, equal bit for bit from run to run, and for any "
-               "number of GPUs; slower")
+        False, "cuda: gradients of a step, and the scores of `importance`, equal bit for bit from run to run, and for "
+               "any number of GPUs; slower")
 
     lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
     position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
     position_lr_final: float = _recipe(0.0000016, 0.0000064, "last learning rate of positions, times the scene extent")
     position_lr_max_steps: int = _option(30_000, "step at which the last position learning rate is reached")
     feature_lr: float = _recipe(0.0025, 0.005, "learning rate of base colours; higher SH bands take a 20th of it, "
-                                                "with gate a tenth")
+                                                "with importance a tenth")
     opacity_lr: float = _option(0.05, "learning rate of opacity logits")
     scaling_lr: float = _recipe(0.005, 0.01, "learning rate of log scales")
     rotation_lr: float = _option(0.001, "learning rate of quaternions")
@@ -131,7 +132,7 @@ class TrainConfig:
         0.01, "largest scale, as a part of the scene extent, that is cloned; larger ones are split")
     densify_from_iter: int = _option(500, "densification starts after this step")
     densify_until_iter: int = _option(
-        15_000, "densification stops before this step; all milestones of gate are parts of it")
+        15_000, "densification stops before this step; all milestones of importance are parts of it")
     densification_interval: int = _option(100, "steps between two densifications")
     opacity_reset_interval: int = _option(3000, "steps between two opacity resets")
 
@@ -142,9 +143,9 @@ class TrainConfig:
         try:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
-            if self.schedule is None:
-                self.schedule = "gate" if self.budget else "3dgs"
-            for name, value in {**_recipe_of(self.schedule), **_learned_gate_of(self.blend_mode)}.items():
+            if self.strategy is None:
+                self.strategy = "importance" if self.budget else "3dgs"
+            for name, value in {**_recipe_of(self.strategy), **_learned_gate_of(self.blend_mode)}.items():
                 if getattr(self, name) is None:
                     setattr(self, name, value)
         except ValueError as error:
@@ -165,23 +166,23 @@ class TrainConfig:
         self._require("iterations", self.iterations >= 1, "at least 1")
         self._require("batch", self.batch >= 1, "at least 1")
         self._require("iterations", self.iterations % self.batch == 0, f"a multiple of --batch, {self.batch}")
-        if self.batch > 1 and self.schedule not in BATCHED:
-            raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.schedule}: only "
+        if self.batch > 1 and self.strategy not in BATCHED:
+            raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.strategy}: only "
                               f"{' and '.join(BATCHED)} know batches")
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
         self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
         self._require("budget", self.budget >= 0, "at least 0")
-        needs_budget = self.schedule in ("gate", "mcmc")
-        self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.schedule}")
-        if self.schedule == "gate":
-            self.gate_options()
-            self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy gate; "
+        needs_budget = self.strategy in ("importance", "mcmc")
+        self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.strategy}")
+        if self.strategy == "importance":
+            self.importance_options()
+            self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy importance; "
                           "--scale-recipe makes it half of --iterations")
             self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter "
-                          "with --strategy gate, whose removals end there; --scale-recipe shortens all of it")
-        self._require("strategy_options", not self.strategy_options or self.schedule == "gate",
-                      f"left out with --strategy {self.schedule}: only gate has some")
+                          "with --strategy importance, whose removals end there; --scale-recipe shortens all of it")
+        self._require("strategy_options", not self.strategy_options or self.strategy == "importance",
+                      f"left out with --strategy {self.strategy}: only importance has some")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
         self._require("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "between 0 and 1")
         self._require("background_gate_bound", 0.0 <= self.background_gate_bound < 1.0, "at least 0 and below 1")
@@ -199,14 +200,14 @@ class TrainConfig:
             self._require(name, getattr(self, name) >= 0, "at least 0")
         return self
 
-    def gate_options(self) -> GateOptions:
-        """The settings of the strategy `gate`. Raises ConfigError."""
-        return parse_gate_options(self.strategy_options)
+    def importance_options(self) -> ImportanceOptions:
+        """The settings of the strategy `importance`. Raises ConfigError."""
+        return parse_importance_options(self.strategy_options)
 
     @property
     def most_points(self) -> int:
-        """How many points to start from at most, 0: any number. Only `gate` starts from more than the budget."""
-        return 0 if self.schedule == "gate" else self.budget
+        """How many points to start from at most, 0: any number. Only `importance` starts from more than the budget."""
+        return 0 if self.strategy == "importance" else self.budget
 
     def _require(self, name: str, holds: bool, requirement: str) -> None:
         if not holds:
@@ -225,8 +226,8 @@ class TrainConfig:
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
             usual = _learned_gate_of(str(self.blend_mode))
             options = {"background_gate": None, **self._unset(usual), **options}
-        if options.get("schedule", self.schedule) != self.schedule:
-            usual = _recipe_of(str(self.schedule))
+        if options.get("strategy", self.strategy) != self.strategy:
+            usual = _recipe_of(str(self.strategy))
             options = {**self._unset(usual), "strategy_options": "", **options}
         return dataclasses.replace(self, **options)
 
@@ -237,7 +238,7 @@ class TrainConfig:
     def unusual_recipe(self) -> Dict[str, Any]:
         """What of the recipe differs from the strategy's defaults."""
         usual = {**{option.name: option.default for option in dataclasses.fields(self)},
-                 **_recipe_of(str(self.schedule))}
+                 **_recipe_of(str(self.strategy))}
         return {name: getattr(self, name) for name in RECIPE if getattr(self, name) != usual[name]}
 
     def shortened(self) -> TrainConfig:
@@ -245,7 +246,7 @@ class TrainConfig:
 
         The densification interval stays, as far as ten densifications fit. What is not at its default is kept.
         """
-        default = TrainConfig(blend_mode=self.blend_mode, schedule=self.schedule)
+        default = TrainConfig(blend_mode=self.blend_mode, strategy=self.strategy)
         share = self.iterations / default.iterations
         milestones = {name: max(1, round(getattr(default, name) * share)) for name in (
             "position_lr_max_steps", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
@@ -268,6 +269,7 @@ class TrainConfig:
     @classmethod
     def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
         """The options of an earlier run; one that names no background gate was trained with 0."""
+        values = of_today(values)
         mode, gate = mode_of_record(values["blend_mode"]), values.get("background_gate")
         return cls(**{**values, "blend_mode": mode,
                       "background_gate": 0.0 if gate is None and mode in GATED_MODES else gate})
@@ -288,7 +290,7 @@ class TrainConfig:
         if not isinstance(values, dict):
             raise ConfigError(f"{path}: expected a json object of options")
         known = {option.name for option in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - known)
+        unknown = sorted(set(of_today(values)) - known)
         if unknown:
             raise ConfigError(f"{path}: unknown option {', '.join(unknown)} (written by another version?)")
         # Rendering must use the mode of the training, so an absent mode is never replaced by a default.
@@ -343,9 +345,19 @@ class TrainConfig:
                               f"{self.output}` alone keeps the run's options; more --iterations extend it")
 
 
-def _recipe_of(schedule: str) -> Dict[str, Any]:
+def of_today(record: Dict[str, Any]) -> Dict[str, Any]:
+    """Options or a row by today's names. Earlier versions called `strategy` `schedule`, and `importance` `gate`."""
+    def renamed(values: Dict[str, Any]) -> Dict[str, Any]:
+        return {"strategy" if name == "schedule" else name:
+                "importance" if (name, value) == ("schedule", "gate") else value for name, value in values.items()}
+
+    protocol = record.get("protocol")
+    return renamed({**record, "protocol": renamed(protocol)} if isinstance(protocol, dict) else record)
+
+
+def _recipe_of(strategy: str) -> Dict[str, Any]:
     """What a strategy sets of the recipe, by option, where strategies differ."""
-    recipe = "gate" if schedule == "gate" else "published"
+    recipe = "importance" if strategy == "importance" else "published"
     return {option.name: option.metadata[recipe] for option in dataclasses.fields(TrainConfig)
             if recipe in option.metadata}
 

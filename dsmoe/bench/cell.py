@@ -30,7 +30,7 @@ from .names import ROW_NAME, read_json
 LOG_NAME = "log.txt"
 SHARING = {"cuda": "cells_per_gpu", "cpu": "cells_at_once"}  # what a row's machine calls it, by device
 SHARING_NAME = "cells_at_once.json"  # beside a checkpoint: its seconds were counted while so many shared the device
-AXES = ("blend_mode", "background_gate", "schedule", "densify_grad_threshold", "seed", "headline")
+AXES = ("blend_mode", "background_gate", "strategy", "densify_grad_threshold", "seed", "headline")
 PROGRESS_BAR = re.compile(r"\|.*\| \d+/\d+ \[")  # tqdm's
 LONGEST = 300  # characters of a log's last line
 FIGURES = ("psnr", "psnr_float", "ssim", "psnr_edge", "num_gaussians", "train_seconds", "fps", "peak_gpu_mib")

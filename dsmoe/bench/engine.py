@@ -311,7 +311,7 @@ def _line(row: Row) -> str:
     def shown(field: str, form: str) -> str:
         return "-" if row.get(field) is None else format(row[field], form)
 
-    name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("schedule") or "own schedule",
+    name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("strategy") or "own strategy",
                       shown("densify_grad_threshold", "g"),
                       *([f"n{row['budget']}"] if row["method"] == NATIVE and row.get("budget") else []),
                       f"s{row['seed']}"])

@@ -17,7 +17,7 @@ VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with
 # Of each public trainer, whether it can be patched to this package's rasterizer (dsmoe/patches).
 CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
              "2dgs": False, "dbs": False}
-WITHOUT_SCHEDULE = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
+WITHOUT_STRATEGY = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
 COUNTED_BY = {"taming": "--budget", "dbs": "--cap_max"}  # they are given a number of primitives, and have no threshold
 NEEDS = {"dbs": "--cap_max"}  # an argument without which a method has no size
 OF_NATIVE_ALONE = ("strategy_options",)

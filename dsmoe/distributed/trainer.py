@@ -22,8 +22,8 @@ class BatchTrainer(Trainer):
     """A training run whose steps have several views; each process of the group has a part of the Gaussians."""
 
     def __init__(self, config: TrainConfig, scene: Scene, group: Group) -> None:
-        if config.schedule not in BATCHED:
-            raise ConfigError(f"--strategy is {config.schedule}; on several GPUs it must be {' or '.join(BATCHED)}")
+        if config.strategy not in BATCHED:
+            raise ConfigError(f"--strategy is {config.strategy}; on several GPUs it must be {' or '.join(BATCHED)}")
         self.group = group
         self._asked = False
         super().__init__(config, scene)

@@ -36,7 +36,7 @@ class FixedGaussians(Strategy):
     """Gaussians are neither added nor removed."""
 
     def __init__(self, context: StrategyContext, squares: float = 0.0) -> None:
-        """squares: the weight of the squared error in place of L1, as at the end of `gate`; 0: L1."""
+        """squares: the weight of the squared error in place of L1, as at the end of `importance`; 0: L1."""
         super().__init__(context)
         self.squares = squares
 
@@ -92,9 +92,9 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
     if iterations < 1:
         raise TrainerError(f"--bake-iterations is {iterations}; it must be at least 1")
     blend = {"blend_mode": mode, "background_gate": gate} if _takes_gate(mode) else {"blend_mode": "alpha"}
-    squares = config.gate_options().squares if config.schedule == "gate" else 0.0
+    squares = config.importance_options().squares if config.strategy == "importance" else 0.0
     config = config.changed(
-        **blend, schedule="steady", densify_until_iter=0, budget=0, batch=1, iterations=iterations,
+        **blend, strategy="steady", densify_until_iter=0, budget=0, batch=1, iterations=iterations,
         sh_degree=renderer.model.sh_degree, position_lr_max_steps=iterations, eval_every=0,
         # Trained positions move little: they start at the geometric mean of the run's rates.
         position_lr_init=math.sqrt(config.position_lr_init * config.position_lr_final),

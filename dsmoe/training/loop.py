@@ -79,7 +79,7 @@ class Trainer:
             self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
             background_gate=self.gate.value if self.gate else float(config.background_gate),
             deterministic=config.deterministic)
-        self.strategy = STRATEGIES[str(config.schedule)](StrategyContext(
+        self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
             config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer, self.shards))
         self.order = ViewOrder(len(scene.train), config.seed)
         self.watch = Stopwatch(config.device)

@@ -85,7 +85,7 @@ class ThreeDGS:
         """What the suite says of the recipe, default of ours or not; what it does not say is the trainer's own."""
         options = self.recipe()
         options.pop("sh_degree_interval", None)
-        if self.config.schedule == "steady":
+        if self.config.strategy == "steady":
             # Size prune and reset both wait for the interval: beyond the last iteration there is neither.
             options["opacity_reset_interval"] = self.config.iterations + 1
         flags = ["--antialiasing"] if options.pop("antialiasing", False) else []
@@ -99,7 +99,7 @@ class ThreeDGS:
         """What the row's protocol says otherwise than of the native trainer; None where there is no such thing."""
         own = {word.partition("=")[0] for word in self.method["arguments"]}
         recipe = {name: value for name, value in self.recipe().items() if "--" + name not in own}
-        rules = {"schedule": self.cell["schedule"], "recipe": recipe, "scale_recipe": False,
+        rules = {"strategy": self.cell["strategy"], "recipe": recipe, "scale_recipe": False,
                  "arguments": portable(self.arguments)}
         if not self.of_gaussians:
             rules["sh_degree"] = recipe.get("sh_degree")

@@ -76,10 +76,10 @@ def l2_ssim_loss(image, target, weight, squares):
 
 
 @pytest.mark.parametrize("options, squares", [
-    ({"schedule": "3dgs"}, 0), ({"schedule": "gate", "budget": 60}, 30),
-    ({"schedule": "gate", "budget": 60, "strategy_options": "squares=5"}, 5)])
+    ({"strategy": "3dgs"}, 0), ({"strategy": "importance", "budget": 60}, 30),
+    ({"strategy": "importance", "budget": 60, "strategy_options": "squares=5"}, 5)])
 def test_the_loss_is_the_one_with_which_the_run_ended(smoe_run, monkeypatch, options, squares):
-    """`gate` ends with D-SSIM and so many times the squared error."""
+    """`importance` ends with D-SSIM and so many times the squared error."""
     losses = []
     loss = RisingGate.loss
 

@@ -72,7 +72,7 @@ def test_training_leaves_results_config_and_model(trained):
     assert row["train_seconds"] > 0 and row["fps"] > 0
     protocol = row["protocol"]
     assert (protocol["train_views"], protocol["test_views"], protocol["image_size"]) == (7, 2, [32, 24])
-    for name in ("split", "resolution", "downscaler", "background", "principal_point", "schedule",
+    for name in ("split", "resolution", "downscaler", "background", "principal_point", "strategy",
                  "densify_grad_threshold", "iterations", "seed", "machine", "versions"):
         assert name in protocol
     with open(ply_of(trained), "rb") as file:
@@ -684,7 +684,7 @@ def test_scale_recipe(scene, tmp_path):
 
 @pytest.mark.parametrize("with_scene", [False, True])
 def test_a_changed_milestone_is_told_before_what_is_wrong_with_it(scene, tmp_path, capsys, with_scene):
-    """15,000 is above the iterations, which `gate` refuses; the run that is there has 15."""
+    """15,000 is above the iterations, which `importance` refuses; the run that is there has 15."""
     output, options = str(tmp_path / "out"), ["--iterations", "30", "--scale-recipe", "--budget", "40"]
     assert main(["train", scene, "-o", output, *options, "--quiet"]) == 0
     words = [scene, *options] if with_scene else []

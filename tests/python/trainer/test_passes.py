@@ -42,8 +42,8 @@ def assert_equal(one, other):
     dict(blend_mode="alpha"), dict(blend_mode="smoe", background_gate=0.0),
     dict(blend_mode="smoe", background_gate="learned", random_background=True),
     dict(blend_mode="alpha", antialiasing=True, white_background=True, sh_degree=1),
-    dict(blend_mode="alpha", schedule="steady", sh_degree=0),
-    dict(blend_mode="smoe", schedule="gate", budget=60)], ids=str)
+    dict(blend_mode="alpha", strategy="steady", sh_degree=0),
+    dict(blend_mode="smoe", strategy="importance", budget=60)], ids=str)
 def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
     """Densifications are at 8, 16, 24; an opacity reset alone, at 12, replaces one parameter of all."""
     config = tiny_config.changed(**options)
@@ -87,7 +87,7 @@ def test_a_checkpoint_on_the_way(tiny_config, scene, tmp_path):
 def test_what_a_strategy_adds_reaches_all_gaussians(tiny_config, scene, monkeypatch):
     """By both passes alike, seen or not; a sum in another order is rounded otherwise."""
     monkeypatch.setattr("dsmoe.training.mcmc_strategy.NOISE_RATE", 0)
-    config = tiny_config.changed(schedule="mcmc", budget=100)
+    config = tiny_config.changed(strategy="mcmc", budget=100)
     dense, direct = (trained(config, scene, direct, 3) for direct in (False, True))
     assert (direct._passes._radii == 0).any(), "all were seen"
     for name in PARAMETERS:

@@ -160,27 +160,27 @@ def test_densification_calendar_of_3dgs(iteration, densifies):
     assert context.model.num_gaussians == (2 if densifies else 1)
 
 
-@pytest.mark.parametrize("schedule, iteration, resets", [("3dgs", 3000, True), ("3dgs", 2900, False),
+@pytest.mark.parametrize("strategy, iteration, resets", [("3dgs", 3000, True), ("3dgs", 2900, False),
                                                          ("3dgs", 12_000, True), ("3dgs", 15_000, False),
                                                          ("steady", 3000, False)])
-def test_opacity_reset_calendar(schedule, iteration, resets):
+def test_opacity_reset_calendar(strategy, iteration, resets):
     context = context_of([SMALL], [0.5])
-    run(STRATEGIES[schedule](context), iteration, [0.0])
+    run(STRATEGIES[strategy](context), iteration, [0.0])
     assert float(context.model.opacities.detach()) == pytest.approx(0.01 if resets else 0.5, rel=1e-5)
 
 
-@pytest.mark.parametrize("schedule, white, resets", [("3dgs", True, True), ("3dgs", False, False),
+@pytest.mark.parametrize("strategy, white, resets", [("3dgs", True, True), ("3dgs", False, False),
                                                      ("steady", True, False)])
-def test_white_background_resets_once_more_where_densification_starts(schedule, white, resets):
+def test_white_background_resets_once_more_where_densification_starts(strategy, white, resets):
     context = context_of([SMALL], [0.5], white_background=white)
-    run(STRATEGIES[schedule](context), 500, [0.0])
+    run(STRATEGIES[strategy](context), 500, [0.0])
     assert float(context.model.opacities.detach()) == pytest.approx(0.01 if resets else 0.5, rel=1e-5)
 
 
-@pytest.mark.parametrize("schedule, iteration, survivors", [("3dgs", 3000, 2), ("3dgs", 3100, 1), ("steady", 3100, 2)])
-def test_size_prune_works_only_after_the_first_reset(schedule, iteration, survivors):
+@pytest.mark.parametrize("strategy, iteration, survivors", [("3dgs", 3000, 2), ("3dgs", 3100, 1), ("steady", 3100, 2)])
+def test_size_prune_works_only_after_the_first_reset(strategy, iteration, survivors):
     context = context_of([SMALL, 1.01], [0.5, 0.5])
-    run(STRATEGIES[schedule](context), iteration, [0.0, 0.0])
+    run(STRATEGIES[strategy](context), iteration, [0.0, 0.0])
     assert context.model.num_gaussians == survivors
 
 

@@ -1,4 +1,4 @@
-"""The strategy `gate`: to a given number of Gaussians, those that explain most.
+"""The strategy `importance`: to a given number of Gaussians, those that explain most.
 
 It grows well beyond the budget, removes in steps the Gaussians whose removal changes the training views least, and then
 moves the cheapest of what is left to where the error is. Cost and error are sums over pixels of squared colours, so
@@ -38,12 +38,12 @@ CHILD_SCALE = 0.65
 CHILD_COVER = 0.744
 
 
-class GateStrategy(SteadyStrategy):
+class ImportanceStrategy(SteadyStrategy):
     """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
 
     def __init__(self, context: StrategyContext) -> None:
         config = context.config
-        self.options = config.gate_options()
+        self.options = config.importance_options()
         super().__init__(context)
         context.optimizer.scale_rate("shs", self.options.bands)
         self.start = context.model.num_gaussians
