@@ -400,7 +400,7 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     from .results.rows import blend_name, results_table, viewer_warning
     from .system.device import device_line
     from .system.process import command
-    from .training.loop import train
+    from .train import train
 
     if not group.leads:
         train(config, arguments.resume, arguments.overwrite, progress=False, group=group)

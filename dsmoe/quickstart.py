@@ -29,7 +29,7 @@ from .system.device import chosen_device, device_line
 from .system.interrupt import exit_status
 from .system.output_folder import Record, make_folder, only_one, own_record, read_record, remove_files, write_record
 from .system.process import command, set_up_process
-from .training.loop import train
+from .train import train
 
 MODES = ("alpha", "smoe")
 PICTURES = 3  # test views that are shown

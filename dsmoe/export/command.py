@@ -59,7 +59,7 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
 
 def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str]:
     """The model for alpha, its .ply in the folder, and what that costs."""
-    from ..training.bake import bake
+    from .bake import bake
 
     config, before = trained.config, trained.renderer
     if not is_folder(config.scene):

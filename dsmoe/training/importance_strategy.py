@@ -18,7 +18,7 @@ from ..errors import ConfigError
 from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from ..scenes.images import View
 from .drawing import draw
-from .strategy import SteadyStrategy, Step, StrategyContext
+from .strategy import SteadyStrategy, StrategyContext, ViewStep
 
 # Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, sixteen removals are at 8,200 to 13,825,
 # moves are every 500 until 20,000.
@@ -76,7 +76,7 @@ class ImportanceStrategy(SteadyStrategy):
             return super().loss(iteration, image, target)
         return l2_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim, self.options.squares)
 
-    def before_backward(self, step: Step) -> None:
+    def before_backward(self, step: ViewStep) -> None:
         if self._looks(step):
             self._look(step.view, step.target, step.rendering.color, step.splats())
         if self.options.anneal != 1:
@@ -84,7 +84,7 @@ class ImportanceStrategy(SteadyStrategy):
             share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
             self.context.optimizer.scale_other_rates(self.options.anneal**share)
 
-    def after_step(self, step: Step) -> None:
+    def after_step(self, step: ViewStep) -> None:
         if step.iteration in self.removals:
             self.remove(1 + sum(later > step.iteration for later in self.removals))
         elif step.iteration in self.moves:
@@ -157,7 +157,7 @@ class ImportanceStrategy(SteadyStrategy):
         for rows, place in ((parents, means + offsets), (places, means - offsets)):
             self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
 
-    def _looks(self, step: Step) -> bool:
+    def _looks(self, step: ViewStep) -> bool:
         """Whether the next decision looks at this step's view: one of each group, in the last round of the views."""
         if step.view.camera.name not in self.sought:
             return False

@@ -10,12 +10,13 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.images import as_float
 from diff_smoe_rasterization.losses import fused_ssim, l1_ssim_loss
 from dsmoe.cli import main
+from dsmoe.export.bake import RisingGate, bake
 from dsmoe.inspection import open_renderer
 from dsmoe.results.evaluation import evaluate
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
-from dsmoe.training.bake import RisingGate, bake
-from dsmoe.training.loop import Trainer, train
+from dsmoe.train import train
+from dsmoe.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

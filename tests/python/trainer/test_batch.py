@@ -12,7 +12,8 @@ from dsmoe.errors import ConfigError, TrainerError
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.group import ALONE
-from dsmoe.training.loop import Trainer, train
+from dsmoe.train import train
+from dsmoe.training.trainer import Trainer
 
 
 @pytest.fixture

@@ -16,9 +16,10 @@ from dsmoe.errors import ConfigError
 from dsmoe.importance_options import importance_settings, parse_importance_options
 from dsmoe.scenes.nerf import random_points
 from dsmoe.scenes.scene import load_scene
-from dsmoe.training.loop import Trainer, train
+from dsmoe.train import train
 from dsmoe.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
 from dsmoe.training.passes import AutogradPasses
+from dsmoe.training.trainer import Trainer
 
 
 def trainer_of(config, **options):
@@ -285,7 +286,7 @@ def test_mcmc_regularises_opacities_and_scales(tiny_config):
     gradients = torch.autograd.grad(expected, [raw["opacities"], raw["scales"]])
     passes = AutogradPasses(trainer.model, trainer.optimizer, trainer.renderer)
     with torch.no_grad():
-        trainer.strategy.after_backward(SimpleNamespace(add_gradient=passes.add_gradient))
+        trainer.strategy.after_backward(SimpleNamespace(add_gradient=passes._add_gradient))
     torch.testing.assert_close(raw["opacities"].grad, gradients[0])
     torch.testing.assert_close(raw["scales"].grad, gradients[1])
 

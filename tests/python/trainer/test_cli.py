@@ -24,7 +24,7 @@ from dsmoe.config import GROUPS, TrainConfig
 from dsmoe.results.rows import viewer_warning
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training import forecast
-from dsmoe.training.loop import Trainer
+from dsmoe.training.trainer import Trainer
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
          "--densification-interval", "4", "--quiet"]
@@ -570,9 +570,9 @@ def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
     arguments = ["train", scene, "-o", str(tmp_path / "out"), *SHORT]
     for function, words in ((cuda, "the GPU is out of memory, 20.00 GiB"), (array, "out of memory, 1.00 PiB"),
                             (cpu, f"the machine is out of memory, {2**50} bytes more were asked for")):
-        monkeypatch.setattr("dsmoe.training.loop.load_scene", function)
+        monkeypatch.setattr("dsmoe.train.load_scene", function)
         assert words in fails(capsys, *arguments)
-    monkeypatch.setattr("dsmoe.training.loop.load_scene", defect)
+    monkeypatch.setattr("dsmoe.train.load_scene", defect)
     with pytest.raises(RuntimeError, match="another one"):
         main(arguments)
 
@@ -656,7 +656,7 @@ def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monke
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dsmoe.training.loop.load_scene", interrupted)
+    monkeypatch.setattr("dsmoe.train.load_scene", interrupted)
     assert main(["train", scene, "-o", str(tmp_path / "out"), *SHORT]) == 130
     assert capsys.readouterr().err.endswith("interrupted\n")
 

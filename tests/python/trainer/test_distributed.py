@@ -19,7 +19,7 @@ from dsmoe.distributed.shards import run_of
 from dsmoe.errors import TrainerError
 from dsmoe.results.modelfile import model_path
 from dsmoe.system import torchrun as torchrun_module
-from dsmoe.training.loop import train
+from dsmoe.train import train
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 PACKAGES = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterization.__file__)))  # of the one under test

@@ -17,7 +17,8 @@ from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.group import ALONE
 from dsmoe.system.process import SPARE_BYTES, return_spare_memory
-from dsmoe.training.loop import Run, Trainer, train
+from dsmoe.train import Run, train
+from dsmoe.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
 

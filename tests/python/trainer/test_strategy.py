@@ -7,7 +7,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from diff_smoe_rasterization import Rendering
 from dsmoe.config import TrainConfig
 from dsmoe.model import PARAMETERS, GaussianModel, GaussianOptimizer
 from dsmoe.training.strategies import STRATEGIES
@@ -51,12 +50,13 @@ def moments(context, name, key="exp_avg"):
 
 
 def observed_step(context, iteration, gradients, radii=None):
-    """A step after its backward pass: gradients [N] are the norms of means2D.grad."""
-    means2D = torch.zeros(len(gradients), 3, requires_grad=True)
+    """A step after its backward pass: gradients [N] are the norms of those by the places on the image."""
     values = torch.tensor(gradients)
-    means2D.grad = torch.stack([0.6 * values, -0.8 * values, torch.full_like(values, 99.0)], dim=1)
+    by_place = torch.stack([0.6 * values, -0.8 * values, torch.full_like(values, 99.0)], dim=1)
     radii = torch.ones(len(gradients), dtype=torch.int32) if radii is None else torch.tensor(radii, dtype=torch.int32)
-    return Step(iteration, None, None, Rendering(torch.zeros(3, 1, 1), radii), None, means2D, torch.zeros(()), None)
+    step = Step(iteration, 1, torch.zeros(()))
+    step.seen.append((by_place, radii))
+    return step
 
 
 def run(strategy, *arguments, **keywords):

@@ -16,8 +16,9 @@ from ..results.evaluation import evaluate
 from ..results.rendering import Renderer
 from ..results.rows import viewer_warning
 from ..scenes.scene import load_scene
-from .loop import Run, Trainer
-from .strategy import AnyStep, Strategy, StrategyContext
+from ..train import Run
+from ..training.strategy import Step, Strategy, StrategyContext
+from ..training.trainer import Trainer
 
 RISE = 0.4  # the part of the iterations in which the background gate goes to 1
 LEAST_GATE = 0.01  # where a gate of 0 begins, which no factor raises
@@ -53,7 +54,7 @@ class RisingGate(FixedGaussians):
         super().__init__(context, squares)
         self.first = max(float(context.render.background_gate), LEAST_GATE)
 
-    def after_step(self, step: AnyStep) -> None:
+    def after_step(self, step: Step) -> None:
         renderer, gate = self.context.render, self.gate(step.iteration)
         if gate != 1:
             renderer.background_gate = gate
