@@ -24,12 +24,12 @@ from ...results.pictures import evenly_spaced
 from ...scenes.images import View
 from ...scenes.scene import Scene
 from ...system.children import die_with_parent
-from ..cell import last_line
 from ..errors import BenchError
+from ..logs import last_line
 from ..measure import Measures
 from ..names import COUNTED_BY, RECIPE, read_json
 from ..protocol import commit_of, config_of
-from . import Outcome, scene_of
+from .outcome import Outcome, scene_of
 
 OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py")
 # Mean difference between the trainer's ground truth and ours: rounding leaves half a grey level at the most, another

@@ -19,7 +19,7 @@ from ...train import HISTORY_NAME, train
 from ..measure import Measures
 from ..names import read_json
 from ..protocol import config_of
-from . import Outcome, scene_of
+from .outcome import Outcome, scene_of
 
 
 def run_native(cell: Dict[str, Any], output: str) -> Outcome:
