@@ -1,7 +1,6 @@
-"""Every option of a training run in one dataclass; the command line, OUT/config.json and resume all read it."""
+"""Every option of a training run in one dataclass, its checks and its file OUT/config.json."""
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import glob
 import json
@@ -32,15 +31,6 @@ PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
 LARGEST = 2**53  # of whole numbers, up to which floats hold each
 DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
-# How `--help` groups the options; those that no group names are of the last one.
-GROUPS = {
-    "scene": ("images", "resolution", "test_every", "principal_point", "init_points", "white_background",
-              "random_background"),
-    "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
-    "length, and number of Gaussians": ("iterations", "batch", "budget", "strategy", "strategy_options"),
-    "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
-    "recipe": (),
-}
 LEARNED = "learned"  # the background gate that a training finds
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
@@ -388,81 +378,16 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     return float(resolve_background_gate(blend_mode, asked))
 
 
-def _number_or_learned(text: str) -> Union[float, str]:
-    try:
-        return text if text == LEARNED else float(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
-
-
-def _flags(option: dataclasses.Field[Any]) -> Sequence[str]:
+def flags_of(option: dataclasses.Field[Any]) -> Sequence[str]:
     """How an option is typed; texts have the first of these."""
     return option.metadata.get("flags", ("--" + option.name.replace("_", "-"),))
 
 
 def _flag(option: dataclasses.Field[Any]) -> str:
-    return _flags(option)[0]
+    return flags_of(option)[0]
 
 
 def flags_text(options: Dict[str, Any]) -> str:
     """What to type for options by name."""
     known = {option.name: option for option in dataclasses.fields(TrainConfig)}
     return " ".join(f"{_flag(known[name])} {value}" for name, value in options.items())
-
-
-_TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
-
-
-def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
-                  defaults: bool = True) -> Dict[str, argparse._ArgumentGroup]:
-    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser; returns their groups.
-
-    Options that are not given are absent from the parsed arguments. defaults: whether the help text names what they
-    are then.
-    """
-    groups = {title: parser.add_argument_group(title) for title in GROUPS}
-    titles = {name: title for title, names in GROUPS.items() for name in names}
-    for option in dataclasses.fields(TrainConfig):
-        if option.name in skip:
-            continue
-        text = option.metadata["help"].replace("%", "%%")
-        if option.metadata.get("positional"):
-            parser.add_argument(option.name, metavar=option.name.upper(), help=text)
-            continue
-        flags, group = _flags(option), groups[titles.get(option.name, "recipe")]
-        if option.type == "bool":
-            group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
-            continue
-        keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": argparse.SUPPRESS}
-        if option.metadata.get("required"):
-            keywords["required"] = True
-        elif option.default is not None and defaults:
-            text += f" (default: {option.metadata.get('typed_default', option.default)})"
-        if option.metadata.get("choices"):
-            keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
-        else:
-            kind = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
-            keywords["metavar"] = option.metadata.get("metavar", kind)
-        group.add_argument(*flags, help=text, dest=option.name, **keywords)
-    return groups
-
-
-def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
-    """The options of TrainConfig among parsed arguments."""
-    names = {option.name for option in dataclasses.fields(TrainConfig)}
-    return {name: value for name, value in vars(arguments).items() if name in names}
-
-
-def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None) -> TrainConfig:
-    """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
-
-    With --scale-recipe the milestones that are not given keep their share of the iterations. earlier: the run that goes
-    on with these options.
-    """
-    options = given_options(arguments)
-    config = TrainConfig(**options)
-    if getattr(arguments, "scale_recipe", False):
-        config = dataclasses.replace(config.shortened(), **options)
-    if earlier:
-        earlier.check_continued_by(config)
-    return config.validate()

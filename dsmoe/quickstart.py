@@ -14,7 +14,8 @@ from typing import Any, Dict, List, Optional
 
 import torch
 
-from .config import TrainConfig, add_arguments, flags_text
+from .config import TrainConfig, flags_text
+from .config_arguments import add_arguments
 from .errors import TrainerError, in_one_line
 from .inspection import open_renderer, to_image
 from .results.metrics import psnr, quantised

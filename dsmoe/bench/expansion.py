@@ -7,7 +7,6 @@ import json
 import os
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import yaml
@@ -18,13 +17,23 @@ from ..config import BATCHED, LEARNED
 from ..errors import ConfigError
 from . import schema
 from .errors import BenchError
-from .names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, OF_NATIVE_ALONE, RECIPE, WITHOUT_STRATEGY, blend_of
+from .names import (
+    AXIS_OF,
+    CHECKOUTS,
+    COUNTED_BY,
+    LACKS,
+    NATIVE,
+    NEEDS,
+    OF_NATIVE_ALONE,
+    RECIPE,
+    SHIPPED,
+    WITHOUT_STRATEGY,
+    blend_of,
+)
 from .protocol import config_of
 
-SHIPPED = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("*.yaml")}
 Values = Dict[str, Any]
 Axes = Dict[str, List[Any]]
-AXIS_OF = {axis: "strategy" if axis == "strategies" else axis[:-1] for axis in schema.Axes.model_fields}
 # Where things lie changes no figure.
 NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "base_commit", "unset")
 

@@ -11,6 +11,12 @@ from diff_smoe_rasterization.settings import GATED_MODES
 from ..config import RECIPE as TRAINER_RECIPE
 from .errors import BenchError
 
+SHIPPED = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("*.yaml")}  # suites, by name
+# The axes of a suite (schema.py), and what a cell calls its value.
+AXIS_OF = {"blend_modes": "blend_mode", "background_gates": "background_gate",
+           "densify_grad_thresholds": "densify_grad_threshold", "strategies": "strategy", "budgets": "budget",
+           "seeds": "seed"}
+SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")  # fields by which `--only` chooses cells
 NATIVE = "native"
 LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
 VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse

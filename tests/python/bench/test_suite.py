@@ -7,9 +7,10 @@ import pytest
 import yaml
 
 from dsmoe import bench
-from dsmoe.bench import engine
+from dsmoe.bench import engine, schema
 from dsmoe.bench.errors import BenchError
-from dsmoe.bench.expansion import SHIPPED, expand, find_suite, load_suite, read_yaml
+from dsmoe.bench.expansion import expand, find_suite, load_suite, read_yaml
+from dsmoe.bench.names import AXIS_OF, SHIPPED
 from dsmoe.bench.protocol import config_of
 from dsmoe.bench.schema import THRESHOLDS
 
@@ -47,6 +48,22 @@ def test_gates_are_of_smoe_alone(content):
     names = [cell["id"] for cell in cells]
     assert [cell["id"] for cell in expand(content, "").cells] == [names[4], names[2]]
     assert names[1].startswith("native_tiny_smoe-learned_3dgs_") and names[3].startswith("native_tiny_smoe-0.05_3dgs_")
+
+
+def test_cells_are_named_as_before_strategies_had_their_names():
+    """So that earlier rows are found; commit aeb180a gave these names, for `schedules` with `gate` and `steady`."""
+    def cell(strategy, budget):
+        content = {"name": "one", "scenes": [{"name": "tiny", "path": "scene"}], "methods": [{"name": "native"}],
+                   "blend_modes": ["alpha"], "densify_grad_thresholds": [0.0002], "strategies": [strategy],
+                   "budgets": [budget]}
+        return expand(content, "").cells[0]["id"]
+
+    assert cell("importance", 40) == "native_tiny_alpha_gate_0.0002_n40_s0_fde6de"
+    assert cell("steady", 0) == "native_tiny_alpha_steady_0.0002_s0_bc42d5"
+
+
+def test_the_axes_of_the_command_line_are_those_of_the_schema():
+    assert list(AXIS_OF) == list(schema.Axes.model_fields)
 
 
 def test_missing_libraries_are_named_with_what_to_type(monkeypatch):

@@ -20,7 +20,8 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import io
 from dsmoe import inspection
 from dsmoe.cli import main
-from dsmoe.config import GROUPS, TrainConfig
+from dsmoe.config import TrainConfig
+from dsmoe.config_arguments import GROUPS
 from dsmoe.results.rows import viewer_warning
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training import forecast

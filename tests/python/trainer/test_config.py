@@ -9,7 +9,8 @@ import os
 import pytest
 
 from diff_smoe_rasterization.settings import record_of
-from dsmoe.config import TrainConfig, add_arguments, config_from_arguments
+from dsmoe.config import TrainConfig
+from dsmoe.config_arguments import add_arguments, config_from_arguments
 from dsmoe.errors import ConfigError
 
 # The published defaults of 3DGS (2023).
