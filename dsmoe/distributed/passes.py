@@ -5,7 +5,8 @@ from typing import Callable, Dict, Optional, Sequence
 
 import torch
 
-from ..model import GaussianModel, GaussianOptimizer
+from ..model import GaussianModel
+from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer
 from ..system.group import Group
 from ..training.background_gate import LearnedGate

@@ -18,7 +18,8 @@ from diff_smoe_rasterization.optimizers import corrected_rates
 from diff_smoe_rasterization.settings import GATED_MODES, Rendering
 from diff_smoe_rasterization.splats import Splats
 
-from ..model import PARAMETERS, GaussianModel, GaussianOptimizer
+from ..model import PARAMETERS, GaussianModel
+from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer, package_rasterizer
 from ..scenes.cameras import Camera
 from ..scenes.images import View

@@ -16,7 +16,8 @@ from diff_smoe_rasterization.settings import Rendering
 from diff_smoe_rasterization.splats import Splats
 
 from ..config import TrainConfig
-from ..model import GaussianModel, GaussianOptimizer, inverse_sigmoid, rotation_matrices
+from ..model import GaussianModel, inverse_sigmoid, rotation_matrices
+from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer
 from ..scenes.images import View
 from .shards import Shards

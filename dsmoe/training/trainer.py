@@ -9,7 +9,8 @@ from diff_smoe_rasterization.images import as_float
 
 from ..config import LEARNED, TrainConfig
 from ..errors import TrainerError
-from ..model import GaussianModel, GaussianOptimizer
+from ..model import GaussianModel
+from ..optimizer import GaussianOptimizer
 from ..results.evaluation import Evaluation, evaluate
 from ..results.metrics import psnr
 from ..results.rendering import Rasterize, Renderer, background_color

@@ -8,7 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dsmoe.config import TrainConfig
-from dsmoe.model import PARAMETERS, GaussianModel, GaussianOptimizer
+from dsmoe.model import PARAMETERS, GaussianModel
+from dsmoe.optimizer import GaussianOptimizer
 from dsmoe.training.strategies import STRATEGIES
 from dsmoe.training.strategy import Step, Strategy, StrategyContext
 
