@@ -49,16 +49,22 @@ def settings_from_camera(K: Any, R: Any, t: Any, width: int, height: int, bg: Op
         raise ValueError(f"settings_from_camera: R is {rotation.tolist()}; it must be a rotation")
     last = K.new_tensor([[0.0, 0.0, 0.0, 1.0]])
     view = torch.cat([torch.cat([R, t[:, None]], dim=1), last])
-    # The rasterizer puts NDC x at pixel index ((x + 1) width - 1) / 2, so that a point at fx X/Z + cx (COLMAP's
-    # coordinates, half a pixel above the index) needs x = 2 fx/width X/Z + 2 cx/width - 1; y likewise.
-    size = K.new_tensor([width, height])[:, None]
-    image = 2 * K[:2] / size - K.new_tensor([[0.0, 0.0, 1.0]])
-    depth = CLIP_FAR / (CLIP_FAR - CLIP_NEAR)
-    clip = torch.cat([torch.cat([image, K.new_zeros(2, 1)], dim=1),
-                      K.new_tensor([[0.0, 0.0, depth, -CLIP_NEAR * depth], [0.0, 0.0, 1.0, 0.0]])])
     view, projection, center = (matrix.contiguous().to(bg.device, dtype)
-                                for matrix in (view.T, (clip @ view).T, -R.T @ t))
+                                for matrix in (view.T, (clip_matrix(K, width, height) @ view).T, -R.T @ t))
     return GaussianRasterizationSettings(
         image_height=height, image_width=width, tanfovx=width / (2 * fx), tanfovy=height / (2 * fy), bg=bg,
         scale_modifier=scale_modifier, viewmatrix=view, projmatrix=projection, sh_degree=sh_degree, campos=center,
         **options)
+
+
+def clip_matrix(K: torch.Tensor, width: int, height: int) -> torch.Tensor:
+    """[..., 4, 4] view to clip coordinates, for column vectors, of pinhole intrinsics K [..., 3, 3] in pixels.
+
+    Differentiable with respect to K, which is as in `settings_from_camera`.
+    """
+    # The rasterizer puts NDC x at pixel index ((x + 1) width - 1) / 2, so that a point at fx X/Z + cx (COLMAP's
+    # coordinates, half a pixel above the index) needs x = 2 fx/width X/Z + 2 cx/width - 1; y likewise.
+    image = torch.stack([2 * K[..., 0, :] / width, 2 * K[..., 1, :] / height], -2) - K.new_tensor([0.0, 0.0, 1.0])
+    depth = CLIP_FAR / (CLIP_FAR - CLIP_NEAR)
+    last = K.new_tensor([[0.0, 0.0, depth, -CLIP_NEAR * depth], [0.0, 0.0, 1.0, 0.0]])
+    return torch.cat([torch.cat([image, torch.zeros_like(image[..., :1])], -1), last.expand(*K.shape[:-2], 2, 4)], -2)

@@ -27,6 +27,16 @@ def activate(opacities: torch.Tensor, scales: torch.Tensor,
     return _OPS.activate(opacities, scales, rotations)
 
 
+def quaternion_to_matrix(rotations: torch.Tensor) -> torch.Tensor:
+    """[..., 3, 3] rotation matrices of quaternions (w, x, y, z) [..., 4], used as given, as the rasterizer does."""
+    w, x, y, z = rotations.unbind(-1)
+    return torch.stack([
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ], -1).unflatten(-1, (3, 3))
+
+
 def add_view(dL_dmeans2D: torch.Tensor, radii: torch.Tensor, gradient_sum: torch.Tensor,
              view_count: torch.Tensor) -> None:
     """Adds one view to the statistics of densification, in place.

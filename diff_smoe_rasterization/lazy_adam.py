@@ -8,14 +8,13 @@ step and all that it has missed since are made at once, in registers.
 """
 from __future__ import annotations
 
-import math
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
 from .checks import check_tensors
 from .extension import _C  # noqa: F401  (loading it registers the ops)
-from .optimizers import FusedAdam
+from .optimizers import FusedAdam, corrected_rates
 
 _OPS = torch.ops.diff_smoe_rasterization
 _CAPACITY = 4096  # steps whose rates are kept; then every row is brought up to date
@@ -123,11 +122,8 @@ class LazyAdam:
         if self._steps == len(self._rates):
             self.catch_up()
         self._look_up()
-        rates, root_scales, age = [], [], int(self._states[0]["step"]) + 1
-        for group in self._groups:
-            beta1, beta2 = group["betas"]
-            rates.append(group["lr"] / (1 - beta1**age))
-            root_scales.append(1 / math.sqrt(1 - beta2**age))
+        age = int(self._states[0]["step"]) + 1
+        rates, root_scales = zip(*(corrected_rates(group, age) for group in self._groups))
         _OPS.lazy_adam_step(self._marks, self._rates, self._steps, rates, root_scales, radii)
         for state in self._states:  # behind the op: where it refuses radii no step is counted
             state["step"] = age

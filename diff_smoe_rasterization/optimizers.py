@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Callable, Dict, Iterable, List, Optional
+from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple
 
 import torch
 
@@ -44,7 +44,6 @@ class FusedAdam(torch.optim.Adam):
             return loss
         launches: Dict[Any, _Launch] = {}
         for group in self.param_groups:
-            beta1, beta2 = group["betas"]
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
@@ -52,11 +51,16 @@ class FusedAdam(torch.optim.Adam):
                 if not state:
                     state.update(step=0, **_zero_moments(parameter))
                 age = state["step"] = int(state["step"]) + 1
-                _launch_of(launches, parameter, group).add(
-                    parameter, state, group["lr"] / (1 - beta1**age), 1 / math.sqrt(1 - beta2**age))
+                _launch_of(launches, parameter, group).add(parameter, state, *corrected_rates(group, age))
         for launch in launches.values():
             launch.run()
         return loss
+
+
+def corrected_rates(group: Dict[str, Any], step: int) -> Tuple[float, float]:
+    """The rate and the root scale (include/dsmoe/adam.h) of a group's step number `step`, 1 in the first."""
+    beta1, beta2 = group["betas"]
+    return group["lr"] / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
 
 
 class SparseGaussianAdam(torch.optim.Adam):

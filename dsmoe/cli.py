@@ -1,4 +1,4 @@
-"""The `dsmoe` command: scene, train, eval, render, patch, run, bench, info; a few lines each over what does it."""
+"""The `dsmoe` command: each of its commands in a few lines over what does the work."""
 from __future__ import annotations
 
 import argparse
@@ -6,190 +6,19 @@ import difflib
 import os
 import shlex
 import sys
-from typing import TYPE_CHECKING, Any, Dict, Iterator, List, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Dict, List, Optional
 
-from diff_smoe_rasterization._version import __version__
-from diff_smoe_rasterization.settings import BLEND_MODES
-
-from .config import (
-    CHECKPOINT_NAME,
-    DEVICES,
-    PRINCIPAL_POINTS,
-    TrainConfig,
-    add_arguments,
-    blend_mode_typed,
-    config_from_arguments,
-    given_options,
-    holds_run,
-)
+from .arguments import build_parser, completion_script
+from .config import CHECKPOINT_NAME, TrainConfig, holds_run
+from .config_arguments import config_from_arguments, given_options
 from .errors import TrainerError, in_one_line, is_lost, printable
-from .patches import TRAINERS, PatchError
+from .patches import PatchError
 from .system.files import is_folder
 from .system.interrupt import PromptInterrupt, exit_status
 
 if TYPE_CHECKING:
     from .results.evaluation import Measure
     from .system.group import Group
-
-
-TRAIN_EXAMPLES = """examples:
-  dsmoe train garden -o garden_model                              the recipe of 3DGS
-  dsmoe train garden -o small --blend-mode smoe --budget 30000    a model of 30,000 Gaussians
-  dsmoe train garden -o quick --iterations 3000 --scale-recipe --resolution 4    minutes on a processor"""
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
-    parser = argparse.ArgumentParser(prog="dsmoe", description="Gaussian splatting with alpha and SMoE blending.")
-    parser.add_argument("--version", action="version", version=f"dsmoe {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    train = commands.add_parser("train", help="train Gaussians on a scene",
-                                usage="%(prog)s SCENE -o OUT [OPTION ...]\n       %(prog)s --resume OUT [OPTION ...]",
-                                description="Trains Gaussians on a scene: photographs whose cameras are known.",
-                                formatter_class=argparse.RawDescriptionHelpFormatter, epilog=TRAIN_EXAMPLES)
-    train.add_argument("scene", metavar="SCENE", nargs="?", default=argparse.SUPPRESS,
-                       help="folder of a COLMAP scene, of a transforms.json (nerfstudio, instant-ngp, Polycam) or of a "
-                            "NeRF-synthetic scene; --resume finds it in OUT")
-    train.add_argument("-o", "--output", metavar="OUT", default=argparse.SUPPRESS, help="folder to write")
-    groups = add_arguments(train, skip=("scene", "output"))
-    groups["length, and number of Gaussians"].add_argument(
-        "--scale-recipe", action="store_true",
-        help="squeeze the recipe into --iterations: its milestones (densification, resets, learning rate, SH degrees) "
-             "keep their share of 30,000 steps, unless they are given")
-    earlier_run = groups["run"].add_mutually_exclusive_group()
-    earlier_run.add_argument("--resume", action="store_true",
-                             help="continue the run in OUT from its last checkpoint with its own options; more "
-                                  "--iterations extend it")
-    earlier_run.add_argument("--overwrite", action="store_true",
-                             help="replace the run in OUT, once this one can start")
-    groups["run"].add_argument(
-        "--gpus", type=int, metavar="N",
-        help="train on so many GPUs of this machine: torchrun starts this command once for each; with --batch N or "
-             "more")
-    groups["run"].add_argument("--quiet", action="store_true", help="no progress bars")
-    train.set_defaults(run=_train)
-
-    scene = commands.add_parser("scene", help="make a scene of photographs",
-                                description="Finds where photographs were taken, by COLMAP, and writes a scene for "
-                                            "`dsmoe train`: images without lens distortion, cameras and points. It "
-                                            "needs pycolmap. Started again it goes on with what it has found.")
-    scene.add_argument("photos", metavar="PHOTOS", help="folder of photographs; subfolders are read too")
-    scene.add_argument("-o", "--output", metavar="SCENE", required=True,
-                       help="folder to write: new, empty, or of the same photographs")
-    scene.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto",
-                       help="which photographs are compared. exhaustive: all pairs; sequential: neighbours by name, as "
-                            "of a video; auto: all pairs of up to 200 (default: auto)")
-    scene.add_argument("--camera-model", default="OPENCV",
-                       choices=("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"),
-                       help="of the lens, by COLMAP's names (default: OPENCV)")
-    scene.add_argument("--quiet", action="store_true", help="no progress bars")
-    scene.set_defaults(run=_scene)
-
-    evaluate = commands.add_parser("eval", help="measure a trained run again",
-                                   description="Measures PSNR, SSIM and FPS of a finished run.")
-    evaluate.add_argument("output", metavar="OUT", help="output folder of `dsmoe train`")
-    evaluate.add_argument("--split", choices=("test", "train"), default="test", help="which views (default: test)")
-    evaluate.add_argument("--scene", help="where the scene lies now, if it has moved")
-    evaluate.add_argument("--lpips", choices=("vgg", "alex"),
-                          help="also LPIPS with this network; weights: $DSMOE_LPIPS_VGG or $DSMOE_LPIPS_ALEX, else "
-                               "torchmetrics downloads them")
-    _add_device(evaluate)
-    evaluate.set_defaults(run=_eval)
-
-    render = commands.add_parser("render", help="write images or a video of a trained run or a .ply",
-                                 description="Writes one PNG for every camera of a scene, or a video around it.")
-    render.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
-    render.add_argument("-o", "--output", metavar="DIR|VIDEO", required=True,
-                        help="folder for the images: new, empty, or of an earlier rendering; with --orbit also a file "
-                             "that ends in .mp4 (needs imageio-ffmpeg) or .gif")
-    render.add_argument("--orbit", action="store_true", help="once around what the scene's cameras look at")
-    render.add_argument("--frames", type=int, default=120, metavar="N", help="of an orbit (default: 120)")
-    render.add_argument("--fps", type=float, default=30.0, metavar="X", help="of a video (default: 30)")
-    render.add_argument("--split", choices=("test", "train", "all"), default="test",
-                        help="which cameras (default: test)")
-    _add_model_options(render, "whose cameras are rendered (default: the run's; needed for a .ply)")
-    render.add_argument("--resolution", type=int, metavar="N",
-                        help="as in train (default: the run's, for a .ply -1)")
-    render.add_argument("--principal-point", choices=PRINCIPAL_POINTS,
-                        help="as in train (default: the run's, for a .ply scene)")
-    render.add_argument("--depth", action="store_true",
-                        help="also NAME.depth.npy: view depth in the scene's units [H, W] float32, 0: nothing is hit")
-    render.add_argument("--alpha", action="store_true",
-                        help="also NAME.alpha.png: how much of a pixel Gaussians cover, 8 bits")
-    render.add_argument("--overwrite", action="store_true",
-                        help="write into any folder, and replace files of the same names; a VIDEO that is there too")
-    _add_device(render)
-    render.set_defaults(run=_render)
-
-    export = commands.add_parser("export", help="write a trained model for other programs, or as a page to look at",
-                                 description="Writes a trained model as one file. A page (.html) shows it in a "
-                                             "browser by the blend that it was trained with; other viewers show the "
-                                             "other formats by alpha.")
-    export.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
-    export.add_argument("-o", "--output", metavar="FILE", help="file to write (default: model.FORMAT)")
-    export.add_argument("--format", choices=("html", "ply", "splat", "spz", "glb"),
-                        help="default: by the ending of FILE, else html; spz needs gsply")
-    export.add_argument("--sh-degree", type=int, choices=range(4), metavar="N",
-                        help="keep view-dependent colour up to this degree: smaller files (default: all; .splat "
-                             "holds degree 0)")
-    export.add_argument("--bake", choices=("alpha",),
-                        help="first fine-tune the model to this blend, which every viewer shows; needs the scene's "
-                             "images, and prints the dB that it costs")
-    export.add_argument("--bake-iterations", type=int, default=5000, metavar="N", help="(default: 5000)")
-    _add_model_options(export, "whose test views the page begins with, and on which --bake trains (default: the run's)")
-    export.add_argument("--overwrite", action="store_true", help="replace a FILE that is there")
-    _add_device(export)
-    export.set_defaults(run=_export)
-
-    view = commands.add_parser("view", help="look at a trained model or a running training in the browser",
-                               description="Serves a live viewer of a run's model, of the checkpoints of a training "
-                                           "that goes on, or of a .ply. It needs viser.")
-    view.add_argument("source", metavar="OUT|PLY", help="output folder of `dsmoe train`, or a .ply file")
-    _add_model_options(view, "at whose first test view it begins (default: the run's)")
-    view.add_argument("--host", default="127.0.0.1", help="address to serve at; 0.0.0.0: to the network too "
-                                                          "(default: 127.0.0.1, this machine only)")
-    view.add_argument("--port", type=int, default=8080, help="or the next free one (default: 8080)")
-    _add_device(view)
-    view.set_defaults(run=_view)
-
-    patch = commands.add_parser("patch", help="make a public trainer's checkout train with this rasterizer",
-                                description="Patches a checkout of a public trainer, which then knows the options "
-                                            f"--blend_mode and --background_gate: {', '.join(TRAINERS)}.")
-    _add_patch_arguments(patch)
-
-    run = commands.add_parser("run", help="run an unmodified public trainer with this rasterizer",
-                              usage="dsmoe run --blend-mode MODE [--background-gate V] [--trainer NAME] -- COMMAND ...",
-                              description="Runs a command of an unmodified trainer with this rasterizer. Nothing is "
-                                          "written into the checkout; what the command starts has the rasterizer too.")
-    run.add_argument("--blend-mode", "--blend_mode", type=blend_mode_typed, choices=BLEND_MODES, required=True,
-                     help="nothing records it: give the same where a trained model is rendered")
-    run.add_argument("--background-gate", "--background_gate", type=float, metavar="V",
-                     help="in smoe, how much the background weighs; 0 is the paper's Eq. 7 (default: "
-                          "$DSMOE_BACKGROUND_GATE, else 0); nothing records it either")
-    run.add_argument("--trainer", metavar="NAME",
-                     help="a trainer (3dgs-2023, ...) or, for other trainers, the rasterizer whose API they call "
-                          "(inria, inria_2024, scaffold, ...); default: found out from the script's folder")
-    run.add_argument("words", metavar="COMMAND", nargs=argparse.REMAINDER, help="such as: python train.py -s DATA")
-    run.set_defaults(run=_run)
-
-    bench = commands.add_parser("bench", help="compare blend modes and trainers over a suite of scenes",
-                                description="Runs suites of training runs, measured alike, and reports on them.")
-    _add_bench_arguments(bench)
-
-    info = commands.add_parser("info", help="versions, backends, SIMD level, threads, GPU")
-    info.add_argument("--cmake", action="store_true",
-                      help="print only what CMAKE_PREFIX_PATH needs for find_package(diff_smoe_rasterization) in C++")
-    info.set_defaults(run=_info)
-
-    completion = commands.add_parser("completion", help="a script by which a shell completes commands and options",
-                                     description="Prints a script for the shell. In ~/.bashrc or, behind compinit, in "
-                                                 "~/.zshrc: eval \"$(dsmoe completion bash)\", respectively zsh.")
-    completion.add_argument("shell", choices=("bash", "zsh"))
-    completion.set_defaults(run=_completion)
-    for command in (train, scene, evaluate, render, export, view, run, info, completion):
-        command.set_defaults(command_parser=command)
-    return parser
 
 
 def main(argv: Optional[List[str]] = None) -> int:
@@ -201,7 +30,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     if unknown:  # argparse would show the usage of `dsmoe` alone
         _refuse(unknown, getattr(arguments, "command_parser", parser))
     try:
-        status = arguments.run(arguments) or 0
+        status = COMMANDS[arguments.command](arguments) or 0
         sys.stdout.flush()
         return status
     except BrokenPipeError:  # whoever read the output, such as `head`, has enough of it
@@ -231,11 +60,6 @@ def _refuse(unknown: List[str], parser: argparse.ArgumentParser) -> None:
                  + (f" (is {', '.join(meant)} meant?)" if meant else ""))
 
 
-def _add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--device", choices=DEVICES, default="auto",
-                        help="where to render; auto: $DSMOE_DEVICE, else the GPU if it can be used (default: auto)")
-
-
 def _choose_device(arguments: argparse.Namespace) -> None:
     """Replaces `auto` by a device, and says which it is."""
     from .system.device import chosen_device, device_line
@@ -244,91 +68,8 @@ def _choose_device(arguments: argparse.Namespace) -> None:
     print(device_line(arguments.device), flush=True)
 
 
-def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
-    """What says how a trained model is opened; scene: what its folder is for."""
-    parser.add_argument("--scene", help="folder " + scene)
-    parser.add_argument("--blend-mode", type=blend_mode_typed, choices=BLEND_MODES,
-                        help="needed for a .ply that does not record it; must agree where it does")
-    parser.add_argument("--background-gate", type=float, metavar="X",
-                        help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
-    parser.add_argument("--white-background", action="store_true", default=None,
-                        help="white background (default: the run's, for a .ply black)")
-
-
-def _add_patch_arguments(patch: argparse.ArgumentParser) -> None:
-    actions = patch.add_subparsers(dest="action", required=True, metavar="ACTION")
-    for name, text in (("apply", "patch the checkout; each line of the patch says so"),
-                       ("check", "say whether it is patchable, and what is patched of it"),
-                       ("diff", "show what the patch changes, and write nothing"),
-                       ("revert", "take the patch out of every file, byte for byte")):
-        action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        action.add_argument("path", metavar="PATH", help="the checkout's folder")
-        if name != "revert":
-            action.add_argument("--modernise", action="store_true",
-                                help="also what the trainer needs to start on today's torch, CUDA and Python")
-            action.add_argument("--fuse", action="store_true",
-                                help="also SSIM and Adam by this package's kernels: the same results, sooner")
-            action.add_argument("--trainer", metavar="NAME", help="which trainer it is (default: found out)")
-        action.set_defaults(run=_patch, command_parser=action)
-
-
-def _add_bench_arguments(bench: argparse.ArgumentParser) -> None:
-    actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION")
-    run = actions.add_parser("run", help="run what is not done yet of a suite",
-                             description="Runs a suite with Snakemake; started again, it continues. A cell that fails "
-                                         "becomes a row with its reason, and the command returns 1.",
-                             usage="%(prog)s SUITE [-o RESULTS] [OPTION ...]")  # --slurm would take a SUITE behind it
-    run.add_argument("suite", metavar="SUITE", help="a .yaml file, or a shipped one: smoke, table1, table2, table3, "
-                                                    "fig4, fig5, captures, captures_ablation, captures_baselines, "
-                                                    "gate, gate_equal, budgets")
-    run.add_argument("-o", "--output", metavar="RESULTS", help="folder to write (default: bench_results/NAME)")
-    run.add_argument("--device", choices=DEVICES,
-                     help="where to train, in place of the suite's protocol.device; auto: the GPU if it can be used")
-    run.add_argument("--jobs", type=int, metavar="N",
-                     help="cells at once (default: --per-gpu on each GPU; on the CPU one, beyond which their times and "
-                          "FPS stay out of the report)")
-    run.add_argument("--per-gpu", type=int, default=1, metavar="K",
-                     help="cells that share a GPU (default: 1); beyond 1 their times and FPS stay out of the report")
-    run.add_argument("--slurm", nargs="*", metavar="KEY=VALUE",
-                     help="submit cells to Slurm; resources of each, such as slurm_partition=gpu runtime=120 "
-                          "mem_mb=32000 cpus_per_task=8")
-    run.add_argument("--only", action="append", default=[], metavar="FIELD=VALUE",
-                     help="only such cells; fields: method, scene, blend_mode, background_gate, schedule, "
-                          "densify_grad_threshold, budget, seed, headline")
-    run.add_argument("--rows", metavar="FILE|RESULTS",
-                     help="a file of rows (.jsonl), or a folder of results, whose cells are not run again")
-    run.add_argument("--retry-failed", action="store_true", help="run failed cells again")
-    run.add_argument("--dry-run", action="store_true", help="say which cells are done and which are not")
-    run.set_defaults(run=_bench_run)
-    report = actions.add_parser("report", help="tables, curves and a page of results",
-                                description="Writes tables, curves and a page that works offline.")
-    report.add_argument("results", metavar="RESULTS", help="folder of `dsmoe bench run`, or a file rows.jsonl")
-    report.add_argument("-o", "--output", metavar="DIR", default="report", help="folder to write (default: report)")
-    report.set_defaults(run=_bench_report)
-
-
-def _completion(arguments: argparse.Namespace) -> None:
-    cases = "\n".join(f"    {path}) words='{' '.join(words)}' ;;" for path, words in _words_of(build_parser()))
-    print(("autoload -U +X bashcompinit && bashcompinit\n" if arguments.shell == "zsh" else "") + f"""_dsmoe() {{
-  local words
-  case "${{COMP_WORDS[*]:1:COMP_CWORD-1}} " in
-{cases}
-  esac
-  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
-}}
-complete -o bashdefault -o default -F _dsmoe dsmoe""")
-
-
-def _words_of(parser: argparse.ArgumentParser, path: str = "") -> Iterator[Tuple[str, List[str]]]:
-    """(pattern of what is typed before, words that may follow) of a parser's commands and then its own."""
-    words: List[str] = []
-    for action in parser._actions:
-        words += action.option_strings
-        if isinstance(action, argparse._SubParsersAction):
-            words += action.choices
-            for name, child in action.choices.items():
-                yield from _words_of(child, f"{path}{name}\\ ")
-    yield path + "*", words
+def _bench(arguments: argparse.Namespace) -> Optional[int]:
+    return _bench_run(arguments) if arguments.action == "run" else _bench_report(arguments)
 
 
 def _bench_run(arguments: argparse.Namespace) -> int:
@@ -413,7 +154,7 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     from .results.rows import blend_name, results_table, viewer_warning
     from .system.device import device_line
     from .system.process import command
-    from .training.loop import train
+    from .train import train
 
     if not group.leads:
         train(config, arguments.resume, arguments.overwrite, progress=False, group=group)
@@ -424,11 +165,11 @@ def _train_in(group: Group, config: TrainConfig, arguments: argparse.Namespace) 
     batch = f", {config.batch} views a step" if config.batch > 1 else ""
     processes = f", in {group.size} processes" if group.size > 1 else ""
     print(f"{printable(config.scene)} -> {printable(config.output)}: blend mode {blend}, strategy "
-          f"{config.schedule}{budget}, {config.iterations} iterations{batch}{processes}, seed {config.seed}")
+          f"{config.strategy}{budget}, {config.iterations} iterations{batch}{processes}, seed {config.seed}")
     if group.size > config.batch:
         print(f"note: {group.size} processes share {config.batch} view{'s' if config.batch > 1 else ''} a step, so "
               f"{group.size - config.batch} blend nothing; --batch {group.size} keeps all busy")
-    if config.schedule == "gate" and 4 * config.densify_until_iter >= 3 * config.iterations:
+    if config.strategy == "importance" and 4 * config.densify_until_iter >= 3 * config.iterations:
         print(f"note: --densify-until-iter {config.densify_until_iter} leaves no iterations to settle; below three "
               "quarters of --iterations it does, and --scale-recipe makes it half of them")
     row = train(config, arguments.resume, arguments.overwrite, progress=not arguments.quiet, group=group,
@@ -581,3 +322,11 @@ def _info(arguments: argparse.Namespace) -> None:
     from .system.environment import describe
 
     print(describe())
+
+
+def _completion(arguments: argparse.Namespace) -> None:
+    print(completion_script(arguments.shell))
+
+
+COMMANDS = {"train": _train, "scene": _scene, "eval": _eval, "render": _render, "export": _export, "view": _view,
+            "patch": _patch, "run": _run, "bench": _bench, "info": _info, "completion": _completion}

@@ -1,7 +1,6 @@
-"""Every option of a training run in one dataclass; the command line, OUT/config.json and resume all read it."""
+"""Every option of a training run in one dataclass, its checks and its file OUT/config.json."""
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import glob
 import json
@@ -18,30 +17,20 @@ from diff_smoe_rasterization.settings import (
     record_of,
     resolve_background_gate,
     resolve_blend_mode,
-    said_of_name_in_files,
 )
 
 from .errors import ConfigError
-from .gate_options import GateOptions, parse_gate_options
+from .importance_options import ImportanceOptions, parse_importance_options
 from .system.files import is_file, is_folder, write_text_atomically
 
 CONFIG_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.pt"  # beside it
-SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
-BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
+STRATEGY_NAMES = ("3dgs", "steady", "importance", "mcmc")
+BATCHED = ("3dgs", "steady")  # the strategies that train on batches of views, and on several GPUs
 PRINCIPAL_POINTS = ("scene", "centre")
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
 LARGEST = 2**53  # of whole numbers, up to which floats hold each
 DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
-# How `--help` groups the options; those that no group names are of the last one.
-GROUPS = {
-    "scene": ("images", "resolution", "test_every", "principal_point", "init_points", "white_background",
-              "random_background"),
-    "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
-    "length, and number of Gaussians": ("iterations", "batch", "budget", "schedule", "strategy_options"),
-    "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
-    "recipe": (),
-}
 LEARNED = "learned"  # the background gate that a training finds
 # Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
 RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
@@ -54,9 +43,10 @@ def _option(default: Any, text: str, **extra: Any) -> Any:
     return field(default=default, metadata={"help": text, **extra})
 
 
-def _recipe(published: Any, gate: Any, text: str) -> Any:
-    """A field of the recipe that --strategy gate sets otherwise: None until `__post_init__` knows the strategy."""
-    return _option(None, f"{text} (default: {published}; gate: {gate})", published=published, gate=gate)
+def _recipe(published: Any, importance: Any, text: str) -> Any:
+    """A field of the recipe that `importance` sets otherwise: None until `__post_init__` knows the strategy."""
+    return _option(None, f"{text} (default: {published}; importance: {importance})", published=published,
+                   importance=importance)
 
 
 @dataclass
@@ -100,12 +90,12 @@ class TrainConfig:
         0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
            "0: all points, respectively 100,000")
     budget: int = _option(0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed; 0: none")
-    schedule: Optional[str] = _option(
+    strategy: Optional[str] = _option(
         None, "how Gaussians are added and removed. 3dgs: the original recipe; steady: no opacity reset and no size "
-              "prune; gate: grow beyond the budget, remove what changes the images least, move the rest to where the "
-              "error is; mcmc: relocation and noise (default: gate with --budget, else 3dgs)",
-        choices=SCHEDULES, flags=("--strategy", "--schedule"))
-    strategy_options: str = _option("", "settings of `gate`: NAME=X,...", metavar="NAME=X,...")
+              "prune; importance: grow beyond the budget, remove what changes the images least, move the rest to where "
+              "the error is; mcmc: relocation and noise (default: importance with --budget, else 3dgs)",
+        choices=STRATEGY_NAMES, flags=("--strategy", "--schedule"))
+    strategy_options: str = _option("", "settings of `importance`: NAME=X,...", metavar="NAME=X,...")
     seed: int = _option(0, "seed of every random choice")
     device: str = _option("cpu", "where to train; auto: $DSMOE_DEVICE, else the GPU if it can be used",
                           choices=DEVICES[1:], typed_choices=DEVICES, typed_default=DEVICES[0])
@@ -113,15 +103,15 @@ class TrainConfig:
     sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
     antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
     deterministic: bool = _option(
-        False, "cuda: gradients of a step, and the scores of `gate`, equal bit for bit from run to run, and for any "
-               "number of GPUs; slower")
+        False, "cuda: gradients of a step, and the scores of `importance`, equal bit for bit from run to run, and for "
+               "any number of GPUs; slower")
 
     lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
     position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
     position_lr_final: float = _recipe(0.0000016, 0.0000064, "last learning rate of positions, times the scene extent")
     position_lr_max_steps: int = _option(30_000, "step at which the last position learning rate is reached")
     feature_lr: float = _recipe(0.0025, 0.005, "learning rate of base colours; higher SH bands take a 20th of it, "
-                                                "with gate a tenth")
+                                                "with importance a tenth")
     opacity_lr: float = _option(0.05, "learning rate of opacity logits")
     scaling_lr: float = _recipe(0.005, 0.01, "learning rate of log scales")
     rotation_lr: float = _option(0.001, "learning rate of quaternions")
@@ -132,7 +122,7 @@ class TrainConfig:
         0.01, "largest scale, as a part of the scene extent, that is cloned; larger ones are split")
     densify_from_iter: int = _option(500, "densification starts after this step")
     densify_until_iter: int = _option(
-        15_000, "densification stops before this step; all milestones of gate are parts of it")
+        15_000, "densification stops before this step; all milestones of importance are parts of it")
     densification_interval: int = _option(100, "steps between two densifications")
     opacity_reset_interval: int = _option(3000, "steps between two opacity resets")
 
@@ -143,9 +133,9 @@ class TrainConfig:
         try:
             self.blend_mode = resolve_blend_mode(self.blend_mode)
             self.background_gate = _training_gate(self.blend_mode, self.background_gate)
-            if self.schedule is None:
-                self.schedule = "gate" if self.budget else "3dgs"
-            for name, value in {**_recipe_of(self.schedule), **_learned_gate_of(self.blend_mode)}.items():
+            if self.strategy is None:
+                self.strategy = "importance" if self.budget else "3dgs"
+            for name, value in {**_recipe_of(self.strategy), **learned_gate_of(self.blend_mode)}.items():
                 if getattr(self, name) is None:
                     setattr(self, name, value)
         except ValueError as error:
@@ -166,23 +156,23 @@ class TrainConfig:
         self._require("iterations", self.iterations >= 1, "at least 1")
         self._require("batch", self.batch >= 1, "at least 1")
         self._require("iterations", self.iterations % self.batch == 0, f"a multiple of --batch, {self.batch}")
-        if self.batch > 1 and self.schedule not in BATCHED:
-            raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.schedule}: only "
+        if self.batch > 1 and self.strategy not in BATCHED:
+            raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.strategy}: only "
                               f"{' and '.join(BATCHED)} know batches")
         self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
         self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
         self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
         self._require("budget", self.budget >= 0, "at least 0")
-        needs_budget = self.schedule in ("gate", "mcmc")
-        self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.schedule}")
-        if self.schedule == "gate":
-            self.gate_options()
-            self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy gate; "
+        needs_budget = self.strategy in ("importance", "mcmc")
+        self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.strategy}")
+        if self.strategy == "importance":
+            self.importance_options()
+            self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy importance; "
                           "--scale-recipe makes it half of --iterations")
             self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter "
-                          "with --strategy gate, whose removals end there; --scale-recipe shortens all of it")
-        self._require("strategy_options", not self.strategy_options or self.schedule == "gate",
-                      f"left out with --strategy {self.schedule}: only gate has some")
+                          "with --strategy importance, whose removals end there; --scale-recipe shortens all of it")
+        self._require("strategy_options", not self.strategy_options or self.strategy == "importance",
+                      f"left out with --strategy {self.strategy}: only importance has some")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
         self._require("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "between 0 and 1")
         self._require("background_gate_bound", 0.0 <= self.background_gate_bound < 1.0, "at least 0 and below 1")
@@ -200,14 +190,14 @@ class TrainConfig:
             self._require(name, getattr(self, name) >= 0, "at least 0")
         return self
 
-    def gate_options(self) -> GateOptions:
-        """The settings of the strategy `gate`. Raises ConfigError."""
-        return parse_gate_options(self.strategy_options)
+    def importance_options(self) -> ImportanceOptions:
+        """The settings of the strategy `importance`. Raises ConfigError."""
+        return parse_importance_options(self.strategy_options)
 
     @property
     def most_points(self) -> int:
-        """How many points to start from at most, 0: any number. Only `gate` starts from more than the budget."""
-        return 0 if self.schedule == "gate" else self.budget
+        """How many points to start from at most, 0: any number. Only `importance` starts from more than the budget."""
+        return 0 if self.strategy == "importance" else self.budget
 
     def _require(self, name: str, holds: bool, requirement: str) -> None:
         if not holds:
@@ -224,10 +214,10 @@ class TrainConfig:
 
     def _changed(self, options: Dict[str, Any]) -> TrainConfig:
         if options.get("blend_mode", self.blend_mode) != self.blend_mode:
-            usual = _learned_gate_of(str(self.blend_mode))
+            usual = learned_gate_of(str(self.blend_mode))
             options = {"background_gate": None, **self._unset(usual), **options}
-        if options.get("schedule", self.schedule) != self.schedule:
-            usual = _recipe_of(str(self.schedule))
+        if options.get("strategy", self.strategy) != self.strategy:
+            usual = _recipe_of(str(self.strategy))
             options = {**self._unset(usual), "strategy_options": "", **options}
         return dataclasses.replace(self, **options)
 
@@ -238,7 +228,7 @@ class TrainConfig:
     def unusual_recipe(self) -> Dict[str, Any]:
         """What of the recipe differs from the strategy's defaults."""
         usual = {**{option.name: option.default for option in dataclasses.fields(self)},
-                 **_recipe_of(str(self.schedule))}
+                 **_recipe_of(str(self.strategy))}
         return {name: getattr(self, name) for name in RECIPE if getattr(self, name) != usual[name]}
 
     def shortened(self) -> TrainConfig:
@@ -246,7 +236,7 @@ class TrainConfig:
 
         The densification interval stays, as far as ten densifications fit. What is not at its default is kept.
         """
-        default = TrainConfig(blend_mode=self.blend_mode, schedule=self.schedule)
+        default = TrainConfig(blend_mode=self.blend_mode, strategy=self.strategy)
         share = self.iterations / default.iterations
         milestones = {name: max(1, round(getattr(default, name) * share)) for name in (
             "position_lr_max_steps", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
@@ -269,6 +259,7 @@ class TrainConfig:
     @classmethod
     def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
         """The options of an earlier run; one that names no background gate was trained with 0."""
+        values = of_today(values)
         mode, gate = mode_of_record(values["blend_mode"]), values.get("background_gate")
         return cls(**{**values, "blend_mode": mode,
                       "background_gate": 0.0 if gate is None and mode in GATED_MODES else gate})
@@ -293,7 +284,7 @@ class TrainConfig:
         if not isinstance(values, dict):
             raise ConfigError(f"{path}: expected a json object of options")
         known = {option.name for option in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - known)
+        unknown = sorted(set(of_today(values)) - known)
         if unknown:
             raise ConfigError(f"{path}: unknown option {', '.join(unknown)} (written by another version?)")
         # Rendering must use the mode of the training, so an absent mode is never replaced by a default.
@@ -330,7 +321,7 @@ class TrainConfig:
         if later.iterations > self.iterations:
             harmless.add("iterations")
         if self.blend_mode != later.blend_mode:  # what follows from that needs no text of its own
-            before, after = _learned_gate_of(self.blend_mode), _learned_gate_of(later.blend_mode)
+            before, after = learned_gate_of(self.blend_mode), learned_gate_of(later.blend_mode)
             harmless |= {name for name in before
                          if getattr(self, name) == before[name] and getattr(later, name) == after[name]}
         texts = []
@@ -348,14 +339,24 @@ class TrainConfig:
                               f"{self.output}` alone keeps the run's options; more --iterations extend it")
 
 
-def _recipe_of(schedule: str) -> Dict[str, Any]:
+def of_today(record: Dict[str, Any]) -> Dict[str, Any]:
+    """Options or a row by today's names. Earlier versions called `strategy` `schedule`, and `importance` `gate`."""
+    def renamed(values: Dict[str, Any]) -> Dict[str, Any]:
+        return {"strategy" if name == "schedule" else name:
+                "importance" if (name, value) == ("schedule", "gate") else value for name, value in values.items()}
+
+    protocol = record.get("protocol")
+    return renamed({**record, "protocol": renamed(protocol)} if isinstance(protocol, dict) else record)
+
+
+def _recipe_of(strategy: str) -> Dict[str, Any]:
     """What a strategy sets of the recipe, by option, where strategies differ."""
-    recipe = "gate" if schedule == "gate" else "published"
+    recipe = "importance" if strategy == "importance" else "published"
     return {option.name: option.metadata[recipe] for option in dataclasses.fields(TrainConfig)
             if recipe in option.metadata}
 
 
-def _learned_gate_of(blend_mode: str) -> Dict[str, float]:
+def learned_gate_of(blend_mode: str) -> Dict[str, float]:
     """How a background gate is learned by default, where blend modes differ."""
     tails = blend_mode == "smoe"
     return {"background_gate_bound": 0.0 if tails else 0.03, "background_gate_start": 0.1 if tails else 1.0,
@@ -381,105 +382,16 @@ def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[flo
     return float(resolve_background_gate(blend_mode, asked))
 
 
-def _number_or_learned(text: str) -> Union[float, str]:
-    try:
-        return text if text == LEARNED else float(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
-
-
-def blend_mode_typed(text: str) -> str:
-    """What --blend-mode takes: `choices` refuses what is no blend mode, this says more of names that files use."""
-    if said_of_name_in_files(text):
-        raise argparse.ArgumentTypeError(f"is {text!r}; it must be {said_of_name_in_files(text)}")
-    return text
-
-
-def _flags(option: dataclasses.Field[Any]) -> Sequence[str]:
+def flags_of(option: dataclasses.Field[Any]) -> Sequence[str]:
     """How an option is typed; texts have the first of these."""
     return option.metadata.get("flags", ("--" + option.name.replace("_", "-"),))
 
 
 def _flag(option: dataclasses.Field[Any]) -> str:
-    return _flags(option)[0]
+    return flags_of(option)[0]
 
 
 def flags_text(options: Dict[str, Any]) -> str:
     """What to type for options by name."""
     known = {option.name: option for option in dataclasses.fields(TrainConfig)}
     return " ".join(f"{_flag(known[name])} {value}" for name, value in options.items())
-
-
-_TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
-
-
-def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
-                  defaults: bool = True) -> Dict[str, argparse._ArgumentGroup]:
-    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser; returns their groups.
-
-    Options that are not given are absent from the parsed arguments. defaults: whether the help text names what they
-    are then.
-    """
-    groups = {title: parser.add_argument_group(title) for title in GROUPS}
-    titles = {name: title for title, names in GROUPS.items() for name in names}
-    for option in dataclasses.fields(TrainConfig):
-        if option.name in skip:
-            continue
-        text = option.metadata["help"].replace("%", "%%")
-        if option.metadata.get("positional"):
-            parser.add_argument(option.name, metavar=option.name.upper(), help=text)
-            continue
-        flags, group = _flags(option), groups[titles.get(option.name, "recipe")]
-        if option.type == "bool":
-            group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
-            continue
-        kind = blend_mode_typed if option.name == "blend_mode" else _TYPES[str(option.type)]
-        keywords: Dict[str, Any] = {"type": kind, "default": argparse.SUPPRESS}
-        if option.metadata.get("required"):
-            keywords["required"] = True
-        elif option.default is not None and defaults:
-            text += f" (default: {option.metadata.get('typed_default', option.default)})"
-        if option.metadata.get("choices"):
-            keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
-        else:
-            letter = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
-            keywords["metavar"] = option.metadata.get("metavar", letter)
-        group.add_argument(*flags, help=text, dest=option.name, **keywords)
-    return groups
-
-
-def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
-    """The options of TrainConfig among parsed arguments."""
-    names = {option.name for option in dataclasses.fields(TrainConfig)}
-    return {name: value for name, value in vars(arguments).items() if name in names}
-
-
-def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None) -> TrainConfig:
-    """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
-
-    With --scale-recipe the milestones that are not given keep their share of the iterations. earlier: the run that goes
-    on with these options.
-    """
-    options = given_options(arguments)
-    config = TrainConfig(**options)
-    if getattr(arguments, "scale_recipe", False):
-        config = dataclasses.replace(config.shortened(), **options)
-    if earlier:
-        earlier.check_continued_by(config)
-    _check_learned(config, options)
-    return config.validate()
-
-
-def _check_learned(config: TrainConfig, given: Dict[str, Any]) -> None:
-    """Raises ConfigError where it is given how the background gate is learned, and the gate is not learned."""
-    useless = [option for option in dataclasses.fields(TrainConfig)
-               if option.name in _learned_gate_of(config.blend_mode) and option.name in given]
-    if not useless or config.background_gate == LEARNED:
-        return
-    if config.blend_mode in GATED_MODES:
-        asked = "--background-gate" if "background_gate" in given else "$" + BACKGROUND_GATE_VARIABLE
-        why = f"{asked} fixes the background gate at {config.background_gate}; --background-gate {LEARNED} learns it"
-    else:
-        why = (f"in the blend mode {config.blend_mode} no background gate is learned; --blend-mode "
-               f"{' or '.join(GATED_MODES)} learns one")
-    raise ConfigError(f"{_flag(useless[0])} is given, but {why}")

@@ -6,6 +6,7 @@ from typing import Iterator, Sequence
 import torch
 from PIL import Image
 
+from .choices import ORBIT_FRAMES, VIDEO_FPS
 from .errors import TrainerError
 from .inspection import said_of_images, to_image, write_images
 from .opening import Trained
@@ -14,7 +15,7 @@ from .scenes.cameras import Camera
 from .system.progress import progress_bar
 
 
-def film(trained: Trained, path: str, frames: int = 120, fps: float = 30.0, outputs: Sequence[str] = (),
+def film(trained: Trained, path: str, frames: int = ORBIT_FRAMES, fps: float = VIDEO_FPS, outputs: Sequence[str] = (),
          overwrite: bool = False) -> str:
     """Goes once around the scene and writes what is seen; returns a line that says what was written.
 

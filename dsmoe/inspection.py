@@ -26,8 +26,8 @@ from .system.device import check_device
 from .system.files import write_json_atomically
 from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
 from .system.progress import progress_bar
+from .train import PER_VIEW_NAME
 from .training.checkpoint import damage_named, load_checkpoint
-from .training.loop import PER_VIEW_NAME
 
 RENDER = "dsmoe render"  # in its folders' records
 

@@ -11,6 +11,7 @@ import urllib.parse
 from dataclasses import dataclass
 from typing import Any, Callable, List, Optional, Sequence, Tuple
 
+from .choices import CAMERA_MODEL, MATCHING, MOST_EXHAUSTIVE
 from .errors import SceneError, TrainerError
 from .scenes.images import UNREADABLE, image_size, open_image
 from .system.files import is_folder
@@ -24,7 +25,6 @@ WRITTEN = ("images", "sparse/0", *(f"{WORK}/{name}" for name in ("models", "best
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 UNKNOWN_ENDINGS = (".heic", ".heif", ".dng", ".raw", ".cr2", ".nef", ".arw")
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
-MOST_EXHAUSTIVE = 200  # photographs, up to which "auto" compares all pairs
 MIN_PHOTOS = 3
 POLL_SECONDS = 0.5
 FOCAL_LENGTH, EXIF = 37386, 0x8769  # tags
@@ -50,8 +50,8 @@ class Made:
                 f"reprojection error {self.error:.2f} pixels")
 
 
-def make_scene(photos: str, output: str, matching: str = "auto", camera_model: str = "OPENCV", progress: bool = True,
-               say: Callable[[str], None] = lambda text: None) -> Made:
+def make_scene(photos: str, output: str, matching: str = MATCHING[0], camera_model: str = CAMERA_MODEL,
+               progress: bool = True, say: Callable[[str], None] = lambda text: None) -> Made:
     """Writes a COLMAP scene of the photographs in a folder: pinhole images, and where each was taken.
 
     matching: "exhaustive" compares all pairs, "sequential" neighbours by name, "auto" all pairs of up to

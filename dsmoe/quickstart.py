@@ -14,7 +14,8 @@ from typing import Any, Dict, List, Optional
 
 import torch
 
-from .config import TrainConfig, add_arguments, flags_text
+from .config import TrainConfig, flags_text
+from .config_arguments import add_arguments
 from .errors import TrainerError, in_one_line
 from .inspection import open_renderer, to_image
 from .results.metrics import psnr, quantised
@@ -29,7 +30,7 @@ from .system.device import chosen_device, device_line
 from .system.interrupt import exit_status
 from .system.output_folder import Record, make_folder, only_one, own_record, read_record, remove_files, write_record
 from .system.process import command, set_up_process
-from .training.loop import train
+from .train import train
 
 MODES = ("alpha", "smoe")
 PICTURES = 3  # test views that are shown

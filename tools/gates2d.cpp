@@ -256,8 +256,8 @@ double Fit::step() {
   tensor.square = numbers_of(square_);
   tensor.size = static_cast<int64_t>(kKernelNumbers * model_.kernels.size());
   tensor.row_size = kKernelNumbers;
-  tensor.rates = {rate / (1 - std::pow(beta1, done_)), 1 / std::sqrt(1 - std::pow(beta2, done_))};
-  cpu::adam<double>({tensor}, {{beta1, beta2, 1 - beta1, 1 - beta2, 1e-15}, nullptr}, 1);
+  tensor.rates = adam_rates<double>(rate, done_, beta1, beta2);
+  cpu::adam<double>({tensor}, {adam_constants<double>(beta1, beta2, 1e-15), nullptr}, 1);
   return loss;
 }
 

@@ -5,6 +5,7 @@
 #include <map>
 #include <stdexcept>
 
+#include "dsmoe/covariance.h"
 #include "io/file.h"
 
 namespace dsmoe::tools {
@@ -26,10 +27,8 @@ Vector unit(const Vector& a) { return scaled(a, 1 / std::sqrt(dot(a, a))); }
 
 /// By rows, of a quaternion (w, x, y, z) of unit length.
 std::array<double, 9> rotation_matrix(const std::array<double, 4>& q) {
-  const auto [w, x, y, z] = q;
-  return {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),  //
-          2 * (x * y + w * z),     1 - 2 * (x * x + z * z), 2 * (y * z - w * x),  //
-          2 * (x * z - w * y),     2 * (y * z + w * x),     1 - 2 * (x * x + y * y)};
+  const auto [x, y, z] = quaternion_to_rotation<double>({q[0], q[1], q[2], q[3]});
+  return {x.x, x.y, x.z, y.x, y.y, y.z, z.x, z.y, z.z};
 }
 
 /// -R p, for the translation of a camera at p.

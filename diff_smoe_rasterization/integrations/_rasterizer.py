@@ -21,6 +21,13 @@ ON_REQUEST = {"inverse_depth": ("inverse_depth",), "depth": ("depth", "alpha"), 
 COUNTED = ("pixels", "weights", "n_touched", "counts", "opacity_sums")  # results that need another walk
 
 
+def pixel_rays(settings: Settings, like: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+    """Returns x [W] and y [H] of the rays (x, y, 1) through the pixels, in the camera's frame."""
+    lens = torch.linalg.solve(settings.viewmatrix.to(like), settings.projmatrix.to(like))
+    x, y = ((2 * torch.arange(size).to(like) + 1) / size - 1 for size in (settings.image_width, settings.image_height))
+    return (x - lens[2, 0]) / lens[0, 0], (y - lens[2, 1]) / lens[1, 1]
+
+
 def settings_with(names: Sequence[str], module: str) -> type:
     """Returns the package's settings as a class that has the fields `names` behind `debug`.
 

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as functional
 
 from diff_smoe_rasterization import GaussianRasterizationSettings, rasterize, reference, visible_radii
+from diff_smoe_rasterization.camera import clip_matrix
 from diff_smoe_rasterization.gaussians import divided
 from diff_smoe_rasterization.settings import BackgroundGate
 
@@ -107,7 +108,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
     means2d, depths = _image_points(means, viewmats, Ks)
     differentiable = [means, opacities, colors, viewmats, backgrounds, *shape.values()]
     with_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in differentiable)
-    projections = viewmats.transpose(1, 2) @ _clip_matrices(Ks.detach(), width, height)
+    projections = viewmats.transpose(1, 2) @ clip_matrix(Ks.detach(), width, height).transpose(1, 2).contiguous()
     centres = torch.inverse(viewmats)[:, :3, 3]
     focal_lengths = Ks[:, (0, 1), (0, 1)].tolist()
     all_settings = [GaussianRasterizationSettings(
@@ -166,15 +167,6 @@ def _image_points(means, viewmats, Ks):
     depths = in_view[..., 2]
     focal_lengths, principal_points = Ks[:, None, (0, 1), (0, 1)], Ks[:, None, :2, 2]
     return focal_lengths * in_view[..., :2] / depths[..., None] + principal_points, depths
-
-
-def _clip_matrices(Ks, width, height):
-    """Returns camera to clip coordinates [C, 4, 4], for row vectors; pixels [0, width] become x in [-1, 1]."""
-    clip = Ks.new_zeros(len(Ks), 4, 4)
-    clip[:, 0, 0], clip[:, 1, 1] = 2 * Ks[:, 0, 0] / width, 2 * Ks[:, 1, 1] / height
-    clip[:, 2, 0], clip[:, 2, 1] = 2 * Ks[:, 0, 2] / width - 1, 2 * Ks[:, 1, 2] / height - 1
-    clip[:, 2, 2:] = 1
-    return clip
 
 
 class _Points:

@@ -11,8 +11,9 @@ from typing import Any, Dict
 import torch
 
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
+from diff_smoe_rasterization.gaussians import quaternion_to_matrix
 
-from ._rasterizer import classes_of, results_of
+from ._rasterizer import classes_of, pixel_rays, results_of
 from ._walk import Walk
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
@@ -51,16 +52,11 @@ class GaussianRasterizer(_Rasterizer):
         gidx = _strongest(settings, inputs)
         found, shown = gidx >= 0, gidx.clamp(min=0)
         view = settings.viewmatrix.to(color)
-        lens = torch.linalg.solve(view, settings.projmatrix.to(color))
-        y, x = ((2 * torch.arange(size).to(color) + 1) / size - 1 for size in gidx.shape)
-        x, y = (x - lens[2, 0]) / lens[0, 0], (y - lens[2, 1]) / lens[1, 1]
+        x, y = pixel_rays(settings, color)
         ray = x[None, :, None] * view[:3, 0] + y[:, None, None] * view[:3, 1] + view[:3, 2]  # of view z 1
         origin = settings.campos.to(color)
-        w, i, j, k = rotations[shown].unbind(-1)
-        axes = torch.stack([1 - 2 * (j * j + k * k), 2 * (i * j + w * k), 2 * (i * k - w * j),
-                            2 * (i * j - w * k), 1 - 2 * (i * i + k * k), 2 * (j * k + w * i),
-                            2 * (i * k + w * j), 2 * (j * k - w * i), 1 - 2 * (i * i + j * j)], -1)
-        local = axes.unflatten(-1, (3, 3)) / (3 * scales[shown])[..., None]  # an ellipsoid becomes the unit sphere
+        axes = quaternion_to_matrix(rotations[shown]).transpose(-1, -2).contiguous()
+        local = axes / (3 * scales[shown])[..., None]  # an ellipsoid becomes the unit sphere
         along = (local @ ray[..., None])[..., 0]
         start = (local @ (origin - means3D[shown])[..., None])[..., 0]
         a, b, c = (along * along).sum(-1), 2 * (along * start).sum(-1), (start * start).sum(-1) - 1

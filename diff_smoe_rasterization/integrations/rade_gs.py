@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
 from diff_smoe_rasterization import reference
 
-from ._rasterizer import classes_of, median_places, results_of, results_with_features
+from ._rasterizer import classes_of, median_places, pixel_rays, results_of, results_with_features
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -35,7 +35,8 @@ def _render(settings, inputs):
     color, radii, alpha, sums = results_with_features(
         ("color", "radii", "alpha", "features"), settings, inputs, "features",
         torch.cat([planes, normals, torch.ones_like(planes[:, :1])], 1))
-    x, y = _rays(settings, color)
+    x, y = pixel_rays(settings, color)
+    x, y = x.expand(len(y), -1), y[:, None].expand(-1, len(x))
     length = (x * x + y * y + 1).sqrt()
     shown = sums[6] > 0
     mean = (sums[0] + sums[1] * x + sums[2] * y) / torch.where(shown, sums[6], 1) / length
@@ -73,15 +74,6 @@ def _planes(settings: Settings, inputs: Dict[str, Any]) -> Tuple[torch.Tensor, t
     slope = slope * length + z * ray / length  # of the distance
     planes = torch.cat([z * length - (slope * ray).sum(1, keepdim=True), slope], 1)
     return planes.masked_fill(~is_before, 0), normalize(-product, dim=1)
-
-
-def _rays(settings: Settings, like: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-    """Returns x and y [H, W] of the rays (x, y, 1) through the pixels, in the camera's frame."""
-    lens = torch.linalg.solve(settings.viewmatrix.to(like), settings.projmatrix.to(like))
-    height, width = settings.image_height, settings.image_width
-    y, x = ((2 * torch.arange(size).to(like) + 1) / size - 1 for size in (height, width))
-    x, y = (x - lens[2, 0]) / lens[0, 0], (y - lens[2, 1]) / lens[1, 1]
-    return x[None].expand(height, width), y[:, None].expand(height, width)
 
 
 GaussianRasterizationSettings, _Rasterizer, rasterize_gaussians = classes_of("rade_gs", __name__, _render)

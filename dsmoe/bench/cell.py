@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -25,14 +24,13 @@ from ..errors import TrainerError
 from ..system.children import die_with_parent
 from ..system.files import write_json_atomically
 from ..system.output_folder import locked
+from .logs import last_line
 from .names import ROW_NAME, read_json
 
 LOG_NAME = "log.txt"
 SHARING = {"cuda": "cells_per_gpu", "cpu": "cells_at_once"}  # what a row's machine calls it, by device
 SHARING_NAME = "cells_at_once.json"  # beside a checkpoint: its seconds were counted while so many shared the device
-AXES = ("blend_mode", "background_gate", "schedule", "densify_grad_threshold", "seed", "headline")
-PROGRESS_BAR = re.compile(r"\|.*\| \d+/\d+ \[")  # tqdm's
-LONGEST = 300  # characters of a log's last line
+AXES = ("blend_mode", "background_gate", "strategy", "densify_grad_threshold", "seed", "headline")
 FIGURES = ("psnr", "psnr_float", "ssim", "psnr_edge", "num_gaussians", "train_seconds", "fps", "peak_gpu_mib")
 
 
@@ -137,14 +135,6 @@ def supervise(cell_path: str, output: str, gpu: Optional[str] = None, per_device
     if not os.path.isfile(row_path):
         write_json_atomically(row_path, failed_row(cell, how_it_ended(status, log_path), time.time() - started))
     return read_json(row_path)
-
-
-def last_line(path: str) -> str:
-    """The last line of a log that says something, which a progress bar does not; empty where nothing was printed."""
-    text = Path(path).read_text(encoding="utf-8", errors="replace").replace("\r", "\n")
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    lines = [line for line in lines if not PROGRESS_BAR.search(line)] or lines
-    return lines[-1][:LONGEST] if lines else ""
 
 
 def how_it_ended(status: int, log_path: str) -> str:

@@ -24,14 +24,24 @@ from ..system.output_folder import (
 from . import require
 from .cell import identity
 from .errors import BenchError
-from .expansion import AXIS_OF, NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
-from .names import CELL_NAME, CELLS_FOLDER, NATIVE, ROW_NAME, ROWS_NAME, SUITE_NAME, VARIABLES, blend_of, check_weights
+from .expansion import NOT_IN_THE_IDENTITY, Suite, find_suite, load_suite, refuse
+from .names import (
+    CELL_NAME,
+    CELLS_FOLDER,
+    NATIVE,
+    ROW_NAME,
+    ROWS_NAME,
+    SELECTORS,
+    SUITE_NAME,
+    VARIABLES,
+    blend_of,
+    check_weights,
+)
 from .preparation import made_scene, prepared_method, what_is_missing
 from .protocol import COMMIT_VARIABLE, ROOT, project_commit
 from .rows import CellFile, CellRow, Row, at_once, cell_folders, read_object, read_rows
 
 COMMAND = "dsmoe bench run"  # in its folders' records
-SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")
 SNAKEFILE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "Snakefile")
 
 
@@ -311,7 +321,7 @@ def _line(row: Row) -> str:
     def shown(field: str, form: str) -> str:
         return "-" if row.get(field) is None else format(row[field], form)
 
-    name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("schedule") or "own schedule",
+    name = "  ".join([row["label"], row["scene"], blend_of(row), row.get("strategy") or "own strategy",
                       shown("densify_grad_threshold", "g"),
                       *([f"n{row['budget']}"] if row["method"] == NATIVE and row.get("budget") else []),
                       f"s{row['seed']}"])

@@ -7,7 +7,6 @@ import json
 import os
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import yaml
@@ -18,13 +17,23 @@ from ..config import BATCHED, LEARNED
 from ..errors import ConfigError
 from . import schema
 from .errors import BenchError
-from .names import CHECKOUTS, COUNTED_BY, LACKS, NATIVE, NEEDS, OF_NATIVE_ALONE, RECIPE, WITHOUT_SCHEDULE, blend_of
+from .names import (
+    AXIS_OF,
+    CHECKOUTS,
+    COUNTED_BY,
+    LACKS,
+    NATIVE,
+    NEEDS,
+    OF_NATIVE_ALONE,
+    RECIPE,
+    SHIPPED,
+    WITHOUT_STRATEGY,
+    blend_of,
+)
 from .protocol import config_of
 
-SHIPPED = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("*.yaml")}
 Values = Dict[str, Any]
 Axes = Dict[str, List[Any]]
-AXIS_OF = {axis: axis[:-1] for axis in schema.Axes.model_fields}
 # Where things lie changes no figure.
 NOT_IN_THE_IDENTITY = ("path", "base", "python", "pythonpath", "commit", "base_commit", "unset")
 
@@ -183,9 +192,9 @@ def _method(method: Values, where: str, protocol: Values, folder: str) -> Values
         refuse(not wanted.items() <= dict(zip(arguments, arguments[1:])).items(),
                f"{where}.budget: is {given['budget']}; {name} is told so by its arguments, among which must be "
                f"{' '.join(itertools.chain(*wanted.items()))}")
-    if name in WITHOUT_SCHEDULE:
-        refuse("schedules" in axes, f"{where}.schedules: {name} has none of the schedules; leave them out")
-        axes["schedules"] = [None]
+    if name in WITHOUT_STRATEGY:
+        refuse("strategies" in axes, f"{where}.strategies: {name} has a strategy of its own; leave them out")
+        axes["strategies"] = [None]
     _can_follow(protocol, name, where)
     python = os.path.expanduser(os.path.expandvars(given["python"])) if "python" in given else None
     given.setdefault("pythonpath", [])
@@ -224,8 +233,8 @@ def _can_follow(protocol: Values, name: str, where: str) -> None:
 def _can_train(scene: Values, method: Values, axes: Axes) -> None:
     name, thresholds = method["name"], axes["densify_grad_thresholds"]
     what = f"scenes: {scene['name']}, methods: {method['label']}"
-    refuse(scene["background"] == "white" and "steady" in axes["schedules"],
-           f"{what}: {scene['name']} is white, where 3DGS resets opacities once more: a checkout's schedule cannot be "
+    refuse(scene["background"] == "white" and "steady" in axes["strategies"],
+           f"{what}: {scene['name']} is white, where 3DGS resets opacities once more: a checkout's strategy cannot be "
            "`steady` there")
     refuse(scene["init_points"],
            f"{what}: init_points is {scene['init_points']}, but checkouts start from all points")
@@ -244,9 +253,9 @@ def _can_divide(protocol: Values, method: Values, axes: Axes) -> None:
             continue
         what = f"protocol.{field} is {protocol[field]}"
         refuse(method["name"] != NATIVE, f"{what}, but method {method['label']} knows none; only {NATIVE} does")
-        for schedule in axes["schedules"]:
-            refuse(schedule not in BATCHED,
-                   f"{what}, but schedule {schedule} knows none; only {' and '.join(BATCHED)} do")
+        for strategy in axes["strategies"]:
+            refuse(strategy not in BATCHED,
+                   f"{what}, but strategy {strategy} knows none; only {' and '.join(BATCHED)} do")
     refuse(protocol.get("gpus", 1) > 1 and protocol["device"] != "cuda",
            f"protocol.gpus is {protocol.get('gpus')}; it needs protocol.device: cuda")
 
@@ -282,14 +291,16 @@ def _gated(blend_mode: str, gate: Any, *rest: Any) -> Tuple[Any, ...]:
 def cell_id(cell: Values) -> str:
     """A readable name, and a checksum of everything that decides the figures: another protocol is another cell."""
     blend = blend_of(cell)
-    named = ("densify_grad_threshold", "schedule", "budget", "seed", "protocol")
-    identity = {**{key: cell[key] for key in named if key in cell}, "blend_mode": blend}
+    # Names stay as earlier versions made them, so that earlier rows are found.
+    strategy = "gate" if cell["strategy"] == "importance" else cell["strategy"]
+    named = ("densify_grad_threshold", "budget", "seed", "protocol")
+    identity = {**{key: cell[key] for key in named if key in cell}, "blend_mode": blend, "schedule": strategy}
     for key in ("method", "scene"):
         identity[key] = {name: value for name, value in cell[key].items() if name not in NOT_IN_THE_IDENTITY}
     checksum = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:6]
     threshold = re.sub(r"\.?0+$", "", f"{cell['densify_grad_threshold']:.7f}")
     return "_".join([cell["method"]["label"], cell["scene"]["name"], blend.replace(" ", "-"),
-                     cell["schedule"] or "own", threshold, *([f"n{cell['budget']}"] if "budget" in cell else []),
+                     strategy or "own", threshold, *([f"n{cell['budget']}"] if "budget" in cell else []),
                      f"s{cell['seed']}", checksum])
 
 

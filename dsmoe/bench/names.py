@@ -11,13 +11,19 @@ from diff_smoe_rasterization.settings import GATED_MODES
 from ..config import RECIPE as TRAINER_RECIPE
 from .errors import BenchError
 
+SHIPPED = {path.stem: str(path) for path in Path(__file__).with_name("shipped").glob("*.yaml")}  # suites, by name
+# The axes of a suite (schema.py), and what a cell calls its value.
+AXIS_OF = {"blend_modes": "blend_mode", "background_gates": "background_gate",
+           "densify_grad_thresholds": "densify_grad_threshold", "strategies": "strategy", "budgets": "budget",
+           "seeds": "seed"}
+SELECTORS = ("method", "scene", *AXIS_OF.values(), "headline")  # fields by which `--only` chooses cells
 NATIVE = "native"
 LPIPS_KINDS = ("lpips_vgg_inria", "lpips_vgg_std", "lpips_alex")
 VARIANTS = ("native", "unpatched", "patched", "fused")  # fused: by a patch with --fuse
 # Of each public trainer, whether it can be patched to this package's rasterizer (dsmoe/patches).
 CHECKOUTS = {"3dgs-2023": True, "3dgs-2024": True, "taming": True, "c3dgs": True, "hac": True, "hac-plus": True,
              "2dgs": False, "dbs": False}
-WITHOUT_SCHEDULE = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
+WITHOUT_STRATEGY = ("hac", "hac-plus", "dbs")  # they grow and prune by rules of their own
 COUNTED_BY = {"taming": "--budget", "dbs": "--cap_max"}  # they are given a number of primitives, and have no threshold
 NEEDS = {"dbs": "--cap_max"}  # an argument without which a method has no size
 OF_NATIVE_ALONE = ("strategy_options",)

@@ -45,7 +45,7 @@ def config_of(cell: Dict[str, Any], output: str = "") -> TrainConfig:
         background_gate=cell["background_gate"], iterations=protocol["iterations"], batch=protocol.get("batch", 1),
         resolution=scene["resolution"], images=scene["images"], principal_point=protocol["principal_point"],
         white_background=scene["background"] == "white", init_points=scene["init_points"],
-        schedule=cell["schedule"] or "3dgs", budget=cell.get("budget", 0), seed=cell["seed"], device=protocol["device"],
+        strategy=cell["strategy"] or "3dgs", budget=cell.get("budget", 0), seed=cell["seed"], device=protocol["device"],
         densify_grad_threshold=cell["densify_grad_threshold"], eval_every=protocol["evaluate_every"],
         checkpoint_every=protocol["checkpoint_every"])
     if protocol["scale_recipe"]:

@@ -9,7 +9,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 from typing_extensions import Annotated
 
-from ..config import LEARNED
+from ..config import LEARNED, of_today
 from .errors import BenchError
 from .names import CELLS_FOLDER, ROW_NAME, ROWS_NAME
 from .schema import first_mistake, must
@@ -49,14 +49,14 @@ Machine = create_model("Machine", __base__=Part, **_may_be(str, "device"),
 RowFile = create_model(  # older rows have fewer fields
     "RowFile", __base__=Part, cell=(str, ...), suite=(str, ...), ok=(bool, ...), method=(str, ...),
     blend_mode=(str, ...), scene=(str, ...), seed=(int, ...),
-    **_may_be(str, "label", "variant", "schedule", "dataset", "end", "reason"), **_may_be(int, "budget", "iterations"),
+    **_may_be(str, "label", "variant", "strategy", "dataset", "end", "reason"), **_may_be(int, "budget", "iterations"),
     **_may_be(Gate, "background_gate"), **_may_be(Decibels, "psnr", "psnr_float", "psnr_edge"),
     **_may_be(Number, "densify_grad_threshold", "ssim", "num_gaussians", "train_seconds", "wall_seconds", "fps",
               "peak_gpu_mib"),
     **_may_be(Dict[str, Any], "protocol", "commit"), **_may_be(Size, "size_bytes"), **_may_be(Machine, "machine"),
     **_may_be(Lpips, "lpips"), **_may_be(List[Optional[Lpips]], "lpips_all"))
 CellRow = create_model(  # of `dsmoe bench run`: it says all that its cell's name says
-    "CellRow", __base__=RowFile, label=(str, ...), variant=(str, ...), schedule=(Optional[str], ...),
+    "CellRow", __base__=RowFile, label=(str, ...), variant=(str, ...), strategy=(Optional[str], ...),
     densify_grad_threshold=(Number, ...), iterations=(int, ...))
 CellFile = create_model("CellFile", __base__=Part, suite=(str, ...),
                         **dict.fromkeys(("protocol", "scene", "method"), (Dict[str, Any], ...)))
@@ -85,7 +85,7 @@ def _object(text: str, place: str) -> Dict[str, Any]:
         raise ReportError(f"{place}: not valid json, as `dsmoe bench run` writes it ({error})") from error
     if not isinstance(found, dict):
         raise ReportError(f"{place}: expected one object, as `dsmoe bench run` writes it")
-    return found
+    return of_today(found)
 
 
 def _typed(found: Dict[str, Any], place: str, model: Type[Any] = RowFile) -> Row:
@@ -123,7 +123,7 @@ def _listed(text: str, path: str) -> List[Row]:
             place = f"{path}, line {number}"
             entry = _object(line, place)
             if isinstance(entry.get(SHARED), dict):
-                shared = entry[SHARED]
+                shared = of_today(entry[SHARED])
             else:
                 found.append(_typed(_merged(shared, entry), place))
     return found
@@ -210,11 +210,11 @@ def of_one_protocol(rows: Sequence[Row]) -> Tuple[List[Row], List[str]]:
 
 
 def _rules(row: Row) -> Dict[str, Any]:
-    """The rules that the row states, by name. `gate` brings learning rates of its own: its recipes are compared."""
+    """The rules that the row states, by name. The recipe of `importance`, which has other rates, is one of its own."""
     found: Dict[str, Any] = {}
     for name, value in (row.get("protocol") or {}).items():
         if name in RULES or name.startswith(RULE_PREFIXES):
-            name = "recipe of gate" if (name, row.get("schedule")) == ("recipe", "gate") else name
+            name = "recipe of importance" if (name, row.get("strategy")) == ("recipe", "importance") else name
             found.update({f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict)
                          else {name: value})
     return {name: value for name, value in found.items() if value is not None}

@@ -10,7 +10,7 @@ from typing_extensions import Annotated
 
 from diff_smoe_rasterization.settings import BLEND_MODES
 
-from ..config import LEARNED, PRINCIPAL_POINTS, SCHEDULES, TrainConfig
+from ..config import LEARNED, PRINCIPAL_POINTS, STRATEGY_NAMES, TrainConfig
 from .errors import BenchError
 from .names import CHECKOUTS, LPIPS_KINDS, NATIVE, RECIPE, VARIANTS
 
@@ -72,7 +72,7 @@ class Axes(Part):
     blend_modes: some(one_of(BLEND_MODES)) = ["alpha", "smoe"]
     background_gates: some(Gate) = [0]
     densify_grad_thresholds: some(Threshold) = list(THRESHOLDS)
-    schedules: some(one_of(SCHEDULES)) = ["3dgs"]
+    strategies: some(one_of(STRATEGY_NAMES)) = ["3dgs"]
     budgets: some(Budget) = [0]
     seeds: some(Seed) = [0]
 

@@ -9,7 +9,8 @@ from typing import Any, Callable, Dict, List, Tuple
 
 import torch
 
-from ..model import GaussianModel, GaussianOptimizer
+from ..model import GaussianModel
+from ..optimizer import GaussianOptimizer
 from ..system.group import Group
 from ..training.shards import Shards
 

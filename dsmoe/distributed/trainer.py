@@ -1,20 +1,21 @@
-"""Training on batches of views, on one process or with the Gaussians divided over several."""
+"""Training on batches of views, in one process or with the Gaussians divided over several; the choice of a trainer."""
 from __future__ import annotations
 
-from typing import Any, Callable, Dict, List, Optional, Sequence
+from typing import Any, Callable, Dict, Optional, Sequence
 
 import torch
 
 from ..config import BATCHED, TrainConfig
-from ..errors import ConfigError
+from ..errors import ConfigError, TrainerError
 from ..model import GaussianModel
 from ..results.evaluation import Evaluation, rows_of_views, summary
+from ..results.rendering import Rasterize
 from ..scenes.images import View
 from ..scenes.scene import Scene
-from ..system.group import Group
-from ..training.loop import Trainer
-from ..training.strategy import BatchStep
+from ..system.group import ALONE, Group
+from ..training.trainer import Trainer
 from .batch import Batch
+from .passes import BatchPasses
 from .shards import DividedShards
 
 
@@ -22,15 +23,19 @@ class BatchTrainer(Trainer):
     """A training run whose steps have several views; each process of the group has a part of the Gaussians."""
 
     def __init__(self, config: TrainConfig, scene: Scene, group: Group) -> None:
-        if config.schedule not in BATCHED:
-            raise ConfigError(f"--strategy is {config.schedule}; on several GPUs it must be {' or '.join(BATCHED)}")
+        if config.strategy not in BATCHED:
+            raise ConfigError(f"--strategy is {config.strategy}; on several GPUs it must be {' or '.join(BATCHED)}")
         self.group = group
-        self._asked = False
         super().__init__(config, scene)
 
     def _make_shards(self) -> DividedShards:
         self.divided = DividedShards(self.group, self.model, self.optimizer)
         return self.divided
+
+    def _make_passes(self, rasterize: Optional[Rasterize]) -> BatchPasses:
+        self.batches = BatchPasses(self.model, self.optimizer, self.renderer, self.gate, self.group,
+                                   lambda: self.wants_stop())
+        return self.batches
 
     @property
     def checkpoint_device(self) -> str:
@@ -40,61 +45,9 @@ class BatchTrainer(Trainer):
     def num_gaussians(self) -> int:
         return self.divided.num_gaussians
 
-    def step(self, before_change: Optional[Callable[[], None]] = None) -> BatchStep:  # type: ignore[override]
-        """One step over a batch of views, in the order that `Trainer.step` has."""
-        config = self.config
-        self._refuse_empty()
-        self.iteration += config.batch
-        step = BatchStep(self.iteration, config.batch, torch.zeros(()))
-        self.optimizer.set_position_rate(self.iteration)
-        if step.due(config.sh_degree_interval):
-            self.model.raise_sh_degree()
-        views = [self.scene.train[self.order.next()] for _ in range(config.batch)]
-        with torch.no_grad():
-            self._render(step, views)
-        if before_change:
-            before_change()
-        if self.iteration < config.iterations:
-            with torch.no_grad():
-                self.strategy.after_backward(step)
-                self.optimizer.step()
-                if self.gate:
-                    self.gate.step()
-                self.strategy.after_step(step)
-        return step
-
-    def _render(self, step: BatchStep, views: List[View]) -> None:
-        """From the views to the gradients of the parameters, the loss, and what the views saw."""
-        config, device = self.config, self.model.raw["means3D"].device
-        colors = [torch.rand(3, device=device) if config.random_background else None for _ in views]
-        settings = [self.renderer.settings_of(view.camera) for view in views]
-        settings = [each if color is None else each._replace(bg=color) for each, color in zip(settings, colors)]
-        batch = Batch(self.group, self.model, settings, note=int(self.wants_stop()))
-        self._asked = any(batch.notes)
-        numbers = torch.zeros(2, len(views), device=device)  # losses, and gradients by the background's gate
-        records: Dict[int, torch.Tensor] = {}
-
-        def blend(view: int) -> None:  # what one view has saved is gone before the next one is blended
-            drawn = batch.draw(view, settings[view])
-            loss, gradient = self.loss_of(views[view], self.target_of(views[view], colors[view]), drawn.color)
-            records[view], dL_dgate = drawn.backward(gradient, self.gate is not None)
-            numbers[0, view] = loss
-            if self.gate:
-                numbers[1, view] = dL_dgate[0]
-
-        for view in batch.own_views:
-            blend(view)
-        self.group.add_up(numbers)
-        step.loss = numbers[0].mean()
-        self.strategy.before_backward(step)
-        means2D = batch.backward(batch.give_back(records))
-        step.views = [(gradients, projected.radii) for gradients, projected in zip(means2D, batch.projected)]
-        if self.gate:
-            self.gate.take_gradient(sum(numbers[1].unbind(), torch.zeros((), device=device)))
-
     def stops(self) -> bool:
         """Whether a process was asked to stop before the latest step, which all learn in that step."""
-        return self._asked
+        return self.batches.asked
 
     def evaluate(self, progress: bool = False) -> Evaluation:
         """Renders the test views, each in one of the processes; a time of a view is that of all by their number."""
@@ -136,6 +89,16 @@ class BatchTrainer(Trainer):
         super().load_state_dict({**state, **own, "random": {**state["random"], "cuda": []}})
         if generators and torch.cuda.is_available():
             torch.cuda.set_rng_state(generators[0].cpu())
+
+
+def new_trainer(config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None,
+                group: Optional[Group] = None) -> Trainer:
+    """The trainer of a run: the usual one for one view a step in one process. Raises TrainerError."""
+    if config.batch == 1 and (group is None or group.size == 1):
+        return Trainer(config, scene, rasterize)
+    if rasterize is not None:
+        raise TrainerError("train: rasterize is given; batches of views and several processes need the package's own")
+    return BatchTrainer(config, scene, group or ALONE)
 
 
 def _map_tensors(value: Any, function: Callable[[torch.Tensor], Any]) -> Any:

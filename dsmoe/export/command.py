@@ -9,6 +9,8 @@ from typing import Any, Dict, Optional, Tuple
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES, record_of
 
+from ..choices import BAKE_ITERATIONS
+from ..choices import EXPORT_FORMATS as FORMATS
 from ..errors import TrainerError
 from ..opening import Trained, open_trained
 from ..results.modelfile import save_model
@@ -20,9 +22,7 @@ from .glb import BLEND, Blend, glb_bytes
 from .splat import splat_bytes
 from .spz import check_spz, spz_bytes
 
-FORMATS = ("html", "ply", "splat", "spz", "glb")
 VIEWS = 16  # of a page, at most
-BAKE_ITERATIONS = 5000
 
 
 def export(source: str, path: Optional[str] = None, form: Optional[str] = None, sh_degree: Optional[int] = None,
@@ -59,7 +59,7 @@ def export(source: str, path: Optional[str] = None, form: Optional[str] = None, 
 
 def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str]:
     """The model for alpha, its .ply in the folder, and what that costs."""
-    from ..training.bake import bake
+    from .bake import bake
 
     config, before = trained.config, trained.renderer
     if not is_folder(config.scene):

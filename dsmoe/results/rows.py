@@ -9,7 +9,7 @@ from diff_smoe_rasterization.settings import GATED_MODES
 
 from ..config import LEARNED, TrainConfig
 from ..errors import TrainerError
-from ..gate_options import gate_settings
+from ..importance_options import importance_settings
 from ..scenes.images import DOWNSCALER
 from ..scenes.scene import Scene
 from ..system.environment import machine, versions
@@ -40,8 +40,8 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
         unusual["deterministic"] = True
     if config.budget:
         unusual["budget"] = config.budget
-    if config.schedule == "gate":  # with the defaults of this version
-        unusual.update(strategy_options=gate_settings(config.gate_options()),
+    if config.strategy == "importance":  # with the defaults of this version
+        unusual.update(strategy_options=importance_settings(config.importance_options()),
                        densify_until_iter=config.densify_until_iter)
     if config.unusual_recipe():
         unusual["recipe"] = config.unusual_recipe()
@@ -69,7 +69,7 @@ def result_row(config: TrainConfig, scene: Scene, num_gaussians: int, train_seco
             "downscaler": DOWNSCALER,
             "background": "white" if config.white_background else "black",
             "principal_point": config.principal_point,
-            "schedule": config.schedule,
+            "strategy": config.strategy,
             "densify_grad_threshold": config.densify_grad_threshold,
             "init_points": len(scene.points.positions),
             "iterations": config.iterations,

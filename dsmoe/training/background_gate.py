@@ -10,7 +10,7 @@ from diff_smoe_rasterization.optimizers import FusedAdam
 from diff_smoe_rasterization.settings import MAX_BACKGROUND_GATE
 
 from ..config import TrainConfig
-from ..model import batch_betas
+from ..optimizer import batch_betas
 
 LIMIT = math.log(MAX_BACKGROUND_GATE)  # of |p|: beyond it float32 would soon be 0 or infinite
 

@@ -11,9 +11,9 @@ import torch
 
 from diff_smoe_rasterization.gaussians import divided
 
-from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
+from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from .drawing import draw
-from .strategy import Step, Strategy, StrategyContext
+from .strategy import Strategy, StrategyContext, ViewStep
 
 DEAD_OPACITY = 0.005  # fainter Gaussians are relocated
 START_OPACITY, START_SCALE = 0.5, 0.1  # of the first Gaussians; the scale is a part of that of 3DGS
@@ -33,12 +33,12 @@ class MCMCStrategy(Strategy):
             context.model.raw["opacities"].fill_(float(inverse_sigmoid(torch.tensor(START_OPACITY))))
             context.model.raw["scales"] += float(torch.tensor(START_SCALE).log())
 
-    def after_backward(self, step: Step) -> None:
+    def after_backward(self, step: ViewStep) -> None:
         """Adds the gradients of the two regularisers, which are means over the Gaussians."""
         for name, weight in (("opacities", OPACITY_WEIGHT), ("scales", SCALE_WEIGHT)):
             step.add_gradient(name, weight / self.context.model.stored[name].numel())
 
-    def after_step(self, step: Step) -> None:
+    def after_step(self, step: ViewStep) -> None:
         config = self.context.config
         if (config.densify_from_iter < step.iteration < round(GROWTH_ENDS * config.densify_until_iter)
                 and step.iteration % config.densification_interval == 0):
@@ -81,7 +81,7 @@ class MCMCStrategy(Strategy):
         """Adds noise to the positions, in the shape of each Gaussian and where it is faint (Eq. 8)."""
         opacities, scales, rotations = self.context.model.activated()
         means = self.context.model.stored["means3D"]
-        axes = quaternion_to_matrix(rotations) * scales.unsqueeze(1)
+        axes = rotation_matrices(rotations) * scales.unsqueeze(1)
         faint = torch.sigmoid(NOISE_STEEPNESS * (DEAD_OPACITY - opacities))
         noise = faint * (NOISE_RATE * self.context.optimizer.position_rate) * torch.randn_like(means)
         means += torch.bmm(axes, torch.bmm(axes.transpose(1, 2), noise.unsqueeze(2))).squeeze(2)

@@ -6,7 +6,7 @@ renderings of training views included, is in StrategyContext.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Callable, Dict, Iterable, List, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 import torch
 
@@ -16,7 +16,8 @@ from diff_smoe_rasterization.settings import Rendering
 from diff_smoe_rasterization.splats import Splats
 
 from ..config import TrainConfig
-from ..model import GaussianModel, GaussianOptimizer, inverse_sigmoid, quaternion_to_matrix
+from ..model import GaussianModel, inverse_sigmoid, rotation_matrices
+from ..optimizer import GaussianOptimizer
 from ..results.rendering import Renderer
 from ..scenes.images import View
 from .shards import Shards
@@ -47,7 +48,7 @@ class StrategyContext:
 
 
 Seen = Tuple[torch.Tensor, torch.Tensor]
-"""Of one view dL/dpixel times (0.5 W, 0.5 H), [N, 3], and the radii [N] int32."""
+"""Of one view dL/dpixel times (0.5 W, 0.5 H), [N, 3], where radii > 0, and these radii [N] int32."""
 
 
 def is_due(iteration: int, interval: int, batch: int = 1) -> bool:
@@ -55,11 +56,14 @@ def is_due(iteration: int, interval: int, batch: int = 1) -> bool:
     return interval > 0 and iteration // interval > (iteration - batch) // interval
 
 
-class StepClock:
-    """When a step is. Iterations count views, from 1; a step has `batch` of them, of which `iteration` is the last."""
+@dataclass
+class Step:
+    """One training step, as far as it has come when a hook is called. Iterations count views, from 1."""
 
-    iteration: int
-    batch: int
+    iteration: int  # of its last view
+    batch: int  # views, each an iteration
+    loss: torch.Tensor  # the mean over the views
+    seen: List[Seen] = field(default_factory=list, init=False)  # what each view says of the Gaussians; after backward
 
     def due(self, interval: int) -> bool:
         """Whether a multiple of the interval is among the step's iterations."""
@@ -71,48 +75,21 @@ class StepClock:
 
 
 @dataclass
-class Step(StepClock):
-    """One training step, as far as it has come when a hook is called."""
+class ViewStep(Step):
+    """A step over one view, in one process."""
 
-    iteration: int
     view: View
     target: torch.Tensor  # [3, H, W] what the rendering is compared with, uint8 or in 0 to 1
     rendering: Rendering
     splats: Callable[[], Splats]  # of the rendering; before backward
-    means2D: torch.Tensor  # [N, 3]; after backward its .grad holds dL/dpixel times (0.5 W, 0.5 H) where radii > 0
-    loss: torch.Tensor
     add_gradient: Callable[[str, float], None]  # to that by every opacity, scale or rotation; after backward
-    batch: int = 1
-
-    def seen(self) -> Iterable[Seen]:
-        """What each view of the step says of the Gaussians; after backward."""
-        gradient = self.means2D.grad
-        assert gradient is not None
-        return [(gradient, self.rendering.radii)]
-
-
-@dataclass
-class BatchStep(StepClock):
-    """One training step over several views."""
-
-    iteration: int
-    batch: int
-    loss: torch.Tensor  # the mean over the views
-    views: List[Seen] = field(default_factory=list)
-
-    def seen(self) -> Iterable[Seen]:
-        """What each view of the step says of the Gaussians; after backward."""
-        return self.views
-
-
-AnyStep = Union[Step, BatchStep]
 
 
 class Strategy:
     """Does nothing: a fixed set of Gaussians. The base of every strategy.
 
     Hooks run in this order in each step; rows may be added or removed in the last two (through the optimizer), which
-    the last iteration of a run leaves out.
+    the last iteration of a run leaves out. A strategy that is not among config.BATCHED gets each step as a ViewStep.
     """
 
     def __init__(self, context: StrategyContext) -> None:
@@ -123,13 +100,13 @@ class Strategy:
         """The loss of a rendering [3, H, W], and its gradient by it. target: floats, or bytes of 255ths."""
         return l1_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim)
 
-    def before_backward(self, step: AnyStep) -> None:
+    def before_backward(self, step: Step) -> None:
         """The loss is known, its gradients are not."""
 
-    def after_backward(self, step: AnyStep) -> None:
+    def after_backward(self, step: Step) -> None:
         """Gradients are known, the optimizer has not stepped. A parameter replaced here is not stepped."""
 
-    def after_step(self, step: AnyStep) -> None:
+    def after_step(self, step: Step) -> None:
         """The optimizer has stepped."""
 
     def state_dict(self) -> Dict[str, Any]:
@@ -154,7 +131,7 @@ class ThreeDGSStrategy(Strategy):
         super().__init__(context)
         self._forget_statistics()
 
-    def after_backward(self, step: AnyStep) -> None:
+    def after_backward(self, step: Step) -> None:
         config = self.context.config
         if step.iteration >= self.densify_until:
             return
@@ -224,7 +201,7 @@ class ThreeDGSStrategy(Strategy):
                                           len(parents) // CHILDREN)
         offsets = normal.reshape(-1, 3) * scales
         # No torch.bmm: it may round otherwise for another number of rows, of which a process has only some.
-        turned = (quaternion_to_matrix(raw["rotations"]) * offsets.unsqueeze(1)).sum(2)
+        turned = (rotation_matrices(raw["rotations"]) * offsets.unsqueeze(1)).sum(2)
         return raw["means3D"] + turned, torch.log(scales / SPLIT_SHRINK)
 
     def prune(self, large_too: bool) -> torch.Tensor:
@@ -241,8 +218,8 @@ class ThreeDGSStrategy(Strategy):
         opacities = self.context.model.opacities.detach()
         self.context.optimizer.set_opacity_logits(inverse_sigmoid(opacities.clamp(max=RESET_OPACITY)))
 
-    def _observe(self, step: AnyStep) -> None:
-        for gradients, radii in step.seen():
+    def _observe(self, step: Step) -> None:
+        for gradients, radii in step.seen:
             add_view(gradients, radii, self.gradient_sum, self.view_count)
 
     def _mean_gradients(self) -> torch.Tensor:

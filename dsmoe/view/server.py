@@ -15,6 +15,7 @@ import numpy as np
 
 from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES, MAX_BACKGROUND_GATE
 
+from ..choices import VIEW_HOST, VIEW_PORT
 from ..errors import TrainerError
 from ..scenes.cameras import Camera, quaternion_to_rotation
 from ..system.process import pip_install
@@ -94,7 +95,7 @@ def _between(least: float, value: Any, most: float) -> float:
 class Viewer:
     """Shows a model to any number of browsers; one thread renders."""
 
-    def __init__(self, followed: Followed, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, followed: Followed, host: str = VIEW_HOST, port: int = VIEW_PORT) -> None:
         """Starts the server; where the port is taken, it takes the next free one. Raises TrainerError without viser."""
         if not 0 <= port < 2**16:
             raise TrainerError(f"--port is {port}; it must be between 0 and {2**16 - 1}")

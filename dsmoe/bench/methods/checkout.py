@@ -24,12 +24,12 @@ from ...results.pictures import evenly_spaced
 from ...scenes.images import View
 from ...scenes.scene import Scene
 from ...system.children import die_with_parent
-from ..cell import last_line
 from ..errors import BenchError
+from ..logs import last_line
 from ..measure import Measures
 from ..names import COUNTED_BY, RECIPE, read_json
 from ..protocol import commit_of, config_of
-from . import Outcome, scene_of
+from .outcome import Outcome, scene_of
 
 OBSERVER = os.path.join(os.path.dirname(os.path.abspath(__file__)), "observer.py")
 # Mean difference between the trainer's ground truth and ours: rounding leaves half a grey level at the most, another
@@ -85,7 +85,7 @@ class ThreeDGS:
         """What the suite says of the recipe, default of ours or not; what it does not say is the trainer's own."""
         options = self.recipe()
         options.pop("sh_degree_interval", None)
-        if self.config.schedule == "steady":
+        if self.config.strategy == "steady":
             # Size prune and reset both wait for the interval: beyond the last iteration there is neither.
             options["opacity_reset_interval"] = self.config.iterations + 1
         flags = ["--antialiasing"] if options.pop("antialiasing", False) else []
@@ -99,7 +99,7 @@ class ThreeDGS:
         """What the row's protocol says otherwise than of the native trainer; None where there is no such thing."""
         own = {word.partition("=")[0] for word in self.method["arguments"]}
         recipe = {name: value for name, value in self.recipe().items() if "--" + name not in own}
-        rules = {"schedule": self.cell["schedule"], "recipe": recipe, "scale_recipe": False,
+        rules = {"strategy": self.cell["strategy"], "recipe": recipe, "scale_recipe": False,
                  "arguments": portable(self.arguments)}
         if not self.of_gaussians:
             rules["sh_degree"] = recipe.get("sh_degree")

@@ -15,11 +15,11 @@ from ...results.pictures import evenly_spaced
 from ...results.rows import read_results
 from ...system import torchrun
 from ...system.process import set_up_process
-from ...training.loop import HISTORY_NAME, train
+from ...train import HISTORY_NAME, train
 from ..measure import Measures
 from ..names import read_json
 from ..protocol import config_of
-from . import Outcome, scene_of
+from .outcome import Outcome, scene_of
 
 
 def run_native(cell: Dict[str, Any], output: str) -> Outcome:

@@ -30,7 +30,7 @@ __all__ = ["ReportError", "report"]
 PAGE_NAME = "index.html"
 COMMAND = "dsmoe bench report"
 MOST_ABSENT = 3  # cells without a row that are named
-NOT_PROTOCOL = ("seed", "schedule", "densify_grad_threshold", "init_points", "versions", "iterations",
+NOT_PROTOCOL = ("seed", "strategy", "densify_grad_threshold", "init_points", "versions", "iterations",
                 "continued", "arguments", "background_gate", "budget")  # of one cell, or said otherwise
 
 
@@ -125,7 +125,7 @@ def _protocols(rows: Sequence[Row]) -> List[Dict[str, Any]]:
         rules: Dict[str, Dict[str, None]] = {}  # of each the values, as a set in order
         for row in here:
             said = {name: value for name, value in (row.get("protocol") or {}).items() if name not in NOT_PROTOCOL}
-            said.update(iterations=row.get("iterations"), schedules=row.get("schedule") or "the method's own")
+            said.update(iterations=row.get("iterations"), strategies=row.get("strategy") or "the method's own")
             for name, value in said.items():
                 values = rules.setdefault(name.replace("_", " "), {})
                 values.update({} if value is None else {_plain(name, value): None})

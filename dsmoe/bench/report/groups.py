@@ -12,7 +12,7 @@ from ...config import LEARNED
 from ..names import blend_of
 from ..rows import ReportError, Row, at_once
 
-PAPER_ITERATIONS, PAPER_SCHEDULE = 30000, "3dgs"
+PAPER_ITERATIONS, PAPER_STRATEGY = 30000, "3dgs"
 MILLION = 1e6
 TIMES = ("train_seconds", "wall_seconds", "fps")  # of cells that shared their machine these are not its own
 FIELDS = ("psnr", "psnr_float", "psnr_edge", "ssim", "num_gaussians", "peak_gpu_mib", *TIMES)
@@ -26,7 +26,7 @@ class Setting(NamedTuple):
     name: str  # the method's label in the suite: it tells apart what the other fields do not
     variant: Optional[str]
     blend: str  # as `blend_of` has it: each gate of smoe is a blend of its own
-    schedule: Optional[str]
+    strategy: Optional[str]
     threshold: Optional[float]
     budget: Optional[int]
     iterations: Optional[int]
@@ -50,7 +50,7 @@ class Setting(NamedTuple):
         """Such as "native, smoe, steady"; it says where a checkout is unpatched or fused."""
         told = self.variant in (None, "native", "patched") or self.variant in self.name
         words = [self.name if told else f"{self.name}-{self.variant}"] + [self.blend] * blend
-        words += [self.schedule] if self.schedule not in (None, PAPER_SCHEDULE) else []
+        words += [self.strategy] if self.strategy not in (None, PAPER_STRATEGY) else []
         words += ["fixed number"] if self.budget is not None else []
         words += [f"{self.iterations:,} iterations"] if self.iterations not in (None, PAPER_ITERATIONS) else []
         return ", ".join(words)
@@ -64,7 +64,7 @@ class Setting(NamedTuple):
     def order(self) -> Tuple:
         """A sort key: methods as one list, thresholds from sparse to dense, alpha before the gated modes."""
         mode = BLEND_MODES.index(self.mode) if self.mode in BLEND_MODES else len(BLEND_MODES)
-        return (self.method != "native", self.method, self.name, self.variant or "", self.schedule or "",
+        return (self.method != "native", self.method, self.name, self.variant or "", self.strategy or "",
                 self.budget is not None, self.budget or 0, self.iterations or 0, self.end != "sparse",
                 -(self.threshold or 0), mode, self.blend)
 
@@ -158,7 +158,7 @@ def grouped(rows: Iterable[Row], end_of: Callable[[Row], Optional[str]]) -> List
     found: Dict[Tuple[Setting, str], Dict[int, Row]] = {}
     for row in rows:
         setting = Setting(row["method"], row.get("label") or row["method"], row.get("variant"), blend_of(row),
-                          row.get("schedule"), row.get("densify_grad_threshold"), row.get("budget"),
+                          row.get("strategy"), row.get("densify_grad_threshold"), row.get("budget"),
                           row.get("iterations"), end_of(row))
         twin = found.setdefault((setting, row["scene"]), {}).setdefault(row["seed"], row)
         if twin is not row:

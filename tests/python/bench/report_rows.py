@@ -15,7 +15,7 @@ TRUTH, ALPHA, SMOE = (100, 100, 100), (180, 100, 100), (100, 100, 160)
 def row(scene="bonsai", blend_mode="alpha", threshold=0.005, seed=0, psnr=20.0, **changes):
     """A row that succeeded; changes replace or add fields."""
     fields = {"suite": "table1", "ok": True, "reason": None, "method": "native", "variant": "native",
-              "blend_mode": blend_mode, "schedule": "3dgs", "densify_grad_threshold": threshold, "scene": scene,
+              "blend_mode": blend_mode, "strategy": "3dgs", "densify_grad_threshold": threshold, "scene": scene,
               "seed": seed, "iterations": 30000, "psnr": psnr, "psnr_float": psnr, "ssim": 0.75,
               "lpips": {"value": 0.25, "kind": "lpips_alex", "reason": None},
               "psnr_edge": None if psnr is None else psnr - 2,
@@ -23,7 +23,7 @@ def row(scene="bonsai", blend_mode="alpha", threshold=0.005, seed=0, psnr=20.0, 
               "wall_seconds": 120.0, "fps": 200.0, "peak_gpu_mib": None, "protocol": dict(PROTOCOL),
               "commit": {"project": "abc1234", "trainer": None}, "machine": {"device": "Card X"}, "history": []}
     fields.update(changes)
-    parts = ("suite", "method", "scene", "blend", "schedule", "densify_grad_threshold", "seed")
+    parts = ("suite", "method", "scene", "blend", "strategy", "densify_grad_threshold", "seed")
     named = {**fields, "blend": blend_of(fields)}
     return {"cell": "-".join(str(named[part]) for part in parts), **fields}
 

@@ -103,12 +103,12 @@ def test_a_row_says_that_its_cell_shared_its_processor(worked):
 
 
 def test_a_cell_of_a_budget_ends_with_it(worked, content, tmp_path, monkeypatch):
-    """By the strategy `gate`, whose options the recipe of the row has. The model goes when the row is there: whatever
-    happens in between, nothing is trained again."""
+    """By the strategy `importance`, whose options the recipe of the row has. The model goes when the row is there:
+    whatever happens in between, nothing is trained again."""
     there = []
     monkeypatch.setattr(cells.shutil, "rmtree", lambda *_, **__: there.append((tmp_path / "out/row.json").exists()))
     options = {**content["protocol"]["options"], "strategy_options": "overshoot=2"}
-    row = worked("out", schedules=["gate"], budgets=[40], protocol={**content["protocol"], "options": options})
+    row = worked("out", strategies=["importance"], budgets=[40], protocol={**content["protocol"], "options": options})
     assert row["ok"], row["reason"]
     assert row["num_gaussians"] == row["budget"] == row["protocol"]["budget"] == 40
     assert row["protocol"]["recipe"]["strategy_options"] == "overshoot=2" and "_gate_0.005_n40_s0_" in row["cell"]

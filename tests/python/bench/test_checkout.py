@@ -80,7 +80,7 @@ def test_a_patched_checkout_gives_a_row(small, tmp_path):
     assert (row["method"], row["variant"], row["blend_mode"]) == ("3dgs-2023", "patched", "smoe")
     assert all(row[figure] > 0 for figure in ("psnr", "psnr_float", "ssim", "fps", "num_gaussians"))
     protocol = row["protocol"]
-    assert protocol["schedule"] == row["schedule"] == "3dgs" and protocol["recipe"] == {}
+    assert protocol["strategy"] == row["strategy"] == "3dgs" and protocol["recipe"] == {}
     assert protocol["densify_grad_threshold"] == 0.0001 and protocol["sh_degree"] == 3
     assert 0 < row["train_seconds"] < row["wall_seconds"]
     # The ground truth was rounded to 8 bits on its way here: a quarter of a grey level on average.
@@ -140,7 +140,7 @@ def test_trainers_of_one_process_have_rules_of_their_own(name, method, there, ab
     assert there in words and not {*absent} & {*words.split()} and f"--renders {shape.renders}" in ours
     assert ("--hold-out --model-renders beta_model" in ours) == (name == "dbs")
     rules = shape.rules()
-    assert rules["schedule"] is rules["sh_degree"] is None and rules["recipe"] == {} and not shape.of_gaussians
+    assert rules["strategy"] is rules["sh_degree"] is None and rules["recipe"] == {} and not shape.of_gaussians
     assert ("densify_grad_threshold" in rules) == (name == "dbs")
 
 
@@ -211,7 +211,7 @@ def test_a_checkout_must_have_the_same_split(names, wrong):
 
 
 @pytest.mark.parametrize("name, axes, there, absent, recipe", [
-    ("3dgs-2023", {"schedules": ["steady"]}, ["--opacity_reset_interval", str(ITERATIONS + 1)], [], {}),
+    ("3dgs-2023", {"strategies": ["steady"]}, ["--opacity_reset_interval", str(ITERATIONS + 1)], [], {}),
     ("3dgs-2023", {}, ["--blend_mode", "smoe", "--background_gate", "0.0"], [], {}),
     ("3dgs-2023", {"background_gates": [0.3]}, ["--blend_mode", "smoe", "--background_gate", "0.3"], [], {}),
     ("3dgs-2023", {"blend_mode": "alpha"}, ["--blend_mode", "alpha"], ["--background_gate"], {}),

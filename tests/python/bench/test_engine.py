@@ -58,7 +58,7 @@ def copied(finished, tmp_path):
 def test_a_row_says_what_was_measured_and_how(finished):
     row, = [row for row in rows_of(finished[2]).values() if row["ok"]]
     assert all(row[name] > 0 for name in ("psnr", "psnr_float", "ssim", "psnr_edge", "train_seconds", "fps"))
-    assert (row["method"], row["variant"], row["blend_mode"], row["schedule"]) == ("native", "native", "smoe", "3dgs")
+    assert (row["method"], row["variant"], row["blend_mode"], row["strategy"]) == ("native", "native", "smoe", "3dgs")
     assert row["background_gate"] == row["protocol"]["background_gate"] == 0
     assert row["size_bytes"]["common"] == row["num_gaussians"] * 236  # 59 numbers of 4 bytes
     assert row["size_bytes"]["own"] > row["size_bytes"]["common"]  # the file has normals and a header beside them

@@ -234,6 +234,22 @@ def test_rules_that_one_row_does_not_state_are_not_compared():
     assert kept == entries[:3] and "recipe.feature_lr is 0.01 in them and 0.0025 in 2 others" in told
 
 
+def test_rows_that_call_the_strategy_schedule_are_read(tmp_path):
+    """Earlier versions did, and called the strategy `importance` `gate`."""
+    entries = [row(blend_mode=mode, strategy=strategy, budget=100, protocol={**PROTOCOL, "strategy": strategy})
+               for mode in ("alpha", "smoe") for strategy in ("steady", "importance")]
+    earlier = json.loads(json.dumps(entries).replace('"strategy"', '"schedule"').replace('"importance"', '"gate"'))
+    assert earlier[1]["schedule"] == earlier[1]["protocol"]["schedule"] == "gate"
+    expected = sorted(entries, key=lambda entry: entry["cell"])
+    assert rows.read_rows(write_rows(tmp_path, earlier)) == expected
+    text = rows.packed([{**entry, "history": None} for entry in earlier + earlier[1:2]])  # `gate` is the commonest
+    shared = json.loads(text.partition("\n")[0])["shared"]
+    assert shared["schedule"] == shared["protocol"]["schedule"] == "gate" and text.count('"schedule":"steady"') == 4
+    (tmp_path / "rows.jsonl").write_text(text, encoding="utf-8")
+    kept = [{name: value for name, value in entry.items() if name != "history"} for entry in expected]
+    assert rows.read_rows(str(tmp_path)) == kept
+
+
 @pytest.mark.parametrize("text, reason", [
     ("{", "line 1: not valid json"), ("[]", "line 1: expected one object"), ("", "no rows"),
     ('{"cell": "a"}', "lacks suite, ok, method"), ("\xff", "rows.jsonl: not text in UTF-8"),
@@ -279,7 +295,7 @@ def test_what_has_no_place_on_an_axis_is_left_out(tmp_path):
 
 
 def test_the_legend_lies_inside_and_above_the_panels():
-    entries = [row(blend_mode=mode, label=f"{'a long name of method ' * 2}{method}", schedule="steady",
+    entries = [row(blend_mode=mode, label=f"{'a long name of method ' * 2}{method}", strategy="steady",
                    threshold=threshold)
                for mode in ("alpha", "smoe") for method in range(4) for threshold in (0.005, 0.0002)]
     drawn = curves.rate_distortion(groups_of(entries))

@@ -102,11 +102,11 @@ def test_the_protocol_of_a_scene_is_what_its_cells_share_and_vary(texts):
     said = {**PROTOCOL, "arguments": ["--port", "0"]}
     other = row(seed=2, protocol={**PROTOCOL, "principal_point": "centre"})
     markdown, page = texts([row(protocol=said), failed(seed=1, iterations=7), other, row(
-        blend_mode="smoe", schedule="steady", protocol=said, machine={"cells_per_gpu": 3})])
+        blend_mode="smoe", strategy="steady", protocol=said, machine={"cells_per_gpu": 3})])
     assert ("2 seeds; 1 failed; left out, since principal_point is 'centre' in them and 'scene' in 2 others of bonsai: "
             f"{other['cell']}.") in markdown
     rules = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", page))
-    assert rules["iterations"] == "30000" and rules["schedules"] == "3dgs; steady"
+    assert rules["iterations"] == "30000" and rules["strategies"] == "3dgs; steady"
     assert rules["cells that shared their GPU or CPU"] == "1 of 2, up to 3 at once" and "arguments" not in rules
 
 

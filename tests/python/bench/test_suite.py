@@ -7,9 +7,10 @@ import pytest
 import yaml
 
 from dsmoe import bench
-from dsmoe.bench import engine
+from dsmoe.bench import engine, schema
 from dsmoe.bench.errors import BenchError
-from dsmoe.bench.expansion import SHIPPED, expand, find_suite, load_suite, read_yaml
+from dsmoe.bench.expansion import expand, find_suite, load_suite, read_yaml
+from dsmoe.bench.names import AXIS_OF, SHIPPED
 from dsmoe.bench.protocol import config_of
 from dsmoe.bench.schema import THRESHOLDS
 
@@ -27,13 +28,13 @@ def test_cells_are_every_combination(content):
     scenes = [{**content["scenes"][0], "name": name} for name in ("one", "two")]
     scenes[1]["densify_grad_thresholds"] = [0.001]
     methods = [{"name": "native"}, {"name": "native", "label": "other", "densify_grad_thresholds": [0.0001]}]
-    cells = expand(dict(content, scenes=scenes, methods=methods, schedules=["3dgs", "steady"], seeds=[0, 1],
+    cells = expand(dict(content, scenes=scenes, methods=methods, strategies=["3dgs", "steady"], seeds=[0, 1],
                            headline={"densify_grad_thresholds": [0.005]}, headline_seeds=[1, 2]), "").cells
     thresholds = {("one", "native"): 0.005, ("two", "native"): 0.001, ("one", "other"): 1e-4, ("two", "other"): 1e-4}
-    assert {(cell["scene"]["name"], cell["method"]["label"], cell["blend_mode"], cell["schedule"], cell["seed"],
+    assert {(cell["scene"]["name"], cell["method"]["label"], cell["blend_mode"], cell["strategy"], cell["seed"],
              cell["densify_grad_threshold"], cell["headline"]) for cell in cells} == {
-        (*place, mode, schedule, seed, threshold, threshold == 0.005) for place, threshold in thresholds.items()
-        for mode in ("alpha", "smoe") for schedule in ("3dgs", "steady")
+        (*place, mode, strategy, seed, threshold, threshold == 0.005) for place, threshold in thresholds.items()
+        for mode in ("alpha", "smoe") for strategy in ("3dgs", "steady")
         for seed in ((0, 1, 2) if threshold == 0.005 else (0, 1))}
     assert len(cells) == len({cell["id"] for cell in cells}) == 2 * 2 * (3 + 3 * 2)
 
@@ -47,6 +48,22 @@ def test_gates_are_of_smoe_alone(content):
     names = [cell["id"] for cell in cells]
     assert [cell["id"] for cell in expand(content, "").cells] == [names[4], names[2]]
     assert names[1].startswith("native_tiny_smoe-learned_3dgs_") and names[3].startswith("native_tiny_smoe-0.05_3dgs_")
+
+
+def test_cells_are_named_as_before_strategies_had_their_names():
+    """So that earlier rows are found; commit aeb180a gave these names, for `schedules` with `gate` and `steady`."""
+    def cell(strategy, budget):
+        content = {"name": "one", "scenes": [{"name": "tiny", "path": "scene"}], "methods": [{"name": "native"}],
+                   "blend_modes": ["alpha"], "densify_grad_thresholds": [0.0002], "strategies": [strategy],
+                   "budgets": [budget]}
+        return expand(content, "").cells[0]["id"]
+
+    assert cell("importance", 40) == "native_tiny_alpha_gate_0.0002_n40_s0_fde6de"
+    assert cell("steady", 0) == "native_tiny_alpha_steady_0.0002_s0_bc42d5"
+
+
+def test_the_axes_of_the_command_line_are_those_of_the_schema():
+    assert list(AXIS_OF) == list(schema.Axes.model_fields)
 
 
 def test_missing_libraries_are_named_with_what_to_type(monkeypatch):
@@ -98,8 +115,9 @@ def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
     ({"densify_grad_thresholds": [0]}, ["densify_grad_thresholds[0]"]),
     ({"densify_grad_thresholds": [1e300]}, ["densify_grad_thresholds[0]", "less than or equal to 1000000"]),
     ({"budgets": [3]}, ["budgets[0]", "0, which is none, or at least 4"]),
-    ({"schedules": ["gate"]}, ["--budget is 0", "--strategy gate"]),
-    ({"protocol": {"options": {"strategy_options": "overshoot=2"}}}, ["--strategy-options", "only gate has some"]),
+    ({"strategies": ["importance"]}, ["--budget is 0", "--strategy importance"]),
+    ({"protocol": {"options": {"strategy_options": "overshoot=2"}}},
+     ["--strategy-options", "only importance has some"]),
     ({"seeds": 0}, ["seeds", "a valid list, such as [0]"]), ({"seeds": [1.0]}, ["seeds[0]", "1.0", "integer"]),
     ({"name": "../x"}, ["name"]), ({"scenes": [{"name": "a"}]}, ["scenes[0]", "path", "synthetic"]),
     ({"scenes": [{"name": "a", "path": "p", "resolution": 0}]}, ["scenes[0].resolution"]),
@@ -117,7 +135,7 @@ def test_budgets_are_an_axis_that_leaves_other_cells_their_names(content):
     ({"protocol": {"iterations": 0}}, ["protocol.iterations"]),
     ({"protocol": {"gpus": 2, "device": "cpu"}}, ["protocol.gpus is 2; it needs protocol.device: cuda"]),
     ({"protocol": {"gpus": 2}, "methods": [{"name": "3dgs-2023", "path": "x"}]}, ["method 3dgs-2023 knows none"]),
-    ({"protocol": {"batch": 2}, "schedules": ["mcmc"]}, ["protocol.batch is 2, but schedule mcmc knows none"]),
+    ({"protocol": {"batch": 2}, "strategies": ["mcmc"]}, ["protocol.batch is 2, but strategy mcmc knows none"]),
     ({"protocol": {"batch": 7}}, ["--iterations is 30000; it must be a multiple of --batch, 7"]),
     ({"protocol": {"options": {"densify_until": 1}}}, ["protocol.options", "densify_until"]),
     ({"protocol": {"options": {"lambda_dssim": 2}}}, ["--lambda-dssim", "2"]),
@@ -175,7 +193,7 @@ def test_a_checkouts_arguments_cannot_change_the_protocol(content, words):
     ("3dgs-2023", {"protocol": {"scale_recipe": True}}, "protocol"),
     ("3dgs-2023", {"protocol": {"options": {"sh_degree_interval": 500}}}, "protocol"),
     ("3dgs-2023", {"protocol": {"device": "cpu"}}, "trains on CUDA"),
-    ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "background": "white"}], "schedules": ["steady"]},
+    ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "background": "white"}], "strategies": ["steady"]},
      "lego is white"),
     ("3dgs-2023", {"scenes": [{"name": "lego", "path": "p", "init_points": 10}]}, "3dgs-2023: init_points is 10"),
     ("3dgs-2023", {"budgets": [500]}, "budgets: are for the native trainer alone"),

@@ -12,12 +12,13 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.images import as_float
 from diff_smoe_rasterization.losses import fused_ssim, l1_ssim_loss
 from dsmoe.cli import main
+from dsmoe.export.bake import RisingGate, bake
 from dsmoe.inspection import open_renderer
 from dsmoe.results.evaluation import evaluate
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
-from dsmoe.training.bake import RisingGate, bake
-from dsmoe.training.loop import Trainer, train
+from dsmoe.train import train
+from dsmoe.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +79,10 @@ def l2_ssim_loss(image, target, weight, squares):
 
 
 @pytest.mark.parametrize("options, squares", [
-    ({"schedule": "3dgs"}, 0), ({"schedule": "gate", "budget": 60}, 30),
-    ({"schedule": "gate", "budget": 60, "strategy_options": "squares=5"}, 5)])
+    ({"strategy": "3dgs"}, 0), ({"strategy": "importance", "budget": 60}, 30),
+    ({"strategy": "importance", "budget": 60, "strategy_options": "squares=5"}, 5)])
 def test_the_loss_is_the_one_with_which_the_run_ended(smoe_run, monkeypatch, options, squares):
-    """`gate` ends with D-SSIM and so many times the squared error."""
+    """`importance` ends with D-SSIM and so many times the squared error."""
     losses = []
     loss = RisingGate.loss
 

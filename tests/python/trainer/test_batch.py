@@ -12,7 +12,8 @@ from dsmoe.errors import ConfigError, TrainerError
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.group import ALONE
-from dsmoe.training.loop import Trainer, train
+from dsmoe.train import train
+from dsmoe.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -138,8 +139,8 @@ def test_training_lowers_the_loss(tiny_config, scene):
 @pytest.mark.parametrize("options, text", [
     (dict(batch=0), "--batch is 0; it must be at least 1"),
     (dict(batch=3), "--iterations is 40; it must be a multiple of --batch, 3"),
-    (dict(batch=4, schedule="gate", budget=50), "--batch is 4; it must be 1 with --strategy gate"),
-    (dict(batch=4, schedule="mcmc", budget=50), "--batch is 4; it must be 1 with --strategy mcmc")])
+    (dict(batch=4, strategy="importance", budget=50), "--batch is 4; it must be 1 with --strategy importance"),
+    (dict(batch=4, strategy="mcmc", budget=50), "--batch is 4; it must be 1 with --strategy mcmc")])
 def test_batches_that_do_not_fit_are_refused(tiny_config, options, text):
     with pytest.raises(ConfigError, match=text):
         tiny_config.changed(**options)

@@ -13,12 +13,13 @@ from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.losses import fused_ssim
 from dsmoe.config import TrainConfig
 from dsmoe.errors import ConfigError
-from dsmoe.gate_options import gate_settings, parse_gate_options
+from dsmoe.importance_options import importance_settings, parse_importance_options
 from dsmoe.scenes.nerf import random_points
 from dsmoe.scenes.scene import load_scene
-from dsmoe.training.loop import Trainer, train
+from dsmoe.train import train
 from dsmoe.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
 from dsmoe.training.passes import AutogradPasses
+from dsmoe.training.trainer import Trainer
 
 
 def trainer_of(config, **options):
@@ -39,7 +40,7 @@ def counts_of(trainer):
 @pytest.mark.parametrize("budget", [40, 250], ids=["below_the_points", "above_the_points"])
 def test_gate_overshoots_and_ends_with_the_budget(tiny_config, budget, mode):
     config = tiny_config.changed(densification_interval=2, densify_grad_threshold=1e-6)
-    counts = counts_of(trainer_of(config, schedule="gate", budget=budget, blend_mode=mode,
+    counts = counts_of(trainer_of(config, strategy="importance", budget=budget, blend_mode=mode,
                                   strategy_options="removals=4"))
     # densify_until_iter is 30: growth ends before 16, removals are at 16, 19, 22 and 25.
     assert counts[0] > 100 and counts[15] > 1.2 * max(counts[0], budget)
@@ -51,7 +52,7 @@ def test_gate_overshoots_and_ends_with_the_budget(tiny_config, budget, mode):
 
 @pytest.mark.parametrize("points", [40, 250], ids=["below_the_budget", "above_the_budget"])
 def test_gate_starts_from_random_points(tiny_config, points):
-    config = tiny_config.changed(schedule="gate", budget=100, densification_interval=2)
+    config = tiny_config.changed(strategy="importance", budget=100, densification_interval=2)
     scene = dataclasses.replace(load_scene(config, progress=False), points=random_points(points, seed=0))
     counts = counts_of(Trainer(config, scene))
     assert counts[0] == points and counts[-1] == 100
@@ -59,15 +60,15 @@ def test_gate_starts_from_random_points(tiny_config, points):
 
 def test_gate_adds_what_the_threshold_leaves_out(tiny_config):
     """No gradient reaches the threshold; the budget is reached all the same."""
-    counts = counts_of(trainer_of(tiny_config, schedule="gate", budget=200, densify_grad_threshold=1e3))
+    counts = counts_of(trainer_of(tiny_config, strategy="importance", budget=200, densify_grad_threshold=1e3))
     assert counts[0] < 150 and counts[-1] == 200
 
 
-@pytest.mark.parametrize("schedule", ["3dgs", "steady", "mcmc"])
+@pytest.mark.parametrize("strategy", ["3dgs", "steady", "mcmc"])
 @pytest.mark.parametrize("budget", [50, 250])
-def test_the_others_stay_below_the_budget(tiny_config, schedule, budget):
+def test_the_others_stay_below_the_budget(tiny_config, strategy, budget):
     config = tiny_config.changed(densification_interval=2, densify_grad_threshold=1e-6, opacity_reset_interval=1000)
-    counts = counts_of(trainer_of(config, schedule=schedule, budget=budget))
+    counts = counts_of(trainer_of(config, strategy=strategy, budget=budget))
     assert counts[0] == min(budget, trainer_of(config).model.num_gaussians)
     assert max(counts) == budget, "the budget is used"
     assert counts[-1] > 0.9 * budget
@@ -75,7 +76,7 @@ def test_the_others_stay_below_the_budget(tiny_config, schedule, budget):
 
 def test_without_a_budget_3dgs_is_as_it_was(tiny_config, tmp_path):
     free = tiny_config.changed(output=str(tmp_path / "free"))
-    roomy = tiny_config.changed(output=str(tmp_path / "roomy"), budget=100_000, schedule="3dgs")
+    roomy = tiny_config.changed(output=str(tmp_path / "roomy"), budget=100_000, strategy="3dgs")
     train(free, progress=False)
     train(roomy, progress=False)
     # A roomy budget takes the same Gaussians; topk and the threshold give the same mask.
@@ -85,25 +86,26 @@ def test_without_a_budget_3dgs_is_as_it_was(tiny_config, tmp_path):
 @pytest.mark.parametrize("budget, goal", [(100_000, 1_000_000), (500_000, 2_000_000), (1_500_000, 3_000_000)])
 def test_growth_ends_where_memory_does(tiny_config, budget, goal):
     """Ten times the budget, but no more than two million or twice the budget, whichever is more."""
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
     context = trainer.strategy.context
     trainer.strategy.context = dataclasses.replace(context, config=dataclasses.replace(context.config, budget=budget))
     assert trainer.strategy.overshoot() == goal
 
 
-@pytest.mark.parametrize("schedule, killed_at, settings", [
-    ("gate", 14, ""), ("gate", 24, ""), ("gate", 24, "removals=4,views=5"), ("gate", 39, ""), ("mcmc", 24, "")])
-def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, killed_at, settings):
+@pytest.mark.parametrize("strategy, killed_at, settings", [
+    ("importance", 14, ""), ("importance", 24, ""), ("importance", 24, "removals=4,views=5"), ("importance", 39, ""),
+    ("mcmc", 24, "")])
+def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, strategy, killed_at, settings):
     """Checkpoints at 10, 20, 30 lie in growth, between removals and among moves.
 
     With four removals, at 16, 19, 22 and 25, that at 20 has looked at some of the views of the next one.
     """
-    (_, row), _ = killed_and_resumed(tiny_config, tmp_path, killed_at, schedule=schedule, budget=120,
+    (_, row), _ = killed_and_resumed(tiny_config, tmp_path, killed_at, strategy=strategy, budget=120,
                                      densification_interval=4, strategy_options=settings)
     assert row["num_gaussians"] == 120
     recorded = row["protocol"].get("strategy_options")
-    assert recorded is None if schedule == "mcmc" else (settings or "removals=16") in recorded
-    assert row["protocol"].get("densify_until_iter") == (None if schedule == "mcmc" else 30)
+    assert recorded is None if strategy == "mcmc" else (settings or "removals=16") in recorded
+    assert row["protocol"].get("densify_until_iter") == (None if strategy == "mcmc" else 30)
 
 
 def looking(trainer, monkeypatch):
@@ -118,7 +120,7 @@ def looking(trainer, monkeypatch):
 
 def test_a_decision_looks_once_at_each_of_its_views(tiny_config, monkeypatch):
     """Removals at 16, 19, 22, 25. Of the five views that each wants, what the steps before do not show is rendered."""
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options="removals=4,views=5")
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60, strategy_options="removals=4,views=5")
     strategy, log = trainer.strategy, {}
     look = strategy._look
 
@@ -139,7 +141,7 @@ def test_a_decision_looks_once_at_each_of_its_views(tiny_config, monkeypatch):
 
 def test_a_decision_looks_at_the_first_of_each_group_of_neighbours(tiny_config):
     """Views of a circle, from a random one on, in four groups: only the first view that is looked at counts."""
-    strategy = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options="views=4").strategy
+    strategy = trainer_of(tiny_config, strategy="importance", budget=60, strategy_options="views=4").strategy
     views, beginnings = strategy.context.views, set()
     for _ in range(30):
         strategy._forget_looks()
@@ -158,7 +160,7 @@ def test_a_decision_looks_at_the_first_of_each_group_of_neighbours(tiny_config):
 @pytest.mark.parametrize("mode", ["alpha", "smoe_eq7"])
 def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
     """The cost of a Gaussian, and all errors together, against renderings of all training views."""
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60, blend_mode=mode,
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60, blend_mode=mode,
                          **({"background_gate": 0.05} if mode == "smoe_eq7" else {}))
     with torch.no_grad():
         trainer.model.raw["opacities"] -= 1.0  # no pixel is full
@@ -185,10 +187,10 @@ def test_scores_are_what_the_views_lose(tiny_config, mode, monkeypatch):
 
 def test_rates_of_gate_fall_behind_the_moves(tiny_config):
     """The positions' as ever; the others fall to a tenth from step 40 to the last. The higher bands' is doubled."""
-    config = tiny_config.changed(iterations=80, position_lr_max_steps=80, schedule="gate", budget=60)
+    config = tiny_config.changed(iterations=80, position_lr_max_steps=80, strategy="importance", budget=60)
     rates_alone = {name: getattr(config, name) for name in ("position_lr_init", "position_lr_final", "feature_lr",
                                                             "scaling_lr")}
-    plain, trainer = trainer_of(config, schedule="steady", **rates_alone), trainer_of(config)
+    plain, trainer = trainer_of(config, strategy="steady", **rates_alone), trainer_of(config)
 
     def rates(one):
         return torch.tensor([group["lr"] for group in one.optimizer.adam.param_groups])
@@ -202,9 +204,9 @@ def test_rates_of_gate_fall_behind_the_moves(tiny_config):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_the_loss_of_gate_is_of_squares_behind_the_moves(tiny_config, masked):
+def test_the_loss_of_importance_is_of_squares_behind_the_moves(tiny_config, masked):
     """Until step 40 it is that of 3DGS."""
-    config = tiny_config.changed(iterations=42, schedule="gate", budget=60, strategy_options="squares=7")
+    config = tiny_config.changed(iterations=42, strategy="importance", budget=60, strategy_options="squares=7")
     scene = load_scene(config, progress=False)
     if masked:
         mask = torch.full((1, 24, 32), 51, dtype=torch.uint8)
@@ -224,7 +226,7 @@ def test_the_loss_of_gate_is_of_squares_behind_the_moves(tiny_config, masked):
 
 
 def test_removal_keeps_the_costliest(tiny_config, monkeypatch):
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
     costs = looking(trainer, monkeypatch).costs
     kept = trainer.model.raw["means3D"][costs >= costs.sort(descending=True).values[59]].detach().clone()
     trainer.strategy.remove(1)
@@ -232,7 +234,7 @@ def test_removal_keeps_the_costliest(tiny_config, monkeypatch):
 
 
 def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
     strategy, count = trainer.strategy, trainer.model.num_gaussians
     costs, errors = torch.full((count,), 5.0), torch.zeros(count)
     costs[7], errors[3], costs[8], errors[4] = 0.5, 10.0, 1.0, 4.0
@@ -246,7 +248,7 @@ def test_a_move_takes_the_cheapest_to_an_error(tiny_config, monkeypatch):
 
 
 def test_children_lie_on_the_longest_axis(tiny_config):
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
     for _ in range(2):
         trainer.step()
     model, adam = trainer.model, trainer.optimizer.adam
@@ -278,19 +280,19 @@ def test_copies_look_as_the_one_before(opacity, copies):
 
 
 def test_mcmc_regularises_opacities_and_scales(tiny_config):
-    trainer = trainer_of(tiny_config, schedule="mcmc", budget=100)
+    trainer = trainer_of(tiny_config, strategy="mcmc", budget=100)
     raw = trainer.model.raw
     expected = (OPACITY_WEIGHT * raw["opacities"].sigmoid().mean() + SCALE_WEIGHT * raw["scales"].exp().mean())
     gradients = torch.autograd.grad(expected, [raw["opacities"], raw["scales"]])
     passes = AutogradPasses(trainer.model, trainer.optimizer, trainer.renderer)
     with torch.no_grad():
-        trainer.strategy.after_backward(SimpleNamespace(add_gradient=passes.add_gradient))
+        trainer.strategy.after_backward(SimpleNamespace(add_gradient=passes._add_gradient))
     torch.testing.assert_close(raw["opacities"].grad, gradients[0])
     torch.testing.assert_close(raw["scales"].grad, gradients[1])
 
 
 def test_noise_shakes_the_faint_only(tiny_config):
-    trainer = trainer_of(tiny_config, schedule="mcmc", budget=100)
+    trainer = trainer_of(tiny_config, strategy="mcmc", budget=100)
     trainer.optimizer.set_position_rate(1)
     with torch.no_grad():
         trainer.model.raw["opacities"][:50] = torch.logit(torch.tensor(0.001))
@@ -302,10 +304,11 @@ def test_noise_shakes_the_faint_only(tiny_config):
 
 
 @pytest.mark.parametrize("options, words", [
-    (dict(schedule="gate"), "--budget is 0; it must be at least 4 with --strategy gate"),
-    (dict(schedule="mcmc"), "--budget is 0; it must be at least 4 with --strategy mcmc"),
+    (dict(strategy="importance"), "--budget is 0; it must be at least 4 with --strategy importance"),
+    (dict(strategy="mcmc"), "--budget is 0; it must be at least 4 with --strategy mcmc"),
     (dict(budget=-1), "--budget is -1; it must be at least 0"),
-    (dict(budget=100, densify_until_iter=1), "--densify-until-iter is 1; it must be at least 2 with --strategy gate"),
+    (dict(budget=100, densify_until_iter=1),
+     "--densify-until-iter is 1; it must be at least 2 with --strategy importance"),
     (dict(budget=100, iterations=7000), "--iterations is 7000; it must be at least --densify-until-iter"),
 ])
 def test_what_cannot_be_is_said(options, words):
@@ -332,32 +335,32 @@ def test_settings_of_gate_are_checked(text, words):
 def test_settings_of_gate_are_of_gate_only():
     text = "overshoot=0,removals=1,views=1000000,moves=0,worth=0,bands=1,anneal=0.5,squares=0"
     assert TrainConfig(budget=60, strategy_options=text.replace(",", ", ")).validate()
-    assert gate_settings(parse_gate_options(text)) == text
+    assert importance_settings(parse_importance_options(text)) == text
     with pytest.raises(ConfigError, match="--strategy-options is 'views=3'; it must be left out with --strategy mcmc"):
-        TrainConfig(budget=60, schedule="mcmc", strategy_options="views=3").validate()
+        TrainConfig(budget=60, strategy="mcmc", strategy_options="views=3").validate()
     config = TrainConfig(budget=60, strategy_options="views=3")
     assert config.changed(seed=1).strategy_options == "views=3"
-    assert config.changed(schedule="mcmc").strategy_options == ""
+    assert config.changed(strategy="mcmc").strategy_options == ""
 
 
 @pytest.mark.parametrize("iterations", [2, 3, 5, 6, 7, 8])
 def test_the_shortest_runs_of_gate_end_with_the_budget(tiny_config, iterations):
     """All milestones lie within a few steps, of which the last changes nothing."""
-    config = tiny_config.changed(schedule="gate", budget=60, iterations=iterations, densify_until_iter=iterations)
+    config = tiny_config.changed(strategy="importance", budget=60, iterations=iterations, densify_until_iter=iterations)
     assert counts_of(trainer_of(config))[-1] == 60
 
 
 def test_a_budget_that_growth_cannot_reach_is_refused(tiny_config):
     """One densification lies between steps 4 and 16, none behind step 16."""
     with pytest.raises(ConfigError, match="--budget is 1000; it must be at most .* --densify-from-iter 4 and step 16"):
-        trainer_of(tiny_config, schedule="gate", budget=1000)
+        trainer_of(tiny_config, strategy="importance", budget=1000)
     with pytest.raises(ConfigError, match="--budget is 200"):
-        trainer_of(tiny_config, schedule="gate", budget=200, densify_from_iter=16)
+        trainer_of(tiny_config, strategy="importance", budget=200, densify_from_iter=16)
 
 
 def test_children_of_an_opaque_one_can_be_trained(tiny_config):
     """In float32 the sigmoid of 20 is 1, whose logit is infinite."""
-    trainer = trainer_of(tiny_config, schedule="gate", budget=60)
+    trainer = trainer_of(tiny_config, strategy="importance", budget=60)
     trainer.step()
     with torch.no_grad():
         trainer.model.raw["opacities"][5] = 20.0
@@ -367,7 +370,7 @@ def test_children_of_an_opaque_one_can_be_trained(tiny_config):
 
 def test_mcmc_grows_from_a_few(tiny_config):
     """A twentieth of them is less than one."""
-    trainer = trainer_of(tiny_config, schedule="mcmc", budget=7, init_points=5)
+    trainer = trainer_of(tiny_config, strategy="mcmc", budget=7, init_points=5)
     counts = []
     with torch.no_grad():
         for _ in range(3):
@@ -377,8 +380,8 @@ def test_mcmc_grows_from_a_few(tiny_config):
 
 
 def test_a_budget_asks_for_gate():
-    assert TrainConfig(budget=100).schedule == "gate" and TrainConfig().schedule == "3dgs"
-    assert TrainConfig(budget=100, schedule="steady").schedule == "steady"
+    assert TrainConfig(budget=100).strategy == "importance" and TrainConfig().strategy == "3dgs"
+    assert TrainConfig(budget=100, strategy="steady").strategy == "steady"
 
 
 def test_gate_has_a_recipe_of_its_own(tmp_path):
@@ -390,12 +393,12 @@ def test_gate_has_a_recipe_of_its_own(tmp_path):
 
     published, own = (0.00016, 0.0000016, 0.0025, 0.005), (0.00064, 0.0000064, 0.005, 0.01)
     config = TrainConfig(budget=100)
-    assert recipe(config) == own and recipe(TrainConfig(schedule="mcmc", budget=100)) == published
+    assert recipe(config) == own and recipe(TrainConfig(strategy="mcmc", budget=100)) == published
     assert recipe(TrainConfig(budget=100, feature_lr=0.0025)) == own[:2] + (0.0025,) + own[3:]
     config.save(str(tmp_path))
     assert recipe(TrainConfig.load(str(tmp_path))) == own
-    assert recipe(config.changed(schedule="steady")) == published
-    assert recipe(config.changed(scaling_lr=0.02).changed(schedule="3dgs")) == published[:3] + (0.02,)
-    assert recipe(TrainConfig().changed(schedule="gate", budget=9)) == own
+    assert recipe(config.changed(strategy="steady")) == published
+    assert recipe(config.changed(scaling_lr=0.02).changed(strategy="3dgs")) == published[:3] + (0.02,)
+    assert recipe(TrainConfig().changed(strategy="importance", budget=9)) == own
     short = dataclasses.replace(config, iterations=3000).shortened()
     assert (short.densify_until_iter, short.feature_lr, short.opacity_reset_interval) == (1500, 0.005, 300)

@@ -20,11 +20,12 @@ import diff_smoe_rasterization
 from diff_smoe_rasterization import io
 from dsmoe import inspection
 from dsmoe.cli import main
-from dsmoe.config import GROUPS, TrainConfig
+from dsmoe.config import TrainConfig
+from dsmoe.config_arguments import GROUPS
 from dsmoe.results.rows import viewer_warning
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training import forecast
-from dsmoe.training.loop import Trainer
+from dsmoe.training.trainer import Trainer
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
          "--densification-interval", "4", "--quiet"]
@@ -72,7 +73,7 @@ def test_training_leaves_results_config_and_model(trained):
     assert row["train_seconds"] > 0 and row["fps"] > 0
     protocol = row["protocol"]
     assert (protocol["train_views"], protocol["test_views"], protocol["image_size"]) == (7, 2, [32, 24])
-    for name in ("split", "resolution", "downscaler", "background", "principal_point", "schedule",
+    for name in ("split", "resolution", "downscaler", "background", "principal_point", "strategy",
                  "densify_grad_threshold", "iterations", "seed", "machine", "versions"):
         assert name in protocol
     with open(ply_of(trained), "rb") as file:
@@ -628,9 +629,9 @@ def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
     arguments = ["train", scene, "-o", str(tmp_path / "out"), *SHORT]
     for function, words in ((cuda, "the GPU is out of memory, 20.00 GiB"), (array, "out of memory, 1.00 PiB"),
                             (cpu, f"the machine is out of memory, {2**50} bytes more were asked for")):
-        monkeypatch.setattr("dsmoe.training.loop.load_scene", function)
+        monkeypatch.setattr("dsmoe.train.load_scene", function)
         assert words in fails(capsys, *arguments)
-    monkeypatch.setattr("dsmoe.training.loop.load_scene", defect)
+    monkeypatch.setattr("dsmoe.train.load_scene", defect)
     with pytest.raises(RuntimeError, match="another one"):
         main(arguments)
 
@@ -714,7 +715,7 @@ def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monke
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dsmoe.training.loop.load_scene", interrupted)
+    monkeypatch.setattr("dsmoe.train.load_scene", interrupted)
     assert main(["train", scene, "-o", str(tmp_path / "out"), *SHORT]) == 130
     assert capsys.readouterr().err.endswith("interrupted\n")
 
@@ -742,7 +743,7 @@ def test_scale_recipe(scene, tmp_path):
 
 @pytest.mark.parametrize("with_scene", [False, True])
 def test_a_changed_milestone_is_told_before_what_is_wrong_with_it(scene, tmp_path, capsys, with_scene):
-    """15,000 is above the iterations, which `gate` refuses; the run that is there has 15."""
+    """15,000 is above the iterations, which `importance` refuses; the run that is there has 15."""
     output, options = str(tmp_path / "out"), ["--iterations", "30", "--scale-recipe", "--budget", "40"]
     assert main(["train", scene, "-o", output, *options, "--quiet"]) == 0
     words = [scene, *options] if with_scene else []

@@ -9,7 +9,8 @@ import os
 import pytest
 
 from diff_smoe_rasterization.settings import record_of
-from dsmoe.config import TrainConfig, add_arguments, config_from_arguments
+from dsmoe.config import TrainConfig
+from dsmoe.config_arguments import add_arguments, config_from_arguments
 from dsmoe.errors import ConfigError
 
 # The published defaults of 3DGS (2023).
@@ -31,15 +32,15 @@ def parse(*arguments):
 def test_defaults_are_those_of_3dgs():
     config = parse()
     assert {name: getattr(config, name) for name in PUBLISHED} == PUBLISHED
-    assert (config.scene, config.output, config.blend_mode, config.schedule) == ("scene", "out", "alpha", "3dgs")
+    assert (config.scene, config.output, config.blend_mode, config.strategy) == ("scene", "out", "alpha", "3dgs")
 
 
 def test_every_option_is_on_the_command_line():
     config = parse("--blend-mode", "smoe_tn", "--iterations", "7", "--densify-grad-threshold", "5e-3",
-                   "--white-background", "--schedule", "steady", "--principal-point", "centre", "--seed", "3",
+                   "--white-background", "--strategy", "steady", "--principal-point", "centre", "--seed", "3",
                    "--init-points", "99", "--percent-dense", "0.5", "--sh-degree", "1")
     assert (config.blend_mode, config.iterations, config.densify_grad_threshold) == ("smoe_tn", 7, 0.005)
-    assert (config.white_background, config.schedule, config.principal_point) == (True, "steady", "centre")
+    assert (config.white_background, config.strategy, config.principal_point) == (True, "steady", "centre")
     assert (config.seed, config.init_points, config.percent_dense, config.sh_degree) == (3, 99, 0.5, 1)
 
 
@@ -124,6 +125,24 @@ def test_how_a_gate_is_learned_is_refused_where_none_is(monkeypatch, option):
     parse("--blend-mode", "smoe", "--background-gate", "learned", *given)
 
 
+@pytest.mark.parametrize("recorded, strategy", [("gate", "importance"), ("steady", "steady"), ("mcmc", "mcmc")])
+def test_a_file_that_calls_the_strategy_schedule_still_opens(tmp_path, recorded, strategy):
+    TrainConfig(scene="s", output=str(tmp_path), budget=100).save(str(tmp_path))
+    values = json.loads((tmp_path / "config.json").read_text())
+    assert values.pop("strategy") == "importance"
+    values["schedule"] = recorded  # as earlier versions wrote it
+    (tmp_path / "config.json").write_text(json.dumps(values))
+    assert TrainConfig.load(str(tmp_path)).strategy == TrainConfig.of_record(values).strategy == strategy
+
+
+def test_schedule_is_another_name_of_the_option_and_gate_is_no_strategy(capsys):
+    assert parse("--schedule", "steady").strategy == "steady"
+    with pytest.raises(SystemExit):
+        parse("--schedule", "gate", "--budget", "9")
+    text = capsys.readouterr().err
+    assert "--strategy" in text and "'importance'" in text
+
+
 @pytest.mark.parametrize("mode, expected", [("smoe_eq7", 0.0), ("alpha", 1.0), ("smoe_tn", 0.0)])
 def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypatch, mode, expected):
     monkeypatch.setenv("DSMOE_BACKGROUND_GATE", "0.7")  # must not fill the gap
@@ -153,7 +172,7 @@ def test_a_file_that_names_no_background_gate_is_of_the_paper(tmp_path, monkeypa
     ("densify_grad_threshold", 0.0, "--densify-grad-threshold is 0.0"),
     ("position_lr_final", float("nan"), "--position-lr-final is nan"),
     ("checkpoint_every", -1, "--checkpoint-every is -1"),
-    ("schedule", "fast", "--strategy is 'fast'; it must be one of 3dgs, steady, gate, mcmc"),
+    ("strategy", "fast", "--strategy is 'fast'; it must be one of 3dgs, steady, importance, mcmc"),
     ("device", "tpu", "--device is 'tpu'"),
     ("budget", "500", "--budget is '500'; it must be a whole number"),
     ("iterations", 1e3, "--iterations is 1000.0; it must be a whole number"),
@@ -184,7 +203,7 @@ def test_file_round_trip(tmp_path, mode):
     (lambda values: values.update(feature_lr=10**400), "it must be at most 2^53"),
     *((lambda values, name=name, value=value: values.update({name: value}), words) for value in ([], {}, [5])
       for name, words in (("scene", "--scene is"), ("images", "--images is"), ("device", "--device is"),
-                          ("background_gate", "background_gate"), ("schedule", "--strategy is"),
+                          ("background_gate", "background_gate"), ("strategy", "--strategy is"),
                           ("strategy_options", "--strategy-options is"))),
 ])
 def test_a_wrong_file_is_refused(tmp_path, monkeypatch, edit, words):

@@ -19,7 +19,7 @@ from dsmoe.distributed.shards import run_of
 from dsmoe.errors import TrainerError
 from dsmoe.results.modelfile import model_path
 from dsmoe.system import torchrun as torchrun_module
-from dsmoe.training.loop import train
+from dsmoe.train import train
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 PACKAGES = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterization.__file__)))  # of the one under test
@@ -106,7 +106,7 @@ def test_a_process_saves_and_ends_where_torchrun_is_killed(tiny_config):
 @needs_torchrun
 def test_a_budget_holds_for_all_processes_together(tiny_config, tmp_path):
     """One view a step, two processes, of which one blends nothing: the model of the usual training."""
-    config = tiny_config.changed(schedule="steady", budget=170, iterations=20, output=str(tmp_path / "one"))
+    config = tiny_config.changed(strategy="steady", budget=170, iterations=20, output=str(tmp_path / "one"))
     row = train(config, progress=False)
     assert 165 < row["num_gaussians"] <= 170 and row["num_gaussians"] != row["protocol"]["init_points"]
     other = dataclasses.replace(config, output=str(tmp_path / "two"))

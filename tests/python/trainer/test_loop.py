@@ -12,11 +12,12 @@ from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient as l1_ssim
 from dsmoe.errors import TrainerError
 from dsmoe.results.rendering import package_rasterizer
 from dsmoe.scenes.scene import load_scene
+from dsmoe.train import Run, train
 from dsmoe.training import strategy
 from dsmoe.training.background_gate import LearnedGate
-from dsmoe.training.loop import Run, Trainer, train
 from dsmoe.training.strategies import STRATEGIES
 from dsmoe.training.strategy import Strategy
+from dsmoe.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -204,11 +205,12 @@ def test_a_strategy_sees_every_stage_of_a_step(tiny_config, scene, monkeypatch):
 
     class Recorder(Strategy):
         def before_backward(self, step):
-            seen.append(("before", step.iteration, self.context.model.raw["means3D"].grad is None,
-                         step.means2D.grad is None))
+            seen.append(("before", step.iteration, self.context.model.raw["means3D"].grad is None, step.seen == []))
 
         def after_backward(self, step):
-            assert step.means2D.grad.shape == (self.context.model.num_gaussians, 3) and step.means2D.grad.any()
+            (gradient, radii), = step.seen
+            assert gradient.shape == (self.context.model.num_gaussians, 3) and gradient.any()
+            assert radii is step.rendering.radii
             self.before_step = self.context.model.raw["means3D"].detach().clone()
             other = self.context.render(self.context.views[0].camera, outputs=("alpha",))
             seen.append(("after", tuple(other.alpha.shape), bool((step.rendering.radii > 0).any())))

@@ -11,7 +11,8 @@ from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES
 from dsmoe.config import TrainConfig
 from dsmoe.errors import TrainerError
-from dsmoe.model import PARAMETERS, GaussianModel, GaussianOptimizer, exponential_rate
+from dsmoe.model import PARAMETERS, GaussianModel
+from dsmoe.optimizer import GaussianOptimizer, exponential_rate
 from dsmoe.results.modelfile import (
     Recorded,
     agreed_background_gate,

@@ -17,7 +17,8 @@ from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system.group import ALONE
 from dsmoe.system.process import SPARE_BYTES, return_spare_memory
-from dsmoe.training.loop import Run, Trainer, train
+from dsmoe.train import Run, train
+from dsmoe.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
 
@@ -76,11 +77,11 @@ def test_a_step_does_not_wait_for_the_device(config, scene, options):
     assert all(torch.isfinite(trainer.model.raw[name]).all() for name in PARAMETERS)
 
 
-@pytest.mark.parametrize("schedule", ["3dgs", "steady", "gate", "mcmc"])
+@pytest.mark.parametrize("strategy", ["3dgs", "steady", "importance", "mcmc"])
 @pytest.mark.parametrize("mode", ["alpha", "smoe"])
-def test_a_whole_run(config, schedule, mode):
-    budget = 100 if schedule in ("gate", "mcmc") else 0
-    config = config.changed(schedule=schedule, budget=budget, blend_mode=mode, eval_every=10)
+def test_a_whole_run(config, strategy, mode):
+    budget = 100 if strategy in ("importance", "mcmc") else 0
+    config = config.changed(strategy=strategy, budget=budget, blend_mode=mode, eval_every=10)
     row = train(config, progress=False)
     assert not budget or row["num_gaussians"] == budget
     assert row["protocol"]["device"] == "cuda" and math.isfinite(row["psnr"]) and row["fps"] > 0
@@ -90,7 +91,7 @@ def test_a_whole_run(config, schedule, mode):
 
 def test_a_run_with_few_points_and_other_options(config):
     # A few iterations after a reset of the opacities, on white, 20 Gaussians would be pruned: "steady" resets none.
-    config = config.changed(init_points=20, white_background=True, antialiasing=True, sh_degree=1, schedule="steady")
+    config = config.changed(init_points=20, white_background=True, antialiasing=True, sh_degree=1, strategy="steady")
     row = train(config, progress=False)
     assert row["protocol"]["init_points"] == 20 and row["num_gaussians"] > 0 and math.isfinite(row["psnr"])
 
@@ -141,10 +142,10 @@ def test_a_deterministic_training_over_batches_repeats_bit_for_bit(config, scene
 
 
 def test_a_deterministic_training_to_a_budget_repeats_bit_for_bit(config, scene):
-    """`gate` removes and moves by importance, so the sums of importance must repeat too."""
+    """`importance` removes and moves by importance, so the sums of importance must repeat too."""
     results = []
     for _ in range(2):
-        trainer = Trainer(config.changed(deterministic=True, schedule="gate", budget=60), scene)
+        trainer = Trainer(config.changed(deterministic=True, strategy="importance", budget=60), scene)
         for _ in range(config.iterations):
             trainer.step()
         results.append({name: tensor.detach().clone() for name, tensor in trainer.model.raw.items()})

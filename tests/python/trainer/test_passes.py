@@ -7,8 +7,8 @@ import torch
 from dsmoe.model import PARAMETERS
 from dsmoe.scenes.scene import load_scene
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
-from dsmoe.training.loop import Trainer
 from dsmoe.training.passes import AutogradPasses, DirectPasses
+from dsmoe.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -16,9 +16,15 @@ def scene(tiny_config):
     return load_scene(tiny_config, progress=False)
 
 
+def make_direct(trainer):
+    """On the CPU it is not by itself."""
+    trainer.passes = DirectPasses(trainer.model, trainer.optimizer, trainer.renderer, trainer.gate)
+
+
 def trained(config, scene, direct, steps=40):
     trainer = Trainer(config, scene)
-    trainer.direct = direct  # on the CPU it is not by itself
+    if direct:
+        make_direct(trainer)
     for _ in range(steps):
         trainer.step()
     return trainer
@@ -42,13 +48,13 @@ def assert_equal(one, other):
     dict(blend_mode="alpha"), dict(blend_mode="smoe", background_gate=0.0),
     dict(blend_mode="smoe", background_gate="learned", random_background=True),
     dict(blend_mode="alpha", antialiasing=True, white_background=True, sh_degree=1),
-    dict(blend_mode="alpha", schedule="steady", sh_degree=0),
-    dict(blend_mode="smoe", schedule="gate", budget=60)], ids=str)
+    dict(blend_mode="alpha", strategy="steady", sh_degree=0),
+    dict(blend_mode="smoe", strategy="importance", budget=60)], ids=str)
 def test_direct_passes_train_as_autograd_does(tiny_config, scene, options):
     """Densifications are at 8, 16, 24; an opacity reset alone, at 12, replaces one parameter of all."""
     config = tiny_config.changed(**options)
     trainers = [trained(config, scene, direct) for direct in (False, True)]
-    assert [type(trainer._passes) for trainer in trainers] == [AutogradPasses, DirectPasses]
+    assert [type(trainer.passes) for trainer in trainers] == [AutogradPasses, DirectPasses]
     assert trainers[1].model.num_gaussians != len(scene.points.positions), "something must have been densified"
     assert_equal(*trainers)
 
@@ -57,7 +63,8 @@ def test_who_reads_the_model_finds_it_up_to_date(tiny_config, scene):
     """At any time, and reading changes nothing of what follows."""
     quiet, disturbed = (Trainer(tiny_config, scene) for _ in range(2))
     dense = Trainer(tiny_config, scene)
-    quiet.direct = disturbed.direct = True
+    make_direct(quiet)
+    make_direct(disturbed)
     waited = False
     for step in range(30):
         for trainer in (quiet, disturbed, dense):
@@ -77,7 +84,7 @@ def test_a_checkpoint_on_the_way(tiny_config, scene, tmp_path):
     path = str(tmp_path / "checkpoint.pt")
     save_checkpoint(path, broken.state_dict())
     resumed = Trainer(tiny_config, scene)
-    resumed.direct = True
+    make_direct(resumed)
     resumed.load_state_dict(load_checkpoint(path, "cpu"))
     for _ in range(19):
         resumed.step()
@@ -87,8 +94,8 @@ def test_a_checkpoint_on_the_way(tiny_config, scene, tmp_path):
 def test_what_a_strategy_adds_reaches_all_gaussians(tiny_config, scene, monkeypatch):
     """By both passes alike, seen or not; a sum in another order is rounded otherwise."""
     monkeypatch.setattr("dsmoe.training.mcmc_strategy.NOISE_RATE", 0)
-    config = tiny_config.changed(schedule="mcmc", budget=100)
+    config = tiny_config.changed(strategy="mcmc", budget=100)
     dense, direct = (trained(config, scene, direct, 3) for direct in (False, True))
-    assert (direct._passes._radii == 0).any(), "all were seen"
+    assert (direct.passes._radii == 0).any(), "all were seen"
     for name in PARAMETERS:
         torch.testing.assert_close(direct.model.raw[name], dense.model.raw[name], rtol=1e-5, atol=1e-5)

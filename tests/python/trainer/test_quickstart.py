@@ -114,11 +114,11 @@ def test_nothing_is_written_where_a_link_in_the_folder_leads(tiny_scene, tmp_pat
 
 def test_given_options_win_over_chosen_ones(tiny_scene):
     chosen = quickstart.choose_options(tiny_scene, {})
-    assert (chosen.iterations, chosen.densify_until_iter, chosen.schedule) == (2000, 1000, "steady")
+    assert (chosen.iterations, chosen.densify_until_iter, chosen.strategy) == (2000, 1000, "steady")
     assert chosen.resolution == -1, "images this small are not reduced"
-    given = quickstart.choose_options(tiny_scene, {"iterations": 600, "densify_until_iter": 100, "schedule": "3dgs"})
+    given = quickstart.choose_options(tiny_scene, {"iterations": 600, "densify_until_iter": 100, "strategy": "3dgs"})
     assert (given.iterations, given.densify_until_iter, given.opacity_reset_interval) == (600, 100, 60)
-    assert given.schedule == "3dgs"
+    assert given.strategy == "3dgs"
 
 
 def test_large_scenes_are_reduced_and_told(monkeypatch, tiny_scene, capsys):

@@ -6,7 +6,7 @@ from real_data import folder
 
 from dsmoe.config import TrainConfig
 from dsmoe.scenes.scene import load_scene
-from dsmoe.training.loop import Trainer
+from dsmoe.training.trainer import Trainer
 
 
 @pytest.mark.parametrize("name, views, points, size", [("fox", (43, 7), 13_710, (67, 118)),

@@ -13,15 +13,17 @@ import torch
 from PIL import Image
 
 from diff_smoe_rasterization import io
+from dsmoe import train as runs
 from dsmoe.config import TrainConfig
 from dsmoe.errors import TrainerError, in_one_line
 from dsmoe.results.modelfile import model_path
 from dsmoe.scenes.scene import load_scene
 from dsmoe.system import files
-from dsmoe.training import checkpoint, loop
+from dsmoe.train import train
+from dsmoe.training import checkpoint
 from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
-from dsmoe.training.loop import Trainer, train
 from dsmoe.training.order import ViewOrder
+from dsmoe.training.trainer import Trainer
 
 
 class Killed(Exception):
@@ -337,7 +339,7 @@ def test_a_link_in_the_place_of_a_product_is_named(tiny_config, tmp_path):
 @pytest.mark.parametrize("step", [0, 1, 2])
 def test_what_an_overwriting_run_leaves_that_is_killed_as_it_begins_is_not_gone_on_with(tiny_config, monkeypatch, step):
     """After 0, 1 or 2 of its removals: the old run whole, or none."""
-    config, removals, remove = dataclasses.replace(tiny_config, iterations=4), [], loop.remove_files
+    config, removals, remove = dataclasses.replace(tiny_config, iterations=4), [], runs.remove_files
     train(config, progress=False)
 
     def killed(*arguments):
@@ -347,7 +349,7 @@ def test_what_an_overwriting_run_leaves_that_is_killed_as_it_begins_is_not_gone_
         remove(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(loop, "remove_files", killed)
+        patch.setattr(runs, "remove_files", killed)
         patch.setattr(TrainConfig, "save", killed)
         train(dataclasses.replace(config, seed=1), overwrite=True, progress=False)
     assert os.path.isfile(os.path.join(config.output, "config.json")) == (step == 0)
@@ -477,7 +479,7 @@ def test_a_checkpoint_that_is_no_state_of_the_run_is_named_and_not_begun_with(ti
     train(config, progress=False)
     path, begun = os.path.join(config.output, "checkpoint.pt"), []
     state = load_checkpoint(path, "cpu")
-    run = loop.Run(Trainer(config, load_scene(config, progress=False)), progress=False)
+    run = runs.Run(Trainer(config, load_scene(config, progress=False)), progress=False)
     monkeypatch.setattr(run.trainer, "load_state_dict", begun.append)
     assert run.resume() and len(begun) == 1 and state["gate"]["adam"]
     for place, value in ALTERATIONS:

@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 
 from dsmoe.results import scalars
-from dsmoe.training.loop import train
+from dsmoe.train import train
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from dsmoe.scenes.images import target_size
 from dsmoe.scenes.layout import PosedImage, hold_out
 from dsmoe.scenes.pointcloud import PointCloud
 from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from dsmoe.training.loop import Trainer
+from dsmoe.training.trainer import Trainer
 
 
 def load(folder, **options):

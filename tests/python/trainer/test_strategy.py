@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from diff_smoe_rasterization import Rendering
 from dsmoe.config import TrainConfig
-from dsmoe.model import PARAMETERS, GaussianModel, GaussianOptimizer
+from dsmoe.model import PARAMETERS, GaussianModel
+from dsmoe.optimizer import GaussianOptimizer
 from dsmoe.training.strategies import STRATEGIES
 from dsmoe.training.strategy import Step, Strategy, StrategyContext
 
@@ -51,12 +51,13 @@ def moments(context, name, key="exp_avg"):
 
 
 def observed_step(context, iteration, gradients, radii=None):
-    """A step after its backward pass: gradients [N] are the norms of means2D.grad."""
-    means2D = torch.zeros(len(gradients), 3, requires_grad=True)
+    """A step after its backward pass: gradients [N] are the norms of those by the places on the image."""
     values = torch.tensor(gradients)
-    means2D.grad = torch.stack([0.6 * values, -0.8 * values, torch.full_like(values, 99.0)], dim=1)
+    by_place = torch.stack([0.6 * values, -0.8 * values, torch.full_like(values, 99.0)], dim=1)
     radii = torch.ones(len(gradients), dtype=torch.int32) if radii is None else torch.tensor(radii, dtype=torch.int32)
-    return Step(iteration, None, None, Rendering(torch.zeros(3, 1, 1), radii), None, means2D, torch.zeros(()), None)
+    step = Step(iteration, 1, torch.zeros(()))
+    step.seen.append((by_place, radii))
+    return step
 
 
 def run(strategy, *arguments, **keywords):
@@ -160,27 +161,27 @@ def test_densification_calendar_of_3dgs(iteration, densifies):
     assert context.model.num_gaussians == (2 if densifies else 1)
 
 
-@pytest.mark.parametrize("schedule, iteration, resets", [("3dgs", 3000, True), ("3dgs", 2900, False),
+@pytest.mark.parametrize("strategy, iteration, resets", [("3dgs", 3000, True), ("3dgs", 2900, False),
                                                          ("3dgs", 12_000, True), ("3dgs", 15_000, False),
                                                          ("steady", 3000, False)])
-def test_opacity_reset_calendar(schedule, iteration, resets):
+def test_opacity_reset_calendar(strategy, iteration, resets):
     context = context_of([SMALL], [0.5])
-    run(STRATEGIES[schedule](context), iteration, [0.0])
+    run(STRATEGIES[strategy](context), iteration, [0.0])
     assert float(context.model.opacities.detach()) == pytest.approx(0.01 if resets else 0.5, rel=1e-5)
 
 
-@pytest.mark.parametrize("schedule, white, resets", [("3dgs", True, True), ("3dgs", False, False),
+@pytest.mark.parametrize("strategy, white, resets", [("3dgs", True, True), ("3dgs", False, False),
                                                      ("steady", True, False)])
-def test_white_background_resets_once_more_where_densification_starts(schedule, white, resets):
+def test_white_background_resets_once_more_where_densification_starts(strategy, white, resets):
     context = context_of([SMALL], [0.5], white_background=white)
-    run(STRATEGIES[schedule](context), 500, [0.0])
+    run(STRATEGIES[strategy](context), 500, [0.0])
     assert float(context.model.opacities.detach()) == pytest.approx(0.01 if resets else 0.5, rel=1e-5)
 
 
-@pytest.mark.parametrize("schedule, iteration, survivors", [("3dgs", 3000, 2), ("3dgs", 3100, 1), ("steady", 3100, 2)])
-def test_size_prune_works_only_after_the_first_reset(schedule, iteration, survivors):
+@pytest.mark.parametrize("strategy, iteration, survivors", [("3dgs", 3000, 2), ("3dgs", 3100, 1), ("steady", 3100, 2)])
+def test_size_prune_works_only_after_the_first_reset(strategy, iteration, survivors):
     context = context_of([SMALL, 1.01], [0.5, 0.5])
-    run(STRATEGIES[schedule](context), iteration, [0.0, 0.0])
+    run(STRATEGIES[strategy](context), iteration, [0.0, 0.0])
     assert context.model.num_gaussians == survivors
 
 

@@ -22,7 +22,8 @@ from dsmoe.inspection import to_image
 from dsmoe.opening import open_trained
 from dsmoe.results.rendering import Renderer
 from dsmoe.scenes.scene import load_scene
-from dsmoe.training.loop import Run, Trainer, train
+from dsmoe.train import Run, train
+from dsmoe.training.trainer import Trainer
 from dsmoe.view import server
 from dsmoe.view.following import Followed
 from dsmoe.view.gate_map import largest_gates

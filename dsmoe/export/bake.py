@@ -16,8 +16,9 @@ from ..results.evaluation import evaluate
 from ..results.rendering import Renderer
 from ..results.rows import viewer_warning
 from ..scenes.scene import load_scene
-from .loop import Run, Trainer
-from .strategy import AnyStep, Strategy, StrategyContext
+from ..train import Run
+from ..training.strategy import Step, Strategy, StrategyContext
+from ..training.trainer import Trainer
 
 RISE = 0.4  # the part of the iterations in which the background gate goes to 1
 LEAST_GATE = 0.01  # where a gate of 0 begins, which no factor raises
@@ -36,7 +37,7 @@ class FixedGaussians(Strategy):
     """Gaussians are neither added nor removed."""
 
     def __init__(self, context: StrategyContext, squares: float = 0.0) -> None:
-        """squares: the weight of the squared error in place of L1, as at the end of `gate`; 0: L1."""
+        """squares: the weight of the squared error in place of L1, as at the end of `importance`; 0: L1."""
         super().__init__(context)
         self.squares = squares
 
@@ -53,7 +54,7 @@ class RisingGate(FixedGaussians):
         super().__init__(context, squares)
         self.first = max(float(context.render.background_gate), LEAST_GATE)
 
-    def after_step(self, step: AnyStep) -> None:
+    def after_step(self, step: Step) -> None:
         renderer, gate = self.context.render, self.gate(step.iteration)
         if gate != 1:
             renderer.background_gate = gate
@@ -92,9 +93,9 @@ def bake(config: TrainConfig, renderer: Renderer, iterations: int, progress: boo
     if iterations < 1:
         raise TrainerError(f"--bake-iterations is {iterations}; it must be at least 1")
     blend = {"blend_mode": mode, "background_gate": gate} if _takes_gate(mode) else {"blend_mode": "alpha"}
-    squares = config.gate_options().squares if config.schedule == "gate" else 0.0
+    squares = config.importance_options().squares if config.strategy == "importance" else 0.0
     config = config.changed(
-        **blend, schedule="steady", densify_until_iter=0, budget=0, batch=1, iterations=iterations,
+        **blend, strategy="steady", densify_until_iter=0, budget=0, batch=1, iterations=iterations,
         sh_degree=renderer.model.sh_degree, position_lr_max_steps=iterations, eval_every=0,
         # Trained positions move little: they start at the geometric mean of the run's rates.
         position_lr_init=math.sqrt(config.position_lr_init * config.position_lr_final),

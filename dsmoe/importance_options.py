@@ -1,4 +1,4 @@
-"""What `--strategy-options` may set of the strategy `gate`, and in which ranges."""
+"""What `--strategy-options` may set of the strategy `importance`, and in which ranges."""
 from __future__ import annotations
 
 import dataclasses
@@ -15,8 +15,8 @@ def _setting(default: Any, holds: Callable[[Any], bool], requirement: str) -> An
 
 
 @dataclass(frozen=True)
-class GateOptions:
-    """Settings of the strategy `gate`."""
+class ImportanceOptions:
+    """Settings of the strategy `importance`."""
 
     # Growth ends at so many times the budget; 0: wherever the threshold leads.
     overshoot: float = _setting(10.0, lambda x: x == 0 or x >= 1, "0 or at least 1")
@@ -38,12 +38,12 @@ class GateOptions:
 
 
 @functools.lru_cache(maxsize=None)
-def parse_gate_options(text: str) -> GateOptions:
+def parse_importance_options(text: str) -> ImportanceOptions:
     """The settings from `NAME=X,...`; what is not named keeps its default.
 
     Raises ConfigError with the name, the value and what it must be.
     """
-    known = {option.name: option for option in dataclasses.fields(GateOptions)}
+    known = {option.name: option for option in dataclasses.fields(ImportanceOptions)}
     values: Dict[str, Any] = {}
     for part in filter(None, text.split(",")):
         name, _, value = part.strip().partition("=")
@@ -61,9 +61,9 @@ def parse_gate_options(text: str) -> GateOptions:
             raise ConfigError(f"--strategy-options: {name} is {value!r}; it must be {what}, {requirement}") from error
         if not known[name].metadata["holds"](values[name]):
             raise ConfigError(f"--strategy-options: {name} is {value}; it must be {requirement}")
-    return GateOptions(**values)
+    return ImportanceOptions(**values)
 
 
-def gate_settings(options: GateOptions) -> str:
-    """All settings, as `parse_gate_options` takes them."""
+def importance_settings(options: ImportanceOptions) -> str:
+    """All settings, as `parse_importance_options` takes them."""
     return ",".join(f"{name}={value:.12g}" for name, value in dataclasses.asdict(options).items())

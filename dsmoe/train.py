@@ -1,34 +1,27 @@
-"""The training loop: one step, a run of them with progress, and the whole of `dsmoe train`."""
+"""A whole run of `dsmoe train`: a trainer with an output folder, which has progress, checkpoints and results."""
 from __future__ import annotations
 
 import contextlib
 import math
 import os
 import re
-from typing import IO, Any, Callable, Dict, List, Optional, Tuple, Union
+from typing import IO, Any, Callable, Dict, List, Optional, Tuple
 
-import torch
-
-from diff_smoe_rasterization.images import as_float
-
-from ..config import CHECKPOINT_NAME, CONFIG_NAME, LEARNED, TrainConfig, holds_run
-from ..errors import TrainerError
-from ..model import GaussianModel, GaussianOptimizer
-from ..results.evaluation import Evaluation, evaluate
-from ..results.metrics import psnr
-from ..results.modelfile import FOLDER, model_path, save_model
-from ..results.pictures import loss_plot
-from ..results.rendering import Rasterize, Renderer, background_color
-from ..results.rows import RESULTS_NAME, result_row, write_results
-from ..results.scalars import FOLDER as SCALARS_FOLDER
-from ..results.scalars import Scalars, scalar_files
-from ..scenes.images import View
-from ..scenes.scene import Scene, describe_scene, load_scene, read_layout, scene_fingerprint
-from ..system.device import check_device
-from ..system.files import is_file, write_atomically, write_json_atomically
-from ..system.group import ALONE, Group
-from ..system.interrupt import DelayedInterrupt
-from ..system.output_folder import (
+from .config import CHECKPOINT_NAME, CONFIG_NAME, TrainConfig, holds_run
+from .distributed.trainer import new_trainer
+from .errors import TrainerError
+from .results.modelfile import FOLDER, model_path, save_model
+from .results.pictures import loss_plot
+from .results.rendering import Rasterize
+from .results.rows import RESULTS_NAME, result_row, write_results
+from .results.scalars import FOLDER as SCALARS_FOLDER
+from .results.scalars import Scalars, scalar_files
+from .scenes.scene import Scene, describe_scene, load_scene, read_layout, scene_fingerprint
+from .system.device import check_device
+from .system.files import is_file, write_atomically, write_json_atomically
+from .system.group import Group
+from .system.interrupt import DelayedInterrupt
+from .system.output_folder import (
     Record,
     check_inside,
     check_there,
@@ -38,18 +31,11 @@ from ..system.output_folder import (
     remove_files,
     write_record,
 )
-from ..system.progress import progress_bar
-from ..system.stopwatch import Stopwatch
-from .background_gate import LearnedGate
-from .checkpoint import damage_named, load_checkpoint, save_checkpoint
-from .forecast import Forecast
-from .order import ViewOrder
-from .passes import AutogradPasses, DirectPasses
-from .randomness import random_state, restore_random_state, seed_everything
-from .shards import Shards
-from .state_check import check_state
-from .strategies import STRATEGIES
-from .strategy import AnyStep, Step, StrategyContext, is_due
+from .system.progress import progress_bar
+from .training.checkpoint import damage_named, load_checkpoint, save_checkpoint
+from .training.forecast import Forecast
+from .training.strategy import Step, is_due
+from .training.trainer import Trainer
 
 HISTORY_NAME = "history.json"  # the evaluations during a run
 LOSS_NAME = "loss.png"
@@ -57,182 +43,6 @@ PER_VIEW_NAME = "per_view.json"
 PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME)  # beside config.json and the models
 TRAIN = "dsmoe train"  # in its folders' records
 PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
-
-
-class Trainer:
-    """A training run over a loaded scene; `step` is one iteration of 3DGS."""
-
-    group = ALONE  # the processes that train together
-
-    def __init__(self, config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None) -> None:
-        """rasterize: a function with the signature of the package's `rasterize`, which is the default."""
-        seed_everything(config.seed)
-        self.config = config
-        self.scene = scene.to(config.device)
-        self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
-        self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
-        self.shards = self._make_shards()
-        background = background_color(config.white_background, config.device)
-        learned = config.background_gate == LEARNED
-        self.gate = LearnedGate(config, config.device) if learned else None
-        self.renderer = Renderer(
-            self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
-            background_gate=self.gate.value if self.gate else float(config.background_gate),
-            deterministic=config.deterministic)
-        self.strategy = STRATEGIES[str(config.schedule)](StrategyContext(
-            config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer, self.shards))
-        self.order = ViewOrder(len(scene.train), config.seed)
-        self.watch = Stopwatch(config.device)
-        self.iteration = 0
-        self.direct = config.device != "cpu" and rasterize is None
-        self._passes: Union[AutogradPasses, DirectPasses, None] = None
-        self.wants_stop: Callable[[], bool] = lambda: False  # whether this process was asked to stop
-
-    def _make_shards(self) -> Shards:
-        """Which of the Gaussians this process has; may take the others from the model."""
-        return Shards()
-
-    @property
-    def leads(self) -> bool:
-        """Whether this process prints and writes."""
-        return self.group.leads
-
-    @property
-    def is_divided(self) -> bool:
-        """Whether several processes train together."""
-        return self.group.size > 1
-
-    def meet(self) -> None:
-        """Waits for the other processes."""
-        self.group.gather_numbers([0], self.config.device)
-
-    @property
-    def checkpoint_device(self) -> str:
-        """Where a checkpoint is read to."""
-        return self.config.device
-
-    @property
-    def num_gaussians(self) -> int:
-        """Of all processes."""
-        return self.model.num_gaussians
-
-    def whole_model(self) -> Optional[GaussianModel]:
-        """The model with the Gaussians of all processes, where this one leads."""
-        return self.model
-
-    def stops(self) -> bool:
-        """Whether the run is to end behind this step, before its last iteration."""
-        return self.wants_stop()
-
-    def step(self, before_change: Optional[Callable[[], None]] = None) -> Step:
-        """One iteration, in the order of 3DGS: densification comes between the gradients and the optimizer's step.
-
-        before_change: called once the gradients are known and nothing has changed yet, which is where 3DGS evaluates
-        and saves. So the last iteration changes nothing: what it saves neither an opacity reset nor a densification
-        may have touched.
-        """
-        config, model = self.config, self.model
-        self._refuse_empty()
-        self.iteration += 1
-        self.optimizer.set_position_rate(self.iteration)
-        if self.iteration % config.sh_degree_interval == 0:
-            model.raise_sh_degree()
-        view = self.scene.train[self.order.next()]
-        color = torch.rand(3, device=config.device) if config.random_background else None
-        if self._passes is None:
-            passes = DirectPasses if self.direct else AutogradPasses
-            self._passes = passes(model, self.optimizer, self.renderer)
-        rendering, means2D = self._passes.render(view.camera, color, self.gate() if self.gate else None)
-        target = self.target_of(view, color)
-        loss, gradient = self.loss_of(view, target, rendering.color.detach())
-        step = Step(self.iteration, view, target, rendering, self._passes.splats, means2D, loss,
-                    self._passes.add_gradient)
-        self.strategy.before_backward(step)
-        self._passes.backward(gradient)
-        if before_change:
-            before_change()
-        if self.iteration < config.iterations:
-            with torch.no_grad():
-                self.strategy.after_backward(step)
-                self._passes.update()
-                if self.gate:
-                    self.gate.step()
-                self.strategy.after_step(step)
-        return step
-
-    def _refuse_empty(self) -> None:
-        if self.num_gaussians == 0:
-            raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
-                               "try another --densify-grad-threshold or --strategy steady")
-
-    def target_of(self, view: View, color: Optional[torch.Tensor]) -> torch.Tensor:
-        """What a rendering is compared with. color: [3] the background, where it is of this step alone."""
-        return view.image if color is None or view.opacity is None else view.image_over(
-            color, self.renderer.background)
-
-    def loss_of(self, view: View, target: torch.Tensor, image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-        """The loss of a rendering and its gradient."""
-        self._report = (image, target, view)
-        mask = view.mask_float()
-        if mask is None:
-            return self.strategy.loss(self.iteration, image, target)
-        loss, gradient = self.strategy.loss(self.iteration, image * mask, as_float(target) * mask)
-        return loss, gradient * mask
-
-    def training_psnr(self) -> float:
-        """PSNR of the last step's rendering, the last one of this process, against its training image."""
-        image, target, view = self._report
-        return psnr(image.clamp(0, 1), as_float(target), view.mask_float())
-
-    @property
-    def background_gate(self) -> float:
-        """The gate as it is now; where it is learned, the host waits for the device."""
-        return float(self.renderer.background_gate)
-
-    def evaluate(self, progress: bool = False) -> Evaluation:
-        """Renders the test views."""
-        return evaluate(self.renderer, self.scene.test, self.config.device, progress)
-
-    def state_dict(self) -> Dict[str, Any]:
-        """Everything the rest of the run depends on, as tensors and plain values."""
-        return {
-            "config": self.config.record(),
-            "scene": scene_fingerprint(self.scene),
-            "iteration": self.iteration,
-            "train_seconds": self.watch.seconds,
-            "raw": {name: tensor.detach() for name, tensor in self.model.raw.items()},
-            "active_sh_degree": self.model.active_sh_degree,
-            "optimizer": self.optimizer.state_dict(),
-            "strategy": self.strategy.state_dict(),
-            "gate": self.gate.state_dict() if self.gate else None,
-            "order": self.order.state_dict(),
-            "random": random_state(),
-        }
-
-    def check_state(self, state: Dict[str, Any]) -> None:
-        """Raises TrainerError where a state is another run's, Misfit and others where it can be none's."""
-        differences = TrainConfig.of_record(state["config"]).differences(self.config)
-        if differences:
-            raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
-        for name, here in scene_fingerprint(self.scene).items():
-            there = state["scene"].get(name, here)  # earlier versions recorded fewer of them
-            if here != there:
-                raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
-                                   f"and {here} in {self.config.scene}")
-        check_state(state, self.config, self.strategy.state_dict(), self.order.count)
-
-    def load_state_dict(self, state: Dict[str, Any]) -> None:
-        """Takes what `state_dict` gave, and `check_state` found to fit."""
-        self.iteration = state["iteration"]
-        self.watch.seconds = state["train_seconds"]
-        self.optimizer.replace_all(state["raw"])
-        self.model.active_sh_degree = state["active_sh_degree"]
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.strategy.load_state_dict(state["strategy"])
-        if self.gate:
-            self.gate.load_state_dict(state["gate"])
-        self.order.load_state_dict(state["order"])
-        restore_random_state(state["random"])
 
 
 class Run:
@@ -373,7 +183,7 @@ class Run:
         return str(self.trainer.config.blend_mode)
 
 
-def _check_loss(step: AnyStep) -> float:
+def _check_loss(step: Step) -> float:
     """The step's loss. Raises TrainerError where it is not finite: nothing that follows would be worth keeping."""
     loss = float(step.loss.detach())
     if not math.isfinite(loss):
@@ -436,7 +246,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
     config.validate()
     check_device(config.device)
     if group and not group.leads:  # the folder is the first process's
-        run = Run(_new_trainer(config, scene or load_scene(config, False), rasterize, group), progress=False)
+        run = Run(new_trainer(config, scene or load_scene(config, False), rasterize, group), progress=False)
         if resume:
             run.resume()
         return run.train()
@@ -452,7 +262,7 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
         if say and layout:
             say(describe_scene(scene, layout, config))
         forecast = Forecast(config, scene) if say and config.device == "cpu" else None
-        run = Run(_new_trainer(config, scene, rasterize, group), progress, lock, forecast)
+        run = Run(new_trainer(config, scene, rasterize, group), progress, lock, forecast)
         if resume:
             resumed = run.resume()
             print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
@@ -465,14 +275,3 @@ def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, pr
             remove_files(config.output, [*files, *(scalar_files(config.output) if overwrite else ())])
         config.save(config.output)
         return run.train()
-
-
-def _new_trainer(config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize], group: Optional[Group]) -> Trainer:
-    """One view a step in one process has the usual trainer; what has more, the other one."""
-    if config.batch == 1 and (group is None or group.size == 1):
-        return Trainer(config, scene, rasterize)
-    if rasterize is not None:
-        raise TrainerError("train: rasterize is given; batches of views and several processes need the package's own")
-    from ..distributed.trainer import BatchTrainer
-
-    return BatchTrainer(config, scene, group or ALONE)

@@ -1,4 +1,4 @@
-"""The strategy `gate`: to a given number of Gaussians, those that explain most.
+"""The strategy `importance`: to a given number of Gaussians, those that explain most.
 
 It grows well beyond the budget, removes in steps the Gaussians whose removal changes the training views least, and then
 moves the cheapest of what is left to where the error is. Cost and error are sums over pixels of squared colours, so
@@ -15,10 +15,10 @@ from diff_smoe_rasterization.losses import l2_ssim_loss_and_gradient
 from diff_smoe_rasterization.splats import Splats
 
 from ..errors import ConfigError
-from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
+from ..model import PARAMETERS, inverse_sigmoid, rotation_matrices
 from ..scenes.images import View
 from .drawing import draw
-from .strategy import SteadyStrategy, Step, StrategyContext
+from .strategy import SteadyStrategy, StrategyContext, ViewStep
 
 # Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, sixteen removals are at 8,200 to 13,825,
 # moves are every 500 until 20,000.
@@ -38,12 +38,12 @@ CHILD_SCALE = 0.65
 CHILD_COVER = 0.744
 
 
-class GateStrategy(SteadyStrategy):
+class ImportanceStrategy(SteadyStrategy):
     """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
 
     def __init__(self, context: StrategyContext) -> None:
         config = context.config
-        self.options = config.gate_options()
+        self.options = config.importance_options()
         super().__init__(context)
         context.optimizer.scale_rate("shs", self.options.bands)
         self.start = context.model.num_gaussians
@@ -76,7 +76,7 @@ class GateStrategy(SteadyStrategy):
             return super().loss(iteration, image, target)
         return l2_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim, self.options.squares)
 
-    def before_backward(self, step: Step) -> None:
+    def before_backward(self, step: ViewStep) -> None:
         if self._looks(step):
             self._look(step.view, step.target, step.rendering.color, step.splats())
         if self.options.anneal != 1:
@@ -84,7 +84,7 @@ class GateStrategy(SteadyStrategy):
             share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
             self.context.optimizer.scale_other_rates(self.options.anneal**share)
 
-    def after_step(self, step: Step) -> None:
+    def after_step(self, step: ViewStep) -> None:
         if step.iteration in self.removals:
             self.remove(1 + sum(later > step.iteration for later in self.removals))
         elif step.iteration in self.moves:
@@ -146,7 +146,7 @@ class GateStrategy(SteadyStrategy):
         raw = {name: self.context.model.raw[name].detach().index_select(0, parents) for name in PARAMETERS}
         scales = raw["scales"].exp()
         axis = scales.argmax(dim=1, keepdim=True)
-        directions = quaternion_to_matrix(raw["rotations"]).gather(2, axis.unsqueeze(1).expand(-1, 3, 1)).squeeze(2)
+        directions = rotation_matrices(raw["rotations"]).gather(2, axis.unsqueeze(1).expand(-1, 3, 1)).squeeze(2)
         offsets = CHILD_OFFSET * scales.gather(1, axis) * directions
         opacities = raw["opacities"].sigmoid()
         children = torch.minimum(opacities, (1 - (1 - opacities).sqrt()) / CHILD_COVER)
@@ -157,7 +157,7 @@ class GateStrategy(SteadyStrategy):
         for rows, place in ((parents, means + offsets), (places, means - offsets)):
             self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
 
-    def _looks(self, step: Step) -> bool:
+    def _looks(self, step: ViewStep) -> bool:
         """Whether the next decision looks at this step's view: one of each group, in the last round of the views."""
         if step.view.camera.name not in self.sought:
             return False

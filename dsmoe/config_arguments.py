@@ -1,0 +1,110 @@
+"""The options of TrainConfig on a command line: how they are offered, and the config that was typed."""
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from typing import Any, Dict, Optional, Sequence, Union
+
+from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, GATED_MODES, said_of_name_in_files
+
+from .config import LEARNED, TrainConfig, flags_of, learned_gate_of
+from .errors import ConfigError
+
+# How `--help` groups the options; those that no group names are of the last one.
+GROUPS = {
+    "scene": ("images", "resolution", "test_every", "principal_point", "init_points", "white_background",
+              "random_background"),
+    "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
+    "length, and number of Gaussians": ("iterations", "batch", "budget", "strategy", "strategy_options"),
+    "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
+    "recipe": (),
+}
+
+
+def _number_or_learned(text: str) -> Union[float, str]:
+    try:
+        return text if text == LEARNED else float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
+
+
+def blend_mode_typed(text: str) -> str:
+    """What --blend-mode takes: `choices` refuses what is no blend mode, this says more of names that files use."""
+    if said_of_name_in_files(text):
+        raise argparse.ArgumentTypeError(f"is {text!r}; it must be {said_of_name_in_files(text)}")
+    return text
+
+
+_TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
+
+
+def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
+                  defaults: bool = True) -> Dict[str, argparse._ArgumentGroup]:
+    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser; returns their groups.
+
+    Options that are not given are absent from the parsed arguments. defaults: whether the help text names what they
+    are then.
+    """
+    groups = {title: parser.add_argument_group(title) for title in GROUPS}
+    titles = {name: title for title, names in GROUPS.items() for name in names}
+    for option in dataclasses.fields(TrainConfig):
+        if option.name in skip:
+            continue
+        text = option.metadata["help"].replace("%", "%%")
+        if option.metadata.get("positional"):
+            parser.add_argument(option.name, metavar=option.name.upper(), help=text)
+            continue
+        flags, group = flags_of(option), groups[titles.get(option.name, "recipe")]
+        if option.type == "bool":
+            group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
+            continue
+        kind = blend_mode_typed if option.name == "blend_mode" else _TYPES[str(option.type)]
+        keywords: Dict[str, Any] = {"type": kind, "default": argparse.SUPPRESS}
+        if option.metadata.get("required"):
+            keywords["required"] = True
+        elif option.default is not None and defaults:
+            text += f" (default: {option.metadata.get('typed_default', option.default)})"
+        if option.metadata.get("choices"):
+            keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
+        else:
+            letter = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
+            keywords["metavar"] = option.metadata.get("metavar", letter)
+        group.add_argument(*flags, help=text, dest=option.name, **keywords)
+    return groups
+
+
+def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
+    """The options of TrainConfig among parsed arguments."""
+    names = {option.name for option in dataclasses.fields(TrainConfig)}
+    return {name: value for name, value in vars(arguments).items() if name in names}
+
+
+def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None) -> TrainConfig:
+    """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
+
+    With --scale-recipe the milestones that are not given keep their share of the iterations. earlier: the run that goes
+    on with these options.
+    """
+    options = given_options(arguments)
+    config = TrainConfig(**options)
+    if getattr(arguments, "scale_recipe", False):
+        config = dataclasses.replace(config.shortened(), **options)
+    if earlier:
+        earlier.check_continued_by(config)
+    _check_learned(config, options)
+    return config.validate()
+
+
+def _check_learned(config: TrainConfig, given: Dict[str, Any]) -> None:
+    """Raises ConfigError where it is given how the background gate is learned, and the gate is not learned."""
+    useless = [option for option in dataclasses.fields(TrainConfig)
+               if option.name in learned_gate_of(config.blend_mode) and option.name in given]
+    if not useless or config.background_gate == LEARNED:
+        return
+    if config.blend_mode in GATED_MODES:
+        asked = "--background-gate" if "background_gate" in given else "$" + BACKGROUND_GATE_VARIABLE
+        why = f"{asked} fixes the background gate at {config.background_gate}; --background-gate {LEARNED} learns it"
+    else:
+        why = (f"in the blend mode {config.blend_mode} no background gate is learned; --blend-mode "
+               f"{' or '.join(GATED_MODES)} learns one")
+    raise ConfigError(f"{flags_of(useless[0])[0]} is given, but {why}")

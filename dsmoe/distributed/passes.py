@@ -1,0 +1,61 @@
+"""The passes of a step over a batch of views, with the Gaussians divided over the processes of a group."""
+from __future__ import annotations
+
+from typing import Callable, Dict, Optional, Sequence
+
+import torch
+
+from ..model import GaussianModel
+from ..optimizer import GaussianOptimizer
+from ..results.rendering import Renderer
+from ..system.group import Group
+from ..training.background_gate import LearnedGate
+from ..training.passes import Compare, Passes, ViewOver
+from ..training.strategy import Step
+from .batch import Batch
+
+
+class BatchPasses(Passes):
+    """Each view is blended in one of the processes; each process gets the gradients of its own Gaussians."""
+
+    def __init__(self, model: GaussianModel, optimizer: GaussianOptimizer, renderer: Renderer,
+                 gate: Optional[LearnedGate], group: Group, wants_stop: Callable[[], bool]) -> None:
+        """wants_stop: whether this process was asked to stop; `asked` says whether one was, before the latest step."""
+        super().__init__(model, optimizer, renderer, gate)
+        self.group, self.wants_stop, self.asked = group, wants_stop, False
+        self._batch: Optional[Batch] = None
+
+    @torch.no_grad()
+    def render(self, iteration: int, views: Sequence[ViewOver], compare: Compare) -> Step:
+        settings = [self.renderer.settings_of(shown.view.camera, shown.background) for shown in views]
+        batch = self._batch = Batch(self.group, self.model, settings, note=int(self.wants_stop()))
+        self.asked = any(batch.notes)
+        # Losses, and gradients by the background's gate.
+        numbers = torch.zeros(2, len(views), device=self.model.raw["means3D"].device)
+        self._records: Dict[int, torch.Tensor] = {}
+
+        def blend(view: int) -> None:  # what one view has saved is gone before the next one is blended
+            drawn = batch.draw(view, settings[view])
+            _, loss, gradient = compare(views[view], drawn.color)
+            self._records[view], dL_dgate = drawn.backward(gradient, self.gate is not None)
+            numbers[0, view] = loss
+            if self.gate:
+                numbers[1, view] = dL_dgate[0]
+
+        for view in batch.own_views:
+            blend(view)
+        self.group.add_up(numbers)
+        losses, self._dL_dgates = numbers
+        return Step(iteration, len(views), losses.mean())
+
+    @torch.no_grad()
+    def backward(self, step: Step) -> None:
+        batch, self._batch = self._batch, None  # it holds on to memory
+        assert batch is not None, "render comes first"
+        means2D = batch.backward(batch.give_back(self._records))
+        step.seen += [(gradients, projected.radii) for gradients, projected in zip(means2D, batch.projected)]
+        if self.gate:
+            self.gate.take_gradient(sum(self._dL_dgates.unbind(), torch.zeros_like(step.loss)))
+
+    def update(self) -> None:
+        self.optimizer.step()

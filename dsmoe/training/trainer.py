@@ -1,0 +1,210 @@
+"""A training run over a loaded scene: its state, and one step after the other."""
+from __future__ import annotations
+
+from typing import Any, Callable, Dict, List, Optional, Tuple
+
+import torch
+
+from diff_smoe_rasterization.images import as_float
+
+from ..config import LEARNED, TrainConfig
+from ..errors import TrainerError
+from ..model import GaussianModel
+from ..optimizer import GaussianOptimizer
+from ..results.evaluation import Evaluation, evaluate
+from ..results.metrics import psnr
+from ..results.rendering import Rasterize, Renderer, background_color
+from ..scenes.images import View
+from ..scenes.scene import Scene, scene_fingerprint
+from ..system.group import ALONE
+from ..system.stopwatch import Stopwatch
+from .background_gate import LearnedGate
+from .order import ViewOrder
+from .passes import AutogradPasses, DirectPasses, Passes, ViewOver
+from .randomness import random_state, restore_random_state, seed_everything
+from .shards import Shards
+from .state_check import check_state
+from .strategies import STRATEGIES
+from .strategy import Step, StrategyContext, is_due
+
+
+class Trainer:
+    """A training run over a loaded scene; `step` is one iteration of 3DGS, or several over a batch of views."""
+
+    group = ALONE  # the processes that train together
+
+    def __init__(self, config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None) -> None:
+        """rasterize: a function with the signature of the package's `rasterize`, which is the default."""
+        seed_everything(config.seed)
+        self.config = config
+        self.scene = scene.to(config.device)
+        self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
+        self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
+        self.shards = self._make_shards()
+        background = background_color(config.white_background, config.device)
+        learned = config.background_gate == LEARNED
+        self.gate = LearnedGate(config, config.device) if learned else None
+        self.renderer = Renderer(
+            self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
+            background_gate=self.gate.value if self.gate else float(config.background_gate),
+            deterministic=config.deterministic)
+        self.strategy = STRATEGIES[str(config.strategy)](StrategyContext(
+            config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer, self.shards))
+        self.order = ViewOrder(len(scene.train), config.seed)
+        self.watch = Stopwatch(config.device)
+        self.iteration = 0
+        self.wants_stop: Callable[[], bool] = lambda: False  # whether this process was asked to stop
+        self.passes = self._make_passes(rasterize)
+
+    def _make_shards(self) -> Shards:
+        """Which of the Gaussians this process has; may take the others from the model."""
+        return Shards()
+
+    def _make_passes(self, rasterize: Optional[Rasterize]) -> Passes:
+        """How a step comes from its views to the next parameters."""
+        direct = self.config.device != "cpu" and rasterize is None
+        return (DirectPasses if direct else AutogradPasses)(self.model, self.optimizer, self.renderer, self.gate)
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process prints and writes."""
+        return self.group.leads
+
+    @property
+    def is_divided(self) -> bool:
+        """Whether several processes train together."""
+        return self.group.size > 1
+
+    def meet(self) -> None:
+        """Waits for the other processes."""
+        self.group.gather_numbers([0], self.config.device)
+
+    @property
+    def checkpoint_device(self) -> str:
+        """Where a checkpoint is read to."""
+        return self.config.device
+
+    @property
+    def num_gaussians(self) -> int:
+        """Of all processes."""
+        return self.model.num_gaussians
+
+    def whole_model(self) -> Optional[GaussianModel]:
+        """The model with the Gaussians of all processes, where this one leads."""
+        return self.model
+
+    def stops(self) -> bool:
+        """Whether the run is to end behind this step, before its last iteration."""
+        return self.wants_stop()
+
+    def step(self, before_change: Optional[Callable[[], None]] = None) -> Step:
+        """One step of `batch` iterations, in the order of 3DGS: densification, then the optimizer's step.
+
+        before_change: called once the gradients are known and nothing has changed yet, which is where 3DGS evaluates
+        and saves. So the last iteration changes nothing: what it saves neither an opacity reset nor a densification
+        may have touched.
+        """
+        config = self.config
+        self._refuse_empty()
+        self.iteration += config.batch
+        self.optimizer.set_position_rate(self.iteration)
+        if is_due(self.iteration, config.sh_degree_interval, config.batch):
+            self.model.raise_sh_degree()
+        step = self.passes.render(self.iteration, self._next_views(), self._compare)
+        self.strategy.before_backward(step)
+        self.passes.backward(step)
+        if before_change:
+            before_change()
+        if self.iteration < config.iterations:
+            with torch.no_grad():
+                self.strategy.after_backward(step)
+                self.passes.update()
+                if self.gate:
+                    self.gate.step()
+                self.strategy.after_step(step)
+        return step
+
+    def _next_views(self) -> List[ViewOver]:
+        config = self.config
+        views = [self.scene.train[self.order.next()] for _ in range(config.batch)]
+        return [ViewOver(view, torch.rand(3, device=config.device) if config.random_background else None)
+                for view in views]
+
+    def _compare(self, shown: ViewOver, image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What a rendering is compared with, its loss, and the gradient of that."""
+        target = self.target_of(*shown)
+        return (target, *self.loss_of(shown.view, target, image))
+
+    def _refuse_empty(self) -> None:
+        if self.num_gaussians == 0:
+            raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
+                               "try another --densify-grad-threshold or --strategy steady")
+
+    def target_of(self, view: View, color: Optional[torch.Tensor]) -> torch.Tensor:
+        """What a rendering is compared with. color: [3] the background, where it is of this step alone."""
+        return view.image if color is None or view.opacity is None else view.image_over(
+            color, self.renderer.background)
+
+    def loss_of(self, view: View, target: torch.Tensor, image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        """The loss of a rendering and its gradient."""
+        self._report = (image, target, view)
+        mask = view.mask_float()
+        if mask is None:
+            return self.strategy.loss(self.iteration, image, target)
+        loss, gradient = self.strategy.loss(self.iteration, image * mask, as_float(target) * mask)
+        return loss, gradient * mask
+
+    def training_psnr(self) -> float:
+        """PSNR of the last step's rendering, the last one of this process, against its training image."""
+        image, target, view = self._report
+        return psnr(image.clamp(0, 1), as_float(target), view.mask_float())
+
+    @property
+    def background_gate(self) -> float:
+        """The gate as it is now; where it is learned, the host waits for the device."""
+        return float(self.renderer.background_gate)
+
+    def evaluate(self, progress: bool = False) -> Evaluation:
+        """Renders the test views."""
+        return evaluate(self.renderer, self.scene.test, self.config.device, progress)
+
+    def state_dict(self) -> Dict[str, Any]:
+        """Everything the rest of the run depends on, as tensors and plain values."""
+        return {
+            "config": self.config.record(),
+            "scene": scene_fingerprint(self.scene),
+            "iteration": self.iteration,
+            "train_seconds": self.watch.seconds,
+            "raw": {name: tensor.detach() for name, tensor in self.model.raw.items()},
+            "active_sh_degree": self.model.active_sh_degree,
+            "optimizer": self.optimizer.state_dict(),
+            "strategy": self.strategy.state_dict(),
+            "gate": self.gate.state_dict() if self.gate else None,
+            "order": self.order.state_dict(),
+            "random": random_state(),
+        }
+
+    def check_state(self, state: Dict[str, Any]) -> None:
+        """Raises TrainerError where a state is another run's, Misfit and others where it can be none's."""
+        differences = TrainConfig.of_record(state["config"]).differences(self.config)
+        if differences:
+            raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
+        for name, here in scene_fingerprint(self.scene).items():
+            there = state["scene"].get(name, here)  # earlier versions recorded fewer of them
+            if here != there:
+                raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
+                                   f"and {here} in {self.config.scene}")
+        check_state(state, self.config, self.strategy.state_dict(), self.order.count)
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        """Takes what `state_dict` gave, and `check_state` found to fit."""
+        self.iteration = state["iteration"]
+        self.watch.seconds = state["train_seconds"]
+        self.optimizer.replace_all(state["raw"])
+        self.model.active_sh_degree = state["active_sh_degree"]
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.strategy.load_state_dict(state["strategy"])
+        if self.gate:
+            self.gate.load_state_dict(state["gate"])
+        self.order.load_state_dict(state["order"])
+        restore_random_state(state["random"])
