@@ -19,7 +19,7 @@ template <class S> struct CountArguments {
   TileGrid grid;           // of the image
   SavedForward<S> saved;   // projected, order and num_ordered are read; num_instances is added to
   const int32_t* radii;    // [N] pixels
-  S tail_reach;            // of RasterConfig
+  S tail_reach;            // of BlendRules
 };
 
 // The rows of tiles that the warp's Gaussians meet. position: of the lane's Gaussian in the depth order.

@@ -241,14 +241,14 @@ template <class S> void blend(const Frame<S>& frame, const Work& work) {
   for_each_band(frame, work, [&](const Frame<S>& band) {
     const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
     // Double is for checking: it has only the general kernel.
-    dispatch_blend(
-        config.blend.mode, sizeof(S) == 4 ? config.num_features() : kAnyFeatures, [&](auto mode, auto features) {
-          constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
-          const unsigned paired_tiles = kFeatures != kAnyFeatures ? min(tiles, kMostSharedTiles) : 0;
-          blend_kernel<S, decltype(mode)::value, kFeatures>
-              <<<tiles + paired_tiles, kWalkBlock, 0, work.stream>>>(blend_arguments(band, work), paired_tiles);
-          DSMOE_CHECK_LAUNCH("blend");
-        });
+    const int num_features = sizeof(S) == 4 ? config.num_features() : kAnyFeatures;
+    dispatch_blend(config.blend.mode, num_features, [&](auto mode, auto features) {
+      constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
+      const unsigned paired_tiles = kFeatures != kAnyFeatures ? min(tiles, kMostSharedTiles) : 0;
+      blend_kernel<S, decltype(mode)::value, kFeatures>
+          <<<tiles + paired_tiles, kWalkBlock, 0, work.stream>>>(blend_arguments(band, work), paired_tiles);
+      DSMOE_CHECK_LAUNCH("blend");
+    });
   });
 }
 

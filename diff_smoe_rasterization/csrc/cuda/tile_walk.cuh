@@ -34,7 +34,7 @@ template <class S> struct BlendArguments {
   ImageOutputs<S> images;     // [features, H, W], and the radii [N]
   bool marked;                // entries of lists are marked with quarters
   bool near_first;            // marks are by near pairs, and so are walks that are not wide
-  S wide_below, tail_reach;   // of RasterConfig
+  S wide_below, tail_reach;   // of BlendRules
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
