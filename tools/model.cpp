@@ -87,8 +87,8 @@ std::vector<std::string> blend_names() {
   return names;
 }
 
-BlendChoice choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
-                         std::optional<double> background_gate) {
+BlendRules<double> choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
+                                std::optional<double> background_gate) {
   const bool is_splat = file_extension(file) == ".splat";  // which viewers blend by alpha
   const std::string record = is_splat ? "alpha" : model.blend_mode;
   const std::optional<BlendMode> recorded = blend_mode_of_record(record);
@@ -101,7 +101,7 @@ BlendChoice choose_blend(const io::GaussianModel& model, const std::string& file
   if (!chosen) {
     throw io::FormatError(file + ": records the blend mode " + io::printable(record) + ", which is none of ours");
   }
-  BlendChoice choice;
+  BlendRules<double> choice;
   choice.mode = *chosen;
   const std::string name = recorded ? blend_names()[static_cast<std::size_t>(*recorded)] : io::printable(record);
   if (recorded && record != name && record != record_of(*recorded)) {

@@ -30,18 +30,12 @@ Model activated(io::GaussianModel raw);
 /// Reads a .ply of Inria's layout or a .splat, by its name. Throws io::IoError, also where no Gaussian is finite.
 io::GaussianModel read_model(const std::string& path);
 
-/// How a model is blended.
-struct BlendChoice {
-  BlendMode mode = BlendMode::kAlpha;
-  double background_gate = 0;  // of smoe and smoe_eq7
-};
-
 std::vector<std::string> blend_names();
 
 /// The blend that a file records, or the one that is asked for (empty, nullopt: nothing is). Notes go to stderr where
 /// they disagree, and where a file has an older name. Throws UsageError where neither says.
-BlendChoice choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
-                         std::optional<double> background_gate);
+BlendRules<double> choose_blend(const io::GaussianModel& model, const std::string& file, const std::string& mode,
+                                std::optional<double> background_gate);
 
 /// A place in the middle of the Gaussians, and how far they reach: medians, which outliers do not move.
 struct Extent {

@@ -12,7 +12,7 @@
 namespace dsmoe::tools {
 
 struct RenderOptions {
-  BlendChoice blend;
+  BlendRules<double> blend;
   std::array<float, 3> background = {0, 0, 0};
   bool antialiasing = false;
   bool depth = false;     // is wanted
@@ -46,8 +46,7 @@ bool has_cuda_renderer();
 /// What both implementations fill in the same way.
 template <class S> RasterConfig<S> raster_config(const RenderOptions& options) {
   RasterConfig<S> config;
-  config.mode = options.blend.mode;
-  config.background_gate = static_cast<S>(options.blend.background_gate);
+  config.blend = options.blend.as<S>();
   config.antialiasing = options.antialiasing;
   config.depth = options.depth;
   config.num_threads = options.num_threads;

@@ -20,7 +20,7 @@ Scene<float> benchmark_scene(const benchmark::State& state, BlendMode mode) {
   Scene<double> scene = make_scene(1, static_cast<int>(state.range(0)), kWidth, kHeight);
   scene.config.scale_modifier = 0.15;
   scene.config.num_threads = static_cast<int>(state.range(1));
-  scene.config.mode = mode;
+  scene.config.blend.mode = mode;
   return convert<float>(scene);
 }
 

@@ -37,27 +37,30 @@ template <class Frame> constexpr bool kOnHost = !std::is_pointer_v<decltype(Fram
 // The shape of saved.features.
 template <class Frame> constexpr const char* kFeatureShape = kOnHost<Frame> ? "[N, F]" : "[N, feature_stride(F)]";
 
+// on_host: the host may read what the rules point to.
+template <class S> void refuse_rules(const char* function, const BlendRules<S>& rules, bool on_host) {
+  const int mode = static_cast<int>(rules.mode);
+  if (mode < 0 || mode >= BlendModes::kSize) {
+    refuse(function, "blend_mode is ", mode, "; it must be 0 to ", BlendModes::kSize - 1);
+  }
+  refuse_negative(function, "alpha_min", rules.alpha_min);
+  if (rules.faint_below != kFaintBelowOfMode) refuse_negative(function, "faint_below", rules.faint_below);
+  if (on_host || rules.background_gate_at == nullptr) refuse_negative(function, "background_gate", rules.lambda());
+}
+
 // What every pass reads: the sizes, and what decides which pairs count.
 template <class Frame> void refuse_frame(const char* function, const Frame& frame) {
   constexpr int64_t kMostGaussians = std::numeric_limits<int32_t>::max();
   const auto& config = frame.config;
   const int64_t count = frame.inputs.num_gaussians;
-  const int mode = static_cast<int>(config.mode);
   if (count < 0 || count > kMostGaussians) {
     refuse(function, "num_gaussians is ", count, "; it must be 0 to ", kMostGaussians);
   }
   if (frame.camera.width < 1 || frame.camera.height < 1) {
     refuse(function, "width x height is ", frame.camera.width, " x ", frame.camera.height, "; both must be positive");
   }
-  if (mode < 0 || mode >= BlendModes::kSize) {
-    refuse(function, "blend_mode is ", mode, "; it must be 0 to ", BlendModes::kSize - 1);
-  }
+  refuse_rules(function, config.blend, kOnHost<Frame>);
   if (config.num_channels < 1) refuse(function, "num_channels is ", config.num_channels, "; it must be 1 or more");
-  refuse_negative(function, "alpha_min", config.alpha_min);
-  if (config.faint_below != kFaintBelowOfMode) refuse_negative(function, "faint_below", config.faint_below);
-  if (kOnHost<Frame> || config.background_gate_at == nullptr) {
-    refuse_negative(function, "background_gate", config.gate_of_background());
-  }
   if (config.most_instances < 1) {
     refuse(function, "most_instances is ", config.most_instances, "; it must be 1 or more");
   }
@@ -265,13 +268,13 @@ template <class Frame, class S>
 void refuse_importance(const char* function, const Frame& frame, const ImportanceMap<S>& map) {
   const int64_t count = frame.inputs.num_gaussians;
   refuse_walk(function, frame);
-  refuse_unremovable(function, frame.config.mode);
+  refuse_unremovable(function, frame.config.blend.mode);
   refuse_instance_sums(function, frame);
   refuse_footprints(function, frame);
   refuse_null(function, "background", frame.config.background, "[C]", 1);
   refuse_null(function, "saved.final_transmittance", frame.saved.final_transmittance, "[H, W]", 1);
   refuse_null(function, "saved.gate_sum", frame.saved.gate_sum, "[H, W]", 1);
-  refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", has_tails(frame.config.mode));
+  refuse_null(function, "saved.tails", frame.saved.tails, "[H, W]", has_tails(frame.config.blend.mode));
   refuse_null(function, "color", map.color, "[C, H, W]", 1);
   refuse_null(function, "pixel_weights", map.pixel_weights, "[H, W]", 1);
   refuse_null(function, "share_weights", map.share_weights, "[H, W]", 1);

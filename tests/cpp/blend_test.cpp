@@ -20,8 +20,8 @@ struct Pixel {
   Vector alpha;
   Vector color, depth, inverse_depth;
   double background = 0.35;
-  double background_gate = 0;  // read by smoe and smoe_eq7 alone
-  double tails = 0;            // B, read by smoe alone
+  double lambda = 0;  // read by smoe and smoe_eq7 alone
+  double tails = 0;   // B, read by smoe alone
   int size() const { return static_cast<int>(alpha.size()); }
 };
 
@@ -74,7 +74,7 @@ Finished paper(BlendMode mode, const Pixel& pixel, int stop) {
   }
   const bool gated = out.gate_sum >= static_cast<double>(1e-30f);
   out.depth = gated ? sum_z / out.gate_sum : 0;
-  const double of_background = pixel.background_gate * out.transmittance + (mode == BlendMode::kSmoe ? pixel.tails : 0);
+  const double of_background = pixel.lambda * out.transmittance + (mode == BlendMode::kSmoe ? pixel.tails : 0);
   if (mode == BlendMode::kAlpha) {
     out.color = sum_color + out.transmittance * pixel.background;
     out.inverse_depth = sum_inverse_z;
@@ -117,7 +117,7 @@ template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
     inverse_depth += pair.weight * Real(pixel.inverse_depth[i]);
     if (pair.contributes) out.last = i + 1;
   }
-  auto end = state.end(Real(pixel.background_gate));
+  auto end = state.end(Real(pixel.lambda));
   end.tails = Real(pixel.tails);
   out.color = finish_feature<kMode>(FeatureRule::kBlended, end, color, Real(pixel.background));
   out.depth = finish_feature<kMode>(FeatureRule::kAveraged, end, depth, Real(0));
@@ -130,7 +130,7 @@ template <BlendMode kMode, class Real> Finished blended(const Pixel& pixel) {
 
 Pixel random_pixel(Random& random, int count, double largest_alpha) {
   Pixel pixel;
-  pixel.background_gate = random.uniform(0, 1) < 0.5 ? 0 : random.log_uniform(1e-3, 3);
+  pixel.lambda = random.uniform(0, 1) < 0.5 ? 0 : random.log_uniform(1e-3, 3);
   pixel.tails = random.uniform(0, 1) < 0.5 ? 0 : random.log_uniform(1e-6, 1e-1);
   for (int i = 0; i < count; ++i) {
     const double z = random.uniform(1, 4);
@@ -151,7 +151,7 @@ Pixel saturated_pixel() {
   pixel.color = {0.1, 0.9, 0.4, 0.6, 0.2, 0.8, 0.3};
   pixel.depth = {1, 1.5, 2, 2.5, 3, 3.5, 4};
   for (const double z : pixel.depth) pixel.inverse_depth.push_back(1 / z);
-  pixel.background_gate = 0.4;
+  pixel.lambda = 0.4;
   pixel.tails = 0.02;
   return pixel;
 }
@@ -254,13 +254,13 @@ struct Weights {
 struct PixelGradient {
   Vector power;  // dL/dpower, which is alpha dL/dalpha: no alpha is clamped
   Vector color, depth, inverse_depth;
-  double background = 0, background_gate = 0;
+  double background = 0, lambda = 0;
 };
 
 // The pairs in front of `middle` belong to another walk, which knows those behind by their sum alone.
 template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel, const Weights& g, int middle = 0) {
   const Finished forward = blended<kMode, Real>(pixel);
-  const PixelEnd<Real> end = {Real(forward.transmittance), Real(forward.denominator_part), Real(pixel.background_gate),
+  const PixelEnd<Real> end = {Real(forward.transmittance), Real(forward.denominator_part), Real(pixel.lambda),
                               Real(pixel.tails)};
   const auto begin = begin_backward<kMode>(end, Real(g.gate_sum));
   auto constants = begin.pixel;
@@ -275,8 +275,7 @@ template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel
   Real behind = 0;
   PixelGradient out;
   out.background = by_color.background;
-  out.background_gate =
-      begin.background_gate + by_color.background_gate + by_depth.background_gate + by_inverse_depth.background_gate;
+  out.lambda = begin.lambda + by_color.lambda + by_depth.lambda + by_inverse_depth.lambda;
   out.power = out.color = out.depth = out.inverse_depth = Vector(pixel.size());
   for (int i = pixel.size() - 1; i >= 0; --i) {
     if constexpr (kResumes<kMode>) {
@@ -309,7 +308,7 @@ Vector flat(const Pixel& pixel, const PixelGradient& g) {
   for (int i = 0; i < pixel.size(); ++i) out.push_back(g.power[i] / pixel.alpha[i]);
   for (const Vector* part : {&g.color, &g.depth, &g.inverse_depth}) out.insert(out.end(), part->begin(), part->end());
   out.push_back(g.background);
-  out.push_back(g.background_gate);
+  out.push_back(g.lambda);
   return out;
 }
 
@@ -322,7 +321,7 @@ Vector paper_gradient(BlendMode mode, const Pixel& pixel, const Weights& g, doub
     x.insert(x.end(), part->begin(), part->end());
   }
   x.push_back(pixel.background);
-  x.push_back(pixel.background_gate);
+  x.push_back(pixel.lambda);
   auto loss = [&](const Vector& v) {
     Pixel moved = pixel;
     moved.alpha.assign(v.begin(), v.begin() + n);
@@ -330,7 +329,7 @@ Vector paper_gradient(BlendMode mode, const Pixel& pixel, const Weights& g, doub
     moved.depth.assign(v.begin() + 2 * n, v.begin() + 3 * n);
     moved.inverse_depth.assign(v.begin() + 3 * n, v.begin() + 4 * n);
     moved.background = v[4 * n];
-    moved.background_gate = v[4 * n + 1];
+    moved.lambda = v[4 * n + 1];
     const Finished f = paper(mode, moved, stop);
     return g.color * f.color + g.depth * f.depth + g.inverse_depth * f.inverse_depth + g.gate_sum * f.gate_sum;
   };
@@ -340,7 +339,7 @@ Vector paper_gradient(BlendMode mode, const Pixel& pixel, const Weights& g, doub
 // Alphas well above the step, so that the differences judge dL/dalpha itself.
 Pixel differentiable_pixel(Random& random, double largest_alpha) {
   Pixel pixel = random_pixel(random, 12, largest_alpha);
-  pixel.background_gate = random.uniform(0.05, 2);
+  pixel.lambda = random.uniform(0.05, 2);
   for (double& alpha : pixel.alpha) alpha = random.uniform(0.02, largest_alpha);
   return pixel;
 }
@@ -421,7 +420,7 @@ TYPED_TEST(BlendOf, GradientsAreBoundedByThoseOfTheImageAndTheLargestFeature) {
     feature(g.color, pixel.color, pixel.background, actual.color);
     feature(g.depth, pixel.depth, 0, actual.depth);
     feature(g.inverse_depth, pixel.inverse_depth, 0, actual.inverse_depth);
-    most *= 2 * std::max(1.0, Policy::background_gate(pixel.background_gate));
+    most *= 2 * std::max(1.0, Policy::background_gate(pixel.lambda));
     for (const double power : actual.power) EXPECT_LE(abs(power), spare * most);
   }
 }

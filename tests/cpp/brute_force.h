@@ -80,7 +80,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
         }
         const S dx = S(x) - g.mean.x, dy = S(y) - g.mean.y;
         const S power = ColumnExponent<S, S>(g.conic, dx).at(dy);
-        S least_alpha = config.alpha_cut().of(g.opacity);
+        S least_alpha = config.blend.alpha_cut().of(g.opacity);
         if (near) least_alpha = near_alpha(g.opacity, least_alpha);
         const auto gate = evaluate_gate<kMode>(power, g.opacity, least_alpha);
         const double terms = double(g.conic.xx) * dx * dx + double(g.conic.yy) * dy * dy;
@@ -102,19 +102,19 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
       }
     };
     bool wide = Blend<kMode>::kTails;
-    if (config.blends_near_first()) {
+    if (config.blend.blends_near_first()) {
       auto state = PixelState<S>::open();
       for_each_pair(true, [&](int64_t, S, S, S, const Gate<S>& gate) {
         decide_stop(state, gate);
         Blend<kMode>::accumulate(state, gate);
       });
-      decide(state.gate_sum, config.wide_below());
-      wide = state.gate_sum < config.wide_below();
+      decide(state.gate_sum, config.blend.wide_below());
+      wide = state.gate_sum < config.blend.wide_below();
     }
     auto state = PixelState<S>::open();
     S tails = S(0);
     std::vector<S> sums(num_features);
-    for_each_pair(config.blends_near_first() && !wide, [&](int64_t i, S dx, S dy, S power, const Gate<S>& gate) {
+    for_each_pair(config.blend.blends_near_first() && !wide, [&](int64_t i, S dx, S dy, S power, const Gate<S>& gate) {
       out.num_pairs += gate.counts;
       decide_stop(state, gate);
       if (Blend<kMode>::kTails && wide) add_tail(state, tails, tail_of(gate, power <= S(0)));
@@ -134,7 +134,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
     out.greatest.push_back(greatest);
     out.num_contributing.push_back(num_contributing);
     out.lead.push_back(greatest < 0 ? 1 : 1 - second_weight / greatest_weight);
-    auto end = state.end(config.gate_of_background());
+    auto end = state.end(config.blend.lambda());
     end.tails = tails;
     out.gate_sum[pixel] = finish_alpha<kMode>(end);
     int f = 0;
@@ -150,7 +150,7 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
 
 template <class S> BruteForce<S> brute_force(const Scene<S>& scene) {
   BruteForce<S> out;
-  dispatch_blend(scene.config.mode, kAnyFeatures, [&](auto mode, auto) { out = brute_force_in<mode()>(scene); });
+  dispatch_blend(scene.config.blend.mode, kAnyFeatures, [&](auto mode, auto) { out = brute_force_in<mode()>(scene); });
   return out;
 }
 

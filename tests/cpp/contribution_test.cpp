@@ -87,7 +87,7 @@ TYPED_TEST_SUITE(ContributionsIn, AllModes);
 TYPED_TEST(ContributionsIn, EqualBruteForce) {
   for (const bool antialiasing : {false, true}) {
     Scene<double> scene = make_scene(41, 40, 37, 29);
-    scene.config.mode = TypeParam::value;
+    scene.config.blend.mode = TypeParam::value;
     scene.config.antialiasing = antialiasing;
     expect_brute_force(scene);
     if (!antialiasing) expect_brute_force(convert<float>(scene));
@@ -96,7 +96,7 @@ TYPED_TEST(ContributionsIn, EqualBruteForce) {
 
 TYPED_TEST(ContributionsIn, DoNotDependOnThreads) {
   Scene<double> wide = make_scene(42, 300, 131, 83);
-  wide.config.mode = TypeParam::value;
+  wide.config.blend.mode = TypeParam::value;
   const Scene<float> scene = convert<float>(wide);
   const Sums<float> expected = sums_of(scene, 1);
   for (const int threads : {2, 3, 7}) {
@@ -110,7 +110,7 @@ TYPED_TEST(ContributionsIn, DoNotDependOnThreads) {
 
 TYPED_TEST(ContributionsIn, AreZeroWhereThereAreNoGaussians) {
   Scene<double> scene = make_scene(43, 0, 37, 29);
-  scene.config.mode = TypeParam::value;
+  scene.config.blend.mode = TypeParam::value;
   EXPECT_TRUE(sums_of(scene, 2).pixels.empty());
 }
 

@@ -52,7 +52,7 @@ TYPED_TEST_SUITE(GateMapIn, AllModes);
 TYPED_TEST(GateMapIn, EqualsBruteForce) {
   for (const unsigned seed : {41, 44}) {  // with a gate for the background, and without
     Scene<double> scene = make_scene(seed, 150, 61, 47);
-    scene.config.mode = TypeParam::value;
+    scene.config.blend.mode = TypeParam::value;
     for (double& scale : scene.scales) scale /= 4;  // so that some pixels are empty
     expect_brute_force(scene);
     expect_brute_force(convert<float>(scene));
@@ -63,7 +63,7 @@ TYPED_TEST(GateMapIn, TakesTheNearestOfEqualGates) {
   // Both faint and in one place. In modes with transmittance the nearer one's gate is greater, else they are equal and
   // the first in the list counts.
   Scene<double> scene = make_scene(45, 2, 16, 16);
-  scene.config.mode = TypeParam::value;
+  scene.config.blend.mode = TypeParam::value;
   scene.means3D = {0, 0, 0, 0, 0, 0};
   scene.scales = {0.5, 0.5, 0.5, 0.5, 0.5, 0.5};
   scene.opacities = {0.25, 0.25};
@@ -75,7 +75,7 @@ TYPED_TEST(GateMapIn, TakesTheNearestOfEqualGates) {
 
 TYPED_TEST(GateMapIn, DoesNotDependOnThreads) {
   Scene<double> wide = make_scene(42, 300, 131, 83);
-  wide.config.mode = TypeParam::value;
+  wide.config.blend.mode = TypeParam::value;
   const Scene<float> scene = convert<float>(wide);
   const Map expected = map_of(scene);
   for (const int threads : {2, 7}) {
@@ -87,7 +87,7 @@ TYPED_TEST(GateMapIn, DoesNotDependOnThreads) {
 
 TYPED_TEST(GateMapIn, IsEmptyWithoutGaussians) {
   Scene<double> scene = make_scene(43, 0, 37, 29);
-  scene.config.mode = TypeParam::value;
+  scene.config.blend.mode = TypeParam::value;
   const Map map = map_of(scene, 2);
   EXPECT_EQ(map.gaussians, std::vector<int32_t>(scene.pixels(), -1));
   EXPECT_EQ(map.counts, std::vector<int32_t>(scene.pixels(), 0));

@@ -49,7 +49,7 @@ TEST(OwnMode, HasNoImportance) {
 
 TEST(OwnMode, IsDrawnAndDifferentiatedByTheWalk) {
   Scene<double> scene = make_scene(1, 60, 37, 29);
-  scene.config.mode = BlendMode::kSmoeStd;  // the same cut and order
+  scene.config.blend.mode = BlendMode::kSmoeStd;  // the same cut and order
   Rendering<double> r = project_and_bin(scene);
   const auto config = scene.raster_config();
   const auto saved = r.saved();

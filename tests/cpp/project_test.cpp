@@ -153,7 +153,7 @@ TEST(ProjectGaussian, BackwardIsTheDerivativeOutsideTheFrustumWhereTheJacobianIs
     Scene<double> scene = single_gaussian();
     scene.means3D = mean;
     scene.scales = {3, 2, 2.5};  // still reaches the image
-    scene.config.mode = BlendMode::kSmoe;
+    scene.config.blend.mode = BlendMode::kSmoe;
     expect_backward_is_the_derivative(scene);
   }
 }
@@ -180,7 +180,7 @@ TEST(ProjectGaussian, RadiusDoesNotDependOnModeOpacityOrAntialiasing) {
   for (const double opacity : {-1.0, 0.0, 1e-9, 3.0}) {
     scene.opacities = {opacity};
     for (const auto mode : all_modes()) {
-      scene.config.mode = mode;
+      scene.config.blend.mode = mode;
       EXPECT_EQ(project(scene).radius, radius);
     }
   }
@@ -248,7 +248,7 @@ TEST(ProjectGaussian, KeepsTheDigitsOfANeedleInFloat) {
   Random random(3);
   for (int i = 0; i < 200; ++i) {
     Scene<double> wide = single_gaussian();
-    wide.config.mode = BlendMode::kSmoe;
+    wide.config.blend.mode = BlendMode::kSmoe;
     wide.scales = {float(random.uniform(500, 1000)), 0.007f, 0.009f};
     for (double& component : wide.rotations) component = float(random.uniform(-0.5, 0.5));
     const Scene<float> scene = convert<float>(wide);
@@ -270,7 +270,7 @@ TEST(ProjectGaussian, RadiusIsPositiveExactlyWhereTheFootprintMeetsTheImage) {
   for (const auto mode : {BlendMode::kAlpha, BlendMode::kSmoe, BlendMode::kSmoeEq7}) {
     Scene<double> scene = single_gaussian();
     const auto& camera = scene.camera;
-    scene.config.mode = mode;
+    scene.config.blend.mode = mode;
     scene.scales = {0.1, 0.04, 0.2};
     int seen = 0, unseen = 0;
     for (double shift = -6; shift < 6; shift += 0.02) {

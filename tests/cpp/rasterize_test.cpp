@@ -23,7 +23,7 @@ namespace {
 using Vector = std::vector<double>;
 
 template <class S> Scene<S> in_mode(Scene<S> scene, BlendMode mode) {
-  scene.config.mode = mode;
+  scene.config.blend.mode = mode;
   return scene;
 }
 
@@ -99,7 +99,7 @@ TYPED_TEST(RasterizeIn, EqualsBruteForceWithAnyNumberOfChannels) {
 
 TYPED_TEST(RasterizeIn, EqualsBruteForceWithAlphaMinAndAntialiasing) {
   Scene<double> scene = in_mode(make_scene(6, 80, 37, 29), TypeParam::value);
-  scene.config.alpha_min = 0.01;
+  scene.config.blend.alpha_min = 0.01;
   scene.config.antialiasing = true;
   expect_brute_force(scene);
   expect_brute_force(convert<float>(scene));
@@ -135,7 +135,7 @@ Scene<double> smooth_scene(unsigned seed, double smallest_opacity, double larges
     for (int k = 0; k < 4; ++k) scene.rotations[4 * i + k] = q[k] / length;
   }
   scene.config.depth = scene.config.inverse_depth = true;
-  scene.config.faint_below = 0;  // gradients hold the sum of tails constant
+  scene.config.blend.faint_below = 0;  // gradients hold the sum of tails constant
   return scene;
 }
 
@@ -258,9 +258,9 @@ TEST(Rasterize, TheBackgroundsGateMayBeANumberOrLieInMemory) {
   Rendering<float> in_memory = render(scene);
   Rendering<float> number = render(scene);
   cpu::Frame<float> frame = frame_of(scene, number);
-  frame.config.background_gate = *frame.config.background_gate_at;
-  ASSERT_GT(frame.config.background_gate, 0);
-  frame.config.background_gate_at = nullptr;
+  frame.config.blend.background_gate = *frame.config.blend.background_gate_at;
+  ASSERT_GT(frame.config.blend.background_gate, 0);
+  frame.config.blend.background_gate_at = nullptr;
   std::fill(number.color.begin(), number.color.end(), -1);
   cpu::blend(frame);
   EXPECT_EQ(number.color, in_memory.color);
@@ -430,7 +430,7 @@ TYPED_TEST(RasterizeIn, GivenCovariancesOfAnyKindLeaveGradientsFinite) {
 // 4096 x 4096 tiles times 260 Gaussians: bands would make it, but this caller asks for one list.
 TEST(Rasterize, SaysHowManyInstancesAreTooMany) {
   Scene<float> scene = convert<float>(make_scene(33, 260, 65536, 65536));
-  scene.config.mode = BlendMode::kSmoeEq7;
+  scene.config.blend.mode = BlendMode::kSmoeEq7;
   std::fill(scene.means3D.begin(), scene.means3D.end(), 0.0f);
   std::fill(scene.scales.begin(), scene.scales.end(), 100.0f);
   std::fill(scene.opacities.begin(), scene.opacities.end(), 0.5f);

@@ -34,12 +34,14 @@ template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
       {[](auto& f) { f.inputs.num_gaussians = -1; }, "num_gaussians is -1; it must be 0 to 2147483647"},
       {[](auto& f) { f.camera.width = 0; }, "width x height is 0 x 29; both must be positive"},
       {[](auto& f) { f.camera.height = -4; }, "width x height is 37 x -4; both must be positive"},
-      {[](auto& f) { f.config.mode = static_cast<BlendMode>(99); }, "blend_mode is 99; it must be 0 to " + last_mode},
-      {[](auto& f) { f.config.mode = static_cast<BlendMode>(-1); }, "blend_mode is -1; it must be 0 to " + last_mode},
+      {[](auto& f) { f.config.blend.mode = static_cast<BlendMode>(99); },
+       "blend_mode is 99; it must be 0 to " + last_mode},
+      {[](auto& f) { f.config.blend.mode = static_cast<BlendMode>(-1); },
+       "blend_mode is -1; it must be 0 to " + last_mode},
       {[](auto& f) { f.config.num_channels = 0; }, "num_channels is 0; it must be 1 or more"},
-      {[](auto& f) { f.config.alpha_min = -0.5f; }, "alpha_min is -0.5; it must be 0 or more and finite"},
-      {[](auto& f) { f.config.faint_below = -0.5f; }, "faint_below is -0.5; it must be 0 or more and finite"},
-      {[](auto& f) { f.config.background_gate_at = nullptr, f.config.background_gate = -0.1f; },
+      {[](auto& f) { f.config.blend.alpha_min = -0.5f; }, "alpha_min is -0.5; it must be 0 or more and finite"},
+      {[](auto& f) { f.config.blend.faint_below = -0.5f; }, "faint_below is -0.5; it must be 0 or more and finite"},
+      {[](auto& f) { f.config.blend.background_gate_at = nullptr, f.config.blend.background_gate = -0.1f; },
        "background_gate is -0.1; it must be 0 or more and finite"},
       {[](auto& f) { f.config.most_instances = 0; }, "most_instances is 0; it must be 1 or more"},
       {[](auto& f) { f.inputs.means3D = nullptr; }, "means3D is null; it must point to an array [N, 3]"},
@@ -82,7 +84,7 @@ TEST(Refuse, AForwardPassOnTheCpuNamesWhatIsWrong) {
   Rendering<float> rendering(scene);
   auto cases = cases_of_forward<Frame>();
   const float negative = -1;
-  cases.push_back({[&](Frame& f) { f.config.background_gate_at = &negative; },
+  cases.push_back({[&](Frame& f) { f.config.blend.background_gate_at = &negative; },
                    "background_gate is -1; it must be 0 or more and finite"});
   for (const auto& c : cases) {
     Frame frame = frame_of(scene, rendering);
@@ -104,7 +106,7 @@ TEST(Refuse, AFrameOfDevicePointersIsHeldToTheSame) {
       {[](Frame& f) { f.camera.position = nullptr; }, "camera.position is null; it must point to an array [3]"});
   Frame good;
   good.inputs = scene.inputs(), good.config = scene.raster_config(), good.images = rendering.images();
-  good.config.background_gate_at = reinterpret_cast<const float*>(8);  // of the device: the host must not read it
+  good.config.blend.background_gate_at = reinterpret_cast<const float*>(8);  // of the device: the host must not read it
   good.camera.width = 37, good.camera.height = 29;
   good.camera.tan_fov_x = good.camera.tan_fov_y = 0.6f;
   good.camera.view = scene.camera.view, good.camera.projection = scene.camera.projection;

@@ -15,7 +15,7 @@ namespace {
 
 struct Pixel {
   std::vector<double> alpha, color;  // front to back
-  double background = 0.3, background_gate = 0, tails = 0;
+  double background = 0.3, lambda = 0, tails = 0;
   int size() const { return static_cast<int>(alpha.size()); }
 };
 
@@ -32,7 +32,7 @@ double color_of(BlendMode mode, const Pixel& pixel, int omitted) {
   }
   if (mode == BlendMode::kAlpha) return numerator + transmittance * pixel.background;
   const bool by_weight = mode == BlendMode::kSmoe || mode == BlendMode::kSmoeEq7;
-  const double gate = by_weight ? pixel.background_gate * transmittance + pixel.tails : 0;
+  const double gate = by_weight ? pixel.lambda * transmittance + pixel.tails : 0;
   const double denominator = (by_weight ? sum_weight : sum_alpha) + gate;
   return denominator > 0 ? (numerator + gate * pixel.background) / denominator : pixel.background;
 }
@@ -51,7 +51,7 @@ template <BlendMode kMode, class S> void expect_omissions(const Pixel& pixel, do
   const PixelState<S> open = {S(1), S(pixel.tails)};
   PixelState<S> state = open;
   for (const auto& gate : gates) Blend<kMode>::accumulate(state, gate);
-  const PixelEnd<S> end = state.end(S(pixel.background_gate));
+  const PixelEnd<S> end = state.end(S(pixel.lambda));
   const S value = S(color_of(kMode, pixel, -1)), background = S(pixel.background);
   state = open;
   S front = S(pixel.tails) * (background - value);
@@ -111,7 +111,7 @@ TYPED_TEST(RemovalIn, EqualsTheSumsOverTheOthers) {
   for (const double gate : {0.0, 0.03, 1.0}) {
     for (const double opacity : {0.6, 0.01}) {
       Pixel pixel = layers(opacity);
-      if (Blend<kMode>::kLearnsGate) pixel.background_gate = gate;
+      if (Blend<kMode>::kLearnsGate) pixel.lambda = gate;
       if (Blend<kMode>::kTails) pixel.tails = 0.01;
       // Some dozens of roundings; where the sums are small, of transmittances near 1 in place of them.
       expect_omissions<kMode, double>(pixel, 1e-15 * 20 / opacity);

@@ -105,7 +105,7 @@ void expect_close(const std::vector<S>& a, const std::vector<S>& b, double toler
 
 template <class S> void expect_levels_agree(BlendMode mode, bool depths) {
   Scene<double> wide = make_scene(41, 40, 37, 29);
-  wide.config.mode = mode;
+  wide.config.blend.mode = mode;
   wide.config.depth = wide.config.inverse_depth = depths;
   const Scene<S> scene = convert<S>(wide);
   const ImageWeights<S> weights(scene, 2);

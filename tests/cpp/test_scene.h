@@ -42,7 +42,7 @@ template <class S> struct Scene {
   RasterConfig<S> raster_config() const {
     RasterConfig<S> out = config;
     out.background = background.data();
-    out.background_gate_at = out.background + out.num_channels;
+    out.blend.background_gate_at = out.background + out.num_channels;
     return out;
   }
 
@@ -129,11 +129,9 @@ template <class To, class From> Scene<To> convert(const Scene<From>& from) {
   to.camera.width = from.camera.width, to.camera.height = from.camera.height;
   to.camera.tan_fov_x = To(from.camera.tan_fov_x), to.camera.tan_fov_y = To(from.camera.tan_fov_y);
   to.camera.near = To(from.camera.near);
-  to.config.mode = from.config.mode;
+  to.config.blend = from.config.blend.template as<To>();
   to.config.num_channels = from.config.num_channels;
   to.config.scale_modifier = To(from.config.scale_modifier);
-  to.config.alpha_min = To(from.config.alpha_min);
-  to.config.faint_below = To(from.config.faint_below);
   to.config.antialiasing = from.config.antialiasing;
   to.config.clamp_color = from.config.clamp_color;
   to.config.depth = from.config.depth;
@@ -167,7 +165,7 @@ template <class S> struct Rendering {
     instance_offsets.resize(scene.count + 1, -1);
     tile_offsets.resize(num_tiles(scene.camera.width, scene.camera.height) + 1, -1);
     for (auto* image : {&final_transmittance, &gate_sum}) image->resize(scene.pixels(), unwritten);
-    if (has_tails(scene.config.mode)) sums.resize(2 * scene.pixels(), unwritten);
+    if (has_tails(scene.config.blend.mode)) sums.resize(2 * scene.pixels(), unwritten);
     color.resize(scene.pixels() * scene.config.num_channels, unwritten);
     if (scene.config.depth) depth.resize(scene.pixels(), unwritten);
     if (scene.config.inverse_depth) inverse_depth.resize(scene.pixels(), unwritten);

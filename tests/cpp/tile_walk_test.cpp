@@ -46,9 +46,9 @@ template <class S> void expect_the_cells_of_random_gaussians() {
     saved.features = const_cast<S*>(features);
     saved.instances = const_cast<TileInstance*>(&instance);
     RasterConfig<S> config;
-    config.mode = BlendMode::kSmoeEq7;
-    config.background_gate = S(kGate);
-    if (n % 2 > 0) config.faint_below = S(kFaintBelow);
+    config.blend.mode = BlendMode::kSmoeEq7;
+    config.blend.background_gate = S(kGate);
+    if (n % 2 > 0) config.blend.faint_below = S(kFaintBelow);
     const auto pairs = n % 4 < 2 ? Pairs::kNarrow : Pairs::kWide;
     const Tile<S> tile = {config, saved, kSide, kSide, n % 3, n / 3 % 3, 0, 0, 1};
     const TileExtent extent(tile);
@@ -70,7 +70,7 @@ template <class S> void expect_the_cells_of_random_gaussians() {
         if (!smooth) continue;
         ++smooth_pairs;
         ASSERT_TRUE(gate.counts) << "Gaussian " << n << " pixel " << at + lane;
-        if (config.blends_near_first()) {
+        if (config.blend.blends_near_first()) {
           ASSERT_GE(gate.logit, listed.near_alpha) << "Gaussian " << n << " pixel " << at + lane;
         }
         // The exponent's terms round at half an ulp each, in both ways of summing them; the exponentials at some ulps.

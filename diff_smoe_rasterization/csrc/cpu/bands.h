@@ -16,7 +16,7 @@ namespace cpu {
 // The tiles that may hold pairs of Gaussian i, in the rows that the frame's lists are of.
 template <class S> TileRect bounds_in(const Frame<S>& frame, int64_t i) {
   const TileGrid grid(frame.camera.width, frame.camera.height);
-  TileRect bounds = tile_bounds(frame.config.mode, grid, frame.saved.projected[i].mean, S(frame.images.radii[i]));
+  TileRect bounds = tile_bounds(frame.config.blend.mode, grid, frame.saved.projected[i].mean, S(frame.images.radii[i]));
   bounds.y0 = max(bounds.y0, frame.saved.band.begin), bounds.y1 = min(bounds.y1, frame.saved.band.end);
   return bounds;
 }
@@ -24,7 +24,7 @@ template <class S> TileRect bounds_in(const Frame<S>& frame, int64_t i) {
 // Calls visit(tile_x0, tile_x1, tile_y) for each row of tiles that list Gaussian i.
 template <class S, class Visit> void for_each_tile_row(const Frame<S>& frame, int64_t i, Visit visit) {
   const ProjectedGaussian<S>& gaussian = frame.saved.projected[i];
-  const S reach = gaussian.squared_reach + frame.config.tail_reach();
+  const S reach = gaussian.squared_reach + frame.config.blend.tail_reach();
   for_each_tile_row(gaussian.conic, gaussian.mean, reach, bounds_in(frame, i), visit);
 }
 

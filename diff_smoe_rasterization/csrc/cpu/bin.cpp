@@ -30,7 +30,7 @@ std::vector<KeyedIndex<DepthBits<S>>> depth_order(int64_t num_gaussians, const R
     if (saved.instance_offsets[i + 1] == saved.instance_offsets[i]) continue;
     order.push_back({depth_bits(saved.projected[i].depth), static_cast<int32_t>(i)});
   }
-  dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
+  dispatch_blend(config.blend.mode, kAnyFeatures, [&](auto mode, auto) {
     if (Blend<decltype(mode)::value>::kNeedsDepthOrder) radix_sort(order);
   });
   return order;

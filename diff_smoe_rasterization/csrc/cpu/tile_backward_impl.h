@@ -29,18 +29,18 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
   // Starts every pixel. Returns how many entries of the list some numerator has seen.
   DSMOE_HD int64_t read(const Tile<S>& tile, const TileExtent& extent, const TileGradients<S>& gradients) const {
     const int64_t pixels = static_cast<int64_t>(tile.width) * tile.height;
-    const S background_gate = tile.config.gate_of_background();
+    const S lambda = tile.config.blend.lambda();
     const int num_channels = tile.config.num_channels;
     S* dL_dbackground =
         gradients.dL_dbackground != nullptr ? gradients.dL_dbackground + tile.index * (num_channels + 1) : nullptr;
     int64_t num_seen = 0;
     extent.for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
-      PixelEnd<S> end = {abs(tile.saved.final_transmittance[index]), tile.saved.gate_sum[index], background_gate, S(0)};
+      PixelEnd<S> end = {abs(tile.saved.final_transmittance[index]), tile.saved.gate_sum[index], lambda, S(0)};
       if constexpr (Blend<kMode>::kTails) end.tails = tile.saved.tails[index];
       const S* dL_dalpha = gradients.dL_dimages.gate_sum;
       const auto begin = begin_backward<kMode>(end, dL_dalpha != nullptr ? dL_dalpha[index] : S(0));
       auto pixel = begin.pixel;
-      if (Blend<kMode>::kTails && dL_dbackground != nullptr) dL_dbackground[num_channels] += begin.background_gate;
+      if (Blend<kMode>::kTails && dL_dbackground != nullptr) dL_dbackground[num_channels] += begin.lambda;
       for (int f = 0; f < num_features(); ++f) {
         const S* gradient = feature_image(tile.config, gradients.dL_dimages, f, pixels);
         if (gradient == nullptr) continue;
@@ -50,7 +50,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
         scaled_of(f).pixel(x, y) = share.scaled;
         if (dL_dbackground == nullptr) continue;
         if (f < num_channels) dL_dbackground[f] += share.background;
-        dL_dbackground[num_channels] += share.background_gate;
+        dL_dbackground[num_channels] += share.lambda;
       }
       transmittance_.pixel(x, y) = pixel.transmittance;
       suffix_.pixel(x, y) = pixel.suffix;
@@ -170,7 +170,7 @@ int64_t blend_tile_backward(const Tile<S>& tile, const TileGradients<S>& gradien
 template <class S> int64_t backward(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch) {
   int64_t pairs = 0;
   const int num_features = gradients.absolute ? kAnyFeatures : tile.config.num_features();
-  dispatch_blend(tile.config.mode, num_features, [&](auto mode, auto features) {
+  dispatch_blend(tile.config.blend.mode, num_features, [&](auto mode, auto features) {
     pairs = blend_tile_backward<S, decltype(mode)::value, decltype(features)::value>(tile, gradients, scratch);
   });
   return pairs;

@@ -76,7 +76,7 @@ template <class S, BlendMode kMode> int64_t sum_tile(const Tile<S>& tile, const 
 
 template <class S> int64_t contributions(const Tile<S>& tile, const TileContributions<S>& out, S* scratch) {
   int64_t pairs = 0;
-  dispatch_blend(tile.config.mode, kAnyFeatures,
+  dispatch_blend(tile.config.blend.mode, kAnyFeatures,
                  [&](auto mode, auto) { pairs = sum_tile<S, decltype(mode)::value>(tile, out, scratch); });
   return pairs;
 }

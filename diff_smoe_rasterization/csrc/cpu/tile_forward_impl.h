@@ -38,7 +38,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   // Blends all pixels, by their near pairs where the rendering blends them first, and then the wide ones with all their
   // pairs. Returns how many pairs had their exponent evaluated.
   DSMOE_HD int64_t paint() {
-    const bool near_first = tile_.config.blends_near_first();
+    const bool near_first = tile_.config.blend.blends_near_first();
     int64_t pairs = 0;
     // Where near pairs are not blended first, all pixels of a mode with tails are wide.
     if (!Blend<kMode>::kTails || near_first) pairs += paint<Pairs::kNarrow>();
@@ -51,17 +51,17 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
 
   // Finishes the pixels, pack by pack, and writes them.
   DSMOE_HD void write(const ImageOutputs<S>& images) const {
-    const S background_gate = tile_.config.gate_of_background();
+    const S lambda = tile_.config.blend.lambda();
     const int64_t pixels = static_cast<int64_t>(tile_.width) * tile_.height;
     extent_.for_each_pixel(tile_.width, [&](int x, int y, int64_t index) {
       const PixelState<S> state = {transmittance_.pixel(x, y), gate_sum_.pixel(x, y)};
       const bool wide = Blend<kMode>::kNearFirst && wide_.pixel(x, y) > S(0);
-      tile_.saved.final_transmittance[index] = kept_transmittance(state.end(background_gate), wide);
+      tile_.saved.final_transmittance[index] = kept_transmittance(state.end(lambda), wide);
       tile_.saved.gate_sum[index] = gate_sum_.pixel(x, y);
       if constexpr (Blend<kMode>::kTails) {
         tile_.saved.tails[index] = tails_.pixel(x, y);
         images.gate_sum[index] = finish_alpha<kMode>(
-            PixelEnd<S>{abs(transmittance_.pixel(x, y)), gate_sum_.pixel(x, y), background_gate, tails_.pixel(x, y)});
+            PixelEnd<S>{abs(transmittance_.pixel(x, y)), gate_sum_.pixel(x, y), lambda, tails_.pixel(x, y)});
       }
       tile_.saved.last_contributor[index] = static_cast<int32_t>(last_.pixel(x, y));
     });
@@ -72,7 +72,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
       const PixelArray<S> sum = sum_of(f);
       for (int at = 0; at < kTilePixels; at += P::kLanes) {
         const PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
-        auto end = state.end(background_gate);
+        auto end = state.end(lambda);
         if constexpr (Blend<kMode>::kTails) end.tails = tails_.load(at);
         sum.store(at, finish_feature<kMode>(rule, end, sum.load(at), background));
       }
@@ -84,7 +84,7 @@ template <class S, BlendMode kMode, int kFeatures> class TilePainter {
   // Closes the pixels that their near pairs cover, and opens the others anew, with their cells. Returns whether there
   // is one.
   DSMOE_HD bool open_wide(bool near_first) {
-    const S wide_below = tile_.config.wide_below();
+    const S wide_below = tile_.config.blend.wide_below();
     open_ = 0;
     for (int y = 0; y < extent_.rows; ++y) {
       for (int x = 0; x < extent_.columns; ++x) {
@@ -216,7 +216,7 @@ int64_t blend_tile(const Tile<S>& tile, const ImageOutputs<S>& images, S* memory
 
 template <class S> int64_t forward(const Tile<S>& tile, const ImageOutputs<S>& images, S* scratch) {
   int64_t pairs = 0;
-  dispatch_blend(tile.config.mode, tile.config.num_features(), [&](auto mode, auto features) {
+  dispatch_blend(tile.config.blend.mode, tile.config.num_features(), [&](auto mode, auto features) {
     pairs = blend_tile<S, decltype(mode)::value, decltype(features)::value>(tile, images, scratch);
   });
   return pairs;

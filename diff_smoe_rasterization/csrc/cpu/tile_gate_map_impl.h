@@ -77,7 +77,7 @@ template <class S, BlendMode kMode> int64_t map_tile(const Tile<S>& tile, const 
 
 template <class S> int64_t gate_map(const Tile<S>& tile, const GateMap& map, S* scratch) {
   int64_t pairs = 0;
-  dispatch_blend(tile.config.mode, kAnyFeatures,
+  dispatch_blend(tile.config.blend.mode, kAnyFeatures,
                  [&](auto mode, auto) { pairs = map_tile<S, decltype(mode)::value>(tile, map, scratch); });
   return pairs;
 }

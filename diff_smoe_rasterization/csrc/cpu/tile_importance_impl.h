@@ -18,7 +18,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
   DSMOE_HD ImportanceVisitor(const Tile<S>& tile, Scratch<S> scratch, const TileImportances<S>& out)
       : num_channels_(kFeatures != kAnyFeatures ? kFeatures : tile.config.num_channels),
         background_(tile.config.background),
-        background_gate_(tile.config.gate_of_background()),
+        lambda_(tile.config.blend.lambda()),
         transmittance_(scratch.pixels()),
         gate_sum_(scratch.pixels()),
         last_(scratch.pixels()),
@@ -70,7 +70,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
 
   template <class Pairs> DSMOE_HD void take(int at, const Pairs& pairs, Mask<P> not_past, Importance<P>& sum) const {
     PixelState<P> state = {transmittance_.load(at), gate_sum_.load(at)};
-    const PixelEnd<P> end = {end_transmittance_.load(at), end_gate_sum_.load(at), background_gate_, P(S(0))};
+    const PixelEnd<P> end = {end_transmittance_.load(at), end_gate_sum_.load(at), lambda_, P(S(0))};
     const auto removal = remove_pair<kMode>(state, end, pairs.gate, not_past);
     transmittance_.store(at, state.transmittance);
     gate_sum_.store(at, state.gate_sum);
@@ -95,7 +95,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
 
   const int num_channels_;
   const S* const background_;
-  const S background_gate_;
+  const S lambda_;
   const PixelArray<S> transmittance_, gate_sum_, last_, end_transmittance_, end_gate_sum_, weight_, share_weight_;
   const PixelArray<S> alone_;     // |bg - C|^2
   const PixelArray<S> channels_;  // two arrays a channel: C, and A
@@ -117,7 +117,7 @@ int64_t importance_of_tile(const Tile<S>& tile, const TileImportances<S>& out, S
 
 template <class S> int64_t importance(const Tile<S>& tile, const TileImportances<S>& out, S* scratch) {
   int64_t pairs = 0;
-  dispatch_blend(tile.config.mode, tile.config.num_channels, [&](auto mode, auto channels) {
+  dispatch_blend(tile.config.blend.mode, tile.config.num_channels, [&](auto mode, auto channels) {
     constexpr BlendMode kMode = decltype(mode)::value;
     constexpr int kChannels = decltype(channels)::value;
     if constexpr (kRemovable<kMode>) pairs = importance_of_tile<S, kMode, kChannels>(tile, out, scratch);

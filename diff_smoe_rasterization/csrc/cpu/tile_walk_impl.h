@@ -131,10 +131,10 @@ template <class S> class GaussianList {
       : tile_(tile),
         extent_(extent),
         num_features_(num_features),
-        near_first_(tile.config.blends_near_first()),
+        near_first_(tile.config.blend.blends_near_first()),
         near_(near_first_ && pairs == Pairs::kNarrow),
-        further_reach_(pairs == Pairs::kWithTails ? tile.config.tail_reach() : S(0)),
-        cut_(tile.config.alpha_cut()) {}
+        further_reach_(pairs == Pairs::kWithTails ? tile.config.blend.tail_reach() : S(0)),
+        cut_(tile.config.blend.alpha_cut()) {}
 
   // Fills `listed` with entry i of all lists. next: an entry that will soon be wanted; the Gaussians of a list lie
   // anywhere in memory.

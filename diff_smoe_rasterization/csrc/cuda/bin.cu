@@ -19,7 +19,7 @@ template <class S> struct CountArguments {
   TileGrid grid;           // of the image
   SavedForward<S> saved;   // projected, order and num_ordered are read; num_instances is added to
   const int32_t* radii;    // [N] pixels
-  S tail_reach;            // of RasterConfig
+  S tail_reach;            // of BlendRules
 };
 
 // The rows of tiles that the warp's Gaussians meet. position: of the lane's Gaussian in the depth order.
@@ -76,11 +76,11 @@ template <class S> void count_instances(const Frame<S>& frame, const Work& work)
   while (arguments.gaussians_per_warp > 1 && num_gaussians < enough * arguments.gaussians_per_warp) {
     arguments.gaussians_per_warp /= 2;
   }
-  arguments.mode = frame.config.mode;
+  arguments.mode = frame.config.blend.mode;
   arguments.grid = TileGrid(frame.camera.width, frame.camera.height);
   arguments.saved = frame.saved;
   arguments.radii = frame.images.radii;
-  arguments.tail_reach = frame.config.tail_reach();
+  arguments.tail_reach = frame.config.blend.tail_reach();
   int64_t* num_entries = allocate<int64_t>(*work.scratch, 1);
   const auto clear = [&](int64_t* count) {
     check(cudaMemsetAsync(count, 0, sizeof(*count), work.stream), "counting instances");

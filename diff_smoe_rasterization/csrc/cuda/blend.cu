@@ -176,7 +176,7 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
   for (int k = 0; k < kPixels; ++k) {
     if (!tile.inside(arguments, blended.first + k)) continue;
     const int64_t index = tile.pixel_index(arguments, blended.first + k);
-    auto end = blended.state[k].end(config.gate_of_background());
+    auto end = blended.state[k].end(config.blend.lambda());
     if constexpr (Blend<kMode>::kTails) end.tails = tails[k];
     if (first_feature == 0) {
       arguments.saved.final_transmittance[index] = kept_transmittance(end, blended.wide[k]);
@@ -241,7 +241,8 @@ template <class S> void blend(const Frame<S>& frame, const Work& work) {
   for_each_band(frame, work, [&](const Frame<S>& band) {
     const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
     // Double is for checking: it has only the general kernel.
-    dispatch_blend(config.mode, sizeof(S) == 4 ? config.num_features() : kAnyFeatures, [&](auto mode, auto features) {
+    const int num_features = sizeof(S) == 4 ? config.num_features() : kAnyFeatures;
+    dispatch_blend(config.blend.mode, num_features, [&](auto mode, auto features) {
       constexpr int kFeatures = sizeof(S) == 4 ? decltype(features)::value : kAnyFeatures;
       const unsigned paired_tiles = kFeatures != kAnyFeatures ? min(tiles, kMostSharedTiles) : 0;
       blend_kernel<S, decltype(mode)::value, kFeatures>

@@ -236,11 +236,11 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
   const int num_features = kFeatures != kAnyFeatures ? kFeatures : arguments.num_features;
   const int64_t size = int64_t(arguments.width) * arguments.height;
   PixelEnd<S> end[kLanePixels];
-  S dL_dbackground_gate = S(0);
+  S dL_dlambda = S(0);
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
-    end[k] = {S(1), S(0), config.gate_of_background(), S(0)};
+    end[k] = {S(1), S(0), config.blend.lambda(), S(0)};
     pixels.wide[k] = false;
     if (inside) {
       const S kept = arguments.saved.final_transmittance[index];
@@ -252,7 +252,7 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
     const S* dL_dalpha = arguments.dL_dimages.gate_sum;
     const auto begin = begin_backward<kMode>(end[k], inside && dL_dalpha != nullptr ? dL_dalpha[index] : S(0));
     pixels.state[k] = begin.pixel;
-    if constexpr (Blend<kMode>::kTails) dL_dbackground_gate += begin.background_gate;
+    if constexpr (Blend<kMode>::kTails) dL_dlambda += begin.lambda;
     pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
   }
   S* dL_dbackground = nullptr;  // the warp's row
@@ -272,14 +272,14 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
       const auto feature = add_feature<kMode>(feature_rule(config, f), pixels.state[k], end[k], dL_dvalue, value,
                                               feature_background(config, f));
       pixels.scaled.set(arguments, tile, k, f, feature.scaled);
-      share += feature.background, dL_dbackground_gate += feature.background_gate;
+      share += feature.background, dL_dlambda += feature.lambda;
     }
     if (dL_dbackground == nullptr || f >= config.num_channels) continue;
     share = sum_lanes(share);
     if (tile.lane == 0) dL_dbackground[f] = share;
   }
   if (dL_dbackground != nullptr) {
-    const S share = sum_lanes(dL_dbackground_gate);
+    const S share = sum_lanes(dL_dlambda);
     if (tile.lane == 0) dL_dbackground[config.num_channels] = share;
   }
 }
@@ -358,7 +358,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
 
 template <class S, int kFeatures, bool kAbsolute = false, class Sink>
 void launch_backward(const BackwardWithSink<S, Sink>& arguments, int64_t blocks, cudaStream_t stream) {
-  dispatch_blend(arguments.config.mode, kFeatures, [&](auto mode, auto) {
+  dispatch_blend(arguments.config.blend.mode, kFeatures, [&](auto mode, auto) {
     blend_backward_kernel<S, decltype(mode)::value, kFeatures, kAbsolute>
         <<<static_cast<unsigned>(blocks), kWalkBlock, 0, stream>>>(arguments);
     DSMOE_CHECK_LAUNCH("blend_backward");

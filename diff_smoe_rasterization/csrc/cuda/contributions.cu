@@ -124,7 +124,7 @@ template <class S> void contributions(const Frame<S>& frame, const ContributionM
       arguments.pixels = to.is_first_walk() ? sums.pixels : nullptr;
       arguments.sums = to;
       const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
-      dispatch_blend(config.mode, kAnyFeatures, [&](auto mode, auto) {
+      dispatch_blend(config.blend.mode, kAnyFeatures, [&](auto mode, auto) {
         contributions_kernel<S, decltype(mode)::value, Sums><<<tiles, kWalkBlock, 0, stream>>>(arguments);
         DSMOE_CHECK_LAUNCH("contributions");
       });

@@ -91,7 +91,7 @@ template <class S> void gate_map(const Frame<S>& frame, const GateMap& map, cons
   refuse_gate_map("cuda::gate_map", frame, map);
   for_each_band(frame, work, [&](const Frame<S>& band) {
     const unsigned tiles = static_cast<unsigned>(num_band_tiles(band));
-    dispatch_blend(frame.config.mode, kAnyFeatures, [&](auto mode, auto) {
+    dispatch_blend(frame.config.blend.mode, kAnyFeatures, [&](auto mode, auto) {
       gate_map_kernel<S, decltype(mode)::value>
           <<<tiles, kWalkBlock, 0, work.stream>>>(blend_arguments(band, work), map);
       DSMOE_CHECK_LAUNCH("gate_map");

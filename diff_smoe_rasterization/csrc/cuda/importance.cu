@@ -173,7 +173,7 @@ constexpr bool kWeighsSegments = kWalksSegments<S, kMode, kChannels>&& Blend<kMo
 // unless a gate of the background is in it: behind 1,300 opacities of 2e-5 to 5e-5 the norm of the costs is off by
 // 4.4e-4 at the gate 0, by 1.2e-4 at 0.03.
 template <BlendMode kMode, class Config> __device__ bool knows_front(const Config& config) {
-  return !Blend<kMode>::kDivides || config.gate_of_background() >= 0.01f;
+  return !Blend<kMode>::kDivides || config.blend.lambda() >= 0.01f;
 }
 
 // Sets what a warp's pixels start with at the list's begin. The tails' sum is held constant, as in the backward pass.
@@ -181,7 +181,7 @@ template <BlendMode kMode, class Config> __device__ bool knows_front(const Confi
 template <BlendMode kMode, class S, int kChannels>
 __device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& arguments, const WarpTile<S>& tile,
                                              WeighedPixels<S, kChannels>& pixels) {
-  const S background_gate = arguments.config.gate_of_background();
+  const S lambda = arguments.config.blend.lambda();
   const int num_channels = kChannels != kAnyFeatures ? kChannels : arguments.config.num_channels;
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
@@ -190,7 +190,7 @@ __device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& argum
     pixels.state[k] = {S(1), tails};
     const S kept = arguments.saved.final_transmittance[index];
     pixels.wide[k] = inside && is_wide(kept);
-    pixels.end[k] = {abs(kept), inside ? arguments.saved.gate_sum[index] + tails : S(0), background_gate, S(0)};
+    pixels.end[k] = {abs(kept), inside ? arguments.saved.gate_sum[index] + tails : S(0), lambda, S(0)};
     pixels.weight[k] = inside ? arguments.map.pixel_weights[index] : S(0);
     pixels.share_weight[k] = inside ? arguments.map.share_weights[index] : S(0);
     pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
@@ -294,7 +294,7 @@ template <class S> void importance(const Frame<S>& frame, const ImportanceMap<S>
       arguments.sums = sums;
       // Whether lists have segments depends on earlier renderings, as in the backward pass.
       if (work.deterministic) arguments.saved.segments = nullptr;
-      dispatch_blend(frame.config.mode, num_channels, [&](auto mode, auto channels) {
+      dispatch_blend(frame.config.blend.mode, num_channels, [&](auto mode, auto channels) {
         constexpr BlendMode kMode = decltype(mode)::value;
         constexpr int kChannels = decltype(channels)::value;
         if constexpr (kRemovable<kMode>) {

@@ -183,14 +183,14 @@ __global__ void __launch_bounds__(kStoreBlock)
       sums.exponents[number] = gradient(number - kNumGateMoments) + 1;  // w may exceed D by its rounding
       continue;
     }
-    int most = gradient(num_features) + has_tails(config.mode);  // whose alpha image is like a feature of 1
+    int most = gradient(num_features) + has_tails(config.blend.mode);  // whose alpha image is like a feature of 1
     for (int f = 0; f < num_features; ++f) {
       const S background = abs(feature_background(config, f));
       int feature = max(kNoExponent, bounds.features[f]);
       if (is_finite(background)) feature = max(feature, exponent_of(background));
       most = max(most, gradient(f) + feature + 1);
     }
-    const S gate = config.gate_of_background();
+    const S gate = config.blend.lambda();
     const int terms = 32 - __clz(num_features);  // log2 of num_features + 1, rounded up
     sums.exponents[number] = most + terms + 1 + (gate > S(1) && is_finite(gate) ? exponent_of(gate) : 0) + 1;
   }

@@ -57,14 +57,14 @@ template <class S> struct MacroBounds {
   MacroGrid grid;        // of the band
   TileGrid image;        // all its tiles
   const int32_t* radii;  // [N] pixels; null where footprints have no other bounds than their ellipse
-  S tail_reach;          // of RasterConfig
+  S tail_reach;          // of BlendRules
 
   MacroBounds() = default;
   explicit MacroBounds(const Frame<S>& frame)
       : grid(band_grid(frame)),
         image(frame.camera.width, frame.camera.height),
-        radii(has_tails(frame.config.mode) ? frame.images.radii : nullptr),
-        tail_reach(frame.config.tail_reach()) {}
+        radii(has_tails(frame.config.blend.mode) ? frame.images.radii : nullptr),
+        tail_reach(frame.config.blend.tail_reach()) {}
 };
 
 template <class S, class Key> struct ListArguments {
@@ -312,7 +312,7 @@ template <class S> struct TestArguments {
   BlendMode mode;            // decides the bounds of footprints
   TileGrid image, tiles;     // all tiles, and those of the band
   int macro_columns;
-  S tail_reach;           // of RasterConfig
+  S tail_reach;           // of BlendRules
   bool near_first;        // squares are those that near pairs meet
   uint64_t* squares;      // [entries] written: which squares the footprint meets
   uint64_t* listed;       // [entries] written: those too that only wide pixels have pairs or tails in; null where
@@ -598,14 +598,15 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   test.gaussians = pass.values;
   test.saved = saved;
   test.radii = frame.images.radii;
-  test.mode = frame.config.mode;
+  test.mode = frame.config.blend.mode;
   test.image = image;
   test.tiles = tiles;
   test.macro_columns = grid.columns;
   test.tail_reach = list.bounds.tail_reach;
   test.squares = allocate<uint64_t>(scratch, capacity);
-  test.near_first = frame.config.blends_near_first();
-  const bool marks_some = has_tails(frame.config.mode) || test.near_first;  // of the pairs for which tiles are listed
+  test.near_first = frame.config.blend.blends_near_first();
+  // Whether marks are by some of the pairs for which tiles are listed.
+  const bool marks_some = has_tails(test.mode) || test.near_first;
   test.listed = marks_some ? allocate<uint64_t>(scratch, capacity) : nullptr;
   test.tile_counts = tile_counts;
   test_squares_kernel<<<resident_blocks(most_chunks), kChunk, 0, stream>>>(test);

@@ -22,7 +22,7 @@ template <class T> T* allocate_zeros(Scratch& scratch, int64_t count, cudaStream
 
 // Memory for what the depth sort sorts; null in a mode without a depth order.
 template <class S> DepthBits<S>* allocate_depths(const Frame<S>& frame, Scratch& scratch) {
-  if (!needs_depth_order(frame.config.mode)) return nullptr;
+  if (!needs_depth_order(frame.config.blend.mode)) return nullptr;
   return allocate<DepthBits<S>>(scratch, frame.inputs.num_gaussians);
 }
 
@@ -34,8 +34,8 @@ void add_pairs(const Work& work, int64_t* sum) {
 template <class S> InstanceCapacities::Key capacity_key(const Frame<S>& frame) {
   int device = 0;
   check(cudaGetDevice(&device), "asking for the device");
-  return InstanceCapacities::key(device, frame.camera.width, frame.camera.height, static_cast<int>(frame.config.mode),
-                                 frame.inputs.num_gaussians);
+  return InstanceCapacities::key(device, frame.camera.width, frame.camera.height,
+                                 static_cast<int>(frame.config.blend.mode), frame.inputs.num_gaussians);
 }
 
 // Returns for how many instances there will be room, 1 or more; 0 where there are more than are listed at once.

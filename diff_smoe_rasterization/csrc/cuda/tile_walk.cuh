@@ -34,7 +34,7 @@ template <class S> struct BlendArguments {
   ImageOutputs<S> images;     // [features, H, W], and the radii [N]
   bool marked;                // entries of lists are marked with quarters
   bool near_first;            // marks are by near pairs, and so are walks that are not wide
-  S wide_below, tail_reach;   // of RasterConfig
+  S wide_below, tail_reach;   // of BlendRules
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
@@ -48,9 +48,9 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   arguments.saved = frame.saved;
   arguments.images = frame.images;
   arguments.marked = marks_quarters(frame.inputs.num_gaussians);
-  arguments.near_first = frame.config.blends_near_first();
-  arguments.wide_below = frame.config.wide_below();
-  arguments.tail_reach = frame.config.tail_reach();
+  arguments.near_first = frame.config.blend.blends_near_first();
+  arguments.wide_below = frame.config.blend.wide_below();
+  arguments.tail_reach = frame.config.blend.tail_reach();
   arguments.pairs = work.pairs;
   return arguments;
 }
@@ -292,7 +292,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
   if (kVisitsTails<Visitor>) reach += arguments.tail_reach;
   loaded.meets = may_meet(gaussian.conic, gaussian.mean, reach, tile.rect);
   if (!tile.source.listed) {
-    const BlendMode mode = arguments.config.mode;
+    const BlendMode mode = arguments.config.blend.mode;
     const TileRect bounds = tile_bounds(mode, TileGrid(arguments.width, arguments.height), gaussian.mean,
                                         bounding_radius<S>(mode, arguments.images.radii, entry.gaussian));
     loaded.meets &=

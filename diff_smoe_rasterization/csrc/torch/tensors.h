@@ -162,11 +162,11 @@ template <class S> GaussianInputs<S> gaussian_inputs(const Inputs& inputs, const
 // What decides which pairs count and how they are blended.
 template <class S> RasterConfig<S> blend_config(const at::Tensor& background_gate, const Options& options) {
   RasterConfig<S> out;
-  out.mode = static_cast<BlendMode>(to_int(options.blend_mode));
-  out.background_gate = static_cast<S>(options.fixed_background_gate);
-  out.background_gate_at = data<S>(background_gate);
-  out.alpha_min = static_cast<float>(options.alpha_min);  // thresholds are float32 values in every scalar type
-  out.faint_below = static_cast<float>(options.faint_below);
+  out.blend.mode = static_cast<BlendMode>(to_int(options.blend_mode));
+  out.blend.background_gate = static_cast<S>(options.fixed_background_gate);
+  out.blend.background_gate_at = data<S>(background_gate);
+  out.blend.alpha_min = static_cast<float>(options.alpha_min);  // thresholds are float32 values in every scalar type
+  out.blend.faint_below = static_cast<float>(options.faint_below);
   out.most_instances = most_instances();
   return out;
 }

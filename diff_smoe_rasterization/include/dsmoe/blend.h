@@ -69,7 +69,7 @@ DSMOE_HD Gate<Real> evaluate_gate(Real power, S opacity, S least_alpha) {
 template <class Real> struct PixelEnd {
   Real transmittance;                  // T
   Real gate_sum;                       // W; ablations: sum alpha
-  Scalar<Real> background_gate;        // lambda
+  Scalar<Real> lambda;                 // of the background
   Real tails = Real(Scalar<Real>(0));  // B, where the mode has tails
 };
 
@@ -87,8 +87,8 @@ template <class Real> struct PixelState {
 
   static DSMOE_HD PixelState open() { return {Real(Scalar<Real>(1)), Real(Scalar<Real>(0))}; }
   DSMOE_HD Mask<Real> is_open() const { return transmittance > Real(Scalar<Real>(0)); }
-  DSMOE_HD PixelEnd<Real> end(Scalar<Real> background_gate) const {
-    return {abs(transmittance), gate_sum, background_gate, Real(Scalar<Real>(0))};
+  DSMOE_HD PixelEnd<Real> end(Scalar<Real> lambda) const {
+    return {abs(transmittance), gate_sum, lambda, Real(Scalar<Real>(0))};
   }
 };
 

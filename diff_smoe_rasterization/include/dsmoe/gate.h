@@ -43,8 +43,7 @@ template <class S> struct AlphaCut {
   S alpha_min;  // the caller's
   S faint;      // where pairs are cut by G: lambda / 255, and nothing inside 3 sigma
 
-  DSMOE_HD AlphaCut(S alpha_min, S background_gate)
-      : alpha_min(alpha_min), faint(static_cast<float>(background_gate) * kAlphaCut) {}
+  DSMOE_HD AlphaCut(S alpha_min, S lambda) : alpha_min(alpha_min), faint(static_cast<float>(lambda) * kAlphaCut) {}
   DSMOE_HD S of(S opacity) const { return max(alpha_min, min(faint, opacity * S(kCoreKernel))); }
 };
 

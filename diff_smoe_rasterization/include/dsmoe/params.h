@@ -10,6 +10,7 @@
 #include <optional>
 #include <string_view>
 
+#include "dsmoe/blend_rules.h"
 #include "dsmoe/project.h"
 
 namespace dsmoe {
@@ -74,20 +75,12 @@ template <class S> struct GaussianInputs {
 // Features that may follow the colour's channels: the flags of RasterConfig that its num_features counts.
 constexpr int kMostFurtherFeatures = 2;
 
-constexpr float kFaintBelowOfMode = -std::numeric_limits<float>::infinity();
-
 template <class S> struct RasterConfig {
-  BlendMode mode = BlendMode::kAlpha;
+  BlendRules<S> blend;
   int num_channels = 3;           // C
   const S* background = nullptr;  // [C]
   S scale_modifier = 1;
   S low_pass = S(kLowPass);  // px^2 added to the projected variances
-  S alpha_min = 0;           // SMoE modes: also skip alpha below this; kSmoe: such pairs are no strong ones
-  S background_gate = 0;     // lambda of kSmoe and kSmoeEq7, 0 or more
-  const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
-  // kSmoe, kSmoeEq7: faint pairs and tails count where the gate sum of near ones is less; 2: everywhere, 0: nowhere;
-  // kFaintBelowOfMode: as it is usual in the mode
-  S faint_below = S(kFaintBelowOfMode);
   bool antialiasing = false;
   bool clamp_color = true;  // colours from shs are at least 0
   bool depth = false;       // the expected depth is asked for
@@ -95,21 +88,8 @@ template <class S> struct RasterConfig {
   int num_threads = 1;                      // CPU backend; below 1 counts as 1
   int64_t most_instances = kMostInstances;  // that are listed at once, 1 or more
 
-  DSMOE_HD S gate_of_background() const {
-    return background_gate_at != nullptr ? *background_gate_at : background_gate;
-  }
-  DSMOE_HD AlphaCut<S> alpha_cut() const {
-    return {alpha_min, cut_of(mode) == Cut::kKernel ? gate_of_background() : S(0)};
-  }
-  DSMOE_HD S wide_below() const { return faint_below == S(kFaintBelowOfMode) ? S(faint_below_of(mode)) : faint_below; }
-  // Whether a pixel is first blended with its near pairs only.
-  DSMOE_HD bool blends_near_first() const { return near_first(mode) && wide_below() <= S(1); }
-  // What the tails reach beyond the strong pairs: is added to the squared reach of a footprint where tiles are listed.
-  DSMOE_HD S tail_reach() const {
-    return has_tails(mode) ? S(2) * log(max(alpha_min, S(kStrongAlpha)) / S(kTailAlpha)) : S(0);
-  }
   DSMOE_HD ProjectionRules<S> projection_rules() const {
-    return {mode, scale_modifier, alpha_cut(), low_pass, antialiasing, inverse_depth};
+    return {blend.mode, scale_modifier, blend.alpha_cut(), low_pass, antialiasing, inverse_depth};
   }
   DSMOE_HD int num_features() const { return num_channels + depth + inverse_depth; }
   DSMOE_HD void leave_out_further_features() { depth = inverse_depth = false; }

@@ -31,7 +31,7 @@ template <BlendMode kMode, class Real>
 DSMOE_HD FeatureEnd<Real> feature_end(FeatureRule rule, const PixelEnd<Real>& end) {
   using S = Scalar<Real>;
   const bool averaged = rule == FeatureRule::kAveraged, divides = averaged || Blend<kMode>::kDivides;
-  const S gate = averaged ? S(0) : Blend<kMode>::background_gate(end.background_gate);
+  const S gate = averaged ? S(0) : Blend<kMode>::background_gate(end.lambda);
   const Real moving = Real(gate) * end.transmittance;
   const Real weight = Blend<kMode>::kTails && !averaged ? moving + end.tails : moving;
   // Where nothing is divided the gate sum is not read: it is an image of the caller's, who may have changed it.
@@ -47,9 +47,9 @@ DSMOE_HD Real finish_feature(FeatureRule rule, const PixelEnd<Real>& end, Real s
 
 // What one feature of a pixel hands on.
 template <class Real> struct FeatureBackward {
-  Real scaled;           // g', to the experts
-  Real background;       // dL/dbackground
-  Real background_gate;  // dL/dlambda
+  Real scaled;      // g', to the experts
+  Real background;  // dL/dbackground
+  Real lambda;      // dL/dlambda
 };
 
 // Adds one feature's share to b and R. value is the finished feature of the pixel.
@@ -77,7 +77,7 @@ template <BlendMode kMode, class Real> DSMOE_HD Real finish_alpha(const PixelEnd
 // A pixel where its backward pass begins, and dL/dlambda of its alpha.
 template <class Real> struct BackwardBegin {
   PixelBackward<Real> pixel;
-  Real background_gate;
+  Real lambda;
 };
 
 // Starts a pixel's backward pass; the features join one by one through add_feature. dL_dalpha: by the alpha image.
@@ -88,7 +88,7 @@ DSMOE_HD BackwardBegin<Real> begin_backward(const PixelEnd<Real>& end, Real dL_d
   PixelBackward<Real> pixel = {end.transmittance, zero, zero};
   const auto by = add_feature<kMode>(FeatureRule::kBlended, pixel, end, dL_dalpha, finish_alpha<kMode>(end), zero);
   pixel.base = pixel.base - by.scaled;
-  return {pixel, by.background_gate};
+  return {pixel, by.lambda};
 }
 
 }  // namespace dsmoe

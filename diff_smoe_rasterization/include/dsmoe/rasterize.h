@@ -70,7 +70,7 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame) {
   sizes.num_features = frame.config.num_features();
   sizes.tiles = num_tiles(frame.camera.width, frame.camera.height);
   sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
-  sizes.tails = has_tails(frame.config.mode);
+  sizes.tails = has_tails(frame.config.blend.mode);
   return sizes;
 }
 

@@ -168,7 +168,7 @@ template <class S> SavedSizes saved_sizes(const Frame<S>& frame, const Run& run)
   sizes.pixels = static_cast<int64_t>(frame.camera.width) * frame.camera.height;
   sizes.segments =
       run.for_backward && !run.deterministic && sizeof(S) == sizeof(float) && sizes.num_features == kFastFeatures;
-  sizes.tails = has_tails(frame.config.mode);
+  sizes.tails = has_tails(frame.config.blend.mode);
   return sizes;
 }
 

@@ -20,7 +20,7 @@ int main() {
   frame.camera.width = frame.camera.height = kSize;
   frame.camera.tan_fov_x = frame.camera.tan_fov_y = kTanFov;
   for (int i = 0; i < 16; ++i) frame.camera.view[i] = kView[i], frame.camera.projection[i] = kProjection[i];
-  frame.config.mode = dsmoe::BlendMode::kSmoe;
+  frame.config.blend.mode = dsmoe::BlendMode::kSmoe;
   frame.config.background = kBackground;
   frame.images.color = color.data();
   frame.images.gate_sum = gate_sum.data();

@@ -66,7 +66,7 @@ int main() {
   frame.camera.view = view.get();
   frame.camera.projection = projection.get();
   frame.camera.position = position.get();
-  frame.config.mode = dsmoe::BlendMode::kSmoe;
+  frame.config.blend.mode = dsmoe::BlendMode::kSmoe;
   frame.config.background = background.get();
   frame.images.color = color.get();
   frame.images.gate_sum = gate_sum.get();

@@ -106,11 +106,11 @@ TEST_P(Modes, GradientsAreTheCores) {
   std::copy_n(data(scene.settings.campos), 3, camera.position);
   auto& config = frame.config;
   dsmoe::BlendModes::for_each([&](auto mode) {
-    if (std::string(GetParam()) == dsmoe::Blend<decltype(mode)::value>::kName) config.mode = mode();
+    if (std::string(GetParam()) == dsmoe::Blend<decltype(mode)::value>::kName) config.blend.mode = mode();
   });
   config.background = data(scene.settings.bg);
-  config.background_gate = config.mode == dsmoe::BlendMode::kAlpha ? 1 : 0;
-  if (scene.settings.background_gate) config.background_gate_at = data(scene.settings.background_gate->tensor);
+  config.blend.background_gate = config.blend.mode == dsmoe::BlendMode::kAlpha ? 1 : 0;
+  if (scene.settings.background_gate) config.blend.background_gate_at = data(scene.settings.background_gate->tensor);
   config.depth = config.inverse_depth = true;
   const at::Tensor color = at::zeros({3, kSize, kSize}, at::kDouble), alpha = at::zeros({kSize, kSize}, at::kDouble);
   const at::Tensor depth = at::zeros_like(alpha), inverse_depth = at::zeros_like(alpha);
@@ -166,7 +166,8 @@ TEST_P(Modes, GradientsAreTheCores) {
   const auto tensors = scene.tensors();
   constexpr size_t kBackground = 7;
   // The ablations see it only where no gate is open, and here one is everywhere.
-  const bool sees_background = config.mode != dsmoe::BlendMode::kSmoeTn && config.mode != dsmoe::BlendMode::kSmoeStd;
+  const bool sees_background =
+      config.blend.mode != dsmoe::BlendMode::kSmoeTn && config.blend.mode != dsmoe::BlendMode::kSmoeStd;
   for (size_t i = 0; i < tensors.size(); ++i) {
     ASSERT_TRUE(tensors[i]->grad().defined()) << "tensor " << i;
     EXPECT_TRUE(at::equal(tensors[i]->grad(), own[i])) << "tensor " << i;

@@ -21,7 +21,7 @@ namespace {
 // What a rendering and its backward pass leave.
 template <class S> struct Results {
   explicit Results(const Scene<S>& scene)
-      : mode(scene.config.mode),
+      : mode(scene.config.blend.mode),
         rendering(scene),
         weights(scene, 7),
         gradient(scene),
@@ -75,7 +75,7 @@ Results<double> on_cpu(const Scene<double>& scene, const std::vector<bool>& unsu
   cpu::forward(frame, heap);
   out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
     cpu::contributions(frame, contributions);
-    if (is_removable(frame.config.mode)) cpu::importance(frame, importance);
+    if (is_removable(frame.config.blend.mode)) cpu::importance(frame, importance);
   });
   cpu::backward(frame, out.gradients());
   return out;
@@ -130,7 +130,7 @@ Results<float> by_kernels(const Scene<float>& scene, const std::vector<bool>& un
   if (how.weighs) {
     out.weigh(unsure, [&](const auto& contributions, const auto& importance) {
       cuda::contributions(frame, contributions, work);
-      if (is_removable(frame.config.mode)) cuda::importance(frame, importance, work);
+      if (is_removable(frame.config.blend.mode)) cuda::importance(frame, importance, work);
     });
   }
   cuda::backward(frame, out.gradients(), run, memory);
@@ -189,12 +189,12 @@ void expect_cpu(const Scene<double>& of, const How& how = {}) {
 // A scene in all its modes, with and without a gate of the background where the mode has one, and with the rule for
 // faint pairs that is not usual in the mode.
 template <BlendMode kMode> std::vector<Scene<double>> in_mode(Scene<double> scene) {
-  scene.config.mode = kMode;
+  scene.config.blend.mode = kMode;
   scene.background.back() = 0;
   std::vector<Scene<double>> scenes = {scene};
   if (Blend<kMode>::kLearnsGate) scene.background.back() = 0.03, scenes.push_back(scene);
   if (Blend<kMode>::kNearFirst) {
-    scene.config.faint_below = Blend<kMode>::kFaintBelow < 1 ? kFaintEverywhere : kFaintBelow;
+    scene.config.blend.faint_below = Blend<kMode>::kFaintBelow < 1 ? kFaintEverywhere : kFaintBelow;
     scenes.push_back(scene);
   }
   return scenes;
@@ -402,7 +402,7 @@ TEST(Kernels, PackNoFootprintsThatAreNotThere) {
 // Where pixels do not stop, both passes evaluate all pairs of the entries that meet a square.
 TEST(Kernels, CountThePairsOfBothPasses) {
   Scene<double> scene = long_lists();
-  scene.config.mode = BlendMode::kSmoeTn;
+  scene.config.blend.mode = BlendMode::kSmoeTn;
   StageTimes times;
   by_kernels(convert<float>(scene), std::vector<bool>(scene.pixels(), false), {false, kMostInstances, false, &times});
   EXPECT_GT(times.backward_pairs, 0);

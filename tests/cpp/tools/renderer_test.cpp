@@ -39,7 +39,8 @@ View make_view() {
 
 RenderOptions options_of(BlendMode mode) {
   RenderOptions options;
-  options.blend = {mode, mode == BlendMode::kSmoe ? 0.05 : 0};
+  options.blend.mode = mode;
+  if (mode == BlendMode::kSmoe) options.blend.background_gate = 0.05;
   options.background = {0.1f, 0.5f, 0.9f};
   options.depth = options.gate_map = true;
   return options;
