@@ -4,6 +4,7 @@
 #pragma once
 
 #include <algorithm>
+#include <iterator>
 #include <stdexcept>
 #include <string>
 #include <string_view>
@@ -103,13 +104,14 @@ template <class Backend> void rasterize(Arguments& arguments) {
   RenderingCall<Backend> call("rasterize", arguments);
   const Inputs& inputs = call.inputs;
   const Options& options = call.options;
-  const Images images = allocate_images(inputs[kMeans3D], image_sizes(inputs), options);
+  Images images = allocate_images(inputs[kMeans3D], image_sizes(inputs), options);
   TensorMemory memory(inputs[kMeans3D]);
   call.run([&](auto zero) { Backend::template forward<decltype(zero)>(inputs, options, images, memory); });
   if (options.debug) {
     for (Image image : kDifferentiable) refuse_nan(std::string("rasterize: ") + kImageNames[image], images[image]);
   }
-  arguments.give_back_with_list({images.begin(), images.end()}, memory.take_saved());
+  arguments.give_back_with_list(Tensors(std::make_move_iterator(images.begin()), std::make_move_iterator(images.end())),
+                                memory.take_saved());
 }
 
 template <class Backend> void radii(Arguments& arguments) {
@@ -275,7 +277,7 @@ template <class Backend> void blend(Arguments& arguments) {
   memory.give(0, of.gates), memory.give(1, of.features.view({-1}));
   dispatch("blend", of.gates, [&](auto zero) { Backend::template blend<decltype(zero)>(of, options, images, memory); });
   Tensors results;
-  for (const Image image : kDifferentiable) results.push_back(images[image]);
+  for (const Image image : kDifferentiable) results.push_back(std::move(images[image]));
   arguments.give_back_with_list(results, memory.take_saved());
 }
 

@@ -7,21 +7,29 @@ namespace dsmoe {
 namespace binding {
 namespace {
 
-// Numbers of sizes and strides, without memory of their own for what tensors usually have.
-std::vector<int64_t> dense_strides(const Sizes& sizes) {
-  std::vector<int64_t> strides(sizes.size());
-  int64_t stride = 1;
-  for (size_t i = sizes.size(); i-- > 0;) {
-    strides[i] = stride;
-    stride *= std::max<int64_t>(sizes.data()[i], 1);
+// The strides of a dense tensor.
+class DenseStrides {
+ public:
+  explicit DenseStrides(const Sizes& sizes) {
+    if (sizes.size() > few_.size()) many_.resize(sizes.size());
+    int64_t* const strides = many_.empty() ? few_.data() : many_.data();
+    int64_t stride = 1;
+    for (size_t i = sizes.size(); i-- > 0;) {
+      strides[i] = stride;
+      stride *= std::max<int64_t>(sizes.data()[i], 1);
+    }
   }
-  return strides;
-}
+  const int64_t* data() const { return many_.empty() ? few_.data() : many_.data(); }
+
+ private:
+  std::array<int64_t, 4> few_;  // what tensors usually have
+  std::vector<int64_t> many_;
+};
 
 int32_t number_of(ScalarType type) { return torch::stable::detail::to<int32_t>(torch::stable::detail::from(type)); }
 
 Tensor new_tensor(const Sizes& sizes, int32_t type, const Device& device) {
-  const std::vector<int64_t> strides = dense_strides(sizes);
+  const DenseStrides strides(sizes);
   AtenTensorHandle handle = nullptr;
   if (aoti_torch_empty_strided(static_cast<int64_t>(sizes.size()), sizes.data(), strides.data(), type, device.type(),
                                device.index(), &handle) != TORCH_SUCCESS) {
@@ -70,13 +78,10 @@ std::ostream& operator<<(std::ostream& out, const Sizes& sizes) {
   return out << "]";
 }
 
-Tensor::Tensor(AtenTensorHandle own)
-    : handle_(own, [](AtenTensorHandle handle) {
-        if (handle != nullptr) aoti_torch_delete_tensor_object(handle);
-      }) {
+Tensor::Tensor(AtenTensorHandle own) : owner_(std::make_shared<Owner>(own)) {
   bool is_defined = false;
   check_call(aoti_torch_is_defined(own, &is_defined), "is_defined");
-  if (!is_defined) handle_ = nullptr;
+  if (!is_defined) owner_ = nullptr;
 }
 
 AtenTensorHandle Tensor::new_handle() const {
@@ -87,6 +92,11 @@ AtenTensorHandle Tensor::new_handle() const {
     check_call(aoti_torch_new_uninitialized_tensor(&handle), "new_uninitialized_tensor");
   }
   return handle;
+}
+
+AtenTensorHandle Tensor::release() {
+  if (owner_.use_count() != 1) return new_handle();
+  return std::exchange(std::exchange(owner_, nullptr)->handle, nullptr);
 }
 
 int64_t Tensor::dim() const {
@@ -166,10 +176,10 @@ Tensor empty(Sizes sizes, const Tensor& like, ScalarType type) {
   return new_tensor(sizes, number_of(type), like.device());
 }
 
-StableIValue to_value(const Tensors& tensors) {
+StableIValue to_value(Tensors tensors) {
   StableListHandle list;
   check_call(torch_new_list_reserve_size(tensors.size(), &list), "list");
-  for (const Tensor& tensor : tensors) check_call(torch_list_push_back(list, to_value(tensor)), "list");
+  for (Tensor& tensor : tensors) check_call(torch_list_push_back(list, to_value(std::move(tensor))), "list");
   return torch::stable::detail::from(list);
 }
 

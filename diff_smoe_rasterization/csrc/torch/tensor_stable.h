@@ -84,10 +84,11 @@ class Tensor {
  public:
   Tensor() = default;                     // undefined
   explicit Tensor(AtenTensorHandle own);  // takes the handle; undefined where that tensor is
-  AtenTensorHandle get() const { return handle_.get(); }
+  AtenTensorHandle get() const { return owner_->handle; }
   AtenTensorHandle new_handle() const;  // another one, which the caller owns
+  AtenTensorHandle release();           // the same, where this is the last reference; undefined from then on
 
-  bool defined() const { return handle_ != nullptr; }
+  bool defined() const { return owner_ != nullptr; }
   int64_t dim() const;
   int64_t size(int64_t dim) const;
   Sizes sizes() const;
@@ -106,7 +107,16 @@ class Tensor {
   void copy_(const Tensor& from) const;
 
  private:
-  std::shared_ptr<AtenTensorOpaque> handle_;
+  struct Owner {
+    explicit Owner(AtenTensorHandle handle) : handle(handle) {}
+    ~Owner() {
+      if (handle != nullptr) aoti_torch_delete_tensor_object(handle);
+    }
+    Owner(const Owner&) = delete;
+    Owner& operator=(const Owner&) = delete;
+    AtenTensorHandle handle;
+  };
+  std::shared_ptr<Owner> owner_;
 };
 using OptionalTensor = std::optional<Tensor>;
 using Tensors = std::vector<Tensor>;
@@ -115,10 +125,12 @@ Tensor empty(Sizes sizes, const Tensor& like);
 Tensor empty(Sizes sizes, const Tensor& like, ScalarType type);
 inline Tensor empty_like(const Tensor& like) { return empty(like.sizes(), like); }
 
+// What libtorch takes over.
 inline StableIValue to_value(const Tensor& tensor) { return torch::stable::detail::from(tensor.new_handle()); }
+inline StableIValue to_value(Tensor&& tensor) { return torch::stable::detail::from(tensor.release()); }
 inline StableIValue to_value(int64_t value) { return torch::stable::detail::from(value); }
 inline StableIValue to_value(bool value) { return torch::stable::detail::from(value); }
-StableIValue to_value(const Tensors& tensors);
+StableIValue to_value(Tensors tensors);
 StableIValue to_value(const std::vector<int64_t>& numbers);
 
 // Calls an op of PyTorch by the name and the arguments of its schema. Returns its first result.
@@ -196,16 +208,16 @@ class Arguments {
     return value;
   }
 
-  template <class... Results> void give_back(const Results&... results) {
+  template <class... Results> void give_back(Results&&... results) {
     size_t next = 0;
-    ((stack_[next++] = to_value(results)), ...);
+    ((stack_[next++] = to_value(std::forward<Results>(results))), ...);
   }
 
   // The same of tensors, and of a list behind them.
-  void give_back_with_list(const Tensors& tensors, const Tensors& list) {
+  void give_back_with_list(Tensors tensors, Tensors list) {
     size_t next = 0;
-    for (const Tensor& tensor : tensors) stack_[next++] = to_value(tensor);
-    stack_[next] = to_value(list);
+    for (Tensor& tensor : tensors) stack_[next++] = to_value(std::move(tensor));
+    stack_[next] = to_value(std::move(list));
   }
 
  private:
