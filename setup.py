@@ -169,6 +169,8 @@ def extension():
     ops = ["torch", "stable_abi" if stable else "torch_cpp"] + ([] if without_cuda else ["torch_cuda"])
     groups = ["core", "io"] + ([] if without_cuda else ["cuda"]) + ([] if stable else ops)
     libraries = {group: path for group, path in compiled_libraries(torch).items() if group in groups}
+    if stable:
+        libraries.pop("io", None)  # torch builds no library of no source
     flags = sources["flags"] + ["-g0", "-pthread"]
     if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
         flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
