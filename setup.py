@@ -30,7 +30,6 @@ USUAL_CARDS = (80, 90)
 SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
 # The oldest PyTorch whose stable ABI has what the ops take, and the oldest Python that it supports.
 STABLE_ABI_SINCE, STABLE_PYTHON = "2.11", "cp310"
-FOLDERS_INSTALLED_INSIDE = ("integrations", "patches", "benchmarks")
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
 
 
@@ -189,12 +188,13 @@ def extension():
                          "-Wl,--whole-archive", *libraries.values(), "-Wl,--no-whole-archive"],
     )
     library.libraries.remove("torch_python")
-    macros = [] if without_cuda else [("DSMOE_WITH_CUDA", None), ("USE_CUDA", None)]
+    macros = [] if without_cuda else [("DSMOE_WITH_CUDA", None)]
     if stable:
         major, minor = map(int, STABLE_ABI_SINCE.split("."))
         macros += [("DSMOE_STABLE_ABI", None), ("TORCH_TARGET_VERSION", f"0x{major:02x}{minor:02x}000000000000")]
         # With its own CUDA runtime it needs none of PyTorch's libraries.
         library.libraries = [] if without_cuda else ["cudart_static", "dl", "rt"]
+        macros += [] if without_cuda else [("USE_CUDA", None)]  # by which PyTorch declares its functions of CUDA
     module = (make if stable else cpp_extension.CppExtension)(
         f"{PACKAGE}._C",
         [f"{PACKAGE}/{path}" for group in ["python"] + (ops if stable else []) for path in sources[group]],
@@ -248,22 +248,7 @@ def commit():
         return None
 
 
-def packages():
-    """Returns the arguments of setup() that say which folder is which package."""
-    inside = [name for name in FOLDERS_INSTALLED_INSIDE if (ROOT / name / "__init__.py").is_file()]
-    folders = {PACKAGE: PACKAGE, **{f"{PACKAGE}.{name}": name for name in inside}}
-    names = list(folders)
-    for name, folder in folders.items():
-        names += [f"{name}.{child}" for child in setuptools.find_packages(str(ROOT / folder))]
-    data = {PACKAGE: ["include/dsmoe/*.h", "csrc/io/*.h", "cmake/*.cmake", "py.typed"],
-            f"{PACKAGE}.export": ["page/*"],
-            f"{PACKAGE}.patches": ["shims/*/*.py", "stand_ins/*/*.py"],  # no packages of ours
-            f"{PACKAGE}.benchmarks.suite": ["Snakefile", "shipped/*.yaml", "shipped/scenes/*.yaml"],
-            f"{PACKAGE}.benchmarks.suite.report": ["*.json", "page.*", "table.*"]}
-    return {"packages": names, "package_dir": folders, "package_data": data}
-
-
 if __name__ == "__main__":
     if int(setuptools.__version__.split(".")[0]) < 61:  # it would ignore pyproject.toml and install "UNKNOWN 0.0.0"
         sys.exit(f"setuptools {setuptools.__version__} is too old; type: pip install 'setuptools>=61,<82'; build again")
-    setuptools.setup(**packages(), **(extension() if COMMANDS_THAT_COMPILE & set(sys.argv) else {}))
+    setuptools.setup(**(extension() if COMMANDS_THAT_COMPILE & set(sys.argv) else {}))

@@ -3,8 +3,11 @@
     from diff_smoe_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 
 as with Inria's rasterizer of 2023; `blend_mode` in the settings is the one addition. `rasterize` is the full function.
+
+A module is imported when one of its names is first used: importing torch takes seconds, and `settings` and the help of
+`dsmoe` need none of it. Only where torch is loaded already, all names are imported at once, which registers the ops.
 """
-import os
+import importlib
 import sys
 from typing import TYPE_CHECKING, Any, List
 
@@ -33,8 +36,6 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    import importlib
-
     if name in _HOMES.values():
         return importlib.import_module("." + name, __name__)
     if name not in _HOMES:
@@ -47,22 +48,12 @@ def __dir__() -> List[str]:
     return sorted({*globals(), *_HOMES, *_HOMES.values()})
 
 
-# What is plain Python (settings, reference, the help of `dsmoe`) works without the compiled part; the names above
-# say why they cannot be had when they are asked for. To load it takes seconds where torch is not loaded yet, so a
-# program pays for it when it asks for one of them. Where torch is loaded, the import registers torch's ops at once,
-# as programs expect that load an exported model; but for `dsmoe`, which does so where it renders.
-if "torch" in sys.modules and os.path.basename((getattr(sys, "argv", None) or [""])[0]) != "dsmoe":
+if "torch" in sys.modules:
     try:
         for _name in _HOMES:
             __getattr__(_name)
-    except ImportError:
+    except ImportError:  # not built; the first name that is used says so
         pass
-
-# setup.py installs the folders integrations, patches and benchmarks inside the package. In a source tree they lie
-# beside it, where its submodules are then looked for too. Beside an installed package such folders are a stranger's.
-_beside = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
-if all(os.path.isfile(os.path.join(_beside, *path)) for path in (("sources.txt",), ("build_support", "backend.py"))):
-    __path__.append(_beside)
 
 __all__ = ["BLEND_MODES", "Contributions", "DirectRendering", "Footprints", "FusedAdam",
            "GaussianRasterizationSettings", "GaussianRasterizer", "Importance", "LazyAdam", "OUTPUTS", "Rendering",

@@ -46,11 +46,9 @@ def _load() -> Any:
     except ModuleNotFoundError as error:
         if error.name != f"{__package__}._C":
             raise
-        folder = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-        elsewhere = (f" ({folder} was imported; a package installed elsewhere is found from another folder, or by "
-                     "python -I)") if os.path.isfile(os.path.join(folder, "sources.txt")) else ""
-        _fail(f"its extension _C is not built for this Python{elsewhere}; in the source folder type: "
-              "pip install --no-build-isolation .", error)
+        folder = os.path.dirname(os.path.abspath(__file__))
+        _fail(f"its extension _C is not built for this Python in {folder}; in the source folder type: "
+              "pip install --no-build-isolation -e .", error)
     except ImportError as error:
         _fail((f"its extension does not load ({error}); it was built against torch "
                f"{built_against or 'of another build'}, and torch {torch.__version__} is running; ") + _BUILD_AGAIN,
@@ -73,9 +71,10 @@ BACKENDS = ("cpu", "cuda") if _built_with_cuda() else ("cpu",)
 def build_info() -> Dict[str, Any]:
     """Returns what this build is and what it runs on.
 
-    Keys: version, torch (running), torch_built_with, stable_abi_since (the oldest torch that this build works with; None
-    where torch_built_with is the only one), compiler, cuda_built, without_cuda_because (None where it is built or the
-    build left no word), simd_level ("avx512", "avx2" or "baseline"), num_threads (torch's, which the CPU backend uses).
+    Keys: version, torch (running), torch_built_with, stable_abi_since (the oldest torch that this build works with;
+    None where torch_built_with is the only one), compiler, cuda_built, without_cuda_because (None where it is built or
+    the build left no word), simd_level ("avx512", "avx2" or "baseline"), num_threads (torch's, which the CPU backend
+    uses).
     """
     return {"version": __version__, "torch": torch.__version__, **_C.build_info(),
             "stable_abi_since": _recorded("STABLE_ABI_SINCE"),

@@ -10,9 +10,9 @@ import torch
 from diff_smoe_rasterization import FusedAdam, distCUDA2, io, rasterize
 from diff_smoe_rasterization.losses import l1_ssim_loss
 from diff_smoe_rasterization.settings import record_of
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.scenes.synthetic import write_synthetic_scene
+from dsmoe.config import TrainConfig
+from dsmoe.scenes.scene import load_scene
+from dsmoe.scenes.synthetic import write_synthetic_scene
 
 RATES = {"means3D": 5e-4, "dc": 0.01, "opacities": 0.05, "scales": 0.01, "rotations": 0.002}  # of Adam, as in 3DGS
 

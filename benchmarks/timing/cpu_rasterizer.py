@@ -27,7 +27,7 @@ import models
 import torch
 
 from diff_smoe_rasterization import BLEND_MODES, build_info, rasterize, set_profiling, stage_times
-from diff_smoe_rasterization.trainer.system.environment import processor_name
+from dsmoe.system.environment import processor_name
 
 STAGES = ("project", "sort", "bin", "blend", "blend_backward", "project_backward")
 PAIRS = ("forward_pairs", "backward_pairs")

@@ -20,15 +20,15 @@ import models
 import numpy as np
 import torch
 
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.distributed.batch import Batch
-from diff_smoe_rasterization.trainer.distributed.shards import run_of
-from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
-from diff_smoe_rasterization.trainer.scenes.images import View
-from diff_smoe_rasterization.trainer.scenes.pointcloud import PointCloud
-from diff_smoe_rasterization.trainer.scenes.scene import Scene
-from diff_smoe_rasterization.trainer.system.environment import machine, versions
-from diff_smoe_rasterization.trainer.system.group import join_group, leave_group
+from dsmoe.config import TrainConfig
+from dsmoe.distributed.batch import Batch
+from dsmoe.distributed.shards import run_of
+from dsmoe.distributed.trainer import BatchTrainer
+from dsmoe.scenes.images import View
+from dsmoe.scenes.pointcloud import PointCloud
+from dsmoe.scenes.scene import Scene
+from dsmoe.system.environment import machine, versions
+from dsmoe.system.group import join_group, leave_group
 
 
 def rows_of(packed: Dict[str, torch.Tensor], copies: int, begin: int, end: int) -> Dict[str, torch.Tensor]:

@@ -19,7 +19,7 @@ from gpu_renderers import Ours, ours
 from gpu_worker import event_milliseconds, num_instances, wake_the_clocks
 
 from diff_smoe_rasterization import autograd, direct, extension
-from diff_smoe_rasterization.cli import main as dsmoe
+from dsmoe.cli import main as dsmoe
 
 LEARNED = 70  # calls after which room is what was seen, and an eighth more
 LEAST_INSTANCES = 2 * 65_536  # more than there is room for where nothing is visible

@@ -12,7 +12,7 @@ from typing import Dict, List, Type
 import torch
 from models import Model, mode_and_gate
 
-from diff_smoe_rasterization.trainer.scenes.cameras import Camera
+from dsmoe.scenes.cameras import Camera
 
 NEAR = 0.2
 FAR = 1e4  # for the peers that take a far plane; beyond every Gaussian

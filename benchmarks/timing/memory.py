@@ -16,7 +16,7 @@ import torch
 from models import Model
 
 from diff_smoe_rasterization import rasterize
-from diff_smoe_rasterization.trainer.scenes.cameras import Camera
+from dsmoe.scenes.cameras import Camera
 
 UNITS = ("Gaussian", "pixel", "tile instance")
 LIMITS = dict(zip(UNITS, (200, 64, 72)))  # bytes of float32 renderings with three channels

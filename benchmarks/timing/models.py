@@ -13,10 +13,10 @@ from diff_smoe_rasterization.settings import (
     resolve_background_gate,
     resolve_blend_mode,
 )
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.results.modelfile import load_model
-from diff_smoe_rasterization.trainer.scenes.cameras import Camera
-from diff_smoe_rasterization.trainer.scenes.scene import load_cameras
+from dsmoe.config import TrainConfig
+from dsmoe.results.modelfile import load_model
+from dsmoe.scenes.cameras import Camera
+from dsmoe.scenes.scene import load_cameras
 
 
 def mode_and_gate(blend: str) -> Tuple[str, Optional[float]]:

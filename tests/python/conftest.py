@@ -11,7 +11,7 @@ import torch
 from devices import without_cuda_because
 
 from diff_smoe_rasterization.settings import BLEND_MODES
-from diff_smoe_rasterization.trainer.results import scalars
+from dsmoe.results import scalars
 
 
 def pytest_addoption(parser):

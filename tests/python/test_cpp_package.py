@@ -15,8 +15,8 @@ import torch
 import diff_smoe_rasterization
 from diff_smoe_rasterization import extension
 from diff_smoe_rasterization import settings as settings_module
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.scenes.synthetic import write_synthetic_scene
+from dsmoe.cli import main
+from dsmoe.scenes.synthetic import write_synthetic_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 INSTALLED = Path(diff_smoe_rasterization.__file__).parent
@@ -223,7 +223,7 @@ def test_the_cpp_trainer_is_as_good_as_pythons(tmp_path_factory, tmp_path, optio
     """Same scene, recipe and number of steps; the order of views and the places of split Gaussians are others."""
     folder = tmp_path_factory.getbasetemp() / "cpp_trainer"
     if not (folder / "train").is_file():
-        build(ROOT / "integrations" / "libtorch", folder, "-DCMAKE_BUILD_TYPE=Release")
+        build(ROOT / "examples" / "libtorch", folder, "-DCMAKE_BUILD_TYPE=Release")
     write_synthetic_scene(str(tmp_path / "scene"), views=24, width=100, height=75, points=1000, supersampling=1)
     printed = run(folder / "train", tmp_path / "scene", tmp_path / "cpp", "--iterations", "300", *options)
     ours = float(re.search(r"test PSNR ([0-9.]+) dB", printed).group(1))

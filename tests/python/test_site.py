@@ -34,7 +34,7 @@ def test_every_link_of_a_page_leads_somewhere(stage):
 
 
 def test_every_dsmoe_command_of_a_page_can_be_typed(stage):
-    from diff_smoe_rasterization.cli import build_parser
+    from dsmoe.cli import build_parser
 
     typed = []
     for page in stage.markdown_files():

@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from diff_smoe_rasterization.trainer.scenes.synthetic import write_synthetic_scene
+from dsmoe.scenes.synthetic import write_synthetic_scene
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -4,7 +4,7 @@ import sys
 import time
 from pathlib import Path
 
-COMMAND = [sys.executable, "-m", "diff_smoe_rasterization", "bench"]
+COMMAND = [sys.executable, "-m", "dsmoe", "bench"]
 
 
 def tiny_suite(scene):

@@ -3,7 +3,7 @@ import json
 
 from PIL import Image
 
-from diff_smoe_rasterization.benchmarks.suite.names import blend_of
+from dsmoe.bench.names import blend_of
 
 PROTOCOL = {"split": "sorted by name, every 8th is a test image", "resolution": -1, "image_size": [48, 32],
             "downscaler": "pillow bicubic", "background": "black", "principal_point": "scene",

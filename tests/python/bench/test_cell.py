@@ -8,11 +8,11 @@ import pytest
 from bench_commands import python_that
 from checkouts import environment
 
-from diff_smoe_rasterization.benchmarks.suite import cell as cells
-from diff_smoe_rasterization.benchmarks.suite.expansion import expand
-from diff_smoe_rasterization.benchmarks.suite.methods import native
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.errors import TrainerError
+from dsmoe.bench import cell as cells
+from dsmoe.bench.expansion import expand
+from dsmoe.bench.methods import native
+from dsmoe.cli import main
+from dsmoe.errors import TrainerError
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_the_process_of_a_cell_is_told_its_gpus_and_how_many_have_them(gpus, tol
 @pytest.mark.parametrize("module", ["cell", "engine", "report"])
 def test_what_needs_no_torch_does_not_load_it(module):
     """It takes seconds, of each cell once more."""
-    program = f"import sys, diff_smoe_rasterization.benchmarks.suite.{module}; sys.exit('torch' in sys.modules)"
+    program = f"import sys, dsmoe.bench.{module}; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True, env=environment())
 
 

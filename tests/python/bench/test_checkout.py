@@ -21,12 +21,12 @@ from bench_commands import python_that, wait_for
 from checkouts import HERE, PACKAGE_PARENT, PACKAGES, contents, make_checkout, make_scene
 from PIL import Image
 
-from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite import preparation
-from diff_smoe_rasterization.benchmarks.suite.cell import work
-from diff_smoe_rasterization.benchmarks.suite.expansion import expand
-from diff_smoe_rasterization.benchmarks.suite.methods import checkout as shapes
-from diff_smoe_rasterization.benchmarks.suite.methods import observer
+from dsmoe.bench import preparation
+from dsmoe.bench.cell import work
+from dsmoe.bench.errors import BenchError
+from dsmoe.bench.expansion import expand
+from dsmoe.bench.methods import checkout as shapes
+from dsmoe.bench.methods import observer
 
 ITERATIONS = 7
 
@@ -253,7 +253,7 @@ def test_a_trainer_ends_with_its_cell(small, tmp_path):
     cell, pid = tmp_path / "cell.json", tmp_path / "pid"
     python = python_that(f"echo $$ >{pid}.part\nmv {pid}.part {pid}\nexec sleep 600\n", tmp_path)
     cell.write_text(json.dumps(small("3dgs-2023", python=python)))
-    run = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization.benchmarks.suite.cell", str(cell),
+    run = subprocess.Popen([sys.executable, "-m", "dsmoe.bench.cell", str(cell),
                             str(tmp_path / "out")], cwd=str(tmp_path))
     wait_for(pid.is_file, 60)
     run.terminate()

@@ -16,14 +16,14 @@ import yaml
 from bench_commands import COMMAND, python_that, rows_of, tiny_suite, wait_for
 from checkouts import environment
 
-from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite import engine
-from diff_smoe_rasterization.benchmarks.suite.cell import failed_row
-from diff_smoe_rasterization.benchmarks.suite.expansion import expand
-from diff_smoe_rasterization.benchmarks.suite.names import blend_of
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.system.output_folder import Record, write_record
+from dsmoe.bench import engine
+from dsmoe.bench.cell import failed_row
+from dsmoe.bench.errors import BenchError
+from dsmoe.bench.expansion import expand
+from dsmoe.bench.names import blend_of
+from dsmoe.cli import main
+from dsmoe.errors import TrainerError
+from dsmoe.system.output_folder import Record, write_record
 
 pytest.importorskip("snakemake", reason="the engine is Snakemake: pip install snakemake")
 
@@ -287,7 +287,7 @@ def test_what_is_queued_is_cancelled_at_leisure(number, tmp_path):
     told, snakemake = tmp_path / "told", tmp_path / "snakemake"
     snakemake.write_text("trap 'trap - INT; sleep 1; echo cancelled >>told; kill $!; exit 1' INT\n"
                          "echo running >told\nsleep 60 &\nwait\n")
-    program = ("from diff_smoe_rasterization.benchmarks.suite import engine\n"
+    program = ("from dsmoe.bench import engine\n"
                "with engine.only_one('.') as lock:\n"
                "    engine.run_snakemake(['sh', 'snakemake'], lock, is_queued=True)\n")
     run = started([sys.executable, "-c", program], tmp_path, stderr=subprocess.DEVNULL)

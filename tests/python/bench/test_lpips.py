@@ -4,10 +4,10 @@ import pytest
 import real_data
 import torch
 
-from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite.measure import Measures
-from diff_smoe_rasterization.benchmarks.suite.names import check_weights
-from diff_smoe_rasterization.trainer.results.metrics import quantised
+from dsmoe.bench.errors import BenchError
+from dsmoe.bench.measure import Measures
+from dsmoe.bench.names import check_weights
+from dsmoe.results.metrics import quantised
 
 
 def test_weights_that_are_named_and_not_there_are_refused_where_they_are_wanted(monkeypatch, tmp_path):

@@ -5,9 +5,9 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from diff_smoe_rasterization.benchmarks.suite import measure
-from diff_smoe_rasterization.benchmarks.suite.measure import Measures, edge_mask, edge_psnr
-from diff_smoe_rasterization.trainer.results.evaluation import summary
+from dsmoe.bench import measure
+from dsmoe.bench.measure import Measures, edge_mask, edge_psnr
+from dsmoe.results.evaluation import summary
 
 
 def step_image(height=24, width=32, column=16, low=0.2, high=0.8):

@@ -7,7 +7,7 @@ import pytest
 from checkouts import make_checkout
 from PIL import Image
 
-from diff_smoe_rasterization.benchmarks.suite import preparation
+from dsmoe.bench import preparation
 
 
 def test_a_made_up_scene_is_made_anew_where_its_parameters_have_changed(tmp_path):

@@ -7,8 +7,8 @@ import math
 import pytest
 from report_rows import PROTOCOL, failed, row, write_rows
 
-from diff_smoe_rasterization.benchmarks.suite import rows
-from diff_smoe_rasterization.benchmarks.suite.report import ReportError, curves, groups, layouts, tables
+from dsmoe.bench import rows
+from dsmoe.bench.report import ReportError, curves, groups, layouts, tables
 
 
 def table_of(entries, name, suite="table1"):

@@ -9,8 +9,8 @@ from checkouts import contents
 from PIL import Image
 from report_rows import ALPHA, PROTOCOL, SMOE, TRUTH, failed, row, write_images, write_rows
 
-from diff_smoe_rasterization.benchmarks.suite.report import ReportError, images, report
-from diff_smoe_rasterization.trainer.errors import TrainerError
+from dsmoe.bench.report import ReportError, images, report
+from dsmoe.errors import TrainerError
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def written(tmp_path_factory):
 @pytest.fixture
 def no_figures(monkeypatch):
     """They take two seconds a report."""
-    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.report.draw_all", lambda *_: [])
+    monkeypatch.setattr("dsmoe.bench.report.draw_all", lambda *_: [])
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_a_report_that_fails_leaves_the_earlier_one(written, tmp_path, monkeypat
     output = tmp_path / "report"
     shutil.copytree(written, output)
     before = contents(output)
-    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.report._page", lambda *_: 1 / 0)  # written last
+    monkeypatch.setattr("dsmoe.bench.report._page", lambda *_: 1 / 0)  # written last
     with pytest.raises(ZeroDivisionError):
         report(write_rows(tmp_path / "results", [row("fox")]), str(output))
     assert contents(output) == before

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from diff_smoe_rasterization.benchmarks import suite as suite_package
-from diff_smoe_rasterization.benchmarks.errors import BenchError
-from diff_smoe_rasterization.benchmarks.suite import engine
-from diff_smoe_rasterization.benchmarks.suite.expansion import expand, find_suite, load_suite, read_yaml
-from diff_smoe_rasterization.benchmarks.suite.protocol import config_of
-from diff_smoe_rasterization.benchmarks.suite.schema import THRESHOLDS
+from dsmoe import bench
+from dsmoe.bench import engine
+from dsmoe.bench.errors import BenchError
+from dsmoe.bench.expansion import SHIPPED, expand, find_suite, load_suite, read_yaml
+from dsmoe.bench.protocol import config_of
+from dsmoe.bench.schema import THRESHOLDS
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 
@@ -50,10 +50,10 @@ def test_gates_are_of_smoe_alone(content):
 
 
 def test_missing_libraries_are_named_with_what_to_type(monkeypatch):
-    monkeypatch.setattr(suite_package.importlib.util, "find_spec", lambda name: None if name == "snakemake" else name)
-    suite_package.require("pyyaml")
+    monkeypatch.setattr(bench.importlib.util, "find_spec", lambda name: None if name == "snakemake" else name)
+    bench.require("pyyaml")
     with pytest.raises(ImportError) as error:
-        suite_package.require("snakemake", "pyyaml")
+        bench.require("snakemake", "pyyaml")
     assert str(error.value).startswith("dsmoe bench needs snakemake: ")
     extra = re.search(r"^bench = (\[.*\])$", (BENCHMARKS.parent / "pyproject.toml").read_text(), re.MULTILINE).group(1)
     for name in re.findall(r"[\"](\w+)", extra):
@@ -218,7 +218,7 @@ def somewhere(monkeypatch):
         monkeypatch.setenv(variable, "/somewhere")
 
 
-@pytest.mark.parametrize("name", sorted({"smoke"}.union(p.stem for p in (BENCHMARKS / "suite/shipped").glob("*.yaml"))))
+@pytest.mark.parametrize("name", sorted({"smoke", *SHIPPED}))
 def test_shipped_suites_are_valid(name, somewhere):
     suite = load_suite(find_suite(name))
     assert suite.name == name and suite.cells

@@ -20,9 +20,9 @@ from scenes import (
 from diff_smoe_rasterization import rasterize, reference
 from diff_smoe_rasterization.extension import _C
 from diff_smoe_rasterization.settings import OUTPUTS
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.model import GaussianModel
-from diff_smoe_rasterization.trainer.scenes.scene import load_cameras, read_layout
+from dsmoe.config import TrainConfig
+from dsmoe.model import GaussianModel
+from dsmoe.scenes.scene import load_cameras, read_layout
 
 
 def crowd(mode, **options):

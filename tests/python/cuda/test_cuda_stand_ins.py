@@ -8,7 +8,7 @@ import torch
 from diff_smoe_rasterization import fused_ssim
 from diff_smoe_rasterization.integrations import weighted_distance
 from diff_smoe_rasterization.integrations.torch_scatter import scatter, scatter_max
-from diff_smoe_rasterization.patches import fuse, modernise
+from dsmoe.patches import fuse, modernise
 
 
 def test_the_nearest_row_of_a_codebook(gpu, monkeypatch):

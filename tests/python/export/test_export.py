@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.export import html
-from diff_smoe_rasterization.export.splat import splat_bytes
+from dsmoe.cli import main
+from dsmoe.export import html
+from dsmoe.export.splat import splat_bytes
 
 QUARTER = np.sqrt(0.5)  # cos and sin of an eighth turn
 

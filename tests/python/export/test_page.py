@@ -9,13 +9,13 @@ import torch
 from browser import browser  # noqa: F401
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.export import html
-from diff_smoe_rasterization.trainer.inspection import to_image
-from diff_smoe_rasterization.trainer.opening import open_trained
-from diff_smoe_rasterization.trainer.results.modelfile import load_model
-from diff_smoe_rasterization.trainer.results.rendering import Renderer
-from diff_smoe_rasterization.trainer.scenes.orbit import default_camera, orbit_of_points
+from dsmoe.cli import main
+from dsmoe.export import html
+from dsmoe.inspection import to_image
+from dsmoe.opening import open_trained
+from dsmoe.results.modelfile import load_model
+from dsmoe.results.rendering import Renderer
+from dsmoe.scenes.orbit import default_camera, orbit_of_points
 
 # A mean error of 1.4/255: what the page's 8-bit harmonics and 16-bit shapes may cost. It reaches 55 to 69 dB.
 LEAST_PSNR = 45

@@ -1,13 +1,12 @@
 """What every flavour of Inria's API promises its trainers, against the reference."""
 from __future__ import annotations
 
-import importlib.util
 import inspect
-from pathlib import Path
 
 import pytest
 import torch
 from comparison import assert_all_close, assert_close, assert_same_gradients, reference_gradients
+from packaged import packages_and_data
 from scenes import gradients, random_scene, random_weights
 
 from diff_smoe_rasterization import Rendering, rasterize
@@ -205,11 +204,4 @@ def test_no_gaussians_leave_the_background(flavour, mode):
 
 
 def test_the_package_installs_the_modules():
-    pytest.importorskip("setuptools")
-    path = Path(__file__).resolve().parents[3] / "setup.py"
-    spec = importlib.util.spec_from_file_location("dsmoe_setup", path)
-    setup = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(setup)
-    packages = setup.packages()
-    assert "diff_smoe_rasterization.integrations" in packages["packages"]
-    assert packages["package_dir"]["diff_smoe_rasterization.integrations"] == "integrations"
+    assert "diff_smoe_rasterization.integrations" in packages_and_data()[0]

@@ -14,7 +14,7 @@ from checkouts import environment, make_scene
 @pytest.fixture(scope="session")
 def dsmoe():
     """Runs the command in this process; returns status, out, err."""
-    from diff_smoe_rasterization import cli
+    from dsmoe import cli
 
     def run(*argv):
         out, err = io.StringIO(), io.StringIO()

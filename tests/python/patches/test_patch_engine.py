@@ -11,8 +11,8 @@ import pytest
 from checkouts import contents
 from tiny import ARGS, CHECKOUT, GR, PATCHED, RENDER, RENDERER, TRAIN, digest, make, marked, refused
 
-from diff_smoe_rasterization import patches
-from diff_smoe_rasterization.patches import engine
+from dsmoe import patches
+from dsmoe.patches import engine
 
 NOBODY = 65534
 
@@ -175,8 +175,8 @@ def test_options_are_added_to_a_patch_and_stay_with_it(tmp_path, dsmoe):
         assert said.status == 0 and f"metrics.py: {', '.join(options)}" in said.out
         assert patches.check(tmp_path).applied == options and not patches.apply(tmp_path).written
     first, second, *rest = (tmp_path / "metrics.py").read_text().splitlines(keepends=True)
-    assert first == marked("from diff_smoe_rasterization.patches import modernise; modernise.start()")
-    assert second == marked("from diff_smoe_rasterization.patches import fuse; fuse.start()")
+    assert first == marked("from dsmoe.patches import modernise; modernise.start()")
+    assert second == marked("from dsmoe.patches import fuse; fuse.start()")
     assert "".join(rest) == SCRIPT
     assert (tmp_path / setup).read_text() == "flags = ['-O2', '-DDSMOE_PATCH_STD=14']\n"
     assert (tmp_path / "utils/x.py").read_text() == SCRIPT
@@ -418,10 +418,10 @@ def test_what_the_command_says(tmp_path, dsmoe):
 
 
 def test_the_readme_has_every_trainer_rule_and_state():
-    from diff_smoe_rasterization.patches.rules import OPTIONS, rules_of
-    from diff_smoe_rasterization.patches.trainers import TRAINERS
+    from dsmoe.patches.rules import OPTIONS, rules_of
+    from dsmoe.patches.trainers import TRAINERS
 
-    text = (Path(__file__).resolve().parents[3] / "patches" / "README.md").read_text()
+    text = (Path(__file__).resolve().parents[3] / "dsmoe" / "patches" / "README.md").read_text()
     cells = {line.split(" | ")[0].strip(" |`"): line for line in text.splitlines() if line.startswith("| `")}
     for trainer in TRAINERS:
         assert f"`{trainer.flavour}`" in cells[trainer.name]

@@ -1,21 +1,21 @@
 """`dsmoe run`: what the command's processes see, what is refused, and the exit status."""
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from checkouts import PACKAGE_PARENT, contents, environment
+from packaged import ROOT, packages_and_data
 from tiny import GR, RENDERER, make, refused
 
-from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.integrations.contracts import CONTRACTS, NAMES
-from diff_smoe_rasterization.patches import run
 from diff_smoe_rasterization.settings import BLEND_MODES, GATED_MODES
+from dsmoe import patches
+from dsmoe.patches import run
 
 SHOW = """import os, sys
 sys.path.insert(0, "")
@@ -34,7 +34,7 @@ def test_an_unmodified_checkout_runs_and_stays_as_it_was(tmp_path, python):
         "show.py": SHOW, "parent.py": "import os, subprocess, sys\nos.chdir(os.path.dirname(sys.argv[0]))\n"
                                       "sys.exit(subprocess.call([sys.executable, 'show.py'] + sys.argv[1:]))\n"})
     before = contents(tmp_path)
-    result = python("-m", "diff_smoe_rasterization", *RUN, "--background-gate", "0.25", "--", sys.executable,
+    result = python("-m", "dsmoe", *RUN, "--background-gate", "0.25", "--", sys.executable,
                     checkout / "parent.py", *WORDS, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert result.status == 7, result.err
     assert result.out.splitlines() == [f"diff_smoe_rasterization.rasterizer smoe {WORDS}"]
@@ -56,7 +56,7 @@ ENDS = {  # what a command does, and how `dsmoe run` ends then
 def test_it_ends_as_the_command_unless_nothing_was_rendered(code, tmp_path, python):
     script = f"import sys\nfrom diff_gaussian_rasterization import GaussianRasterizer as made\n{code}\n"
     make(tmp_path, {"x.py": script})
-    result = python("-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py", cwd=tmp_path)
+    result = python("-m", "dsmoe", *RUN, "--", sys.executable, "x.py", cwd=tmp_path)
     status, said = ENDS[code]
     assert result.status == status and said in result.err, result.err
 
@@ -66,7 +66,7 @@ def test_the_command_ends_where_dsmoe_run_is_killed(tmp_path):
     make(tmp_path, {"x.py": "import signal, sys, time\n"
                             "signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('told to end', flush=True)))\n"
                             "print('ready', flush=True)\ntime.sleep(60)\n"})
-    words = [sys.executable, "-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py"]
+    words = [sys.executable, "-m", "dsmoe", *RUN, "--", sys.executable, "x.py"]
     with subprocess.Popen(words, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "ready\n"
         process.kill()
@@ -81,7 +81,7 @@ def test_that_nothing_was_rendered_is_said_at_the_first_step(renders, tmp_path, 
         "w = torch.ones(1, requires_grad=True)\nw.sum().backward()\nadam = torch.optim.Adam([w])\n"
         "adam.step()\nadam.step()\nprint('trained')\n")
     make(tmp_path, {GR: None, "x.py": script})
-    result = python("-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py", cwd=tmp_path,
+    result = python("-m", "dsmoe", *RUN, "--", sys.executable, "x.py", cwd=tmp_path,
                     PYTHONPATH=str(PACKAGE_PARENT))
     assert result.out.endswith("trained\n") and result.status == (0 if renders else 1), result.err
     assert result.err.count("the first step of an optimizer, and this rasterizer has rendered nothing") == (not renders)
@@ -94,7 +94,7 @@ def test_a_signal_reaches_the_command(number, ignored, tmp_path):
                             f"ignored = signal.getsignal({int(number)}) == signal.SIG_IGN\n"
                             f"signal.signal({int(number)}, lambda *_: exit(5))\n"
                             "print(ignored, flush=True)\ntime.sleep(0.5 if ignored else 60)\nexit(6)\n"})
-    process = subprocess.Popen([sys.executable, "-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py"],
+    process = subprocess.Popen([sys.executable, "-m", "dsmoe", *RUN, "--", sys.executable, "x.py"],
                                cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
                                preexec_fn=lambda: ignored and signal.signal(number, signal.SIG_IGN))
     assert process.stdout.readline().decode() == f"{ignored}\n"
@@ -263,7 +263,7 @@ print(list(color.shape), [round(one[0, 4, 4].item(), 1) for one in (depth, media
 """
     make(tmp_path, {GR: None, "x.py": script})
     before = contents(tmp_path)
-    result = python("-m", "diff_smoe_rasterization", "run", "--blend-mode", "alpha", "--", sys.executable, "x.py",
+    result = python("-m", "dsmoe", "run", "--blend-mode", "alpha", "--", sys.executable, "x.py",
                     cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert result.out == "[3, 8, 8] [2.0, 2.0, 1.0] torch.int32\n", result.err
     assert contents(tmp_path) == before
@@ -318,7 +318,7 @@ def test_a_rasterizer_of_another_name_is_answered_for_by_that_name(tmp_path, pyt
     script = "".join(f"from {module} import GaussianRasterizer, GaussianRasterizationSettings\n"
                      "GaussianRasterizer(None)\n" for module in modules)
     make(tmp_path, {"x.py": script})
-    result = python("-m", "diff_smoe_rasterization", *RUN, "--trainer", "absgs", "--", sys.executable, "x.py",
+    result = python("-m", "dsmoe", *RUN, "--trainer", "absgs", "--", sys.executable, "x.py",
                     cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert result.status == 0, result.err
     said = [line.split()[4] for line in result.err.splitlines() if "the rasterizer is" in line]
@@ -368,7 +368,7 @@ def test_gsplat_gets_this_rasterizer_and_keeps_its_strategies(version, radii, tm
     for name, text in GSPLAT.items() if version else ():
         (installed / name).parent.mkdir(parents=True, exist_ok=True)
         (installed / name).write_text(text.replace("{version}", version))
-    result = python("-m", "diff_smoe_rasterization", *RUN, "--", sys.executable, "x.py", cwd=tmp_path,
+    result = python("-m", "dsmoe", *RUN, "--", sys.executable, "x.py", cwd=tmp_path,
                     PYTHONPATH=os.pathsep.join([str(PACKAGE_PARENT), str(installed)]))
     assert result.status == 0, result.err
     ours = "diff_smoe_rasterization.integrations.gsplat"
@@ -465,7 +465,7 @@ def test_sparse_adam_is_offered_to_what_was_written_for_it(files, words, is_offe
     """Where 3DGS of 2024 finds it, it renders another way; forks for the branch without it break there."""
     model = "class GaussianModel:\n    def get_features_dc(self): ...\n"
     make(tmp_path, {GR: OF_2024, "train.py": TRY_SPARSE, "scene/gaussian_model.py": model, **files})
-    result = python("-m", "diff_smoe_rasterization", *PYTHON, *words, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+    result = python("-m", "dsmoe", *PYTHON, *words, cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
     assert (result.status, result.out) == (0, f"{is_offered}\n"), result.err
 
 
@@ -490,17 +490,12 @@ def test_a_patched_checkout_is_refused_until_nothing_of_the_patch_is_left(tmp_pa
 
 def test_the_package_brings_the_shims_and_nothing_beside_itself():
     """Not one of the names that the shims stand in for is installed as such."""
-    pytest.importorskip("setuptools")
-    root = Path(__file__).resolve().parents[3]
-    spec = importlib.util.spec_from_file_location("dsmoe_setup", root / "setup.py")
-    setup = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(setup)
-    packages = setup.packages()
-    assert {name.partition(".")[0] for name in packages["packages"]} == {"diff_smoe_rasterization"}
-    brought = {path for pattern in packages["package_data"]["diff_smoe_rasterization.patches"]
-               for path in (root / "patches").glob(pattern)}
+    packages, data = packages_and_data()
+    assert {name.partition(".")[0] for name in packages} == {"diff_smoe_rasterization", "dsmoe"}
+    patches = ROOT / "dsmoe" / "patches"
+    brought = {path for pattern in data["dsmoe.patches"] for path in patches.glob(pattern)}
     for folder in ("shims", "stand_ins"):
-        assert set() != set((root / "patches" / folder).rglob("*.py")) <= brought
+        assert set() != set((patches / folder).rglob("*.py")) <= brought
     for contract in CONTRACTS:
         module = importlib.import_module(f"diff_smoe_rasterization.integrations.{contract.name}")
         names = NAMES if contract.module != "gsplat" else ("rasterization",)

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from diff_smoe_rasterization import BLEND_MODES, GaussianRasterizationSettings, settings
-from diff_smoe_rasterization.patches import runtime
 from diff_smoe_rasterization.settings import GATED_MODES, record_of, resolve_blend
+from dsmoe.patches import runtime
 
 ALPHA = {"blend_mode": "alpha", "background_gate": None}
 

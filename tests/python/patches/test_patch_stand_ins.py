@@ -14,7 +14,7 @@ from checkouts import PACKAGE_PARENT, environment
 from torch.nn.functional import conv2d
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization.patches import fuse, modernise, runtime
+from dsmoe.patches import fuse, modernise, runtime
 
 
 def window(size, sigma=1.5):
@@ -187,8 +187,8 @@ def test_adam_is_fused_where_it_has_no_other_arguments(adams):
 
 
 STARTED = """import sys
-from diff_smoe_rasterization.patches import modernise; modernise.start()
-from diff_smoe_rasterization.patches import fuse; fuse.start()
+from dsmoe.patches import modernise; modernise.start()
+from dsmoe.patches import fuse; fuse.start()
 import numpy as np, torch
 from PIL import Image
 from utils.loss_utils import ssim

@@ -11,8 +11,8 @@ import pytest
 from checkouts import PACKAGE_PARENT, contents
 from tiny import ARGS, GR, RENDERER, TRAIN, make, refused
 
-from diff_smoe_rasterization import patches
-from diff_smoe_rasterization.patches import facts
+from dsmoe import patches
+from dsmoe.patches import facts
 
 
 def only_statements_change(diff):
@@ -20,7 +20,7 @@ def only_statements_change(diff):
     lines = [line for line in diff.splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")]
     removed, added = ([line[1:].strip() for line in lines if line[0] == sign] for sign in "-+")
     assert removed and all(line.startswith("from diff_gaussian_rasterization import") for line in removed), removed
-    ours = "from diff_smoe_rasterization.integrations.", "from diff_smoe_rasterization.patches.sparse_adam "
+    ours = "from diff_smoe_rasterization.integrations.", "from dsmoe.patches.sparse_adam "
     assert all("# dsmoe patch" in line or line.startswith(ours) for line in added), added
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from checkouts import contents, make_checkout
 
-from diff_smoe_rasterization import patches
 from diff_smoe_rasterization.settings import record_of
+from dsmoe import patches
 
-RUN = ("-m", "diff_smoe_rasterization", "run", "--blend-mode")
+RUN = ("-m", "dsmoe", "run", "--blend-mode")
 
 
 def model(output):

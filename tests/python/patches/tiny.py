@@ -6,7 +6,7 @@ import hashlib
 import pytest
 from checkouts import contents
 
-from diff_smoe_rasterization import patches
+from dsmoe import patches
 
 GR, ARGS = "gaussian_renderer/__init__.py", "arguments/__init__.py"
 RENDERER = '''import math  # the camera's angles
@@ -65,7 +65,7 @@ def marked(text):
 
 def imported(name):
     """The line by which a patched file gets a name."""
-    return marked(f"from diff_smoe_rasterization.patches.runtime import {name}")
+    return marked(f"from dsmoe.patches.runtime import {name}")
 
 
 INRIA = "diff_smoe_rasterization.integrations.inria"

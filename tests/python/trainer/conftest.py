@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 from tiny_scene import one_thread, tiny_scene  # noqa: F401
 
-from diff_smoe_rasterization.trainer.config import TrainConfig
+from dsmoe.config import TrainConfig
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ from __future__ import annotations
 import os
 import sys
 
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
-from diff_smoe_rasterization.trainer.errors import TrainerError
+from dsmoe.cli import main
+from dsmoe.distributed.trainer import BatchTrainer
+from dsmoe.errors import TrainerError
 
 step = BatchTrainer.step
 

@@ -7,21 +7,21 @@ import re
 import pytest
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.images import as_float
 from diff_smoe_rasterization.losses import fused_ssim, l1_ssim_loss
-from diff_smoe_rasterization.trainer.inspection import open_renderer
-from diff_smoe_rasterization.trainer.results.evaluation import evaluate
-from diff_smoe_rasterization.trainer.results.modelfile import model_path
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training.bake import RisingGate, bake
-from diff_smoe_rasterization.trainer.training.loop import Trainer, train
+from dsmoe.cli import main
+from dsmoe.inspection import open_renderer
+from dsmoe.results.evaluation import evaluate
+from dsmoe.results.modelfile import model_path
+from dsmoe.scenes.scene import load_scene
+from dsmoe.training.bake import RisingGate, bake
+from dsmoe.training.loop import Trainer, train
 
 
 @pytest.fixture(scope="module")
 def smoe_run(tiny_scene, tmp_path_factory):
     """Trained for a second by a small gate, so that alpha shows its Gaussians much darker."""
-    from diff_smoe_rasterization.trainer.config import TrainConfig
+    from dsmoe.config import TrainConfig
 
     config = TrainConfig(scene=tiny_scene, output=str(tmp_path_factory.mktemp("run") / "out"), blend_mode="smoe",
                          background_gate=0.01, iterations=250, sh_degree=1, sh_degree_interval=100, checkpoint_every=0)

@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 
-from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
-from diff_smoe_rasterization.trainer.errors import ConfigError, TrainerError
-from diff_smoe_rasterization.trainer.results.modelfile import model_path
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.system.group import ALONE
-from diff_smoe_rasterization.trainer.training.loop import Trainer, train
+from dsmoe.distributed.trainer import BatchTrainer
+from dsmoe.errors import ConfigError, TrainerError
+from dsmoe.results.modelfile import model_path
+from dsmoe.scenes.scene import load_scene
+from dsmoe.system.group import ALONE
+from dsmoe.training.loop import Trainer, train
 
 
 @pytest.fixture
@@ -153,7 +153,7 @@ def test_another_rasterizer_is_refused(tiny_config):
 def test_a_disturbed_rendering_does_not_count_in_batches_either(tiny_config, scene, monkeypatch):
     """As in test_loop.py: of five passes the clock disturbs one."""
     clock = iter([0.0, 0.01, 1.0, 1.99, *(2 + 0.01 * (i % 2) for i in range(16))])
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.results.evaluation.synchronised_time", lambda _: next(clock))
+    monkeypatch.setattr("dsmoe.results.evaluation.synchronised_time", lambda _: next(clock))
     evaluation = BatchTrainer(tiny_config, scene, ALONE).evaluate()
     assert [row["milliseconds"] for row in evaluation.per_view] == pytest.approx([10, 10], rel=1e-9)
     assert next(clock, None) is None

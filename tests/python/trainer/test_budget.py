@@ -11,14 +11,14 @@ from test_resume import killed_and_resumed, ply_bytes
 
 from diff_smoe_rasterization import rasterize
 from diff_smoe_rasterization.losses import fused_ssim
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.errors import ConfigError
-from diff_smoe_rasterization.trainer.gate_options import gate_settings, parse_gate_options
-from diff_smoe_rasterization.trainer.scenes.nerf import random_points
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training.loop import Trainer, train
-from diff_smoe_rasterization.trainer.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
-from diff_smoe_rasterization.trainer.training.passes import AutogradPasses
+from dsmoe.config import TrainConfig
+from dsmoe.errors import ConfigError
+from dsmoe.gate_options import gate_settings, parse_gate_options
+from dsmoe.scenes.nerf import random_points
+from dsmoe.scenes.scene import load_scene
+from dsmoe.training.loop import Trainer, train
+from dsmoe.training.mcmc_strategy import OPACITY_WEIGHT, SCALE_WEIGHT, divided
+from dsmoe.training.passes import AutogradPasses
 
 
 def trainer_of(config, **options):

@@ -7,8 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import rasterize, settings_from_camera
-from diff_smoe_rasterization.trainer.scenes.cameras import Camera, scene_extent
-from diff_smoe_rasterization.trainer.scenes.orbit import look_at
+from dsmoe.scenes.cameras import Camera, quaternion_to_rotation, rotation_to_quaternion, scene_extent
+from dsmoe.scenes.orbit import look_at
 
 
 @pytest.fixture
@@ -122,3 +122,20 @@ def test_scene_extent_is_by_hand():
     assert scene_extent(corners[0] + 1e-16 * np.arange(9).reshape(3, 3)) == 1.0
     assert scene_extent(np.array([[0.1, 0, 0], [0.1 + 1e-15, 0, 0], [0.1, 1e-15, 0]])) == 1.0
     assert scene_extent(0.001 * corners) == pytest.approx(0.0011 * 2**0.5), "a small scene keeps its size"
+
+
+def test_quaternions_are_the_rotations_that_scipy_makes_of_them():
+    """Also there and back, whichever component is the largest, and half turns."""
+    random = np.random.RandomState(0)
+    drawn = random.normal(size=(200, 4)) * 10 ** random.uniform(-3, 3, (200, 1))
+    for quaternion in [*drawn, *np.eye(4), [0, -3, 0, 3]]:
+        w, x, y, z = quaternion
+        expected = Rotation.from_quat([x, y, z, w])
+        rotation = quaternion_to_rotation(quaternion)
+        # Ten products of numbers up to 1, rounded to doubles.
+        np.testing.assert_allclose(rotation, expected.as_matrix(), rtol=0, atol=1e-15)
+        unit = quaternion / np.linalg.norm(quaternion)
+        back = rotation_to_quaternion(rotation)
+        np.testing.assert_allclose(back * np.sign(back @ unit), unit, rtol=0, atol=2e-15)
+    with pytest.raises(ValueError, match="the quaternion is 0"):
+        quaternion_to_rotation([0, 0, 0, 0])

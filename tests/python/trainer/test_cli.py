@@ -18,13 +18,13 @@ from PIL import Image
 
 import diff_smoe_rasterization
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer import inspection
-from diff_smoe_rasterization.trainer.config import GROUPS, TrainConfig
-from diff_smoe_rasterization.trainer.results.rows import viewer_warning
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training import forecast
-from diff_smoe_rasterization.trainer.training.loop import Trainer
+from dsmoe import inspection
+from dsmoe.cli import main
+from dsmoe.config import GROUPS, TrainConfig
+from dsmoe.results.rows import viewer_warning
+from dsmoe.scenes.scene import load_scene
+from dsmoe.training import forecast
+from dsmoe.training.loop import Trainer
 
 SHORT = ["--iterations", "12", "--densify-from-iter", "2", "--densify-until-iter", "10",
          "--densification-interval", "4", "--quiet"]
@@ -272,7 +272,7 @@ def test_eval_measures_lpips_where_asked(trained, tmp_path, capsys, monkeypatch)
     assert "nowhere.npz: no such file" in fails(capsys, "eval", run, "--lpips", "vgg")
     monkeypatch.delenv("DSMOE_LPIPS_VGG")
     asked = []
-    monkeypatch.setattr("diff_smoe_rasterization.benchmarks.suite.lpips.lpips_network",
+    monkeypatch.setattr("dsmoe.bench.lpips.lpips_network",
                         lambda kind, device: asked.append((kind, device)) or (lambda image, target: 0.25))
     assert main(["eval", run, "--lpips", "vgg"]) == 0
     assert "LPIPS (vgg, v0.1, 8-bit images in [-1, 1]): 0.2500\n" in capsys.readouterr().out
@@ -570,9 +570,9 @@ def test_too_little_memory_is_one_line(scene, tmp_path, monkeypatch, capsys):
     arguments = ["train", scene, "-o", str(tmp_path / "out"), *SHORT]
     for function, words in ((cuda, "the GPU is out of memory, 20.00 GiB"), (array, "out of memory, 1.00 PiB"),
                             (cpu, f"the machine is out of memory, {2**50} bytes more were asked for")):
-        monkeypatch.setattr("diff_smoe_rasterization.trainer.training.loop.load_scene", function)
+        monkeypatch.setattr("dsmoe.training.loop.load_scene", function)
         assert words in fails(capsys, *arguments)
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.training.loop.load_scene", defect)
+    monkeypatch.setattr("dsmoe.training.loop.load_scene", defect)
     with pytest.raises(RuntimeError, match="another one"):
         main(arguments)
 
@@ -656,7 +656,7 @@ def test_an_interruption_before_training_promises_nothing(scene, tmp_path, monke
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.training.loop.load_scene", interrupted)
+    monkeypatch.setattr("dsmoe.training.loop.load_scene", interrupted)
     assert main(["train", scene, "-o", str(tmp_path / "out"), *SHORT]) == 130
     assert capsys.readouterr().err.endswith("interrupted\n")
 
@@ -712,7 +712,7 @@ def test_info(capsys):
 def test_the_module_is_the_command(tmp_path):
     """In a process of its own, with the package that is tested."""
     package = os.path.dirname(os.path.dirname(diff_smoe_rasterization.__file__))
-    done = subprocess.run([sys.executable, "-m", "diff_smoe_rasterization", "train", "/nowhere", "-o", "x"],
+    done = subprocess.run([sys.executable, "-m", "dsmoe", "train", "/nowhere", "-o", "x"],
                           capture_output=True, text=True, check=False, cwd=tmp_path,
                           env={**os.environ, "PYTHONPATH": package})
     assert (done.returncode, done.stderr) == (1, "dsmoe train: error: scene /nowhere: no such folder\n")

@@ -9,8 +9,8 @@ import os
 import pytest
 
 from diff_smoe_rasterization.settings import record_of
-from diff_smoe_rasterization.trainer.config import TrainConfig, add_arguments, config_from_arguments
-from diff_smoe_rasterization.trainer.errors import ConfigError
+from dsmoe.config import TrainConfig, add_arguments, config_from_arguments
+from dsmoe.errors import ConfigError
 
 # The published defaults of 3DGS (2023).
 PUBLISHED = {

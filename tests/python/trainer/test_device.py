@@ -7,10 +7,10 @@ import os
 import pytest
 import torch
 
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.system import device
-from diff_smoe_rasterization.trainer.system.device import chosen_device, device_line
+from dsmoe.cli import main
+from dsmoe.errors import TrainerError
+from dsmoe.system import device
+from dsmoe.system.device import chosen_device, device_line
 
 
 @pytest.fixture

@@ -14,12 +14,12 @@ import torch
 import torch.distributed
 
 import diff_smoe_rasterization
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.distributed.shards import run_of
-from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.results.modelfile import model_path
-from diff_smoe_rasterization.trainer.system import torchrun as torchrun_module
-from diff_smoe_rasterization.trainer.training.loop import train
+from dsmoe.cli import main
+from dsmoe.distributed.shards import run_of
+from dsmoe.errors import TrainerError
+from dsmoe.results.modelfile import model_path
+from dsmoe.system import torchrun as torchrun_module
+from dsmoe.training.loop import train
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 PACKAGES = os.path.dirname(os.path.dirname(os.path.abspath(diff_smoe_rasterization.__file__)))  # of the one under test
@@ -64,7 +64,7 @@ def test_processes_die_and_others_resume_bit_for_bit(tiny_config, tmp_path):
     alone = dataclasses.replace(config, output=str(tmp_path / "alone"))
     shutil.copytree(config.output, alone.output)
 
-    status, out, errors = torchrun(3, "-m", "diff_smoe_rasterization", "train", "--resume", "-o", config.output)
+    status, out, errors = torchrun(3, "-m", "dsmoe", "train", "--resume", "-o", config.output)
     assert status == 0, errors
     # The last checkpoint before 32: densifications were at 8 and 16, and one at 24 follows.
     assert "resumed at iteration 20" in out or "resumed at iteration 28" in out
@@ -83,7 +83,7 @@ def test_a_process_saves_and_ends_where_torchrun_is_killed(tiny_config):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
-    worker = [sys.executable, "-m", "diff_smoe_rasterization", "train", tiny_config.scene, "-o", tiny_config.output,
+    worker = [sys.executable, "-m", "dsmoe", "train", tiny_config.scene, "-o", tiny_config.output,
               "--iterations", "1000000", "--batch", "1", "--quiet", "--checkpoint-every", "0"]
     launcher = f"import subprocess, sys; sys.exit(subprocess.call({worker!r}))"
     environment = {"PYTHONPATH": os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")]), "RANK": "0",
@@ -111,7 +111,7 @@ def test_a_budget_holds_for_all_processes_together(tiny_config, tmp_path):
     assert 165 < row["num_gaussians"] <= 170 and row["num_gaussians"] != row["protocol"]["init_points"]
     other = dataclasses.replace(config, output=str(tmp_path / "two"))
     status, out, errors = torchrun(
-        2, "-m", "diff_smoe_rasterization", "train", config.scene, "-o", other.output, "--quiet",
+        2, "-m", "dsmoe", "train", config.scene, "-o", other.output, "--quiet",
         "--strategy", "steady", "--budget", "170", "--iterations", "20", "--blend-mode", "smoe",
         "--sh-degree-interval", "10", "--densify-from-iter", "4", "--densify-until-iter", "30",
         "--densification-interval", "8", "--densify-grad-threshold", "0.002")
@@ -144,7 +144,7 @@ def test_gpus_starts_torchrun_with_the_same_command(tiny_config, monkeypatch):
     assert seen == [(2, [*words, "--device", "cuda"])] * 2
     command = torchrun_module.torchrun_command(2, words)
     assert command[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
-    assert command[6:] == ["-m", "diff_smoe_rasterization", *words]
+    assert command[6:] == ["-m", "dsmoe", *words]
 
 
 def test_more_gpus_than_there_are_is_refused(monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from diff_smoe_rasterization.trainer.training import drawing
+from dsmoe.training import drawing
 
 WEIGHTS = torch.tensor([0.0, 1.0, 2.0, 0.0, 5.0, 0.0])
 DRAWS = 20_000

@@ -9,10 +9,10 @@ import torch
 from PIL import Image
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.inspection import to_image
-from diff_smoe_rasterization.trainer.opening import open_trained
-from diff_smoe_rasterization.trainer.results.video import write_video
+from dsmoe.cli import main
+from dsmoe.inspection import to_image
+from dsmoe.opening import open_trained
+from dsmoe.results.video import write_video
 
 
 @pytest.fixture

@@ -12,12 +12,12 @@ from PIL import Image
 from scipy.optimize import brentq
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.errors import SceneError
-from diff_smoe_rasterization.trainer.scenes import undistortion
-from diff_smoe_rasterization.trainer.scenes.lens import lens_of
-from diff_smoe_rasterization.trainer.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
+from dsmoe.cli import main
+from dsmoe.config import TrainConfig
+from dsmoe.errors import SceneError
+from dsmoe.scenes import undistortion
+from dsmoe.scenes.lens import lens_of
+from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
 
 WIDTH, HEIGHT = 96, 72
 FX, FY, CX, CY = 70.0, 72.0, 46.5, 37.0

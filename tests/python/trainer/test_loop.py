@@ -9,14 +9,14 @@ import torch
 
 from diff_smoe_rasterization.losses import l1_ssim_loss
 from diff_smoe_rasterization.losses import l1_ssim_loss_and_gradient as l1_ssim
-from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.results.rendering import package_rasterizer
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training import strategy
-from diff_smoe_rasterization.trainer.training.background_gate import LearnedGate
-from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
-from diff_smoe_rasterization.trainer.training.strategies import STRATEGIES
-from diff_smoe_rasterization.trainer.training.strategy import Strategy
+from dsmoe.errors import TrainerError
+from dsmoe.results.rendering import package_rasterizer
+from dsmoe.scenes.scene import load_scene
+from dsmoe.training import strategy
+from dsmoe.training.background_gate import LearnedGate
+from dsmoe.training.loop import Run, Trainer, train
+from dsmoe.training.strategies import STRATEGIES
+from dsmoe.training.strategy import Strategy
 
 
 @pytest.fixture
@@ -236,7 +236,7 @@ def test_evaluation_counts_every_view_once(tiny_config, scene):
 def test_a_disturbed_rendering_does_not_count(tiny_config, scene, monkeypatch):
     """The clock says 10 ms for each timed rendering, but 990 ms for the second one, which the median leaves out."""
     times = iter([0.0, 0.01, 1.0, 1.99, *(2 + 0.01 * (i % 2) for i in range(16))])
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.results.evaluation.synchronised_time", lambda _: next(times))
+    monkeypatch.setattr("dsmoe.results.evaluation.synchronised_time", lambda _: next(times))
     evaluation = Trainer(tiny_config, scene).evaluate()
     assert [row["milliseconds"] for row in evaluation.per_view] == pytest.approx([10, 10], rel=1e-9)
     assert evaluation.fps == pytest.approx(100, rel=1e-9)
@@ -245,7 +245,7 @@ def test_a_disturbed_rendering_does_not_count(tiny_config, scene, monkeypatch):
 
 def test_a_long_evaluation_has_one_pass(tiny_config, scene, monkeypatch):
     times = iter([0.0, 1.0, 1.0, 2.0])
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.results.evaluation.synchronised_time", lambda _: next(times))
+    monkeypatch.setattr("dsmoe.results.evaluation.synchronised_time", lambda _: next(times))
     assert Trainer(tiny_config, scene).evaluate().fps == 1
 
 
@@ -258,7 +258,7 @@ def test_evaluation_leaves_training_alone(tiny_config, scene):
 def test_training_seconds_are_those_of_the_steps(tiny_config, scene, monkeypatch):
     """Evaluation and checkpoints take no part of them."""
     clock = [0.0]
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.system.stopwatch.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("dsmoe.system.stopwatch.time.perf_counter", lambda: clock[0])
     step, save = Trainer.step, Run.save_checkpoint
 
     def timed(function, seconds):

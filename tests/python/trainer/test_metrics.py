@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from diff_smoe_rasterization.losses import fused_ssim
-from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.results.evaluation import summary
-from diff_smoe_rasterization.trainer.results.metrics import image_metrics, masked_ssim, psnr, quantised
+from dsmoe.errors import TrainerError
+from dsmoe.results.evaluation import summary
+from dsmoe.results.metrics import image_metrics, masked_ssim, psnr, quantised
 
 
 def test_psnr_by_hand():

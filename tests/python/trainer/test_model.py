@@ -9,17 +9,17 @@ import torch
 
 from diff_smoe_rasterization import io
 from diff_smoe_rasterization.settings import GATED_MODES
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.model import PARAMETERS, GaussianModel, GaussianOptimizer, exponential_rate
-from diff_smoe_rasterization.trainer.results.modelfile import (
+from dsmoe.config import TrainConfig
+from dsmoe.errors import TrainerError
+from dsmoe.model import PARAMETERS, GaussianModel, GaussianOptimizer, exponential_rate
+from dsmoe.results.modelfile import (
     Recorded,
     agreed_background_gate,
     agreed_blend_mode,
     load_model,
     save_model,
 )
-from diff_smoe_rasterization.trainer.scenes.pointcloud import PointCloud
+from dsmoe.scenes.pointcloud import PointCloud
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
 

@@ -10,14 +10,14 @@ import pytest
 import torch
 from devices import without_cuda_because
 
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer.distributed.trainer import BatchTrainer
-from diff_smoe_rasterization.trainer.model import PARAMETERS
-from diff_smoe_rasterization.trainer.results.modelfile import model_path
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.system.group import ALONE
-from diff_smoe_rasterization.trainer.system.process import SPARE_BYTES, return_spare_memory
-from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
+from dsmoe.cli import main
+from dsmoe.distributed.trainer import BatchTrainer
+from dsmoe.model import PARAMETERS
+from dsmoe.results.modelfile import model_path
+from dsmoe.scenes.scene import load_scene
+from dsmoe.system.group import ALONE
+from dsmoe.system.process import SPARE_BYTES, return_spare_memory
+from dsmoe.training.loop import Run, Trainer, train
 
 pytestmark = pytest.mark.skipif(without_cuda_because() is not None, reason=f"without CUDA: {without_cuda_because()}")
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from diff_smoe_rasterization.trainer.errors import SceneError
-from diff_smoe_rasterization.trainer.scenes.orbit import default_camera, look_at, orbit_of_cameras, orbit_of_points
+from dsmoe.errors import SceneError
+from dsmoe.scenes.orbit import default_camera, look_at, orbit_of_cameras, orbit_of_points
 
 
 def ring(target, up, count=7):

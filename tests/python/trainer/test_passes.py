@@ -4,11 +4,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from diff_smoe_rasterization.trainer.model import PARAMETERS
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training.checkpoint import load_checkpoint, save_checkpoint
-from diff_smoe_rasterization.trainer.training.loop import Trainer
-from diff_smoe_rasterization.trainer.training.passes import AutogradPasses, DirectPasses
+from dsmoe.model import PARAMETERS
+from dsmoe.scenes.scene import load_scene
+from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
+from dsmoe.training.loop import Trainer
+from dsmoe.training.passes import AutogradPasses, DirectPasses
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_a_checkpoint_on_the_way(tiny_config, scene, tmp_path):
 
 def test_what_a_strategy_adds_reaches_all_gaussians(tiny_config, scene, monkeypatch):
     """By both passes alike, seen or not; a sum in another order is rounded otherwise."""
-    monkeypatch.setattr("diff_smoe_rasterization.trainer.training.mcmc_strategy.NOISE_RATE", 0)
+    monkeypatch.setattr("dsmoe.training.mcmc_strategy.NOISE_RATE", 0)
     config = tiny_config.changed(schedule="mcmc", budget=100)
     dense, direct = (trained(config, scene, direct, 3) for direct in (False, True))
     assert (direct._passes._radii == 0).any(), "all were seen"

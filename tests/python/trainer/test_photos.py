@@ -12,11 +12,11 @@ from real_data import folder
 from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.cli import main
-from diff_smoe_rasterization.trainer import photos
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.system.output_folder import Record, write_record
+from dsmoe import photos
+from dsmoe.cli import main
+from dsmoe.config import TrainConfig
+from dsmoe.scenes.scene import load_scene
+from dsmoe.system.output_folder import Record, write_record
 
 
 def fails(capsys, *words):

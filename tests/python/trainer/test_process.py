@@ -7,8 +7,8 @@ import time
 
 import torch
 
-from diff_smoe_rasterization.trainer.system import process, progress
-from diff_smoe_rasterization.trainer.system.heartbeat import Heartbeat
+from dsmoe.system import process, progress
+from dsmoe.system.heartbeat import Heartbeat
 
 
 def test_a_training_on_a_gpu_has_one_thread_of_the_host_and_one_on_the_cpu_has_all(monkeypatch):

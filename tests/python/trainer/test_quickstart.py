@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from diff_smoe_rasterization import cli
+from dsmoe import cli
 from diff_smoe_rasterization.io import read_gaussians
 from diff_smoe_rasterization.settings import record_of
-from diff_smoe_rasterization.trainer import quickstart, short_run
-from diff_smoe_rasterization.trainer.results.pictures import busiest_window, comparison, evenly_spaced
-from diff_smoe_rasterization.trainer.system import files
+from dsmoe import quickstart, short_run
+from dsmoe.results.pictures import busiest_window, comparison, evenly_spaced
+from dsmoe.system import files
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,9 @@ from __future__ import annotations
 import pytest
 from real_data import folder
 
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training.loop import Trainer
+from dsmoe.config import TrainConfig
+from dsmoe.scenes.scene import load_scene
+from dsmoe.training.loop import Trainer
 
 
 @pytest.mark.parametrize("name, views, points, size", [("fox", (43, 7), 13_710, (67, 118)),

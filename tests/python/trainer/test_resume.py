@@ -13,15 +13,15 @@ import torch
 from PIL import Image
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.errors import TrainerError
-from diff_smoe_rasterization.trainer.results.modelfile import model_path
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.system import files
-from diff_smoe_rasterization.trainer.training import checkpoint, loop
-from diff_smoe_rasterization.trainer.training.checkpoint import load_checkpoint, save_checkpoint
-from diff_smoe_rasterization.trainer.training.loop import Trainer, train
-from diff_smoe_rasterization.trainer.training.order import ViewOrder
+from dsmoe.config import TrainConfig
+from dsmoe.errors import TrainerError
+from dsmoe.results.modelfile import model_path
+from dsmoe.scenes.scene import load_scene
+from dsmoe.system import files
+from dsmoe.training import checkpoint, loop
+from dsmoe.training.checkpoint import load_checkpoint, save_checkpoint
+from dsmoe.training.loop import Trainer, train
+from dsmoe.training.order import ViewOrder
 
 
 class Killed(Exception):

@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import pytest
 
-from diff_smoe_rasterization.trainer.results import scalars
-from diff_smoe_rasterization.trainer.training.loop import train
+from dsmoe.results import scalars
+from dsmoe.training.loop import train
 
 
 @pytest.fixture

@@ -14,16 +14,16 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.errors import SceneError
-from diff_smoe_rasterization.trainer.results.pictures import file_names
-from diff_smoe_rasterization.trainer.scenes import undistortion
-from diff_smoe_rasterization.trainer.scenes.cameras import Camera
-from diff_smoe_rasterization.trainer.scenes.images import target_size
-from diff_smoe_rasterization.trainer.scenes.layout import PosedImage, hold_out
-from diff_smoe_rasterization.trainer.scenes.pointcloud import PointCloud
-from diff_smoe_rasterization.trainer.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
-from diff_smoe_rasterization.trainer.training.loop import Trainer
+from dsmoe.config import TrainConfig
+from dsmoe.errors import SceneError
+from dsmoe.results.pictures import file_names
+from dsmoe.scenes import undistortion
+from dsmoe.scenes.cameras import Camera
+from dsmoe.scenes.images import target_size
+from dsmoe.scenes.layout import PosedImage, hold_out
+from dsmoe.scenes.pointcloud import PointCloud
+from dsmoe.scenes.scene import describe_scene, load_cameras, load_scene, read_layout
+from dsmoe.training.loop import Trainer
 
 
 def load(folder, **options):

@@ -8,10 +8,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from diff_smoe_rasterization import Rendering
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.model import PARAMETERS, GaussianModel, GaussianOptimizer
-from diff_smoe_rasterization.trainer.training.strategies import STRATEGIES
-from diff_smoe_rasterization.trainer.training.strategy import Step, Strategy, StrategyContext
+from dsmoe.config import TrainConfig
+from dsmoe.model import PARAMETERS, GaussianModel, GaussianOptimizer
+from dsmoe.training.strategies import STRATEGIES
+from dsmoe.training.strategy import Step, Strategy, StrategyContext
 
 EXTENT = 10.0
 SMALL, LARGE = 0.099, 0.101  # on either side of percent_dense * EXTENT = 0.1

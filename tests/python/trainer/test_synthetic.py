@@ -5,9 +5,9 @@ import os
 
 import numpy as np
 
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.scenes import synthetic
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
+from dsmoe.config import TrainConfig
+from dsmoe.scenes import synthetic
+from dsmoe.scenes.scene import load_scene
 
 
 def test_a_sphere_is_hit_where_it_is():

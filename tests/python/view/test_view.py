@@ -15,19 +15,19 @@ from browser import browser  # noqa: F401
 from tiny_scene import one_thread, tiny_scene  # noqa: F401
 
 from diff_smoe_rasterization import io
-from diff_smoe_rasterization.cli import main
 from diff_smoe_rasterization.settings import BLEND_MODES
-from diff_smoe_rasterization.trainer.config import TrainConfig
-from diff_smoe_rasterization.trainer.inspection import to_image
-from diff_smoe_rasterization.trainer.opening import open_trained
-from diff_smoe_rasterization.trainer.results.rendering import Renderer
-from diff_smoe_rasterization.trainer.scenes.scene import load_scene
-from diff_smoe_rasterization.trainer.training.loop import Run, Trainer, train
-from diff_smoe_rasterization.view import server
-from diff_smoe_rasterization.view.following import Followed
-from diff_smoe_rasterization.view.gate_map import largest_gates
-from diff_smoe_rasterization.view.guard import CAMERA, is_wanted, refusal
-from diff_smoe_rasterization.view.picture import SHOWN, Blend, Look, own_colours, picture
+from dsmoe.cli import main
+from dsmoe.config import TrainConfig
+from dsmoe.inspection import to_image
+from dsmoe.opening import open_trained
+from dsmoe.results.rendering import Renderer
+from dsmoe.scenes.scene import load_scene
+from dsmoe.training.loop import Run, Trainer, train
+from dsmoe.view import server
+from dsmoe.view.following import Followed
+from dsmoe.view.gate_map import largest_gates
+from dsmoe.view.guard import CAMERA, is_wanted, refusal
+from dsmoe.view.picture import SHOWN, Blend, Look, own_colours, picture
 
 
 @pytest.fixture
@@ -303,7 +303,7 @@ def test_without_viser_the_command_says_what_to_install(model, monkeypatch, caps
 @pytest.mark.slow
 def test_a_browser_shows_the_rendering_of_its_camera(model, browser, tmp_path):  # noqa: F811
     pytest.importorskip("viser")
-    from diff_smoe_rasterization.view.server import Viewer, camera_of
+    from dsmoe.view.server import Viewer, camera_of
 
     viewer = Viewer(Followed(model), port=0)
     try:

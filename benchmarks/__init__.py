@@ -1,1 +1,0 @@
-"""Benchmarks: suite/ compares trainers (`dsmoe bench`), timing/ times the rasterizer."""

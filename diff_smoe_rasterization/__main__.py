@@ -1,9 +1,0 @@
-"""python -m diff_smoe_rasterization: the `dsmoe` command."""
-from __future__ import annotations
-
-import sys
-
-from .cli import main
-
-if __name__ == "__main__":
-    sys.exit(main())

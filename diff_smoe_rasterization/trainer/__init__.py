@@ -1,1 +1,0 @@
-"""The native trainer: scenes in, Gaussians out, through the package's public `rasterize` alone."""

@@ -1,0 +1,456 @@
+"""Every option of a training run in one dataclass; the command line, OUT/config.json and resume all read it."""
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import glob
+import json
+import os
+from dataclasses import dataclass, field
+from typing import Any, Dict, List, Optional, Sequence, Union
+
+from diff_smoe_rasterization.settings import (
+    BACKGROUND_GATE_VARIABLE,
+    BLEND_MODES,
+    GATED_MODES,
+    MAX_BACKGROUND_GATE,
+    mode_of_record,
+    record_of,
+    resolve_background_gate,
+    resolve_blend_mode,
+)
+
+from .errors import ConfigError
+from .gate_options import GateOptions, parse_gate_options
+from .system.files import is_file, is_folder, write_text_atomically
+
+CONFIG_NAME = "config.json"
+CHECKPOINT_NAME = "checkpoint.pt"  # beside it
+SCHEDULES = ("3dgs", "steady", "gate", "mcmc")
+BATCHED = ("3dgs", "steady")  # the schedules that train on batches of views, and on several GPUs
+PRINCIPAL_POINTS = ("scene", "centre")
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}  # what an option must be
+LARGEST = 2**53  # of whole numbers, up to which floats hold each
+DEVICES = ("auto", "cpu", "cuda")  # of the command line; a run knows the last two
+# How `--help` groups the options; those that no group names are of the last one.
+GROUPS = {
+    "scene": ("images", "resolution", "test_every", "principal_point", "init_points", "white_background",
+              "random_background"),
+    "blending": ("blend_mode", "background_gate", "background_gate_bound", "antialiasing"),
+    "length, and number of Gaussians": ("iterations", "batch", "budget", "schedule", "strategy_options"),
+    "run": ("device", "seed", "deterministic", "eval_every", "checkpoint_every"),
+    "recipe": (),
+}
+LEARNED = "learned"  # the background gate that a training finds
+# Options of the recipe; every row names densify_grad_threshold, and all of strategy_options, besides.
+RECIPE = ("sh_degree", "sh_degree_interval", "antialiasing", "lambda_dssim", "position_lr_init", "position_lr_final",
+          "position_lr_max_steps", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr", "percent_dense",
+          "densify_from_iter", "densify_until_iter", "densification_interval", "opacity_reset_interval")
+
+
+def _option(default: Any, text: str, **extra: Any) -> Any:
+    """A dataclass field whose metadata is what argparse needs to offer it."""
+    return field(default=default, metadata={"help": text, **extra})
+
+
+def _recipe(published: Any, gate: Any, text: str) -> Any:
+    """A field of the recipe that --strategy gate sets otherwise: None until `__post_init__` knows the strategy."""
+    return _option(None, f"{text} (default: {published}; gate: {gate})", published=published, gate=gate)
+
+
+@dataclass
+class TrainConfig:
+    """Options of one training run; defaults are those of 3D Gaussian Splatting (the 2023 release).
+
+    Raises ConfigError from `validate` with the option's name, its value and what it must be.
+    """
+
+    scene: str = _option("", "folder of a scene: COLMAP, transforms.json or NeRF-synthetic", positional=True)
+    output: str = _option("", "folder to write", flags=("-o", "--output"), required=True)
+    blend_mode: Optional[str] = _option(
+        None, "how Gaussians make a pixel (default: $DSMOE_BLEND_MODE, else alpha)", choices=BLEND_MODES)
+    background_gate: Union[float, str, None] = _option(
+        None, "smoe, smoe_eq7: how much the background weighs against the Gaussians: 0 is the paper's rule, 1 about "
+              f"alpha blending, `{LEARNED}` finds it with the scene (default: $DSMOE_BACKGROUND_GATE, else {LEARNED})",
+        metavar=f"X|{LEARNED}")
+    background_gate_bound: float = _option(
+        None, "a learned background gate stays above this (default: 0.03; smoe: 0)", kind=float)
+    background_gate_start: float = _option(
+        None, "a learned background gate starts with this (default: 1; smoe: 0.1)", kind=float)
+    background_gate_lr: float = _option(
+        None, "learning rate of the logarithm of what a learned background gate has above its bound (default: 0.01; "
+              "smoe: 0.03)", kind=float)
+    iterations: int = _option(30_000, "views to train on, a view each step; with --batch B, B each step")
+    batch: int = _option(
+        1, "views a step, whose gradients add up; learning rates are those of one view times the square root")
+    resolution: int = _option(
+        -1, "1, 2, 4, 8: divide the image size by it; -1: cap the width at 1600; else the width in pixels")
+    images: str = _option("images", "image folder inside a COLMAP scene")
+    principal_point: str = _option(
+        "scene", "scene: as calibrated; centre: moved to the image centre, as Inria's loader does",
+        choices=PRINCIPAL_POINTS)
+    test_every: int = _option(
+        8, "every so many images, sorted by name, one is kept for testing, the first among them; 0: none. A scene that "
+           "lists its test images itself keeps those")
+    white_background: bool = _option(False, "white background instead of black")
+    random_background: bool = _option(
+        False, "each step's image with transparency lies over a colour of its own; measured over black or white")
+    init_points: int = _option(
+        0, "start from a random subset of this many points (NeRF-synthetic without points: this many random points); "
+           "0: all points, respectively 100,000")
+    budget: int = _option(0, "the number of Gaussians to end with, or with 3dgs and steady not to exceed; 0: none")
+    schedule: Optional[str] = _option(
+        None, "how Gaussians are added and removed. 3dgs: the original recipe; steady: no opacity reset and no size "
+              "prune; gate: grow beyond the budget, remove what changes the images least, move the rest to where the "
+              "error is; mcmc: relocation and noise (default: gate with --budget, else 3dgs)",
+        choices=SCHEDULES, flags=("--strategy", "--schedule"))
+    strategy_options: str = _option("", "settings of `gate`: NAME=X,...", metavar="NAME=X,...")
+    seed: int = _option(0, "seed of every random choice")
+    device: str = _option("cpu", "where to train; auto: $DSMOE_DEVICE, else the GPU if it can be used",
+                          choices=DEVICES[1:], typed_choices=DEVICES, typed_default=DEVICES[0])
+    sh_degree: int = _option(3, "highest spherical-harmonics degree, 0 to 3")
+    sh_degree_interval: int = _option(1000, "steps between two increments of the active degree")
+    antialiasing: bool = _option(False, "compensate opacity for the 0.3 px low-pass")
+    deterministic: bool = _option(
+        False, "cuda: gradients of a step, and the scores of `gate`, equal bit for bit from run to run, and for any "
+               "number of GPUs; slower")
+
+    lambda_dssim: float = _option(0.2, "weight of D-SSIM; 1 minus it weighs L1")
+    position_lr_init: float = _recipe(0.00016, 0.00064, "first learning rate of positions, times the scene extent")
+    position_lr_final: float = _recipe(0.0000016, 0.0000064, "last learning rate of positions, times the scene extent")
+    position_lr_max_steps: int = _option(30_000, "step at which the last position learning rate is reached")
+    feature_lr: float = _recipe(0.0025, 0.005, "learning rate of base colours; higher SH bands take a 20th of it, "
+                                                "with gate a tenth")
+    opacity_lr: float = _option(0.05, "learning rate of opacity logits")
+    scaling_lr: float = _recipe(0.005, 0.01, "learning rate of log scales")
+    rotation_lr: float = _option(0.001, "learning rate of quaternions")
+
+    densify_grad_threshold: float = _option(
+        0.0002, "mean screen-space gradient (NDC units) from which a Gaussian is cloned or split")
+    percent_dense: float = _option(
+        0.01, "largest scale, as a part of the scene extent, that is cloned; larger ones are split")
+    densify_from_iter: int = _option(500, "densification starts after this step")
+    densify_until_iter: int = _option(
+        15_000, "densification stops before this step; all milestones of gate are parts of it")
+    densification_interval: int = _option(100, "steps between two densifications")
+    opacity_reset_interval: int = _option(3000, "steps between two opacity resets")
+
+    eval_every: int = _option(0, "evaluate the test views every so many steps; 0: only at the end")
+    checkpoint_every: int = _option(1000, "write a checkpoint every so many steps; 0: only at the end")
+
+    def __post_init__(self) -> None:
+        try:
+            self.blend_mode = resolve_blend_mode(self.blend_mode)
+            self.background_gate = _training_gate(self.blend_mode, self.background_gate)
+            if self.schedule is None:
+                self.schedule = "gate" if self.budget else "3dgs"
+            for name, value in {**_recipe_of(self.schedule), **_learned_gate_of(self.blend_mode)}.items():
+                if getattr(self, name) is None:
+                    setattr(self, name, value)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+
+    def validate(self) -> TrainConfig:
+        """Checks every option that needs no file; returns self."""
+        for option in dataclasses.fields(self):
+            value, choices = getattr(self, option.name), option.metadata.get("choices")
+            kind = option.metadata.get("kind") or type(option.metadata.get("published", option.default))
+            fits = isinstance(value, (int, float) if kind is float else kind)
+            if kind in KINDS and (not fits or isinstance(value, bool) != (kind is bool)):
+                raise ConfigError(f"{_flag(option)} is {value!r}; it must be {KINDS[kind]}")
+            if isinstance(value, int) and abs(value) > LARGEST:
+                raise ConfigError(f"{_flag(option)} is {value}; it must be at most 2^53")
+            if choices and value not in choices:
+                raise ConfigError(f"{_flag(option)} is {value!r}; it must be one of {', '.join(choices)}")
+        self._require("iterations", self.iterations >= 1, "at least 1")
+        self._require("batch", self.batch >= 1, "at least 1")
+        self._require("iterations", self.iterations % self.batch == 0, f"a multiple of --batch, {self.batch}")
+        if self.batch > 1 and self.schedule not in BATCHED:
+            raise ConfigError(f"--batch is {self.batch}; it must be 1 with --strategy {self.schedule}: only "
+                              f"{' and '.join(BATCHED)} know batches")
+        self._require("resolution", self.resolution == -1 or self.resolution >= 1, "-1 or at least 1")
+        self._require("test_every", self.test_every == 0 or self.test_every >= 2, "0 or at least 2")
+        self._require("init_points", self.init_points == 0 or self.init_points >= 4, "0 or at least 4")
+        self._require("budget", self.budget >= 0, "at least 0")
+        needs_budget = self.schedule in ("gate", "mcmc")
+        self._require("budget", self.budget >= 4 or not needs_budget, f"at least 4 with --strategy {self.schedule}")
+        if self.schedule == "gate":
+            self.gate_options()
+            self._require("densify_until_iter", self.densify_until_iter >= 2, "at least 2 with --strategy gate; "
+                          "--scale-recipe makes it half of --iterations")
+            self._require("iterations", self.iterations >= self.densify_until_iter, "at least --densify-until-iter "
+                          "with --strategy gate, whose removals end there; --scale-recipe shortens all of it")
+        self._require("strategy_options", not self.strategy_options or self.schedule == "gate",
+                      f"left out with --strategy {self.schedule}: only gate has some")
+        self._require("sh_degree", 0 <= self.sh_degree <= 3, "0, 1, 2 or 3")
+        self._require("lambda_dssim", 0.0 <= self.lambda_dssim <= 1.0, "between 0 and 1")
+        self._require("background_gate_bound", 0.0 <= self.background_gate_bound < 1.0, "at least 0 and below 1")
+        self._require("background_gate_start",
+                      self.background_gate_bound < self.background_gate_start <= MAX_BACKGROUND_GATE,
+                      f"above --background-gate-bound, {self.background_gate_bound}, and at most "
+                      f"{MAX_BACKGROUND_GATE:g}")
+        self._require("seed", 0 <= self.seed < 2**32, "between 0 and 2^32 - 1")
+        for name in ("sh_degree_interval", "position_lr_max_steps", "densification_interval", "opacity_reset_interval"):
+            self._require(name, getattr(self, name) >= 1, "at least 1")
+        for name in ("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr",
+                     "densify_grad_threshold", "percent_dense", "background_gate_lr"):
+            self._require(name, 0.0 < getattr(self, name) < float("inf"), "a positive number")
+        for name in ("densify_from_iter", "densify_until_iter", "eval_every", "checkpoint_every"):
+            self._require(name, getattr(self, name) >= 0, "at least 0")
+        return self
+
+    def gate_options(self) -> GateOptions:
+        """The settings of the strategy `gate`. Raises ConfigError."""
+        return parse_gate_options(self.strategy_options)
+
+    @property
+    def most_points(self) -> int:
+        """How many points to start from at most, 0: any number. Only `gate` starts from more than the budget."""
+        return 0 if self.schedule == "gate" else self.budget
+
+    def _require(self, name: str, holds: bool, requirement: str) -> None:
+        if not holds:
+            flag = "--" + name.replace("_", "-")
+            raise ConfigError(f"{flag} is {getattr(self, name)!r}; it must be {requirement}")
+
+    def changed(self, **options: Any) -> TrainConfig:
+        """A validated copy with some options set.
+
+        Another blend mode takes its own background gate, also of how that is learned what is at its default. Another
+        strategy takes what of the recipe is at its default and its own options.
+        """
+        return self._changed(options).validate()
+
+    def _changed(self, options: Dict[str, Any]) -> TrainConfig:
+        if options.get("blend_mode", self.blend_mode) != self.blend_mode:
+            usual = _learned_gate_of(str(self.blend_mode))
+            options = {"background_gate": None, **self._unset(usual), **options}
+        if options.get("schedule", self.schedule) != self.schedule:
+            usual = _recipe_of(str(self.schedule))
+            options = {**self._unset(usual), "strategy_options": "", **options}
+        return dataclasses.replace(self, **options)
+
+    def _unset(self, usual: Dict[str, Any]) -> Dict[str, None]:
+        """None for each option that is as usual."""
+        return {name: None for name in usual if getattr(self, name) == usual[name]}
+
+    def unusual_recipe(self) -> Dict[str, Any]:
+        """What of the recipe differs from the strategy's defaults."""
+        usual = {**{option.name: option.default for option in dataclasses.fields(self)},
+                 **_recipe_of(str(self.schedule))}
+        return {name: getattr(self, name) for name in RECIPE if getattr(self, name) != usual[name]}
+
+    def shortened(self) -> TrainConfig:
+        """The same recipe squeezed into `iterations` steps: each milestone keeps its share of the 30,000 of 3DGS.
+
+        The densification interval stays, as far as ten densifications fit. What is not at its default is kept.
+        """
+        default = TrainConfig(blend_mode=self.blend_mode, schedule=self.schedule)
+        share = self.iterations / default.iterations
+        milestones = {name: max(1, round(getattr(default, name) * share)) for name in (
+            "position_lr_max_steps", "sh_degree_interval", "densify_from_iter", "densify_until_iter",
+            "opacity_reset_interval")}
+        fitting = max(1, milestones["densify_until_iter"] // 10)
+        milestones["densification_interval"] = min(default.densification_interval, fitting)
+        return dataclasses.replace(self, **{name: value for name, value in milestones.items()
+                                            if getattr(self, name) == getattr(default, name)})
+
+    def save(self, folder: str) -> None:
+        """Writes OUT/config.json, with the scene's absolute path."""
+        scene = os.path.abspath(self.scene) if self.scene else ""
+        text = json.dumps({**self.record(), "scene": scene}, indent=2) + "\n"
+        write_text_atomically(os.path.join(folder, CONFIG_NAME), text)
+
+    def record(self) -> Dict[str, Any]:
+        """The options as files hold them: what `of_record` reads."""
+        return {**dataclasses.asdict(self), "blend_mode": record_of(str(self.blend_mode))}
+
+    @classmethod
+    def of_record(cls, values: Dict[str, Any]) -> TrainConfig:
+        """The options of an earlier run; one that names no background gate was trained with 0."""
+        mode, gate = mode_of_record(values["blend_mode"]), values.get("background_gate")
+        return cls(**{**values, "blend_mode": mode,
+                      "background_gate": 0.0 if gate is None and mode in GATED_MODES else gate})
+
+    @classmethod
+    def load(cls, folder: str) -> TrainConfig:
+        """Reads OUT/config.json. Raises ConfigError where the file is absent or wrong, naming file and reason."""
+        path = os.path.join(folder, CONFIG_NAME)
+        if not holds_run(folder):
+            runs = sorted(map(os.path.dirname, glob.glob(os.path.join(glob.escape(folder), "*", CONFIG_NAME))))
+            raise ConfigError(f"{folder} holds no {CONFIG_NAME}: it is not the output folder of `dsmoe train`"
+                              + (f"; such are {', '.join(runs[:3])}" if runs else ""))
+        try:
+            with open(path, encoding="utf-8") as file:
+                values = json.load(file)
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(f"{path}: not valid json ({error})") from error
+        if not isinstance(values, dict):
+            raise ConfigError(f"{path}: expected a json object of options")
+        known = {option.name for option in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise ConfigError(f"{path}: unknown option {', '.join(unknown)} (written by another version?)")
+        # Rendering must use the mode of the training, so an absent mode is never replaced by a default.
+        if mode_of_record(str(values.get("blend_mode"))) not in BLEND_MODES:
+            raise ConfigError(f"{path}: blend_mode is {values.get('blend_mode')!r}; "
+                             f"it must be one of {', '.join(BLEND_MODES)}")
+        values["output"] = folder  # the folder may have been moved
+        try:
+            return cls.of_record(values).validate()
+        except (TypeError, OverflowError, ConfigError) as error:
+            raise ConfigError(f"{path}: {error}") from error
+
+    @classmethod
+    def of_run(cls, folder: str, scene_option: str, resumes: bool = False, **options: Any) -> TrainConfig:
+        """The options of the run in a folder with some set. Raises ConfigError, also where its scene is not there.
+
+        scene_option: what says where the scene lies now, for that error. resumes: whether that run goes on with them.
+        """
+        earlier = cls.load(folder)
+        config = earlier._changed(options)
+        if resumes:
+            earlier.check_continued_by(config)
+        config.validate()
+        if "scene" not in options and not is_folder(config.scene):
+            here = "" if os.path.isabs(config.scene) else " here, and the path is relative to where it was trained"
+            raise ConfigError(f"scene {config.scene}, on which {folder} was trained: no such folder{here}; "
+                              f"name with {scene_option} where it lies now")
+        return config
+
+    def differences(self, later: TrainConfig) -> List[str]:
+        """Options that keep `later` from continuing this run, one text each; more iterations do not."""
+        # These alter when something is written or where, never the trained Gaussians.
+        harmless = {"scene", "output", "eval_every", "checkpoint_every"}
+        if later.iterations > self.iterations:
+            harmless.add("iterations")
+        if self.blend_mode != later.blend_mode:  # what follows from that needs no text of its own
+            before, after = _learned_gate_of(self.blend_mode), _learned_gate_of(later.blend_mode)
+            harmless |= {name for name in before
+                         if getattr(self, name) == before[name] and getattr(later, name) == after[name]}
+        texts = []
+        for option in dataclasses.fields(self):
+            mine, theirs = getattr(self, option.name), getattr(later, option.name)
+            if option.name not in harmless and mine != theirs:
+                texts.append(f"{_flag(option)} is {mine!r}, not {theirs!r}")
+        return texts
+
+    def check_continued_by(self, later: TrainConfig) -> None:
+        """Raises ConfigError where `later` cannot continue this run. Comes before `validate`, which knows no run."""
+        differences = self.differences(later)
+        if differences:
+            raise ConfigError(f"{self.output} holds a run with other options: {'; '.join(differences)}. `--resume -o "
+                              f"{self.output}` alone keeps the run's options; more --iterations extend it")
+
+
+def _recipe_of(schedule: str) -> Dict[str, Any]:
+    """What a strategy sets of the recipe, by option, where strategies differ."""
+    recipe = "gate" if schedule == "gate" else "published"
+    return {option.name: option.metadata[recipe] for option in dataclasses.fields(TrainConfig)
+            if recipe in option.metadata}
+
+
+def _learned_gate_of(blend_mode: str) -> Dict[str, float]:
+    """How a background gate is learned by default, where blend modes differ."""
+    tails = blend_mode == "smoe"
+    return {"background_gate_bound": 0.0 if tails else 0.03, "background_gate_start": 0.1 if tails else 1.0,
+            "background_gate_lr": 0.03 if tails else 0.01}
+
+
+def holds_run(folder: str) -> bool:
+    """Whether OUT/config.json is there. Raises TrainerError where that cannot be seen."""
+    return is_file(os.path.join(folder, CONFIG_NAME))
+
+
+def _training_gate(blend_mode: str, asked: Union[float, str, None]) -> Union[float, str]:
+    """The background gate that a training takes: a number, 1 in `alpha` and 0 in the ablations, or LEARNED.
+
+    asked: None means in GATED_MODES $DSMOE_BACKGROUND_GATE, else LEARNED. Raises ValueError for a value that is no
+    gate, and for one that the mode does not know.
+    """
+    if blend_mode not in GATED_MODES:
+        fixed = float(resolve_background_gate(blend_mode, None))
+        return fixed if asked in (None, fixed) else float(resolve_background_gate(blend_mode, asked))
+    if asked == LEARNED or asked is None and not os.environ.get(BACKGROUND_GATE_VARIABLE):
+        return LEARNED
+    return float(resolve_background_gate(blend_mode, asked))
+
+
+def _number_or_learned(text: str) -> Union[float, str]:
+    try:
+        return text if text == LEARNED else float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"is {text!r}; it must be a number or `{LEARNED}`") from error
+
+
+def _flags(option: dataclasses.Field[Any]) -> Sequence[str]:
+    """How an option is typed; texts have the first of these."""
+    return option.metadata.get("flags", ("--" + option.name.replace("_", "-"),))
+
+
+def _flag(option: dataclasses.Field[Any]) -> str:
+    return _flags(option)[0]
+
+
+def flags_text(options: Dict[str, Any]) -> str:
+    """What to type for options by name."""
+    known = {option.name: option for option in dataclasses.fields(TrainConfig)}
+    return " ".join(f"{_flag(known[name])} {value}" for name, value in options.items())
+
+
+_TYPES = {"int": int, "float": float, "str": str, "Optional[str]": str, "Union[float, str, None]": _number_or_learned}
+
+
+def add_arguments(parser: argparse.ArgumentParser, skip: Sequence[str] = (),
+                  defaults: bool = True) -> Dict[str, argparse._ArgumentGroup]:
+    """Offers every option of TrainConfig, but those named in `skip`, on an argparse parser; returns their groups.
+
+    Options that are not given are absent from the parsed arguments. defaults: whether the help text names what they
+    are then.
+    """
+    groups = {title: parser.add_argument_group(title) for title in GROUPS}
+    titles = {name: title for title, names in GROUPS.items() for name in names}
+    for option in dataclasses.fields(TrainConfig):
+        if option.name in skip:
+            continue
+        text = option.metadata["help"].replace("%", "%%")
+        if option.metadata.get("positional"):
+            parser.add_argument(option.name, metavar=option.name.upper(), help=text)
+            continue
+        flags, group = _flags(option), groups[titles.get(option.name, "recipe")]
+        if option.type == "bool":
+            group.add_argument(*flags, action="store_true", help=text, default=argparse.SUPPRESS)
+            continue
+        keywords: Dict[str, Any] = {"type": _TYPES[str(option.type)], "default": argparse.SUPPRESS}
+        if option.metadata.get("required"):
+            keywords["required"] = True
+        elif option.default is not None and defaults:
+            text += f" (default: {option.metadata.get('typed_default', option.default)})"
+        if option.metadata.get("choices"):
+            keywords["choices"] = option.metadata.get("typed_choices", option.metadata["choices"])
+        else:
+            kind = "N" if option.type == "int" else "X" if option.type == "float" else "NAME"
+            keywords["metavar"] = option.metadata.get("metavar", kind)
+        group.add_argument(*flags, help=text, dest=option.name, **keywords)
+    return groups
+
+
+def given_options(arguments: argparse.Namespace) -> Dict[str, Any]:
+    """The options of TrainConfig among parsed arguments."""
+    names = {option.name for option in dataclasses.fields(TrainConfig)}
+    return {name: value for name, value in vars(arguments).items() if name in names}
+
+
+def config_from_arguments(arguments: argparse.Namespace, earlier: Optional[TrainConfig] = None) -> TrainConfig:
+    """Builds a validated TrainConfig from parsed arguments; options that are not given keep their defaults.
+
+    With --scale-recipe the milestones that are not given keep their share of the iterations. earlier: the run that goes
+    on with these options.
+    """
+    options = given_options(arguments)
+    config = TrainConfig(**options)
+    if getattr(arguments, "scale_recipe", False):
+        config = dataclasses.replace(config.shortened(), **options)
+    if earlier:
+        earlier.check_continued_by(config)
+    return config.validate()

@@ -1,0 +1,172 @@
+"""A batch of views of Gaussians that are divided over processes: footprints go to where a view is blended.
+
+Every process projects its own Gaussians for all views and sends what a view sees to the process that blends it. The
+gradients by those footprints come back, and each process makes of them the gradients of its own Gaussians. A process
+that is alone does the same without sending.
+"""
+from __future__ import annotations
+
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
+
+import torch
+
+from diff_smoe_rasterization.autograd import INPUTS
+from diff_smoe_rasterization.footprints import GATE_GRADIENTS, Footprints, blend_op_arguments, projection_arguments
+from diff_smoe_rasterization.settings import GaussianRasterizationSettings
+
+from ..model import PARAMETERS, GaussianModel
+from ..system.group import Group
+
+_OPS = torch.ops.diff_smoe_rasterization
+_GATE = 8  # numbers of a footprint before its features
+
+
+class Projected(NamedTuple):
+    """The own Gaussians on the image of one view, as the backward pass needs them."""
+
+    inputs: Sequence[Optional[torch.Tensor]]  # of the op `project`
+    options: Sequence[Any]  # likewise
+    visible: torch.Tensor  # [M] int64
+    features: torch.Tensor  # [N, F]
+    radii: torch.Tensor  # [N] int32
+
+
+class DrawnImage:
+    """One view as this process has blended it."""
+
+    def __init__(self, footprints: Footprints, settings: GaussianRasterizationSettings, for_backward: bool) -> None:
+        self.radii = footprints.radii
+        self._tensors, self._options = blend_op_arguments(footprints, settings)
+        self._options = (*self._options, for_backward)
+        *images, self._saved = _OPS.blend(*self._tensors, *self._options)
+        self._images = images
+        self.color: torch.Tensor = images[0]  # [C, H, W]
+
+    def backward(self, dL_dcolor: torch.Tensor, wants_gate: bool) -> Tuple[torch.Tensor, torch.Tensor]:
+        """Gradients by the footprints, [M, 6 + F], and by the background's gate, [1], or [0] where it is not wanted."""
+        radii, bg, gate = self._tensors[2:]
+        records, _, dL_dgate = _OPS.blend_backward(dL_dcolor, None, None, None, self._images, self._saved, radii, bg,
+                                                   gate, *self._options, wants_gate)
+        return records, dL_dgate
+
+
+class Batch:
+    """The views of one step, from projection to gradients. View k is blended by process k of the group, in turns."""
+
+    def __init__(self, group: Group, model: GaussianModel, settings: Sequence[GaussianRasterizationSettings],
+                 note: int = 0) -> None:
+        """Projects and sends. settings: of each view. note: a number; `notes` has those of all processes."""
+        self.group, self.model = group, model
+        self.owners = [view % group.size for view in range(len(settings))]
+        self.own_views = [view for view, owner in enumerate(self.owners) if owner == group.rank]
+        # In which views lie side by side in what is sent: those of one receiver together.
+        self._order = sorted(range(len(settings)), key=lambda view: self.owners[view])
+        self._values = model.activated()
+        opacities, scales, rotations = self._values
+        arguments = {**model.color_arguments(), "scales": scales, "rotations": rotations,
+                     "means2D": model.raw["means3D"]}  # of which only the gradient is of use
+        self.projected: List[Projected] = []
+        packed: List[torch.Tensor] = []
+        for each in settings:
+            inputs, options = projection_arguments(each, model.raw["means3D"], opacities, **arguments)
+            gates, features, radii = _OPS.project(*inputs, *options, True)
+            visible = radii.nonzero().squeeze(1)
+            self.projected.append(Projected(inputs, (*options, True), visible, features, radii))
+            packed.append(_OPS.pack_footprints(gates, features, radii, visible))
+        *rows, notes = zip(*group.gather_numbers([*map(len, packed), note], str(radii.device)))
+        self.notes = list(notes)
+        self._counts: List[Sequence[int]] = rows  # [view][process] how many footprints
+        if group.size == 1:
+            self._arrived = {view: [rows] for view, rows in enumerate(packed)}
+        else:
+            outgoing = joined([packed[view] for view in self._order])
+            self._arrived = self._split(group.exchange(outgoing, *self._lengths()))
+
+    def _lengths(self) -> Tuple[List[int], List[int]]:
+        """How many rows go to each process, and how many come from each."""
+        group = self.group
+        sent = [sum(self._counts[view][group.rank] for view, owner in enumerate(self.owners) if owner == rank)
+                for rank in range(group.size)]
+        received = [sum(self._counts[view][rank] for view in self.own_views) for rank in range(group.size)]
+        return sent, received
+
+    def _split(self, rows: torch.Tensor) -> Dict[int, List[torch.Tensor]]:
+        """What came, by own view the rows of each process in their order: that of all Gaussians."""
+        parts = iter(rows.split([self._counts[view][rank] for rank in range(self.group.size)
+                                 for view in self.own_views]))
+        by_rank = [{view: next(parts) for view in self.own_views} for _ in range(self.group.size)]
+        return {view: [of_rank[view] for of_rank in by_rank] for view in self.own_views}
+
+    def draw(self, view: int, settings: GaussianRasterizationSettings, for_backward: bool = True) -> DrawnImage:
+        """Blends one of the own views, once."""
+        rows = joined(self._arrived.pop(view))
+        radii = rows[:, -1].contiguous().view(torch.int32)
+        return DrawnImage(Footprints(rows[:, :_GATE], rows[:, _GATE:-1], radii), settings, for_backward)
+
+    def give_back(self, records: Dict[int, torch.Tensor]) -> List[torch.Tensor]:
+        """From the gradients by the footprints of each own view to those by the own footprints of each view.
+
+        The records are taken out of `records`.
+        """
+        if self.group.size == 1:
+            return [records.pop(view) for view in range(len(self.owners))]
+        by_view = {view: records.pop(view).split(list(self._counts[view])) for view in self.own_views}
+        parts = [by_view[view][rank] for rank in range(self.group.size) for view in self.own_views]
+        sent, received = self._lengths()
+        width = GATE_GRADIENTS + self.projected[0].features.shape[1]
+        outgoing = joined(parts) if parts else self.projected[0].features.new_empty((0, width))
+        del by_view, parts
+        returned = self.group.exchange(outgoing, received, sent)
+        pieces = returned.split([self._counts[view][self.group.rank] for view in self._order])
+        return [piece for _, piece in sorted(zip(self._order, pieces), key=lambda pair: pair[0])]
+
+    def backward(self, records: List[torch.Tensor]) -> List[torch.Tensor]:
+        """Sets the gradients of the model's parameters, sums over the views in their order.
+
+        records: what `give_back` returned; it is emptied. Returns for each view dL/dpixel times (W / 2, H / 2), [N, 3].
+        """
+        present = [tensor is not None for tensor in self.projected[0].inputs]
+        names, wanted = gradient_places(present)
+        sums: Optional[List[torch.Tensor]] = None
+        means2D: List[torch.Tensor] = []
+        for projected in self.projected:
+            rows = records.pop(0)
+            dense = rows.new_zeros((len(projected.radii), rows.shape[1]))
+            dense.index_copy_(0, projected.visible, rows)
+            given = [tensor for tensor in projected.inputs if tensor is not None]
+            gradients = _OPS.project_backward(dense, None, given, present, projected.features, projected.radii,
+                                              *projected.options, wanted)
+            means2D.append(gradients.pop(names.index("means2D")))
+            if sums is None:
+                sums = gradients
+            else:
+                torch._foreach_add_(sums, gradients)
+            del rows, dense, gradients  # they are as large as the parameters
+        names.remove("means2D")
+        self._set_gradients(dict(zip(names, sums or ())))
+        return means2D
+
+    def _set_gradients(self, by_input: Dict[str, torch.Tensor]) -> None:
+        raw = self.model.raw
+        through = ("opacities", "scales", "rotations")
+        gradients = _OPS.activate_backward([raw[name] for name in through], list(self._values),
+                                           *(by_input[name] for name in through))
+        by_name = {"means3D": by_input["means3D"], **dict(zip(through, gradients))}
+        if self.model.active_sh_degree == 0:  # `color_arguments`
+            by_name["dc"] = by_input["shs"]
+        else:
+            by_name.update(dc=by_input["dc"], shs=by_input["shs"])
+        for name in PARAMETERS:
+            raw[name].grad = by_name.get(name)
+
+
+def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
+    """All rows of the parts, copied only where there are several parts."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
+
+
+def gradient_places(present: Sequence[bool]) -> Tuple[List[str], List[bool]]:
+    """The inputs of the op `project` whose gradients a step wants: their names, and which of all they are."""
+    wanted = [here and name in ("means3D", "means2D", "opacities", "dc", "shs", "scales", "rotations")
+              for name, here in zip(INPUTS, present)]
+    return [name for name, want in zip(INPUTS, wanted) if want], wanted

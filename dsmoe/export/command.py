@@ -1,0 +1,117 @@
+"""`dsmoe export`: a trained model as one file."""
+from __future__ import annotations
+
+import dataclasses
+import os
+import tempfile
+from typing import Any, Dict, Optional, Tuple
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.settings import GATED_MODES, record_of
+
+from ..errors import TrainerError
+from ..opening import Trained, open_trained
+from ..results.modelfile import save_model
+from ..results.pictures import evenly_spaced
+from ..results.rows import blend_name, viewer_warning
+from ..system.files import check_output, is_folder, new_file, write_atomically
+from . import html
+from .glb import BLEND, Blend, glb_bytes
+from .splat import splat_bytes
+from .spz import check_spz, spz_bytes
+
+FORMATS = ("html", "ply", "splat", "spz", "glb")
+VIEWS = 16  # of a page, at most
+BAKE_ITERATIONS = 5000
+
+
+def export(source: str, path: Optional[str] = None, form: Optional[str] = None, sh_degree: Optional[int] = None,
+           blend_mode: Optional[str] = None, background_gate: Optional[float] = None, *, overwrite: bool = False,
+           bake: Optional[str] = None, bake_iterations: int = BAKE_ITERATIONS, device: str = "cpu",
+           **options: Any) -> Tuple[str, str]:
+    """Writes the model of a run's folder or of a .ply; returns the file's path and a note, which may be empty.
+
+    form: one of FORMATS; None: by the ending of `path`, else html. path: None: model.FORM. sh_degree: the highest
+    degree of view-dependent colour that is kept. overwrite: `path` may be a file that is there. bake: "alpha"
+    fine-tunes the model to that blend, on the scene's images and the device; the note says what it costs. The rest is
+    as in `open_trained`. Raises TrainerError.
+    """
+    ending = os.path.splitext(path)[1][1:].lower() if path else FORMATS[0]
+    if form and path and ending in FORMATS and ending != form:
+        raise TrainerError(f"{path}: its ending says {ending}, and --format says {form}; they must agree")
+    form = form or ending
+    if form not in FORMATS:
+        raise TrainerError(f"{path}: its ending is none of {', '.join(FORMATS)}; say which --format it is")
+    path = path or f"model.{form}"
+    check_output(path, overwrite)  # refused before anything is read
+    if form == "spz":
+        check_spz()
+    trained = open_trained(source, blend_mode, background_gate, device, **options)
+    if os.path.exists(path) and os.path.samefile(path, trained.ply):
+        raise TrainerError(f"{path} is the model itself; choose another file with -o")
+    if not bake:
+        return path, _write(path, form, trained, sh_degree, overwrite)
+    with tempfile.TemporaryDirectory() as folder:
+        baked, note = _baked(trained, folder, bake_iterations)
+        _write(path, form, baked, sh_degree, overwrite)
+    return path, note
+
+
+def _baked(trained: Trained, folder: str, iterations: int) -> Tuple[Trained, str]:
+    """The model for alpha, its .ply in the folder, and what that costs."""
+    from ..training.bake import bake
+
+    config, before = trained.config, trained.renderer
+    if not is_folder(config.scene):
+        raise TrainerError("--bake trains on the scene's images; name the scene's folder with --scene")
+    baked = bake(config.changed(output=folder, device=str(before.background.device.type)), before, iterations)
+    ply = os.path.join(folder, "baked.ply")
+    save_model(ply, baked.renderer.model, baked.renderer.blend_mode, 1.0)
+    name = blend_name(before.blend_mode, float(before.background_gate))
+    note = "the scene has no test images: what the baking costs was not measured"
+    if baked.trained is not None:
+        note = (f"test PSNR: {baked.trained:.2f} dB in {name}, {baked.shown:.2f} dB when viewers blend that by alpha, "
+                f"{baked.baked:.2f} dB baked to alpha ({baked.baked - baked.trained:+.2f} dB)")
+    return dataclasses.replace(trained, ply=ply, renderer=baked.renderer), note
+
+
+def _write(path: str, form: str, trained: Trained, sh_degree: Optional[int], overwrite: bool) -> str:
+    """Writes the file; returns a warning, which may be empty."""
+    gaussians = io.read_gaussians(trained.ply)
+    if sh_degree is not None:
+        gaussians = dataclasses.replace(gaussians, shs=gaussians.shs[:, :(sh_degree + 1) ** 2 - 1])
+    renderer = trained.renderer
+    warning = viewer_warning({"blend_mode": renderer.blend_mode, "background_gate": renderer.background_gate}, form)
+    if form == "ply":
+        _write_ply(path, trained, gaussians, overwrite)
+    else:
+        blend = Blend(renderer.blend_mode, float(renderer.background_gate)) if warning else None
+        content = {"html": lambda: html.page(gaussians, _shown(trained)).encode("utf-8"),
+                   "splat": lambda: splat_bytes(gaussians), "spz": lambda: spz_bytes(gaussians),
+                   "glb": lambda: glb_bytes(gaussians, blend)}[form]()
+        write_atomically(path, lambda file: file.write(content), overwrite)
+    if form == "html" or not warning:
+        return ""
+    if form == "glb":
+        warning = f"note: the .glb requires {BLEND}, so that no viewer shows its {renderer.blend_mode} by alpha"
+    return warning + "; with --bake alpha every viewer shows the model"
+
+
+def _write_ply(path: str, trained: Trained, gaussians: io.Gaussians, overwrite: bool) -> None:
+    mode, gate = trained.renderer.blend_mode, trained.renderer.background_gate
+    recorded: Dict[str, Any] = {"blend_mode": record_of(mode),
+                                "background_gate": float(gate) if mode in GATED_MODES else None}
+    others = tuple(line for line in gaussians.comments if line.split(" ")[0] not in recorded)  # of an older name
+    with new_file(path, overwrite) as temporary:
+        io.write_gaussians(temporary, dataclasses.replace(gaussians, comments=others, **recorded))
+
+
+def _shown(trained: Trained) -> html.Shown:
+    renderer = trained.renderer
+    red, green, blue = renderer.background.tolist()
+    cameras = [trained.cameras[index] for index in evenly_spaced(len(trained.cameras), VIEWS)]
+    title = os.path.basename(os.path.abspath(trained.config.scene or trained.ply))
+    return html.Shown(title, renderer.blend_mode, float(renderer.background_gate), (red, green, blue),
+                      renderer.antialiasing, cameras, trained.orbit)
+
+

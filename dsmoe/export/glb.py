@@ -1,0 +1,115 @@
+"""Binary glTF with Khronos' extension KHR_gaussian_splatting, whose viewers blend by alpha."""
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any, Dict, List, NamedTuple, Optional, Tuple
+
+import numpy as np
+
+from diff_smoe_rasterization._version import __version__
+from diff_smoe_rasterization.io import Gaussians
+
+from ..errors import TrainerError
+from ..model import SH_C0
+from .rows import rotatable_rows, sigmoid, y_up
+
+SPLATTING = "KHR_gaussian_splatting"
+BLEND = "DSMOE_gaussian_splatting_blend"
+"""The extension of models that are not blended by alpha: `blendMode` and `backgroundGate`. It is required, so that a
+viewer that does not know it refuses the file."""
+
+POINTS, VERTICES = 0, 34962  # of glTF: a primitive's mode, a buffer view's target
+FLOAT, UNSIGNED_SHORT = 5126, 5123  # component types
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+LARGEST = 2**32 - 1  # bytes of a .glb, whose length has 32 bits
+
+
+class Blend(NamedTuple):
+    """How a pixel is made."""
+
+    mode: str  # one of BLEND_MODES
+    background_gate: float
+
+
+def glb_bytes(gaussians: Gaussians, blend: Optional[Blend]) -> bytes:
+    """The file's content, in the axes of glTF (y up). blend: None for alpha.
+
+    Left out are Gaussians that are not finite, and those whose quaternion is 0. Raises TrainerError where none is left,
+    as glTF has no empty arrays, and where they are too many.
+    """
+    attributes = _attributes(gaussians, fallback=blend is None)
+    count = len(attributes["POSITION"])
+    if not count:
+        raise TrainerError("a .glb holds one Gaussian at least, but the model has none that can be shown")
+    document, offset = _document(blend), 0
+    for index, (name, array) in enumerate(attributes.items()):
+        document["bufferViews"].append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes,
+                                        "target": VERTICES})
+        document["accessors"].append({"bufferView": index, "type": TYPES[array.shape[1]], "count": count,
+                                      **_component(array)})
+        document["meshes"][0]["primitives"][0]["attributes"][name] = index
+        offset += array.nbytes
+    positions = attributes["POSITION"]
+    document["accessors"][0].update(min=positions.min(axis=0).tolist(), max=positions.max(axis=0).tolist())
+    document["buffers"] = [{"byteLength": offset}]
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    length = 12 + 8 + len(text) + 8 + offset
+    if length > LARGEST:
+        raise TrainerError(f"a .glb has 4 GiB at most, but {count:,} Gaussians take {length:,} bytes; a lower "
+                           "--sh-degree makes it smaller")
+    return b"".join([struct.pack("<4sII", b"glTF", 2, length), struct.pack("<I4s", len(text), b"JSON"), text,
+                     struct.pack("<I4s", offset, b"BIN\0"), *(array.tobytes() for array in attributes.values())])
+
+
+def _document(blend: Optional[Blend]) -> Dict[str, Any]:
+    """The JSON without what depends on the arrays."""
+    splatting: Dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    document: Dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"diff_smoe_rasterization {__version__}"},
+        "extensionsUsed": [SPLATTING],
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"mode": POINTS, "attributes": {}, "extensions": {SPLATTING: splatting}}]}],
+        "accessors": [], "bufferViews": [],
+    }
+    if blend:
+        splatting["extensions"] = {BLEND: {"blendMode": blend.mode, "backgroundGate": blend.background_gate}}
+        document["extensionsUsed"].append(BLEND)
+        document["extensionsRequired"] = [SPLATTING, BLEND]
+    return document
+
+
+def _attributes(gaussians: Gaussians, fallback: bool) -> Dict[str, np.ndarray]:
+    """By name, the position first: [N, 1], [N, 3] or [N, 4], of 4 bytes or a multiple a row.
+
+    fallback: with colours for viewers that know no Gaussians and show points.
+    """
+    position, logit, log_scales, rotations, dc, harmonics = rotatable_rows(y_up(gaussians))
+    opacity = sigmoid(logit)
+    scales = np.exp(log_scales.astype(np.float64)).clip(max=np.finfo(np.float32).max)
+    unit = rotations / np.linalg.norm(rotations.astype(np.float64), axis=1, keepdims=True)
+    attributes = {"POSITION": position, f"{SPLATTING}:ROTATION": unit[:, [1, 2, 3, 0]], f"{SPLATTING}:SCALE": scales,
+                  f"{SPLATTING}:OPACITY": opacity, f"{SPLATTING}:SH_DEGREE_0_COEF_0": dc}
+    for index, (degree, place) in enumerate(_coefficients(gaussians.sh_degree)):
+        attributes[f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{place}"] = harmonics[:, 3 * index:3 * index + 3]
+    arrays = {name: np.ascontiguousarray(array, "<f4") for name, array in attributes.items()}
+    if fallback:
+        linear = _linear((0.5 + SH_C0 * dc.astype(np.float64)).clip(0, 1))
+        arrays["COLOR_0"] = np.rint(np.hstack([linear, opacity]) * 65535).astype("<u2")
+    return arrays
+
+
+def _coefficients(sh_degree: int) -> List[Tuple[int, int]]:
+    """(degree, place in it) of the harmonics from degree 1 on, in the order of a .ply, which is glTF's."""
+    return [(degree, place) for degree in range(1, sh_degree + 1) for place in range(2 * degree + 1)]
+
+
+def _component(array: np.ndarray) -> Dict[str, Any]:
+    return {"componentType": FLOAT} if array.dtype == np.float32 else {
+        "componentType": UNSIGNED_SHORT, "normalized": True}
+
+
+def _linear(srgb: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1] to linear, IEC 61966-2-1."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,45 @@
+"""The Gaussians of a model that can be shown."""
+from __future__ import annotations
+
+import dataclasses
+from typing import List
+
+import numpy as np
+
+from diff_smoe_rasterization.io import Gaussians
+
+from ..results.modelfile import finite_gaussians
+
+# What half a turn about x makes of x, y, z, and of the real spherical harmonics of degrees 1 to 3 (y, z, x; xy, ...).
+TURNED_AXES = np.array([1, -1, -1], np.float32)
+TURNED_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Opacities of logits, in float64."""
+    with np.errstate(over="ignore"):  # exp(1000) is infinite, and the opacity 0
+        return 1 / (1 + np.exp(-logits.astype(np.float64)))
+
+
+def finite_rows(gaussians: Gaussians) -> List[np.ndarray]:
+    """Positions [M, 3], opacity logits [M, 1], log scales [M, 3], quaternions [M, 4], dc [M, 3] and the other harmonics
+    [M, 3 (K - 1)] of the M Gaussians all of whose numbers are finite."""
+    arrays = [gaussians.means3D, gaussians.opacity_logits, gaussians.log_scales, gaussians.rotations,
+              gaussians.dc[:, 0], gaussians.shs.reshape(len(gaussians.shs), 3 * gaussians.shs.shape[1])]
+    finite = finite_gaussians(gaussians)
+    return [array[finite] for array in arrays]
+
+
+def rotatable_rows(gaussians: Gaussians) -> List[np.ndarray]:
+    """`finite_rows` without those whose quaternion is 0, which viewers cannot turn into a rotation."""
+    rows = finite_rows(gaussians)
+    turned = rows[3].any(axis=1)
+    return [array[turned] for array in rows]
+
+
+def y_up(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians after half a turn about x: from COLMAP's axes (y down, z forward) to those of OpenGL."""
+    signs = np.concatenate([[1], TURNED_AXES]).astype(np.float32)  # of w, x, y, z: R becomes D R D, with D = its turn
+    harmonics = TURNED_HARMONICS[:gaussians.shs.shape[1], None]
+    return dataclasses.replace(gaussians, means3D=gaussians.means3D * TURNED_AXES,
+                               rotations=gaussians.rotations * signs, shs=gaussians.shs * harmonics)

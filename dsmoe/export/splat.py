@@ -1,0 +1,30 @@
+"""The .splat format of web viewers: 32 bytes a Gaussian, without view-dependent colour."""
+from __future__ import annotations
+
+import numpy as np
+
+from diff_smoe_rasterization.io import Gaussians
+
+from ..model import SH_C0
+from .rows import rotatable_rows
+
+RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+
+
+def splat_bytes(gaussians: Gaussians) -> bytes:
+    """The file's content: the largest and most opaque first, as viewers that show a file while it loads expect.
+
+    Each has its position and its three standard deviations in world units, colour of degree 0 and opacity in 8 bits,
+    and its quaternion (w, x, y, z) as 128 + 128 q in 8 bits. Left out are Gaussians that are not finite, and those
+    whose quaternion is 0, which viewers cannot turn into a rotation.
+    """
+    position, logit, log_scales, rotations, dc, _ = rotatable_rows(gaussians)
+    opacity = 1 / (1 + np.exp(-logit.astype(np.float64)))
+    scale = np.exp(log_scales.astype(np.float64))
+    colour = 0.5 + SH_C0 * dc.astype(np.float64)
+    quaternion = rotations / np.linalg.norm(rotations.astype(np.float64), axis=1, keepdims=True)
+    records = np.empty(len(opacity), RECORD)
+    records["position"], records["scale"] = position, scale
+    records["rgba"] = np.rint(np.hstack([colour, opacity]).clip(0, 1) * 255)
+    records["rotation"] = np.rint(quaternion * 128 + 128).clip(0, 255)
+    return records[np.argsort(-scale.prod(axis=1) * opacity[:, 0], kind="stable")].tobytes()

@@ -1,0 +1,177 @@
+"""What is done with a trained model: measure it again, write its images."""
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any, Dict, List, Optional, Sequence, Tuple
+
+import numpy as np
+import torch
+from PIL import Image
+
+from diff_smoe_rasterization.settings import mode_of_record
+
+from .config import LEARNED, TrainConfig
+from .errors import TrainerError
+from .results.evaluation import Measure, evaluate
+from .results.metrics import image_metrics, quantised
+from .results.modelfile import Recorded, agreed_background_gate, agreed_blend_mode, load_model, trained_model_path
+from .results.pictures import file_names
+from .results.rendering import Rasterize, Renderer, background_color
+from .results.rows import read_results, result_row, write_results
+from .scenes.cameras import Camera
+from .scenes.scene import load_cameras, load_scene
+from .system.device import check_device
+from .system.files import write_json_atomically
+from .system.output_folder import Record, make_folder, only_one, own_record, remove_files, write_record
+from .system.progress import progress_bar
+from .training.loop import PER_VIEW_NAME
+
+RENDER = "dsmoe render"  # in its folders' records
+
+
+def evaluate_run(output: str, device: str = "cpu", split: str = "test", scene_folder: Optional[str] = None,
+                 progress: bool = True, rasterize: Optional[Rasterize] = None,
+                 measure: Measure = image_metrics) -> Dict[str, Any]:
+    """Measures the run in `output` again and returns its row; for the test split OUT/results.json follows.
+
+    scene_folder: where the scene lies, if not where it was trained. measure: as in `evaluate`. A folder that cannot be
+    written to is told, no error. Raises TrainerError.
+    """
+    options = {"scene": scene_folder} if scene_folder else {}
+    config = TrainConfig.of_run(output, "--scene", device=device, **options)
+    check_device(device)
+    ply = trained_model_path(output, config.iterations)
+    earlier = [row for row in read_results(output) if _is_of(row, config)]
+    scene = load_scene(config, progress).to(device)
+    renderer = open_renderer(config, ply, config.blend_mode, device, rasterize, _gate_of(config))
+    views = {"test": scene.test, "train": scene.train}[split]
+    if not views:
+        raise TrainerError(f"scene {config.scene} has no {split} views")
+    masked = bool(earlier) and "masks" in earlier[0].get("protocol", {})
+    if masked != any(view.mask is not None for view in views) and earlier:
+        raise TrainerError(f"{config.scene} has {'no masks' if masked else 'masks'}, but the run was measured "
+                           f"{'with' if masked else 'without'} them: these would be figures of other pixels; "
+                           f"{'put them back' if masked else 'rename the folder'}, or name another --scene")
+    evaluation = evaluate(renderer, views, device, progress, measure)
+    seconds = earlier[0].get("train_seconds") if earlier else None
+    row = result_row(config, scene, renderer.model.num_gaussians, seconds, evaluation, renderer.background_gate)
+    if split == "test":
+        try:
+            write_results(output, [row])
+            write_json_atomically(os.path.join(output, PER_VIEW_NAME), evaluation.per_view)
+        except OSError as error:
+            print(f"warning: {output}: its results could not be written anew ({error.strerror}); the figures hold")
+    return row
+
+
+def open_renderer(config: TrainConfig, ply: str, asked_blend_mode: Optional[str], device: str,
+                  rasterize: Optional[Rasterize] = None, asked_gate: Optional[float] = None) -> Renderer:
+    """A renderer for a .ply with the blend mode and the background gate that it records.
+
+    config gives background and antialiasing. A mode that has another name now is told on stderr. Raises TrainerError
+    where what is asked disagrees with the file.
+    """
+    model, recorded = load_model(ply, device)
+    mode = agreed_blend_mode(ply, recorded.blend_mode, asked_blend_mode)
+    gate = agreed_background_gate(ply, mode, recorded, asked_gate)
+    if recorded.note:
+        print(f"note: {ply}: {recorded.note}", file=sys.stderr)
+    return Renderer(model, mode, background_color(config.white_background, device), config.antialiasing, rasterize,
+                    background_gate=gate)
+
+
+def open_run(config: TrainConfig, asked_blend_mode: Optional[str], asked_gate: Optional[float], device: str,
+             rasterize: Optional[Rasterize] = None) -> Tuple[Renderer, str]:
+    """A renderer for the model of the run that config is of, and its .ply.
+
+    Raises TrainerError where the run has not ended, and where what is asked disagrees with it.
+    """
+    ply = trained_model_path(config.output, config.iterations)
+    mode = agreed_blend_mode(config.output, config.blend_mode, asked_blend_mode)
+    if config.background_gate != LEARNED:
+        recorded = Recorded(mode, float(config.background_gate))
+        asked_gate = agreed_background_gate(config.output, mode, recorded, asked_gate)
+    return open_renderer(config, ply, mode, device, rasterize, asked_gate), ply
+
+
+def _is_of(row: Dict[str, Any], config: TrainConfig) -> bool:
+    """Whether a row is of the run's blend mode, whichever version wrote both."""
+    mode = row.get("blend_mode")
+    return config.blend_mode in (mode, mode_of_record(str(mode)))
+
+
+def _gate_of(config: TrainConfig) -> Optional[float]:
+    """The gate that a run names; None where it was learned, which its .ply alone says."""
+    return None if config.background_gate == LEARNED else float(config.background_gate)
+
+
+def render_images(config: TrainConfig, ply: Optional[str], folder: str, split: str = "test",
+                  blend_mode: Optional[str] = None, device: str = "cpu",
+                  rasterize: Optional[Rasterize] = None, background_gate: Optional[float] = None,
+                  outputs: Sequence[str] = (), overwrite: bool = False) -> List[str]:
+    """Writes a PNG per camera of config.scene into `folder`; returns the paths.
+
+    folder: new, empty, or of an earlier rendering, whose images of another model or scene are removed; with
+    `overwrite` any, whose files of the same names are replaced.
+    outputs: "depth" and "alpha" are written beside each, as NAME.depth.npy [H, W] float32, which is the expected view
+    depth in the scene's units, 0 where nothing is hit, and NAME.alpha.png, 8 bits, white where Gaussians cover.
+
+    ply: a file whose comments, else `blend_mode` and `background_gate`, say how it is blended; None: the model of the
+    run that config is of, whose record these two must not contradict. Raises TrainerError.
+    """
+    check_device(device)
+    own_record(folder, RENDER, overwrite)  # refused before anything is read
+    if ply is None:
+        renderer, ply = open_run(config, blend_mode, background_gate, device, rasterize)
+    else:
+        renderer = open_renderer(config, ply, blend_mode, device, rasterize, background_gate)
+    cameras = load_cameras(config, split)
+    if not cameras:
+        raise TrainerError(f"scene {config.scene} has no {split} views")
+    return write_images(renderer, cameras, folder, said_of_images(config, ply, renderer), outputs, overwrite)
+
+
+def write_images(renderer: Renderer, cameras: Sequence[Camera], folder: str, subject: str,
+                 outputs: Sequence[str] = (), overwrite: bool = False) -> List[str]:
+    """Writes a PNG per camera into `folder`; returns the paths.
+
+    subject: what they show, for the folder's record: images of something else are removed. The rest is as in
+    `render_images`. Raises TrainerError.
+    """
+    endings = {"depth": ".depth.npy", "alpha": ".alpha.png"}
+    stems = file_names([camera.name for camera in cameras])
+    written = [stem + ending for stem in stems for ending in (".png", *map(endings.get, outputs))]
+    if len({*written}) < len(written):
+        raise TrainerError(f"{subject}: names of cameras differ only by {' or '.join(endings.values())}; rename one")
+    own_record(folder, RENDER, overwrite)  # refused before the folder is made
+    make_folder(folder)
+    with only_one(folder), torch.no_grad():
+        earlier = own_record(folder, RENDER, overwrite)
+        kept = earlier.files if subject == earlier.subject else []  # those of another split
+        write_record(folder, RENDER, Record(subject, sorted({*kept, *written})), earlier.files, overwrite)
+        remove_files(folder, written)
+        paths = [os.path.join(folder, stem) for stem in stems]
+        for camera, path in zip(progress_bar(cameras, desc="images", unit="image", leave=False), paths):
+            rendering = renderer(camera, outputs=tuple(outputs))
+            to_image(rendering.color).save(path + ".png")
+            if rendering.depth is not None:
+                np.save(path + endings["depth"], rendering.depth[0].cpu().numpy())
+            if rendering.alpha is not None:
+                to_image(rendering.alpha.expand(3, -1, -1)).convert("L").save(path + endings["alpha"])
+    return [path + ".png" for path in paths]
+
+
+def said_of_images(config: TrainConfig, ply: str, renderer: Renderer) -> str:
+    """What images show, for their folder's record: other words, and they are not kept beside each other."""
+    model = os.stat(ply)
+    return (f"{os.path.abspath(ply)}, {model.st_size} bytes of {model.st_mtime_ns}, on "
+            f"{os.path.abspath(config.scene)}: {renderer.blend_mode} {renderer.background_gate}, resolution "
+            f"{config.resolution}, principal point {config.principal_point}, "
+            f"{'white' if config.white_background else 'black'} background")
+
+
+def to_image(color: torch.Tensor) -> Image.Image:
+    """A rendering [3, H, W] as an 8-bit image, rounded as the metrics round."""
+    values = (quantised(color.detach()) * 255).round().to(torch.uint8)
+    return Image.fromarray(np.ascontiguousarray(values.permute(1, 2, 0).cpu().numpy()))

@@ -1,0 +1,321 @@
+"""The trainable Gaussians: raw parameters, their activations, Adam, and the Inria-format .ply."""
+from __future__ import annotations
+
+import math
+from typing import Any, Callable, Dict, Optional, Tuple
+
+import torch
+
+from diff_smoe_rasterization.gaussians import activate
+from diff_smoe_rasterization.lazy_adam import LazyAdam
+from diff_smoe_rasterization.neighbors import distCUDA2
+from diff_smoe_rasterization.optimizers import FusedAdam
+
+from .config import TrainConfig
+from .scenes.pointcloud import PointCloud
+from .system.process import return_spare_memory
+
+SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi))
+INITIAL_OPACITY = 0.1
+MIN_SQUARED_DISTANCE = 1e-7  # of coinciding points, so that log scales stay finite
+ADAM_EPSILON = 1e-15
+
+PARAMETERS = ("means3D", "dc", "shs", "opacities", "scales", "rotations")
+"""The raw parameters: shapes [N, 3], [N, 1, 3], [N, K-1, 3], [N, 1] logits, [N, 3] logs, [N, 4] unnormalised."""
+
+
+def inverse_sigmoid(x: torch.Tensor) -> torch.Tensor:
+    """log(x / (1 - x))"""
+    return torch.log(x / (1 - x))
+
+
+def quaternion_to_matrix(rotations: torch.Tensor) -> torch.Tensor:
+    """[N, 4] quaternions (w, x, y, z), normalised here -> [N, 3, 3]."""
+    w, x, y, z = torch.nn.functional.normalize(rotations).unbind(1)
+    return torch.stack([
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ], dim=1).view(-1, 3, 3)
+
+
+class GaussianModel:
+    """N Gaussians as leaf tensors under an Adam optimizer with the learning rates of 3DGS.
+
+    Rows can be appended and removed in training; the optimizer's moments follow.
+    """
+
+    def __init__(self, raw: Dict[str, torch.Tensor], sh_degree: int) -> None:
+        """raw: tensors named in PARAMETERS. sh_degree: highest degree that `shs` holds."""
+        self.sh_degree = sh_degree
+        self.active_sh_degree = 0
+        self.stored = {name: raw[name].detach().clone().contiguous().requires_grad_() for name in PARAMETERS}
+        """The raw parameters, of which rows of spherical harmonics may wait for steps of `lazy`."""
+        self.lazy: Optional[LazyAdam] = None
+
+    @classmethod
+    def from_points(cls, points: PointCloud, sh_degree: int, device: str) -> GaussianModel:
+        """Initialises as 3DGS: round Gaussians as wide as the distance to their neighbours, opacity 0.1."""
+        count = len(points.positions)
+        positions = torch.tensor(points.positions, device=device)
+        log_scales = distCUDA2(positions).clamp(min=MIN_SQUARED_DISTANCE).sqrt().log()
+        rotations = torch.zeros(count, 4, device=device)
+        rotations[:, 0] = 1
+        return cls({
+            "means3D": positions.float(),
+            "dc": ((torch.tensor(points.colors, device=device) - 0.5) / SH_C0).float().unsqueeze(1),
+            "shs": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device=device),
+            "opacities": inverse_sigmoid(torch.full((count, 1), INITIAL_OPACITY, device=device)),
+            "scales": log_scales.float().unsqueeze(1).repeat(1, 3),
+            "rotations": rotations,
+        }, sh_degree)
+
+    @property
+    def raw(self) -> Dict[str, torch.Tensor]:
+        """The raw parameters by name, brought up to date."""
+        if self.lazy is not None:
+            self.lazy.catch_up()
+        return self.stored
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.stored["means3D"].shape[0]
+
+    def activated(self) -> Tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Opacities [N, 1] in (0, 1), scales [N, 3] in world units, and rotations [N, 4], unit quaternions."""
+        return activate(self.stored["opacities"], self.stored["scales"], self.stored["rotations"])
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """[N, 1] in (0, 1)"""
+        return self.activated()[0]
+
+    @property
+    def scales(self) -> torch.Tensor:
+        """[N, 3] world units"""
+        return self.activated()[1]
+
+    @property
+    def rotations(self) -> torch.Tensor:
+        """[N, 4] unit quaternions"""
+        return self.activated()[2]
+
+    def color_arguments(self) -> Dict[str, torch.Tensor]:
+        """The colour arguments of `rasterize`; while degree 0 is active the higher bands are left out."""
+        raw = self.raw
+        return {name: raw[source] for name, source in self.color_sources().items()}
+
+    def color_sources(self) -> Dict[str, str]:
+        """The parameters that are the colour arguments of `rasterize`, by these."""
+        return {"shs": "dc"} if self.active_sh_degree == 0 else {"dc": "dc", "shs": "shs"}
+
+    def raise_sh_degree(self) -> None:
+        """Activates one more SH degree, up to the highest."""
+        self.active_sh_degree = min(self.active_sh_degree + 1, self.sh_degree)
+
+
+class GaussianOptimizer:
+    """Adam over a GaussianModel, one group per parameter, with the exponential schedule of positions."""
+
+    def __init__(self, model: GaussianModel, config: TrainConfig, extent: float) -> None:
+        """extent: the scene's scale, which multiplies the learning rate of positions.
+
+        A batch of B views takes the learning rates of one view times sqrt(B), and its betas to the power of B.
+        """
+        self.model = model
+        self.config = config
+        self.position_scale = extent * math.sqrt(config.batch)
+        rates = {
+            "means3D": config.position_lr_init * extent,
+            "dc": config.feature_lr,
+            "shs": config.feature_lr / 20,
+            "opacities": config.opacity_lr,
+            "scales": config.scaling_lr,
+            "rotations": config.rotation_lr,
+        }
+        rates = {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
+        self.rates = rates
+        self.adam = FusedAdam([{"params": [model.raw[name]], "lr": rates[name], "name": name} for name in PARAMETERS],
+                              eps=ADAM_EPSILON, betas=batch_betas(config.batch))
+
+    def set_position_rate(self, iteration: int) -> None:
+        """Sets the positions' learning rate for this step."""
+        config = self.config
+        rate = exponential_rate(iteration, config.position_lr_init, config.position_lr_final,
+                                config.position_lr_max_steps)
+        self.group("means3D")["lr"] = rate * self.position_scale
+
+    @property
+    def position_rate(self) -> float:
+        """The learning rate of positions in this step, world units."""
+        return self.group("means3D")["lr"]
+
+    def scale_rate(self, name: str, factor: float) -> None:
+        """Multiplies what the options say of one learning rate, which is not the positions'."""
+        self.rates[name] *= factor
+        self.group(name)["lr"] = self.rates[name]
+
+    def scale_other_rates(self, factor: float) -> None:
+        """Sets the learning rates of all but the positions to a part of what the options say."""
+        for name in PARAMETERS[1:]:
+            self.group(name)["lr"] = factor * self.rates[name]
+
+    def step(self) -> None:
+        """Steps every parameter that has a gradient, then drops the gradients."""
+        if self.model.raw["shs"].grad is not None:
+            self.start_higher_bands()
+        self.adam.step()
+        for tensor in self.model.stored.values():
+            tensor.grad = None
+
+    def append(self, rows: Dict[str, torch.Tensor]) -> None:
+        """Adds Gaussians, raw parameters as in PARAMETERS; their moments start at zero."""
+        for name in PARAMETERS:
+            self._replace(name, lambda tensor, new: torch.cat([tensor, new]), rows[name])
+        return_spare_memory(self.model.raw["means3D"].device)
+
+    def keep(self, mask: torch.Tensor) -> None:
+        """Removes the Gaussians where mask [N] (bool) is False."""
+        self.take(mask.nonzero().squeeze(1))  # on a GPU the host waits here, once for all tensors
+
+    def take(self, rows: torch.Tensor, new: Optional[Dict[str, torch.Tensor]] = None) -> None:
+        """Puts these rows [M] of Gaussians in place of all, in one pass over memory.
+
+        new: raw parameters of the last ones, where they differ from those of their rows. As many of the last ones begin
+        without moments.
+        """
+        new = new or {}
+        fresh = max((len(values) for values in new.values()), default=0)
+        for name in PARAMETERS:  # one after the other: then only one is in memory twice
+            old = self._tensors(name)
+            taken = torch.ops.diff_smoe_rasterization.gather_rows([tensor.detach() for tensor in old.values()], rows)
+            tensors = dict(zip(old, taken))
+            for key, tensor in tensors.items():
+                if key != "raw":
+                    tensor[len(tensor) - fresh:] = 0
+                elif name in new:
+                    tensor[len(tensor) - fresh:] = new[name]
+            del old
+            self._put(name, tensors)
+        return_spare_memory(self.model.raw["means3D"].device)
+
+    def set_opacity_logits(self, logits: torch.Tensor) -> None:
+        """Sets all opacity logits [N, 1] and forgets their moments."""
+        self._replace("opacities", lambda tensor, new: new.clone(), logits)
+
+    @torch.no_grad()
+    def overwrite(self, rows: torch.Tensor, raw: Dict[str, torch.Tensor], like: Optional[torch.Tensor] = None) -> None:
+        """Puts Gaussians, raw parameters as in PARAMETERS, in place of those in other rows [M], which differ.
+
+        Their moments start at zero; like: rows [M] whose second moments they take over instead.
+        """
+        for name in PARAMETERS:
+            tensor = self.model.raw[name]
+            tensor.index_copy_(0, rows, raw[name])
+            state = self.adam.state.get(tensor)
+            if not state:
+                continue
+            squares = state["exp_avg_sq"]
+            state["exp_avg"].index_fill_(0, rows, 0)
+            if like is None:
+                squares.index_fill_(0, rows, 0)
+            else:
+                squares.index_copy_(0, rows, squares.index_select(0, like))
+
+    def rearrange(self, edit: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        """Puts edit(rows) in place of every parameter and every moment."""
+        for name in PARAMETERS:
+            tensor = self.model.raw[name]
+            self._replace(name, lambda rows, _: edit(rows), tensor.new_zeros(0))
+
+    def replace_all(self, raw: Dict[str, torch.Tensor]) -> None:
+        """Sets every parameter, any number of rows, and forgets all moments."""
+        self.model.lazy = None
+        self.adam.state.clear()
+        for name in PARAMETERS:
+            self._replace(name, lambda _, new: new.clone(), raw[name])
+
+    def _replace(self, name: str, edit: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
+                 rows: torch.Tensor) -> None:
+        """Puts edit(tensor, rows) in place of a parameter and edit(moment, zeros like rows) in place of its moments."""
+        self._put(name, {key: edit(tensor.detach(), rows.detach() if key == "raw" else torch.zeros_like(rows))
+                         for key, tensor in self._tensors(name).items()})
+
+    def _tensors(self, name: str) -> Dict[str, torch.Tensor]:
+        """The parameter, `raw`, and its moments, where it has some, by their names in Adam's state."""
+        parameter = self.model.raw[name]
+        state = self.adam.state.get(parameter, {})
+        return {"raw": parameter, **{key: state[key] for key in ("exp_avg", "exp_avg_sq") if key in state}}
+
+    def _put(self, name: str, tensors: Dict[str, torch.Tensor]) -> None:
+        """Puts others in place of what `_tensors` gives.
+
+        The new leaf has no gradient, so the current step leaves it alone: as in 3DGS, where an iteration that
+        densifies steps nothing and one that resets opacities steps all but them.
+        """
+        if name in self.model.color_sources().values():
+            self.model.lazy = None  # `_tensors` has brought it up to date
+        moments = {key: tensor.contiguous() for key, tensor in tensors.items()}
+        new = moments.pop("raw").requires_grad_()
+        state = self.adam.state.pop(self.model.stored[name], None)
+        if state is not None:
+            state.update(moments)
+            self.adam.state[new] = state
+        self.group(name)["params"][0] = new
+        self.model.stored[name] = new
+
+    def group(self, name: str) -> Dict[str, Any]:
+        """The parameter's group in Adam."""
+        return self.adam.param_groups[PARAMETERS.index(name)]
+
+    def lazy_colors(self) -> LazyAdam:
+        """What steps the spherical harmonics whose rows are read now and then; the model is up to date by it."""
+        model = self.model
+        names = list(model.color_sources().values())
+        parameters = [model.stored[name] for name in names]
+        lazy = model.lazy
+        if lazy is None or [id(tensor) for tensor in lazy.parameters] != [id(tensor) for tensor in parameters]:
+            if lazy is not None:
+                lazy.catch_up()
+            if "shs" in names:
+                self.start_higher_bands()
+            lazy = model.lazy = LazyAdam(self.adam, parameters)
+        return lazy
+
+    def start_higher_bands(self) -> None:
+        """Gives `shs` its Adam state where it has none yet, as old as that of `dc`.
+
+        While degree 0 is active its gradient would be zero: Adam would leave it where it is and only count the
+        step. Skipping that, and taking over the count, gives the same numbers and saves most of the step's time.
+        """
+        bands, base = self.model.stored["shs"], self.model.stored["dc"]
+        if bands in self.adam.state or base not in self.adam.state:
+            return
+        self.adam.state[bands] = {
+            "step": self.adam.state[base]["step"],
+            "exp_avg": torch.zeros_like(bands),
+            "exp_avg_sq": torch.zeros_like(bands),
+        }
+
+    def state_dict(self) -> Dict[str, Dict]:
+        """Adam's state by parameter name."""
+        return {name: dict(self.adam.state[self.model.raw[name]]) for name in PARAMETERS
+                if self.model.raw[name] in self.adam.state}
+
+    def load_state_dict(self, states: Dict[str, Dict]) -> None:
+        """Takes what `state_dict` gave."""
+        self.model.lazy = None
+        self.adam.state.clear()
+        for name, state in states.items():
+            self.adam.state[self.model.raw[name]] = dict(state)
+
+
+def batch_betas(batch: int) -> Tuple[float, float]:
+    """Adam's betas for the gradients of so many views at once."""
+    return 0.9**batch, 0.999**batch
+
+
+def exponential_rate(step: int, first: float, last: float, max_steps: int) -> float:
+    """Log-linear interpolation from `first` at step 0 to `last` at max_steps, constant from there on."""
+    share = min(max(step / max_steps, 0.0), 1.0)
+    return math.exp((1 - share) * math.log(first) + share * math.log(last))

@@ -1,0 +1,172 @@
+"""`dsmoe run`: a command of an unmodified trainer, with this package's rasterizer in front of its own.
+
+PYTHONPATH names shims/, in which `diff_gaussian_rasterization` is the module of integrations whose API the trainer
+calls. DSMOE_BLEND_MODE is the mode, and in GATED_MODES DSMOE_BACKGROUND_GATE the background's gate. Whatever the
+command starts has them. That nothing was rendered is an error.
+"""
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Dict, List, NoReturn, Optional, Sequence, Set, Tuple
+
+from diff_smoe_rasterization.integrations.contracts import CONTRACTS, contract_of
+from diff_smoe_rasterization.settings import BACKGROUND_GATE_VARIABLE, BLEND_MODE_VARIABLE, training_background_gate
+from dsmoe.system.children import die_with_parent
+
+from . import facts
+from .runtime import RASTERIZER_VARIABLE, SHIMS, STAND_INS, USED_VARIABLE, WITHOUT_VARIABLE
+from .source import PatchError
+from .trainers import GR, RASTERIZER, TRAINER_NAMES, TRAINERS
+
+RENAMED = "DSMOE_RUN_RENAMED"  # the names under which the trainer imports a rasterizer that is known
+FLAVOURS = tuple(sorted(contract.name for contract in CONTRACTS))
+
+
+def run(words: Sequence[str], blend_mode: str, trainer: Optional[str] = None,
+        background_gate: Optional[float] = None) -> NoReturn:
+    """Runs the command, and ends with its exit status, or 128 + N where signal N ended it.
+
+    Where this process is killed, the command gets a SIGTERM. Raises PatchError where the command would not run, or did
+    not, with this rasterizer.
+    """
+    environment, lines = prepare(words, blend_mode, trainer, dict(os.environ), background_gate)
+    for line in lines:
+        print("dsmoe run: " + line, file=sys.stderr)
+    with tempfile.TemporaryDirectory(prefix="dsmoe_run_") as folder:
+        used = Path(folder, "used")
+        for name in filter(None, environment.pop(RENAMED, "").split(os.pathsep)):
+            Path(folder, "shims", name).mkdir(parents=True)
+            Path(folder, "shims", name, "__init__.py").write_text((SHIMS / RASTERIZER / "__init__.py").read_text())
+            environment["PYTHONPATH"] = os.pathsep.join([str(Path(folder, "shims")), environment["PYTHONPATH"]])
+        try:
+            child = subprocess.Popen(list(words), env={**environment, USED_VARIABLE: str(used)},
+                                     preexec_fn=die_with_parent)
+        except OSError as error:
+            raise PatchError(f"{words[0]}: {error.strerror}") from None
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the command too
+        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
+            if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup, which the command inherits
+                signal.signal(number, lambda received, _: child.send_signal(received))
+        status, is_used = child.wait(), used.exists()
+    if status == 0 and not is_used:
+        raise PatchError("the command ended without an error, but this package's rasterizer rendered nothing: what was "
+                         f"trained or rendered was not {blend_mode}. A command that renders nothing needs no dsmoe run")
+    sys.exit(status if status >= 0 else 128 - status)
+
+
+def prepare(words: Sequence[str], blend_mode: str, trainer: Optional[str],
+            environment: Dict[str, str], background_gate: Optional[float] = None) -> Tuple[Dict[str, str], List[str]]:
+    """Returns the environment of the command, and what the user is told about it."""
+    try:
+        gate = training_background_gate(blend_mode, background_gate)
+    except ValueError as error:
+        raise PatchError(str(error)) from None
+    if not words:
+        raise PatchError("there is no command; type: dsmoe run --blend-mode MODE -- python train.py ...")
+    script = _script(words)
+    folders = _folders(script)
+    files = {folder: _read(folder, everywhere=folder == folders[0]) for folder in folders}
+    flavour, where, warnings, found = _flavour(files, trainer, script)
+    module = contract_of(flavour).module
+    known_names = {name for name in facts.MODULES if module == RASTERIZER and "from " + name in found}
+    renamed = sorted(facts.those(found, "renamed ") | known_names)
+    named = flavour if module == RASTERIZER else "inria"  # beside another stands Inria's
+    if flavour == facts.OF_GSPLAT:  # unless what is beside it is known
+        beside = facts.contract_of(found - {"from " + facts.OF_GSPLAT})[0]
+        named = beside.name if beside and beside.module == RASTERIZER else named
+    path = [str(SHIMS), str(STAND_INS), *filter(None, [environment.get("PYTHONPATH")])]
+    environment = {**environment, BLEND_MODE_VARIABLE: blend_mode, RASTERIZER_VARIABLE: named,
+                   BACKGROUND_GATE_VARIABLE: "" if gate is None else str(gate), "PYTHONPATH": os.pathsep.join(path),
+                   "PYTHONDONTWRITEBYTECODE": "1", RENAMED: os.pathsep.join(renamed)}  # no __pycache__ in the checkout
+    warnings += facts.of_one_name(folders[0])
+    if named == "inria_2024" and not _may_use_sparse_adam(words, files, found):
+        environment[WITHOUT_VARIABLE] = facts.SPARSE_ADAM
+    if renamed:
+        why = "as --trainer says" if trainer else "since its calls fit"
+        warnings += [f"{', '.join(renamed)} is taken for {RASTERIZER} under another name, {why}; if it computes "
+                     "something else, that is not computed here"]
+        module = ", ".join([*renamed, *[module] * ("from " + module in found)])
+    if "," in flavour and flavour not in ("color,radii", trainer):
+        warnings += [f"the results are told by what the trainer calls them: {flavour}"]
+    blend = blend_mode if gate is None else f"{blend_mode}, background gate {gate}"
+    return environment, [f"{where}: {module} will be {flavour} of this package, blend mode {blend}; each process that "
+                         "imports it says so", *(f"warning: {warning}" for warning in warnings)]
+
+
+def _flavour(files: Dict[Path, Dict[str, bytes]], trainer: Optional[str], script: Optional[Path]
+             ) -> Tuple[str, str, List[str], Set[str]]:
+    """Returns the flavour, for which trainer it was chosen, what speaks against it, and the facts."""
+    by_name = {"": "", **{name: name for name in FLAVOURS}, **{known.name: known.flavour for known in TRAINERS}}
+    with contextlib.suppress(KeyError):
+        by_name.setdefault(trainer or "", contract_of(trainer or "").name)
+    if (trainer or "") not in by_name:
+        raise PatchError(f"there is no trainer {trainer!r}; it must be one of {', '.join(TRAINER_NAMES)}, or for "
+                         f"another trainer the rasterizer whose API it calls: {', '.join(FLAVOURS)}, or what a call "
+                         "returns, such as color,depth,median_depth,alpha,radii")
+    reasons, everything = [], set()
+    for path in (next(iter(files)) / name for name in (RASTERIZER, f"{RASTERIZER}.py")):
+        if path.exists():  # where Python looks first
+            raise PatchError(f"{path} would be imported before this package's; move it away")
+    for folder, texts in files.items():
+        inside = script is not None and folder in script.parents
+        name = script.relative_to(folder).as_posix() if script and inside else ""
+        found = facts.of_checkout(texts, name)
+        everything |= found
+        if facts.PATCHED in found:
+            raise PatchError(f"{folder} is patched already: run the command itself, with --blend_mode (train.py) or "
+                             "without (render.py, which reads it from cfg_args)")
+        known, reason = facts.recognise(found)
+        if known and not trainer:
+            return known.flavour, f"{known.name if GR in texts else 'the trainer'} in {folder}", [], found
+        is_hidden = by_name[trainer or ""] == facts.OF_GSPLAT and "has gsplat" in found
+        if trainer and (facts.those(found, "uses ") or found and not facts.calls_some(found) and not is_hidden):
+            raise PatchError(f"{folder}: {reason}; --trainer {trainer} cannot help")
+        if known and known.flavour != by_name[trainer or ""]:
+            reason = f"by what it imports and calls this is {known.flavour}"
+        reasons += [f"{folder}: {reason}"] if found and reason else []
+    if trainer:
+        module = contract_of(by_name[trainer]).module
+        return by_name[trainer], trainer, reasons or [f"no file that imports {module} was found"] * (
+            not everything), everything
+    nearest = dict.fromkeys([next(iter(files)), Path.cwd()])
+    below = [f"{folder}: {hint}" for folder in nearest for hint in facts.below(folder)]
+    raise PatchError("no trainer that is known was found; --trainer names it, or the rasterizer whose API it calls "
+                     "(--trainer list prints the names):\n  " + "\n  ".join(
+                         [*reasons, *below] or [f"there is no {GR} in {', '.join(map(str, files))}"]))
+
+
+def _script(words: Sequence[str]) -> Optional[Path]:
+    """Returns the file that a command runs: the first .py, or that of `-m`; None where there is none."""
+    modules = [after.replace(".", "/") + ".py" for word, after in zip(words, words[1:]) if word == "-m"]
+    return next((Path(word).resolve() for word in [*words, *modules]
+                 if word.endswith(".py") and Path(word).is_file()), None)
+
+
+def _folders(script: Optional[Path]) -> List[Path]:
+    """Returns where the checkout may be: the script's folder, those above it, the current folder."""
+    folders = [script.parent, *list(script.parent.parents)[:2]] if script else []
+    return list(dict.fromkeys([*folders, Path.cwd()]))
+
+
+def _read(folder: Path, everywhere: bool) -> Dict[str, bytes]:
+    """Returns the Python files in a folder and two levels below it; {} where none imports a rasterizer.
+
+    everywhere: also where it is no checkout like that of 3DGS.
+    """
+    patterns = ("*.py", "*/*.py", "*/*/*.py") if everywhere or (folder / GR).is_file() else ()
+    paths = (path for pattern in patterns for path in folder.glob(pattern) if path.is_file())
+    files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths
+             if not {"submodules", "site-packages"} & set(path.parts)}
+    return files if GR in files or any(map(facts.IMPORTS_RASTERIZER.search, files.values())) else {}
+
+
+def _may_use_sparse_adam(words: Sequence[str], files: Dict[Path, Dict[str, bytes]], found: Set[str]) -> bool:
+    """Whether the trainer was written for SparseGaussianAdam, or the command asks for it."""
+    return any(facts.ASKS_FOR_SPARSE_ADAM in word for word in words) or any(
+        facts.is_for_sparse_adam(folder, texts, found) for folder, texts in files.items())

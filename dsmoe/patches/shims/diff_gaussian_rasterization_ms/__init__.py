@@ -1,0 +1,3 @@
+from dsmoe.patches.runtime import rasterizer_of_run
+
+globals().update(rasterizer_of_run("mini_splatting"))

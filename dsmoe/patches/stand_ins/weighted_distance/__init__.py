@@ -1,0 +1,3 @@
+from dsmoe.patches.runtime import is_installed
+
+is_installed("weighted_distance._C")

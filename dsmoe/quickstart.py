@@ -1,0 +1,187 @@
+"""One scene, both blends: trains with `alpha` and with `smoe`, and shows what differs.
+
+python -m dsmoe.quickstart [SCENE] [--iterations N] [--resolution R] [-o OUT]
+"""
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import shlex
+import shutil
+import sys
+from typing import Any, Dict, List, Optional
+
+import torch
+
+from .config import TrainConfig, add_arguments, flags_text
+from .errors import TrainerError, in_one_line
+from .inspection import open_renderer, to_image
+from .results.metrics import psnr, quantised
+from .results.modelfile import model_path
+from .results.pictures import comparison, evenly_spaced, file_names
+from .results.rows import RESULTS_NAME, results_table, viewer_warning, write_results
+from .scenes.images import View, image_size
+from .scenes.scene import Scene, load_scene, read_layout
+from .scenes.synthetic import write_synthetic_scene
+from .short_run import short_run
+from .system.device import chosen_device, device_line
+from .system.interrupt import exit_status
+from .system.output_folder import Record, make_folder, only_one, own_record, read_record, remove_files, write_record
+from .system.process import command, set_up_process
+from .training.loop import train
+
+MODES = ("alpha", "smoe")
+PICTURES = 3  # test views that are shown
+DEFAULT_FOLDER = "quickstart_output"  # has a folder for each scene
+PROGRAM = "quickstart"  # in its folder's record
+MADE_UP = "the one that it makes itself"
+MADE_UP_NAME = "room"
+# On a GPU the scene that it makes is larger too.
+MADE_UP_ON_GPU = {"views": 64, "width": 480, "height": 360, "points": 30_000}
+
+# Offered by `dsmoe train` and fixed here.
+FIXED = ("scene", "output", "blend_mode", "background_gate", "background_gate_bound", "background_gate_start",
+         "background_gate_lr", "eval_every", "checkpoint_every")
+
+
+def main(argv: Optional[List[str]] = None) -> int:
+    """Runs the comparison; returns the exit status."""
+    arguments = _parse(argv)
+    try:
+        run(arguments)
+        return 0
+    except Exception as error:
+        text = in_one_line(error)
+        if text is None:
+            raise
+        print(f"quickstart: error: {text}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt as stop:
+        print("\nquickstart: interrupted", file=sys.stderr)
+        return exit_status(stop)
+
+
+def _parse(argv: Optional[List[str]]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="quickstart", argument_default=argparse.SUPPRESS,
+        description="Trains a scene twice, with alpha blending and with SMoE gating, and compares the results. "
+                    "Options that are not given are chosen so that a processor finishes in minutes; on a GPU it "
+                    "trains at full size for about a minute.")
+    parser.add_argument("scene", nargs="?", metavar="SCENE", default=None,
+                        help="folder of a scene: COLMAP, transforms.json or NeRF-synthetic (default: one made on the "
+                             "spot)")
+    parser.add_argument("-o", "--output", metavar="OUT", default=None,
+                        help="folder to write: new, empty, or of the same scene (default: "
+                             f"{DEFAULT_FOLDER}/NAME, with the scene's name)")
+    parser.add_argument("--quiet", action="store_true", default=False, help="no progress bars")
+    add_arguments(parser, skip=FIXED, defaults=False)
+    return parser.parse_args(argv)
+
+
+def run(arguments: argparse.Namespace) -> List[Dict[str, Any]]:
+    """Makes the scene where none is named, trains both modes, writes results and pictures; returns the rows."""
+    given = {name: value for name, value in vars(arguments).items() if name not in ("scene", "output", "quiet")}
+    progress = not arguments.quiet
+    given["device"] = chosen_device(given.get("device"))
+    print(device_line(given["device"]), flush=True)
+    config = choose_options(arguments.scene, given) if arguments.scene else None
+    subject = os.path.abspath(arguments.scene) if arguments.scene else MADE_UP
+    output = arguments.output or default_output(subject)
+    _earlier_files(output, subject)
+    make_folder(output)  # a folder that cannot be made is told before images are read
+    with only_one(output):
+        earlier = _earlier_files(output, subject)  # again: another run may have been at work there
+        if config is None:
+            folder = os.path.join(output, "scene")
+            print(f"making a scene in {folder}", flush=True)
+            write_record(output, PROGRAM, Record(subject, earlier), earlier)  # the scene is its own
+            write_synthetic_scene(folder, **({} if given["device"] == "cpu" else MADE_UP_ON_GPU))
+            config = choose_options(folder, given)
+        set_up_process(config.device)
+        scene = load_scene(config, progress)
+        if scene.note:
+            print(scene.note, flush=True)
+        views = shown_views(scene)
+        files = [RESULTS_NAME, *(mode + ".ply" for mode in MODES), *views]
+        write_record(output, PROGRAM, Record(subject, files), earlier)
+        remove_files(output, files)
+        rows = []
+        for mode in MODES:
+            rows.append(train(config.changed(blend_mode=mode, output=os.path.join(output, mode)), overwrite=True,
+                              progress=progress, scene=scene))
+            shutil.copyfile(model_path(os.path.join(output, mode), config.iterations),
+                            os.path.join(output, mode + ".ply"))
+        write_results(output, rows)
+        pictures = write_pictures(config, views, output)
+    print()
+    print(results_table(rows))
+    print(f"\n{len(scene.train)} training and {len(scene.test)} test views; "
+          f"results and models: {output}; pictures: {', '.join(pictures)}")
+    print(viewer_warning(rows[1]))
+    print(f"to look at it in a browser: {command()} export {shlex.quote(os.path.join(output, MODES[1]))} -o model.html")
+    return rows
+
+
+def default_output(subject: str) -> str:
+    """The folder for a scene where none is named: by its name, with a number where that is another scene's."""
+    name = MADE_UP_NAME if subject == MADE_UP else os.path.basename(subject)
+    for number in itertools.count(1):
+        folder = os.path.join(DEFAULT_FOLDER, name if number == 1 else f"{name}_{number}")
+        record = read_record(folder, PROGRAM)
+        if record is None or record.subject in ("", subject):
+            break
+    return folder
+
+
+def _earlier_files(output: str, subject: str) -> List[str]:
+    """What an earlier comparison on the same scene has written. Raises TrainerError where `output` holds another's."""
+    record = own_record(output, PROGRAM, folders=("scene", *MODES))
+    if record.subject not in ("", subject):
+        raise TrainerError(f"{output} holds the models and pictures of another scene, {record.subject}; choose another "
+                           "folder with -o, or remove it")
+    return record.files
+
+
+def choose_options(folder: str, given: Dict[str, Any]) -> TrainConfig:
+    """The given options, and for the others a short training (`short_run`); prints what it chose.
+
+    The recipe's milestones keep their share of the iterations (`TrainConfig.shortened`).
+    """
+    layout = read_layout(TrainConfig(scene=folder))
+    device = given.get("device", "cpu")
+    chosen = short_run(device, *image_size(layout.train[0].path), len(layout.points.positions))
+    chosen = {name: value for name, value in chosen.items() if name not in given}
+    if chosen:
+        lasts = "some minutes" if device == "cpu" else "about a minute"
+        print(f"chosen for a run of {lasts}: {flags_text(chosen)}", flush=True)
+    base = TrainConfig(scene=folder, blend_mode=MODES[0], checkpoint_every=0)
+    return base.changed(**{**chosen, **given}).shortened().changed(**given)
+
+
+def shown_views(scene: Scene) -> Dict[str, View]:
+    """Some test views, by the names of their pictures."""
+    views = scene.test or scene.train
+    names = file_names([view.camera.name for view in views])
+    return {f"compare_{names[index]}.png": views[index] for index in evenly_spaced(len(views), PICTURES)}
+
+
+def write_pictures(config: TrainConfig, views: Dict[str, View], output: str) -> List[str]:
+    """Ground truth, alpha and smoe beside each other for each view; returns the paths."""
+    renderers = [(mode, open_renderer(config, os.path.join(output, mode + ".ply"), mode, config.device))
+                 for mode in MODES]
+    paths = []
+    for name, view in views.items():
+        labelled = []
+        truth, mask = view.image_float(), view.mask_float()
+        for mode, renderer in renderers:
+            with torch.no_grad():
+                color = renderer(view.camera).color.cpu()
+            labelled.append((f"{mode}  {psnr(quantised(color), truth, mask):.2f} dB", to_image(color)))
+        paths.append(os.path.join(output, name))
+        comparison(to_image(truth), labelled).save(paths[-1])
+    return paths
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,131 @@
+"""GaussianModel to and from Inria-format .ply files, whose comments record blend mode and background gate."""
+from __future__ import annotations
+
+import os
+from typing import NamedTuple, Optional, Tuple
+
+import numpy as np
+import torch
+
+from diff_smoe_rasterization import io
+from diff_smoe_rasterization.settings import (
+    BLEND_MODES,
+    GATED_MODES,
+    mode_of_record,
+    record_of,
+    resolve_background_gate,
+    said_of_record,
+)
+
+from ..errors import TrainerError
+from ..model import GaussianModel
+from ..system.files import is_file, new_file
+
+LARGEST_LOG = 88.7  # exp of more is infinite in float32
+FOLDER = "point_cloud"  # OUT/point_cloud/iteration_N/point_cloud.ply, where viewers of 3DGS look
+
+
+class Recorded(NamedTuple):
+    """What a file says of the blend that its Gaussians were trained with; None where it does not."""
+
+    blend_mode: Optional[str]
+    background_gate: Optional[float]
+    note: str = ""  # what to tell the user of it
+
+
+def model_path(output: str, iteration: int) -> str:
+    """Where a run keeps its Gaussians of that iteration."""
+    return os.path.join(output, FOLDER, f"iteration_{iteration}", "point_cloud.ply")
+
+
+def trained_model_path(output: str, iterations: int) -> str:
+    """The .ply that a run of so many iterations ends with. Raises TrainerError where it is not there."""
+    path = model_path(output, iterations)
+    if not is_file(path):
+        raise TrainerError(f"{path}: no such file; the training in {output} has not ended (continue it with --resume)")
+    return path
+
+
+def save_model(path: str, model: GaussianModel, blend_mode: str, background_gate: float) -> None:
+    """Writes the raw parameters, `comment blend_mode NAME` and in GATED_MODES `comment background_gate VALUE`."""
+    raw = {name: tensor.detach().cpu().numpy() for name, tensor in model.raw.items()}
+    gaussians = io.Gaussians(
+        means3D=raw["means3D"], dc=raw["dc"], shs=raw["shs"], opacity_logits=raw["opacities"],
+        log_scales=raw["scales"], rotations=raw["rotations"], blend_mode=record_of(blend_mode),
+        background_gate=background_gate if blend_mode in GATED_MODES else None)
+    with new_file(path) as temporary:
+        io.write_gaussians(temporary, gaussians)
+
+
+def load_model(path: str, device: str) -> Tuple[GaussianModel, Recorded]:
+    """Reads a .ply; returns the model, all its SH degrees active, and what the file says of its blend.
+
+    Raises TrainerError naming file and reason, also where no Gaussian can be shown.
+    """
+    try:
+        stored = io.read_gaussians(path)
+    except (OSError, ValueError) as error:
+        raise TrainerError(str(error)) from error
+    arrays = {"means3D": stored.means3D, "dc": stored.dc, "shs": stored.shs, "opacities": stored.opacity_logits,
+              "scales": stored.log_scales, "rotations": stored.rotations}
+    shown = finite_gaussians(stored)
+    if len(shown) and not shown.any():
+        raise TrainerError(f"{path}: each of its {len(shown):,} Gaussians has a number that is NaN or infinite, so the "
+                           "rasterizer shows none; was the training diverging?")
+    raw = {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
+    model = GaussianModel(raw, stored.sh_degree)
+    model.active_sh_degree = stored.sh_degree
+    record = stored.blend_mode
+    mode = record if record is None else mode_of_record(record)
+    return model, Recorded(mode, stored.background_gate, said_of_record(record))
+
+
+def finite_gaussians(gaussians: io.Gaussians) -> np.ndarray:
+    """[N] bool: which Gaussians have finite numbers, their scales included. Others cannot be shown."""
+    g = gaussians
+    arrays = (g.means3D, g.dc, g.shs, g.opacity_logits, g.rotations, np.where(g.log_scales < LARGEST_LOG, 0, np.nan))
+    return np.all([np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in arrays], axis=0)
+
+
+def agreed_blend_mode(path: str, recorded: Optional[str], asked: Optional[str]) -> str:
+    """The blend mode to render a .ply with: the recorded one, or the one asked for where none is recorded.
+
+    Raises TrainerError where neither is known, where they disagree, or where the recorded one is unknown.
+    """
+    if recorded is not None and recorded not in BLEND_MODES:
+        raise TrainerError(f"{path}: its comment records the blend mode {recorded!r}; this version knows "
+                           f"{', '.join(BLEND_MODES)}")
+    if recorded is None and asked is None:
+        raise TrainerError(f"{path} does not say which blend mode it was trained with (no `comment blend_mode`); "
+                           "pass --blend-mode, which is alpha for files of other 3DGS programs")
+    if recorded is not None and asked is not None and asked != recorded:
+        raise TrainerError(f"{path} was trained with the blend mode {recorded}, not {asked}; "
+                           "in another mode its Gaussians show another scene")
+    return recorded or asked or ""
+
+
+def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked: Optional[float]) -> float:
+    """The background gate to render a .ply with in this blend mode: by the rules of `agreed_blend_mode`.
+
+    A file that records `smoe_eq7` and no gate is an older one, trained with 0. Raises TrainerError.
+    """
+    if blend_mode not in GATED_MODES:
+        fixed = float(resolve_background_gate(blend_mode, None))
+        for said in (recorded.background_gate, asked):
+            if said not in (None, fixed):
+                raise TrainerError(f"{path}: the background gate is {said!r}; in the blend mode {blend_mode} it is "
+                                   f"{fixed:g}")
+        return fixed
+    gate = recorded.background_gate
+    if gate is None and recorded.blend_mode is not None:
+        gate = 0.0
+    if gate is not None and asked is not None and asked != gate:
+        raise TrainerError(f"{path} was trained with the background gate {gate!r}, not {asked!r}; "
+                           "with another one its Gaussians show another scene")
+    if gate is None and asked is None:
+        raise TrainerError(f"{path} does not say which background gate it was trained with (no `comment "
+                           "background_gate`); pass --background-gate, which is 0 for the paper's Eq. 7")
+    try:
+        return float(resolve_background_gate(blend_mode, asked if gate is None else gate))
+    except ValueError as error:
+        raise TrainerError(str(error)) from error

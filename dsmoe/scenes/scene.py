@@ -1,0 +1,170 @@
+"""Loads a scene folder: cameras, images, the train/test split and the points to start from.
+
+Three kinds are known: COLMAP (a sparse model beside a folder of images), transforms.json, and NeRF-synthetic
+(transforms_train.json).
+Everything that can be wrong with a folder is a SceneError here, before training starts.
+"""
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from dataclasses import dataclass
+from typing import Any, Dict, Iterable, List, Optional, Sequence
+
+import numpy as np
+
+from ..config import TrainConfig
+from ..errors import SceneError
+from ..system.files import is_file, is_folder
+from .cameras import LARGEST, Camera, scene_extent
+from .colmap import read_colmap_layout
+from .images import MAX_WIDTH, View, fitted_camera, image_size, load_views
+from .layout import Layout, check_files, with_masks
+from .nerf import TRANSFORMS, read_nerf_layout, read_transforms_layout
+from .pointcloud import PointCloud
+from .undistortion import undistorted
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A loaded scene."""
+
+    kind: str
+    train: Sequence[View]
+    test: Sequence[View]
+    points: PointCloud
+    extent: float  # world units
+    split: str
+    note: str = ""  # what was done to its images, in a line
+
+    def to(self, device: str) -> Scene:
+        """The same scene with its images on `device`."""
+
+        return dataclasses.replace(self, train=[view.to(device) for view in self.train],
+                                   test=[view.to(device) for view in self.test])
+
+
+def load_scene(config: TrainConfig, progress: bool = True, layout: Optional[Layout] = None) -> Scene:
+    """Reads the folder config.scene with the config's resolution, background, principal point and initial points.
+
+    layout: what `read_layout` gave, where it is at hand. Raises SceneError naming the file and the reason.
+    """
+    layout, note = undistorted(layout or read_layout(config), config.scene, progress)
+    images = load_views(list(layout.train) + list(layout.test), config, progress)
+    train, test = images[:len(layout.train)], images[len(layout.train):]
+    points = layout.points.subset(config.init_points, config.seed).subset(config.most_points, config.seed)
+    extent = scene_extent(np.stack([view.camera.center for view in train]))
+    return Scene(layout.kind, train, test, points, extent, layout.split, note)
+
+
+def read_layout(config: TrainConfig) -> Layout:
+    """Reads everything of a scene folder but its images, whose presence it checks."""
+    folder = config.scene
+    if not is_folder(folder):
+        raise SceneError(f"scene {folder}: no such folder")
+    if is_file(os.path.join(folder, "transforms_train.json")):
+        layout = read_nerf_layout(folder, config)
+    elif is_folder(os.path.join(folder, "sparse")):
+        layout = read_colmap_layout(folder, config)
+    elif is_file(os.path.join(folder, TRANSFORMS)):
+        layout = read_transforms_layout(folder, config)
+    else:
+        raise SceneError(f"scene {folder}: neither a folder `sparse` (COLMAP) nor {TRANSFORMS} (nerfstudio, "
+                         "instant-ngp, Polycam) nor transforms_train.json (NeRF-synthetic) is in it. Of photographs "
+                         "`dsmoe scene PHOTOS -o SCENE` makes a scene")
+    if not layout.train:
+        raise SceneError(f"scene {folder}: no training image is left after the split ({layout.split}); "
+                         "--test-every 0 keeps none for testing")
+    _check_images(folder, layout)
+    check_files([image.path for image in list(layout.train) + list(layout.test)])
+    return with_masks(folder, layout)
+
+
+def describe_scene(scene: Scene, layout: Layout, config: TrainConfig) -> str:
+    """What was loaded, in a line, or two where images were undistorted; layout: what the scene was loaded from."""
+    sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
+    size = " to ".join(f"{width}x{height}" for width, height in sizes[::max(1, len(sizes) - 1)])
+    first, file_size = scene.train[0].camera, image_size(layout.train[0].path)
+    if (first.width, first.height) != file_size:
+        why = f", at most {MAX_WIDTH} wide" if config.resolution == -1 else ""
+        size += f" (scaled from {file_size[0]}x{file_size[1]} by --resolution {config.resolution}{why})"
+    count, there = len(scene.points.positions), len(layout.points.positions)
+    points = f"{count:,} points" if count == there else f"{count:,} of {there:,} points"
+    return (f"{len(scene.train)} training and {len(scene.test)} test images ({scene.split}), {size} pixels, {points} "
+            "to start from" + (f"\n{scene.note}" if scene.note else ""))
+
+
+def scene_fingerprint(scene: Scene) -> Dict[str, Any]:
+    """Plain values that differ between scenes and stay when a folder is moved: what a resumed run must find again."""
+
+    def lines(texts: Iterable[str]) -> str:
+        return _checksum("\n".join(sorted(texts)).encode("utf-8", "surrogateescape"))  # a name may be no UTF-8
+
+    def names_and_sizes(views: Sequence[View]) -> str:
+        return lines(f"{view.camera.name} {view.camera.width}x{view.camera.height}" for view in views)
+
+    def files(views: Sequence[View]) -> str:
+        return lines(f"{view.camera.name} {view.checksum}" for view in views)
+
+    views = [*scene.train, *scene.test]
+    return {
+        "number of training views": len(scene.train),
+        "number of test views": len(scene.test),
+        "number of masks": sum(view.mask is not None for view in views),
+        "number of points": len(scene.points.positions),
+        # Six digits, since another numpy may sum in another order.
+        "extent": f"{scene.extent:.6g}",
+        "checksum of the training views' names and sizes": names_and_sizes(scene.train),
+        "checksum of the test views' names and sizes": names_and_sizes(scene.test),
+        "checksum of the points": _checksum(scene.points.positions.tobytes() + scene.points.colors.tobytes()),
+        "checksum of the poses": _checksum(b"".join(_pose(view.camera, scene.extent) for view in views)),
+        "checksum of the intrinsics": _checksum(b"".join(_intrinsics(view.camera) for view in views)),
+        "checksum of the training images": files(scene.train),
+        "checksum of the test images": files(scene.test),
+    }
+
+
+def _pose(camera: Camera, extent: float) -> bytes:
+    """A camera's pose, to a millionth of the scene's extent: another version may round the last digits otherwise."""
+    return _rounded([*camera.rotation.reshape(-1), *(camera.translation / extent)], 6)
+
+
+def _intrinsics(camera: Camera) -> bytes:
+    """To a 10,000th of a pixel."""
+    return _rounded([camera.fx, camera.fy, camera.cx, camera.cy], 4)
+
+
+def _rounded(values: Sequence[float], digits: int) -> bytes:
+    return (np.round(np.asarray(values, "<f8"), digits) + 0.0).tobytes()  # + 0.0 makes 0 of -0
+
+
+def _checksum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def load_cameras(config: TrainConfig, split: str) -> List[Camera]:
+    """The cameras of "train", "test" or "all" images at the config's resolution; images are not decoded."""
+    layout = read_layout(config)
+    posed = {"train": layout.train, "test": layout.test, "all": list(layout.train) + list(layout.test)}[split]
+    return [fitted_camera(image, image_size(image.path), config) for image in posed]
+
+
+def _check_images(folder: str, layout: Layout) -> None:
+    """Raises SceneError for an image that is listed twice, and for a camera that float32 cannot hold."""
+    every = [*layout.train, *layout.test]
+    # The two files of NeRF-synthetic may list the same images.
+    for images in (every,) if layout.kind == "colmap" else (layout.train, layout.test):
+        seen = set()
+        for image in images:
+            path = os.path.normpath(image.path)
+            if path in seen:
+                raise SceneError(f"scene {folder}: the image {image.camera.name} is listed twice, with a pose each")
+            seen.add(path)
+    for image in every:
+        camera = image.camera
+        numbers = [*camera.translation, camera.fx, camera.fy, camera.cx, camera.cy]
+        if not np.abs(numbers).max() <= LARGEST:
+            raise SceneError(f"scene {folder}: the camera of {camera.name} has the translation "
+                             f"{camera.translation.tolist()} and fx, fy, cx, cy {numbers[3:]}; no number may be above "
+                             f"{LARGEST:g}")

@@ -1,0 +1,60 @@
+"""`dsmoe train --gpus N`: the same command once for each GPU, started by torchrun."""
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import List, Sequence
+
+from ..errors import ConfigError
+from .children import die_with_parent
+
+GPUS = "--gpus"
+
+
+def check_gpus(gpus: int, device: str) -> None:
+    """Raises ConfigError where a training cannot take so many GPUs of this machine."""
+    import torch
+
+    if device != "cuda":
+        raise ConfigError(f"{GPUS} is {gpus} with --device {device}; it needs --device cuda")
+    there = torch.cuda.device_count()
+    if there == 0:
+        raise ConfigError(f"{GPUS} is {gpus}, and torch finds no GPU here; on CPUs start torchrun with --device cpu")
+    if not 1 <= gpus <= there:
+        raise ConfigError(f"{GPUS} is {gpus}; it must be at least 1 and at most {there}: so many GPUs torch finds here")
+
+
+def without_gpus(words: Sequence[str]) -> List[str]:
+    """The words of a command without the option --gpus and its number."""
+    kept: List[str] = []
+    words = list(words)
+    while words:
+        word = words.pop(0)
+        if word == GPUS:
+            words.pop(0)
+        elif not word.startswith(GPUS + "="):
+            kept.append(word)
+    return kept
+
+
+def torchrun_command(gpus: int, words: Sequence[str]) -> List[str]:
+    """What starts a `dsmoe` command, given by its words, in so many processes of this machine."""
+    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(gpus), "-m",
+            __name__.split(".")[0], *words]
+
+
+def launch(gpus: int, words: Sequence[str]) -> int:
+    """Runs the command in so many processes; returns torchrun's exit status once all have ended.
+
+    Where this process is killed, torchrun gets a SIGTERM, which it passes on: the processes save a checkpoint and end.
+    """
+    package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    path = os.pathsep.join(part for part in (package, os.environ.get("PYTHONPATH")) if part)
+    environment = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": path}
+    process = subprocess.Popen(torchrun_command(gpus, words), env=environment, preexec_fn=die_with_parent)
+    while True:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:  # torchrun has the signal too, and lets the processes save a checkpoint
+            continue

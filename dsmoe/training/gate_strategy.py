@@ -1,0 +1,208 @@
+"""The strategy `gate`: to a given number of Gaussians, those that explain most.
+
+It grows well beyond the budget, removes in steps the Gaussians whose removal changes the training views least, and then
+moves the cheapest of what is left to where the error is. Cost and error are sums over pixels of squared colours, so
+they can be compared: `Splats.importance`. The rules and what they are worth: docs/trainer.md.
+"""
+from __future__ import annotations
+
+from typing import Any, Dict, Optional, Tuple
+
+import torch
+
+from diff_smoe_rasterization.images import as_float
+from diff_smoe_rasterization.losses import l2_ssim_loss_and_gradient
+from diff_smoe_rasterization.splats import Splats
+
+from ..errors import ConfigError
+from ..model import PARAMETERS, inverse_sigmoid, quaternion_to_matrix
+from ..scenes.images import View
+from .drawing import draw
+from .strategy import SteadyStrategy, Step, StrategyContext
+
+# Milestones, as parts of densify_until_iter (15,000): growth ends at 8,000, sixteen removals are at 8,200 to 13,825,
+# moves are every 500 until 20,000.
+GROWTH_ENDS = 8 / 15
+REMOVALS_BEGIN, REMOVALS_END = 8.2 / 15, 14.2 / 15
+MOVES_END = 4 / 3
+MOVE_INTERVAL = 1 / 30
+
+# Growth beyond this many, or beyond twice the budget where that is more, would cost time and memory: no budget above
+# 200,000 was tried with more.
+MOST_OVERSHOOT = 2_000_000
+
+# A split along the longest axis: each child's offset and scale, in standard deviations of its parent, and the opacity
+# at which both together cover what the parent did.
+CHILD_OFFSET = 0.5
+CHILD_SCALE = 0.65
+CHILD_COVER = 0.744
+
+
+class GateStrategy(SteadyStrategy):
+    """Overshoot, remove by exact cost, then move by cost against error. From any start, below or above the budget."""
+
+    def __init__(self, context: StrategyContext) -> None:
+        config = context.config
+        self.options = config.gate_options()
+        super().__init__(context)
+        context.optimizer.scale_rate("shs", self.options.bands)
+        self.start = context.model.num_gaussians
+        until = config.densify_until_iter
+        self.growth_ends = round(GROWTH_ENDS * until)
+        count = self.options.removals
+        last = config.iterations - 1  # the last iteration changes nothing
+        self.removals = [min(last, round(until * (REMOVALS_BEGIN + (REMOVALS_END - REMOVALS_BEGIN) * i / count)))
+                         for i in range(count)]
+        interval = max(1, round(MOVE_INTERVAL * until))
+        self.moves_end = round(MOVES_END * until)
+        self.moves = [iteration for iteration in range(interval, self.moves_end + 1, interval)
+                      if iteration > self.removals[-1] and self.options.moves > 0]
+        self._check_reach()
+
+    def _check_reach(self) -> None:
+        """Raises ConfigError where growth cannot lead to the budget: a densification doubles at most."""
+        config = self.context.config
+        densifications = sum(iteration > config.densify_from_iter for iteration in range(
+            0, self.growth_ends, config.densification_interval))
+        most = self.start * 2**densifications
+        if most < config.budget:
+            raise ConfigError(f"--budget is {config.budget}; it must be at most {most}: that is what {self.start} "
+                              "points reach with one densification each --densification-interval "
+                              f"{config.densification_interval} between --densify-from-iter "
+                              f"{config.densify_from_iter} and step {self.growth_ends}, where growth ends")
+
+    def loss(self, iteration: int, image: torch.Tensor, target: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        if iteration <= self.moves_end or self.options.squares == 0:
+            return super().loss(iteration, image, target)
+        return l2_ssim_loss_and_gradient(image, target, self.context.config.lambda_dssim, self.options.squares)
+
+    def before_backward(self, step: Step) -> None:
+        if self._looks(step):
+            self._look(step.view, step.target, step.rendering.color, step.splats())
+        if self.options.anneal != 1:
+            span = max(1, self.context.config.position_lr_max_steps - self.moves_end)
+            share = min(max((step.iteration - self.moves_end) / span, 0.0), 1.0)
+            self.context.optimizer.scale_other_rates(self.options.anneal**share)
+
+    def after_step(self, step: Step) -> None:
+        if step.iteration in self.removals:
+            self.remove(1 + sum(later > step.iteration for later in self.removals))
+        elif step.iteration in self.moves:
+            self.move()
+
+    @property
+    def densify_until(self) -> int:
+        return self.growth_ends
+
+    def growth(self, iteration: int) -> Tuple[int, Optional[int]]:
+        """At least what reaches the budget and at most what reaches the overshoot, in equal steps."""
+        config, now = self.context.config, self.context.model.num_gaussians
+        steps = -(-(self.growth_ends - iteration) // config.densification_interval)
+        least = -(-max(0, config.budget - now) // steps)
+        if self.options.overshoot == 0:
+            return least, None
+        return least, -(-max(0, self.overshoot() - now) // steps)
+
+    def overshoot(self) -> int:
+        """How many Gaussians growth leads to, where the gradients suffice."""
+        budget = self.context.config.budget
+        wanted = round(self.options.overshoot * budget)
+        return max(min(wanted, max(2 * budget, MOST_OVERSHOOT)), 2 * self.start)
+
+    def remove(self, steps_left: int) -> None:
+        """Removes the cheapest, down to the budget in steps of equal ratios. steps_left: with this one."""
+        model, budget = self.context.model, self.context.config.budget
+        if model.num_gaussians <= budget:
+            return
+        ratio = model.num_gaussians / budget
+        kept = budget if steps_left == 1 else round(budget * ratio ** ((steps_left - 1) / steps_left))
+        self._look_at_the_rest()
+        mask = torch.zeros_like(self.costs, dtype=torch.bool)
+        mask[torch.topk(self.costs, kept).indices] = True
+        self.context.optimizer.keep(mask)
+        self._forget_statistics()
+
+    def move(self) -> None:
+        """Moves the cheapest Gaussians to others, drawn by their error, which are split there."""
+        self._look_at_the_rest()
+        count = int(self.options.moves * len(self.costs))
+        costs, sources = torch.topk(self.costs, count, largest=False)
+        errors = self.errors
+        self._forget_looks()
+        errors[sources] = 0
+        count = min(count, int((errors > 0).sum()))
+        if count == 0:
+            return
+        targets = draw(errors, count)
+        errors, order = errors[targets].sort(descending=True)
+        worth = (costs[:count] < self.options.worth * errors).nonzero().squeeze(1)
+        self.split(targets[order][worth], sources[worth])
+
+    def split(self, parents: torch.Tensor, places: torch.Tensor) -> None:
+        """Splits Gaussians in two along their longest axis. parents: rows; places: rows that the second children take.
+
+        The children begin without Adam's first moment, and with their parent's second one.
+        """
+        raw = {name: self.context.model.raw[name].detach().index_select(0, parents) for name in PARAMETERS}
+        scales = raw["scales"].exp()
+        axis = scales.argmax(dim=1, keepdim=True)
+        directions = quaternion_to_matrix(raw["rotations"]).gather(2, axis.unsqueeze(1).expand(-1, 3, 1)).squeeze(2)
+        offsets = CHILD_OFFSET * scales.gather(1, axis) * directions
+        opacities = raw["opacities"].sigmoid()
+        children = torch.minimum(opacities, (1 - (1 - opacities).sqrt()) / CHILD_COVER)
+        raw["opacities"] = inverse_sigmoid(children.clamp(max=1 - 1e-6))  # of 1 it is infinite
+        raw["scales"] = torch.where(torch.arange(3, device=axis.device) == axis, (CHILD_SCALE * scales).log(),
+                                    raw["scales"])
+        means = raw["means3D"]
+        for rows, place in ((parents, means + offsets), (places, means - offsets)):
+            self.context.optimizer.overwrite(rows, {**raw, "means3D": place}, like=parents)
+
+    def _looks(self, step: Step) -> bool:
+        """Whether the next decision looks at this step's view: one of each group, in the last round of the views."""
+        if step.view.camera.name not in self.sought:
+            return False
+        removes = self.context.model.num_gaussians > self.context.config.budget
+        following = next((later for later in [*self.removals, *self.moves] if later >= step.iteration), None)
+        return (following is not None and following - step.iteration < len(self.context.views)
+                and (removes or following > self.removals[-1]))
+
+    def _look(self, view: View, target: torch.Tensor, color: torch.Tensor, splats: Splats) -> None:
+        """Adds what each Gaussian is worth to one rendering."""
+        error = (color.detach() - as_float(target)).square().sum(0)
+        mask = view.mask_float()
+        weights = None if mask is None else mask[0]
+        importance = splats.importance(weights, error if weights is None else weights * error)
+        self.costs += importance.removal_costs
+        self.errors += importance.shares
+        group = self.sought.get(view.camera.name)
+        self.sought = {name: other for name, other in self.sought.items() if other != group}
+
+    def _look_at_the_rest(self) -> None:
+        """Renders what the steps before the decision did not show."""
+        for view in self.context.views:
+            if view.camera.name in self.sought:
+                rendering, splats = self.context.render.with_splats(view.camera)
+                self._look(view, view.image, rendering.color, splats)
+
+    def _forget_statistics(self) -> None:
+        super()._forget_statistics()
+        self._forget_looks()
+
+    def _forget_looks(self) -> None:
+        """Begins new sums, [N], for the next decision, which looks at a view of each group of neighbours."""
+        self.costs = torch.zeros_like(self.view_count)  # squared change of the images on the Gaussian's removal
+        self.errors = torch.zeros_like(self.view_count)  # their squared error where the Gaussian is, by its share
+        views = self.context.views
+        count = min(self.options.views, len(views))
+        first = int(torch.randint(len(views), ()))
+        # The group of each view, by name. A look at a view takes out its group.
+        self.sought = {views[(first + i) % len(views)].camera.name: i * count // len(views) for i in range(len(views))}
+
+    def state_dict(self) -> Dict[str, Any]:
+        return {**super().state_dict(), "start": self.start, "costs": self.costs, "errors": self.errors,
+                "sought": self.sought}
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.start, self.costs, self.errors = state["start"], state["costs"], state["errors"]
+        self.sought = dict(state["sought"])

@@ -1,0 +1,478 @@
+"""The training loop: one step, a run of them with progress, and the whole of `dsmoe train`."""
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+from typing import IO, Any, Callable, Dict, List, Optional, Tuple, Union
+
+import torch
+
+from diff_smoe_rasterization.images import as_float
+
+from ..config import CHECKPOINT_NAME, CONFIG_NAME, LEARNED, TrainConfig, holds_run
+from ..errors import TrainerError
+from ..model import GaussianModel, GaussianOptimizer
+from ..results.evaluation import Evaluation, evaluate
+from ..results.metrics import psnr
+from ..results.modelfile import FOLDER, model_path, save_model
+from ..results.pictures import loss_plot
+from ..results.rendering import Rasterize, Renderer, background_color
+from ..results.rows import RESULTS_NAME, result_row, write_results
+from ..results.scalars import FOLDER as SCALARS_FOLDER
+from ..results.scalars import Scalars, scalar_files
+from ..scenes.images import View
+from ..scenes.scene import Scene, describe_scene, load_scene, read_layout, scene_fingerprint
+from ..system.device import check_device
+from ..system.files import is_file, write_atomically, write_json_atomically
+from ..system.group import ALONE, Group
+from ..system.interrupt import DelayedInterrupt
+from ..system.output_folder import (
+    Record,
+    check_inside,
+    check_there,
+    make_folder,
+    only_one,
+    read_record,
+    remove_files,
+    write_record,
+)
+from ..system.progress import progress_bar
+from ..system.stopwatch import Stopwatch
+from .background_gate import LearnedGate
+from .checkpoint import damage_named, load_checkpoint, save_checkpoint
+from .forecast import Forecast
+from .order import ViewOrder
+from .passes import AutogradPasses, DirectPasses
+from .randomness import random_state, restore_random_state, seed_everything
+from .shards import Shards
+from .state_check import check_state
+from .strategies import STRATEGIES
+from .strategy import AnyStep, Step, StrategyContext, is_due
+
+HISTORY_NAME = "history.json"  # the evaluations during a run
+LOSS_NAME = "loss.png"
+PER_VIEW_NAME = "per_view.json"
+PRODUCTS = (CHECKPOINT_NAME, RESULTS_NAME, PER_VIEW_NAME, HISTORY_NAME, LOSS_NAME)  # beside config.json and the models
+TRAIN = "dsmoe train"  # in its folders' records
+PROGRESS_EVERY = {"cpu": 10, "cuda": 100}  # steps between two looks at the loss, which wait for the device
+
+
+class Trainer:
+    """A training run over a loaded scene; `step` is one iteration of 3DGS."""
+
+    group = ALONE  # the processes that train together
+
+    def __init__(self, config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize] = None) -> None:
+        """rasterize: a function with the signature of the package's `rasterize`, which is the default."""
+        seed_everything(config.seed)
+        self.config = config
+        self.scene = scene.to(config.device)
+        self.model = GaussianModel.from_points(scene.points, config.sh_degree, config.device)
+        self.optimizer = GaussianOptimizer(self.model, config, scene.extent)
+        self.shards = self._make_shards()
+        background = background_color(config.white_background, config.device)
+        learned = config.background_gate == LEARNED
+        self.gate = LearnedGate(config, config.device) if learned else None
+        self.renderer = Renderer(
+            self.model, str(config.blend_mode), background, config.antialiasing, rasterize,
+            background_gate=self.gate.value if self.gate else float(config.background_gate),
+            deterministic=config.deterministic)
+        self.strategy = STRATEGIES[str(config.schedule)](StrategyContext(
+            config, self.model, self.optimizer, scene.extent, self.scene.train, self.renderer, self.shards))
+        self.order = ViewOrder(len(scene.train), config.seed)
+        self.watch = Stopwatch(config.device)
+        self.iteration = 0
+        self.direct = config.device != "cpu" and rasterize is None
+        self._passes: Union[AutogradPasses, DirectPasses, None] = None
+        self.wants_stop: Callable[[], bool] = lambda: False  # whether this process was asked to stop
+
+    def _make_shards(self) -> Shards:
+        """Which of the Gaussians this process has; may take the others from the model."""
+        return Shards()
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process prints and writes."""
+        return self.group.leads
+
+    @property
+    def is_divided(self) -> bool:
+        """Whether several processes train together."""
+        return self.group.size > 1
+
+    def meet(self) -> None:
+        """Waits for the other processes."""
+        self.group.gather_numbers([0], self.config.device)
+
+    @property
+    def checkpoint_device(self) -> str:
+        """Where a checkpoint is read to."""
+        return self.config.device
+
+    @property
+    def num_gaussians(self) -> int:
+        """Of all processes."""
+        return self.model.num_gaussians
+
+    def whole_model(self) -> Optional[GaussianModel]:
+        """The model with the Gaussians of all processes, where this one leads."""
+        return self.model
+
+    def stops(self) -> bool:
+        """Whether the run is to end behind this step, before its last iteration."""
+        return self.wants_stop()
+
+    def step(self, before_change: Optional[Callable[[], None]] = None) -> Step:
+        """One iteration, in the order of 3DGS: densification comes between the gradients and the optimizer's step.
+
+        before_change: called once the gradients are known and nothing has changed yet, which is where 3DGS evaluates
+        and saves. So the last iteration changes nothing: what it saves neither an opacity reset nor a densification
+        may have touched.
+        """
+        config, model = self.config, self.model
+        self._refuse_empty()
+        self.iteration += 1
+        self.optimizer.set_position_rate(self.iteration)
+        if self.iteration % config.sh_degree_interval == 0:
+            model.raise_sh_degree()
+        view = self.scene.train[self.order.next()]
+        color = torch.rand(3, device=config.device) if config.random_background else None
+        if self._passes is None:
+            passes = DirectPasses if self.direct else AutogradPasses
+            self._passes = passes(model, self.optimizer, self.renderer)
+        rendering, means2D = self._passes.render(view.camera, color, self.gate() if self.gate else None)
+        target = self.target_of(view, color)
+        loss, gradient = self.loss_of(view, target, rendering.color.detach())
+        step = Step(self.iteration, view, target, rendering, self._passes.splats, means2D, loss,
+                    self._passes.add_gradient)
+        self.strategy.before_backward(step)
+        self._passes.backward(gradient)
+        if before_change:
+            before_change()
+        if self.iteration < config.iterations:
+            with torch.no_grad():
+                self.strategy.after_backward(step)
+                self._passes.update()
+                if self.gate:
+                    self.gate.step()
+                self.strategy.after_step(step)
+        return step
+
+    def _refuse_empty(self) -> None:
+        if self.num_gaussians == 0:
+            raise TrainerError(f"iteration {self.iteration}: every Gaussian has been pruned; "
+                               "try another --densify-grad-threshold or --strategy steady")
+
+    def target_of(self, view: View, color: Optional[torch.Tensor]) -> torch.Tensor:
+        """What a rendering is compared with. color: [3] the background, where it is of this step alone."""
+        return view.image if color is None or view.opacity is None else view.image_over(
+            color, self.renderer.background)
+
+    def loss_of(self, view: View, target: torch.Tensor, image: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        """The loss of a rendering and its gradient."""
+        self._report = (image, target, view)
+        mask = view.mask_float()
+        if mask is None:
+            return self.strategy.loss(self.iteration, image, target)
+        loss, gradient = self.strategy.loss(self.iteration, image * mask, as_float(target) * mask)
+        return loss, gradient * mask
+
+    def training_psnr(self) -> float:
+        """PSNR of the last step's rendering, the last one of this process, against its training image."""
+        image, target, view = self._report
+        return psnr(image.clamp(0, 1), as_float(target), view.mask_float())
+
+    @property
+    def background_gate(self) -> float:
+        """The gate as it is now; where it is learned, the host waits for the device."""
+        return float(self.renderer.background_gate)
+
+    def evaluate(self, progress: bool = False) -> Evaluation:
+        """Renders the test views."""
+        return evaluate(self.renderer, self.scene.test, self.config.device, progress)
+
+    def state_dict(self) -> Dict[str, Any]:
+        """Everything the rest of the run depends on, as tensors and plain values."""
+        return {
+            "config": self.config.record(),
+            "scene": scene_fingerprint(self.scene),
+            "iteration": self.iteration,
+            "train_seconds": self.watch.seconds,
+            "raw": {name: tensor.detach() for name, tensor in self.model.raw.items()},
+            "active_sh_degree": self.model.active_sh_degree,
+            "optimizer": self.optimizer.state_dict(),
+            "strategy": self.strategy.state_dict(),
+            "gate": self.gate.state_dict() if self.gate else None,
+            "order": self.order.state_dict(),
+            "random": random_state(),
+        }
+
+    def check_state(self, state: Dict[str, Any]) -> None:
+        """Raises TrainerError where a state is another run's, Misfit and others where it can be none's."""
+        differences = TrainConfig.of_record(state["config"]).differences(self.config)
+        if differences:
+            raise TrainerError("the checkpoint is of a run with other options: " + "; ".join(differences))
+        for name, here in scene_fingerprint(self.scene).items():
+            there = state["scene"].get(name, here)  # earlier versions recorded fewer of them
+            if here != there:
+                raise TrainerError(f"the checkpoint is of a run on another scene: {name} {there} there "
+                                   f"and {here} in {self.config.scene}")
+        check_state(state, self.config, self.strategy.state_dict(), self.order.count)
+
+    def load_state_dict(self, state: Dict[str, Any]) -> None:
+        """Takes what `state_dict` gave, and `check_state` found to fit."""
+        self.iteration = state["iteration"]
+        self.watch.seconds = state["train_seconds"]
+        self.optimizer.replace_all(state["raw"])
+        self.model.active_sh_degree = state["active_sh_degree"]
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.strategy.load_state_dict(state["strategy"])
+        if self.gate:
+            self.gate.load_state_dict(state["gate"])
+        self.order.load_state_dict(state["order"])
+        restore_random_state(state["random"])
+
+
+class Run:
+    """A Trainer with an output folder: progress, evaluations on the way, checkpoints."""
+
+    def __init__(self, trainer: Trainer, progress: bool = True, lock: Optional[IO[str]] = None,
+                 forecast: Optional[Forecast] = None) -> None:
+        """lock: the folder's, where this process leads. forecast: says how long it will take, where it is to."""
+        self.trainer = trainer
+        self.progress = progress
+        self.lock = lock
+        self.forecast = forecast
+        self.history: List[Dict[str, Any]] = []
+        self.losses: List[Tuple[int, float]] = []  # iteration and loss, as often as the loss is looked at
+        self.scalars: Optional[Scalars] = None  # of the run in progress
+
+    def resume(self) -> bool:
+        """Continues from the folder's checkpoint; False where there is none yet."""
+        path = self._path(CHECKPOINT_NAME)
+        if not is_file(path):
+            return False
+        with damage_named(path):
+            state = load_checkpoint(path, self.trainer.checkpoint_device)
+            self.trainer.check_state(state)
+            self.trainer.load_state_dict(state)
+            self.history = list(state["history"])
+            self.losses = [(int(iteration), float(loss)) for iteration, loss in state["losses"]]
+        unknown = [name for name in scene_fingerprint(self.trainer.scene) if name not in state["scene"]]
+        if unknown and self.trainer.leads:
+            print(f"note: {path} is of an earlier version and lacks the {', the '.join(unknown)}: whether these have "
+                  "changed since is not known")
+        before, config = state["config"]["iterations"], self.trainer.config
+        if before < config.iterations and self.trainer.leads:
+            print(f"extended from {before} to {config.iterations} iterations; milestones stay: densification until "
+                  f"{config.densify_until_iter}, falling learning rate of positions until "
+                  f"{config.position_lr_max_steps}")
+        return True
+
+    def train(self) -> Dict[str, Any]:
+        """Trains to the end, evaluates, writes the .ply and the results; returns the row."""
+        trainer, config = self.trainer, self.trainer.config
+        self.scalars = Scalars(config.output, trainer.iteration, wanted=trainer.leads)
+        new_bar = progress_bar(total=config.iterations, initial=trainer.iteration, desc=self.title, unit="it",
+                               disable=not self.progress, dynamic_ncols=True)
+        patience = DelayedInterrupt(patient=trainer.is_divided)
+        with contextlib.closing(self.scalars), new_bar as bar, patience as interrupt:
+            trainer.wants_stop = lambda: interrupt.asked is not None
+            trainer.watch.start()
+            ends = trainer.iteration >= config.iterations
+            while not ends:
+                ends = self._step(bar)
+            trainer.watch.stop()
+        if trainer.stops():  # in all processes or in none
+            raise interrupt.asked or KeyboardInterrupt
+        return self._write_results()
+
+    def _step(self, bar: Any) -> bool:
+        """One step, and what comes with it: an evaluation, a look at the loss, a checkpoint. Whether the run ends."""
+        trainer, config = self.trainer, self.trainer.config
+        following = trainer.iteration + config.batch
+        evaluates = following < config.iterations and is_due(following, config.eval_every, config.batch)
+        step = trainer.step((lambda: self._evaluate(bar)) if evaluates else None)
+        bar.update(config.batch)
+        forecast = self.forecast(trainer.iteration) if self.forecast else None
+        if forecast:
+            bar.write(forecast)
+        last = trainer.iteration >= config.iterations
+        if last or step.due(PROGRESS_EVERY[config.device]):
+            self.losses.append((trainer.iteration, _check_loss(step)))
+            self._show(bar, self.losses[-1][1])
+        ends = last or trainer.stops()
+        if ends or step.due(config.checkpoint_every):
+            trainer.watch.stop()
+            _check_loss(step)
+            self.save_checkpoint()
+            trainer.watch.start()
+        return ends
+
+    def _write_results(self) -> Dict[str, Any]:
+        """Evaluates the trained model, writes it and the results; returns the row."""
+        trainer, config = self.trainer, self.trainer.config
+        gate, model = trainer.background_gate, trainer.whole_model()
+        if trainer.leads:
+            save_model(self._path(_model_name(trainer.iteration)), model, str(config.blend_mode), gate)
+        evaluation = trainer.evaluate(self.progress)
+        row = result_row(config, trainer.scene, trainer.num_gaussians, trainer.watch.seconds, evaluation, gate)
+        if not trainer.leads:
+            return row
+        write_results(os.path.dirname(self._path(RESULTS_NAME)), [row])
+        write_json_atomically(self._path(PER_VIEW_NAME), evaluation.per_view)
+        if self.losses:
+            write_atomically(self._path(LOSS_NAME), lambda file: loss_plot(self.losses).save(file, "PNG"))
+        return row
+
+    def save_checkpoint(self) -> None:
+        """Writes the state of trainer, history and losses."""
+        state = self.trainer.state_dict()
+        if self.trainer.leads:
+            save_checkpoint(self._path(CHECKPOINT_NAME), {**state, "history": self.history, "losses": self.losses})
+        self.trainer.meet()  # where one process ends before the file is whole, torchrun ends the others
+
+    def _show(self, bar: Any, loss: float) -> None:
+        if not (self.progress or self.scalars.active):
+            return
+        trainer = self.trainer
+        gate = {"gate": trainer.background_gate} if trainer.gate else {}
+        quality, count = trainer.training_psnr(), trainer.num_gaussians
+        self.scalars.add(trainer.iteration, loss=loss, psnr=quality, gaussians=count, **gate)
+        if self.progress:
+            shown = {name: f"{value:.4f}" for name, value in gate.items()}
+            bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{quality:.2f}", **shown, gaussians=count, refresh=False)
+
+    def _evaluate(self, bar: Any) -> None:
+        trainer = self.trainer
+        trainer.watch.stop()
+        evaluation = trainer.evaluate()
+        self.history.append({"iteration": trainer.iteration, **evaluation.metrics,
+                             "num_gaussians": trainer.num_gaussians, "train_seconds": trainer.watch.seconds})
+        if trainer.leads:
+            write_json_atomically(self._path(HISTORY_NAME), self.history)
+        self.scalars.add(trainer.iteration, **{f"test__{name}": value for name, value in evaluation.metrics.items()
+                                               if value is not None})
+        if self.progress and evaluation.metrics["psnr"] is not None:
+            bar.write(f"iteration {trainer.iteration}: test PSNR {evaluation.metrics['psnr']:.2f} dB, "
+                      f"SSIM {evaluation.metrics['ssim']:.4f}, {trainer.num_gaussians} Gaussians")
+        trainer.watch.start()
+
+    def _path(self, name: str) -> str:
+        """A file to write. Raises TrainerError where the folder is no longer the one in which the run has begun."""
+        output = self.trainer.config.output
+        if self.lock:
+            check_there(output, self.lock)
+        return os.path.join(output, name)
+
+    @property
+    def title(self) -> str:
+        """Of the progress bar."""
+        return str(self.trainer.config.blend_mode)
+
+
+def _check_loss(step: AnyStep) -> float:
+    """The step's loss. Raises TrainerError where it is not finite: nothing that follows would be worth keeping."""
+    loss = float(step.loss.detach())
+    if not math.isfinite(loss):
+        raise TrainerError(f"iteration {step.iteration}: the loss is {loss}; lower the learning rates")
+    return loss
+
+
+def _model_name(iterations: int) -> str:
+    """Where in its folder a run of so many iterations keeps its model."""
+    return model_path("", iterations).replace(os.sep, "/")
+
+
+def earlier_files(config: TrainConfig, resume: bool = False, overwrite: bool = False) -> List[str]:
+    """Products and models that earlier runs have written into config.output, their paths in it.
+
+    Raises TrainerError where something is there that this run must not go on with, or replace.
+    """
+    output = config.output
+    record = read_record(output, TRAIN)
+    models = os.path.join(output, FOLDER)
+    if not holds_run(output):
+        recorded = {name.partition("/")[0] for name in record.files} if record else set()
+        there = [name for name in (*PRODUCTS, FOLDER)
+                 if os.path.lexists(os.path.join(output, name)) and name not in recorded]
+        if there:
+            raise TrainerError(f"{output} holds {', '.join(there)} but no {CONFIG_NAME}: no run of {TRAIN} "
+                               "is known to have written them; choose another folder")
+    elif not resume and not overwrite:
+        raise TrainerError(f"{output} already holds a training run; continue it with --resume, "
+                           "replace it with --overwrite, or choose another folder")
+    elif resume or not record:  # a record is enough to be replaced
+        earlier = TrainConfig.load(output)
+        if resume:
+            earlier.check_continued_by(config)
+        record = record or Record(earlier.scene, [_model_name(earlier.iterations)])
+    if os.path.lexists(models) and not os.path.isdir(models):
+        raise TrainerError(f"{models} is no folder; a run writes its model there")
+    check_inside(output, [_model_name(config.iterations), os.path.join(SCALARS_FOLDER, "events")])
+    # A record may be a stranger's: nothing but products and models is removed by it.
+    model = _model_name(0).replace("0", r"\d+").replace(".", r"\.")
+    known = [*(record.files if record else ()), *(PRODUCTS if holds_run(output) else ())]
+    return sorted({name for name in known if name in PRODUCTS or re.fullmatch(model, name)})
+
+
+def train(config: TrainConfig, resume: bool = False, overwrite: bool = False, progress: bool = True,
+          scene: Optional[Scene] = None, rasterize: Optional[Rasterize] = None, group: Optional[Group] = None,
+          say: Optional[Callable[[str], None]] = None) -> Dict[str, Any]:
+    """Trains a scene into config.output; returns the row of results.json.
+
+    resume: continue the run in config.output, bit for bit as if it had not stopped (on the CPU, with the same number
+    of threads and the same SIMD level); start it where it has no checkpoint yet. With more iterations than it had, it
+    is extended: its milestones stay, and where it had ended it lacks the update of its last step. overwrite: replace a
+    run that is there, once this one can start; files that no run wrote stay. scene: a loaded scene, where one is at
+    hand. group: the processes that train together, where there are several; all of them call this. say: is called
+    with a line about what was loaded; with it a training on the CPU also says how long it takes. Raises TrainerError
+    before training starts where anything does not fit, as where another run is at work in the folder.
+    """
+    if resume and overwrite:
+        raise TrainerError("--resume continues a run and --overwrite replaces it; choose one")
+    config.validate()
+    check_device(config.device)
+    if group and not group.leads:  # the folder is the first process's
+        run = Run(_new_trainer(config, scene or load_scene(config, False), rasterize, group), progress=False)
+        if resume:
+            run.resume()
+        return run.train()
+    earlier_files(config, resume, overwrite)
+    layout = None if scene else read_layout(config)
+    make_folder(config.output)  # a folder that cannot be made is told before images are read
+    with only_one(config.output) as lock:
+        earlier = earlier_files(config, resume, overwrite)  # again: another run may have been at work there
+        scene = scene or load_scene(config, progress, layout)
+        if config.random_background and config.background_gate == 0:
+            print("warning: --random-background with a background gate of 0: the background is seen only where no "
+                  "Gaussian is, so little is learned of transparency")
+        if say and layout:
+            say(describe_scene(scene, layout, config))
+        forecast = Forecast(config, scene) if say and config.device == "cpu" else None
+        run = Run(_new_trainer(config, scene, rasterize, group), progress, lock, forecast)
+        if resume:
+            resumed = run.resume()
+            print(f"resumed at iteration {run.trainer.iteration}" if resumed else "no checkpoint yet: starting anew")
+        models = {name for name in earlier if name not in PRODUCTS} if resume else set()
+        files = sorted({*PRODUCTS, *models, _model_name(config.iterations)})
+        write_record(config.output, TRAIN, Record(os.path.abspath(config.scene), files), earlier)
+        if not resume:
+            # First the old options: what is left where this is killed is no run, and --resume does not go on with it.
+            remove_files(config.output, [CONFIG_NAME])
+            remove_files(config.output, [*files, *(scalar_files(config.output) if overwrite else ())])
+        config.save(config.output)
+        return run.train()
+
+
+def _new_trainer(config: TrainConfig, scene: Scene, rasterize: Optional[Rasterize], group: Optional[Group]) -> Trainer:
+    """One view a step in one process has the usual trainer; what has more, the other one."""
+    if config.batch == 1 and (group is None or group.size == 1):
+        return Trainer(config, scene, rasterize)
+    if rasterize is not None:
+        raise TrainerError("train: rasterize is given; batches of views and several processes need the package's own")
+    from ..distributed.trainer import BatchTrainer
+
+    return BatchTrainer(config, scene, group or ALONE)

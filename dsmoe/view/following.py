@@ -1,0 +1,91 @@
+"""The Gaussians that a viewer shows: a trained model, or the last checkpoint of a training that goes on."""
+from __future__ import annotations
+
+import os
+from typing import Any, List, Optional, Tuple
+
+from ..config import CHECKPOINT_NAME, LEARNED, TrainConfig
+from ..errors import TrainerError
+from ..model import GaussianModel
+from ..opening import Trained, open_trained, places
+from ..results.modelfile import model_path
+from ..results.rendering import Renderer, background_color
+from ..scenes.cameras import Camera
+from ..scenes.orbit import Orbit
+from ..system.device import check_device
+from ..system.files import is_file, is_folder
+from ..training.background_gate import LearnedGate
+from ..training.checkpoint import load_checkpoint
+
+
+class Followed:
+    """A model by its run's folder or its .ply; `poll` takes over what a training has written since."""
+
+    renderer: Renderer
+    cameras: List[Camera]
+    orbit: Orbit
+    progress: str  # of a training, in words
+
+    def __init__(self, source: str, blend_mode: Optional[str] = None, background_gate: Optional[float] = None,
+                 device: str = "cpu", **options: Any) -> None:
+        """Arguments as in `open_trained`. Raises TrainerError, also where a run has no checkpoint yet."""
+        self._arguments = (source, blend_mode, background_gate, device)
+        self._options = options
+        self._config: Optional[TrainConfig] = None  # of the run that is shown
+        self._seen: Optional[Tuple[str, int]] = None  # the file that is shown, and when it was written
+        self._is_run = is_folder(source)
+        check_device(device)
+        if self._is_run:
+            self.poll()
+        else:
+            self._take(open_trained(*self._arguments, **options))
+
+    def poll(self) -> bool:
+        """Looks for a newer checkpoint, the end, or another run in the folder; returns whether there is one.
+
+        What was shown stays where this raises: TrainerError, or what a file that is being replaced causes.
+        """
+        if not self._is_run:
+            return False
+        config = TrainConfig.load(self._arguments[0]).changed(**self._options)
+        newest = self._newest(config)
+        if (config, newest) == (self._config, self._seen):
+            return False
+        if newest[0] == CHECKPOINT_NAME:
+            self._take_checkpoint(config)
+        else:
+            self._take(open_trained(*self._arguments, **self._options))
+            self.progress = f"trained, {config.iterations:,} iterations"
+        self._config, self._seen = config, newest
+        return True
+
+    def _newest(self, config: TrainConfig) -> Tuple[str, int]:
+        """The file in the run's folder that has the Gaussians, and when it was written."""
+        for name in (model_path("", config.iterations), CHECKPOINT_NAME):
+            path = os.path.join(config.output, name)
+            if is_file(path):
+                return name, os.stat(path).st_mtime_ns
+        raise TrainerError(f"{path}: no such file yet; the training writes it every --checkpoint-every "
+                           f"{config.checkpoint_every} iterations")
+
+    def _take(self, trained: Trained) -> None:
+        self.renderer, self.cameras, self.orbit = trained.renderer, trained.cameras, trained.orbit
+        self.progress = ""
+
+    def _take_checkpoint(self, config: TrainConfig) -> None:
+        device = self._arguments[-1]
+        state = load_checkpoint(os.path.join(config.output, CHECKPOINT_NAME), device)
+        model = GaussianModel(state["raw"], config.sh_degree)
+        model.active_sh_degree = state["active_sh_degree"]
+        if config.background_gate == LEARNED:
+            learned = LearnedGate(config, device)
+            learned.load_state_dict(state["gate"])
+            gate = float(learned.value)
+        else:
+            gate = float(config.background_gate)
+        renderer = Renderer(model, str(config.blend_mode), background_color(config.white_background, device),
+                            config.antialiasing, background_gate=gate)
+        if config != self._config:
+            self.cameras, self.orbit = places(config, model, needed="scene" in self._options)
+        self.renderer = renderer
+        self.progress = f"training, iteration {state['iteration']:,} of {config.iterations:,}"

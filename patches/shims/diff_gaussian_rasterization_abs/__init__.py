@@ -1,3 +1,0 @@
-from diff_smoe_rasterization.patches.runtime import rasterizer_of_run
-
-globals().update(rasterizer_of_run("absgs"))

@@ -1,4 +1,0 @@
-from diff_smoe_rasterization.patches.runtime import is_installed
-
-if not is_installed("fused_ssim"):
-    from diff_smoe_rasterization import fused_ssim  # noqa: F401
