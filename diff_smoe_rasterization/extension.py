@@ -37,7 +37,7 @@ def _load() -> Any:
     stable_since = _recorded("STABLE_ABI_SINCE")
     if stable_since is not None and _numbers(torch.__version__) < _numbers(stable_since):
         _fail(f"this build works with torch {stable_since} and later, but torch {torch.__version__} is running; update "
-              "torch, or build it against this one, in the source folder: pip install --no-build-isolation .")
+              "torch, or build it against this one, in the source folder: pip install --no-build-isolation -e .")
     mismatch = f"its extension was built against torch {built_against}, but torch {torch.__version__} is running; "
     if stable_since is None and built_against is not None and _release(built_against) != _release(torch.__version__):
         _fail(mismatch + _BUILD_AGAIN)
