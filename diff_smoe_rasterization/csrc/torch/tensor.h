@@ -6,7 +6,7 @@
 //                     device, narrow, view, copy_, clone; a copy is another reference
 //   Sizes, ScalarType (kFloat, kInt, ...), Device
 //   empty, empty_like new tensors of the type and device of another
-//   isfinite ... cat  the few functions of tensors that checks and searches take
+//   isfinite, ...     the few functions of tensors that checks and searches take
 //   DeviceGuard, num_threads, forward_mode_is_open, note_change, has_tangent
 //   DSMOE_CHECK...    errors that are ValueError, TypeError, ... in Python
 //   Library, Arguments, implement   registration of an op, and its arguments
