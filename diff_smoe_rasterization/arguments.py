@@ -5,7 +5,7 @@ import torch
 
 from .autograd import INPUTS, OPTIONS
 from .extension import BACKENDS, build_info
-from .settings import BLEND_MODES, FEATURE_OUTPUTS, OUTPUTS, Rendering, resolve_blend
+from .settings import BLEND_MODES, FEATURE_OUTPUTS, OUTPUTS, Rendering, resolve_blend, resolve_faint_below
 
 
 def op_arguments(function, settings, outputs, means3D, opacities, **tensors):
@@ -38,6 +38,7 @@ def op_options(settings, outputs, blend_mode, fixed_gate):
         if options[place] != getattr(settings, name):  # int() has cut digits off
             raise ValueError(f"{name} is {getattr(settings, name)!r}; it must be a whole number")
     computed = {"fixed_background_gate": fixed_gate, "blend_mode": BLEND_MODES.index(blend_mode),
+                "faint_below": resolve_faint_below(blend_mode, settings.faint_below),
                 **{name: name in outputs for name in FEATURE_OUTPUTS}}
     for name, place in _COMPUTED_OPTIONS.items():
         options.insert(place, computed[name])
@@ -50,7 +51,7 @@ _OUTPUTS = frozenset(OUTPUTS)
 # for_backward, which is the last one.
 assert list(OPTIONS)[-1] == "for_backward"
 _COMPUTED_OPTIONS = {name: place for place, name in enumerate(OPTIONS)
-                     if name in ("fixed_background_gate", "blend_mode", *FEATURE_OUTPUTS)}
+                     if name in ("fixed_background_gate", "blend_mode", "faint_below", *FEATURE_OUTPUTS)}
 _SETTING_OPTIONS = [(name, kind) for name, kind in list(OPTIONS.items())[:-1] if name not in _COMPUTED_OPTIONS]
 _WHOLE_OPTIONS = [(place, name) for place, (name, kind) in enumerate(_SETTING_OPTIONS) if kind is int]
 

@@ -113,8 +113,8 @@ def blend_footprints(footprints: Footprints, settings: GaussianRasterizationSett
                      outputs: Sequence[str] = ()) -> Rendering:
     """The second half of `rasterize`: the images of footprints, of one projection or of several.
 
-    Of the settings it takes the image's size, the background with its gate, the blend mode, alpha_min and
-    deterministic. outputs: those that the footprints were projected for, `alpha` apart.
+    Of the settings it takes the image's size, the background with its gate, the blend mode, alpha_min,
+    faint_below and deterministic. outputs: those that the footprints were projected for, `alpha` apart.
     Raises ValueError, TypeError or RuntimeError as `rasterize` does.
     """
     tensors, options = blend_op_arguments(footprints, settings, outputs)

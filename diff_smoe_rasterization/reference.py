@@ -2,7 +2,8 @@
 
 It is slow, runs in float32 and float64, imports no extension and shares no constant with the C++ core, so that the
 core can be tested against it. Equation numbers are those of "3D SMoE Splatting for Edge-aware Realtime Radiance Field
-Rendering". Read it in this order: `rasterize`, `project`, `pair_counts`, `pair_alphas`, `blend`.
+Rendering". Read it in this order: `rasterize`, `project`, `pair_counts`, `wide_pixels`, `pair_alphas`,
+`blend`.
 
 What the paper leaves open is decided here:
 
@@ -13,7 +14,8 @@ What the paper leaves open is decided here:
 - A Gaussian at `campos` has no view direction: its harmonics above degree 0 are 0, and so are their derivatives.
 - Opacity plays no other part in culling and none in the radius; pairs with opacity <= 0 do not count.
 - Thresholds are float32 values in every scalar type: (1 - 0.99f)^2 < 1e-4f stops a pixel, the same in double does not.
-- `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `pair_tails`.
+- `smoe` cuts pairs as the paper's authors do, `smoe_eq7` as the paper's text says: see `pair_counts`, `tail_sum`.
+- Where the near pairs of a pixel cover it, `smoe` blends no others, and `smoe_eq7` on request: see `wide_pixels`.
 - The background of a pixel without a gate (gate sum under 1e-30) replaces its colour in the SMoE modes.
 - In `smoe_eq7` a background gate that is the number 1 is the mode `alpha`, with its tile rectangle and its cut; a
   tensor of value 1 keeps the footprints. Where the background has a gate, opacity cuts pairs too: see `pair_counts`.
@@ -27,7 +29,16 @@ from typing import NamedTuple, Optional, Sequence, Tuple
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from .settings import OUTPUTS, Contributions, GaussianRasterizationSettings, Importance, Rendering, resolve_blend
+from .settings import (
+    OUTPUTS,
+    Contributions,
+    GaussianRasterizationSettings,
+    Importance,
+    Rendering,
+    leaves_out_faint,
+    resolve_blend,
+    resolve_faint_below,
+)
 
 
 def _float32(value):
@@ -137,7 +148,7 @@ def contributions(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaus
         for y in range(settings.image_height):
             columns = torch.arange(settings.image_width).to(splats.depth)
             row = torch.full_like(columns, y)
-            counts = pair_counts(splats, columns, row, settings, mode, gate)
+            counts, _ = blended_pairs(splats, columns, row, settings, mode, gate)
             weight, stopped = numerator(pair_alphas(splats, columns, row, counts), mode)
             blended = counts & ~stopped
             distance = torch.hypot(columns - splats.position[:, :1], row - splats.position[:, 1:])
@@ -169,9 +180,9 @@ def importance(means3D: torch.Tensor, opacities: torch.Tensor, settings: Gaussia
         splats = project(_rows(gaussians, order), settings)
         x = torch.arange(settings.image_width).to(splats.depth).repeat(settings.image_height)
         y = torch.arange(settings.image_height).to(splats.depth).repeat_interleave(settings.image_width)
-        counts = pair_counts(splats, x, y, settings, mode, gate)
+        counts, wide = blended_pairs(splats, x, y, settings, mode, gate)
         alpha = pair_alphas(splats, x, y, counts)
-        tails = tail_sum(splats, x, y, counts, alpha, settings, mode)
+        tails = tail_sum(splats, x, y, counts, alpha, settings, mode, wide)
         count, weights = len(order), pixel_weights.reshape(-1)
         # With a channel for each Gaussian, the image is the map of their shares.
         identity, black = torch.eye(count).to(alpha), alpha.new_zeros(count)
@@ -415,11 +426,41 @@ def in_rectangle(splats, x, y, settings):
     return (tile_x >= first_x) & (tile_x < past_x) & (tile_y >= first_y) & (tile_y < past_y)
 
 
-def tail_sum(splats, x, y, counts, alpha, settings, mode):
-    """Returns the sum B of each pixel's tails [pixels]; 0 in modes but "smoe", and where W >= tails_below. No gradient.
+def near_pairs(splats, x, y, counts):
+    """Returns which of the pairs that count [n, pixels] are near: alpha >= 1/255, or within 3 sigma. Others are faint.
+
+    Within 3 sigma no pair is faint, or a faint Gaussian would have no gradient.
+    """
+    kernel = torch.exp(_power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y))
+    return counts & ((splats.opacity[:, None] * kernel >= ALPHA_MIN) | (kernel >= KERNEL_KEPT))
+
+
+def wide_pixels(splats, x, y, near, settings, mode):
+    """Returns which pixels are wide [pixels]: those whose near pairs alone have a gate sum below faint_below.
+
+    In the others no faint pair and no tail counts. There a pair of alpha < 1/255 would move its pixel by less than
+    1/255/W, with W the gate sum. near: [n, pixels], of `near_pairs`.
+    """
+    with torch.no_grad():
+        weight, _ = numerator(pair_alphas(splats, x, y, near), mode)
+        return weight.sum(0) < _float32(resolve_faint_below(mode, settings.faint_below))
+
+
+def blended_pairs(splats, x, y, settings, mode, gate):
+    """Returns which pairs are blended [n, pixels], and which pixels are wide [pixels]."""
+    counts = pair_counts(splats, x, y, settings, mode, gate)
+    if not leaves_out_faint(mode, settings.faint_below):
+        return counts, torch.ones_like(x, dtype=torch.bool)
+    near = near_pairs(splats, x, y, counts)
+    wide = wide_pixels(splats, x, y, near, settings, mode)
+    return near | (counts & wide), wide
+
+
+def tail_sum(splats, x, y, counts, alpha, settings, mode, wide):
+    """Returns the sum B of each pixel's tails [pixels]; 0 in modes but "smoe", and where it is not wide. No gradient.
 
     A tail is a pair within the tile rectangle that is too weak to count. Its alpha T joins B while its pixel is open,
-    and T does not feel it. counts, alpha: [n, pixels], of `pair_counts` and `pair_alphas`.
+    and T does not feel it. counts, alpha: [n, pixels], of `blended_pairs` and `pair_alphas`. wide: [pixels].
     """
     with torch.no_grad():
         if mode != "smoe":
@@ -428,10 +469,10 @@ def tail_sum(splats, x, y, counts, alpha, settings, mode):
         power = _power(splats.conic, splats.position[:, :1] - x, splats.position[:, 1:] - y)
         tail = opacity * torch.exp(power)
         is_tail = (opacity > 0) & (power <= 0) & ~counts & in_rectangle(splats, x, y, settings) & (tail >= TAIL_MIN)
-        weight, stopped = numerator(alpha, mode)
+        _, stopped = numerator(alpha, mode)
         transmittance = torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)])[:len(alpha)]
         total = (tail * transmittance).masked_fill(~is_tail | stopped, 0).sum(0)
-        return total.masked_fill(weight.sum(0) >= _float32(settings.tails_below), 0)
+        return total.masked_fill(~wide, 0)
 
 
 def pair_alphas(splats, x, y, counts):
@@ -503,12 +544,12 @@ def _render_blocks(splats, settings, mode, gate):
         y = torch.arange(top, bottom).to(splats.depth).repeat_interleave(right - left)
         with torch.no_grad():
             # The slack keeps rounding in this shortcut from losing a pair; `pair_counts` alone decides.
-            near = footprint_meets(splats, left, top, right - 1, bottom - 1, settings, mode, slack=1.0)
-            counts = pair_counts(_rows(splats, near), x, y, settings, mode, gate)
-        near = _rows(splats, near)
-        alpha = pair_alphas(near, x, y, counts)
-        tails = tail_sum(near, x, y, counts, alpha, settings, mode)
-        image = blend(alpha, near.color, near.depth, settings.bg, mode, gate, tails)
+            meets = footprint_meets(splats, left, top, right - 1, bottom - 1, settings, mode, slack=1.0)
+            counts, wide = blended_pairs(_rows(splats, meets), x, y, settings, mode, gate)
+        met = _rows(splats, meets)
+        alpha = pair_alphas(met, x, y, counts)
+        tails = tail_sum(met, x, y, counts, alpha, settings, mode, wide)
+        image = blend(alpha, met.color, met.depth, settings.bg, mode, gate, tails)
         return image.reshape(-1, bottom - top, right - left)
 
     bands = []

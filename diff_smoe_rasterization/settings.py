@@ -22,8 +22,12 @@ smoe_std   Eq. 6 (classic SMoE)   sum c_i alpha_i / sum alpha_i               wh
 ========== ====================== =========================================== ==========
 
 W = sum alpha_i T_i. In `smoe` the sums are of strong pairs, those of alpha >= 1/2040. A weaker pair in the tiles of its
-Gaussian's 3-sigma square is a tail: B is the sum of the tails' alpha T, and gets no gradient. B counts in pixels where
-W < `tails_below`. `smoe_eq7` sums all pairs of G >= 1e-5.
+Gaussian's 3-sigma square is a tail: B is the sum of the tails' alpha T, and gets no gradient. `smoe_eq7` sums all pairs
+of G >= 1e-5.
+
+A pair that counts is near where alpha >= 1/255, and everywhere within 3 sigma; else it is faint. Where the near pairs
+of a pixel have a gate sum of `faint_below` or more, only they are blended, and B is 0. That is 0.9 in `smoe`, and in
+`smoe_eq7` on request.
 
 With a `background_gate` lambda > 0 the background is one more expert of both, behind all others:
 
@@ -41,6 +45,9 @@ GATED_MODES = tuple(mode for mode, gate in _FIXED_GATES.items() if gate is None)
 
 _RECORDED = {"smoe": "smoe_tails"}
 """What files call a blend mode where it is not its name: `smoe` in a file is the rule of version 0.1, `smoe_eq7`."""
+
+_FAINT_BELOW = {"smoe": 0.9}
+"""The `faint_below` of a blend mode where the caller gives none; of the others it is 2: no pair is left out."""
 
 BLEND_MODE_VARIABLE = "DSMOE_BLEND_MODE"
 BACKGROUND_GATE_VARIABLE = "DSMOE_BACKGROUND_GATE"
@@ -85,8 +92,9 @@ class GaussianRasterizationSettings(NamedTuple):
     # `smoe` and `smoe_eq7`: the background's weight, 0 or more; None: $DSMOE_BACKGROUND_GATE, else 0
     background_gate: Optional[BackgroundGate] = None
     low_pass: float = 0.3  # px^2 added to the variances on the image: no Gaussian is thinner than about a pixel
-    # `smoe`: tails count in pixels whose gate sum is below this. 2: in all, as in the authors' program; slower
-    tails_below: float = 0.9
+    # `smoe` and `smoe_eq7`: faint pairs and tails count in pixels whose near pairs have a gate sum below this. 2: in
+    # all, as in the authors' program and in the text; slower. 0: in none. None: 0.9 in `smoe`, 2 in `smoe_eq7`
+    faint_below: Optional[float] = None
 
 
 class Rendering(NamedTuple):
@@ -198,6 +206,23 @@ def resolve_background_gate(blend_mode: str, background_gate: Optional[Backgroun
         raise ValueError(f"{source} is {background_gate!r}; it must be a number, 0 or more and at most "
                          f"{MAX_BACKGROUND_GATE:g}")
     return value
+
+
+def resolve_faint_below(blend_mode: str, faint_below: Optional[float]) -> float:
+    """Returns the gate sum of near pairs below which a rendering in this blend mode counts faint pairs and tails.
+
+    Raises ValueError for a number that is negative or NaN.
+    """
+    if faint_below is None:
+        return _FAINT_BELOW.get(blend_mode, 2.0)
+    if not faint_below >= 0:
+        raise ValueError(f"faint_below is {faint_below!r}; it must be 0 or more")
+    return float(faint_below)
+
+
+def leaves_out_faint(blend_mode: str, faint_below: Optional[float]) -> bool:
+    """Returns whether a rendering in this blend mode has pixels in which faint pairs do not count."""
+    return blend_mode in GATED_MODES and resolve_faint_below(blend_mode, faint_below) <= 1
 
 
 def _gated_names() -> str:

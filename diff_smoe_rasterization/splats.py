@@ -62,10 +62,10 @@ class Splats:
         Both are of the Gaussians' type and device. The colour image, and the alpha image where it was asked for, must
         be as they were rendered: an image that was edited in place since gives other numbers.
 
-        The removal's image is that of a rendering without the Gaussian, but for two things. In `smoe` the sum of a
-        pixel's tails stays as it is, and where there was none by `tails_below`, there is none. And behind a pixel that
-        was full (T < 1e-4) nothing is known. Without one of its Gaussians such a pixel may take more, of a weight below
-        T / (1 - alpha). Where nothing else is in a pixel, it shows the background's colour.
+        The removal's image is that of a rendering without the Gaussian, but for two things. Which pairs of a pixel
+        count by `faint_below`, and in `smoe` the sum of its tails, stay as they are. And behind a pixel that was full
+        (T < 1e-4) nothing is known. Without one of its Gaussians such a pixel may take more, of a weight below T / (1 -
+        alpha). Where nothing else is in a pixel, it shows the background's colour.
 
         Sums are exact and reproducible as those of `contributions`. Raises ValueError or TypeError where a map does not
         fit.

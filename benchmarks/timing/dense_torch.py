@@ -13,6 +13,7 @@ import math
 import torch
 
 from diff_smoe_rasterization import reference
+from diff_smoe_rasterization.settings import leaves_out_faint, resolve_faint_below
 
 TILE = reference.TILE
 
@@ -125,7 +126,8 @@ def blend_tile(rows, x, y, settings, mode):
     raw = opacity * kernel
     with torch.no_grad():
         if mode in ("alpha", "smoe"):
-            skipped = raw < (reference.ALPHA_MIN if mode == "alpha" else max(reference.STRONG_MIN, settings.alpha_min))
+            least = reference.ALPHA_MIN if mode == "alpha" else max(reference.STRONG_MIN, settings.alpha_min)
+            skipped = raw < least
         else:
             skipped = (kernel < reference.KERNEL_MIN) | (raw < settings.alpha_min)
         skipped |= power > 0
@@ -133,6 +135,15 @@ def blend_tile(rows, x, y, settings, mode):
         if mode == "smoe_eq7" and gate > 0:
             least = float(torch.tensor(gate, dtype=torch.float32) * reference.ALPHA_MIN)  # rounded as float32
             skipped |= raw < (opacity * reference.KERNEL_KEPT).clamp(max=least)
+        wide = torch.ones_like(raw[:, :1], dtype=torch.bool)
+        if leaves_out_faint(mode, settings.faint_below):
+            near = raw >= (opacity * reference.KERNEL_KEPT).clamp(max=reference.ALPHA_MIN)
+            near_alpha = raw.masked_fill(skipped | ~near, 0).clamp(max=reference.ALPHA_MAX)
+            behind = torch.cumprod(1 - near_alpha, 1)
+            in_front = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], 1)
+            gate_sum = (near_alpha * in_front).masked_fill(behind < reference.TRANSMITTANCE_MIN, 0).sum(1, keepdim=True)
+            wide = gate_sum < resolve_faint_below(mode, settings.faint_below)
+            skipped |= ~near & ~wide
     alpha = reference._PassThroughClamp.apply(raw.masked_fill(skipped, 0))
 
     weight = alpha
@@ -151,7 +162,7 @@ def blend_tile(rows, x, y, settings, mode):
             with torch.no_grad():
                 tails = raw.masked_fill(~skipped | (power > 0) | (raw < reference.TAIL_MIN) | stopped, 0)
                 tails = (tails * transmittance).sum(1, keepdim=True)
-                background = background + tails.masked_fill(gate_sum >= settings.tails_below, 0)
+                background = background + tails.masked_fill(~wide, 0)
         total = gate_sum + background
         has_gate = gate_sum >= reference.GATE_SUM_MIN
         blended = weight @ color + background * settings.bg

@@ -54,7 +54,7 @@ template <class Frame> void refuse_frame(const char* function, const Frame& fram
   }
   if (config.num_channels < 1) refuse(function, "num_channels is ", config.num_channels, "; it must be 1 or more");
   refuse_negative(function, "alpha_min", config.alpha_min);
-  refuse_negative(function, "tails_below", config.tails_below);
+  if (config.faint_below != kFaintBelowOfMode) refuse_negative(function, "faint_below", config.faint_below);
   if (kOnHost<Frame> || config.background_gate_at == nullptr) {
     refuse_negative(function, "background_gate", config.gate_of_background());
   }

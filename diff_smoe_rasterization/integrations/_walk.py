@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from diff_smoe_rasterization import Footprints, project_gaussians
 from diff_smoe_rasterization import GaussianRasterizationSettings as Settings
-from diff_smoe_rasterization.settings import resolve_blend
+from diff_smoe_rasterization.settings import leaves_out_faint, resolve_blend, resolve_faint_below
 
 TILE, STEP = 16, 8  # pixels of a tile's side; Gaussians of its list that are taken at once
 FULL = 1e-4  # a pixel of less transmittance takes no more
@@ -29,6 +29,13 @@ class Walk:
         self.columns, self.rows = grid.tolist()
         self.order, self.tile_of, self.places = _lists(footprints, grid, self.mode in ("alpha", "smoe"))
         self.gates = footprints.gates[self.order]
+        self.wide = None  # [tiles, 16, 16]: faint pairs count in these pixels; None: in all
+        if leaves_out_faint(self.mode, settings.faint_below):
+            self.wide = self.image_of_tiles(0) > 0
+            gate_sum = self.image_of_tiles(0.0)
+            for tiles, _, weight in self.steps():
+                gate_sum[tiles] += weight.sum(1)
+            self.wide = gate_sum < resolve_faint_below(self.mode, settings.faint_below)
 
     def image_of_tiles(self, value: float) -> torch.Tensor:
         """Returns [tiles, 16, 16] of one value, int64 where it is an int."""
@@ -69,6 +76,9 @@ class Walk:
             squared = (2 * xy * dx)[:, :, None] * dy + (xx * dx * dx)[:, :, None] + yy[..., None] * dy * dy
             alpha = torch.exp(-0.5 * squared).mul_((opacity * listed[..., None])[..., None]).clamp_(max=0.99)
             alpha.masked_fill_((squared > reach[..., None]) | (squared < 0), 0)
+            if self.wide is not None:
+                near = torch.clamp(2 * torch.log(opacity * 255), min=9)[..., None]  # alpha >= 1/255, or within 3 sigma
+                alpha.masked_fill_((squared > near) & ~self.wide[tiles, None], 0)
             if self.mode == "smoe_std":
                 weight = alpha
             else:

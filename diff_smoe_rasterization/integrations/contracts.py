@@ -1,7 +1,7 @@
 """The Python APIs of public Gaussian rasterizers, as data: how a trainer is recognised by them, and what is returned.
 
 From this table come the modules here, what `dsmoe run` answers for, how `dsmoe patch` tells trainers apart, and the
-table in README.md. A new rasterizer of Inria's kind is one entry and a module of three lines, such as depth.py. One
+table in README.md. A new rasterizer of Inria's kind is one entry, and a function in flavours.py where it does more. One
 that is imported by a name of its own also has a folder of that name in dsmoe/patches/shims.
 """
 from __future__ import annotations

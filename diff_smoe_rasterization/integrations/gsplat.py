@@ -35,7 +35,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
                   sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: str = "classic",
                   channel_chunk: int = 32, distributed: bool = False, camera_model: str = "pinhole",
                   segmented: bool = False, covars: Optional[torch.Tensor] = None, blend_mode: Optional[str] = None,
-                  background_gate: Optional[BackgroundGate] = None, tails_below: float = 0.9,
+                  background_gate: Optional[BackgroundGate] = None, faint_below: Optional[float] = None,
                   **others: Any) -> Tuple[torch.Tensor, torch.Tensor, Dict[str, Any]]:
     """Renders N Gaussians with C pinhole cameras.
 
@@ -61,7 +61,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         blend_mode: one of BLEND_MODES; None: $DSMOE_BLEND_MODE, else "alpha".
         background_gate: `smoe` and `smoe_eq7`: how much the background weighs, a number or a tensor of one element,
             which gets a gradient; None: $DSMOE_BACKGROUND_GATE, else 0.
-        tails_below: `smoe`: tails count in pixels whose gate sum is below this.
+        faint_below: as in GaussianRasterizationSettings.
         tile_size, channel_chunk, segmented: taken and without effect, as they change no image.
 
     Returns:
@@ -115,7 +115,7 @@ def rasterization(means: torch.Tensor, quats: Optional[torch.Tensor], scales: Op
         bg=backgrounds[camera], scale_modifier=1.0, viewmatrix=viewmats[camera].T, projmatrix=projections[camera],
         sh_degree=sh_degree or 0, campos=centres[camera], antialiasing=rasterize_mode == "antialiased",
         near=near_plane, blend_mode=blend_mode, background_gate=background_gate, low_pass=eps2d,
-        tails_below=tails_below)
+        faint_below=faint_below)
         for camera, (focal_x, focal_y) in enumerate(focal_lengths)]
     clips = far_plane < EVERYTHING_NEARER or radius_clip > 0
     if packed or clips:  # else the radii come with the images

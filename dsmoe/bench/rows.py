@@ -26,6 +26,8 @@ Gate = Annotated[Any, must(lambda value: value in (None, LEARNED) or (
 RULES = ("split", "train_views", "test_views", "resolution", "image_size", "downscaler", "background",
          "principal_point", "sh_degree", "recipe", "scale_recipe")
 RULE_PREFIXES = ("psnr", "ssim", "lpips", "edge", "fps", "size", "quantisation")
+SHARED = "shared"  # of a line of rows: what the lines below it have, unless they say otherwise
+UNREPORTED = ("per_view", "history")  # no report reads these fields, which are most of a row
 
 
 class ReportError(BenchError):
@@ -73,12 +75,20 @@ def read_object(path: str, model: Type[Any] = dict) -> Optional[Dict[str, Any]]:
 def checked(text: str, place: str, model: Type[Any] = RowFile) -> Row:
     """The object that a text in json is, of which all that is read has its type. Raises ReportError, which names the
     place of the text."""
+    return _typed(_object(text, place), place, model)
+
+
+def _object(text: str, place: str) -> Dict[str, Any]:
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ReportError(f"{place}: not valid json, as `dsmoe bench run` writes it ({error})") from error
     if not isinstance(found, dict):
         raise ReportError(f"{place}: expected one object, as `dsmoe bench run` writes it")
+    return found
+
+
+def _typed(found: Dict[str, Any], place: str, model: Type[Any] = RowFile) -> Row:
     try:
         TypeAdapter(model).validate_python(found)
     except ValidationError as error:
@@ -96,14 +106,67 @@ def read_rows(results: str) -> List[Row]:
     A cell's own row.json wins over rows.jsonl, and there the last line of a cell.
     """
     listed = results if os.path.isfile(results) else os.path.join(results, ROWS_NAME)
-    lines = _text(listed).split("\n") if os.path.isfile(listed) else []
-    found = [checked(line, f"{listed}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
+    found = _listed(_text(listed), listed) if os.path.isfile(listed) else []
     paths = (os.path.join(results, CELLS_FOLDER, name, ROW_NAME) for name in cell_folders(results))
     found += [checked(_text(path), path) for path in paths if os.path.isfile(path)]
     if not found:
         raise ReportError(f"{results}: no rows: neither {CELLS_FOLDER}/*/{ROW_NAME} nor {ROWS_NAME}")
     rows = {row["cell"]: row for row in found}
     return [rows[name] for name in sorted(rows)]
+
+
+def _listed(text: str, path: str) -> List[Row]:
+    found: List[Row] = []
+    shared: Row = {}
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.strip():
+            place = f"{path}, line {number}"
+            entry = _object(line, place)
+            if isinstance(entry.get(SHARED), dict):
+                shared = entry[SHARED]
+            else:
+                found.append(_typed(_merged(shared, entry), place))
+    return found
+
+
+def _merged(shared: Row, row: Row) -> Row:
+    both = {name: _merged(shared[name], value) if isinstance(value, dict) and isinstance(shared.get(name), dict)
+            else value for name, value in row.items()}
+    return {**shared, **both}
+
+
+def packed(rows: Sequence[Row]) -> str:
+    """A .jsonl to keep: what rows share stands once, in a line ahead of them, and UNREPORTED is left out."""
+    kept = [{name: value for name, value in row.items() if name not in UNREPORTED} for row in rows]
+    shared = _common(kept)
+    lines = [{SHARED: shared}, *(_without(shared, row) for row in kept)]
+    return "".join(json.dumps(line, ensure_ascii=False, separators=(",", ":")) + "\n" for line in lines)
+
+
+def _common(objects: Sequence[Row]) -> Row:
+    """Of each field that all objects have the commonest value; of objects in objects likewise."""
+    found: Row = {}
+    for name in (name for name in objects[0] if all(name in entry for entry in objects)):
+        values = [entry[name] for entry in objects]
+        if all(isinstance(value, dict) for value in values):
+            found[name] = _common(values)
+        else:
+            texts = [json.dumps(value) for value in values]
+            found[name] = json.loads(max(texts, key=texts.count))
+    return found
+
+
+def _without(shared: Row, row: Row) -> Row:
+    found: Row = {}
+    for name, value in row.items():
+        if name not in shared:
+            found[name] = value
+        elif isinstance(value, dict) and isinstance(shared[name], dict):
+            own = _without(shared[name], value)
+            found.update({name: own} if own else {})
+        elif json.dumps(value) != json.dumps(shared[name]):
+            found[name] = value
+    return found
 
 
 def at_once(row: Row) -> int:

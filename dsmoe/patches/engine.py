@@ -23,7 +23,7 @@ from .trainers import GR, INTEGRATIONS, RASTERIZER, TRAINER_NAMES, TRAINERS, Tra
 UNFINISHED = ".dsmoe_unfinished"  # begins the name of a folder of new files, until all are written
 # Signs of an environment, of a run's output and of another checkout or package.
 OF_NO_CHECKOUT = ("pyvenv.cfg", "conda-meta", "cfg_args", GR, ".git", "pyproject.toml")
-CALLS = r"|\b(?:chosen_blend|default_blend|blend_of|saved_blend_of)\("  # what nothing imports without the patch
+CALLS = r"|\b(?:chosen_blend|default_(?:blend|smoe)|(?:saved_)?(?:blend|smoe)_of)\("  # nowhere imported without it
 PathLike = Union[str, Path]
 
 
@@ -62,10 +62,11 @@ class Patched:
                          "take the mark out of it" for name, data in before.items() if leftover(data)]
         scripts = [name for name, data in before.items() if "/" not in name and b"__main__" in data]
         self.notes = [f"--{one}: fits no script: no .py beside train.py has __main__" for one in options if not scripts]
-        rendering = [entry for entry in trainer.entries if entry.blend != "blend_of"]
+        rendering = [entry for entry in trainer.entries if entry.renders]
         if rendering and not entries_in(before, rendering):  # it may render by other means
-            self.notes += [f"{rendering[-1].file}: there is none, nor a function {rendering[-1].function}; a script "
-                           "that renders needs `pipe.blend = saved_blend_of(dataset)`, and says so where it has not"]
+            file, function, *_, blend = rendering[-1]
+            self.notes += [f"{file}: there is none, nor a function {function}; a script that renders needs "
+                           f"`pipe.blend = {blend}(dataset)`, and says so where it has not"]
         for rule in rules_of(trainer, before, sparse_adam):
             why = self.apply(rule.file, rule.name, rule.edit)
             self.problems += [f"{rule.file}: rule {rule.name}: {why}; right would be {rule.says}"] if why else []

@@ -36,7 +36,7 @@ def rules_of(trainer: Trainer, files: Mapping[str, bytes], sparse_adam: bool) ->
         Rule("settings-blend-mode", GR, f"a call of {SETTINGS} by keyword, with `debug=pipe.debug`", settings_blend),
         # Of the groups of options only ModelParams is saved in cfg_args.
         Rule("model-parameter", ARGUMENTS, "a class ModelParams whose __init__ has the statement "
-             "`super().__init__(...)`", model_options),
+             "`super().__init__(...)`", partial(model_options, default=trainer.default)),
         *(Rule("pipe-blend-mode", entry.file, f"a function {entry.function} with the parameters {entry.dataset} and "
                f"{entry.pipe}", partial(pipe_blend, entry=entry)) for entry in entries_in(files, trainer.entries))]
 
@@ -49,7 +49,7 @@ def entries_in(files: Mapping[str, bytes], entries: Sequence[Entry]) -> List[Ent
     found: Dict[Tuple[str, str], Entry] = {}
     for entry in entries:
         scripts = {name for name, data in files.items() if "/" not in name and _functions(data, entry)}
-        if entry.file in files or not scripts and entry.blend == "blend_of":
+        if entry.file in files or not scripts and not entry.renders:
             scripts.add(entry.file)
         found.update({(name, entry.function): entry._replace(file=name) for name in sorted(scripts)})
     return list(found.values())
@@ -110,18 +110,18 @@ def settings_blend(source: Source) -> None:
     _import(source, "chosen_blend", calls)
 
 
-def model_options(source: Source) -> None:
+def model_options(source: Source, default: str) -> None:
     """ModelParams gets a statement that makes the options --blend_mode and --background_gate of two attributes."""
     found = [line for model in source.nodes(ast.ClassDef) if model.name == "ModelParams"
              for init in model.body if getattr(init, "name", "") == "__init__" for line in init.body
              if re.match(rb"\s*super\(.*\)\.__init__\(", source.lines[line.lineno - 1])]
     for line in found[:1]:
-        source.put(marked("self.blend_mode, self.background_gate = default_blend()"), line)
-    _import(source, "default_blend", found)
+        source.put(marked(f"self.blend_mode, self.background_gate = {default}()"), line)
+    _import(source, default, found)
 
 
 def pipe_blend(source: Source, entry: Entry) -> None:
-    """The function that gets both groups begins with `pipe.blend = blend_of(dataset)`."""
+    """The function that gets both groups begins with `pipe.blend = blend_of(dataset)`, or what the entry names."""
     found = _of_entry(source, entry)
     for node in found:
         first = node.body[int(ast.get_docstring(node) is not None and len(node.body) > 1)]

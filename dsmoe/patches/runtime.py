@@ -14,6 +14,7 @@ from typing import Any, Callable, Dict, Optional, Tuple
 
 from diff_smoe_rasterization import settings
 from diff_smoe_rasterization.settings import (
+    BLEND_MODE_VARIABLE,
     BLEND_MODES,
     GATED_MODES,
     mode_of_record,
@@ -24,6 +25,7 @@ from diff_smoe_rasterization.settings import (
 
 SHIMS, STAND_INS = (Path(__file__).resolve().parent / name for name in ("shims", "stand_ins"))
 OPTIONS = ("blend_mode", "background_gate")
+FAINT_EVERYWHERE = 2.0  # no gate sum is above 1
 RASTERIZER_VARIABLE = "DSMOE_RASTERIZER"  # under `dsmoe run`: the module of integrations
 WITHOUT_VARIABLE = "DSMOE_RUN_WITHOUT"  # and a name of it that the trainer must not find
 USED_VARIABLE = "DSMOE_RUN_USED"  # and a file that is made when it is used first
@@ -35,23 +37,49 @@ def default_blend() -> Tuple[str, str]:
     return resolve_blend_mode(None), ""
 
 
+def default_smoe() -> Tuple[str, str]:
+    """Returns what `default_blend` does for the trainer of the paper's authors: smoe, not alpha."""
+    mode, gate = default_blend()
+    return (mode if os.environ.get(BLEND_MODE_VARIABLE) else "smoe"), gate
+
+
+def smoe_of(dataset: Any, of_saved: bool = False) -> Dict[str, Any]:
+    """Returns what `blend_of` does for the trainer of the paper's authors, whose rasterizer is one of `smoe`.
+
+    In `smoe` tails count in every pixel, as in their program. A model without a recorded mode is of that program.
+    """
+    blend = blend_of(dataset, of_saved, unrecorded="smoe")
+    return {**blend, "faint_below": FAINT_EVERYWHERE} if blend["blend_mode"] == "smoe" else blend
+
+
+def saved_smoe_of(dataset: Any) -> Dict[str, Any]:
+    """Returns what `smoe_of` does, for a function that renders a trained model, as `saved_blend_of`."""
+    _take_saved(dataset)
+    return smoe_of(dataset, of_saved=True)
+
+
 def saved_blend_of(dataset: Any) -> Dict[str, Any]:
     """Returns what `blend_of` does, for a function that renders a trained model.
 
     What is not typed as an option is what the model's cfg_args records, whatever default `dataset` brought.
     """
+    _take_saved(dataset)
+    return blend_of(dataset, of_saved=True)
+
+
+def _take_saved(dataset: Any) -> None:
+    """Options that are not typed get the values of the model's cfg_args, None where it has none."""
     saved = _saved(dataset)
     for option in OPTIONS:
         if getattr(dataset, "model_path", "") and not _is_typed(option):
             setattr(dataset, option, saved.get(option))
-    return blend_of(dataset, of_saved=True)
 
 
-def blend_of(dataset: Any, of_saved: bool = False) -> Dict[str, Any]:
+def blend_of(dataset: Any, of_saved: bool = False, unrecorded: str = "alpha") -> Dict[str, Any]:
     """Returns the settings `blend_mode` and `background_gate` of a run (None but in GATED_MODES).
 
     Notes both in `dataset`, the trainer's extracted ModelParams, which the trainer saves as cfg_args; there `smoe` is
-    `smoe_tails`. Without a `blend_mode` (a cfg_args of before the patch): "alpha". In GATED_MODES without a
+    `smoe_tails`. Without a `blend_mode` (a cfg_args of before the patch): `unrecorded`. In GATED_MODES without a
     `background_gate`: 0. `smoe` in the cfg_args of an earlier version is `smoe_eq7`, also where it is typed besides:
     where `dataset` has a trained model's options, so its gate is no text, and under `of_saved`.
     From then on a rendering of this process whose settings name no mode has both.
@@ -61,10 +89,14 @@ def blend_of(dataset: Any, of_saved: bool = False) -> Dict[str, Any]:
     _check_renderer()
     mode, gate = (getattr(dataset, option, None) for option in OPTIONS)  # a gate that is typed is a string
     saved = _saved(dataset)
-    if not mode:
+    if not mode and unrecorded == "smoe":
+        say("this model's cfg_args records no blend mode, so it is smoe with the gate 0, as the program of the paper's "
+            "authors renders")
+        mode, gate = unrecorded, 0.0 if gate is None else gate
+    elif not mode:
         _warn("this model's cfg_args records no blend mode, so it is alpha (a model trained by `dsmoe run`, or before "
               "the patch); --blend_mode says otherwise")
-        mode = "alpha"
+        mode = unrecorded
     if mode == saved.get("blend_mode") and said_of_record(mode) and (of_saved or not isinstance(gate, str)):
         say(f"{dataset.model_path}/cfg_args: {said_of_record(mode)}")
         mode = mode_of_record(mode)

@@ -24,6 +24,11 @@ class Entry(NamedTuple):
     pipe: str = "pipe"
     blend: str = "blend_of"  # what of runtime.py says how it blends
 
+    @property
+    def renders(self) -> bool:
+        """Whether it renders a trained model."""
+        return self.blend.startswith("saved_")
+
 
 class Trainer(NamedTuple):
     """A trainer that can be patched."""
@@ -32,10 +37,11 @@ class Trainer(NamedTuple):
     flavour: str  # the rasterizer that it calls: an entry of contracts.py
     entries: Tuple[Entry, ...]  # none: `dsmoe run` knows it, and no patch does
     signs: Tuple[str, ...] = ()  # it shows all of these
+    default: str = "default_blend"  # what of runtime.py gives the options' defaults
 
 
-def rendering(file: str) -> Entry:
-    return Entry(file, "render_sets", pipe="pipeline", blend="saved_blend_of")
+def rendering(file: str, blend: str = "saved_blend_of") -> Entry:
+    return Entry(file, "render_sets", pipe="pipeline", blend=blend)
 
 
 TRAINING = Entry("train.py", "training")
@@ -59,6 +65,9 @@ TRAINERS = (
     Trainer("instantsplat", "inria", USUAL, ("imports pose_utils",)),
     Trainer("gaussianpro", "inria", USUAL, ("calls depth_propagation",)),
     Trainer("compact-3dgs", "inria", USUAL, ("imports tinycudann",)),
+    # 3D SMoE Splatting (Li et al. 2025) on 3DGS of 2023: smoe unless told otherwise, with tails in every pixel.
+    Trainer("3d-smoe", "inria", (TRAINING._replace(blend="smoe_of"), rendering("render.py", "saved_smoe_of")),
+            ("calls load_init", "calls images_to_video"), "default_smoe"),
     Trainer("3dgs-2023", "inria", USUAL),
     # Rasterizers that return a depth too.
     Trainer("4dgaussians", "depth", USUAL, ("imports deformation",)),

@@ -124,7 +124,8 @@ def agreed_background_gate(path: str, blend_mode: str, recorded: Recorded, asked
                            "with another one its Gaussians show another scene")
     if gate is None and asked is None:
         raise TrainerError(f"{path} does not say which background gate it was trained with (no `comment "
-                           "background_gate`); pass --background-gate, which is 0 for the paper's Eq. 7")
+                           "background_gate`); pass --background-gate, which is 0 for the paper's Eq. 7 and for models "
+                           "of its authors' program")
     try:
         return float(resolve_background_gate(blend_mode, asked if gate is None else gate))
     except ValueError as error:

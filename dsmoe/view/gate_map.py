@@ -1,12 +1,12 @@
 """The gate map: of each pixel the Gaussian with the largest gate, the paper's Figure 10. By the reference's stages."""
 from __future__ import annotations
 
-from typing import Any, List
+from typing import Any, Iterator, List, Tuple
 
 import torch
 
 from diff_smoe_rasterization import reference
-from diff_smoe_rasterization.settings import GaussianRasterizationSettings
+from diff_smoe_rasterization.settings import GaussianRasterizationSettings, leaves_out_faint, resolve_faint_below
 
 from ..model import GaussianModel
 
@@ -61,21 +61,36 @@ def _largest(splats: Any, order: torch.Tensor, left: int, top: int, right: int, 
     x = torch.arange(left, right).to(order.device).repeat(bottom - top).to(splats.depth)
     y = torch.arange(top, bottom).to(order.device).repeat_interleave(right - left).to(splats.depth)
     largest, which = torch.zeros_like(x), torch.full_like(x, -1, dtype=torch.int64)
-    transmittance = torch.ones_like(x)
-    for begin in range(0, len(order), CHUNK):
-        chunk = _rows(splats, slice(begin, begin + CHUNK))
-        counts = reference.pair_counts(chunk, x, y, settings, mode, gate)
-        alpha = reference.pair_alphas(chunk, x, y, counts)
-        # What is in front counts as one pair that lets so much through.
-        weight, stopped = reference.numerator(torch.cat([(1 - transmittance)[None], alpha]), mode)
-        best, row = weight[1:].max(dim=0)
+
+    def chunks(wide: torch.Tensor) -> Iterator[Tuple[int, torch.Tensor, torch.Tensor]]:
+        """Yields where a chunk begins, the weights of its pairs, and the transmittance behind it, front to back."""
+        transmittance = torch.ones_like(x)
+        for begin in range(0, len(order), CHUNK):
+            chunk = _rows(splats, slice(begin, begin + CHUNK))
+            counts = reference.pair_counts(chunk, x, y, settings, mode, gate)
+            if not wide.all():
+                counts &= reference.near_pairs(chunk, x, y, counts) | wide
+            alpha = reference.pair_alphas(chunk, x, y, counts)
+            # What is in front counts as one pair that lets so much through.
+            weight, stopped = reference.numerator(torch.cat([(1 - transmittance)[None], alpha]), mode)
+            transmittance = transmittance * (1 - alpha).prod(dim=0).masked_fill(stopped.any(dim=0), 0)
+            yield begin, weight[1:], transmittance
+
+    wide = torch.ones_like(x, dtype=torch.bool)
+    if leaves_out_faint(mode, settings.faint_below):
+        gate_sum, least = torch.zeros_like(x), resolve_faint_below(mode, settings.faint_below)
+        for _, weight, _ in chunks(~wide):
+            gate_sum += weight.sum(0)
+            if (gate_sum >= least).all():
+                break
+        wide = gate_sum < least
+    for begin, weight, transmittance in chunks(wide):
+        best, row = weight.max(dim=0)
         better = best > largest
         largest = torch.where(better, best, largest)
         which = torch.where(better, order[begin + row], which)
-        if mode != "smoe_std":
-            transmittance = transmittance * (1 - alpha).prod(dim=0).masked_fill(stopped.any(dim=0), 0)
-            if (transmittance <= largest).all():
-                break
+        if mode != "smoe_std" and (transmittance <= largest).all():
+            break
     return which.view(bottom - top, right - left)
 
 

@@ -64,43 +64,60 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
   out.inverse_depth.resize(config.inverse_depth ? pixels : 0);
   for (int64_t pixel = 0; pixel < pixels; ++pixel) {
     const int x = static_cast<int>(pixel % camera.width), y = static_cast<int>(pixel / camera.width);
-    auto state = PixelState<S>::open();
-    S tails = S(0);
-    std::vector<S> sums(num_features);
     double margin = std::numeric_limits<double>::infinity();
     int32_t greatest = -1, num_contributing = 0;
     double greatest_weight = 0, second_weight = 0;
     auto decide = [&](double value, double threshold) { margin = std::min(margin, std::abs(value / threshold - 1)); };
-    for (const int64_t i : order) {
-      const auto& g = projected[i];
-      if (!(g.opacity > S(0))) continue;
-      if (Blend<kMode>::kWithinRadius) {
-        const TileRect rect = radius_rect(g.mean, S(out.radii[i]), grid);
-        const int tile_x = x / kTileSize, tile_y = y / kTileSize;
-        if (tile_x < rect.x0 || tile_x >= rect.x1 || tile_y < rect.y0 || tile_y >= rect.y1) continue;
-      }
-      const S dx = S(x) - g.mean.x, dy = S(y) - g.mean.y;
-      const S power = ColumnExponent<S, S>(g.conic, dx).at(dy);
-      const S least_alpha = config.alpha_cut().of(g.opacity);
-      const auto gate = evaluate_gate<kMode>(power, g.opacity, least_alpha);
-      const double terms = double(g.conic.xx) * dx * dx + double(g.conic.yy) * dy * dy;
-      if (terms > 0) margin = std::min(margin, std::abs(double(power)) / terms);
-      if (Blend<kMode>::kCut == Cut::kAlpha) {
-        decide(gate.alpha, kAlphaCut);
-      } else if (Blend<kMode>::kCut == Cut::kStrong) {
-        decide(gate.alpha, std::max<double>(least_alpha, kStrongAlpha));
-      } else {
-        decide(exp(power), kGateCut);
-        if (least_alpha > 0) decide(gate.alpha, least_alpha);
-      }
-      if (gate.counts) {
-        ++out.num_pairs;
-        if (state.is_open() && Blend<kMode>::kNeedsDepthOrder) {
-          decide(state.transmittance * (S(1) - gate.alpha), kTransmittanceCut);
+    // Calls body(i, dx, dy, power, gate) for each Gaussian of the pixel, front to back. near: only near pairs count.
+    const auto for_each_pair = [&](bool near, auto body) {
+      for (const int64_t i : order) {
+        const auto& g = projected[i];
+        if (!(g.opacity > S(0))) continue;
+        if (Blend<kMode>::kWithinRadius) {
+          const TileRect rect = radius_rect(g.mean, S(out.radii[i]), grid);
+          const int tile_x = x / kTileSize, tile_y = y / kTileSize;
+          if (tile_x < rect.x0 || tile_x >= rect.x1 || tile_y < rect.y0 || tile_y >= rect.y1) continue;
         }
+        const S dx = S(x) - g.mean.x, dy = S(y) - g.mean.y;
+        const S power = ColumnExponent<S, S>(g.conic, dx).at(dy);
+        S least_alpha = config.alpha_cut().of(g.opacity);
+        if (near) least_alpha = near_alpha(g.opacity, least_alpha);
+        const auto gate = evaluate_gate<kMode>(power, g.opacity, least_alpha);
+        const double terms = double(g.conic.xx) * dx * dx + double(g.conic.yy) * dy * dy;
+        if (terms > 0) margin = std::min(margin, std::abs(double(power)) / terms);
+        if (Blend<kMode>::kCut == Cut::kAlpha) {
+          decide(gate.alpha, kAlphaCut);
+        } else if (Blend<kMode>::kCut == Cut::kStrong) {
+          decide(gate.alpha, std::max<double>(least_alpha, kStrongAlpha));
+        } else {
+          decide(exp(power), kGateCut);
+          if (least_alpha > 0) decide(gate.alpha, least_alpha);
+        }
+        body(i, dx, dy, power, gate);
       }
-      auto strong = state;
-      if (Blend<kMode>::kTails) add_tail(strong, tails, gate, power <= S(0));
+    };
+    const auto decide_stop = [&](const PixelState<S>& state, const Gate<S>& gate) {
+      if (gate.counts && state.is_open() && Blend<kMode>::kNeedsDepthOrder) {
+        decide(state.transmittance * (S(1) - gate.alpha), kTransmittanceCut);
+      }
+    };
+    bool wide = Blend<kMode>::kTails;
+    if (config.blends_near_first()) {
+      auto state = PixelState<S>::open();
+      for_each_pair(true, [&](int64_t, S, S, S, const Gate<S>& gate) {
+        decide_stop(state, gate);
+        Blend<kMode>::accumulate(state, gate);
+      });
+      decide(state.gate_sum, config.wide_below());
+      wide = state.gate_sum < config.wide_below();
+    }
+    auto state = PixelState<S>::open();
+    S tails = S(0);
+    std::vector<S> sums(num_features);
+    for_each_pair(config.blends_near_first() && !wide, [&](int64_t i, S dx, S dy, S power, const Gate<S>& gate) {
+      out.num_pairs += gate.counts;
+      decide_stop(state, gate);
+      if (Blend<kMode>::kTails && wide) add_tail(state, tails, tail_of(gate, power <= S(0)));
       const auto pair = Blend<kMode>::accumulate(state, gate);
       add_pair<double>(out.contributions[i], pair.contributes, brute_force_pixel_weight<S>(pixel), pair.weight, dx, dy);
       num_contributing += pair.contributes;
@@ -111,15 +128,14 @@ template <BlendMode kMode, class S> BruteForce<S> brute_force_in(const Scene<S>&
         second_weight = std::max(second_weight, double(pair.weight));
       }
       for (int f = 0; f < num_features; ++f) sums[f] += pair.weight * features[i * num_features + f];
-    }
+    });
     if (state.gate_sum > S(0)) decide(state.gate_sum, kGateSumCut);
-    if (Blend<kMode>::kTails) decide(state.gate_sum, config.tails_below);
     out.margin.push_back(margin);
     out.greatest.push_back(greatest);
     out.num_contributing.push_back(num_contributing);
     out.lead.push_back(greatest < 0 ? 1 : 1 - second_weight / greatest_weight);
     auto end = state.end(config.gate_of_background());
-    if (state.gate_sum < config.tails_below) end.tails = tails;
+    end.tails = tails;
     out.gate_sum[pixel] = finish_alpha<kMode>(end);
     int f = 0;
     for (; f < config.num_channels; ++f) {

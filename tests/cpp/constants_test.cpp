@@ -3,6 +3,8 @@
 
 #include <gtest/gtest.h>
 
+#include <cmath>
+
 namespace dsmoe {
 namespace {
 
@@ -16,6 +18,12 @@ TEST(Thresholds, AreTheSameNumbersInEveryScalarType) {
   EXPECT_TRUE(two_clamped_pairs_fill_a_pixel<float>());
   EXPECT_TRUE(two_clamped_pairs_fill_a_pixel<double>());
   EXPECT_TRUE(two_clamped_pairs_fill_a_pixel<long double>());
+}
+
+TEST(Thresholds, HaveTheirLogarithms) {
+  EXPECT_DOUBLE_EQ(kLog2AlphaCut, std::log2(double(kAlphaCut)));
+  EXPECT_DOUBLE_EQ(kLog2CoreKernel, std::log2(double(kCoreKernel)));
+  EXPECT_NEAR(kCoreKernel, std::exp(-4.5), 1e-9);  // a float32 of 0.01
 }
 
 }  // namespace

@@ -72,6 +72,37 @@ template <BlendMode kMode, class S> void expect_squared_reach_is_exact(S margin)
   EXPECT_GT(without, 10);
 }
 
+// A pair that counts is near where alpha >= 1/255, or G is that of 3 sigma or more: by the least alpha, by the reach,
+// and as kernels ask.
+template <BlendMode kMode, class S> void expect_near_pairs(S margin) {
+  int near_pairs = 0, faint_pairs = 0;
+  Random random(7);
+  for (const S opacity : test_opacities<S>()) {
+    for (const S alpha_min : {S(0), S(1e-3), S(0.01)}) {
+      const S reach = squared_reach(Blend<kMode>::kCut, opacity, alpha_min);
+      const S near = near_reach(opacity, reach);
+      const LogGate<S> gate({S(1), S(0), S(1)}, opacity, reach);
+      for (int n = 0; n < 20; ++n) {
+        const S squared = S(random.uniform(0, 20)), power = S(-0.5) * squared;
+        const auto all = evaluate_gate<kMode>(power, opacity, alpha_min);
+        const bool expected = all.counts && (all.alpha >= S(kAlphaCut) || exp(power) >= S(kCoreKernel));
+        if (std::abs(squared - near) < margin) continue;
+        EXPECT_EQ(evaluate_gate<kMode>(power, opacity, near_alpha(opacity, alpha_min)).counts, expected);
+        EXPECT_EQ(squared <= near, expected);
+        EXPECT_EQ(gate.evaluate(gate.column(sqrt(squared)).at(S(0)), gate.near_least()).counts, expected);
+        (expected ? near_pairs : faint_pairs) += all.counts;
+      }
+    }
+  }
+  EXPECT_GT(near_pairs, 1000);
+  EXPECT_GT(faint_pairs, Blend<kMode>::kCut == Cut::kAlpha ? -1 : 100);
+}
+
+TYPED_TEST(GateOfMode, NearPairsAreThoseOf255thsAndThoseWithinThreeSigma) {
+  expect_near_pairs<TypeParam::value>(1e-4f);
+  expect_near_pairs<TypeParam::value>(1e-11);
+}
+
 // Margins: k^2 is up to 25, its logarithm and the exponential round at epsilon each, so 25 epsilon and a few more.
 TYPED_TEST(GateOfMode, SquaredReachBoundsExactlyThePairsThatCount) {
   expect_squared_reach_is_exact<TypeParam::value>(1e-5f);

@@ -135,7 +135,7 @@ Scene<double> smooth_scene(unsigned seed, double smallest_opacity, double larges
     for (int k = 0; k < 4; ++k) scene.rotations[4 * i + k] = q[k] / length;
   }
   scene.config.depth = scene.config.inverse_depth = true;
-  scene.config.tails_below = 0;  // gradients hold the sum of tails constant
+  scene.config.faint_below = 0;  // gradients hold the sum of tails constant
   return scene;
 }
 

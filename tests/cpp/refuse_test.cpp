@@ -38,6 +38,7 @@ template <class Frame> std::vector<Case<Frame>> cases_of_forward() {
       {[](auto& f) { f.config.mode = static_cast<BlendMode>(-1); }, "blend_mode is -1; it must be 0 to " + last_mode},
       {[](auto& f) { f.config.num_channels = 0; }, "num_channels is 0; it must be 1 or more"},
       {[](auto& f) { f.config.alpha_min = -0.5f; }, "alpha_min is -0.5; it must be 0 or more and finite"},
+      {[](auto& f) { f.config.faint_below = -0.5f; }, "faint_below is -0.5; it must be 0 or more and finite"},
       {[](auto& f) { f.config.background_gate_at = nullptr, f.config.background_gate = -0.1f; },
        "background_gate is -0.1; it must be 0 or more and finite"},
       {[](auto& f) { f.config.most_instances = 0; }, "most_instances is 0; it must be 1 or more"},

@@ -133,6 +133,7 @@ template <class To, class From> Scene<To> convert(const Scene<From>& from) {
   to.config.num_channels = from.config.num_channels;
   to.config.scale_modifier = To(from.config.scale_modifier);
   to.config.alpha_min = To(from.config.alpha_min);
+  to.config.faint_below = To(from.config.faint_below);
   to.config.antialiasing = from.config.antialiasing;
   to.config.clamp_color = from.config.clamp_color;
   to.config.depth = from.config.depth;

@@ -48,11 +48,13 @@ template <class S> void expect_the_cells_of_random_gaussians() {
     RasterConfig<S> config;
     config.mode = BlendMode::kSmoeEq7;
     config.background_gate = S(kGate);
+    if (n % 2 > 0) config.faint_below = S(kFaintBelow);
+    const auto pairs = n % 4 < 2 ? Pairs::kNarrow : Pairs::kWide;
     const Tile<S> tile = {config, saved, kSide, kSide, n % 3, n / 3 % 3, 0, 0, 1};
     const TileExtent extent(tile);
     const PixelCenters<S> pixels(extent);
     ListedGaussian<S> listed;
-    GaussianList<S>(tile, extent, 3).load(0, 0, listed);
+    GaussianList<S>(tile, extent, 3, pairs).load(0, 0, listed);
     for (int at = 0; at < kTilePixels; at += kLanes) {
       const CellBits cell = CellBits(1) << (at / kCellPixels);
       const bool smooth = (listed.smooth & cell) != 0;
@@ -68,6 +70,9 @@ template <class S> void expect_the_cells_of_random_gaussians() {
         if (!smooth) continue;
         ++smooth_pairs;
         ASSERT_TRUE(gate.counts) << "Gaussian " << n << " pixel " << at + lane;
+        if (config.blends_near_first()) {
+          ASSERT_GE(gate.logit, listed.near_alpha) << "Gaussian " << n << " pixel " << at + lane;
+        }
         // The exponent's terms round at half an ulp each, in both ways of summing them; the exponentials at some ulps.
         const double terms = std::abs(gaussian.conic.xx * dx * dx) + 2 * std::abs(gaussian.conic.xy * dx * dy) +
                              std::abs(gaussian.conic.yy * dy * dy);

@@ -9,6 +9,7 @@ from devices import on_the_cpu
 from scenes import gradients
 
 from diff_smoe_rasterization import reference
+from diff_smoe_rasterization.settings import leaves_out_faint, resolve_faint_below
 
 
 @contextlib.contextmanager
@@ -99,12 +100,23 @@ def threshold_margin(scene):
                 # Where the opacity is so small that 3 sigma count, the cut is on G alone.
                 cut = math.log(float(gate) * reference.ALPHA_MIN)
                 distances.append(torch.maximum(log_alpha - cut, power - math.log(reference.KERNEL_KEPT)))
+        counts = reference.pair_counts(splats, x, y, settings, mode, gate)
         if mode != "smoe_std":
-            counts = reference.pair_counts(splats, x, y, settings, mode, gate)
             alpha = reference.pair_alphas(splats, x, y, counts)
             distances.append(torch.log1p(-alpha).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN))
-        if mode == "smoe" and settings.tails_below > 0:
-            weight = reference.numerator(alpha, mode)[0].sum(0, keepdim=True)
-            distances.append(weight.clamp(min=1e-300).log() - math.log(settings.tails_below))
+        if leaves_out_faint(mode, settings.faint_below):
+            # A pair is near by its alpha or by its kernel, and such pairs have an early stop of their own. They decide
+            # in the pixels that they cover, and in others where one pair more, of 1/255, could cover them.
+            near = reference.pair_alphas(splats, x, y, reference.near_pairs(splats, x, y, counts))
+            by_near = [torch.maximum(log_alpha - math.log(reference.ALPHA_MIN),
+                                     power - math.log(reference.KERNEL_KEPT)),
+                       torch.log1p(-near).cumsum(0) - math.log(reference.TRANSMITTANCE_MIN)]
+            below = resolve_faint_below(mode, settings.faint_below)
+            weight = reference.numerator(near, mode)[0].sum(0, keepdim=True)
+            wide = weight < below
+            distances = [distance.masked_fill(~wide, math.inf) for distance in distances]
+            distances += [distance.masked_fill(wide & (weight < 0.99 * below), math.inf) for distance in by_near]
+            if below > 0:
+                distances.append(weight.clamp(min=1e-300).log() - math.log(below))
         nearest = torch.cat([torch.full_like(x, math.inf)[None]] + [distance.abs() for distance in distances]).min(0)[0]
     return nearest.reshape(settings.image_height, settings.image_width)

@@ -14,6 +14,7 @@ from diff_smoe_rasterization.settings import (
     FEATURE_OUTPUTS,
     GaussianRasterizationSettings,
     resolve_background_gate,
+    resolve_faint_below,
 )
 
 CAMERA_FIELDS = ("bg", "viewmatrix", "projmatrix", "campos")
@@ -77,7 +78,7 @@ class Scene(NamedTuple):
 
 def without_tails(scene):
     """Returns the scene without the tails of `smoe`, whose sum the gradients hold constant: for finite differences."""
-    return scene.with_settings(tails_below=0.0)
+    return scene.with_settings(faint_below=0.0)
 
 
 def camera_settings(width, height, position=(0.4, -0.3, -4.0), fov_x=0.9, principal_point=(0.0, 0.0), degree=0, bg=None,
@@ -183,8 +184,8 @@ def gradients(function, scene, outputs=(), camera=True):
 
 
 def transmittance_of(scene):
-    """Returns T behind the last pair of each pixel [H, W]."""
-    return op_results(scene)[1]["final_transmittance"].reshape(scene.settings.image_height, -1)
+    """Returns T behind the last pair of each pixel [H, W]; what is saved of it is negative in wide pixels."""
+    return op_results(scene)[1]["final_transmittance"].abs().reshape(scene.settings.image_height, -1)
 
 
 def op_arguments(scene, op="rasterize", **others):
@@ -193,6 +194,7 @@ def op_arguments(scene, op="rasterize", **others):
     gate = resolve_background_gate(mode, scene.settings.background_gate)
     learned = isinstance(gate, torch.Tensor)
     values = {**scene.settings._asdict(), "blend_mode": BLEND_MODES.index(mode),
+              "faint_below": resolve_faint_below(mode, scene.settings.faint_below),
               **dict.fromkeys(FEATURE_OUTPUTS, True),
               "background_gate": gate if learned else None, "fixed_background_gate": 0.0 if learned else gate,
               "for_backward": True, **scene.inputs, **others}

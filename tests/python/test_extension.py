@@ -25,6 +25,7 @@ from diff_smoe_rasterization.settings import (
     FEATURE_OUTPUTS,
     OUTPUTS,
     GaussianRasterizationSettings,
+    resolve_faint_below,
 )
 
 WHERE_THE_PACKAGE_LIES = Path(diff_smoe_rasterization.__file__).parents[1]
@@ -159,6 +160,8 @@ def test_the_blend_modes_have_the_numbers_and_the_background_gates_of_the_core()
     modes = diff_smoe_rasterization.extension._C.blend_modes
     assert {name: facts["number"] for name, facts in modes.items()} == {mode: i for i, mode in enumerate(BLEND_MODES)}
     assert {name: facts["background_gate"] for name, facts in modes.items()} == _FIXED_GATES
+    below = {mode: resolve_faint_below(mode, None) for mode in BLEND_MODES}
+    assert {name: round(facts["faint_below"], 6) for name, facts in modes.items()} == below  # a float32
 
 
 @on_every_device

@@ -7,10 +7,10 @@ import pytest
 import torch
 from by_hand import facing_camera, on_axis
 from comparison import assert_all_close, assert_close, one_thread
-from devices import on_the_cpu
-from scenes import gradients, random_scene, without_tails
+from devices import on_the_cpu, random_normal
+from scenes import gradients, op_results, random_scene, without_tails
 
-from diff_smoe_rasterization import rasterize, reference
+from diff_smoe_rasterization import rasterize, rasterize_with_splats, reference
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -66,7 +66,7 @@ def authors_image(scene):
 def test_equals_the_authors_sums_over_black(function, dtype, tolerance):
     """tolerance: tails below 2^-35 are left out, some of 60, of a sum of 1/2040 or more. float32: its rounding."""
     scene = random_scene("smoe", 60, 37, 29, seed=3, scale=0.08, opacity=(0.01, 0.9), channels=3,
-                         bg=torch.zeros(3)).with_settings(tails_below=2.0)
+                         bg=torch.zeros(3)).with_settings(faint_below=2.0)
     expected = authors_image(scene.to("cpu"))
     with one_thread():
         rendering = function(settings=scene.to(dtype).settings, **scene.to(dtype).inputs)
@@ -107,10 +107,76 @@ def test_a_tail_by_hand(function, depths):
 
 
 def test_tails_count_below_a_gate_sum(function):
-    images = [line(function, (0.3, 0.05), BEHIND, 16, tails_below=below)[0].color[:, 0, 20]
+    images = [line(function, (0.3, 0.05), BEHIND, 16, faint_below=below)[0].color[:, 0, 20]
               for below in (0.0, 0.29, 0.31, 2.0)]
     assert torch.equal(images[0], images[1]) and torch.equal(images[2], images[3])
     assert (images[1] - images[2]).abs().min() > 1e-5
+
+
+def near_weight(opacities, distance):
+    """The weight behind a Gaussian of opacity 0.95 of one `distance` pixels beside the pixel, and its alpha there."""
+    kernel = math.exp(-0.5 * distance ** 2 / (15.7 * (1 + (distance / 20.5) ** 2) + 0.3))
+    return opacities[1] * kernel * (1 - opacities[0]), opacities[1] * kernel
+
+
+@pytest.mark.parametrize("opacity, distance, near", [
+    (0.9, 15, True),  # alpha 0.0089 is above 1/255, at 3.04 sigma
+    (0.3, 15, False),  # alpha 0.0030, at 3.04 sigma
+    (0.002, 4, True),  # alpha 0.0012, at 0.98 sigma
+    (0.012, 11, True),  # alpha 0.00063, at 2.43 sigma
+    (0.02, 13, False),  # alpha 0.00045 is not strong
+])
+def test_a_faint_pair_counts_where_the_near_ones_do_not_cover(function, opacity, distance, near):
+    """Behind a Gaussian of opacity 0.95 only near pairs count; behind one of 0.85 all strong ones."""
+    for front in (0.95, 0.85):
+        o = (front, opacity)
+        rendering, opacities, _ = line(function, o, BEHIND, distance)
+        alone, _, _ = line(function, (front, 0.0), BEHIND, distance)
+        weight, alpha = near_weight(o, distance)
+        by_opacity, = torch.autograd.grad(rendering.color[0, 0, 20], opacities)
+        counts = alpha >= STRONG and (near or front < 0.9)
+        assert (by_opacity[1].item() != 0) == counts
+        if counts:
+            expected = (front * 0.9 + weight * 0.2) / (front + weight)
+            assert rendering.color[0, 0, 20].item() == pytest.approx(expected, rel=1e-6)  # 1e-7 in the clip w
+        elif front > 0.9:  # neither faint pairs nor tails
+            assert torch.equal(rendering.color[:, 0, 20], alone.color[:, 0, 20])
+            # What is left out is less than what its bound says.
+            assert alpha / front < 1 / 255 / 0.9
+
+
+@pytest.mark.parametrize("mode", ["smoe", "smoe_learned_gate", "smoe_eq7", "eq7_gate"])
+@pytest.mark.parametrize("channels", [None, 5])
+def test_equals_the_reference_on_both_sides_of_the_threshold(mode, channels):
+    """The image, its gradients and what `Splats` says; each of the two rules has its pixels."""
+    background = torch.tensor([0.2, 0.5, 0.8, 0.3, 0.6], dtype=torch.float64)[:channels or 3]
+    scene = random_scene(mode, 400, 61, 45, seed=6, scale=0.1, opacity=(0.01, 1.0), channels=channels, degree=1,
+                         bg=background).with_settings(faint_below=0.9)
+    wide = (op_results(scene)[1]["final_transmittance"] < 0).reshape(45, 61)
+    everywhere = rasterize(settings=scene.with_settings(faint_below=2.0).settings, **scene.inputs).color
+    nowhere = rasterize(settings=without_tails(scene).settings, **scene.inputs).color
+    image, actual = gradients(rasterize, scene, ("alpha",))
+    assert 0.1 < wide.double().mean() < 0.9
+    assert_close(image.color[:, wide], everywhere[:, wide], EXACT, "wide pixels")
+    assert_close(image.color[:, ~wide], nowhere[:, ~wide], EXACT, "covered pixels")
+    moved = (everywhere - nowhere).abs().amax(0)
+    assert (moved[~wide] > 1e-5).double().mean() > 0.5 and moved[wide].max() > 0.005
+    with one_thread(), on_the_cpu():
+        expected_image, expected = gradients(reference.rasterize, scene.to("cpu"), ("alpha",))
+    assert_close(image.color.cpu(), expected_image.color, EXACT, "colour")
+    assert_all_close({name: value.cpu() for name, value in actual.items()}, expected, EXACT)
+    maps = [random_normal((45, 61), seed, torch.float64).abs() for seed in (1, 2)]
+    splats = rasterize_with_splats(settings=scene.settings, **scene.inputs)[1]
+    given = {name: tensor for name, tensor in scene.to("cpu").inputs.items() if name != "means2D"}
+    with one_thread(), on_the_cpu():
+        settings = scene.to("cpu").settings
+        contributions = reference.contributions(settings=settings, pixel_weights=maps[0].cpu(), **given)[2]
+        worth = reference.importance(settings=settings, pixel_weights=maps[0].cpu(), share_weights=maps[1].cpu(),
+                                     **given)
+    assert torch.equal(splats.contributions(maps[0]).pixels.cpu(), contributions.pixels)
+    assert_all_close(splats.contributions(maps[0])._asdict(), contributions._asdict(), EXACT)
+    # Roundings grow by 1 / (1 - alpha), up to 100, and where a pixel's other owners are faint.
+    assert_all_close(splats.importance(*maps)._asdict(), worth._asdict(), 1e-9)
 
 
 def test_a_pair_outside_the_tiles_of_the_square_is_none(function):
@@ -131,3 +197,9 @@ def test_gradients_hold_the_tails_constant():
     assert_all_close({name: value.cpu() for name, value in actual.items()}, expected, EXACT)
     _, plain = gradients(rasterize, without_tails(scene), ("alpha",))
     assert (plain["opacities"] - actual["opacities"]).abs().max() > 1e-3
+
+
+def test_refuses_a_faint_below_that_is_negative():
+    scene = random_scene("smoe", 3).with_settings(faint_below=-1.0)
+    with pytest.raises(ValueError, match="faint_below is -1.0; it must be 0 or more"):
+        rasterize(settings=scene.settings, **scene.inputs)

@@ -11,7 +11,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
  public:
   using P = Pack<S>;
   static constexpr BlendMode kMode = kBlendMode;
-  static constexpr bool kBackToFront = true, kTails = false;
+  static constexpr bool kBackToFront = true;
 
   DSMOE_HD BackwardVisitor(int num_features, Scratch<S> scratch, const TileGradients<S>& gradients)
       : num_features_(num_features),
@@ -35,7 +35,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
         gradients.dL_dbackground != nullptr ? gradients.dL_dbackground + tile.index * (num_channels + 1) : nullptr;
     int64_t num_seen = 0;
     extent.for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
-      PixelEnd<S> end = {tile.saved.final_transmittance[index], tile.saved.gate_sum[index], background_gate, S(0)};
+      PixelEnd<S> end = {abs(tile.saved.final_transmittance[index]), tile.saved.gate_sum[index], background_gate, S(0)};
       if constexpr (Blend<kMode>::kTails) end.tails = tile.saved.tails[index];
       const S* dL_dalpha = gradients.dL_dimages.gate_sum;
       const auto begin = begin_backward<kMode>(end, dL_dalpha != nullptr ? dL_dalpha[index] : S(0));
@@ -158,11 +158,13 @@ template <class S, BlendMode kBlendMode, int kFeatures> class BackwardVisitor {
 template <class S, BlendMode kMode, int kFeatures>
 int64_t blend_tile_backward(const Tile<S>& tile, const TileGradients<S>& gradients, S* memory) {
   const int num_features = kFeatures != kAnyFeatures ? kFeatures : tile.config.num_features();
-  BackwardVisitor<S, kMode, kFeatures> visitor(num_features, {memory}, gradients);
+  Scratch<S> scratch = {memory};
+  const WidePixels<kMode, S> wide(tile, scratch.pixels());
+  BackwardVisitor<S, kMode, kFeatures> visitor(num_features, scratch, gradients);
   const int64_t num_seen = visitor.read(tile, TileExtent(tile), gradients);
   const int64_t end = Blend<kMode>::kStopsEarly ? tile.begin + num_seen : tile.end;
   for (int64_t i = end; i < tile.end; ++i) visitor.write_zeros(tile.saved.instances[i].slot);
-  return walk_tile(tile, tile.begin, end, num_features, visitor);
+  return walk_tile(tile, tile.begin, end, num_features, wide, visitor);
 }
 
 template <class S> int64_t backward(const Tile<S>& tile, const TileGradients<S>& gradients, S* scratch) {

@@ -13,7 +13,7 @@ template <class S, BlendMode kBlendMode> class ContributionVisitor {
  public:
   using P = Pack<S>;
   static constexpr BlendMode kMode = kBlendMode;
-  static constexpr bool kBackToFront = false, kTails = false;
+  static constexpr bool kBackToFront = false;
 
   DSMOE_HD ContributionVisitor(Scratch<S> scratch, const TileContributions<S>& out)
       : transmittance_(scratch.pixels()),
@@ -66,10 +66,12 @@ template <class S, BlendMode kBlendMode> class ContributionVisitor {
 };
 
 template <class S, BlendMode kMode> int64_t sum_tile(const Tile<S>& tile, const TileContributions<S>& out, S* memory) {
-  ContributionVisitor<S, kMode> visitor({memory}, out);
+  Scratch<S> scratch = {memory};
+  const WidePixels<kMode, S> wide(tile, scratch.pixels());
+  ContributionVisitor<S, kMode> visitor(scratch, out);
   const int64_t end = tile.begin + visitor.read(tile);
   for (int64_t i = end; i < tile.end; ++i) out.instances[tile.saved.instances[i].slot] = no_contribution<S>();
-  return walk_tile(tile, tile.begin, end, 0, visitor);
+  return walk_tile(tile, tile.begin, end, 0, wide, visitor);
 }
 
 template <class S> int64_t contributions(const Tile<S>& tile, const TileContributions<S>& out, S* scratch) {

@@ -12,7 +12,7 @@ template <class S, BlendMode kBlendMode> class GateMapVisitor {
  public:
   using P = Pack<S>;
   static constexpr BlendMode kMode = kBlendMode;
-  static constexpr bool kBackToFront = false, kTails = false;
+  static constexpr bool kBackToFront = false;
 
   DSMOE_HD explicit GateMapVisitor(Scratch<S> scratch)
       : transmittance_(scratch.pixels()),
@@ -67,8 +67,10 @@ template <class S, BlendMode kMode> int64_t map_tile(const Tile<S>& tile, const 
   TileExtent(tile).for_each_pixel(tile.width, [&](int, int, int64_t index) {
     num_seen = max<int64_t>(num_seen, tile.saved.last_contributor[index]);
   });
-  GateMapVisitor<S, kMode> visitor({memory});
-  const int64_t pairs = walk_tile(tile, tile.begin, tile.begin + num_seen, 0, visitor);
+  Scratch<S> scratch = {memory};
+  const WidePixels<kMode, S> wide(tile, scratch.pixels());
+  GateMapVisitor<S, kMode> visitor(scratch);
+  const int64_t pairs = walk_tile(tile, tile.begin, tile.begin + num_seen, 0, wide, visitor);
   visitor.write(tile, map);
   return pairs;
 }

@@ -13,7 +13,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
  public:
   using P = Pack<S>;
   static constexpr BlendMode kMode = kBlendMode;
-  static constexpr bool kBackToFront = false, kTails = false;
+  static constexpr bool kBackToFront = false;
 
   DSMOE_HD ImportanceVisitor(const Tile<S>& tile, Scratch<S> scratch, const TileImportances<S>& out)
       : num_channels_(kFeatures != kAnyFeatures ? kFeatures : tile.config.num_channels),
@@ -39,7 +39,7 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
     int64_t num_seen = 0;
     TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
       last_.pixel(x, y) = S(tile.saved.last_contributor[index]);
-      end_transmittance_.pixel(x, y) = tile.saved.final_transmittance[index];
+      end_transmittance_.pixel(x, y) = abs(tile.saved.final_transmittance[index]);
       // The tails' sum is held constant. So it stands in front of all pairs, with the background's colour.
       const S tails = Blend<kMode>::kTails ? tile.saved.tails[index] : S(0);
       gate_sum_.pixel(x, y) = tails;
@@ -106,11 +106,13 @@ template <class S, BlendMode kBlendMode, int kFeatures> class ImportanceVisitor 
 
 template <class S, BlendMode kMode, int kFeatures>
 int64_t importance_of_tile(const Tile<S>& tile, const TileImportances<S>& out, S* memory) {
-  ImportanceVisitor<S, kMode, kFeatures> visitor(tile, {memory}, out);
+  Scratch<S> scratch = {memory};
+  const WidePixels<kMode, S> wide(tile, scratch.pixels());
+  ImportanceVisitor<S, kMode, kFeatures> visitor(tile, scratch, out);
   const int64_t num_seen = visitor.read(tile);
   const int64_t end = Blend<kMode>::kStopsEarly ? tile.begin + num_seen : tile.end;
   for (int64_t i = end; i < tile.end; ++i) out.instances[tile.saved.instances[i].slot] = no_importance<S>();
-  return walk_tile(tile, tile.begin, end, tile.config.num_features(), visitor);
+  return walk_tile(tile, tile.begin, end, tile.config.num_features(), wide, visitor);
 }
 
 template <class S> int64_t importance(const Tile<S>& tile, const TileImportances<S>& out, S* scratch) {

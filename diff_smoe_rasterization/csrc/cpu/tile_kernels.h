@@ -51,10 +51,10 @@ constexpr int record_size(int num_features, bool absolute) {
 
 constexpr int kImportanceArrays = 8;  // numbers a pixel besides its channels
 
-// Numbers of scratch memory that one tile needs, for any of the kernels: for each pixel its features and at most five
+// Numbers of scratch memory that one tile needs, for any of the kernels: for each pixel its features and at most six
 // others, and for each feature the largest pack.
 inline int64_t tile_scratch_size(int num_features) {
-  return static_cast<int64_t>(kTilePixels) * (num_features + 5) + 16 * num_features;
+  return static_cast<int64_t>(kTilePixels) * (num_features + 6) + 16 * num_features;
 }
 
 // All return the number of (Gaussian, pixel) pairs whose exponent they evaluated. scratch: 64-byte aligned.

@@ -102,11 +102,13 @@ template <class S> struct PixelCenters {
 template <class S> struct ListedGaussian {
   Vec2<S> mean;
   ExponentFactors<S> exponent;
-  S opacity, least_alpha;
-  S position;  // in the list, from 0
+  S opacity;
+  S least_alpha;  // of the pairs that the walk is for
+  S near_alpha;   // of near pairs
+  S position;     // in the list, from 0
   uint32_t slot;
-  CellBits met;       // the cells that the footprint meets, or some more; where tails are walked, theirs too
-  CellBits smooth;    // those of them over which the Gaussian is smooth
+  CellBits met;       // the cells that pairs of the walk lie in, or some more
+  CellBits smooth;    // those of them over which the Gaussian is smooth, and which have no faint pairs
   const S* features;  // [F]
 
   // Of smooth cells: alpha at the centre, and its factors at the pixels, by the cell's column and by its row.
@@ -115,15 +117,23 @@ template <class S> struct ListedGaussian {
   alignas(64) S row_factors[kCellColumns][kCellPixels];
 };
 
+// Which pairs a walk is for.
+enum class Pairs {
+  kNarrow,    // those that count in every pixel: the near ones where the rendering blends them first
+  kWide,      // all that count in wide pixels
+  kWithTails  // and their tails
+};
+
 // The Gaussians of a tile's list, one after the other.
 template <class S> class GaussianList {
  public:
-  // further_reach: is added to the squared reach that decides which cells a Gaussian meets.
-  DSMOE_HD GaussianList(const Tile<S>& tile, const TileExtent& extent, int num_features, S further_reach = S(0))
+  DSMOE_HD GaussianList(const Tile<S>& tile, const TileExtent& extent, int num_features, Pairs pairs)
       : tile_(tile),
         extent_(extent),
         num_features_(num_features),
-        further_reach_(further_reach),
+        near_first_(tile.config.blends_near_first()),
+        near_(near_first_ && pairs == Pairs::kNarrow),
+        further_reach_(pairs == Pairs::kWithTails ? tile.config.tail_reach() : S(0)),
         cut_(tile.config.alpha_cut()) {}
 
   // Fills `listed` with entry i of all lists. next: an entry that will soon be wanted; the Gaussians of a list lie
@@ -139,6 +149,8 @@ template <class S> class GaussianList {
     listed.exponent = ExponentFactors<S>(gaussian.conic);
     listed.opacity = gaussian.opacity;
     listed.least_alpha = cut_.of(gaussian.opacity);
+    listed.near_alpha = near_alpha(gaussian.opacity, listed.least_alpha);
+    if (near_) listed.least_alpha = listed.near_alpha;
     listed.position = S(i - tile_.begin);
     listed.slot = instance.slot;
     listed.features = saved.features + static_cast<int64_t>(instance.gaussian) * num_features_;
@@ -146,8 +158,8 @@ template <class S> class GaussianList {
   }
 
  private:
-  // Smooth cells lie inside the footprint: each of their pairs counts. The exponent changes by at most `spread` between
-  // a cell's centre and its pixels.
+  // Smooth cells lie inside the footprint, of the near pairs where they come first: each of their pairs counts. The
+  // exponent changes by at most `spread` between a cell's centre and its pixels.
   DSMOE_HD void find_cells(const ProjectedGaussian<S>& gaussian, ListedGaussian<S>& listed) const {
     using P = Pack<S>;
     const Sym2<S>& conic = gaussian.conic;
@@ -156,14 +168,16 @@ template <class S> class GaussianList {
     // Where the determinant is all but lost, the exponent may be above 0. The clamp of alpha, at 0.99, is left out.
     const bool may_be_smooth = bend < S(0.25) * kLargestSpread && gaussian.opacity < S(0.98) &&
                                conic.xy * conic.xy < S(0.9999) * conic.xx * conic.yy;
+    const S full_reach = near_first_ ? near_reach(gaussian.opacity, gaussian.squared_reach) : gaussian.squared_reach;
+    const S reach = near_ ? full_reach : gaussian.squared_reach + further_reach_;
     // As in may_meet, on the other side of the border.
-    const S least_power = S(-0.5) * (gaussian.squared_reach * S(1 - kFootprintSlack) - S(kFootprintSlack));
+    const S least_power = S(-0.5) * (full_reach * S(1 - kFootprintSlack) - S(kFootprintSlack));
     listed.met = listed.smooth = 0;
     for (int first = 0; first < kCells; first += P::kLanes) {
       const P x = fma(P::load(kSquareOfFour<S>.columns + first), P(S(kCellSize)), P(S(extent_.x0)));
       const P y = fma(P::load(kSquareOfFour<S>.rows + first), P(S(kCellSize)), P(S(extent_.y0)));
       const PixelRect<P> rects = {x, y, x + P(S(kCellSize - 1)), y + P(S(kCellSize - 1))};
-      listed.met |= bits_of(may_meet(conic, gaussian.mean, gaussian.squared_reach + further_reach_, rects)) << first;
+      listed.met |= bits_of(may_meet(conic, gaussian.mean, reach, rects)) << first;
       if (!may_be_smooth) continue;
       const P dx = x + P(kReach) - P(gaussian.mean.x), dy = y + P(kReach) - P(gaussian.mean.y);
       const P slope_x = fma(P(S(2) * factors.xx), dx, P(factors.xy) * dy);
@@ -211,11 +225,38 @@ template <class S> class GaussianList {
   const Tile<S>& tile_;
   const TileExtent& extent_;
   const int num_features_;
+  const bool near_first_, near_;
   const S further_reach_;
   const AlphaCut<S> cut_;
 };
 
 constexpr int64_t kPrefetchDistance = 8;  // list entries
+
+// Which pixels of a tile are wide, as the forward pass has said, for passes that walk their pairs again.
+template <BlendMode kMode, class S> class WidePixels {
+ public:
+  using P = Pack<S>;
+
+  DSMOE_HD WidePixels(const Tile<S>& tile, PixelArray<S> covered) : covered_(covered) {
+    if (!Blend<kMode>::kNearFirst) return;
+    for (int i = 0; i < kTilePixels; ++i) covered_.values[i] = S(1);
+    TileExtent(tile).for_each_pixel(tile.width, [&](int x, int y, int64_t index) {
+      if (is_wide(tile.saved.final_transmittance[index])) covered_.pixel(x, y) = S(0), any_ = true;
+    });
+  }
+
+  DSMOE_HD Pairs wanted() const { return any_ ? Pairs::kWide : Pairs::kNarrow; }
+
+  // Takes the faint pairs of covered pixels from a pack of a wide walk. at: of the first pixel.
+  DSMOE_HD void cut(Gate<P>& gate, const ListedGaussian<S>& gaussian, int at) const {
+    if (!Blend<kMode>::kNearFirst || !any_) return;
+    gate.counts = gate.counts & (gate.logit >= covered_.load(at) * P(gaussian.near_alpha));
+  }
+
+ private:
+  const PixelArray<S> covered_;  // 1; 0 in wide pixels
+  bool any_ = false;
+};
 
 // A pack of pairs of one Gaussian. at: of the first pixel in a PixelArray.
 template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
@@ -243,7 +284,6 @@ template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
 
 // Visits the pairs of the list entries [begin, end), and returns how many pairs it visited. A visitor has:
 //   kMode, kBackToFront   how pairs are cut, and the direction
-//   kTails                whether pairs that are tails are visited too
 //   expect(slot)          the slot of a Gaussian that will soon come
 //   begin(gaussian)       returns the sums of a Gaussian, in registers
 //   wanted(at, pixels)    whether pairs of a pack are wanted, and of which pixels; at: of the first in a PixelArray
@@ -252,10 +292,11 @@ template <BlendMode kMode, class S, bool kSmooth> struct PackPairs {
 // Between `begin` and `end`, `wanted` is asked of each pack that the footprint may meet. Where it says so, `take`
 // follows.
 template <class S, class Visitor>
-DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int num_features, Visitor& visitor) {
+DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int num_features,
+                           const WidePixels<Visitor::kMode, S>& wide, Visitor& visitor) {
   const TileExtent extent(tile);
   const PixelCenters<S> pixels(extent);
-  const GaussianList<S> list(tile, extent, num_features, Visitor::kTails ? tile.config.tail_reach() : S(0));
+  const GaussianList<S> list(tile, extent, num_features, wide.wanted());
   const CellBits on_image = extent.cells();
   ListedGaussian<S> gaussian;
   int64_t num_pairs = 0;
@@ -266,7 +307,9 @@ DSMOE_HD int64_t walk_tile(const Tile<S>& tile, int64_t begin, int64_t end, int 
         Mask<Pack<S>> wanted;
         if (!visitor.wanted(at, wanted)) continue;
         num_pairs += Pack<S>::kLanes;
-        visitor.take(at, PackPairs<Visitor::kMode, S, decltype(smooth)::value>(gaussian, pixels, at), wanted, sums);
+        PackPairs<Visitor::kMode, S, decltype(smooth)::value> pairs(gaussian, pixels, at);
+        if (!decltype(smooth)::value) wide.cut(pairs.gate, gaussian, at);
+        visitor.take(at, pairs, wanted, sums);
       }
     }
   };

@@ -15,14 +15,16 @@ template <class S, int kSums, int kPixels> struct BlendedPixels {
   PixelState<S> state[kPixels];
   S sums[kPixels][kSums];  // of weighted features
   int32_t last[kPixels];   // entries of the list that the numerator has seen
+  bool wide[kPixels];      // the pixel is: known behind the narrow walk
 };
 
-// Notes the state of the pixels where a segment begins.
+// Notes the state of the pixels where a segment begins; in a wide walk that of the wide pixels, where `kept`.
 template <class S, int kSums, int kPixels>
 __device__ void note_segment(const BlendArguments<S>& arguments, const WarpTile<S>& tile, int segment,
-                             const BlendedPixels<S, kSums, kPixels>& pixels) {
+                             const BlendedPixels<S, kSums, kPixels>& pixels, bool kept) {
 #pragma unroll
   for (int k = 0; k < kPixels; ++k) {
+    if (kept && !pixels.wide[k]) continue;
     SegmentPixel<S> begin = {abs(pixels.state[k].transmittance), {}};
     for (int f = 0; f < kSums; ++f) begin.sums[f] = pixels.sums[k][f];
     segment_pixel(arguments.saved, tile, segment, pixels.first + k) = begin;
@@ -44,10 +46,12 @@ __device__ void end_segments(const BlendArguments<S>& arguments, const WarpTile<
   }
 }
 
-// Blends kSums features, front to back.
-template <class S, BlendMode kMode, int kSums, int kPixels> struct BlendVisitor {
+// Blends kSums features, front to back. A wide walk has only wide pixels open, and sums their tails too.
+template <class S, BlendMode kMode, int kSums, int kPixels, bool kWide> struct BlendVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = Blend<kMode>::kStopsEarly;
   static constexpr bool kReadsFeatures = true, kInSegments = kWalksSegments<S, kMode, kSums>;
+  static constexpr bool kNearFirst = Blend<kMode>::kNearFirst, kTails = kWide && Blend<kMode>::kTails;
+  static constexpr Pairs kPairs = kTails ? Pairs::kWithTails : kWide ? Pairs::kWide : Pairs::kNarrow;
   static constexpr int kUnroll = kPixels == kLanePixels ? kBlendUnroll : kSharedBlendUnroll;
 
   __device__ __forceinline__ void begin_batch(int32_t position) {
@@ -58,8 +62,9 @@ template <class S, BlendMode kMode, int kSums, int kPixels> struct BlendVisitor 
   __device__ __forceinline__ void begin_segments(int32_t position) {
     for (; next_segment <= position; next_segment += kSegmentLength) {
       const int segment = next_segment / kSegmentLength;
-      note_segment(arguments, tile, segment, pixels);
-      if (tile.lane == 0 && (kPixels == kLanePixels || atomicMax(begun, segment) < segment)) {
+      note_segment(arguments, tile, segment, pixels, kWide && segment <= narrow_last);
+      if (tile.lane == 0 && !(kWide && segment <= narrow_last) &&
+          (kPixels == kLanePixels || atomicMax(begun, segment) < segment)) {
         segment_queue(arguments.saved).push(tile.index, tile.quarter, segment);
       }
     }
@@ -71,7 +76,9 @@ template <class S, BlendMode kMode, int kSums, int kPixels> struct BlendVisitor 
     const S dy = S(tile.y) - gaussian.mean.y;
 #pragma unroll
     for (int k = 0; k < kPixels; ++k) {
-      const auto gate = gaussian.gate.evaluate(exponent.at(below(dy, pixels.first + k)));
+      const S log_logit = exponent.at(below(dy, pixels.first + k));
+      const auto gate = gaussian.gate.evaluate(log_logit);
+      if constexpr (kTails) add_tail(pixels.state[k], tails[k], tail_of(gate, gaussian.gate.inside(log_logit)));
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
       for (int f = 0; f < kSums; ++f) pixels.sums[k][f] = fma(pair.weight, gaussian.features[f], pixels.sums[k][f]);
       pixels.last[k] = pair.contributes ? gaussian.seen : pixels.last[k];
@@ -89,55 +96,26 @@ template <class S, BlendMode kMode, int kSums, int kPixels> struct BlendVisitor 
   BlendedPixels<S, kSums, kPixels>& pixels;
   int32_t next_segment;  // where the next segment begins; beyond the list where it is not noted in segments
   int* begun;            // the last segment that a warp of a shared square has begun
+  int narrow_last = 0;   // the last segment that the warp's narrow walk has begun
+  S tails[kPixels] = {};
 };
 
-// Sums the tails of a lane's pixels. A pixel that wants none is closed.
-template <class S, int kPixels> struct TailVisitor {
-  static constexpr bool kBackToFront = false, kStopsEarly = true, kTails = true;
-  static constexpr bool kReadsFeatures = true, kInSegments = false;
-  static constexpr int kUnroll = kBlendUnroll;
-
-  __device__ __forceinline__ void begin_batch(int32_t) {}
-
-  __device__ __forceinline__ void visit(const StagedGaussian<S, true>& staged, const int32_t&) {
-    const StagedShape<S> gaussian = staged;
-    const auto exponent = gaussian.gate.column(S(tile.x) - gaussian.mean.x);
-    const S dy = S(tile.y) - gaussian.mean.y;
-#pragma unroll
-    for (int k = 0; k < kPixels; ++k) {
-      const S log_logit = exponent.at(below(dy, first + k));
-      add_tail(state[k], tails[k], gaussian.gate.evaluate(log_logit), gaussian.gate.inside(log_logit));
-    }
-  }
-
-  __device__ __forceinline__ bool is_done() const {
-    bool open = false;
-    for (int k = 0; k < kPixels; ++k) open |= state[k].is_open();
-    return !__any_sync(kAllLanes, open);
-  }
-
-  const BlendArguments<S>& arguments;
-  const WarpTile<S>& tile;
-  int first;  // of the lane's pixels, in a lane that has all of them
-  PixelState<S> state[kPixels];
-  S tails[kPixels];
-};
-
-// Walks the list once more for the tails of the pixels whose gate sum is small. Returns how many entries it met.
+// Closes the pixels that the narrow walk has covered, and opens the others anew. Returns whether the warp has one.
 template <class S, int kSums, int kPixels>
-__device__ unsigned sum_tails(const BlendArguments<S>& arguments, const WarpTile<S>& strong, Stage<S, true>& stage,
-                              const BlendedPixels<S, kSums, kPixels>& pixels, S (&tails)[kPixels]) {
-  WarpTile<S> tile = strong;
-  tile.source.tails = true;
-  TailVisitor<S, kPixels> visitor = {arguments, tile, pixels.first, {}, {}};
+__device__ bool open_wide(const BlendArguments<S>& arguments, const WarpTile<S>& tile,
+                          BlendedPixels<S, kSums, kPixels>& pixels) {
+  bool any = false;
   for (int k = 0; k < kPixels; ++k) {
-    const bool wants =
-        tile.inside(arguments, pixels.first + k) && pixels.state[k].gate_sum < arguments.config.tails_below;
-    visitor.state[k] = {wants ? S(1) : S(-1), S(0)};
+    auto& state = pixels.state[k];
+    pixels.wide[k] =
+        tile.inside(arguments, pixels.first + k) && (!arguments.near_first || state.gate_sum < arguments.wide_below);
+    any |= pixels.wide[k];
+    state.transmittance = pixels.wide[k] ? S(1) : -abs(state.transmittance);
+    state.gate_sum = pixels.wide[k] ? S(0) : state.gate_sum;
+    for (int f = 0; f < kSums; ++f) pixels.sums[k][f] = pixels.wide[k] ? S(0) : pixels.sums[k][f];
+    pixels.last[k] = pixels.wide[k] ? 0 : pixels.last[k];
   }
-  const unsigned met = visitor.is_done() ? 0 : walk_tile(stage, {0, tile.source.length}, visitor);
-  for (int k = 0; k < kPixels; ++k) tails[k] = visitor.tails[k];
-  return met;
+  return __any_sync(kAllLanes, any);
 }
 
 // Blends kSums features from `first_feature` on, and writes them. Where two warps share a square, first_pixel says
@@ -156,39 +134,53 @@ __device__ void blend_features(const BlendArguments<S>& arguments, const WarpTil
     }
     for (int f = 0; f < kSums; ++f) blended.sums[k][f] = S(0);
     blended.last[k] = 0;
+    blended.wide[k] = false;
   }
-  using Visitor = BlendVisitor<S, kMode, kSums, kPixels>;
+  using Visitor = BlendVisitor<S, kMode, kSums, kPixels, false>;
   const bool segments = Visitor::kInSegments && has_segments(arguments.saved, tile);
+  const WalkRange range = {0, tile.source.length, first_feature};
   Visitor visitor = {arguments, tile, blended, segments ? kSegmentLength : INT32_MAX, begun};
-  unsigned met = walk_tile(stage, {0, tile.source.length, first_feature}, visitor);
+  unsigned met = 0;
+  // Where near pairs are not blended first, all pixels of a mode with tails are wide.
+  if (!Blend<kMode>::kTails || arguments.near_first) met = walk_tile(stage, range, visitor);
+  int last = segments ? visitor.next_segment / kSegmentLength - 1 : 0;
+  [[maybe_unused]] S tails[kPixels] = {};
+  if constexpr (Blend<kMode>::kNearFirst) {
+    if ((Blend<kMode>::kTails || arguments.near_first) && open_wide(arguments, tile, blended)) {
+      using WideVisitor = BlendVisitor<S, kMode, kSums, kPixels, true>;
+      WideVisitor wide = {arguments, tile, blended, segments ? kSegmentLength : INT32_MAX, begun, last};
+      met += walk_tile(stage, range, wide);
+      if (Visitor::kInSegments && segments) {
+        wide.begin_segments(last * kSegmentLength);  // which the narrow walk has begun
+        last = wide.next_segment / kSegmentLength - 1;
+      }
+      for (int k = 0; k < kPixels; ++k) tails[k] = wide.tails[k];
+    }
+  }
   if (Visitor::kInSegments && segments) {
     // Where pixels do not stop, the backward pass walks the whole list.
-    if (!Visitor::kStopsEarly) visitor.begin_segments(tile.source.length - 1);
-    int last = visitor.next_segment / kSegmentLength - 1;
+    if (!Visitor::kStopsEarly) {
+      visitor.begin_segments(tile.source.length - 1);
+      last = visitor.next_segment / kSegmentLength - 1;
+    }
     if constexpr (kPixels != kLanePixels) {
       // The backward pass asks for both halves of a segment that one of the warps has begun.
       __syncthreads();
-      for (int segment = last + 1; segment <= *begun; ++segment) note_segment(arguments, tile, segment, blended);
+      for (int segment = last + 1; segment <= *begun; ++segment) note_segment(arguments, tile, segment, blended, false);
       last = *begun;
     }
     end_segments(arguments, tile, last, blended);
   }
 
-  [[maybe_unused]] S tails[kPixels] = {};
-  if constexpr (Blend<kMode>::kTails) {
-    if (first_feature == 0) met += sum_tails(arguments, tile, stage, blended, tails);
-  }
   const int64_t pixels = int64_t(arguments.width) * arguments.height;
   for (int k = 0; k < kPixels; ++k) {
     if (!tile.inside(arguments, blended.first + k)) continue;
     const int64_t index = tile.pixel_index(arguments, blended.first + k);
     auto end = blended.state[k].end(config.gate_of_background());
-    if constexpr (Blend<kMode>::kTails) {
-      if (first_feature == 0) arguments.saved.tails[index] = tails[k];
-      end.tails = first_feature == 0 ? tails[k] : arguments.saved.tails[index];
-    }
+    if constexpr (Blend<kMode>::kTails) end.tails = tails[k];
     if (first_feature == 0) {
-      arguments.saved.final_transmittance[index] = end.transmittance;
+      arguments.saved.final_transmittance[index] = kept_transmittance(end, blended.wide[k]);
+      if constexpr (Blend<kMode>::kTails) arguments.saved.tails[index] = tails[k];
       arguments.saved.gate_sum[index] = end.gate_sum;
       arguments.saved.last_contributor[index] = blended.last[k];
       if constexpr (Blend<kMode>::kTails) arguments.images.gate_sum[index] = finish_alpha<kMode>(end);

@@ -97,6 +97,7 @@ template <class S, int kFeatures> struct BackwardPixels {
   S value_begin[kLanePixels];            // with what the sum g'.c begins
   ScaledGradients<S, kFeatures> scaled;  // g'
   int32_t last[kLanePixels];             // entries of the list that the numerator has seen
+  bool wide[kLanePixels];                // the pixel is
 };
 
 // A warp's part in the sums by tensor cores, in shared memory.
@@ -107,9 +108,11 @@ struct TensorShare {
 
 // Walks back to front, and sums for each Gaussian the moments of dL/dpower and the gradients of its features.
 // kAbsolute: also sums |dL/dmean|. Where the number of features is not known, the arguments say that instead.
-template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> struct BackwardVisitor {
+template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink, Pairs kWanted> struct BackwardVisitor {
   static constexpr bool kBackToFront = true, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kInSegments = false;
+  static constexpr bool kNearFirst = Blend<kMode>::kNearFirst;
+  static constexpr Pairs kPairs = kWanted;
   static constexpr bool kTensor = kSumsByTensors<S, kFeatures>;
   static constexpr int kUnroll = kTensor ? kBackwardUnroll : 1;
   [[maybe_unused]] static constexpr int kRecord = kTensorRecord + (kAbsolute ? kNumAbsoluteSums : 0);  // where kTensor
@@ -131,7 +134,7 @@ template <class S, BlendMode kMode, int kFeatures, bool kAbsolute, class Sink> s
     bool contributes[kLanePixels], any = false;
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      gate[k] = gaussian.gate.evaluate(exponent.at(below(dy, k)));
+      gate[k] = evaluate_pair<kPairs>(gaussian.gate, exponent.at(below(dy, k)), pixels.wide[k]);
       contributes[k] = gate[k].counts && gaussian.seen <= pixels.last[k];
       any |= Blend<kMode>::kStopsEarly ? contributes[k] : gate[k].counts;
     }
@@ -238,8 +241,11 @@ __device__ __forceinline__ void begin_pixels(const BackwardArguments<S>& argumen
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
     end[k] = {S(1), S(0), config.gate_of_background(), S(0)};
+    pixels.wide[k] = false;
     if (inside) {
-      end[k].transmittance = arguments.saved.final_transmittance[index];
+      const S kept = arguments.saved.final_transmittance[index];
+      end[k].transmittance = abs(kept);
+      pixels.wide[k] = is_wide(kept);
       end[k].gate_sum = arguments.saved.gate_sum[index];
       if constexpr (Blend<kMode>::kTails) end[k].tails = arguments.saved.tails[index];
     }
@@ -314,7 +320,7 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
                                                   ? kBackwardBlocks
                                                   : kGeneralWalkBlocks)
     blend_backward_kernel(const __grid_constant__ BackwardWithSink<S, Sink> arguments) {
-  using Visitor = BackwardVisitor<S, kMode, kFeatures, kAbsolute, Sink>;
+  using Visitor = BackwardVisitor<S, kMode, kFeatures, kAbsolute, Sink, Pairs::kNarrow>;
   __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
   __shared__ TensorStage tensor_stages[Visitor::kTensor ? kWarpsPerTile : 1];
   __shared__ TensorBasis moment_basis;
@@ -341,9 +347,13 @@ __global__ void __launch_bounds__(kWalkBlock, sizeof(S) == 4 && kFeatures != kAn
 
   TensorStage& tensor_stage = tensor_stages[Visitor::kTensor ? warp : 0];
   if constexpr (Visitor::kTensor) fill_gradient_basis(tensor_stage, pixels.scaled.values, tile.lane);
-  Visitor visitor = {arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, tensor_stage.rows};
-  const unsigned met = walk_tile<S>(stages[warp], range, visitor);
-  count_pairs(arguments, tile.lane, met);
+  bool wide = false;
+  for (int k = 0; k < kLanePixels; ++k) wide |= pixels.wide[k];
+  walk_pairs<kMode>(wide, [&](auto pairs) {
+    BackwardVisitor<S, kMode, kFeatures, kAbsolute, Sink, decltype(pairs)::value> visitor = {
+        arguments, arguments.sink, tile, pixels, {tensor_stage, moment_basis}, tensor_stage.rows};
+    count_pairs(arguments, tile.lane, walk_tile<S>(stages[warp], range, visitor));
+  });
 }
 
 template <class S, int kFeatures, bool kAbsolute = false, class Sink>

@@ -36,12 +36,15 @@ template <class S> struct ScoredPixels {
   PixelState<S> state[kLanePixels];
   S weight[kLanePixels];      // in the caller's map
   int32_t last[kLanePixels];  // entries of the list that the numerator has seen
+  bool wide[kLanePixels];     // the pixel is
 };
 
 // Walks front to back, as the blend does, up to the last pair that the blend took.
-template <class S, BlendMode kMode, class Sums> struct ContributionVisitor {
+template <class S, BlendMode kMode, class Sums, Pairs kWanted> struct ContributionVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
   static constexpr bool kReadsFeatures = false, kInSegments = false;
+  static constexpr bool kNearFirst = Blend<kMode>::kNearFirst;
+  static constexpr Pairs kPairs = kWanted;
   static constexpr int kUnroll = 1;
 
   __device__ __forceinline__ void begin_batch(int32_t) {}
@@ -55,7 +58,7 @@ template <class S, BlendMode kMode, class Sums> struct ContributionVisitor {
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
       const S pixel_dy = below(dy, k);
-      const auto gate = gaussian.gate.evaluate(exponent.at(pixel_dy));
+      const auto gate = evaluate_pair<kPairs>(gaussian.gate, exponent.at(pixel_dy), pixels.wide[k]);
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
       const bool contributes = pair.contributes && gaussian.seen <= pixels.last[k];
       any |= contributes;
@@ -76,23 +79,29 @@ template <class S, BlendMode kMode, class Sums> struct ContributionVisitor {
 template <class S, BlendMode kMode, class Sums>
 __global__ void __launch_bounds__(kWalkBlock)
     contributions_kernel(const __grid_constant__ ContributionArguments<S, Sums> arguments) {
-  using Visitor = ContributionVisitor<S, kMode, Sums>;
-  __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
+  __shared__ Stage<S, false> stages[kWarpsPerTile];
   const WarpTile<S> tile(arguments);
   if (tile.empty) return;
 
   ScoredPixels<S> pixels;
   int32_t seen = 0;
+  bool wide = false;
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
     pixels.state[k] = PixelState<S>::open();
     pixels.weight[k] = inside ? arguments.pixel_weights[index] : S(0);
     pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
+    pixels.wide[k] = inside && is_wide(arguments.saved.final_transmittance[index]);
+    wide |= pixels.wide[k];
     seen = seen > pixels.last[k] ? seen : pixels.last[k];
   }
-  Visitor visitor = {arguments, tile, pixels, TransposedSum<kNumContributions>(tile.lane)};
-  walk_tile(stages[threadIdx.x / kWarp], {0, max_over_lanes(seen)}, visitor);
+  const WalkRange range = {0, max_over_lanes(seen)};
+  walk_pairs<kMode>(wide, [&](auto pairs) {
+    ContributionVisitor<S, kMode, Sums, decltype(pairs)::value> visitor = {arguments, tile, pixels,
+                                                                           TransposedSum<kNumContributions>(tile.lane)};
+    walk_tile<S>(stages[threadIdx.x / kWarp], range, visitor);
+  });
 }
 
 }  // namespace

@@ -17,12 +17,15 @@ template <class S> struct MappedPixels {
   S greatest_weight[kLanePixels];
   int32_t greatest[kLanePixels];  // the Gaussian of that weight
   int32_t count[kLanePixels];     // pairs that contributed
+  bool wide[kLanePixels];         // the pixel is
 };
 
 // All gates of a pixel have one denominator, so the greatest weight is the greatest gate.
-template <class S, BlendMode kMode> struct GateMapVisitor {
+template <class S, BlendMode kMode, Pairs kWanted> struct GateMapVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
   static constexpr bool kReadsFeatures = false, kInSegments = false;
+  static constexpr bool kNearFirst = Blend<kMode>::kNearFirst;
+  static constexpr Pairs kPairs = kWanted;
   static constexpr int kUnroll = 1;
 
   __device__ __forceinline__ void begin_batch(int32_t) {}
@@ -33,7 +36,7 @@ template <class S, BlendMode kMode> struct GateMapVisitor {
     const auto exponent = gaussian.gate.column(dx);
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto gate = gaussian.gate.evaluate(exponent.at(below(dy, k)));
+      const auto gate = evaluate_pair<kPairs>(gaussian.gate, exponent.at(below(dy, k)), pixels.wide[k]);
       const auto pair = Blend<kMode>::accumulate(pixels.state[k], gate);
       pixels.count[k] += pair.contributes;
       if (!pair.contributes || !(pair.weight > pixels.greatest_weight[k])) continue;
@@ -50,24 +53,30 @@ template <class S, BlendMode kMode> struct GateMapVisitor {
 template <class S, BlendMode kMode>
 __global__ void __launch_bounds__(kWalkBlock)
     gate_map_kernel(const __grid_constant__ BlendArguments<S> arguments, GateMap map) {
-  __shared__ WarpStage<S, GateMapVisitor<S, kMode>> stages[kWarpsPerTile];
+  __shared__ Stage<S, false> stages[kWarpsPerTile];
   const WarpTile<S> tile(arguments);
   if (tile.empty) return;
 
   MappedPixels<S> pixels;
   int32_t seen = 0;  // entries of the list that the numerator of some pixel has seen
+  bool wide = false;
   for (int k = 0; k < kLanePixels; ++k) {
     const bool inside = tile.inside(arguments, k);
     pixels.state[k] = PixelState<S>::open();
     pixels.greatest_weight[k] = S(0);
     pixels.greatest[k] = -1;
     pixels.count[k] = 0;
-    const int32_t last = inside ? arguments.saved.last_contributor[tile.pixel_index(arguments, k)] : 0;
+    const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
+    const int32_t last = inside ? arguments.saved.last_contributor[index] : 0;
     seen = seen > last ? seen : last;
+    pixels.wide[k] = inside && is_wide(arguments.saved.final_transmittance[index]);
+    wide |= pixels.wide[k];
   }
-  using Visitor = GateMapVisitor<S, kMode>;
-  Visitor visitor = {arguments, tile, pixels};
-  walk_tile(stages[threadIdx.x / kWarp], {0, max_over_lanes(seen)}, visitor);
+  const WalkRange range = {0, max_over_lanes(seen)};
+  walk_pairs<kMode>(wide, [&](auto pairs) {
+    GateMapVisitor<S, kMode, decltype(pairs)::value> visitor = {arguments, tile, pixels};
+    walk_tile<S>(stages[threadIdx.x / kWarp], range, visitor);
+  });
   for (int k = 0; k < kLanePixels; ++k) {
     if (!tile.inside(arguments, k)) continue;
     const int64_t index = tile.pixel_index(arguments, k);

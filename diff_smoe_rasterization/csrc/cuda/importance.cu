@@ -76,6 +76,7 @@ template <class S, int kChannels> struct WeighedPixels {
   S weight[kLanePixels], share_weight[kLanePixels];  // in the caller's maps
   S alone[kLanePixels];                              // |bg - C|^2
   int32_t last[kLanePixels];                         // entries of the list that the numerator has seen
+  bool wide[kLanePixels];                            // the pixel is
 };
 
 // The numbers of one Gaussian in shared memory, by lane. Four lanes sum a row. Between its rows lie some numbers, so
@@ -111,9 +112,11 @@ __device__ void add_rows(const Sums& sums, const ImportanceRow<S>* rows, const i
 }
 
 // Walks front to back, as the blend does.
-template <class S, BlendMode kMode, int kChannels, class Sums> struct ImportanceVisitor {
+template <class S, BlendMode kMode, int kChannels, class Sums, Pairs kWanted> struct ImportanceVisitor {
   static constexpr bool kBackToFront = false, kStopsEarly = false;
   static constexpr bool kReadsFeatures = true, kInSegments = false;
+  static constexpr bool kNearFirst = Blend<kMode>::kNearFirst;
+  static constexpr Pairs kPairs = kWanted;
   static constexpr int kUnroll = kChannels != kAnyFeatures ? kUnrolledVisits : 1;
 
   __device__ __forceinline__ int num_channels() const {
@@ -131,7 +134,7 @@ template <class S, BlendMode kMode, int kChannels, class Sums> struct Importance
     auto sum = no_importance<S>();
 #pragma unroll
     for (int k = 0; k < kLanePixels; ++k) {
-      const auto gate = gaussian.gate.evaluate(exponent.at(below(dy, k)));
+      const auto gate = evaluate_pair<kPairs>(gaussian.gate, exponent.at(below(dy, k)), pixels.wide[k]);
       const auto removal = remove_pair<kMode>(pixels.state[k], pixels.end[k], gate, gaussian.seen <= pixels.last[k]);
       S squared = S(0);
       for (int c = 0; c < num_channels(); ++c) {
@@ -185,8 +188,9 @@ __device__ __forceinline__ void begin_pixels(const ImportanceArguments<S>& argum
     const int64_t index = inside ? tile.pixel_index(arguments, k) : 0;
     const S tails = Blend<kMode>::kTails && inside ? arguments.saved.tails[index] : S(0);
     pixels.state[k] = {S(1), tails};
-    pixels.end[k] = {arguments.saved.final_transmittance[index],
-                     inside ? arguments.saved.gate_sum[index] + tails : S(0), background_gate, S(0)};
+    const S kept = arguments.saved.final_transmittance[index];
+    pixels.wide[k] = inside && is_wide(kept);
+    pixels.end[k] = {abs(kept), inside ? arguments.saved.gate_sum[index] + tails : S(0), background_gate, S(0)};
     pixels.weight[k] = inside ? arguments.map.pixel_weights[index] : S(0);
     pixels.share_weight[k] = inside ? arguments.map.share_weights[index] : S(0);
     pixels.last[k] = inside ? arguments.saved.last_contributor[index] : 0;
@@ -228,8 +232,7 @@ template <class S, BlendMode kMode, int kChannels, class Sums>
 __global__ void __launch_bounds__(kWalkBlock,
                                   sizeof(S) == 4 && kChannels != kAnyFeatures ? kBlocks : kGeneralWalkBlocks)
     importance_kernel(const __grid_constant__ ImportanceWithSums<S, Sums> arguments) {
-  using Visitor = ImportanceVisitor<S, kMode, kChannels, Sums>;
-  __shared__ WarpStage<S, Visitor> stages[kWarpsPerTile];
+  __shared__ Stage<S, true> stages[kWarpsPerTile];
   __shared__ ImportanceRow<S> rows[kWarpsPerTile][kVisitsPerCheck];
   WarpSegment place = {};
   if constexpr (kWeighsSegments<S, kMode, kChannels>) {
@@ -261,8 +264,13 @@ __global__ void __launch_bounds__(kWalkBlock,
     }
   }
   const int warp = threadIdx.x / kWarp;
-  Visitor visitor = {arguments, tile, pixels, rows[warp]};
-  walk_tile(stages[warp], range, visitor);
+  bool wide = false;
+  for (int k = 0; k < kLanePixels; ++k) wide |= pixels.wide[k];
+  walk_pairs<kMode>(wide, [&](auto pairs) {
+    ImportanceVisitor<S, kMode, kChannels, Sums, decltype(pairs)::value> visitor = {arguments, tile, pixels,
+                                                                                    rows[warp]};
+    walk_tile<S>(stages[warp], range, visitor);
+  });
 }
 
 }  // namespace

@@ -313,8 +313,10 @@ template <class S> struct TestArguments {
   TileGrid image, tiles;     // all tiles, and those of the band
   int macro_columns;
   S tail_reach;           // of RasterConfig
+  bool near_first;        // squares are those that near pairs meet
   uint64_t* squares;      // [entries] written: which squares the footprint meets
-  uint64_t* listed;       // [entries] written: those too that its tails meet; null where the mode has no tails
+  uint64_t* listed;       // [entries] written: those too that only wide pixels have pairs or tails in; null where
+                          // they are the same
   uint32_t* tile_counts;  // [tiles] entries of each tile; zero before
 };
 
@@ -359,7 +361,9 @@ __global__ void __launch_bounds__(kChunk) test_squares_kernel(const __grid_const
                                     bounding_radius<S>(arguments.mode, arguments.radii, gaussian));
       const TileBand& band = arguments.saved.band;
       bounds = rows_in_band(bounds, band, arguments.tiles.rows);
-      squares = met_squares(in_band(projected, band, S(0)), bounds, macro_x, macro_y);
+      ProjectedGaussian<S> near = in_band(projected, band, S(0));
+      if (arguments.near_first) near.squared_reach = near_reach(near.opacity, near.squared_reach);
+      squares = met_squares(near, bounds, macro_x, macro_y);
       arguments.squares[entry] = squares;
       if (arguments.listed != nullptr) {
         squares |= met_squares(in_band(projected, band, arguments.tail_reach), bounds, macro_x, macro_y);
@@ -600,7 +604,9 @@ template <class Key, class S> void bin_by(const Frame<S>& frame, const Work& wor
   test.macro_columns = grid.columns;
   test.tail_reach = list.bounds.tail_reach;
   test.squares = allocate<uint64_t>(scratch, capacity);
-  test.listed = has_tails(frame.config.mode) ? allocate<uint64_t>(scratch, capacity) : nullptr;
+  test.near_first = frame.config.blends_near_first();
+  const bool marks_some = has_tails(frame.config.mode) || test.near_first;  // of the pairs for which tiles are listed
+  test.listed = marks_some ? allocate<uint64_t>(scratch, capacity) : nullptr;
   test.tile_counts = tile_counts;
   test_squares_kernel<<<resident_blocks(most_chunks), kChunk, 0, stream>>>(test);
   DSMOE_CHECK_LAUNCH("test_squares");

@@ -33,7 +33,8 @@ template <class S> struct BlendArguments {
   SavedForward<S> saved;      // what the forward pass leaves, and reads itself
   ImageOutputs<S> images;     // [features, H, W], and the radii [N]
   bool marked;                // entries of lists are marked with quarters
-  S tail_reach;               // of RasterConfig
+  bool near_first;            // marks are by near pairs, and so are walks that are not wide
+  S wide_below, tail_reach;   // of RasterConfig
   unsigned long long* pairs;  // [1] (Gaussian, pixel) pairs that were evaluated are added to it, or null
 };
 
@@ -47,6 +48,8 @@ template <class S> BlendArguments<S> blend_arguments(const Frame<S>& frame, cons
   arguments.saved = frame.saved;
   arguments.images = frame.images;
   arguments.marked = marks_quarters(frame.inputs.num_gaussians);
+  arguments.near_first = frame.config.blends_near_first();
+  arguments.wide_below = frame.config.wide_below();
   arguments.tail_reach = frame.config.tail_reach();
   arguments.pairs = work.pairs;
   return arguments;
@@ -72,20 +75,20 @@ template <class S> class EntrySource {
   // Stands for an entry, and meets no pixels.
   __device__ uint32_t no_entry() const { return marked ? (1u << kMarkShift) - 1 : kSign; }
 
-  // Whether an entry may meet the quarter's pixels. Never for a culled Gaussian, which only the depth order has.
-  __device__ bool may_meet(uint32_t entry) const {
-    if (tails && marked) return entry != no_entry();
+  // Whether an entry may meet the quarter's pixels. Never for a culled Gaussian, which only the depth order has. kWide:
+  // by more pairs than those of the marks.
+  template <bool kWide> __device__ bool may_meet(uint32_t entry) const {
+    if (kWide && marked) return entry != no_entry();
     return ((marked ? entry : ~entry) & wanted_) != 0;
   }
   __device__ int32_t gaussian(uint32_t entry) const {
     return static_cast<int32_t>(marked ? entry & ((1u << kMarkShift) - 1) : entry);
   }
 
-  bool listed;         // the entries are the tile's list; else the depth order, which knows nothing of tiles
-  bool marked;         // an entry says which quarters its strong pairs may meet
-  bool tails = false;  // entries whose pairs in the quarter are tails are wanted too
-  int64_t begin;       // the list's first instance
-  int32_t length;      // entries
+  bool listed;     // the entries are the tile's list; else the depth order, which knows nothing of tiles
+  bool marked;     // an entry says which quarters it may meet
+  int64_t begin;   // the list's first instance
+  int32_t length;  // entries
 
  private:
   static constexpr uint32_t kSign = 1u << 31;
@@ -164,7 +167,7 @@ struct WalkRange {
 };
 
 // Looks ahead in a list.
-template <class S, bool kBackToFront> class EntryFinder {
+template <class S, bool kBackToFront, bool kWide> class EntryFinder {
  public:
   __device__ EntryFinder(const WarpTile<S>& tile, const WalkRange& range, FoundEntry* ring)
       : tile_(tile), range_(range), ring_(ring), cursor_(kBackToFront ? range.end - 1 : range.begin) {
@@ -206,7 +209,7 @@ template <class S, bool kBackToFront> class EntryFinder {
   __device__ void find() {
 #pragma unroll
     for (int i = 0; i < kReadAhead; ++i) {
-      const bool meets = tile_.source.may_meet(entries_[i]);
+      const bool meets = tile_.source.template may_meet<kWide>(entries_[i]);
       const unsigned meet = __ballot_sync(kAllLanes, meets);
       if (meets) {
         ring_[(found_ + __popc(meet & ((1u << tile_.lane) - 1))) % kFoundEntries] = {tile_.source.gaussian(entries_[i]),
@@ -226,6 +229,29 @@ template <class S, bool kBackToFront> class EntryFinder {
   int found_ = 0, taken_ = 0;  // entries so far
 };
 
+// Which pairs a walk is for.
+enum class Pairs {
+  kNarrow,    // those that count in every pixel: the near ones where the rendering blends them first
+  kWide,      // all that count in wide pixels
+  kWithTails  // and their tails
+};
+
+// Calls walk(Constant<kPairs>), with kWide where the mode has wide pixels and some lane has one.
+template <Pairs kPairs> using PairsConstant = std::integral_constant<Pairs, kPairs>;
+template <BlendMode kMode, class Walk> __device__ __forceinline__ void walk_pairs(bool wide, Walk walk) {
+  if constexpr (Blend<kMode>::kNearFirst) {
+    if (__any_sync(kAllLanes, wide)) return walk(PairsConstant<Pairs::kWide>{});
+  }
+  walk(PairsConstant<Pairs::kNarrow>{});
+}
+
+// The gate of a pair in a walk. wide: whether the pixel is; read in a wide walk only.
+template <Pairs kPairs, class S>
+__device__ __forceinline__ Gate<S> evaluate_pair(const LogGate<S>& gate, S log_logit, bool wide) {
+  if constexpr (kPairs == Pairs::kNarrow) return gate.evaluate(log_logit);
+  return gate.evaluate(log_logit, wide ? gate.least : gate.near_least());
+}
+
 // What a lane has loaded of an entry.
 template <class S, bool kWithFeatures> struct LoadedEntry {
   StagedGaussian<S, kWithFeatures> staged;
@@ -236,9 +262,9 @@ template <class S, bool kWithFeatures> struct LoadedEntry {
 template <class Visitor, class = void> constexpr bool kEndsVisits = false;
 template <class Visitor> constexpr bool kEndsVisits<Visitor, std::void_t<decltype(&Visitor::end_visits)>> = true;
 
-// Whether a visitor wants pairs that are tails too: it says so by kTails.
-template <class Visitor, class = void> constexpr bool kVisitsTails = false;
-template <class Visitor> constexpr bool kVisitsTails<Visitor, std::void_t<decltype(Visitor::kTails)>> = Visitor::kTails;
+// Whether a visitor asks each pixel which of its pairs count, and whether it wants pairs that are tails too.
+template <class Visitor> constexpr bool kVisitsFaint = Visitor::kPairs != Pairs::kNarrow;
+template <class Visitor> constexpr bool kVisitsTails = Visitor::kPairs == Pairs::kWithTails;
 
 template <class Visitor, class S>
 __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEntry& entry, bool exists,
@@ -259,8 +285,11 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
   }
   StagedShape<S>& shape = loaded.staged;
   shape = {gaussian.mean, LogGate<S>(gaussian.conic, gaussian.opacity, gaussian.squared_reach), entry.position + 1};
-  if (tile.source.marked && !kVisitsTails<Visitor>) return loaded;
-  const S reach = gaussian.squared_reach + (kVisitsTails<Visitor> ? arguments.tail_reach : S(0));
+  const bool near = Visitor::kNearFirst && !kVisitsFaint<Visitor> && arguments.near_first;
+  if (near) shape.gate.least = shape.gate.near_least();
+  if (tile.source.marked && !kVisitsFaint<Visitor>) return loaded;
+  S reach = near ? near_reach(gaussian.opacity, gaussian.squared_reach) : gaussian.squared_reach;
+  if (kVisitsTails<Visitor>) reach += arguments.tail_reach;
   loaded.meets = may_meet(gaussian.conic, gaussian.mean, reach, tile.rect);
   if (!tile.source.listed) {
     const BlendMode mode = arguments.config.mode;
@@ -275,6 +304,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
 // The walk itself. Returns how many entries met the warp's pixels. A visitor has
 //
 //   kBackToFront, kStopsEarly, kReadsFeatures   what it wants of the walk, static
+//   kNearFirst, kPairs            whether the mode has wide pixels, and which pairs it wants, static
 //   kInSegments                   entries of two segments are never staged together, static
 //   kUnroll                       visits that the compiler may interleave, static
 //   arguments, tile               the rendering, and the warp's place in it
@@ -286,7 +316,7 @@ __device__ __forceinline__ auto load_entry(const Visitor& visitor, const FoundEn
 template <class S, class Visitor>
 __device__ __forceinline__ unsigned walk_tile(WarpStage<S, Visitor>& stage, const WalkRange& range, Visitor& visitor) {
   const int lane = visitor.tile.lane;
-  EntryFinder<S, Visitor::kBackToFront> finder(visitor.tile, range, stage.found);
+  EntryFinder<S, Visitor::kBackToFront, kVisitsFaint<Visitor>> finder(visitor.tile, range, stage.found);
   unsigned met = 0;
   FoundEntry entry;
   int count = finder.template take<Visitor::kInSegments>(entry);

@@ -31,7 +31,7 @@
   X(double, "float", scale_modifier)                                       \
   X(double, "float", near)                                                 \
   X(double, "float", alpha_min)                                            \
-  X(double, "float", tails_below)                                          \
+  X(double, "float", faint_below)                                          \
   X(double, "float", low_pass)                                             \
   X(double, "float", fixed_background_gate) /* where no tensor is given */ \
   X(int64_t, "int", sh_degree)                                             \

@@ -69,7 +69,7 @@ Object saved() {
 
 // The core's list: names in the order of their numbers, each with the facts that Python asks for. `divides`: the
 // backward pass reads the images of the forward pass. `removable`: `importance` takes the mode. `background_gate`: the
-// mode's own, or None where the caller gives it.
+// mode's own, or None where the caller gives it. `faint_below`: what is usual in the mode.
 Object blend_modes() {
   Dict modes;
   BlendModes::for_each([&](auto mode) {
@@ -81,7 +81,8 @@ Object blend_modes() {
                                         .set("divides", Policy::kDivides)
                                         .set("removable", kRemovable<decltype(mode)::value>)
                                         .set("background_gate", gate)
-                                        .set("tails", Policy::kTails)));
+                                        .set("tails", Policy::kTails)
+                                        .set("faint_below", Policy::kFaintBelow)));
   });
   return modes;
 }

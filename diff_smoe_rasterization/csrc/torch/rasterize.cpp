@@ -26,7 +26,7 @@ struct Given : GaussianRasterizationSettings {
   Given(const Settings& settings, const RasterizeArguments& arguments);
 
   int64_t blend_mode = 0;
-  double fixed_background_gate = 0;
+  double fixed_background_gate = 0, faint_below = 0;
   at::Tensor background_gate;
   bool depth = false, inverse_depth = false, for_backward = false;
 
@@ -67,6 +67,7 @@ void Given::resolve_blend() {
     blend_mode = static_cast<int64_t>(mode());
     learns_gate = Policy::kLearnsGate;
     fixed_background_gate = Policy::background_gate(0.0);
+    faint_below = Settings::faint_below.value_or(Policy::kFaintBelow);
   });
   TORCH_CHECK_VALUE(blend_mode >= 0, "rasterize: blend_mode is '", Settings::blend_mode, "'; it must be one of ",
                     mode_names());

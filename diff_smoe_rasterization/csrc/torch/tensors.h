@@ -165,7 +165,7 @@ template <class S> RasterConfig<S> blend_config(const Tensor& background_gate, c
   out.background_gate = static_cast<S>(options.fixed_background_gate);
   out.background_gate_at = data<S>(background_gate);
   out.alpha_min = static_cast<float>(options.alpha_min);  // thresholds are float32 values in every scalar type
-  out.tails_below = static_cast<float>(options.tails_below);
+  out.faint_below = static_cast<float>(options.faint_below);
   out.most_instances = most_instances();
   return out;
 }

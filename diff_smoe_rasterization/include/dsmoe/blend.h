@@ -13,7 +13,9 @@
 //
 // `smoe` is Eq. 7 as the paper's authors compute it. Their pairs are strong or tails (Cut::kStrong). The sums over i
 // are of strong pairs. B is the sum of alpha T over the tails, which takes nothing from T. So where Gaussians end,
-// those that almost reach a pixel draw it to the background.
+// those that almost reach a pixel draw it to the background. That is the rule of wide pixels. A pixel is wide where its
+// near pairs (gate.h) have a gate sum below `faint_below`. In the others only near pairs count, and B is 0. smoe_eq7
+// has that as an option.
 //
 // The first three are of one family, in which the background is one more expert, with the gate lambda:
 //
@@ -70,6 +72,12 @@ template <class Real> struct PixelEnd {
   Scalar<Real> background_gate;        // lambda
   Real tails = Real(Scalar<Real>(0));  // B, where the mode has tails
 };
+
+// What a rendering keeps of a pixel's T: its sign says whether the pixel is wide. T is never 0.
+template <class Real> DSMOE_HD Real kept_transmittance(const PixelEnd<Real>& end, Mask<Real> wide) {
+  return select(wide, -end.transmittance, end.transmittance);
+}
+template <class Real> DSMOE_HD Mask<Real> is_wide(Real kept) { return kept < Real(Scalar<Real>(0)); }
 
 // The running sums of a pixel. The sign of the transmittance says whether the pixel still takes pairs: it is never 0,
 // because a pixel closes at kTransmittanceCut.
@@ -151,6 +159,8 @@ template <bool kTInNumerator, bool kTInDenominator> struct GateBlend {
   static constexpr bool kDivides = true;                     // a pixel is divided by D; else D is 1
   static constexpr bool kLearnsGate = false;                 // the caller gives lambda, and may learn it
   static constexpr bool kTails = false;                      // pairs that do not count may be tails
+  static constexpr bool kNearFirst = false;                  // faint pairs and tails may count in wide pixels only
+  static constexpr float kFaintBelow = kFaintEverywhere;     // which pixels are wide, unless a caller says otherwise
   template <class S> static DSMOE_HD S background_gate(S) { return S(0); }  // what the mode makes of lambda
 
   // Reads alpha and counts, and no logit: not every walk has one here.
@@ -192,14 +202,15 @@ template <> struct Blend<BlendMode::kSmoe> : GateBlend<true, true> {
   static constexpr const char* kName = "smoe";
   static constexpr Law kLaw = Law::kGates;
   static constexpr Cut kCut = Cut::kStrong;
-  static constexpr bool kWithinRadius = true, kLearnsGate = true, kTails = true;
+  static constexpr bool kWithinRadius = true, kLearnsGate = true, kTails = true, kNearFirst = true;
+  static constexpr float kFaintBelow = ::dsmoe::kFaintBelow;
   template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
 
 template <> struct Blend<BlendMode::kSmoeEq7> : GateBlend<true, true> {
   static constexpr const char* kName = "smoe_eq7";
   static constexpr Law kLaw = Law::kGates;
-  static constexpr bool kLearnsGate = true;
+  static constexpr bool kLearnsGate = true, kNearFirst = true;
   template <class S> static DSMOE_HD S background_gate(S lambda) { return lambda; }
 };
 
@@ -232,13 +243,24 @@ DSMOE_HD constexpr bool has_tails(BlendMode mode) {
   return tails;
 }
 
-// The sum of a pixel's tails, B: the pairs of `smoe` that are too weak to be strong, front to back, while the pixel is
-// open. strong: the state of the pixel in front of the pair; it moves past the pair.
-template <class Real>
-DSMOE_HD void add_tail(PixelState<Real>& strong, Real& tails, const Gate<Real>& gate, Mask<Real> inside) {
-  const Real alpha = select(strong.is_open(), tail_of(gate, inside), Real(Scalar<Real>(0)));
-  tails = fma(alpha, strong.transmittance, tails);
-  transmit(strong, gate);
+DSMOE_HD constexpr bool near_first(BlendMode mode) {
+  bool first = false;
+  BlendModes::for_each(
+      [&](auto of) { first |= decltype(of)::value == mode && Blend<decltype(of)::value>::kNearFirst; });
+  return first;
+}
+
+DSMOE_HD constexpr float faint_below_of(BlendMode mode) {
+  float below = kFaintEverywhere;
+  BlendModes::for_each(
+      [&](auto of) { below = decltype(of)::value == mode ? Blend<decltype(of)::value>::kFaintBelow : below; });
+  return below;
+}
+
+// Adds a pair to the sum of a pixel's tails, B, where it is a tail and the pixel is open. state: of the pixel in front
+// of the pair. tail: of the pair, by tail_of.
+template <class Real> DSMOE_HD void add_tail(const PixelState<Real>& state, Real& tails, Real tail) {
+  tails = fma(select(state.is_open(), tail, Real(Scalar<Real>(0))), state.transmittance, tails);
 }
 
 // Whether a backward walk of the mode can be continued by resume_backward. Else one walk takes a whole list.

@@ -12,13 +12,15 @@ constexpr float kGateCut = 1e-5f;           // `smoe_eq7` and the ablations skip
 // is strong, so that the denominator is at least kStrongAlpha, and half a unit of its last digit is 2^-24 of that.
 constexpr float kStrongAlpha = 1.0f / 2040.0f;
 constexpr float kTailAlpha = 0x1p-35f;
-// Tails count where the gate sum is below this, unless a caller says otherwise. With more, they move a pixel by less
-// than `alpha` mode's own cut does.
-constexpr float kTailsBelow = 0.9f;
+// Faint pairs and tails count where the gate sum of the near pairs is below this, unless a caller says otherwise. With
+// more, such a pair moves a pixel by less than 1 / 255 of it, about what `alpha` mode's own cut allows.
+constexpr float kFaintBelow = 0.9f;
+constexpr float kFaintEverywhere = 2.0f;  // no gate sum of a mode that has faint pairs is above 1
 // exp(-4.5), G at 3 sigma. Under a background gate lambda a pair changes a pixel by at most alpha / lambda. So pairs
 // with alpha < lambda / 255 do not count, as in `alpha` mode. Inside 3 sigma they do: a Gaussian that is cut everywhere
-// has no gradient, and would never come back.
+// has no gradient, and would never come back. For the same reason such a pair is never faint.
 constexpr float kCoreKernel = 0.011108996538242306f;
+constexpr double kLog2AlphaCut = -7.994353351539342, kLog2CoreKernel = -6.492127708889321;  // of the two floats
 constexpr float kTransmittanceCut = 1e-4f;     // a pixel is full where the next pair would leave less
 constexpr float kMaxOpacity = 1e20f;           // with a larger opacity, gradients by a place overflow in float
 constexpr float kGateSumCut = 1e-30f;          // below it no gate is open: the pixel takes the background

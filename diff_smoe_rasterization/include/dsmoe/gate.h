@@ -63,6 +63,20 @@ template <class S> DSMOE_HD S squared_reach(Cut cut, S opacity, S least_alpha) {
   return least_alpha > S(0) ? min(by_gate, by_alpha) : by_gate;
 }
 
+// A pair that counts is near where alpha >= 1/255, and everywhere within 3 sigma; else it is faint. A mode with
+// kNearFirst blends the faint pairs of a pixel only where its near pairs have a small gate sum.
+//
+// The least alpha of a near pair. least_alpha: of a pair that counts.
+template <class S> DSMOE_HD S near_alpha(S opacity, S least_alpha) {
+  return max(least_alpha, min(S(kAlphaCut), opacity * S(kCoreKernel)));
+}
+
+// The squared reach of a Gaussian's near pairs. squared_reach: of all its pairs.
+template <class S> DSMOE_HD S near_reach(S opacity, S squared_reach) {
+  if (!(opacity > S(0))) return squared_reach;
+  return min(squared_reach, max(S(2) * log(opacity / S(kAlphaCut)), S(-2 * kLn2 * kLog2CoreKernel)));
+}
+
 template <class Real> struct Gate {
   Real logit;         // o G, before the clamp
   Real alpha;         // min(0.99, o G)
@@ -113,14 +127,18 @@ template <class S> struct LogGate {
 
   template <class Real> DSMOE_HD ColumnExponent<Real, S> column(Real dx) const { return {factors, dx, greatest}; }
 
-  // Where log_logit is above log2(o) the conic is no ellipse. Such a pair does not count.
-  template <class Real> DSMOE_HD Gate<Real> evaluate(Real log_logit) const {
+  // As near_alpha. It is the same number again where `least` is that of a near pair.
+  DSMOE_HD S near_least() const { return max(least, min(S(kLog2AlphaCut), greatest + S(kLog2CoreKernel))); }
+
+  // Where log_logit is above log2(o) the conic is no ellipse. Such a pair does not count. least: of a pair that counts.
+  template <class Real> DSMOE_HD Gate<Real> evaluate(Real log_logit, Real least) const {
     Gate<Real> gate;
     gate.logit = exp2(log_logit);
     gate.alpha = clamped(gate.logit);
-    gate.counts = (log_logit >= Real(least)) & inside(log_logit);
+    gate.counts = (log_logit >= least) & inside(log_logit);
     return gate;
   }
+  template <class Real> DSMOE_HD Gate<Real> evaluate(Real log_logit) const { return evaluate(log_logit, Real(least)); }
   template <class Real> DSMOE_HD Mask<Real> inside(Real log_logit) const { return log_logit <= Real(greatest); }
 };
 

@@ -74,6 +74,8 @@ template <class S> struct GaussianInputs {
 // Features that may follow the colour's channels: the flags of RasterConfig that its num_features counts.
 constexpr int kMostFurtherFeatures = 2;
 
+constexpr float kFaintBelowOfMode = -std::numeric_limits<float>::infinity();
+
 template <class S> struct RasterConfig {
   BlendMode mode = BlendMode::kAlpha;
   int num_channels = 3;           // C
@@ -83,7 +85,9 @@ template <class S> struct RasterConfig {
   S alpha_min = 0;           // SMoE modes: also skip alpha below this; kSmoe: such pairs are no strong ones
   S background_gate = 0;     // lambda of kSmoe and kSmoeEq7, 0 or more
   const S* background_gate_at = nullptr;  // [1] where it lies instead, or null
-  S tails_below = S(kTailsBelow);  // kSmoe: the tails count where the gate sum is below this; above 1: everywhere
+  // kSmoe, kSmoeEq7: faint pairs and tails count where the gate sum of near ones is less; 2: everywhere, 0: nowhere;
+  // kFaintBelowOfMode: as it is usual in the mode
+  S faint_below = S(kFaintBelowOfMode);
   bool antialiasing = false;
   bool clamp_color = true;  // colours from shs are at least 0
   bool depth = false;       // the expected depth is asked for
@@ -97,6 +101,9 @@ template <class S> struct RasterConfig {
   DSMOE_HD AlphaCut<S> alpha_cut() const {
     return {alpha_min, cut_of(mode) == Cut::kKernel ? gate_of_background() : S(0)};
   }
+  DSMOE_HD S wide_below() const { return faint_below == S(kFaintBelowOfMode) ? S(faint_below_of(mode)) : faint_below; }
+  // Whether a pixel is first blended with its near pairs only.
+  DSMOE_HD bool blends_near_first() const { return near_first(mode) && wide_below() <= S(1); }
   // What the tails reach beyond the strong pairs: is added to the squared reach of a footprint where tiles are listed.
   DSMOE_HD S tail_reach() const {
     return has_tails(mode) ? S(2) * log(max(alpha_min, S(kStrongAlpha)) / S(kTailAlpha)) : S(0);
@@ -121,7 +128,7 @@ template <class S> struct SavedForward {
   int64_t* instance_offsets = nullptr;        // [N + 1] first slot of each Gaussian; the last entry: how many there are
   int64_t* tile_offsets = nullptr;            // [tiles + 1] first instance of each tile
   TileInstance* instances = nullptr;          // [I], or null: no lists are kept, each pass makes them band by band
-  S* final_transmittance = nullptr;           // [H, W] T_{N+1}
+  S* final_transmittance = nullptr;           // [H, W] T_{N+1}; negative in wide pixels
   S* gate_sum = nullptr;                      // [H, W] W; the caller's alpha image but in a mode with tails
   S* tails = nullptr;                         // [H, W] B, in a mode with tails
   S* sums = nullptr;                          // [2, H, W] gate_sum and tails, in a mode with tails

@@ -69,7 +69,7 @@ template <class S> struct SavedForward {
   TileBand band;                     // the rows of tiles that tile_offsets and instances are of
   S* segments = nullptr;             // [num_segment_rows(capacity), kSegmentRow] long lists' states on the way, or null
   int32_t* segment_queue = nullptr;  // [num_queue_entries(capacity), 2] which segments some pixel has reached, or null
-  S* final_transmittance = nullptr;  // [H, W] T_{N+1}
+  S* final_transmittance = nullptr;  // [H, W] T_{N+1}; negative in wide pixels
   S* gate_sum = nullptr;             // [H, W] W; the caller's alpha image but in a mode with tails
   S* tails = nullptr;                // [H, W] B, in a mode with tails
   S* sums = nullptr;                 // [2, H, W] gate_sum and tails, in a mode with tails

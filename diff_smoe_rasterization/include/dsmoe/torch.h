@@ -54,7 +54,8 @@ struct GaussianRasterizationSettings {
   bool clamp_color = true;           // colours from shs are at least 0
   std::optional<BackgroundGate> background_gate;  // `smoe` and `smoe_eq7` only; absent: 0
   double low_pass = 0.3;                          // px^2 added to the variances on the image
-  double tails_below = 0.9;                       // `smoe`: tails count where the gate sum is below this; 2: everywhere
+  std::optional<double> faint_below;              // `smoe` and `smoe_eq7`: faint pairs and tails count where the gate
+                                                  // sum of near ones is below this; absent: 0.9 and 2, everywhere
 };
 
 /// The optional arguments of `rasterize`, N Gaussians; an undefined tensor, or one without elements, is absent.

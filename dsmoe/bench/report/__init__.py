@@ -17,8 +17,8 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from ...system.output_folder import Record, make_folder, own_record, write_record
-from ..names import CELLS_FOLDER, SUITE_NAME, read_json
-from ..rows import ReportError, Row, at_once, of_one_protocol, read_rows
+from ..names import CELLS_FOLDER, ROWS_NAME, SUITE_NAME, read_json
+from ..rows import ReportError, Row, at_once, of_one_protocol, packed, read_rows
 from .curves import draw_all
 from .groups import grouped, is_alone, safe_name, some
 from .images import ERROR_COLORS, ERROR_FULL_SCALE, collect
@@ -47,6 +47,7 @@ def report(results: str, output: str) -> str:
         sections = [_section(results, suite, [row for row in rows if row["suite"] == suite], made)
                     for suite in sorted({row["suite"] for row in rows})]
         _write(made, "report.md", _markdown(sections))
+        _write(made, ROWS_NAME, packed(rows))
         _write(made, PAGE_NAME, _page(sections, commits(rows)))
         files = [path.relative_to(made).as_posix() for path in sorted(Path(made).rglob("*")) if path.is_file()]
         write_record(output, COMMAND, Record(results, files), earlier)

@@ -4,8 +4,9 @@
 // Each Gaussian is a quad, drawn front to back into a float image that holds (S, W) = (sum w c, sum w), w = alpha T.
 // The blend function (ONE_MINUS_DST_ALPHA, ONE) makes the weights: T in front of a pair is 1 - W, since the weights sum
 // to what is no longer transmitted. W itself is added up, so it keeps its digits where it is small. A second pass
-// divides: C = (S + lambda T bg) / (W + lambda T); lambda = 1 is alpha blending. In `smoe` a second image holds B, the
-// sum of the tails' alpha T, and W once more for the blend function; where W is small B is added to lambda T.
+// divides: C = (S + lambda T bg) / (W + lambda T); lambda = 1 is alpha blending. In `smoe` that image is of near pairs
+// only. Pixels in which its W is small are drawn anew, with all strong pairs. A third image holds their B, the sum of
+// the tails' alpha T, which is added to lambda T, and W once more for the blend function.
 
 const CONSTANTS = `#version 300 es
 precision highp float;
@@ -22,9 +23,9 @@ const int ALPHA = 0, SMOE = 1, SMOE_EQ7 = 2;  // RULES: which pairs count
 const float ALPHA_CUT = 1.0 / 255.0;    // alpha: fainter pairs do not count
 const float STRONG_ALPHA = 1.0 / 2040.0;  // smoe: fainter pairs are tails
 const float TAIL_ALPHA = 2.9103830456733704e-11;  // smoe: 2^-35, below which tails do not count
-const float TAILS_BELOW = 0.9;          // smoe: with a larger W no tails count
+const float FAINT_BELOW = 0.9;          // smoe: where near pairs have a larger W no others count
 const float KERNEL_CUT = 1e-5;          // smoe_eq7: smaller kernels do not count
-const float CORE_KERNEL = 0.011108996;  // G at 3 sigma, inside which no gate of the background cuts
+const float CORE_KERNEL = 0.011108996;  // G at 3 sigma, inside which no gate of the background cuts, and no pair is faint
 const float GATE_SUM_CUT = 1e-30;       // below it no gate is open
 `;
 
@@ -37,6 +38,7 @@ uniform vec3 cameraCentre;     // world
 uniform vec2 focal, principalPoint, size;  // pixels
 uniform int degree;            // of the spherical harmonics
 uniform int rule;
+uniform bool wide;             // smoe: all strong pairs and tails are drawn; else near pairs
 uniform bool antialiasing;
 uniform float backgroundGate;  // lambda
 in uint index;                 // of the Gaussian: the instances come front to back
@@ -113,7 +115,8 @@ void main() {
   if (antialiasing) opacity *= sqrt(max(COMPENSATION_FLOOR, unfiltered / determinant));
   leastAlpha = rule == ALPHA ? ALPHA_CUT : rule == SMOE ? STRONG_ALPHA :
                min(backgroundGate * ALPHA_CUT, opacity * CORE_KERNEL);
-  float faintest = rule == SMOE ? TAIL_ALPHA : leastAlpha;
+  if (rule == SMOE && !wide) leastAlpha = max(leastAlpha, min(ALPHA_CUT, opacity * CORE_KERNEL));
+  float faintest = wide ? TAIL_ALPHA : leastAlpha;
   float reach = faintest > 0.0 ? 2.0 * log(opacity / faintest) : 1e9;
   if (rule == SMOE_EQ7) reach = min(reach, -2.0 * log(KERNEL_CUT));
   if (!(opacity > 0.0) || !(reach > 0.0)) return;
@@ -139,6 +142,8 @@ void main() {
 const FRAGMENT = CONSTANTS + `
 uniform vec2 size;
 uniform int rule;
+uniform bool wide;
+uniform sampler2D near;  // where wide: what the near pairs have drawn
 flat in vec2 mean;
 flat in vec3 conic, colour;
 flat in float opacity, leastAlpha;
@@ -149,9 +154,10 @@ void main() {
   vec2 d = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - 0.5 - mean;
   float power = -0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) - conic.y * d.x * d.y;
   if (power > 0.0) discard;
+  if (wide && texelFetch(near, ivec2(gl_FragCoord.xy), 0).a >= FAINT_BELOW) discard;
   float kernel = exp(power), logit = opacity * kernel, alpha = min(logit, ALPHA_MAX);
   bool isStrong = alpha >= leastAlpha && (rule != SMOE_EQ7 || kernel >= KERNEL_CUT);
-  if (!isStrong && (rule != SMOE || alpha < TAIL_ALPHA)) discard;
+  if (!isStrong && (!wide || alpha < TAIL_ALPHA)) discard;
   pair = isStrong ? vec4(colour * alpha, alpha) : vec4(0.0);
   tail = isStrong ? vec4(0.0, 0.0, 0.0, alpha) : vec4(alpha, 0.0, 0.0, 0.0);
 }`;
@@ -160,7 +166,7 @@ const CORNERS = CONSTANTS + `
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
 const DIVISION = CONSTANTS + `
-uniform sampler2D sums, tails;
+uniform sampler2D sums, wideSums, tails;
 uniform int rule;
 uniform vec3 background;
 uniform float backgroundGate;
@@ -168,8 +174,10 @@ out vec4 pixel;
 
 void main() {
   vec4 sum = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
+  bool isWide = rule == SMOE && sum.a < FAINT_BELOW;
+  if (isWide) sum = texelFetch(wideSums, ivec2(gl_FragCoord.xy), 0);
   float weight = backgroundGate * max(0.0, 1.0 - sum.a);
-  if (rule == SMOE && sum.a < TAILS_BELOW) weight += texelFetch(tails, ivec2(gl_FragCoord.xy), 0).r;
+  if (isWide) weight += texelFetch(tails, ivec2(gl_FragCoord.xy), 0).r;
   float denominator = sum.a + weight;
   vec3 blended = (sum.rgb + weight * background) / denominator;
   pixel = vec4(sum.a < GATE_SUM_CUT ? background : blended, 1.0);
@@ -196,7 +204,8 @@ class Renderer {
     gl.enableVertexAttribArray(index);
     gl.vertexAttribIPointer(index, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(index, 1);
-    this.sums = gl.createTexture(), this.tails = gl.createTexture(), this.frame = gl.createFramebuffer();
+    this.sums = gl.createTexture(), this.wideSums = gl.createTexture(), this.tails = gl.createTexture();
+    this.frame = gl.createFramebuffer(), this.wideFrame = gl.createFramebuffer();
   }
 
   program(vertex, fragment) {
@@ -241,11 +250,13 @@ class Renderer {
     const rule = blend.mode === "smoe_eq7" && blend.gate === 1 ? RULES.alpha : RULES[blend.mode];
     const gate = rule === RULES.alpha ? 1 : blend.gate;
     gl.viewport(0, 0, width, height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
     gl.activeTexture(gl.TEXTURE0);
     if (this.width !== width || this.height !== height) {
       const format = this.exact ? gl.RGBA32F : gl.RGBA16F, type = this.exact ? gl.FLOAT : gl.HALF_FLOAT;
-      for (const [texture, place] of [[this.sums, gl.COLOR_ATTACHMENT0], [this.tails, gl.COLOR_ATTACHMENT1]]) {
+      for (const [frame, texture, place] of [[this.frame, this.sums, gl.COLOR_ATTACHMENT0],
+                                             [this.wideFrame, this.wideSums, gl.COLOR_ATTACHMENT0],
+                                             [this.wideFrame, this.tails, gl.COLOR_ATTACHMENT1]]) {
+        gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
         gl.bindTexture(gl.TEXTURE_2D, texture);
         gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, type, null);
         gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
@@ -254,9 +265,6 @@ class Renderer {
       }
       this.width = width, this.height = height;
     }
-    gl.drawBuffers([gl.COLOR_ATTACHMENT0, rule === RULES.smoe ? gl.COLOR_ATTACHMENT1 : gl.NONE]);
-    gl.clearColor(0, 0, 0, 0), gl.clear(gl.COLOR_BUFFER_BIT);
-
     const splat = this.splat, {rotation: r, translation: t} = camera;
     gl.useProgram(splat.program);
     gl.activeTexture(gl.TEXTURE0), gl.bindTexture(gl.TEXTURE_2D, this.gaussians);
@@ -273,17 +281,31 @@ class Renderer {
     gl.uniform1f(splat.at("backgroundGate"), gate);
     gl.enable(gl.BLEND), gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
     gl.bindVertexArray(this.instances);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    this.drawPairs(this.frame, [gl.COLOR_ATTACHMENT0, gl.NONE], null);
+    if (rule === RULES.smoe) this.drawPairs(this.wideFrame, [gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1], this.sums);
 
     gl.disable(gl.BLEND), gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.useProgram(this.divide.program);
     gl.activeTexture(gl.TEXTURE0), gl.bindTexture(gl.TEXTURE_2D, this.sums);
     gl.activeTexture(gl.TEXTURE1), gl.bindTexture(gl.TEXTURE_2D, this.tails);
+    gl.activeTexture(gl.TEXTURE2), gl.bindTexture(gl.TEXTURE_2D, this.wideSums);
     gl.uniform1i(this.divide.at("sums"), 0), gl.uniform1i(this.divide.at("tails"), 1);
+    gl.uniform1i(this.divide.at("wideSums"), 2);
     gl.uniform1i(this.divide.at("rule"), rule);
     gl.uniform3fv(this.divide.at("background"), this.model.background);
     gl.uniform1f(this.divide.at("backgroundGate"), gate);
     gl.bindVertexArray(this.nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Draws all Gaussians into the attachments of a frame. near: what their near pairs have drawn, or null for these.
+  drawPairs(frame, attachments, near) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.drawBuffers(attachments);
+    gl.clearColor(0, 0, 0, 0), gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.uniform1i(this.splat.at("wide"), near !== null), gl.uniform1i(this.splat.at("near"), 2);
+    gl.activeTexture(gl.TEXTURE2), gl.bindTexture(gl.TEXTURE_2D, near);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
   }
 }

@@ -180,7 +180,7 @@ TEST_P(Modes, GradientsAreTheCores) {
 // tails move, so no tails count here.
 TEST_P(Modes, GradientsAreThoseOfFiniteDifferences) {
   Scene scene(GetParam());
-  scene.settings.tails_below = 0;
+  scene.settings.faint_below = 0;
   const auto w = weights();
   double predicted = 0;
   std::vector<at::Tensor> directions;

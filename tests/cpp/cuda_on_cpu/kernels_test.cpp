@@ -186,12 +186,17 @@ void expect_cpu(const Scene<double>& of, const How& how = {}) {
   }
 }
 
-// A scene in all its modes, with and without a gate of the background where the mode has one.
+// A scene in all its modes, with and without a gate of the background where the mode has one, and with the rule for
+// faint pairs that is not usual in the mode.
 template <BlendMode kMode> std::vector<Scene<double>> in_mode(Scene<double> scene) {
   scene.config.mode = kMode;
   scene.background.back() = 0;
   std::vector<Scene<double>> scenes = {scene};
   if (Blend<kMode>::kLearnsGate) scene.background.back() = 0.03, scenes.push_back(scene);
+  if (Blend<kMode>::kNearFirst) {
+    scene.config.faint_below = Blend<kMode>::kFaintBelow < 1 ? kFaintEverywhere : kFaintBelow;
+    scenes.push_back(scene);
+  }
   return scenes;
 }
 
@@ -227,15 +232,16 @@ void put(Scene<double>& scene, int64_t i, double x, double y, double z) {
 }
 
 // One list of five segments and two squares of pixels. All pixels of a half of a square leave in the first segment: of
-// one square the upper half, of the other one the lower half. Some of each other half stay until the third or fourth.
-Scene<double> list_of_unlike_halves() {
+// one square the upper half, of the other one the lower half. Some of each other half stay until the third or fourth;
+// where its Gaussians are faint, all do to the end.
+Scene<double> list_of_unlike_halves(double opacity = 0.05) {
   Random random(7);
   Scene<double> scene = make_scene(7, 2300, 16, 8);
   for (int64_t i = 0; i < scene.count; ++i) {
     const double x = random.uniform(-2.2, 2.2), y = random.uniform(-1.3, 1.3), z = random.uniform(2.7, 3.3);
     put(scene, i, x, y, z);
     for (int axis = 0; axis < 3; ++axis) scene.scales[3 * i + axis] = random.uniform(0.2, 0.3);
-    scene.opacities[i] = random.uniform(0.5, 1) * ((x < 0) == (y < 0) ? 0.6 : 0.05);
+    scene.opacities[i] = random.uniform(0.5, 1) * ((x < 0) == (y < 0) ? 0.6 : opacity);
   }
   return scene;
 }
@@ -277,6 +283,7 @@ TYPED_TEST(KernelsIn, EqualTheCpuWhereTheHalvesOfASquareLeaveAListApart) {
   if (!Blend<TypeParam::value>::kStopsEarly) return;
   this->expect(list_of_unlike_halves());
   this->expect(list_of_unlike_halves(), {false, kMostInstances, true});
+  this->expect(list_of_unlike_halves(0.002));
 }
 
 TYPED_TEST(KernelsIn, EqualTheCpuBehindAVeil) { this->expect(wall_behind_a_veil()); }

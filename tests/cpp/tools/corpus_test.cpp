@@ -1,4 +1,4 @@
-// The kept corpus of the fuzzers, by every compiler: each file is read, or refused with a message that names it.
+// The fuzzers' corpus (fuzz/corpus.tar.gz), by every compiler: each file is read, or refused with its name.
 #include <gtest/gtest.h>
 
 #include <filesystem>
@@ -17,7 +17,7 @@ INSTANTIATE_TEST_SUITE_P(All, CorpusOf, testing::ValuesIn(readers()),
 
 TEST_P(CorpusOf, IsReadOrRefused) {
   int num_read = 0, num_refused = 0;
-  for (const auto& entry : fs::directory_iterator(fs::path("tests/cpp/fuzz/corpus") / GetParam().name)) {
+  for (const auto& entry : fs::directory_iterator(fs::path(DSMOE_CORPUS) / GetParam().name)) {
     const std::string bytes = io::read_bytes(entry.path().string());
     try {
       GetParam().read(bytes);

@@ -1,4 +1,4 @@
-// Every reader of files, by name: what libFuzzer feeds, and what the kept corpus is read by in the tests.
+// Every reader of files, by name: what libFuzzer feeds, and what reads the kept corpus in the tests.
 #pragma once
 
 #include <string>

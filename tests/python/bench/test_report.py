@@ -139,6 +139,20 @@ def test_renderings_that_equal_the_ground_truth_have_an_infinite_psnr(tmp_path):
     assert "PSNR [dB]" not in shown(table_of([nothing], "cells"))
 
 
+def test_packed_rows_are_read_as_they_were_and_say_once_what_they_share(tmp_path):
+    entries = [row(psnr=None), smoe(psnr=21.5, budget=10), row("fox", seed=1, background_gate=None),
+               row("fox", protocol={"recipe": {"sh_degree": 2}, "split": "another"}),
+               failed(scene="lego", protocol={})]
+    text = rows.packed([{**entry, "per_view": [{"psnr": 20.0}]} for entry in entries])
+    (tmp_path / "rows.jsonl").write_text(text, encoding="utf-8")
+    kept = [{name: value for name, value in entry.items() if name != "history"} for entry in entries]
+    assert rows.read_rows(str(tmp_path)) == sorted(kept, key=lambda entry: entry["cell"])
+    assert text.count("abc1234") == 1 and "per_view" not in text and "history" not in text
+    (tmp_path / "rows.jsonl").write_text(text + '{"cell": "more"}\n{"cell": "wrong", "seed": "0"}', encoding="utf-8")
+    with pytest.raises(rows.ReportError, match=r"rows.jsonl, line 8: .*seed"):  # line 7 takes all from the shared line
+        rows.read_rows(str(tmp_path))
+
+
 def test_times_of_different_machines_are_neither_averaged_nor_divided():
     elsewhere = {"train_seconds": 1000.0, "fps": 20.0, "machine": {"device": "Card Y"}}
     entries = [row(**elsewhere), smoe(psnr=21.0), row(seed=1), smoe(seed=1)]

@@ -150,7 +150,7 @@ AS_INRIA = [*RUN, "--trainer", "inria", "--", sys.executable, "train.py"]
     ({"tool.py": ""}, [*RUN, "--", "./tool.py"], "./tool.py: Permission denied"),
     ({GR: None}, PYTHON, f"--trainer list prints the names):\n  there is no {GR} in"),
     ({}, [*RUN, "--trainer", "list", "--", sys.executable], "absgs, c3dgs, cob_gs"),
-    ({}, [*RUN, "--trainer", "nerf", "--", sys.executable], "there is no trainer 'nerf'; it must be one of 3dgs-2023"),
+    ({}, [*RUN, "--trainer", "nerf", "--", sys.executable], "there is no trainer 'nerf'; it must be one of 3d-smoe, 3dgs-2023"),
     ({"diff_gaussian_rasterization.py": ""}, PYTHON, "diff_gaussian_rasterization.py would be imported before"),
     ({"diff_gaussian_rasterization/a": ""}, PYTHON, "diff_gaussian_rasterization would be imported before"),
     ({GR: OURS}, PYTHON, "is patched already: run the command itself, with --blend_mode"),

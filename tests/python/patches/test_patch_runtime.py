@@ -107,6 +107,30 @@ def test_smoe_of_an_earlier_cfg_args_is_smoe_eq7_and_says_so(monkeypatch, tmp_pa
         "blend_mode": "smoe", "background_gate": 0.5}
 
 
+AUTHORS = {"blend_mode": "smoe", "background_gate": 0, "faint_below": 2}  # as the paper's authors' program renders
+
+
+def test_the_authors_trainer_blends_by_smoe_with_all_tails_unless_told_otherwise(monkeypatch):
+    assert runtime.default_smoe() == ("smoe", "") and runtime.smoe_of(run("smoe")) == AUTHORS
+    assert runtime.smoe_of(run("smoe", "0.25")) == {**AUTHORS, "background_gate": 0.25}
+    assert runtime.smoe_of(run("alpha")) == ALPHA
+    monkeypatch.setenv("DSMOE_BLEND_MODE", "smoe_tn")
+    assert runtime.default_smoe() == ("smoe_tn", "")
+
+
+def test_a_model_of_the_authors_program_is_smoe_without_a_warning(tmp_path, capsys):
+    """Their cfg_args knows no mode. What the patch records wins, and an alpha model stays one."""
+    theirs = model(tmp_path, "Namespace(data_device='cuda', eval=True, images='images', init_path='default', model_path"
+                             "='out-temp', resolution=-1, sh_degree=3, source_path='/data/x', white_background=False)")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert runtime.saved_smoe_of(theirs) == AUTHORS
+        assert "records no blend mode, so it is smoe with the gate 0" in capsys.readouterr().err
+        ours = model(tmp_path, f"Namespace(blend_mode={record_of('smoe')!r}, background_gate=0.5, init_path='default')")
+        assert runtime.saved_smoe_of(ours) == {**AUTHORS, "background_gate": 0.5}
+        assert runtime.saved_smoe_of(model(tmp_path, "Namespace(blend_mode='alpha', background_gate=None)")) == ALPHA
+
+
 @pytest.mark.parametrize("dataset", [SimpleNamespace(), SimpleNamespace(blend_mode=None, background_gate=None)])
 def test_an_old_model_is_alpha_and_says_so_once(dataset):
     with pytest.warns(UserWarning, match="records no blend mode"):

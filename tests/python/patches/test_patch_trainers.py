@@ -111,6 +111,43 @@ def test_trainers_of_other_files_get_the_mode_in_each_function(name, files, entr
     assert contents(tmp_path) == before
 
 
+AUTHORS = {
+    GR: RENDERER.replace(ONE_LINE, BY_NAME.format("color, radii") + "    return color\n"),
+    "scene/__init__.py": "class Scene:\n    def __init__(self, args, gaussians):\n        gaussians.load_init()\n",
+    "train.py": "import types\nfrom scene import Scene\n" + TRAIN.replace("import torch\n", "") + (
+        "def render(camera, pc, pipe, bg):\n    return pipe.blend\n"
+        "dataset = types.SimpleNamespace(blend_mode='smoe', background_gate='')\n"
+        "print(training(dataset, 0, types.SimpleNamespace(), 0))\n"),
+    "render.py": f"try:\n    {SPARSE_ADAM}    AVAILABLE = True\nexcept:\n    AVAILABLE = False\n" + (
+        "from gaussian_renderer import render\nfrom scene import Scene\n\n\n"
+        "def images_to_video(folder, path, fps=30):\n    pass\n\n\n"
+        "def render_sets(dataset, iteration, pipeline, skip_train, skip_test, separate_sh):\n"
+        "    images_to_video('', '')\n    return render(None, None, pipeline, None)\n"),
+    "generate_pose.py": f"try:\n    {SPARSE_ADAM}except:\n    pass\nfrom gaussian_renderer import render\n"}
+
+
+def test_the_checkout_of_the_papers_authors_blends_by_smoe_with_tails_in_every_pixel(tmp_path, python):
+    """As its own rasterizer does, which has no other mode; without the signs it is 3DGS of 2023, and alpha."""
+    make(tmp_path, {**AUTHORS, "render.py": AUTHORS["render.py"].replace("    images_to_video", "    print")})
+    assert patches.check(tmp_path).trainer == "3dgs-2023"
+    make(tmp_path, AUTHORS)
+    before = contents(tmp_path)
+    only_statements_change(patches.diff(tmp_path))
+    planned = patches.apply(tmp_path)
+    assert planned.trainer == "3d-smoe" and not planned.notes
+    for file, words in ((ARGS, "= default_smoe()"), ("train.py", "pipe.blend = smoe_of(dataset)"),
+                        ("render.py", "pipeline.blend = saved_smoe_of(dataset)")):
+        assert words in (tmp_path / file).read_text()
+    result = python("train.py", cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+    assert "{'blend_mode': 'smoe', 'background_gate': 0.0, 'faint_below': 2.0}" in result.out, result.err
+    rendered = python("-c", "import render; print(render.AVAILABLE)", cwd=tmp_path, PYTHONPATH=str(PACKAGE_PARENT))
+    assert rendered.out == "False\n", rendered.err
+    patches.revert(tmp_path)
+    for folder in tmp_path.rglob("__pycache__"):
+        shutil.rmtree(folder)
+    assert contents(tmp_path) == before
+
+
 @pytest.mark.parametrize("more, is_offered", [({}, False), ({"scene/gaussian_model.py": SPARSE_ADAM}, True)])
 def test_a_patched_trainer_finds_sparse_adam_where_it_asks_or_was_written_for_it(more, is_offered, tmp_path, python):
     train = TRAIN + f"try:\n    {SPARSE_ADAM}    print(True)\nexcept ImportError:\n    print(False)\n"

@@ -390,6 +390,32 @@ def test_render_never_guesses_or_changes_the_background_gate(trained, scene, tmp
     assert of_the_paper == render(bare, "bare_0", "--blend-mode", "smoe_eq7", "--background-gate", "0") != as_trained
 
 
+def test_a_model_of_the_papers_authors_is_rendered_by_smoe_with_the_gate_0(trained, scene, tmp_path, capsys):
+    """A .ply of Inria's properties without a comment, beside a cfg_args that knows no mode."""
+    ply = tmp_path / "out-temp" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    ply.parent.mkdir(parents=True)
+    (tmp_path / "out-temp" / "cfg_args").write_text("Namespace(eval=True, init_path='default', model_path='out-temp')")
+    with open(ply_of(trained), "rb") as file:
+        header, values = file.read().split(b"end_header\n", 1)
+    properties = [line for line in header.splitlines(keepends=True) if not line.startswith(b"comment")]
+    names = [line.split()[-1].decode() for line in properties if line.startswith(b"property float")]
+    numbered = {"f_dc": 3, "f_rest": 45, "opacity": 0, "scale": 3, "rot": 4}
+    assert names == ["x", "y", "z", "nx", "ny", "nz", *(
+        f"{name}_{i}" if count else name for name, count in numbered.items() for i in range(count or 1))]
+    ply.write_bytes(b"".join([*properties, b"end_header\n", values]))
+
+    def rendered(mode):
+        folder = str(tmp_path / mode)
+        assert main(["render", str(ply), "--scene", scene, "--blend-mode", mode, "--background-gate", "0", "-o", folder]
+                    ) == 0
+        return np.asarray(Image.open(os.path.join(folder, "view_000.png")))
+
+    assert not np.array_equal(rendered("smoe"), rendered("smoe_eq7")), "the two rules show different images"
+    nowhere = ["-o", str(tmp_path / "no")]
+    assert "authors' program" in fails(capsys, "render", str(ply), "--scene", scene, "--blend-mode", "smoe", *nowhere)
+    assert "name the .ply" in fails(capsys, "render", str(tmp_path / "out-temp"), *nowhere)
+
+
 def test_smoe_of_an_earlier_version_is_smoe_eq7_and_a_line_says_so(trained, scene, tmp_path, capsys):
     run = str(tmp_path / "run")
     shutil.copytree(trained, run)

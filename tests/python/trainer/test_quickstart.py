@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dsmoe import cli
 from diff_smoe_rasterization.io import read_gaussians
 from diff_smoe_rasterization.settings import record_of
-from dsmoe import quickstart, short_run
+from dsmoe import cli, quickstart, short_run
 from dsmoe.results.pictures import busiest_window, comparison, evenly_spaced
 from dsmoe.system import files
 
