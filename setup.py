@@ -4,7 +4,8 @@ flags: sources.txt.
 Environment: DSMOE_BUILD_CUDA=auto|0|1 (auto: where torch and the machine have CUDA; unset: where also a GPU is seen, or
 cards are named), TORCH_CUDA_ARCH_LIST, MAX_JOBS; DSMOE_CUDA_ARCH=all compiles for every card where none is seen;
 DSMOE_CORE_FOLDER=DIR links the libraries that CMake has built in DIR (libdsmoe_core.a, libdsmoe_io.a, libdsmoe_cuda.a)
-in place of compiling their sources once more.
+in place of compiling their sources once more; DSMOE_STABLE_ABI=1 makes _C by LibTorch's stable ABI and Python's limited
+API: it loads with every PyTorch from 2.11 on, and libdsmoe.so has no ops for C++.
 """
 import os
 import re
@@ -27,6 +28,8 @@ EVERY_CARD = (70, 75, 80, 86, 90, 100, 110, 120)
 USUAL_CARDS = (80, 90)
 # On one core of an AMD EPYC; a kernel's file for the usual cards.
 SECONDS_OF_A_FILE, SECONDS_OF_A_KERNEL = 6, 20
+# The oldest PyTorch whose stable ABI has what the ops take, and the oldest Python that it supports.
+STABLE_ABI_SINCE, STABLE_PYTHON = "2.11", "cp310"
 COMMANDS_THAT_COMPILE = {"build", "build_ext", "bdist_wheel", "editable_wheel", "develop", "install"}
 
 
@@ -161,8 +164,12 @@ def extension():
     torch, cpp_extension = import_build_tools()
     sources = read_sources()
     without_cuda = reasons_against_cuda(sources["cuda"], torch, cpp_extension.CUDA_HOME)
-    groups = ["core", "io", "torch"] + ([] if without_cuda else ["cuda", "torch_cuda"])
+    stable = os.environ.get("DSMOE_STABLE_ABI", "0") == "1"
+    ops = ["torch", "stable_abi" if stable else "torch_cpp"] + ([] if without_cuda else ["torch_cuda"])
+    groups = ["core", "io"] + ([] if without_cuda else ["cuda"]) + ([] if stable else ops)
     libraries = {group: path for group, path in compiled_libraries(torch).items() if group in groups}
+    if stable:
+        libraries.pop("io", None)  # torch builds no library of no source
     flags = sources["flags"] + ["-g0", "-pthread"]
     if tuple(int(number) for number in torch.__version__.split(".")[:2]) < (2, 0):
         flags.append("-std=c++17")  # torch's own default there is C++14; later ones bring what they need
@@ -181,19 +188,30 @@ def extension():
                          "-Wl,--whole-archive", *libraries.values(), "-Wl,--no-whole-archive"],
     )
     library.libraries.remove("torch_python")
-    module = cpp_extension.CppExtension(
+    macros = [] if without_cuda else [("DSMOE_WITH_CUDA", None)]
+    if stable:
+        major, minor = map(int, STABLE_ABI_SINCE.split("."))
+        macros += [("DSMOE_STABLE_ABI", None), ("TORCH_TARGET_VERSION", f"0x{major:02x}{minor:02x}000000000000")]
+        # With its own CUDA runtime it needs none of PyTorch's libraries.
+        library.libraries = [] if without_cuda else ["cudart_static", "dl", "rt"]
+        macros += [] if without_cuda else [("USE_CUDA", None)]  # by which PyTorch declares its functions of CUDA
+    module = (make if stable else cpp_extension.CppExtension)(
         f"{PACKAGE}._C",
-        [f"{PACKAGE}/{path}" for path in sources["python"]],
+        [f"{PACKAGE}/{path}" for group in ["python"] + (ops if stable else []) for path in sources[group]],
         include_dirs=folders,
-        define_macros=[] if without_cuda else [("DSMOE_WITH_CUDA", None)],
+        define_macros=macros,
         extra_compile_args={"cxx": flags + ["-fvisibility=hidden"]},
         extra_link_args=["-Wl,-rpath,$ORIGIN"],
+        py_limited_api=stable,
     )
+    if stable:
+        module.libraries = ["torch_cpu"]
     built_against = {
         "TORCH_VERSION": torch.__version__,
         "CUDA_VERSION": None if without_cuda else torch.version.cuda,
         "WITHOUT_CUDA_BECAUSE": "; ".join(without_cuda),
         "CXX11_ABI": torch.compiled_with_cxx11_abi(),
+        "STABLE_ABI_SINCE": STABLE_ABI_SINCE if stable else None,
         "COMMIT": commit(),
     }
 
@@ -212,7 +230,8 @@ def extension():
                 return os.path.join(*name.split(".")) + ".so"
             return super().get_ext_filename(name)
 
-    return {"ext_modules": [library, module], "cmdclass": {"build_ext": BuildExtension}}
+    tag = {"options": {"bdist_wheel": {"py_limited_api": STABLE_PYTHON}}} if stable else {}
+    return {"ext_modules": [library, module], "cmdclass": {"build_ext": BuildExtension}, **tag}
 
 
 def commit():

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from typing import Any, Dict, NoReturn, Optional
+from typing import Any, Dict, NoReturn, Optional, Tuple
 
 import torch
 
@@ -24,14 +24,22 @@ def _release(version: str) -> str:
     return ".".join(version.split(".")[:2])
 
 
+def _numbers(version: str) -> Tuple[int, ...]:
+    return tuple(int(number) for number in version.split(".")[:2])
+
+
 def _fail(reason: str, cause: Optional[BaseException] = None) -> NoReturn:
     raise ImportError(f"diff_smoe_rasterization: {reason}") from cause
 
 
 def _load() -> Any:
     built_against = _recorded("TORCH_VERSION")
+    stable_since = _recorded("STABLE_ABI_SINCE")
+    if stable_since is not None and _numbers(torch.__version__) < _numbers(stable_since):
+        _fail(f"this build works with torch {stable_since} and later, but torch {torch.__version__} is running; update "
+              "torch, or build it against this one, in the source folder: pip install --no-build-isolation -e .")
     mismatch = f"its extension was built against torch {built_against}, but torch {torch.__version__} is running; "
-    if built_against is not None and _release(built_against) != _release(torch.__version__):
+    if stable_since is None and built_against is not None and _release(built_against) != _release(torch.__version__):
         _fail(mismatch + _BUILD_AGAIN)
     try:
         return importlib.import_module("._C", __package__)
@@ -63,11 +71,13 @@ BACKENDS = ("cpu", "cuda") if _built_with_cuda() else ("cpu",)
 def build_info() -> Dict[str, Any]:
     """Returns what this build is and what it runs on.
 
-    Keys: version, torch (running), torch_built_with, compiler, cuda_built, without_cuda_because (None where it is built
-    or the build left no word), simd_level ("avx512", "avx2" or "baseline"), num_threads (torch's, which the CPU backend
+    Keys: version, torch (running), torch_built_with, stable_abi_since (the oldest torch that this build works with;
+    None where torch_built_with is the only one), compiler, cuda_built, without_cuda_because (None where it is built or
+    the build left no word), simd_level ("avx512", "avx2" or "baseline"), num_threads (torch's, which the CPU backend
     uses).
     """
     return {"version": __version__, "torch": torch.__version__, **_C.build_info(),
+            "stable_abi_since": _recorded("STABLE_ABI_SINCE"),
             "without_cuda_because": _recorded("WITHOUT_CUDA_BECAUSE") or None}
 
 

@@ -1,7 +1,7 @@
 # find_package(diff_smoe_rasterization) of the Python package: cmake -DCMAKE_PREFIX_PATH="$(dsmoe info --cmake)".
 # All targets are one library, libdsmoe.so, which is linked with the PyTorch that it was built against. That one is
 # found here and not by find_package(Torch): of builds with CUDA, that asks for a whole CUDA toolkit. A project that has
-# found Torch before keeps its own.
+# found Torch before keeps its own. A build by the stable ABI has no dsmoe::torch, and needs no PyTorch here.
 get_filename_component(dsmoe_package "${CMAKE_CURRENT_LIST_DIR}" DIRECTORY)
 
 # What setup.py wrote down: NAME = 'TEXT' or True; empty for None and False.
@@ -14,8 +14,11 @@ endfunction()
 dsmoe_build_info(TORCH_VERSION dsmoe_torch_version)
 dsmoe_build_info(CUDA_VERSION dsmoe_cuda_version)
 dsmoe_build_info(CXX11_ABI dsmoe_cxx11_abi)
+dsmoe_build_info(STABLE_ABI_SINCE dsmoe_stable_abi)
 
-if(TARGET torch)
+if(dsmoe_stable_abi)
+  set(dsmoe_libtorch "")
+elseif(TARGET torch)
   set(dsmoe_libtorch torch)
 else()
   set(dsmoe_hints "${dsmoe_package}/../torch")
@@ -55,7 +58,10 @@ ${dsmoe_found_version} (${DSMOE_LIBTORCH}). CMAKE_PREFIX_PATH=\"$(dsmoe info --c
   endif()
 endif()
 
-set(dsmoe_components core io torch)
+set(dsmoe_components core io)
+if(NOT dsmoe_stable_abi)
+  list(APPEND dsmoe_components torch)
+endif()
 if(dsmoe_cuda_version)
   list(APPEND dsmoe_components cuda)
 endif()
@@ -67,7 +73,7 @@ foreach(name IN LISTS dsmoe_components)
       IMPORTED_LOCATION "${dsmoe_package}/libdsmoe.so"
       INTERFACE_INCLUDE_DIRECTORIES "${dsmoe_package}/include"
       INTERFACE_COMPILE_FEATURES cxx_std_17
-      INTERFACE_LINK_LIBRARIES ${dsmoe_libtorch})
+      INTERFACE_LINK_LIBRARIES "${dsmoe_libtorch}")
   endif()
 endforeach()
 set_property(TARGET dsmoe::io PROPERTY INTERFACE_INCLUDE_DIRECTORIES "${dsmoe_package}/csrc")  # "io/ply.h"
@@ -87,6 +93,9 @@ foreach(name IN LISTS diff_smoe_rasterization_FIND_COMPONENTS)
     set(diff_smoe_rasterization_FOUND FALSE)
     if(name STREQUAL "cuda")
       set(diff_smoe_rasterization_NOT_FOUND_MESSAGE "This build has no dsmoe::cuda; `dsmoe info` says why.")
+    elseif(name STREQUAL "torch")
+      set(diff_smoe_rasterization_NOT_FOUND_MESSAGE "This build works with many releases of PyTorch, and so has no \
+dsmoe::torch. Build it from source, without DSMOE_STABLE_ABI.")
     else()
       set(diff_smoe_rasterization_NOT_FOUND_MESSAGE
         "There is no component ${name}; the components are core, io, cuda and torch.")

@@ -83,6 +83,10 @@ def test_a_strangers_project_uses_the_package(tmp_path, name):
             return
         if not os.path.isdir(os.environ.get("CUDA_HOME", "/usr/local/cuda")):
             pytest.skip("its own calls of CUDA need the toolkit's headers")
+    if name == "torch" and diff_smoe_rasterization.build_info()["stable_abi_since"]:
+        with pytest.raises(AssertionError, match=r"has\s+no\s+dsmoe::torch"):
+            build(CONSUMER, tmp_path, "-DCONSUMER=torch")
+        return
     if name == "torch" and not torch._C._GLIBCXX_USE_CXX11_ABI:
         pytest.skip(f"torch {torch.__version__} has the C++ ABI of before 2015, GoogleTest the one since")
     build(CONSUMER, tmp_path, f"-DCONSUMER={name}")
@@ -148,13 +152,14 @@ configure_package_config_file({ROOT}/build_support/config.cmake.in
     assert targets == {"dsmoe::core", *([f"dsmoe::{name}"] if is_there else [])}
 
 
-def package_built_against(folder, torch_version, cuda_version):
+def package_built_against(folder, torch_version, cuda_version, stable_abi_since=None):
     """A copy of the installed package's config that says so, in `folder`; returns where CMake has to look."""
     package = folder / "site" / "diff_smoe_rasterization"
     shutil.copytree(str(INSTALLED / "cmake"), str(package / "cmake"))
     shutil.copy(str(INSTALLED / "_version.py"), str(package))
     (package / "_build_info.py").write_text(
-        f"TORCH_VERSION = {torch_version!r}\nCUDA_VERSION = {cuda_version!r}\nCXX11_ABI = True\n")
+        f"TORCH_VERSION = {torch_version!r}\nCUDA_VERSION = {cuda_version!r}\nCXX11_ABI = True\n"
+        f"STABLE_ABI_SINCE = {stable_abi_since!r}\n")
     return extension.cmake_prefix_path().replace(str(INSTALLED), str(package))
 
 
@@ -166,6 +171,13 @@ def test_a_package_of_another_torch_is_not_found(tmp_path):
                             universal_newlines=True)
     assert result.returncode != 0
     assert "built against torch 0.4.1" in " ".join(result.stdout.split())
+
+
+@needs_cmake
+@pytest.mark.parametrize("asked, found", [("COMPONENTS core io", True), ("COMPONENTS torch", False)])
+def test_a_package_by_the_stable_abi_needs_no_torch_and_has_no_target_of_it(tmp_path, asked, found):
+    prefixes = package_built_against(tmp_path, "0.4.1", None, stable_abi_since="0.4")
+    assert what_is_found(tmp_path, asked, prefixes=prefixes) == (found, {"dsmoe::core", "dsmoe::io"})
 
 
 @needs_cmake
@@ -204,6 +216,8 @@ def test_every_target_is_documented_by_a_program():
 def test_documented_programs_are_built_and_run(tmp_path, name):
     if name == "cuda" and "cuda" not in extension.BACKENDS:
         pytest.skip("built without CUDA")
+    if name == "torch" and diff_smoe_rasterization.build_info()["stable_abi_since"]:
+        pytest.skip("built by the stable ABI")
     (tmp_path / "program.cpp").write_text(documented_programs()[name])
     (tmp_path / "CMakeLists.txt").write_text(f"""cmake_minimum_required(VERSION 3.21)
 project(program LANGUAGES CXX)

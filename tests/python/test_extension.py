@@ -112,6 +112,13 @@ def test_a_build_against_another_torch_names_both_and_says_what_to_type(copied_p
         load().rasterize
 
 
+def test_a_build_by_the_stable_abi_refuses_an_older_torch(copied_package):
+    folder, load = copied_package
+    (folder / "_build_info.py").write_text("TORCH_VERSION = '99.2'\nSTABLE_ABI_SINCE = '99.1'\n")
+    with pytest.raises(ImportError, match=rf"works with torch 99\.1 and later.*{re.escape(torch.__version__)}"):
+        load().rasterize
+
+
 def test_an_extension_that_does_not_load_names_the_reason_and_both_versions(copied_package):
     folder, load = copied_package
     (folder / "_build_info.py").write_text(f"TORCH_VERSION = {torch.__version__!r}\n")
@@ -135,7 +142,7 @@ def test_a_plain_import_registers_the_ops():
 def test_build_info_tells_what_runs():
     info = build_info()
     assert info["torch"] == torch.__version__
-    assert info["torch_built_with"].split(".")[:2] == torch.__version__.split(".")[:2]
+    assert info["stable_abi_since"] or info["torch_built_with"].split(".")[:2] == torch.__version__.split(".")[:2]
     assert info["version"] == diff_smoe_rasterization.__version__
     assert info["num_threads"] == torch.get_num_threads()
     assert info["simd_level"] in ("avx512", "avx2", "baseline")

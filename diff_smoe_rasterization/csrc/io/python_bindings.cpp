@@ -1,12 +1,7 @@
 #include "io/python_bindings.h"
 
-#include <pybind11/numpy.h>
-#include <pybind11/stl.h>
-
 #include <array>
 #include <cstdint>
-#include <exception>
-#include <memory>
 #include <optional>
 #include <string>
 #include <tuple>
@@ -19,170 +14,140 @@
 
 namespace dsmoe::io {
 
-namespace py = pybind11;
-
 namespace {
+
+using python::Array;
+using python::Dict;
+using python::List;
+using python::Object;
+template <class T> using OptionalArray = std::optional<Array<T>>;
 
 // Paths and names travel as bytes, since a file's name need not be UTF-8; io.py encodes and decodes them.
 
-template <typename T> using InputArray = py::array_t<T, py::array::c_style | py::array::forcecast>;
-
-/// Hands a vector over to numpy without a copy.
-template <typename T> py::array_t<T> to_numpy(std::vector<T>&& values, std::vector<py::ssize_t> shape) {
-  auto owned = std::make_unique<std::vector<T>>(std::move(values));
-  const T* data = owned->data();
-  const py::capsule owner(owned.get(), [](void* vector) { delete static_cast<std::vector<T>*>(vector); });
-  owned.release();
-  return py::array_t<T>(std::move(shape), data, owner);
+template <typename T> Object array_or_none(std::vector<T>&& values, const std::vector<int64_t>& shape) {
+  if (values.empty() && shape[0] != 0) return python::to_python(std::nullopt);
+  return python::array(std::move(values), shape);
 }
 
-template <typename T> py::object to_numpy_or_none(std::vector<T>&& values, std::vector<py::ssize_t> shape) {
-  if (values.empty() && shape[0] != 0) return py::none();
-  return to_numpy(std::move(values), std::move(shape));
+template <typename T> std::vector<T> or_empty(OptionalArray<T>&& array) {
+  return array ? std::move(*array) : std::vector<T>();
 }
 
-template <typename T> std::vector<T> to_vector(const InputArray<T>& array) {
-  return std::vector<T>(array.data(), array.data() + array.size());
-}
-
-template <typename T> std::vector<T> to_vector(const std::optional<InputArray<T>>& array) {
-  return array ? to_vector(*array) : std::vector<T>();
-}
-
-py::str decode_utf8(const std::string& text) {
-  PyObject* decoded = PyUnicode_DecodeUTF8(text.data(), static_cast<py::ssize_t>(text.size()), "backslashreplace");
-  if (decoded == nullptr) throw py::error_already_set();
-  return py::reinterpret_steal<py::str>(decoded);
-}
-
-py::tuple decode_comments(const std::vector<std::string>& comments) {
-  py::tuple decoded(comments.size());
-  for (std::size_t i = 0; i < comments.size(); ++i) decoded[i] = decode_utf8(comments[i]);
-  return decoded;
-}
-
-void translate_errors(std::exception_ptr pointer) {
-  try {
-    std::rethrow_exception(pointer);
-  } catch (const FileError& error) {
-    // Made here, because Python 3.8 does not turn a bare OSError into its subclass (FileNotFoundError ...) by itself.
-    const py::object instance = py::reinterpret_borrow<py::object>(PyExc_OSError)(
-        error.error_number, decode_utf8(error.reason), decode_utf8(error.path));
-    PyErr_SetObject(instance.get_type().ptr(), instance.ptr());
-  } catch (const FormatError& error) {
-    PyErr_SetObject(PyExc_ValueError, decode_utf8(error.what()).ptr());
-  }
-}
-
-py::dict read_gaussians_python(const std::string& path) {
+Object read_gaussians_python(const std::string& path) {
   GaussianModel model;
   {
-    const py::gil_scoped_release unlocked;
+    const python::Unlocked unlocked;
     model = read_gaussians(path);
   }
-  const auto n = static_cast<py::ssize_t>(model.count);
-  const py::ssize_t rest = (model.sh_degree + 1) * (model.sh_degree + 1) - 1;
-  py::dict result;
-  result["means3D"] = to_numpy(std::move(model.means3D), {n, 3});
-  result["dc"] = to_numpy(std::move(model.dc), {n, 1, 3});
-  result["shs"] = to_numpy(std::move(model.shs), {n, rest, 3});
-  result["opacity_logits"] = to_numpy(std::move(model.opacity_logits), {n, 1});
-  result["log_scales"] = to_numpy(std::move(model.log_scales), {n, 3});
-  result["rotations"] = to_numpy(std::move(model.rotations), {n, 4});
-  result["blend_mode"] = model.blend_mode.empty() ? py::object(py::none()) : decode_utf8(model.blend_mode);
-  result["background_gate"] = model.background_gate;
-  result["comments"] = decode_comments(model.comments);
+  const auto n = static_cast<int64_t>(model.count);
+  const int64_t rest = (model.sh_degree + 1) * (model.sh_degree + 1) - 1;
+  Dict result;
+  result.set("means3D", python::array(std::move(model.means3D), {n, 3}));
+  result.set("dc", python::array(std::move(model.dc), {n, 1, 3}));
+  result.set("shs", python::array(std::move(model.shs), {n, rest, 3}));
+  result.set("opacity_logits", python::array(std::move(model.opacity_logits), {n, 1}));
+  result.set("log_scales", python::array(std::move(model.log_scales), {n, 3}));
+  result.set("rotations", python::array(std::move(model.rotations), {n, 4}));
+  if (model.blend_mode.empty()) {
+    result.set("blend_mode", std::nullopt);
+  } else {
+    result.set("blend_mode", model.blend_mode);
+  }
+  result.set("background_gate", model.background_gate);
+  result.set("comments", python::tuple_of(model.comments));
   return result;
 }
 
-void write_gaussians_python(const std::string& path, int sh_degree, const InputArray<float>& means3D,
-                            const InputArray<float>& dc, const InputArray<float>& shs,
-                            const InputArray<float>& opacity_logits, const InputArray<float>& log_scales,
-                            const InputArray<float>& rotations, const std::string& blend_mode,
-                            std::optional<double> background_gate, const std::vector<std::string>& comments) {
+void write_gaussians_python(const std::string& path, int64_t sh_degree, Array<float> means3D, Array<float> dc,
+                            Array<float> shs, Array<float> opacity_logits, Array<float> log_scales,
+                            Array<float> rotations, std::string blend_mode, std::optional<double> background_gate,
+                            std::vector<std::string> comments) {
   GaussianModel model;
-  model.count = static_cast<std::size_t>(means3D.size() / 3);
-  model.sh_degree = sh_degree;
-  model.means3D = to_vector(means3D);
-  model.dc = to_vector(dc);
-  model.shs = to_vector(shs);
-  model.opacity_logits = to_vector(opacity_logits);
-  model.log_scales = to_vector(log_scales);
-  model.rotations = to_vector(rotations);
-  model.blend_mode = blend_mode;
+  model.count = means3D.size() / 3;
+  model.sh_degree = static_cast<int>(sh_degree);
+  model.means3D = std::move(means3D);
+  model.dc = std::move(dc);
+  model.shs = std::move(shs);
+  model.opacity_logits = std::move(opacity_logits);
+  model.log_scales = std::move(log_scales);
+  model.rotations = std::move(rotations);
+  model.blend_mode = std::move(blend_mode);
   model.background_gate = background_gate;
-  model.comments = comments;
-  const py::gil_scoped_release unlocked;
+  model.comments = std::move(comments);
+  const python::Unlocked unlocked;
   write_gaussians(path, model);
 }
 
-py::dict to_dict(PointCloud&& cloud) {
-  const auto n = static_cast<py::ssize_t>(cloud.count);
-  py::dict result;
-  result["positions"] = to_numpy(std::move(cloud.positions), {n, 3});
-  result["colors"] = to_numpy_or_none(std::move(cloud.colors), {n, 3});
-  result["normals"] = to_numpy_or_none(std::move(cloud.normals), {n, 3});
-  result["comments"] = decode_comments(cloud.comments);
+Object to_dict(PointCloud&& cloud) {
+  const auto n = static_cast<int64_t>(cloud.count);
+  Dict result;
+  result.set("positions", python::array(std::move(cloud.positions), {n, 3}));
+  result.set("colors", array_or_none(std::move(cloud.colors), {n, 3}));
+  result.set("normals", array_or_none(std::move(cloud.normals), {n, 3}));
+  result.set("comments", python::tuple_of(cloud.comments));
   return result;
 }
 
-py::dict read_points_python(const std::string& path) {
+Object read_points_python(const std::string& path) {
   PointCloud cloud;
   {
-    const py::gil_scoped_release unlocked;
+    const python::Unlocked unlocked;
     cloud = read_points(path);
   }
   return to_dict(std::move(cloud));
 }
 
-PointCloud to_cloud(const InputArray<double>& positions, const std::optional<InputArray<std::uint8_t>>& colors) {
+PointCloud to_cloud(Array<double>&& positions, OptionalArray<uint8_t>&& colors) {
   PointCloud cloud;
-  cloud.count = static_cast<std::size_t>(positions.size() / 3);
-  cloud.positions = to_vector(positions);
-  cloud.colors = to_vector(colors);
+  cloud.count = positions.size() / 3;
+  cloud.positions = std::move(positions);
+  cloud.colors = or_empty(std::move(colors));
   return cloud;
 }
 
-void write_points_python(const std::string& path, const InputArray<double>& positions,
-                         const std::optional<InputArray<std::uint8_t>>& colors,
-                         const std::optional<InputArray<float>>& normals, const std::vector<std::string>& comments) {
-  PointCloud cloud = to_cloud(positions, colors);
-  cloud.normals = to_vector(normals);
-  cloud.comments = comments;
-  const py::gil_scoped_release unlocked;
+void write_points_python(const std::string& path, Array<double> positions, OptionalArray<uint8_t> colors,
+                         OptionalArray<float> normals, std::vector<std::string> comments) {
+  PointCloud cloud = to_cloud(std::move(positions), std::move(colors));
+  cloud.normals = or_empty(std::move(normals));
+  cloud.comments = std::move(comments);
+  const python::Unlocked unlocked;
   write_points(path, cloud);
 }
 
-py::list to_list(const std::vector<ColmapCamera>& cameras) {
-  py::list result;
+// A copy: these are few numbers.
+template <class Numbers> Object numbers(const Numbers& values) {
+  return python::array(std::vector<double>(values.begin(), values.end()), {static_cast<int64_t>(values.size())});
+}
+
+Object to_list(const std::vector<ColmapCamera>& cameras) {
+  List result;
   for (const ColmapCamera& camera : cameras) {
-    const auto count = static_cast<py::ssize_t>(camera.params.size());
-    result.append(py::make_tuple(camera.id, camera.model->name, camera.width, camera.height,
-                                 py::array_t<double>(count, camera.params.data())));
+    result.append(python::tuple(camera.id, camera.model->name, camera.width, camera.height, numbers(camera.params)));
   }
   return result;
 }
 
-py::list read_colmap_cameras_python(const std::string& path) { return to_list(read_colmap_cameras(path)); }
+Object find_colmap_folder_python(const std::string& folder) { return python::bytes(find_colmap_folder(folder)); }
 
-py::dict read_colmap_python(const std::string& folder) {
+Object read_colmap_cameras_python(const std::string& path) { return to_list(read_colmap_cameras(path)); }
+
+Object read_colmap_python(const std::string& folder) {
   ColmapModel model;
   {
-    const py::gil_scoped_release unlocked;
+    const python::Unlocked unlocked;
     model = read_colmap(folder);
   }
-  py::list images;
+  List images;
   for (const ColmapImage& image : model.images) {
-    images.append(py::make_tuple(image.id, py::bytes(image.name), image.camera_id,
-                                 py::array_t<double>(py::ssize_t{4}, image.qvec.data()),
-                                 py::array_t<double>(py::ssize_t{3}, image.tvec.data())));
+    images.append(
+        python::tuple(image.id, python::bytes(image.name), image.camera_id, numbers(image.qvec), numbers(image.tvec)));
   }
-  py::dict result;
-  result["cameras"] = to_list(model.cameras);
-  result["images"] = images;
-  const auto n = static_cast<py::ssize_t>(model.points.cloud.count);
-  result["point_errors"] = to_numpy(std::move(model.points.errors), {n});
-  result["points"] = to_dict(std::move(model.points.cloud));
+  const auto n = static_cast<int64_t>(model.points.cloud.count);
+  Dict result;
+  result.set("cameras", to_list(model.cameras));
+  result.set("images", Object(images));
+  result.set("point_errors", python::array(std::move(model.points.errors), {n}));
+  result.set("points", to_dict(std::move(model.points.cloud)));
   return result;
 }
 
@@ -190,9 +155,8 @@ using CameraTuple = std::tuple<std::uint32_t, std::string, std::uint64_t, std::u
 using ImageTuple = std::tuple<std::uint32_t, std::string, std::uint32_t, std::array<double, 4>, std::array<double, 3>>;
 
 void write_colmap_python(const std::string& folder, const std::vector<CameraTuple>& cameras,
-                         const std::vector<ImageTuple>& images, const InputArray<double>& positions,
-                         const std::optional<InputArray<std::uint8_t>>& colors,
-                         const std::optional<InputArray<double>>& point_errors, bool text) {
+                         const std::vector<ImageTuple>& images, Array<double> positions, OptionalArray<uint8_t> colors,
+                         OptionalArray<double> point_errors, bool text) {
   ColmapModel model;
   for (const auto& [id, name, width, height, params] : cameras) {
     const CameraModel* camera_model = find_camera_model(name);
@@ -203,24 +167,26 @@ void write_colmap_python(const std::string& folder, const std::vector<CameraTupl
   }
   for (const auto& [id, name, camera_id, qvec, tvec] : images)
     model.images.push_back({id, qvec, tvec, camera_id, name});
-  model.points.cloud = to_cloud(positions, colors);
-  model.points.errors = to_vector(point_errors);
-  const py::gil_scoped_release unlocked;
+  model.points.cloud = to_cloud(std::move(positions), std::move(colors));
+  model.points.errors = or_empty(std::move(point_errors));
+  const python::Unlocked unlocked;
   write_colmap(folder, model, text ? ColmapFormat::kText : ColmapFormat::kBinary);
 }
 
+PyMethodDef methods[] = {python::method<&read_gaussians_python>("read_gaussians"),
+                         python::method<&write_gaussians_python>("write_gaussians"),
+                         python::method<&read_points_python>("read_points"),
+                         python::method<&write_points_python>("write_points"),
+                         python::method<&find_colmap_folder_python>("find_colmap_folder"),
+                         python::method<&read_colmap_python>("read_colmap"),
+                         python::method<&read_colmap_cameras_python>("read_colmap_cameras"),
+                         python::method<&write_colmap_python>("write_colmap"),
+                         {nullptr, nullptr, 0, nullptr}};
+
+PyModuleDef definition = {PyModuleDef_HEAD_INIT, "io", nullptr, -1, methods, nullptr, nullptr, nullptr, nullptr};
+
 }  // namespace
 
-void bind_io(py::module_& module) {
-  py::register_local_exception_translator(&translate_errors);
-  module.def("read_gaussians", &read_gaussians_python);
-  module.def("write_gaussians", &write_gaussians_python);
-  module.def("read_points", &read_points_python);
-  module.def("write_points", &write_points_python);
-  module.def("find_colmap_folder", [](const std::string& folder) { return py::bytes(find_colmap_folder(folder)); });
-  module.def("read_colmap", &read_colmap_python);
-  module.def("read_colmap_cameras", &read_colmap_cameras_python);
-  module.def("write_colmap", &write_colmap_python);
-}
+python::Object make_module() { return Object(PyModule_Create(&definition)); }
 
 }  // namespace dsmoe::io

@@ -1,11 +1,11 @@
+// The functions of this folder for Python, with numpy arrays.
 #pragma once
 
-#include <pybind11/pybind11.h>
+#include "python/python.h"
 
 namespace dsmoe::io {
 
-/// Adds the readers and writers to a Python module; diff_smoe_rasterization/io.py documents and wraps them.
-/// FileError becomes OSError (its subclass by errno, such as FileNotFoundError), FormatError becomes ValueError.
-void bind_io(pybind11::module_& module);
+// The module _C.io.
+python::Object make_module();
 
 }  // namespace dsmoe::io

@@ -22,30 +22,30 @@ std::string to_string(const Shape& shape) {
 
 }  // namespace
 
-std::string dtype_name(at::ScalarType type) {
+std::string dtype_name(ScalarType type) {
   switch (type) {
-    case at::kHalf:
+    case kHalf:
       return "float16";
-    case at::kBFloat16:
+    case kBFloat16:
       return "bfloat16";
-    case at::kFloat:
+    case kFloat:
       return "float32";
-    case at::kDouble:
+    case kDouble:
       return "float64";
-    case at::kByte:
+    case kByte:
       return "uint8";
-    case at::kInt:
+    case kInt:
       return "int32";
-    case at::kLong:
+    case kLong:
       return "int64";
-    case at::kBool:
+    case kBool:
       return "bool";
     default:
-      return c10::toString(type);
+      return toString(type);
   }
 }
 
-bool matches(const at::Tensor& tensor, const Shape& shape) {
+bool matches(const Tensor& tensor, const Shape& shape) {
   if (tensor.dim() != static_cast<int64_t>(shape.size())) return false;
   for (size_t i = 0; i < shape.size(); ++i) {
     if (shape[i].letter == nullptr && tensor.size(i) != shape[i].size) return false;
@@ -53,48 +53,48 @@ bool matches(const at::Tensor& tensor, const Shape& shape) {
   return true;
 }
 
-void check_shape(const char* function, const char* name, const at::Tensor& tensor, const Shape& shape) {
-  TORCH_CHECK_VALUE(matches(tensor, shape), function, ": ", name, " has shape ", tensor.sizes(), "; it must be ",
+void check_shape(const char* function, const char* name, const Tensor& tensor, const Shape& shape) {
+  DSMOE_CHECK_VALUE(matches(tensor, shape), function, ": ", name, " has shape ", tensor.sizes(), "; it must be ",
                     to_string(shape));
 }
 
-void check_same_shape(const char* function, const char* name, const at::Tensor& tensor, const char* other_name,
-                      const at::Tensor& other) {
-  TORCH_CHECK_VALUE(tensor.sizes() == other.sizes(), function, ": ", name, " has shape ", tensor.sizes(),
+void check_same_shape(const char* function, const char* name, const Tensor& tensor, const char* other_name,
+                      const Tensor& other) {
+  DSMOE_CHECK_VALUE(tensor.sizes() == other.sizes(), function, ": ", name, " has shape ", tensor.sizes(),
                     "; it must be ", other.sizes(), ", as ", other_name, " is");
 }
 
-void check_real(const char* function, const char* name, const at::Tensor& tensor) {
-  const at::ScalarType type = tensor.scalar_type();
-  TORCH_CHECK_TYPE(type == at::kFloat || type == at::kDouble, function, ": ", name, " is ", dtype_name(type),
+void check_real(const char* function, const char* name, const Tensor& tensor) {
+  const ScalarType type = tensor.scalar_type();
+  DSMOE_CHECK_TYPE(type == kFloat || type == kDouble, function, ": ", name, " is ", dtype_name(type),
                    "; it must be float32 or float64: cast it, for instance with ", name, ".float()");
 }
 
-void check_type(const char* function, const char* name, const at::Tensor& tensor, at::ScalarType type) {
-  TORCH_CHECK_TYPE(tensor.scalar_type() == type, function, ": ", name, " is ", dtype_name(tensor.scalar_type()),
+void check_type(const char* function, const char* name, const Tensor& tensor, ScalarType type) {
+  DSMOE_CHECK_TYPE(tensor.scalar_type() == type, function, ": ", name, " is ", dtype_name(tensor.scalar_type()),
                    "; it must be ", dtype_name(type));
 }
 
-void check_device(const char* function, const char* name, const at::Tensor& tensor, const char* other_name,
-                  const at::Tensor& other) {
-  TORCH_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
+void check_device(const char* function, const char* name, const Tensor& tensor, const char* other_name,
+                  const Tensor& other) {
+  DSMOE_CHECK_TYPE(tensor.device() == other.device(), function, ": ", name, " is on ", tensor.device(),
                    "; it must be on ", other.device(), ", as ", other_name, " is");
 }
 
-void check_like(const char* function, const char* name, const at::Tensor& tensor, const char* other_name,
-                const at::Tensor& other) {
-  TORCH_CHECK_TYPE(tensor.scalar_type() == other.scalar_type(), function, ": ", name, " is ",
+void check_like(const char* function, const char* name, const Tensor& tensor, const char* other_name,
+                const Tensor& other) {
+  DSMOE_CHECK_TYPE(tensor.scalar_type() == other.scalar_type(), function, ": ", name, " is ",
                    dtype_name(tensor.scalar_type()), "; it must be ", dtype_name(other.scalar_type()), ", as ",
                    other_name, " is");
   check_device(function, name, tensor, other_name, other);
 }
 
-void check_contiguous(const char* function, const char* name, const at::Tensor& tensor) {
-  TORCH_CHECK_VALUE(tensor.is_contiguous(), function, ": ", name, " is not contiguous; it must be");
+void check_contiguous(const char* function, const char* name, const Tensor& tensor) {
+  DSMOE_CHECK_VALUE(tensor.is_contiguous(), function, ": ", name, " is not contiguous; it must be");
 }
 
-void refuse_tangent(const char* function, const at::Tensor& tensor) {
-  TORCH_CHECK_NOT_IMPLEMENTED(!tensor.defined() || !tensor._fw_grad(0).defined(), function,
+void refuse_tangent(const char* function, const Tensor& tensor) {
+  DSMOE_CHECK_NOT_IMPLEMENTED(!has_tangent(tensor), function,
                               ": forward-mode derivatives (torch.func.jvp, jacfwd, dual tensors) are not implemented; "
                               "take those of backward mode (torch.autograd.grad)");
 }

@@ -1,8 +1,4 @@
 // The Python module: what is no tensor op. Importing it registers the ops (schema.cpp).
-#include <ATen/Parallel.h>
-#include <pybind11/pybind11.h>
-#include <torch/version.h>
-
 #include "dsmoe/blend.h"
 #include "dsmoe/constants.h"
 #include "dsmoe/rasterize_cuda.h"
@@ -10,109 +6,145 @@
 #include "io/python_bindings.h"
 #include "most_instances.h"
 #include "profiling.h"
+#include "python/python.h"
 #include "tensors.h"
 
-namespace py = pybind11;
+#ifdef DSMOE_STABLE_ABI
+#include <torch/headeronly/version.h>
+#else
+#include <torch/version.h>
+#endif
 
 namespace {
 
+using namespace dsmoe;
+using python::Dict;
+using python::Object;
+
 // For the test that compares them with the oracle's own.
-py::dict constants() {
-  using namespace py::literals;
-  return py::dict("alpha_max"_a = dsmoe::kAlphaMax, "alpha_cut"_a = dsmoe::kAlphaCut, "gate_cut"_a = dsmoe::kGateCut,
-                  "core_kernel"_a = dsmoe::kCoreKernel, "transmittance_cut"_a = dsmoe::kTransmittanceCut,
-                  "gate_sum_cut"_a = dsmoe::kGateSumCut, "max_opacity"_a = dsmoe::kMaxOpacity,
-                  "radius_root_floor"_a = dsmoe::kRadiusRootFloor, "compensation_floor"_a = dsmoe::kCompensationFloor,
-                  "low_pass"_a = dsmoe::kLowPass, "frustum_margin"_a = dsmoe::kFrustumMargin,
-                  "homogeneous_epsilon"_a = dsmoe::kHomogeneousEpsilon, "tile_size"_a = dsmoe::kTileSize,
-                  "segment_length"_a = dsmoe::cuda::kSegmentLength);
+Object constants() {
+  return Dict()
+      .set("alpha_max", kAlphaMax)
+      .set("alpha_cut", kAlphaCut)
+      .set("gate_cut", kGateCut)
+      .set("core_kernel", kCoreKernel)
+      .set("transmittance_cut", kTransmittanceCut)
+      .set("gate_sum_cut", kGateSumCut)
+      .set("max_opacity", kMaxOpacity)
+      .set("radius_root_floor", kRadiusRootFloor)
+      .set("compensation_floor", kCompensationFloor)
+      .set("low_pass", kLowPass)
+      .set("frustum_margin", kFrustumMargin)
+      .set("homogeneous_epsilon", kHomogeneousEpsilon)
+      .set("tile_size", kTileSize)
+      .set("segment_length", cuda::kSegmentLength);
 }
 
-// The lists of fields.h: names in the order of the ops' arguments and results; the options with their types.
-template <size_t kCount> py::tuple names(const char* const (&list)[kCount]) {
-  py::tuple out(kCount);
-  for (size_t i = 0; i < kCount; ++i) out[i] = py::str(list[i]);
-  return out;
-}
-
-py::dict options() {
-  py::dict types;
-#define DSMOE_TYPE(type, schema, name) types[#name] = schema;
+// The list of fields.h: the options' names in the order of the ops' arguments, with their types.
+Object options() {
+  Dict types;
+#define DSMOE_TYPE(type, schema, name) types.set(#name, schema);
   DSMOE_OPTIONS(DSMOE_TYPE)
 #undef DSMOE_TYPE
   return types;
 }
 
 // What a backend saves: of each tensor its name, its type ("real": that of the inputs) and how many numbers a row has.
-template <class Saved, class Sizes> py::list saved_arrays() {
-  py::list arrays;
+template <class Saved, class Sizes> Object saved_arrays() {
+  python::List arrays;
   Saved saved;
   for_each_array(saved, Sizes(), [&](const char* name, auto*& pointer, int64_t rows) {
-    const dsmoe::SavedArray array = dsmoe::saved_array(name, pointer, rows);
-    const char* type = array.type == dsmoe::NumberType::kInt32   ? "int32"
-                       : array.type == dsmoe::NumberType::kInt64 ? "int64"
-                                                                 : "real";
-    arrays.append(py::make_tuple(name, type, array.columns));
+    const SavedArray array = saved_array(name, pointer, rows);
+    const char* type = array.type == NumberType::kInt32 ? "int32" : array.type == NumberType::kInt64 ? "int64" : "real";
+    arrays.append(python::tuple(name, type, array.columns));
   });
   return arrays;
 }
 
-py::dict saved() {
-  using namespace py::literals;
-  return py::dict("cpu"_a = saved_arrays<dsmoe::SavedForward<float>, dsmoe::SavedSizes>(),
-                  "cuda"_a = saved_arrays<dsmoe::cuda::SavedForward<float>, dsmoe::cuda::SavedSizes>());
+Object saved() {
+  return Dict()
+      .set("cpu", saved_arrays<SavedForward<float>, SavedSizes>())
+      .set("cuda", saved_arrays<cuda::SavedForward<float>, cuda::SavedSizes>());
 }
 
 // The core's list: names in the order of their numbers, each with the facts that Python asks for. `divides`: the
 // backward pass reads the images of the forward pass. `removable`: `importance` takes the mode. `background_gate`: the
 // mode's own, or None where the caller gives it. `faint_below`: what is usual in the mode.
-py::dict blend_modes() {
-  using namespace py::literals;
-  py::dict modes;
-  dsmoe::BlendModes::for_each([&](auto mode) {
-    using Policy = dsmoe::Blend<decltype(mode)::value>;
-    py::object gate = py::none();
-    if (!Policy::kLearnsGate) gate = py::float_(Policy::background_gate(0.0));
-    modes[Policy::kName] =
-        py::dict("number"_a = static_cast<int>(decltype(mode)::value), "divides"_a = Policy::kDivides,
-                 "removable"_a = dsmoe::kRemovable<decltype(mode)::value>, "background_gate"_a = gate,
-                 "tails"_a = Policy::kTails, "faint_below"_a = Policy::kFaintBelow);
+Object blend_modes() {
+  Dict modes;
+  BlendModes::for_each([&](auto mode) {
+    using Policy = Blend<decltype(mode)::value>;
+    std::optional<double> gate;
+    if constexpr (!Policy::kLearnsGate) gate = Policy::background_gate(0.0);
+    modes.set(Policy::kName, Object(Dict()
+                                        .set("number", static_cast<int>(decltype(mode)::value))
+                                        .set("divides", Policy::kDivides)
+                                        .set("removable", kRemovable<decltype(mode)::value>)
+                                        .set("background_gate", gate)
+                                        .set("tails", Policy::kTails)
+                                        .set("faint_below", Policy::kFaintBelow)));
   });
   return modes;
 }
 
-py::dict build_info() {
-  using namespace py::literals;
+Object build_info() {
 #ifdef DSMOE_WITH_CUDA
   constexpr bool kCudaBuilt = true;
 #else
   constexpr bool kCudaBuilt = false;
 #endif
-  return py::dict("torch_built_with"_a = TORCH_VERSION, "compiler"_a = __VERSION__, "cuda_built"_a = kCudaBuilt,
-                  "simd_level"_a = dsmoe::cpu::simd_level(), "num_threads"_a = at::get_num_threads());
+  return Dict()
+      .set("torch_built_with", TORCH_VERSION)
+      .set("compiler", __VERSION__)
+      .set("cuda_built", kCudaBuilt)
+      .set("simd_level", cpu::simd_level())
+      .set("num_threads", binding::num_threads());
 }
 
-py::dict stage_times() {
-  using namespace py::literals;
-  const dsmoe::StageTimes times = dsmoe::binding::stage_times();
-  return py::dict("project"_a = times.project, "sort"_a = times.sort, "bin"_a = times.bin, "blend"_a = times.blend,
-                  "blend_backward"_a = times.blend_backward, "project_backward"_a = times.project_backward,
-                  "forward_pairs"_a = times.forward_pairs, "backward_pairs"_a = times.backward_pairs);
+Object stage_times() {
+  const StageTimes times = binding::stage_times();
+  return Dict()
+      .set("project", times.project)
+      .set("sort", times.sort)
+      .set("bin", times.bin)
+      .set("blend", times.blend)
+      .set("blend_backward", times.blend_backward)
+      .set("project_backward", times.project_backward)
+      .set("forward_pairs", times.forward_pairs)
+      .set("backward_pairs", times.backward_pairs);
 }
+
+void add(PyObject* module, const char* name, Object value) {
+  python::check_status(PyModule_AddObject(module, name, value.get()));
+  value.release();  // which the module has now
+}
+
+PyMethodDef methods[] = {python::method<&build_info>("build_info"),
+                         python::method<&binding::set_most_instances>("set_most_instances"),
+                         python::method<&binding::set_profiling>("set_profiling"),
+                         python::method<&stage_times>("stage_times"),
+                         {nullptr, nullptr, 0, nullptr}};
+
+PyModuleDef definition = {PyModuleDef_HEAD_INIT, "_C", nullptr, -1, methods, nullptr, nullptr, nullptr, nullptr};
 
 }  // namespace
 
-PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
-  m.attr("constants") = constants();
-  m.attr("blend_modes") = blend_modes();
-  m.attr("inputs") = names(dsmoe::binding::kInputNames);
-  m.attr("images") = names(dsmoe::binding::kImageNames);
-  m.attr("options") = options();
-  m.attr("saved") = saved();
-  m.def("build_info", &build_info);
-  m.def("set_most_instances", &dsmoe::binding::set_most_instances);
-  m.def("set_profiling", &dsmoe::binding::set_profiling);
-  m.def("stage_times", &stage_times);
-  py::module_ io = m.def_submodule("io");
-  dsmoe::io::bind_io(io);
+PyMODINIT_FUNC PyInit__C() {
+  try {
+#ifdef DSMOE_STABLE_ABI
+    binding::prepare_python_errors();
+#endif
+    Object module(PyModule_Create(&definition));
+    add(module.get(), "constants", constants());
+    add(module.get(), "blend_modes", blend_modes());
+    add(module.get(), "inputs", python::tuple_of(binding::kInputNames));
+    add(module.get(), "images", python::tuple_of(binding::kImageNames));
+    add(module.get(), "options", options());
+    add(module.get(), "saved", saved());
+    add(module.get(), "io", io::make_module());
+    return module.release();
+  } catch (...) {
+    python::set_error();
+    return nullptr;
+  }
 }

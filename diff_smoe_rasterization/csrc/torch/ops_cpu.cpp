@@ -1,5 +1,5 @@
 // The ops on the CPU.
-#include <ATen/Parallel.h>
+#include <cstring>
 
 #include "ops.h"
 #include "profiling.h"
@@ -10,7 +10,7 @@ namespace {
 
 struct Cpu {
   struct Guard {
-    explicit Guard(at::Device) {}
+    explicit Guard(Device) {}
   };
 
   template <class S>
@@ -20,7 +20,7 @@ struct Cpu {
     std::copy_n(data<S>(inputs[kViewMatrix]), 16, frame.camera.view);
     std::copy_n(data<S>(inputs[kProjMatrix]), 16, frame.camera.projection);
     std::copy_n(data<S>(inputs[kCampos]), 3, frame.camera.position);
-    frame.config.num_threads = at::get_num_threads();
+    frame.config.num_threads = num_threads();
     frame.images = image_outputs<S>(images);
     return frame;
   }
@@ -40,8 +40,8 @@ struct Cpu {
   static int64_t feature_columns(int64_t num_features) { return num_features; }
 
   template <class S>
-  static void project(const Inputs& inputs, const Options& options, const Images& images, const at::Tensor& gates,
-                      const at::Tensor& features, Allocator&) {
+  static void project(const Inputs& inputs, const Options& options, const Images& images, const Tensor& gates,
+                      const Tensor& features, Allocator&) {
     auto own = frame_of_gaussians<S>(inputs, options, images);
     own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(gates));
     own.saved.features = mutable_data<S>(features);
@@ -55,7 +55,7 @@ struct Cpu {
     cpu::Frame<S> frame;
     frame.inputs.num_gaussians = of.gates.size(0);
     frame.config = footprint_config<S>(of.background, of.background_gate, options);
-    frame.config.num_threads = at::get_num_threads();
+    frame.config.num_threads = num_threads();
     set_image(frame.camera, options);
     frame.images = image_outputs<S>(images);
     return frame;
@@ -72,8 +72,7 @@ struct Cpu {
 
   template <class S>
   static void blend_backward(const Footprints& of, const Options& options, const Images& images, const Saved& saved,
-                             const Images& image_gradient_tensors, const at::Tensor& records,
-                             const at::Tensor& background) {
+                             const Images& image_gradient_tensors, const Tensor& records, const Tensor& background) {
     auto own = frame_of_footprints<S>(of, options, images);
     own.saved = unpack<S>("blend_backward", saved, cpu::saved_sizes(own), of.gates.device());
     set_sums(own.saved, cpu::saved_sizes(own), own.images.gate_sum);
@@ -85,8 +84,8 @@ struct Cpu {
   }
 
   template <class S>
-  static void project_backward(const Inputs& inputs, const Options& options, const at::Tensor& features,
-                               const at::Tensor& radii, const at::Tensor& records, const at::Tensor& dL_ddepths,
+  static void project_backward(const Inputs& inputs, const Options& options, const Tensor& features,
+                               const Tensor& radii, const Tensor& records, const Tensor& dL_ddepths,
                                const Inputs& gradient_tensors) {
     auto own = frame_of_gaussians<S>(inputs, options, Images());
     own.saved.features = mutable_data<S>(features);
@@ -100,7 +99,7 @@ struct Cpu {
 
   // Checks what a rendering saved, and points to it.
   template <class S>
-  static SavedForward<S> unpack(const char* function, const Saved& tensors, SavedSizes sizes, at::Device device) {
+  static SavedForward<S> unpack(const char* function, const Saved& tensors, SavedSizes sizes, Device device) {
     SavedForward<S> saved;
     unpack_saved(function, tensors, saved, sizes, device);
     sizes.num_instances =
@@ -126,19 +125,18 @@ struct Cpu {
 
   // The frame of a rendering that is walked again, what it saved not yet in it.
   template <class S>
-  static cpu::Frame<S> frame_of_rendering(const at::Tensor& radii, const RasterConfig<S>& config,
-                                          const Options& options) {
+  static cpu::Frame<S> frame_of_rendering(const Tensor& radii, const RasterConfig<S>& config, const Options& options) {
     cpu::Frame<S> frame;
     frame.inputs.num_gaussians = radii.numel();
     frame.config = config;
-    frame.config.num_threads = at::get_num_threads();
+    frame.config.num_threads = num_threads();
     frame.images.radii = mutable_data<int32_t>(radii);
     set_image(frame.camera, options);
     return frame;
   }
 
   template <class S>
-  static void contributions(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
+  static void contributions(const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
                             const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
     auto own = frame_of_rendering<S>(radii, config, options);
     SavedSizes sizes = cpu::saved_sizes(own);
@@ -148,22 +146,33 @@ struct Cpu {
   }
 
   template <class S>
-  static void importance(const at::Tensor& gate_sum, const at::Tensor& radii, const Saved& saved,
-                         const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
+  static void importance(const Tensor& gate_sum, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config,
+                         const Options& options, const ImportanceMap<S>& map) {
     auto own = frame_of_rendering<S>(radii, config, options);
     own.saved = unpack<S>("importance", saved, cpu::saved_sizes(own), radii.device());
     set_sums(own.saved, cpu::saved_sizes(own), mutable_data<S>(gate_sum));
     cpu::importance(own, map);
   }
 
-  static at::Tensor pack_footprints(const at::Tensor& gates, const at::Tensor& features, const at::Tensor& radii,
-                                    const at::Tensor& visible) {
-    const at::Tensor seen = radii.index_select(0, visible).view(at::kFloat).unsqueeze(1);
-    return at::cat({gates.index_select(0, visible), features.index_select(0, visible), seen}, 1);
+  static Tensor pack_footprints(const Tensor& gates, const Tensor& features, const Tensor& radii,
+                                const Tensor& visible) {
+    const Tensor dense_gates = gates.contiguous(), dense_features = features.contiguous();
+    const int64_t count = visible.numel(), num_features = features.size(1);
+    const Tensor out = empty({count, kProjectedGaussianSize + num_features + 1}, gates);
+    float* row = out.data_ptr<float>();
+    for (int64_t i = 0; i < count; ++i) {
+      const int64_t index = visible.data_ptr<int64_t>()[i];
+      DSMOE_CHECK_INDEX(0 <= index && index < gates.size(0), "pack_footprints: visible[", i, "] is ", index,
+                        "; there are ", gates.size(0), " Gaussians");
+      row = std::copy_n(dense_gates.data_ptr<float>() + index * kProjectedGaussianSize, kProjectedGaussianSize, row);
+      row = std::copy_n(dense_features.data_ptr<float>() + index * num_features, num_features, row);
+      std::memcpy(row++, radii.data_ptr<int32_t>() + index, sizeof(float));
+    }
+    return out;
   }
 
-  static at::Tensor visible(const char* function, const at::Tensor& positions, const at::Tensor& view, double near) {
-    const at::Tensor visible = at::empty({positions.size(0)}, at::kBool);
+  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {
+    const Tensor visible = empty({positions.size(0)}, positions, kBool);
     dispatch(function, positions, [&](auto zero) {
       using S = decltype(zero);
       cpu::Frame<S> frame;
@@ -181,4 +190,4 @@ struct Cpu {
 }  // namespace binding
 }  // namespace dsmoe
 
-TORCH_LIBRARY_IMPL(diff_smoe_rasterization, CPU, m) { dsmoe::binding::register_ops<dsmoe::binding::Cpu>(m); }
+DSMOE_LIBRARY_IMPL(CPU, m) { dsmoe::binding::register_ops<dsmoe::binding::Cpu>(m); }

@@ -1,7 +1,5 @@
 // The ops on CUDA: on the inputs' device, on torch's current stream.
-#include <ATen/cuda/CUDAContext.h>
-#include <c10/cuda/CUDAGuard.h>
-
+#include "cuda_stream.h"
 #include "dsmoe/rasterize_cuda.h"
 #include "ops.h"
 #include "profiling.h"
@@ -11,7 +9,7 @@ namespace binding {
 namespace {
 
 struct Cuda {
-  using Guard = c10::cuda::CUDAGuard;
+  using Guard = DeviceGuard;
 
   template <class S>
   static cuda::Frame<S> frame_of_gaussians(const Inputs& inputs, const Options& options, const Images& images) {
@@ -26,7 +24,7 @@ struct Cuda {
 
   static cuda::Run run(const Options& options, StageTimes* times) {
     cuda::Run run;
-    run.stream = at::cuda::getCurrentCUDAStream();
+    run.stream = current_stream();
     run.deterministic = options.deterministic;
     run.for_backward = options.for_backward;
     run.times = times;
@@ -48,8 +46,8 @@ struct Cuda {
   static int64_t feature_columns(int64_t num_features) { return cuda::feature_stride(static_cast<int>(num_features)); }
 
   template <class S>
-  static void project(const Inputs& inputs, const Options& options, const Images& images, const at::Tensor& gates,
-                      const at::Tensor& features, Allocator& memory) {
+  static void project(const Inputs& inputs, const Options& options, const Images& images, const Tensor& gates,
+                      const Tensor& features, Allocator& memory) {
     auto own = frame_of_gaussians<S>(inputs, options, images);
     own.saved.projected = reinterpret_cast<ProjectedGaussian<S>*>(mutable_data<S>(gates));
     own.saved.features = mutable_data<S>(features);
@@ -79,8 +77,7 @@ struct Cuda {
 
   template <class S>
   static void blend_backward(const Footprints& of, const Options& options, const Images& images, const Saved& saved,
-                             const Images& image_gradient_tensors, const at::Tensor& records,
-                             const at::Tensor& background) {
+                             const Images& image_gradient_tensors, const Tensor& records, const Tensor& background) {
     auto own = frame_of_footprints<S>(of, options, images);
     StageRecorder recorder(Pass::kBackward);
     const cuda::Run how = run(options, recorder.times());
@@ -94,8 +91,8 @@ struct Cuda {
   }
 
   template <class S>
-  static void project_backward(const Inputs& inputs, const Options& options, const at::Tensor& features,
-                               const at::Tensor& radii, const at::Tensor& records, const at::Tensor& dL_ddepths,
+  static void project_backward(const Inputs& inputs, const Options& options, const Tensor& features,
+                               const Tensor& radii, const Tensor& records, const Tensor& dL_ddepths,
                                const Inputs& gradient_tensors) {
     auto own = frame_of_gaussians<S>(inputs, options, Images());
     own.saved.features = mutable_data<S>(features);
@@ -113,7 +110,7 @@ struct Cuda {
   // Checks what a rendering saved, and points to it. The capacity, and whether there are segments, is what it has.
   template <class S>
   static cuda::SavedForward<S> unpack(const char* function, const Saved& tensors, cuda::SavedSizes sizes,
-                                      at::Device device) {
+                                      Device device) {
     cuda::SavedForward<S> saved;
     sizes.segments = saved_length(tensors, saved, "segments") > 0;
     sizes.capacity = saved_length(tensors, saved, "instances");
@@ -140,8 +137,7 @@ struct Cuda {
 
   // The frame of a rendering that is walked again, what it saved not yet in it.
   template <class S>
-  static cuda::Frame<S> frame_of_rendering(const at::Tensor& radii, const RasterConfig<S>& config,
-                                           const Options& options) {
+  static cuda::Frame<S> frame_of_rendering(const Tensor& radii, const RasterConfig<S>& config, const Options& options) {
     cuda::Frame<S> frame;
     frame.inputs.num_gaussians = radii.numel();
     frame.config = config;
@@ -151,7 +147,7 @@ struct Cuda {
   }
 
   template <class S>
-  static void contributions(const at::Tensor& pixel_weights, const at::Tensor& radii, const Saved& saved,
+  static void contributions(const Tensor& pixel_weights, const Tensor& radii, const Saved& saved,
                             const RasterConfig<S>& config, const Options& options, const ContributionSums<S>& sums) {
     auto own = frame_of_rendering<S>(radii, config, options);
     const cuda::Run how = run(options, nullptr);
@@ -163,8 +159,8 @@ struct Cuda {
   }
 
   template <class S>
-  static void importance(const at::Tensor& gate_sum, const at::Tensor& radii, const Saved& saved,
-                         const RasterConfig<S>& config, const Options& options, const ImportanceMap<S>& map) {
+  static void importance(const Tensor& gate_sum, const Tensor& radii, const Saved& saved, const RasterConfig<S>& config,
+                         const Options& options, const ImportanceMap<S>& map) {
     auto own = frame_of_rendering<S>(radii, config, options);
     const cuda::Run how = run(options, nullptr);
     own.saved = unpack<S>("importance", saved, cuda::saved_sizes(own, how), radii.device());
@@ -173,13 +169,13 @@ struct Cuda {
     cuda::importance(own, map, {how.stream, &memory, nullptr, how.deterministic});
   }
 
-  static at::Tensor pack_footprints(const at::Tensor& gates, const at::Tensor& features, const at::Tensor& radii,
-                                    const at::Tensor& visible) {
+  static Tensor pack_footprints(const Tensor& gates, const Tensor& features, const Tensor& radii,
+                                const Tensor& visible) {
     const int64_t num_features = features.size(1), columns = feature_columns(num_features);
     // Features as `project` returns them need no copy.
     const bool in_rows = features.stride(0) == columns && features.stride(1) == 1;
-    const at::Tensor rows = in_rows ? features : padded(features, columns), dense = gates.contiguous();
-    const at::Tensor out = at::empty({visible.numel(), kProjectedGaussianSize + num_features + 1}, gates.options());
+    const Tensor rows = in_rows ? features : padded(features, columns), dense = gates.contiguous();
+    const Tensor out = empty({visible.numel(), kProjectedGaussianSize + num_features + 1}, gates);
     cuda::FootprintRows pack;
     pack.num_gaussians = gates.size(0);
     pack.count = visible.numel();
@@ -189,12 +185,12 @@ struct Cuda {
     pack.num_features = static_cast<int>(num_features);
     pack.radii = radii.data_ptr<int32_t>();
     pack.rows = out.data_ptr<float>();
-    cuda::pack_footprints(pack, {at::cuda::getCurrentCUDAStream()});
+    cuda::pack_footprints(pack, {current_stream()});
     return out;
   }
 
-  static at::Tensor visible(const char* function, const at::Tensor& positions, const at::Tensor& view, double near) {
-    const at::Tensor visible = at::empty({positions.size(0)}, positions.options().dtype(at::kBool));
+  static Tensor visible(const char* function, const Tensor& positions, const Tensor& view, double near) {
+    const Tensor visible = empty({positions.size(0)}, positions, kBool);
     dispatch(function, positions, [&](auto zero) {
       using S = decltype(zero);
       cuda::Frame<S> frame;
@@ -202,7 +198,7 @@ struct Cuda {
       frame.inputs.means3D = positions.data_ptr<S>();
       frame.camera.view = view.data_ptr<S>();
       frame.camera.near = static_cast<float>(near);
-      cuda::mark_visible(frame, visible.data_ptr<bool>(), {at::cuda::getCurrentCUDAStream()});
+      cuda::mark_visible(frame, visible.data_ptr<bool>(), {current_stream()});
     });
     return visible;
   }
@@ -212,4 +208,4 @@ struct Cuda {
 }  // namespace binding
 }  // namespace dsmoe
 
-TORCH_LIBRARY_IMPL(diff_smoe_rasterization, CUDA, m) { dsmoe::binding::register_ops<dsmoe::binding::Cuda>(m); }
+DSMOE_LIBRARY_IMPL(CUDA, m) { dsmoe::binding::register_ops<dsmoe::binding::Cuda>(m); }

@@ -1,6 +1,4 @@
 // What torch knows of the ops. Their arguments are listed in fields.h.
-#include <torch/library.h>
-
 #include <string>
 
 #include "tensors.h"
@@ -84,7 +82,7 @@ const std::string kImportance =
 
 }  // namespace
 
-TORCH_LIBRARY(diff_smoe_rasterization, m) {
+DSMOE_LIBRARY(m) {
   m.def(kRasterize.c_str());
   m.def(kRasterizeBackward.c_str());
   m.def(kRasterizeBackwardSeen.c_str());

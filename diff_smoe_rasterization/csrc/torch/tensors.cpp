@@ -4,7 +4,7 @@ namespace dsmoe {
 namespace binding {
 
 Inputs contiguous(Inputs inputs) {
-  for (at::Tensor& tensor : inputs) {
+  for (Tensor& tensor : inputs) {
     if (tensor.defined()) tensor = tensor.contiguous();
   }
   return inputs;
@@ -21,12 +21,11 @@ std::vector<int64_t> image_shape(Image image, const ImageSizes& sizes, const Opt
   return wanted ? std::vector<int64_t>{1, height, width} : std::vector<int64_t>{0};
 }
 
-Images allocate_images(const at::Tensor& like_tensor, const ImageSizes& sizes, const Options& options) {
-  const at::TensorOptions like = like_tensor.options();
+Images allocate_images(const Tensor& like, const ImageSizes& sizes, const Options& options) {
   Images images;
   for (int i = 0; i < kNumImages; ++i) {
     const auto image = static_cast<Image>(i);
-    images[i] = at::empty(image_shape(image, sizes, options), image == kRadii ? like.dtype(at::kInt) : like);
+    images[i] = empty(image_shape(image, sizes, options), like, image == kRadii ? kInt : like.scalar_type());
   }
   return images;
 }
@@ -34,23 +33,23 @@ Images allocate_images(const at::Tensor& like_tensor, const ImageSizes& sizes, c
 Inputs allocate_gradients(const Inputs& inputs, const InputMask& wanted) {
   Inputs gradients;
   for (int i = 0; i < kNumInputs; ++i) {
-    if (wanted[i]) gradients[i] = at::empty(inputs[i].sizes(), inputs[i].options());
+    if (wanted[i]) gradients[i] = empty_like(inputs[i]);
   }
   return gradients;
 }
 
-at::ScalarType scalar_type(NumberType type) {
+ScalarType scalar_type(NumberType type) {
   switch (type) {
     case NumberType::kFloat:
-      return at::kFloat;
+      return kFloat;
     case NumberType::kDouble:
-      return at::kDouble;
+      return kDouble;
     case NumberType::kInt32:
-      return at::kInt;
+      return kInt;
     case NumberType::kInt64:
-      return at::kLong;
+      return kLong;
   }
-  return at::kFloat;
+  return kFloat;
 }
 
 std::vector<int64_t> saved_shape(const SavedArray& array) {

@@ -1,8 +1,6 @@
 // The arguments of the ops as C++ values, and torch tensors as the core's structs of pointers.
 #pragma once
 
-#include <ATen/ATen.h>
-
 #include <algorithm>
 #include <array>
 #include <limits>
@@ -12,6 +10,7 @@
 #include "dsmoe/rasterize.h"
 #include "fields.h"
 #include "most_instances.h"
+#include "tensor.h"
 
 namespace dsmoe {
 namespace binding {
@@ -47,9 +46,9 @@ template <class Body> void for_each_feature_image(const Body& body) {
 #undef DSMOE_CALL
 }
 
-using Inputs = std::array<at::Tensor, kNumInputs>;  // an absent input is an undefined tensor
-using Images = std::array<at::Tensor, kNumImages>;  // also their gradients, undefined where there is none
-using Saved = std::vector<at::Tensor>;              // the arrays of SavedForward, in the order of for_each_array
+using Inputs = std::array<Tensor, kNumInputs>;  // an absent input is an undefined tensor
+using Images = std::array<Tensor, kNumImages>;  // also their gradients, undefined where there is none
+using Saved = Tensors;                          // the arrays of SavedForward, in the order of for_each_array
 using InputMask = std::array<bool, kNumInputs>;
 
 // The other arguments: numbers and flags.
@@ -89,12 +88,12 @@ inline ImageSizes image_sizes(const Inputs& inputs) { return {num_gaussians(inpu
 std::vector<int64_t> image_shape(Image image, const ImageSizes& sizes, const Options& options);
 
 // All images, nothing filled. like: a tensor of their type and device.
-Images allocate_images(const at::Tensor& like, const ImageSizes& sizes, const Options& options);
+Images allocate_images(const Tensor& like, const ImageSizes& sizes, const Options& options);
 
 // A gradient for each input that wants one, nothing filled; the others stay undefined.
 Inputs allocate_gradients(const Inputs& inputs, const InputMask& wanted);
 
-at::ScalarType scalar_type(NumberType type);
+ScalarType scalar_type(NumberType type);
 
 // What one of the saved arrays looks like as a tensor: [rows] numbers, or [rows, columns].
 std::vector<int64_t> saved_shape(const SavedArray& array);
@@ -102,24 +101,24 @@ std::vector<int64_t> saved_shape(const SavedArray& array);
 // Torch's allocator, behind the core's interface.
 class TensorMemory final : public Allocator {
  public:
-  explicit TensorMemory(const at::Tensor& like) : options_(like.options()) {}
+  explicit TensorMemory(const Tensor& like) : like_(like) {}
 
   void* allocate(size_t bytes) override {
-    scratch_.push_back(at::empty({static_cast<int64_t>(bytes)}, options_.dtype(at::kByte)));
+    scratch_.push_back(empty({static_cast<int64_t>(bytes)}, like_, kByte));
     return scratch_.back().data_ptr();
   }
 
   void* keep(int index, const SavedArray& array) override {
     if (saved_.size() <= static_cast<size_t>(index)) saved_.resize(index + 1);
-    saved_[index] = at::Tensor();  // freed before the new one, where an array is asked for again
-    saved_[index] = at::empty(saved_shape(array), options_.dtype(scalar_type(array.type)));
+    saved_[index] = Tensor();  // freed before the new one, where an array is asked for again
+    saved_[index] = empty(saved_shape(array), like_, scalar_type(array.type));
     return saved_[index].data_ptr();
   }
 
   void release() override { scratch_.clear(); }
 
   // Puts a tensor that is there already among the saved ones.
-  void give(int index, const at::Tensor& tensor) {
+  void give(int index, const Tensor& tensor) {
     if (saved_.size() <= static_cast<size_t>(index)) saved_.resize(index + 1);
     saved_[index] = tensor;
   }
@@ -127,13 +126,13 @@ class TensorMemory final : public Allocator {
   Saved take_saved() { return std::move(saved_); }
 
  private:
-  at::TensorOptions options_;
+  const Tensor like_;
   Saved saved_, scratch_;
 };
 
-template <class S> const S* data(const at::Tensor& tensor) { return tensor.defined() ? tensor.data_ptr<S>() : nullptr; }
+template <class S> const S* data(const Tensor& tensor) { return tensor.defined() ? tensor.data_ptr<S>() : nullptr; }
 
-template <class S> S* mutable_data(const at::Tensor& tensor) {
+template <class S> S* mutable_data(const Tensor& tensor) {
   return tensor.defined() && tensor.numel() > 0 ? tensor.data_ptr<S>() : nullptr;
 }
 
@@ -160,7 +159,7 @@ template <class S> GaussianInputs<S> gaussian_inputs(const Inputs& inputs, const
 }
 
 // What decides which pairs count and how they are blended.
-template <class S> RasterConfig<S> blend_config(const at::Tensor& background_gate, const Options& options) {
+template <class S> RasterConfig<S> blend_config(const Tensor& background_gate, const Options& options) {
   RasterConfig<S> out;
   out.blend.mode = static_cast<BlendMode>(to_int(options.blend_mode));
   out.blend.background_gate = static_cast<S>(options.fixed_background_gate);
@@ -185,8 +184,7 @@ template <class S> RasterConfig<S> raster_config(const Inputs& inputs, const Opt
 
 // The same, of a rendering of footprints.
 template <class S>
-RasterConfig<S> footprint_config(const at::Tensor& background, const at::Tensor& background_gate,
-                                 const Options& options) {
+RasterConfig<S> footprint_config(const Tensor& background, const Tensor& background_gate, const Options& options) {
   RasterConfig<S> out = blend_config<S>(background_gate, options);
   out.num_channels = static_cast<int>(background.numel());
   out.background = data<S>(background);
@@ -250,13 +248,13 @@ struct JointGradient {
     int64_t size;
   };
   std::vector<Part> parts;
-  at::Tensor whole;  // undefined where none of the parts is wanted
+  Tensor whole;  // undefined where none of the parts is wanted
 
-  JointGradient(std::vector<Part> parts, const Inputs& gradients, const at::Tensor& like) : parts(std::move(parts)) {
+  JointGradient(std::vector<Part> parts, const Inputs& gradients, const Tensor& like) : parts(std::move(parts)) {
     int64_t size = 0;
     bool wanted = false;
     for (const auto& part : this->parts) size += part.size, wanted |= gradients[part.input].defined();
-    if (wanted) whole = at::empty({size}, like.options());
+    if (wanted) whole = empty({size}, like);
   }
 
   void store(const Inputs& gradients) const {
@@ -275,7 +273,7 @@ struct JointGradient {
 template <class S, class Gradients, class Backward>
 void with_input_gradients(const Inputs& inputs, const Inputs& gradients, bool seen_only, Gradients& out,
                           Backward backward) {
-  const at::Tensor& like = inputs[kMeans3D];
+  const Tensor& like = inputs[kMeans3D];
   const JointGradient camera({{kViewMatrix, 16}, {kProjMatrix, 16}, {kCampos, 3}}, gradients, like);
   const JointGradient background({{kBackground, num_channels(inputs)}, {kBackgroundGate, 1}}, gradients, like);
   out.inputs = gaussian_gradients<S>(gradients);

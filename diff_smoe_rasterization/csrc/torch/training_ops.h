@@ -3,11 +3,6 @@
 // define the Backends.
 #pragma once
 
-#include <ATen/ATen.h>
-#include <ATen/Dispatch.h>
-#include <c10/core/DeviceGuard.h>
-#include <c10/util/Optional.h>
-
 #include <climits>
 #include <string>
 #include <tuple>
@@ -24,17 +19,12 @@
 namespace dsmoe {
 namespace binding {
 
-// Autograd must notice where a tensor was changed in place after it was saved.
-inline void note_change(at::TensorList tensors) {
-  for (const at::Tensor& tensor : tensors) tensor.unsafeGetTensorImpl()->bump_version();
-}
-
 inline std::string item_name(const char* list, size_t i) { return std::string(list) + "[" + std::to_string(i) + "]"; }
 
 // A list that must have a dense tensor for each parameter, of its shape, type and device.
-inline void check_like_parameters(const char* function, const char* list, at::TensorList tensors,
-                                  at::TensorList parameters) {
-  TORCH_CHECK_VALUE(tensors.size() == parameters.size(), function, ": ", list, " has length ", tensors.size(),
+inline void check_like_parameters(const char* function, const char* list, const Tensors& tensors,
+                                  const Tensors& parameters) {
+  DSMOE_CHECK_VALUE(tensors.size() == parameters.size(), function, ": ", list, " has length ", tensors.size(),
                     "; it must be ", parameters.size());
   for (size_t i = 0; i < tensors.size(); ++i) {
     const std::string name = item_name(list, i);
@@ -45,52 +35,52 @@ inline void check_like_parameters(const char* function, const char* list, at::Te
 }
 
 // Radii [N], or another number of each row.
-inline void check_row_numbers(const char* function, const char* name, const at::Tensor& numbers,
-                              const at::Tensor& like) {
+inline void check_row_numbers(const char* function, const char* name, const Tensor& numbers, const Tensor& like) {
   check_shape(function, name, numbers, {like.size(0)});
-  check_type(function, name, numbers, at::kInt);
+  check_type(function, name, numbers, kInt);
   check_device(function, name, numbers, "its parameters", like);
   check_contiguous(function, name, numbers);
 }
 
 template <class Backend>
-void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList moments, at::TensorList squares,
-          at::ArrayRef<double> rates, at::ArrayRef<double> root_scales, double beta1, double beta2, double epsilon,
-          const OptionalTensor& visible) {
+void adam(const Tensors& parameters, const Tensors& gradients, const Tensors& moments, const Tensors& squares,
+          const std::vector<double>& rates, const std::vector<double>& root_scales, double beta1, double beta2,
+          double epsilon, const OptionalTensor& visible) {
   const char* function = "adam";
   const size_t count = parameters.size();
   for (size_t length : {gradients.size(), moments.size(), squares.size(), rates.size(), root_scales.size()}) {
-    TORCH_CHECK_VALUE(length == count, function, ": lists of ", count, " and of ", length,
+    DSMOE_CHECK_VALUE(length == count, function, ": lists of ", count, " and of ", length,
                       " items are given; all must have the length of parameters");
   }
   if (count == 0) return;
-  const at::Tensor& first = parameters[0];
+  const Tensor& first = parameters[0];
   check_real(function, "parameters[0]", first);
   check_like_parameters(function, "parameters", parameters, parameters);
   check_like_parameters(function, "moments", moments, parameters);
   check_like_parameters(function, "squares", squares, parameters);
-  const c10::DeviceGuard guard(first.device());
+  const DeviceGuard guard(first.device());
 
-  at::Tensor flags;
+  Tensor flags;
   if (visible.has_value()) {
     flags = visible->contiguous();
-    check_type(function, "visible", flags, at::kBool);
+    check_type(function, "visible", flags, kBool);
     check_shape(function, "visible", flags, {"N"});
     check_device(function, "visible", flags, "parameters[0]", first);
   }
 
-  std::vector<at::Tensor> dense_gradients;
+  Tensors dense_gradients;
   for (size_t i = 0; i < count; ++i) {
     const std::string name = item_name("gradients", i), parameter = item_name("parameters", i);
     check_same_shape(function, name.c_str(), gradients[i], parameter.c_str(), parameters[i]);
     check_like(function, name.c_str(), gradients[i], "parameters[0]", first);
-    TORCH_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)), function,
+    DSMOE_CHECK_VALUE(!flags.defined() || (parameters[i].dim() > 0 && parameters[i].size(0) == flags.size(0)), function,
                       ": ", parameter, " has shape ", parameters[i].sizes(), "; visible has ",
                       flags.defined() ? flags.size(0) : 0, " rows, and so must every parameter");
     dense_gradients.push_back(gradients[i].contiguous());
   }
 
-  AT_DISPATCH_FLOATING_TYPES(first.scalar_type(), "adam", [&] {
+  dispatch_real(first, [&](auto zero) {
+    using scalar_t = decltype(zero);
     const auto constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
     std::vector<AdamTensor<scalar_t>> tensors;
     for (size_t i = 0; i < count; ++i) {
@@ -106,25 +96,25 @@ void adam(at::TensorList parameters, at::TensorList gradients, at::TensorList mo
     }
     Backend::adam(tensors, AdamStep<scalar_t>{constants, flags.defined() ? flags.data_ptr<bool>() : nullptr});
   });
-  for (at::TensorList list : {parameters, moments, squares}) note_change(list);
+  for (const Tensors* list : {&parameters, &moments, &squares}) note_change(*list);
 }
 
 template <class Backend>
-void lazy_adam_catch_up(at::TensorList parameters, at::TensorList moments, at::TensorList squares,
-                        at::TensorList gradients, const at::Tensor& marks, const at::Tensor& rates, int64_t steps,
-                        double beta1, double beta2, double epsilon, const OptionalTensor& radii) {
+void lazy_adam_catch_up(const Tensors& parameters, const Tensors& moments, const Tensors& squares,
+                        const Tensors& gradients, const Tensor& marks, const Tensor& rates, int64_t steps, double beta1,
+                        double beta2, double epsilon, const OptionalTensor& radii) {
   const char* function = "lazy_adam_catch_up";
   const auto count = static_cast<int64_t>(parameters.size());
-  TORCH_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors, function, ": ", count,
+  DSMOE_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors, function, ": ", count,
                     " parameters are given; it must be 1 to ", kLazyAdamMaxTensors);
-  const at::Tensor& first = parameters[0];
+  const Tensor& first = parameters[0];
   check_real(function, "parameters[0]", first);
   check_like_parameters(function, "parameters", parameters, parameters);
   check_like_parameters(function, "moments", moments, parameters);
   check_like_parameters(function, "squares", squares, parameters);
   check_like_parameters(function, "gradients", gradients, parameters);
-  for (const at::Tensor& parameter : parameters) {
-    TORCH_CHECK_VALUE(parameter.dim() > 0 && parameter.size(0) == first.size(0), function, ": a parameter has shape ",
+  for (const Tensor& parameter : parameters) {
+    DSMOE_CHECK_VALUE(parameter.dim() > 0 && parameter.size(0) == first.size(0), function, ": a parameter has shape ",
                       parameter.sizes(), "; all must have the rows of the first, ", first.sizes());
   }
   check_row_numbers(function, "marks", marks, first);
@@ -132,10 +122,11 @@ void lazy_adam_catch_up(at::TensorList parameters, at::TensorList moments, at::T
   check_shape(function, "rates", rates, {"capacity", count, 2});
   check_like(function, "rates", rates, "parameters[0]", first);
   check_contiguous(function, "rates", rates);
-  TORCH_CHECK_VALUE(0 <= steps && steps <= rates.size(0), function, ": steps is ", steps, "; rates has ", rates.size(0),
+  DSMOE_CHECK_VALUE(0 <= steps && steps <= rates.size(0), function, ": steps is ", steps, "; rates has ", rates.size(0),
                     " of them");
-  const c10::DeviceGuard guard(first.device());
-  AT_DISPATCH_FLOATING_TYPES(first.scalar_type(), "lazy_adam_catch_up", [&] {
+  const DeviceGuard guard(first.device());
+  dispatch_real(first, [&](auto zero) {
+    using scalar_t = decltype(zero);
     LazyAdam<scalar_t> adam = {};
     adam.num_tensors = static_cast<int>(count);
     adam.num_rows = first.size(0);
@@ -151,16 +142,16 @@ void lazy_adam_catch_up(at::TensorList parameters, at::TensorList moments, at::T
     adam.constants = adam_constants<scalar_t>(beta1, beta2, epsilon);
     Backend::catch_up(adam);
   });
-  for (at::TensorList list : {parameters, moments, squares}) note_change(list);
+  for (const Tensors* list : {&parameters, &moments, &squares}) note_change(*list);
   note_change({marks});
 }
 
 template <class Backend>
-void lazy_adam_step(const at::Tensor& marks, const at::Tensor& rates, int64_t steps, at::ArrayRef<double> new_rates,
-                    at::ArrayRef<double> root_scales, const at::Tensor& radii) {
+void lazy_adam_step(const Tensor& marks, const Tensor& rates, int64_t steps, const std::vector<double>& new_rates,
+                    const std::vector<double>& root_scales, const Tensor& radii) {
   const char* function = "lazy_adam_step";
   const auto count = static_cast<int64_t>(new_rates.size());
-  TORCH_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors && root_scales.size() == new_rates.size(), function, ": ",
+  DSMOE_CHECK_VALUE(0 < count && count <= kLazyAdamMaxTensors && root_scales.size() == new_rates.size(), function, ": ",
                     count, " new_rates and ", root_scales.size(),
                     " root_scales are given; it must be equally many, 1 to ", kLazyAdamMaxTensors);
   check_real(function, "rates", rates);
@@ -170,10 +161,11 @@ void lazy_adam_step(const at::Tensor& marks, const at::Tensor& rates, int64_t st
   check_row_numbers(function, "marks", marks, marks);
   check_row_numbers(function, "radii", radii, marks);
   check_device(function, "rates", rates, "marks", marks);
-  TORCH_CHECK_VALUE(0 <= steps && steps < rates.size(0), function, ": steps is ", steps, "; rates has room for ",
+  DSMOE_CHECK_VALUE(0 <= steps && steps < rates.size(0), function, ": steps is ", steps, "; rates has room for ",
                     rates.size(0));
-  const c10::DeviceGuard guard(marks.device());
-  AT_DISPATCH_FLOATING_TYPES(rates.scalar_type(), "lazy_adam_step", [&] {
+  const DeviceGuard guard(marks.device());
+  dispatch_real(rates, [&](auto zero) {
+    using scalar_t = decltype(zero);
     LazyAdamStep<scalar_t> step = {};
     step.num_rows = marks.size(0);
     step.marks = marks.data_ptr<int32_t>();
@@ -190,14 +182,14 @@ void lazy_adam_step(const at::Tensor& marks, const at::Tensor& rates, int64_t st
 }
 
 template <class Backend>
-void gaussian_adam(at::TensorList raw, at::TensorList values, at::TensorList dL_dvalues, at::TensorList moments,
-                   at::TensorList squares, const at::Tensor& radii, at::ArrayRef<double> rates,
-                   at::ArrayRef<double> root_scales, double beta1, double beta2, double epsilon) {
+void gaussian_adam(const Tensors& raw, const Tensors& values, const Tensors& dL_dvalues, const Tensors& moments,
+                   const Tensors& squares, const Tensor& radii, const std::vector<double>& rates,
+                   const std::vector<double>& root_scales, double beta1, double beta2, double epsilon) {
   const char* function = "gaussian_adam";
   constexpr Activation kActivations[] = {Activation::kNone, Activation::kSigmoid, Activation::kExp,
                                          Activation::kUnitQuaternion};
   constexpr int64_t kSizes[] = {3, 1, 3, 4};
-  TORCH_CHECK_VALUE(
+  DSMOE_CHECK_VALUE(
       raw.size() == kGaussianAdamTensors && rates.size() == raw.size() && root_scales.size() == raw.size(), function,
       ": raw, rates and root_scales must have ", kGaussianAdamTensors, " items each");
   check_real(function, "raw[0]", raw[0]);
@@ -205,13 +197,14 @@ void gaussian_adam(at::TensorList raw, at::TensorList values, at::TensorList dL_
     check_shape(function, item_name("raw", i).c_str(), raw[i], {raw[0].size(0), kSizes[i]});
   }
   check_like_parameters(function, "raw", raw, raw);
-  check_like_parameters(function, "values", values, raw.slice(1));
+  check_like_parameters(function, "values", values, Tensors(raw.begin() + 1, raw.end()));
   check_like_parameters(function, "dL_dvalues", dL_dvalues, raw);
   check_like_parameters(function, "moments", moments, raw);
   check_like_parameters(function, "squares", squares, raw);
   check_row_numbers(function, "radii", radii, raw[0]);
-  const c10::DeviceGuard guard(raw[0].device());
-  AT_DISPATCH_FLOATING_TYPES(raw[0].scalar_type(), "gaussian_adam", [&] {
+  const DeviceGuard guard(raw[0].device());
+  dispatch_real(raw[0], [&](auto zero) {
+    using scalar_t = decltype(zero);
     GaussianAdam<scalar_t> adam = {};
     adam.num_gaussians = raw[0].size(0);
     adam.radii = radii.data_ptr<int32_t>();
@@ -225,47 +218,49 @@ void gaussian_adam(at::TensorList raw, at::TensorList values, at::TensorList dL_
                          static_cast<int>(kSizes[i]),
                          kActivations[i],
                          {static_cast<scalar_t>(rates[i]), static_cast<scalar_t>(root_scales[i])}};
-      for (const at::Tensor* tensor : {&raw[i], &values[i > 0 ? i - 1 : 0], &dL_dvalues[i], &moments[i], &squares[i]}) {
-        TORCH_CHECK_VALUE(i < 3 || reinterpret_cast<uintptr_t>(tensor->data_ptr()) % (4 * sizeof(scalar_t)) == 0,
+      for (const Tensor* tensor : {&raw[i], &values[i > 0 ? i - 1 : 0], &dL_dvalues[i], &moments[i], &squares[i]}) {
+        DSMOE_CHECK_VALUE(i < 3 || reinterpret_cast<uintptr_t>(tensor->data_ptr()) % (4 * sizeof(scalar_t)) == 0,
                           function, ": rotations must begin at a multiple of a quaternion's size");
       }
     }
     Backend::step_gaussians(adam);
   });
-  for (at::TensorList list : {raw, values, moments, squares}) note_change(list);
+  for (const Tensors* list : {&raw, &values, &moments, &squares}) note_change(*list);
 }
 
 // Indices of rows that a tensor does not have. On a GPU the host waits for the smallest and the largest one.
-inline void check_rows(const char* function, const at::Tensor& rows, const at::Tensor& of) {
+inline void check_rows(const char* function, const Tensor& rows, const Tensor& of) {
   if (rows.numel() == 0 || of.dim() == 0) return;
-  const auto [smallest, largest] = at::aminmax(rows);
-  const at::Tensor ends = at::stack({smallest, largest}).cpu();
-  const auto first = ends[0].item<int64_t>(), last = ends[1].item<int64_t>();
-  TORCH_CHECK_INDEX(0 <= first && last < of.size(0), function, ": rows has indices from ", first, " to ", last,
+  const Tensor ends = empty({2}, rows);
+  ends.narrow(0, 0, 1).copy_(smallest(rows)), ends.narrow(0, 1, 1).copy_(largest(rows));
+  const Tensor here = to_cpu(ends);
+  const int64_t first = here.data_ptr<int64_t>()[0], last = here.data_ptr<int64_t>()[1];
+  DSMOE_CHECK_INDEX(0 <= first && last < of.size(0), function, ": rows has indices from ", first, " to ", last,
                     "; the tensors have ", of.size(0), " rows");
 }
 
-template <class Backend> std::vector<at::Tensor> gather_rows(at::TensorList tensors, const at::Tensor& rows) {
+template <class Backend> Tensors gather_rows(const Tensors& tensors, const Tensor& rows) {
   const char* function = "gather_rows";
   if (tensors.empty()) return {};
   check_real(function, "tensors[0]", tensors[0]);
   check_shape(function, "rows", rows, {"M"});
-  check_type(function, "rows", rows, at::kLong);
+  check_type(function, "rows", rows, kLong);
   check_device(function, "rows", rows, "tensors[0]", tensors[0]);
-  const c10::DeviceGuard guard(rows.device());
-  const at::Tensor list = rows.contiguous();
+  const DeviceGuard guard(rows.device());
+  const Tensor list = rows.contiguous();
   check_rows(function, list, tensors[0]);
-  std::vector<at::Tensor> dense, results;
+  Tensors dense, results;
   for (size_t i = 0; i < tensors.size(); ++i) {
     const std::string name = item_name("tensors", i);
     check_like(function, name.c_str(), tensors[i], "tensors[0]", tensors[0]);
-    TORCH_CHECK_VALUE(tensors[i].dim() > 0, function, ": ", name, " has no rows");
+    DSMOE_CHECK_VALUE(tensors[i].dim() > 0, function, ": ", name, " has no rows");
     std::vector<int64_t> shape = tensors[i].sizes().vec();
     shape[0] = list.size(0);
     dense.push_back(tensors[i].contiguous());
-    results.push_back(at::empty(shape, tensors[i].options()));
+    results.push_back(empty(shape, tensors[i]));
   }
-  AT_DISPATCH_FLOATING_TYPES(tensors[0].scalar_type(), "gather_rows", [&] {
+  dispatch_real(tensors[0], [&](auto zero) {
+    using scalar_t = decltype(zero);
     std::vector<GatherTensor<scalar_t>> all;
     for (size_t i = 0; i < dense.size(); ++i) {
       const int64_t size = list.size(0) > 0 ? results[i].numel() / list.size(0) : 0;
@@ -278,32 +273,33 @@ template <class Backend> std::vector<at::Tensor> gather_rows(at::TensorList tens
 
 // The loss and, if it is wanted, its gradient by the image; an empty tensor otherwise.
 template <class Backend>
-std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at::Tensor& target, double l1_weight,
-                                              double ssim_weight, double offset, int64_t margin, bool with_gradient) {
+std::tuple<Tensor, Tensor> image_loss(const Tensor& image, const Tensor& target, double l1_weight, double ssim_weight,
+                                      double offset, int64_t margin, bool with_gradient) {
   const char* function = "image_loss";
   check_real(function, "image", image);
   refuse_tangent(function, image);
   refuse_tangent(function, target);
   check_same_shape(function, "target", target, "image", image);
   check_device(function, "target", target, "image", image);
-  TORCH_CHECK_VALUE(image.dim() >= 2 && image.numel() > 0, function, ": image has shape ", image.sizes(),
+  DSMOE_CHECK_VALUE(image.dim() >= 2 && image.numel() > 0, function, ": image has shape ", image.sizes(),
                     "; it must be [..., H, W] with at least one pixel");
-  const int64_t height = image.size(-2), width = image.size(-1);
-  TORCH_CHECK_VALUE(height <= INT_MAX && width <= INT_MAX, function, ": image has shape ", image.sizes(),
+  const int64_t height = image.size(image.dim() - 2), width = image.size(image.dim() - 1);
+  DSMOE_CHECK_VALUE(height <= INT_MAX && width <= INT_MAX, function, ": image has shape ", image.sizes(),
                     "; its sides may have ", INT_MAX, " pixels");
-  TORCH_CHECK_VALUE(margin >= 0 && height > 2 * margin && width > 2 * margin, function, ": image has shape ",
+  DSMOE_CHECK_VALUE(margin >= 0 && height > 2 * margin && width > 2 * margin, function, ": image has shape ",
                     image.sizes(), "; with a margin of ", margin, " its sides must be at least ", 2 * margin + 1);
-  const bool bytes = target.scalar_type() == at::kByte;
-  TORCH_CHECK_TYPE(bytes || target.scalar_type() == image.scalar_type(), function, ": target is ",
+  const bool bytes = target.scalar_type() == kByte;
+  DSMOE_CHECK_TYPE(bytes || target.scalar_type() == image.scalar_type(), function, ": target is ",
                    dtype_name(target.scalar_type()), "; it must be ", dtype_name(image.scalar_type()),
                    ", as image is, or uint8");
-  const c10::DeviceGuard guard(image.device());
-  const at::Tensor x = image.contiguous(), y = target.contiguous();
+  const DeviceGuard guard(image.device());
+  const Tensor x = image.contiguous(), y = target.contiguous();
   const int64_t planes = x.numel() / (height * width);
-  const at::Tensor loss = at::empty({}, x.options());
-  const at::Tensor gradient = at::empty(with_gradient ? x.sizes() : at::IntArrayRef({0}), x.options());
-  const at::Tensor derivatives = at::empty({with_gradient ? 3 * x.numel() : 0}, x.options());
-  AT_DISPATCH_FLOATING_TYPES(x.scalar_type(), "image_loss", [&] {
+  const Tensor loss = empty(std::vector<int64_t>(), x);
+  const Tensor gradient = with_gradient ? empty_like(x) : empty({0}, x);
+  const Tensor derivatives = empty({with_gradient ? 3 * x.numel() : 0}, x);
+  dispatch_real(x, [&](auto zero) {
+    using scalar_t = decltype(zero);
     ImageLoss<scalar_t> arguments = {};
     arguments.image = x.data_ptr<scalar_t>();
     arguments.target = bytes ? nullptr : y.data_ptr<scalar_t>();
@@ -312,8 +308,7 @@ std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at:
     arguments.height = static_cast<int>(height), arguments.width = static_cast<int>(width);
     arguments.margin = static_cast<int>(margin);
     arguments.l1_weight = l1_weight, arguments.ssim_weight = ssim_weight, arguments.offset = offset;
-    const at::Tensor sums =
-        at::empty({Backend::template num_image_loss_sums<scalar_t>(arguments)}, x.options().dtype(at::kDouble));
+    const Tensor sums = empty({Backend::template num_image_loss_sums<scalar_t>(arguments)}, x, kDouble);
     arguments.sums = sums.data_ptr<double>();
     arguments.loss = loss.data_ptr<scalar_t>();
     arguments.gradient = with_gradient ? gradient.data_ptr<scalar_t>() : nullptr;
@@ -324,12 +319,12 @@ std::tuple<at::Tensor, at::Tensor> image_loss(const at::Tensor& image, const at:
 }
 
 // Opacities [N, 1], scales [N, 3] and rotations [N, 4] of the Gaussians.
-using GaussianTensors = std::tuple<at::Tensor, at::Tensor, at::Tensor>;
+using GaussianTensors = std::tuple<Tensor, Tensor, Tensor>;
 
-inline GaussianTensors checked(const char* function, const at::Tensor& opacities, const at::Tensor& scales,
-                               const at::Tensor& rotations) {
+inline GaussianTensors checked(const char* function, const Tensor& opacities, const Tensor& scales,
+                               const Tensor& rotations) {
   check_real(function, "opacities", opacities);
-  for (const at::Tensor* tensor : {&opacities, &scales, &rotations}) refuse_tangent(function, *tensor);
+  for (const Tensor* tensor : {&opacities, &scales, &rotations}) refuse_tangent(function, *tensor);
   check_like(function, "scales", scales, "opacities", opacities);
   check_like(function, "rotations", rotations, "opacities", opacities);
   check_shape(function, "opacities", opacities, {"N", 1});
@@ -339,23 +334,23 @@ inline GaussianTensors checked(const char* function, const at::Tensor& opacities
 }
 
 inline GaussianTensors empty_like(const GaussianTensors& tensors) {
-  return {at::empty_like(std::get<0>(tensors)), at::empty_like(std::get<1>(tensors)),
-          at::empty_like(std::get<2>(tensors))};
+  return {empty_like(std::get<0>(tensors)), empty_like(std::get<1>(tensors)), empty_like(std::get<2>(tensors))};
 }
 
 template <class S> GaussianParameters<S> pointers(const GaussianTensors& tensors) {
-  const auto pointer = [](const at::Tensor& tensor) -> S* {
+  const auto pointer = [](const Tensor& tensor) -> S* {
     return tensor.defined() ? tensor.data_ptr<std::remove_const_t<S>>() : nullptr;
   };
   return {pointer(std::get<0>(tensors)), pointer(std::get<1>(tensors)), pointer(std::get<2>(tensors))};
 }
 
 template <class Backend>
-GaussianTensors activate(const at::Tensor& opacities, const at::Tensor& scales, const at::Tensor& rotations) {
+GaussianTensors activate(const Tensor& opacities, const Tensor& scales, const Tensor& rotations) {
   const GaussianTensors raw = checked("activate", opacities, scales, rotations);
-  const c10::DeviceGuard guard(opacities.device());
+  const DeviceGuard guard(opacities.device());
   const GaussianTensors values = empty_like(raw);
-  AT_DISPATCH_FLOATING_TYPES(opacities.scalar_type(), "activate", [&] {
+  dispatch_real(opacities, [&](auto zero) {
+    using scalar_t = decltype(zero);
     Backend::for_each_gaussian(Activate<scalar_t>{pointers<const scalar_t>(raw), pointers<scalar_t>(values)},
                                opacities.size(0));
   });
@@ -364,17 +359,17 @@ GaussianTensors activate(const at::Tensor& opacities, const at::Tensor& scales, 
 
 // raw: the arguments of `activate`, values: its results, dL_d...: the gradients by these, where there are any.
 template <class Backend>
-GaussianTensors activate_backward(at::TensorList raw, at::TensorList values, const OptionalTensor& dL_dopacities,
+GaussianTensors activate_backward(const Tensors& raw, const Tensors& values, const OptionalTensor& dL_dopacities,
                                   const OptionalTensor& dL_dscales, const OptionalTensor& dL_drotations) {
   const char* function = "activate_backward";
-  TORCH_CHECK_VALUE(raw.size() == 3 && values.size() == 3, function, ": raw and values must have 3 tensors each");
+  DSMOE_CHECK_VALUE(raw.size() == 3 && values.size() == 3, function, ": raw and values must have 3 tensors each");
   const GaussianTensors raw_tensors = checked(function, raw[0], raw[1], raw[2]);
   const GaussianTensors value_tensors = checked(function, values[0], values[1], values[2]);
   check_same_shape(function, "values", values[0], "raw", raw[0]);
   check_like(function, "values", values[0], "raw", raw[0]);
-  const c10::DeviceGuard guard(raw[0].device());
-  const auto dense = [&](const char* name, const OptionalTensor& gradient, const at::Tensor& value) {
-    if (!gradient.has_value()) return at::Tensor();
+  const DeviceGuard guard(raw[0].device());
+  const auto dense = [&](const char* name, const OptionalTensor& gradient, const Tensor& value) {
+    if (!gradient.has_value()) return Tensor();
     refuse_tangent(function, *gradient);
     check_same_shape(function, name, *gradient, "its value", value);
     check_like(function, name, *gradient, "raw", raw[0]);
@@ -384,7 +379,8 @@ GaussianTensors activate_backward(at::TensorList raw, at::TensorList values, con
                                      dense("dL_dscales", dL_dscales, values[1]),
                                      dense("dL_drotations", dL_drotations, values[2])};
   const GaussianTensors results = empty_like(raw_tensors);
-  AT_DISPATCH_FLOATING_TYPES(raw[0].scalar_type(), "activate_backward", [&] {
+  dispatch_real(raw[0], [&](auto zero) {
+    using scalar_t = decltype(zero);
     ActivateBackward<scalar_t> pass = {};
     pass.raw = pointers<const scalar_t>(raw_tensors);
     pass.values = pointers<const scalar_t>(value_tensors);
@@ -396,23 +392,23 @@ GaussianTensors activate_backward(at::TensorList raw, at::TensorList values, con
 }
 
 template <class Backend>
-void add_view(const at::Tensor& dL_dmeans2D, const at::Tensor& radii, const at::Tensor& gradient_sum,
-              const at::Tensor& view_count) {
+void add_view(const Tensor& dL_dmeans2D, const Tensor& radii, const Tensor& gradient_sum, const Tensor& view_count) {
   const char* function = "add_view";
   check_real(function, "dL_dmeans2D", dL_dmeans2D);
   check_shape(function, "radii", radii, {"N"});
-  check_type(function, "radii", radii, at::kInt);
+  check_type(function, "radii", radii, kInt);
   check_shape(function, "dL_dmeans2D", dL_dmeans2D, {radii.size(0), 3});
   check_device(function, "radii", radii, "dL_dmeans2D", dL_dmeans2D);
-  for (const at::Tensor* statistic : {&gradient_sum, &view_count}) {
+  for (const Tensor* statistic : {&gradient_sum, &view_count}) {
     const char* name = statistic == &gradient_sum ? "gradient_sum" : "view_count";
     check_shape(function, name, *statistic, {radii.size(0)});
     check_like(function, name, *statistic, "dL_dmeans2D", dL_dmeans2D);
     check_contiguous(function, name, *statistic);
   }
-  const c10::DeviceGuard guard(radii.device());
-  const at::Tensor gradients = dL_dmeans2D.contiguous(), dense_radii = radii.contiguous();
-  AT_DISPATCH_FLOATING_TYPES(gradients.scalar_type(), "add_view", [&] {
+  const DeviceGuard guard(radii.device());
+  const Tensor gradients = dL_dmeans2D.contiguous(), dense_radii = radii.contiguous();
+  dispatch_real(gradients, [&](auto zero) {
+    using scalar_t = decltype(zero);
     AddView<scalar_t> pass = {};
     pass.dL_dmeans2D = gradients.data_ptr<scalar_t>();
     pass.radii = dense_radii.data_ptr<int32_t>();
@@ -424,9 +420,22 @@ void add_view(const at::Tensor& dL_dmeans2D, const at::Tensor& radii, const at::
 }
 
 // Of `mean_squared_neighbour_distances`, whose implementations share no more.
-inline void check_points(const at::Tensor& points) {
+inline void check_points(const Tensor& points) {
   check_real("mean_squared_neighbour_distances", "points", points);
   check_shape("mean_squared_neighbour_distances", "points", points, {"N", 3});
+}
+
+template <class Backend> void register_training_ops(Library& m) {
+  implement<&with_arguments<&adam<Backend>>>(m, "adam");
+  implement<&with_arguments<&lazy_adam_catch_up<Backend>>>(m, "lazy_adam_catch_up");
+  implement<&with_arguments<&lazy_adam_step<Backend>>>(m, "lazy_adam_step");
+  implement<&with_arguments<&gaussian_adam<Backend>>>(m, "gaussian_adam");
+  implement<&with_arguments<&gather_rows<Backend>>>(m, "gather_rows");
+  implement<&with_arguments<&image_loss<Backend>>>(m, "image_loss");
+  implement<&with_arguments<&activate<Backend>>>(m, "activate");
+  implement<&with_arguments<&activate_backward<Backend>>>(m, "activate_backward");
+  implement<&with_arguments<&add_view<Backend>>>(m, "add_view");
+  implement<&with_arguments<&Backend::mean_squared_neighbour_distances>>(m, "mean_squared_neighbour_distances");
 }
 
 }  // namespace binding

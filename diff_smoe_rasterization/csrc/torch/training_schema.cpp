@@ -1,7 +1,7 @@
 // What torch knows of the trainers' ops.
-#include <torch/library.h>
+#include "tensor.h"
 
-TORCH_LIBRARY_FRAGMENT(diff_smoe_rasterization, m) {
+DSMOE_LIBRARY_FRAGMENT(m) {
   // One step of Adam in place. rates and root_scales: a number per parameter, see dsmoe/adam.h. visible [N]: rows of
   // every parameter that are stepped.
   m.def(
