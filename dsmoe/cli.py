@@ -196,7 +196,7 @@ def main(argv: Optional[List[str]] = None) -> int:
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
     arguments.command_words = list(sys.argv[1:] if argv is None else argv)
-    if unknown:  # argparse would show the usage of `dsmoe` alone
+    if unknown:  # argparse would show only the usage of `dsmoe`
         getattr(arguments, "command_parser", parser).error("unrecognized arguments: " + " ".join(unknown))
     try:
         status = arguments.run(arguments) or 0
@@ -239,7 +239,7 @@ def _add_model_options(parser: argparse.ArgumentParser, scene: str) -> None:
     parser.add_argument("--blend-mode", choices=BLEND_MODES,
                         help="needed for a .ply that does not record it; must agree where it does")
     parser.add_argument("--background-gate", type=float, metavar="X",
-                        help="likewise, in smoe; a file that records smoe and no gate was trained with 0")
+                        help="background weight for smoe, if the .ply records none; old files without it used 0")
     parser.add_argument("--white-background", action="store_true", default=None,
                         help="white background (default: the run's, for a .ply black)")
 
@@ -436,7 +436,7 @@ def _train_config(arguments: argparse.Namespace) -> TrainConfig:
         given["output"] = arguments.output = given.pop("scene")
         del arguments.scene
     if "output" not in given or "scene" not in given and not arguments.resume:
-        arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs OUT alone")
+        arguments.command_parser.error("SCENE and -o OUT are needed; --resume needs only OUT")
     if arguments.resume and arguments.scale_recipe and "scene" not in given:
         arguments.command_parser.error("--scale-recipe needs SCENE; --resume alone keeps the run's milestones")
     run = given.pop("output")

@@ -50,7 +50,7 @@ class GaussianModel:
         self.sh_degree = sh_degree
         self.active_sh_degree = 0
         self.stored = {name: raw[name].detach().clone().contiguous().requires_grad_() for name in PARAMETERS}
-        """The raw parameters, of which rows of spherical harmonics may wait for steps of `lazy`."""
+        """The raw parameters; some rows of spherical harmonics may wait for steps of `lazy`."""
         self.lazy: Optional[LazyAdam] = None
 
     @classmethod
@@ -250,7 +250,7 @@ class GaussianOptimizer:
     def _put(self, name: str, tensors: Dict[str, torch.Tensor]) -> None:
         """Puts others in place of what `_tensors` gives.
 
-        The new leaf has no gradient, so the current step leaves it alone: as in 3DGS, where an iteration that
+        The new leaf has no gradient, so the current step does not change it: as in 3DGS, where an iteration that
         densifies steps nothing and one that resets opacities steps all but them.
         """
         if name in self.model.color_sources().values():

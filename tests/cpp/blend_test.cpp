@@ -20,8 +20,8 @@ struct Pixel {
   Vector alpha;
   Vector color, depth, inverse_depth;
   double background = 0.35;
-  double background_gate = 0;  // read by smoe and smoe_eq7 alone
-  double tails = 0;            // B, read by smoe alone
+  double background_gate = 0;  // read only by smoe and smoe_eq7
+  double tails = 0;            // B, read only by smoe
   int size() const { return static_cast<int>(alpha.size()); }
 };
 
@@ -257,7 +257,7 @@ struct PixelGradient {
   double background = 0, background_gate = 0;
 };
 
-// The pairs in front of `middle` belong to another walk, which knows those behind by their sum alone.
+// The pairs in front of `middle` belong to another walk, which knows only the sum of those behind.
 template <BlendMode kMode, class Real> PixelGradient backward(const Pixel& pixel, const Weights& g, int middle = 0) {
   const Finished forward = blended<kMode, Real>(pixel);
   const PixelEnd<Real> end = {Real(forward.transmittance), Real(forward.denominator_part), Real(pixel.background_gate),

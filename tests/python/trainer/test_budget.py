@@ -107,7 +107,7 @@ def test_a_killed_run_resumes_bit_for_bit(tiny_config, tmp_path, schedule, kille
 
 
 def looking(trainer, monkeypatch):
-    """The strategy after steps over every training view, none of which has changed a Gaussian."""
+    """The strategy after steps over every training view that changed no Gaussian."""
     monkeypatch.setattr(trainer.strategy, "_looks", lambda step: True)
     monkeypatch.setattr(trainer.strategy, "after_backward", lambda step: None)
     monkeypatch.setattr(trainer.optimizer, "step", lambda: None)
@@ -117,7 +117,7 @@ def looking(trainer, monkeypatch):
 
 
 def test_a_decision_looks_once_at_each_of_its_views(tiny_config, monkeypatch):
-    """Removals at 16, 19, 22, 25. Of the five views that each wants, what the steps before do not show is rendered."""
+    """Removals at 16, 19, 22, 25. Each wants five views; views that the steps before did not show are rendered."""
     trainer = trainer_of(tiny_config, schedule="gate", budget=60, strategy_options="removals=4,views=5")
     strategy, log = trainer.strategy, {}
     look = strategy._look
@@ -342,7 +342,7 @@ def test_settings_of_gate_are_of_gate_only():
 
 @pytest.mark.parametrize("iterations", [2, 3, 5, 6, 7, 8])
 def test_the_shortest_runs_of_gate_end_with_the_budget(tiny_config, iterations):
-    """All milestones lie within a few steps, of which the last changes nothing."""
+    """All milestones lie within a few steps, and the last step changes nothing."""
     config = tiny_config.changed(schedule="gate", budget=60, iterations=iterations, densify_until_iter=iterations)
     assert counts_of(trainer_of(config))[-1] == 60
 

@@ -105,7 +105,7 @@ def test_a_process_saves_and_ends_where_torchrun_is_killed(tiny_config):
 @needs_gloo
 @needs_torchrun
 def test_a_budget_holds_for_all_processes_together(tiny_config, tmp_path):
-    """One view a step, two processes, of which one blends nothing: the model of the usual training."""
+    """One view a step, two processes, so one process blends nothing: the model of the usual training."""
     config = tiny_config.changed(schedule="steady", budget=170, iterations=20, output=str(tmp_path / "one"))
     row = train(config, progress=False)
     assert 165 < row["num_gaussians"] <= 170 and row["num_gaussians"] != row["protocol"]["init_points"]
